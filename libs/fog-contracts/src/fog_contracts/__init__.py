@@ -1,0 +1,1 @@
+"""Channels, messages, cost values and grid geometry of Fognav, defined once."""

@@ -1,0 +1,1 @@
+"""Compiled kernels: A*, inflation, ray casting, likelihood field, particle filter, DWA."""

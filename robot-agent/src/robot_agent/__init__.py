@@ -1,0 +1,1 @@
+"""Localizes, follows and drives; owns the safety gate and the serial port."""

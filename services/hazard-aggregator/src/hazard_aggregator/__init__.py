@@ -1,0 +1,1 @@
+"""Debounces and fuses sensor nodes into one state per area."""

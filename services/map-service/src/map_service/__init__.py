@@ -1,0 +1,1 @@
+"""Turns hazards and no-go zones into one versioned master costmap."""

@@ -1,0 +1,1 @@
+"""Simulated world with wire-level Roomba, RPLidar and sensor nodes."""

@@ -1,0 +1,128 @@
+"""Plane geometry of areas and zones: polygons as sequences of (x, y) in metres, frame `map`."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fog_contracts.grid import GridGeometry, Window
+
+Point = tuple[float, float]
+Polygon = Sequence[Point]
+
+
+class GeometryError(ValueError):
+    """A shape that can't be used; the message names what is wrong with it."""
+
+
+def signed_area(polygon: Polygon) -> float:
+    """Area in m2, positive when the vertices run counter-clockwise (shoelace formula)."""
+    return 0.5 * sum(x0 * y1 - x1 * y0 for (x0, y0), (x1, y1) in zip(polygon, [*polygon[1:], polygon[0]], strict=True))
+
+
+def _cross(o: Point, a: Point, b: Point) -> float:
+    return (a[0] - o[0]) * (b[1] - o[1]) - (a[1] - o[1]) * (b[0] - o[0])
+
+
+def _on_segment(a: Point, b: Point, p: Point) -> bool:
+    return min(a[0], b[0]) <= p[0] <= max(a[0], b[0]) and min(a[1], b[1]) <= p[1] <= max(a[1], b[1])
+
+
+def segments_touch(a: Point, b: Point, c: Point, d: Point) -> bool:
+    """Whether the closed segments ab and cd share a point."""
+    d1, d2, d3, d4 = _cross(c, d, a), _cross(c, d, b), _cross(a, b, c), _cross(a, b, d)
+    if ((d1 > 0) != (d2 > 0)) and ((d3 > 0) != (d4 > 0)) and d1 and d2 and d3 and d4:
+        return True
+    touching = ((d1, c, d, a), (d2, c, d, b), (d3, a, b, c), (d4, a, b, d))
+    return any(side == 0 and _on_segment(p, q, r) for side, p, q, r in touching)
+
+
+def normalized_polygon(points: Sequence[Sequence[float]]) -> list[Point]:
+    """Check a polygon and return it open and counter-clockwise.
+
+    Raises `GeometryError` when it has fewer than three distinct vertices, a number that is not finite, no area, or
+    sides that cross.
+    """
+    ring: list[Point] = []
+    for index, point in enumerate(points):
+        if len(point) != 2 or not all(math.isfinite(v) for v in point):
+            raise GeometryError(f"vertex {index} must be two finite numbers [x, y] in metres, not {list(point)}")
+        vertex = (float(point[0]), float(point[1]))
+        if not ring or vertex != ring[-1]:
+            ring.append(vertex)
+    if len(ring) > 1 and ring[0] == ring[-1]:
+        ring.pop()
+    if len(ring) < 3:
+        raise GeometryError(f"a polygon needs at least three distinct vertices; this one has {len(ring)}")
+    area = signed_area(ring)
+    if abs(area) < 1e-9:
+        raise GeometryError("the polygon has no area: its vertices lie on one line")
+    count = len(ring)
+    for i in range(count):
+        for j in range(i + 1, count):
+            if j == i + 1 or (i == 0 and j == count - 1):
+                continue
+            if segments_touch(ring[i], ring[i + 1], ring[j], ring[(j + 1) % count]):
+                raise GeometryError(f"the polygon crosses itself: side {i} meets side {j}")
+    return ring if area > 0 else ring[::-1]
+
+
+def contains_point(polygon: Polygon, x: float, y: float) -> bool:
+    """Whether the point lies in the polygon (even-odd rule; points on the border may go either way)."""
+    inside = False
+    previous = polygon[-1]
+    for vertex in polygon:
+        (x0, y0), (x1, y1) = previous, vertex
+        if (y0 > y) != (y1 > y) and x < (x1 - x0) * (y - y0) / (y1 - y0) + x0:
+            inside = not inside
+        previous = vertex
+    return inside
+
+
+def distance_to_segment(a: Point, b: Point, x: float, y: float) -> float:
+    """Distance (m) from the point to the closed segment ab."""
+    dx, dy = b[0] - a[0], b[1] - a[1]
+    squared = dx * dx + dy * dy
+    t = 0.0 if squared == 0 else max(0.0, min(1.0, ((x - a[0]) * dx + (y - a[1]) * dy) / squared))
+    return math.hypot(x - a[0] - t * dx, y - a[1] - t * dy)
+
+
+def distance_to_polygon(polygon: Polygon, x: float, y: float) -> float:
+    """Distance (m) from the point to the polygon: 0 inside."""
+    if contains_point(polygon, x, y):
+        return 0.0
+    sides = zip(polygon, [*polygon[1:], polygon[0]], strict=True)
+    return min(distance_to_segment(a, b, x, y) for a, b in sides)
+
+
+def bounding_box(polygon: Polygon) -> tuple[float, float, float, float]:
+    """Smallest upright rectangle around the polygon: (left, bottom, right, top) in metres."""
+    xs, ys = [p[0] for p in polygon], [p[1] for p in polygon]
+    return min(xs), min(ys), max(xs), max(ys)
+
+
+def rasterize(polygon: Polygon, geometry: GridGeometry) -> tuple[Window, NDArray[np.bool_]]:
+    """Return the window of the grid that the polygon touches, and a mask (window height, width) of its cells.
+
+    A cell belongs to the polygon when its centre lies inside or within half a cell's diagonal of the border: a
+    danger is rather drawn one cell too large than too small. The window is empty when the polygon lies off the grid.
+    """
+    margin = geometry.resolution * math.sqrt(0.5)
+    left, bottom, right, top = bounding_box(polygon)
+    window = geometry.window_around(left - margin, bottom - margin, right + margin, top + margin)
+    if window.empty:
+        return window, np.zeros((0, 0), dtype=np.bool_)
+    xs = geometry.origin_x + (np.arange(window.x, window.x + window.width) + 0.5) * geometry.resolution
+    ys = geometry.origin_y + (np.arange(window.y, window.y + window.height) + 0.5) * geometry.resolution
+    px, py = np.meshgrid(xs, ys)
+    inside = np.zeros(px.shape, dtype=np.bool_)
+    near = np.zeros(px.shape, dtype=np.bool_)
+    for (x0, y0), (x1, y1) in zip(polygon, [*polygon[1:], polygon[0]], strict=True):
+        dx, dy = x1 - x0, y1 - y0
+        if dy != 0:
+            inside ^= ((y0 > py) != (y1 > py)) & (px < dx * (py - y0) / dy + x0)
+        squared = dx * dx + dy * dy
+        t = np.zeros_like(px) if squared == 0 else np.clip(((px - x0) * dx + (py - y0) * dy) / squared, 0.0, 1.0)
+        near |= np.hypot(px - x0 - t * dx, py - y0 - t * dy) <= margin
+    return window, inside | near

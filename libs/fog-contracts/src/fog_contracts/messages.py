@@ -1,0 +1,434 @@
+"""Every message that crosses a process border, as frozen types; units are metres, radians and seconds, frame `map`.
+
+Stamps are seconds since the Unix epoch by the sender's clock (`fog_runtime.clock.Clock.stamp`); they serve traces and
+people. Freshness is never judged by them but by the receiver's own monotonic clock.
+"""
+
+from typing import Annotated, Literal
+
+from msgspec import Meta, Struct
+
+Id = Annotated[str, Meta(pattern=r"^[a-z0-9][a-z0-9-]{0,31}$")]
+Metres = Annotated[float, Meta(ge=-100_000.0, le=100_000.0)]
+Radians = Annotated[float, Meta(ge=-1_000.0, le=1_000.0)]
+Speed = Annotated[float, Meta(ge=-10.0, le=10.0)]
+Stamp = Annotated[float, Meta(ge=0.0, le=1e12)]
+Count = Annotated[int, Meta(ge=0, le=2**53)]
+Hash = Annotated[int, Meta(ge=0, le=2**64 - 1)]
+Cells = Annotated[int, Meta(ge=0, le=65_535)]
+Sentence = Annotated[str, Meta(max_length=500)]
+PointXY = tuple[Metres, Metres]
+Ring = Annotated[list[PointXY], Meta(min_length=3, max_length=500)]
+
+AreaState = Literal["blocked", "clear", "unknown"]
+SonarStatus = Literal["ok", "no_echo", "stuck"]
+
+
+class Message(Struct, frozen=True, kw_only=True):
+    """Base of all messages: frozen, fields by name; unknown fields are ignored when decoding."""
+
+
+class Pose(Message, frozen=True, kw_only=True):
+    """Position and heading in the frame `map`."""
+
+    x: Metres
+    y: Metres
+    theta: Radians
+
+
+# --- Sensor side (MQTT, JSON) ---------------------------------------------------------------------------------------
+
+
+class NodeReading(Message, frozen=True, kw_only=True):
+    """One measurement of a node: all its sonars once. A range that is missing is null, never 0."""
+
+    seq: Count
+    boot: Count
+    uptime_ms: Count
+    range_m: Annotated[list[Annotated[float, Meta(gt=0.0, le=20.0)] | None], Meta(min_length=1, max_length=8)]
+    status: Annotated[list[SonarStatus], Meta(min_length=1, max_length=8)]
+    state: AreaState
+    rssi: Annotated[int, Meta(ge=-200, le=100)] | None = None
+    fw: Annotated[str, Meta(max_length=64)] = ""
+
+    def __post_init__(self) -> None:
+        if len(self.range_m) != len(self.status):
+            raise ValueError(f"range_m has {len(self.range_m)} entries but status has {len(self.status)}")
+
+
+class NodeValue(Message, frozen=True, kw_only=True):
+    """A danger that a number can tell (temperature, gas, ...); the threshold is the aggregator's."""
+
+    seq: Count
+    boot: Count
+    kind: Id
+    value: Annotated[float, Meta(ge=-1e9, le=1e9)]
+    unit: Annotated[str, Meta(max_length=16)]
+
+
+class NodeConfig(Message, frozen=True, kw_only=True):
+    """What a node is told about its place: per sonar the range below which an echo means `blocked`."""
+
+    version: Count
+    range_limit_m: Annotated[list[Annotated[float, Meta(gt=0.0, le=20.0)]], Meta(min_length=1, max_length=8)]
+    no_echo_is_clear: Annotated[list[bool], Meta(min_length=1, max_length=8)]
+    pause_ms: Annotated[int, Meta(ge=10, le=60_000)] = 50
+
+
+class Trace(Message, frozen=True, kw_only=True):
+    """Stamps of one hazard's way through the stages; 0 = not reached yet."""
+
+    area: Id
+    epoch: Count
+    seq: Count
+    first_reading: Stamp = 0.0
+    confirmed: Stamp = 0.0
+    costmap_published: Stamp = 0.0
+    plan_published: Stamp = 0.0
+    path_received: Stamp = 0.0
+    first_command: Stamp = 0.0
+
+
+class AreaHazard(Message, frozen=True, kw_only=True):
+    """State of one area as the aggregator judges it; `seq` grows by one with each change, `epoch` with each start."""
+
+    area: Id
+    state: AreaState
+    severity: Annotated[int, Meta(ge=0, le=3)]
+    penalty: Annotated[int, Meta(ge=0, le=254)]
+    since: Stamp
+    seq: Count
+    epoch: Count
+    cause: Sentence
+    nodes: dict[Id, AreaState] = {}
+    explained_by: Id | None = None
+    trace: Trace | None = None
+
+
+class UnknownPolicy(Message, frozen=True, kw_only=True):
+    """What silence costs: how long a node may be silent, and what an unknown area costs when it was clear before."""
+
+    silent_after_s: Annotated[float, Meta(ge=0.5, le=3600.0)] = 3.0
+    penalty: Annotated[int, Meta(ge=0, le=254)] = 200
+
+
+class Debounce(Message, frozen=True, kw_only=True):
+    """How many readings in a row change an area's state (the thesis: five either way)."""
+
+    to_blocked: Annotated[int, Meta(ge=1, le=1000)] = 5
+    to_clear: Annotated[int, Meta(ge=1, le=1000)] = 5
+
+
+class AreaDefinition(Message, frozen=True, kw_only=True):
+    """What an area is: where it lies, who watches it, how it is judged; `number` is its name on the thesis's topics."""
+
+    id: Id
+    label: Annotated[str, Meta(max_length=100)] = ""
+    polygon: Ring
+    nodes: list[Id] = []
+    number: Annotated[int, Meta(ge=0, le=9999)] | None = None
+    debounce: Debounce = Debounce()
+    unknown: UnknownPolicy = UnknownPolicy()
+    version: Count = 0
+    removed: bool = False
+
+
+# --- Map (zenoh, msgpack) -------------------------------------------------------------------------------------------
+
+
+class MapGeometry(Message, frozen=True, kw_only=True):
+    """Size in cells, resolution in m per cell, lower-left corner in the frame `map`."""
+
+    width: Annotated[int, Meta(ge=1, le=65_535)]
+    height: Annotated[int, Meta(ge=1, le=65_535)]
+    resolution: Annotated[float, Meta(gt=0.0, le=10.0)]
+    origin_x: Metres
+    origin_y: Metres
+
+
+class Cause(Message, frozen=True, kw_only=True):
+    """Why cells changed: a hazard area or a zone, and what became of it."""
+
+    kind: Literal["hazard", "zone", "obstacle", "map"]
+    id: Annotated[str, Meta(max_length=64)]
+    state: Annotated[str, Meta(max_length=32)]
+
+
+Layer = Literal["cost", "speed"]
+Packing = Literal["raw", "zlib"]
+
+
+class MapDelta(Message, frozen=True, kw_only=True):
+    """One window of one layer of a new map version; a version is applied when all its `parts` are there.
+
+    `cells` is uint8, row-major, row 0 at the bottom, `w * h` values after unpacking. `hash` is the hash of the whole
+    map (`fog_contracts.replica`) after the version.
+    """
+
+    epoch: Count
+    seq: Count
+    part: Cells
+    parts: Annotated[int, Meta(ge=1, le=65_535)]
+    layer: Layer
+    x: Cells
+    y: Cells
+    w: Annotated[int, Meta(ge=1, le=65_535)]
+    h: Annotated[int, Meta(ge=1, le=65_535)]
+    packing: Packing
+    cells: bytes
+    hash: Hash
+    causes: list[Cause] = []
+    traces: list[Trace] = []
+
+
+class MapHeartbeat(Message, frozen=True, kw_only=True):
+    """The version that the map-service holds now, 10 times a second."""
+
+    epoch: Count
+    seq: Count
+    hash: Hash
+    stamp: Stamp
+
+
+class MapSnapshot(Message, frozen=True, kw_only=True):
+    """The whole map at one version; the layers are zlib-packed uint8 grids of the same geometry.
+
+    `static` is the plain map for localization (0 free, 254 occupied, 255 unknown), never touched by hazards or zones.
+    """
+
+    site: Id
+    epoch: Count
+    seq: Count
+    hash: Hash
+    geometry: MapGeometry
+    cost: bytes
+    speed: bytes
+    static: bytes
+
+
+class HazardArea(Message, frozen=True, kw_only=True):
+    """A hazard with its place: the reason behind cells of the costmap."""
+
+    hazard: AreaHazard
+    polygon: Ring
+    label: str = ""
+
+
+ZoneKind = Literal["BLOCKED", "PENALTY", "SPEED_LIMIT"]
+
+
+class PolygonShape(Message, frozen=True, kw_only=True, tag="polygon", tag_field="type"):
+    """A simple polygon, any orientation."""
+
+    points: Ring
+
+
+class RectangleShape(Message, frozen=True, kw_only=True, tag="rectangle", tag_field="type"):
+    """An upright rectangle by two opposite corners."""
+
+    corner: PointXY
+    opposite: PointXY
+
+
+class CircleShape(Message, frozen=True, kw_only=True, tag="circle", tag_field="type"):
+    """A circle by centre and radius."""
+
+    centre: PointXY
+    radius: Annotated[float, Meta(gt=0.0, le=1000.0)]
+
+
+class CorridorShape(Message, frozen=True, kw_only=True, tag="corridor", tag_field="type"):
+    """Everything within half a width of a polyline."""
+
+    line: Annotated[list[PointXY], Meta(min_length=2, max_length=500)]
+    width: Annotated[float, Meta(gt=0.0, le=1000.0)]
+
+
+Shape = PolygonShape | RectangleShape | CircleShape | CorridorShape
+
+
+class Zone(Message, frozen=True, kw_only=True):
+    """An operator's zone: where, what it does (factor for PENALTY, m/s for SPEED_LIMIT), why, by whom, until when."""
+
+    id: Id
+    kind: ZoneKind
+    shape: Shape
+    factor: Annotated[float, Meta(ge=1.0, le=100.0)] | None = None
+    speed: Annotated[float, Meta(ge=0.01, le=2.54)] | None = None
+    reason: Sentence = ""
+    author: Annotated[str, Meta(max_length=100)] = ""
+    starts_at: Stamp | None = None
+    expires_at: Stamp | None = None
+    enabled: bool = True
+    version: Count = 1
+
+
+class ZoneSet(Message, frozen=True, kw_only=True):
+    """All zones that are stored, with the map version that shows them."""
+
+    epoch: Count
+    seq: Count
+    zones: list[Zone]
+
+
+# --- Planner (zenoh, msgpack) ---------------------------------------------------------------------------------------
+
+PLAN_CODES = {
+    0: "OK",
+    203: "START_OUTSIDE_MAP",
+    204: "GOAL_OUTSIDE_MAP",
+    205: "START_OCCUPIED",
+    206: "GOAL_OCCUPIED",
+    207: "TIMEOUT",
+    208: "NO_VALID_PATH",
+}
+"""Nav2's error codes of `ComputePathToPose`, with their names."""
+
+PlanCode = Literal[0, 203, 204, 205, 206, 207, 208]
+Points = Annotated[list[PointXY], Meta(max_length=100_000)]
+
+
+class Refusal(Message, frozen=True, kw_only=True):
+    """Why there is no path: Nav2's code, a sentence, what cuts the way, and the nearest point that can be reached."""
+
+    code: PlanCode
+    reason: Sentence
+    causes: list[Cause] = []
+    nearest: PointXY | None = None
+
+    @property
+    def name(self) -> str:
+        """Nav2's name of the code."""
+        return PLAN_CODES[self.code]
+
+
+class PlanRequest(Message, frozen=True, kw_only=True):
+    """Ask for a path between two poses, without side effects."""
+
+    start: Pose
+    goal: Pose
+
+
+class PlanReply(Message, frozen=True, kw_only=True):
+    """A path (its points 5 cm or more apart, frame `map`) with its length in metres, or the refusal."""
+
+    points: Points = []
+    length: Annotated[float, Meta(ge=0.0, le=1e6)] = 0.0
+    cost: Annotated[float, Meta(ge=0.0, le=1e12)] = 0.0
+    map_epoch: Count = 0
+    map_seq: Count = 0
+    refusal: Refusal | None = None
+
+
+class RobotGoal(Message, frozen=True, kw_only=True):
+    """The mission of a robot; `pose` is null when it has none (cancelled or reached)."""
+
+    goal_id: Annotated[str, Meta(max_length=64)]
+    pose: Pose | None
+    place: Id | None = None
+    stamp: Stamp = 0.0
+
+
+class RobotPath(Message, frozen=True, kw_only=True):
+    """The way to the goal, or why there is none.
+
+    The robot may drive the first `released_length` metres of `points` without hearing from the planner again; the
+    planner publishes the same `plan_id` again with more of it released while all is well.
+    """
+
+    plan_id: Count
+    planner_epoch: Count
+    goal_id: Annotated[str, Meta(max_length=64)]
+    points: Points
+    map_epoch: Count
+    map_seq: Count
+    released_length: Annotated[float, Meta(ge=0.0, le=1e6)]
+    goal_theta: Radians | None = None
+    refusal: Refusal | None = None
+    traces: list[Trace] = []
+    stamp: Stamp = 0.0
+
+
+# --- Robot (zenoh, msgpack) -----------------------------------------------------------------------------------------
+
+
+class RobotPose(Message, frozen=True, kw_only=True):
+    """Where a robot believes to be; `covariance` is row-major 3 x 3 over (x, y, theta)."""
+
+    x: Metres
+    y: Metres
+    theta: Radians
+    covariance: Annotated[list[float], Meta(min_length=9, max_length=9)]
+    v: Speed
+    w: Speed
+    radius: Annotated[float, Meta(gt=0.0, le=2.0)]
+    height: Annotated[float, Meta(gt=0.0, le=3.0)]
+    stamp: Stamp
+    localized: bool = True
+
+
+Mode = Literal["INIT", "NORMAL", "DEGRADED", "HOLD", "PROTECTIVE_STOP", "FAULT", "EGRESS", "DOCK"]
+
+
+class LoopHealth(Message, frozen=True, kw_only=True):
+    """How well the agent's loops keep their periods (seconds) since its start."""
+
+    control_p99_s: float = 0.0
+    stream_p99_s: float = 0.0
+    late: Count = 0
+
+
+class RobotState(Message, frozen=True, kw_only=True):
+    """What a robot is doing and why, and which map version and path it acts on."""
+
+    mode: Mode
+    reasons: list[Sentence]
+    enabled: bool
+    battery: Annotated[float, Meta(ge=0.0, le=1.0)] | None
+    goal_id: Annotated[str, Meta(max_length=64)] | None
+    map_epoch: Count
+    map_seq: Count
+    plan_id: Count | None
+    planner_epoch: Count | None = None
+    goal_reached: bool = False
+    goal_distance: float | None = None
+    loop: LoopHealth = LoopHealth()
+    traces: list[Trace] = []
+    stamp: Stamp = 0.0
+
+
+class RobotObstacles(Message, frozen=True, kw_only=True):
+    """Points (m, frame `map`) that a robot's lidar sees and the map doesn't know; they hold for `ttl` seconds."""
+
+    points: Annotated[list[PointXY], Meta(max_length=2_000)]
+    stamp: Stamp
+    ttl: Annotated[float, Meta(gt=0.0, le=600.0)]
+
+
+CommandKind = Literal["enable", "disable", "cancel", "egress", "reset", "initial_pose"]
+
+
+class RobotCommand(Message, frozen=True, kw_only=True):
+    """An operator's command: single-use (`nonce`), valid 5 s from `issued_at`, signed (`fog_contracts.commands`)."""
+
+    kind: CommandKind
+    robot: Id
+    operator: Annotated[str, Meta(min_length=1, max_length=100)]
+    nonce: Annotated[str, Meta(min_length=16, max_length=64)]
+    issued_at: Stamp
+    pose: Pose | None = None
+    signature: Annotated[bytes, Meta(max_length=64)] = b""
+
+
+class CommandReply(Message, frozen=True, kw_only=True):
+    """Whether the robot did as told, and why not."""
+
+    accepted: bool
+    reason: Sentence
+
+
+class EgressRequest(Message, frozen=True, kw_only=True):
+    """A robot inside a blocked area asks for a way out."""
+
+    robot: Id
+    pose: Pose

@@ -1,0 +1,349 @@
+"""Versioned copies of the master costmap: one writer, many replicas, and a hash that tells them apart.
+
+Every version is named by `epoch, seq, hash`. The epoch changes when the writer starts, the seq grows by one with each
+change, and the hash is over both layers. It combines the hashes of 64 x 64 tiles by XOR, so that a change costs only
+its touched tiles; each tile's hash is keyed by layer and tile number, so that equal tiles don't cancel out.
+"""
+
+import hashlib
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fog_contracts.channels import DELTA_LIMIT
+from fog_contracts.grid import GridGeometry, Window
+from fog_contracts.messages import (
+    Cause,
+    Layer,
+    MapDelta,
+    MapGeometry,
+    MapHeartbeat,
+    MapSnapshot,
+    Packing,
+    Trace,
+)
+
+TILE: Final = 64
+LAYERS: Final[tuple[Layer, ...]] = get_args(Layer)
+_HEADROOM: Final = 8 * 1024
+"""Bytes of a delta kept for everything but its cells: causes and traces are cut to fit."""
+_MAX_CAUSES: Final = 24
+_MAX_TRACES: Final = 8
+
+Grid = NDArray[np.uint8]
+
+
+class MapError(ValueError):
+    """Bytes that can't be a map of this geometry; the message says what does not fit."""
+
+
+def _pack(cells: Grid) -> tuple[Packing, bytes]:
+    raw = cells.tobytes()
+    packed = zlib.compress(raw, 1)
+    return ("zlib", packed) if len(packed) < len(raw) else ("raw", raw)
+
+
+def _unpack(packing: Packing, data: bytes, shape: tuple[int, int], what: str) -> Grid:
+    size = shape[0] * shape[1]
+    if packing == "zlib":
+        unpacker = zlib.decompressobj()
+        try:
+            data = unpacker.decompress(data, size + 1)
+        except zlib.error as error:
+            raise MapError(f"{what} does not unpack: {error}") from error
+    if len(data) != size:
+        raise MapError(f"{what} has {len(data)} cells or more where {shape[1]} x {shape[0]} = {size} are due")
+    return np.frombuffer(data, dtype=np.uint8).reshape(shape)
+
+
+class TileHashes:
+    """The hash of a map, kept up to date by recomputing touched tiles only."""
+
+    def __init__(self, layers: Mapping[Layer, Grid]) -> None:
+        height, width = layers[LAYERS[0]].shape
+        self._columns = -(-width // TILE)
+        self._rows = -(-height // TILE)
+        self._tiles = {layer: np.zeros((self._rows, self._columns), dtype=np.uint64) for layer in LAYERS}
+        self.value = 0
+        for layer in LAYERS:
+            self.update(layer, layers[layer], Window(0, 0, width, height))
+
+    def update(self, layer: Layer, grid: Grid, window: Window) -> None:
+        """Take in that cells of `grid` inside `window` changed."""
+        if window.empty:
+            return
+        tiles = self._tiles[layer]
+        key = layer.encode()
+        for row in range(window.y // TILE, (window.y + window.height - 1) // TILE + 1):
+            for column in range(window.x // TILE, (window.x + window.width - 1) // TILE + 1):
+                tile = grid[row * TILE : (row + 1) * TILE, column * TILE : (column + 1) * TILE]
+                salt = (row * self._columns + column).to_bytes(8, "little")
+                digest = hashlib.blake2b(tile.tobytes(), digest_size=8, key=key, salt=salt).digest()
+                fresh = int.from_bytes(digest, "little")
+                self.value ^= int(tiles[row, column]) ^ fresh
+                tiles[row, column] = fresh
+
+
+@dataclass(frozen=True)
+class Version:
+    """Name of one state of the map."""
+
+    epoch: int
+    seq: int
+    hash: int
+
+
+class MasterMap:
+    """The writer's side: holds both layers, turns changed windows into deltas, the whole into a snapshot."""
+
+    def __init__(self, site: str, geometry: GridGeometry, static: Grid, cost: Grid, epoch: int) -> None:
+        if static.shape != geometry.shape or cost.shape != geometry.shape:
+            raise MapError(f"layers of shape {static.shape} and {cost.shape} don't fit a map of {geometry.shape}")
+        self.site = site
+        self.geometry = geometry
+        self.static = static
+        self.layers: dict[Layer, Grid] = {"cost": cost.copy(), "speed": np.zeros(geometry.shape, dtype=np.uint8)}
+        self._hashes = TileHashes(self.layers)
+        self._version = Version(epoch, 0, self._hashes.value)
+        self._snapshot: MapSnapshot | None = None
+
+    @property
+    def version(self) -> Version:
+        """The version that holds now."""
+        return self._version
+
+    def heartbeat(self, stamp: float) -> MapHeartbeat:
+        """Return the message that carries the version."""
+        return MapHeartbeat(epoch=self._version.epoch, seq=self._version.seq, hash=self._version.hash, stamp=stamp)
+
+    def write(
+        self,
+        changes: list[tuple[Layer, Window, Grid]],
+        causes: list[Cause],
+        traces: list[Trace],
+    ) -> list[MapDelta]:
+        """Write windows of new cells; return the deltas of the new version, or none when no cell differs.
+
+        Each window is first cut down to the cells that differ; a window too large for one message travels in parts.
+        """
+        pieces: list[tuple[Layer, Window, Packing, bytes]] = []
+        for layer, window, cells in changes:
+            grid = self.layers[layer]
+            tight = self._differing(grid, window, cells)
+            if tight.empty:
+                continue
+            x, y = tight.x - window.x, tight.y - window.y
+            grid[tight.rows, tight.columns] = cells[y : y + tight.height, x : x + tight.width]
+            self._hashes.update(layer, grid, tight)
+            pieces.extend(self._cut(layer, grid, tight))
+        if not pieces:
+            return []
+        self._version = Version(self._version.epoch, self._version.seq + 1, self._hashes.value)
+        self._snapshot = None
+        return [
+            MapDelta(
+                epoch=self._version.epoch,
+                seq=self._version.seq,
+                part=part,
+                parts=len(pieces),
+                layer=layer,
+                x=window.x,
+                y=window.y,
+                w=window.width,
+                h=window.height,
+                packing=packing,
+                cells=data,
+                hash=self._version.hash,
+                causes=causes[:_MAX_CAUSES],
+                traces=traces[:_MAX_TRACES],
+            )
+            for part, (layer, window, packing, data) in enumerate(pieces)
+        ]
+
+    def snapshot(self) -> MapSnapshot:
+        """Return the whole map; encoded once per version and shared by all who ask."""
+        if self._snapshot is None:
+            g = self.geometry
+            self._snapshot = MapSnapshot(
+                site=self.site,
+                epoch=self._version.epoch,
+                seq=self._version.seq,
+                hash=self._version.hash,
+                geometry=MapGeometry(
+                    width=g.width,
+                    height=g.height,
+                    resolution=g.resolution,
+                    origin_x=g.origin_x,
+                    origin_y=g.origin_y,
+                ),
+                cost=zlib.compress(self.layers["cost"].tobytes(), 1),
+                speed=zlib.compress(self.layers["speed"].tobytes(), 1),
+                static=zlib.compress(self.static.tobytes(), 1),
+            )
+        return self._snapshot
+
+    @staticmethod
+    def _differing(grid: Grid, window: Window, cells: Grid) -> Window:
+        if cells.shape != (window.height, window.width):
+            raise MapError(f"cells of shape {cells.shape} don't fill a window of {window.width} x {window.height}")
+        differs = grid[window.rows, window.columns] != cells
+        rows = np.flatnonzero(differs.any(axis=1))
+        columns = np.flatnonzero(differs.any(axis=0))
+        if rows.size == 0:
+            return Window(window.x, window.y, 0, 0)
+        return Window(
+            window.x + int(columns[0]),
+            window.y + int(rows[0]),
+            int(columns[-1] - columns[0]) + 1,
+            int(rows[-1] - rows[0]) + 1,
+        )
+
+    def _cut(self, layer: Layer, grid: Grid, window: Window) -> list[tuple[Layer, Window, Packing, bytes]]:
+        packing, data = _pack(grid[window.rows, window.columns])
+        if len(data) <= DELTA_LIMIT - _HEADROOM:
+            return [(layer, window, packing, data)]
+        if window.height >= window.width:
+            half = window.height // 2
+            first = Window(window.x, window.y, window.width, half)
+            second = Window(window.x, window.y + half, window.width, window.height - half)
+        else:
+            half = window.width // 2
+            first = Window(window.x, window.y, half, window.height)
+            second = Window(window.x + half, window.y, window.width - half, window.height)
+        return [*self._cut(layer, grid, first), *self._cut(layer, grid, second)]
+
+
+@dataclass(frozen=True)
+class Applied:
+    """A new version is in place: the windows that changed, and why."""
+
+    version: Version
+    windows: list[tuple[Layer, Window]]
+    causes: list[Cause]
+    traces: list[Trace]
+
+
+Outcome = Applied | Literal["waiting", "old", "gap"]
+"""`waiting`: parts of the version are missing; `old`: known already; `gap`: only a snapshot helps."""
+
+
+class Replica:
+    """The reader's side: a copy of the map that is either exactly one version of the writer's or known to be broken.
+
+    A gap, an unknown epoch or a wrong hash makes it broken (`needs_snapshot`); a snapshot mends it.
+    """
+
+    def __init__(self) -> None:
+        self.site = ""
+        self.geometry: GridGeometry | None = None
+        self.static: Grid = np.zeros((0, 0), dtype=np.uint8)
+        self.layers: dict[Layer, Grid] = {}
+        self.version: Version | None = None
+        self.needs_snapshot = True
+        self._hashes: TileHashes | None = None
+        self._parts: dict[int, MapDelta] = {}
+
+    @property
+    def cost(self) -> Grid:
+        """The master costmap (height, width)."""
+        return self.layers["cost"]
+
+    @property
+    def speed(self) -> Grid:
+        """The speed layer (height, width), cm/s, 0 = no limit."""
+        return self.layers["speed"]
+
+    def load(self, snapshot: MapSnapshot) -> Applied:
+        """Take a snapshot, whatever was there before; raises `MapError` and changes nothing when it is no map.
+
+        A snapshot older than the copy (same epoch, lower seq) is refused too: answers may overtake one another.
+        """
+        g = snapshot.geometry
+        geometry = GridGeometry(g.width, g.height, g.resolution, g.origin_x, g.origin_y)
+        known = self.version
+        if known and not self.needs_snapshot and known.epoch == snapshot.epoch and snapshot.seq < known.seq:
+            raise MapError(f"the snapshot is of version {snapshot.seq}, older than the copy's {known.seq}")
+        layers: dict[Layer, Grid] = {
+            "cost": _unpack("zlib", snapshot.cost, geometry.shape, "the cost layer").copy(),
+            "speed": _unpack("zlib", snapshot.speed, geometry.shape, "the speed layer").copy(),
+        }
+        static = _unpack("zlib", snapshot.static, geometry.shape, "the static layer")
+        hashes = TileHashes(layers)
+        if hashes.value != snapshot.hash:
+            raise MapError("the snapshot's cells don't have its hash: it was damaged on the way")
+        self.site, self.geometry, self.layers, self.static = snapshot.site, geometry, layers, static
+        self._hashes = hashes
+        self._parts = {}
+        self.version = Version(snapshot.epoch, snapshot.seq, snapshot.hash)
+        self.needs_snapshot = False
+        whole = Window(0, 0, geometry.width, geometry.height)
+        return Applied(self.version, [(layer, whole) for layer in LAYERS], [], [])
+
+    def apply(self, delta: MapDelta) -> Outcome:
+        """Take one delta; the copy changes only when a version is complete and its hash fits."""
+        if self.version is None or self._hashes is None or self.needs_snapshot:
+            return "gap"
+        if delta.epoch != self.version.epoch:
+            return self._broken()
+        if delta.seq <= self.version.seq:
+            return "old"
+        if delta.seq != self.version.seq + 1:
+            return self._broken()
+        if any(known.parts != delta.parts or known.hash != delta.hash for known in self._parts.values()):
+            return self._broken()
+        if delta.part >= delta.parts:
+            return self._broken()
+        self._parts[delta.part] = delta
+        if len(self._parts) < delta.parts:
+            return "waiting"
+        return self._complete(delta)
+
+    def check(self, heartbeat: MapHeartbeat) -> bool:
+        """Compare with the writer's version: False when deltas are missing or the copy is of another history.
+
+        A heartbeat that runs ahead is no break by itself (its delta may be under way): the caller decides how long
+        that may last. Another epoch, or another hash for the same seq, is a break at once.
+        """
+        if self.version is None or self.needs_snapshot:
+            return False
+        if heartbeat.epoch != self.version.epoch:
+            self._broken()
+            return False
+        if heartbeat.seq == self.version.seq and heartbeat.hash != self.version.hash:
+            self._broken()
+            return False
+        return heartbeat.seq <= self.version.seq
+
+    def _complete(self, delta: MapDelta) -> Outcome:
+        assert self.version is not None
+        assert self._hashes is not None
+        assert self.geometry is not None
+        parts = [self._parts[index] for index in sorted(self._parts)]
+        self._parts = {}
+        windows: list[tuple[Layer, Window]] = []
+        for part in parts:
+            window = Window(part.x, part.y, part.w, part.h)
+            if self.geometry.clip(window) != window:
+                return self._broken()
+            try:
+                cells = _unpack(part.packing, part.cells, (part.h, part.w), "a delta")
+            except MapError:
+                # Damaged cells are the same to a replica as lost ones: only a snapshot helps.
+                return self._broken()
+            grid = self.layers[part.layer]
+            grid[window.rows, window.columns] = cells
+            self._hashes.update(part.layer, grid, window)
+            windows.append((part.layer, window))
+        if self._hashes.value != delta.hash:
+            return self._broken()
+        self.version = Version(delta.epoch, delta.seq, delta.hash)
+        return Applied(self.version, windows, list(parts[0].causes), list(parts[0].traces))
+
+    def _broken(self) -> Literal["gap"]:
+        self.needs_snapshot = True
+        self._parts = {}
+        return "gap"

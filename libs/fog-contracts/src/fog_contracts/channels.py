@@ -396,12 +396,42 @@ LIVE = Channel(
     about="presence; no safety signal",
 )
 
+SIM_TRUTH = Channel(
+    "sim_truth",
+    "zenoh",
+    "pub",
+    "fog/{site}/sim/{robot}/truth",
+    m.SimTruth,
+    "msgpack",
+    256 * KIB,
+    ("sim",),
+    ("console",),
+    rate_hz=10.0,
+    max_age_s=1.0,
+    about="what is really so in the simulated world",
+)
+SIM_COMMAND = Channel(
+    "sim_command",
+    "zenoh",
+    "query",
+    "fog/{site}/sim/{robot}/command",
+    m.SimCommand,
+    "msgpack",
+    256 * KIB,
+    ("sim",),
+    ("console",),
+    reply=m.CommandReply,
+    reply_limit=2 * KIB,
+    about="change the simulated world",
+)
+
 CHANNELS: Final[Mapping[str, Channel]] = {
     channel.name: channel
     for channel in (
         NODE_AVAILABILITY, NODE_READING, NODE_VALUE, NODE_CONFIG, AREA_HAZARD, AREA_DEFINITION, THESIS_AREA,
         THESIS_WSN, HOME_ASSISTANT, MAP_DELTA, MAP_HEARTBEAT, MAP_SNAPSHOT, HAZARD, ZONES, PLANNER_PLAN,
         PLANNER_EGRESS, ROBOT_GOAL, ROBOT_PATH, ROBOT_POSE, ROBOT_STATE, ROBOT_OBSTACLES, ROBOT_COMMAND, LIVE,
+        SIM_TRUTH, SIM_COMMAND,
     )
 }  # fmt: skip
 

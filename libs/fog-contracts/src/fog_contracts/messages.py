@@ -14,7 +14,7 @@ Radians = Annotated[float, Meta(ge=-1_000.0, le=1_000.0)]
 Speed = Annotated[float, Meta(ge=-10.0, le=10.0)]
 Stamp = Annotated[float, Meta(ge=0.0, le=1e12)]
 Count = Annotated[int, Meta(ge=0, le=2**53)]
-Hash = Annotated[int, Meta(ge=0, le=2**64 - 1)]
+Hash = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Cells = Annotated[int, Meta(ge=0, le=65_535)]
 Sentence = Annotated[str, Meta(max_length=500)]
 PointXY = tuple[Metres, Metres]
@@ -432,3 +432,42 @@ class EgressRequest(Message, frozen=True, kw_only=True):
 
     robot: Id
     pose: Pose
+
+
+# --- Simulation (zenoh, msgpack): no part of the real system listens ------------------------------------------------
+
+
+class SimObstacle(Message, frozen=True, kw_only=True):
+    """Something that stands on the simulated floor: an upright box by its polygon and height (m)."""
+
+    id: Id
+    polygon: Ring
+    height: Annotated[float, Meta(gt=0.0, le=5.0)] = 1.0
+
+
+class SimTruth(Message, frozen=True, kw_only=True):
+    """What is really so in the simulated world; `clearance` is from the robot's rim to the nearest thing (m)."""
+
+    robot: Id
+    x: Metres
+    y: Metres
+    theta: Radians
+    left: Speed
+    right: Speed
+    distance: Annotated[float, Meta(ge=0.0)]
+    clearance: float
+    min_clearance: float
+    contacts: Count
+    obstacles: list[SimObstacle] = []
+    stamp: Stamp = 0.0
+    sustained_speed: float = 1.0
+
+
+class SimCommand(Message, frozen=True, kw_only=True):
+    """Change the simulated world: put obstacles there, take them away by id, carry the robot elsewhere."""
+
+    place: list[SimObstacle] = []
+    remove: list[Id] = []
+    kidnap: Pose | None = None
+    lidar_silent: bool | None = None
+    nodes_silent: list[Id] | None = None

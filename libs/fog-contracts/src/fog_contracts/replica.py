@@ -83,7 +83,7 @@ class TileHashes:
                 tile = grid[row * TILE : (row + 1) * TILE, column * TILE : (column + 1) * TILE]
                 salt = (row * self._columns + column).to_bytes(8, "little")
                 digest = hashlib.blake2b(tile.tobytes(), digest_size=8, key=key, salt=salt).digest()
-                fresh = int.from_bytes(digest, "little")
+                fresh = int.from_bytes(digest, "little") >> 1  # 63 bits: what every msgpack decoder can bound
                 self.value ^= int(tiles[row, column]) ^ fresh
                 tiles[row, column] = fresh
 

@@ -1,0 +1,96 @@
+"""What a site is: its map, places, areas, nodes and robots, as `site.toml` spells them; lengths in m, angles in rad."""
+
+from typing import Annotated
+
+from msgspec import Meta, field
+
+from fog_contracts.messages import AreaDefinition, Debounce, Id, Message, Metres, Pose, Radians, Ring, UnknownPolicy
+
+
+class Place(Message, frozen=True, kw_only=True):
+    """A named pose; without `theta` any heading will do."""
+
+    x: Metres
+    y: Metres
+    theta: Radians | None = None
+    label: str = ""
+
+
+class Sonar(Message, frozen=True, kw_only=True):
+    """One sonar of a node: its direction relative to the node's, and the calibrated range limit.
+
+    An echo nearer than `range_limit` means `blocked`. `no_echo_is_clear` is true only where calibration recorded
+    that nothing is in range; elsewhere the opposite wall echoes, and silence means `unknown`.
+    """
+
+    angle: Radians = 0.0
+    range_limit: Annotated[float, Meta(gt=0.02, le=4.0)]
+    no_echo_is_clear: bool = False
+
+
+class NodeSite(Message, frozen=True, kw_only=True):
+    """Where a node hangs: position, direction (frame `map`) and height above the floor, and the area it watches."""
+
+    id: Id
+    area: Id
+    x: Metres
+    y: Metres
+    theta: Radians
+    height: Annotated[float, Meta(gt=0.0, le=5.0)] = 0.3
+    sonars: Annotated[list[Sonar], Meta(min_length=1, max_length=8)]
+
+
+class AreaSite(Message, frozen=True, kw_only=True):
+    """A watched area: its polygon, how it is judged, and its number on the thesis's topics."""
+
+    id: Id
+    label: str = ""
+    polygon: Ring
+    number: Annotated[int, Meta(ge=0, le=9999)] | None = None
+    debounce: Debounce = Debounce()
+    unknown: UnknownPolicy = UnknownPolicy()
+
+
+class RobotSite(Message, frozen=True, kw_only=True):
+    """A robot of this site: where it starts, and its body."""
+
+    id: Id
+    start: Pose
+    radius: Annotated[float, Meta(gt=0.0, le=2.0)] = 0.17
+    height: Annotated[float, Meta(gt=0.0, le=3.0)] = 0.35
+
+
+class DemoPlan(Message, frozen=True, kw_only=True):
+    """What the demonstration does here: a drive from one place to another, and the areas that may become blocked."""
+
+    start: Id
+    goal: Id
+    areas: list[Id] = field(default_factory=list)
+
+
+class Site(Message, frozen=True, kw_only=True):
+    """A site as `site.toml` describes it."""
+
+    id: Id
+    name: str = ""
+    map: str = "map.yaml"
+    places: dict[Id, Place] = field(default_factory=dict)
+    areas: list[AreaSite] = field(default_factory=list)
+    nodes: list[NodeSite] = field(default_factory=list)
+    robots: list[RobotSite] = field(default_factory=list)
+    demo: DemoPlan | None = None
+
+    def definitions(self) -> list[AreaDefinition]:
+        """Return the areas as the aggregator publishes them, each with the nodes that watch it."""
+        return [
+            AreaDefinition(
+                id=area.id,
+                label=area.label,
+                polygon=area.polygon,
+                nodes=[node.id for node in self.nodes if node.area == area.id],
+                number=area.number,
+                debounce=area.debounce,
+                unknown=area.unknown,
+            )
+            for area in self.areas
+        ]

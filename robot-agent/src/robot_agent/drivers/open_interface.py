@@ -1,0 +1,667 @@
+"""Roomba 600 Open Interface: commands as bytes, the sensor stream as typed frames, encoders as motion.
+
+Nothing here touches a port or a clock: bytes and arrival times go in, values come out.
+Source: iRobot Create 2 Open Interface specification based on the Roomba 600 (2018).
+
+Full mode has no builder on purpose: the robot is driven in Safe mode only, so that its own cliff, wheel drop and
+charger protection stays on.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections import deque
+from dataclasses import dataclass, replace
+from enum import IntEnum
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+_Enum = TypeVar("_Enum", bound=IntEnum)
+
+BAUD: Final = 115200
+STREAM_PERIOD_S: Final = 0.015
+STREAM_HEADER: Final = 19
+# 15 ms at 115200 baud, ten bits to a byte; a longer stream frame comes out corrupted (specification, opcode 148).
+STREAM_BYTES_MAX: Final = 172
+WHEEL_SPEED_MAX_MM_S: Final = 500
+
+
+class Mode(IntEnum):
+    """OI mode as packet 35 reports it."""
+
+    OFF = 0
+    PASSIVE = 1
+    SAFE = 2
+    FULL = 3
+
+
+class ChargingState(IntEnum):
+    """Charging state as packet 21 reports it."""
+
+    NOT_CHARGING = 0
+    RECONDITIONING = 1
+    FULL_CHARGING = 2
+    TRICKLE = 3
+    WAITING = 4
+    FAULT = 5
+
+
+class Packet(NamedTuple):
+    """One sensor packet: its id, name, size on the wire (1 or 2 bytes, big-endian) and signedness."""
+
+    packet_id: int
+    name: str
+    size: int
+    signed: bool
+
+
+PACKETS: Final[Mapping[int, Packet]] = {
+    packet.packet_id: packet
+    for packet in (
+        Packet(7, "bumps_and_wheel_drops", 1, signed=False),
+        Packet(8, "wall", 1, signed=False),
+        Packet(9, "cliff_left", 1, signed=False),
+        Packet(10, "cliff_front_left", 1, signed=False),
+        Packet(11, "cliff_front_right", 1, signed=False),
+        Packet(12, "cliff_right", 1, signed=False),
+        Packet(13, "virtual_wall", 1, signed=False),
+        Packet(14, "overcurrents", 1, signed=False),
+        Packet(15, "dirt_detect", 1, signed=False),
+        Packet(16, "unused_16", 1, signed=False),
+        Packet(17, "ir_omni", 1, signed=False),
+        Packet(18, "buttons", 1, signed=False),
+        Packet(19, "distance_mm", 2, signed=True),
+        Packet(20, "angle_deg", 2, signed=True),
+        Packet(21, "charging_state", 1, signed=False),
+        Packet(22, "voltage_mv", 2, signed=False),
+        Packet(23, "current_ma", 2, signed=True),
+        Packet(24, "temperature_c", 1, signed=True),
+        Packet(25, "charge_mah", 2, signed=False),
+        Packet(26, "capacity_mah", 2, signed=False),
+        Packet(27, "wall_signal", 2, signed=False),
+        Packet(28, "cliff_left_signal", 2, signed=False),
+        Packet(29, "cliff_front_left_signal", 2, signed=False),
+        Packet(30, "cliff_front_right_signal", 2, signed=False),
+        Packet(31, "cliff_right_signal", 2, signed=False),
+        Packet(32, "unused_32", 1, signed=False),
+        Packet(33, "unused_33", 2, signed=False),
+        Packet(34, "charging_sources", 1, signed=False),
+        Packet(35, "oi_mode", 1, signed=False),
+        Packet(36, "song_number", 1, signed=False),
+        Packet(37, "song_playing", 1, signed=False),
+        Packet(38, "stream_packets", 1, signed=False),
+        Packet(39, "requested_velocity_mm_s", 2, signed=True),
+        Packet(40, "requested_radius_mm", 2, signed=True),
+        Packet(41, "requested_right_mm_s", 2, signed=True),
+        Packet(42, "requested_left_mm_s", 2, signed=True),
+        Packet(43, "left_encoder", 2, signed=False),
+        Packet(44, "right_encoder", 2, signed=False),
+        Packet(45, "light_bumper", 1, signed=False),
+        Packet(46, "light_left_signal", 2, signed=False),
+        Packet(47, "light_front_left_signal", 2, signed=False),
+        Packet(48, "light_center_left_signal", 2, signed=False),
+        Packet(49, "light_center_right_signal", 2, signed=False),
+        Packet(50, "light_front_right_signal", 2, signed=False),
+        Packet(51, "light_right_signal", 2, signed=False),
+        Packet(52, "ir_left", 1, signed=False),
+        Packet(53, "ir_right", 1, signed=False),
+        Packet(54, "left_motor_current_ma", 2, signed=True),
+        Packet(55, "right_motor_current_ma", 2, signed=True),
+        Packet(56, "main_brush_current_ma", 2, signed=True),
+        Packet(57, "side_brush_current_ma", 2, signed=True),
+        Packet(58, "stasis", 1, signed=False),
+    )
+}
+"""Every single packet. Libraries disagree here and there; these sizes add up to the 80 bytes of group 100."""
+
+GROUPS: Final[Mapping[int, tuple[int, int]]] = {
+    0: (7, 26),
+    1: (7, 16),
+    2: (17, 20),
+    3: (21, 26),
+    4: (27, 34),
+    5: (35, 42),
+    6: (7, 42),
+    100: (7, 58),
+    101: (43, 58),
+    106: (46, 51),
+    107: (54, 58),
+}
+"""Group id -> first and last packet in it, both included."""
+
+GUARDIAN_STREAM: Final = (7, 9, 10, 11, 12, 13, 14, 21, 22, 23, 25, 26, 34, 35, 41, 42, 43, 44)
+"""What the guardian streams: all that can stop the robot, the battery, the wheel speeds that the robot believes were
+asked of it, and the encoders. 47 bytes a frame, of 172 possible."""
+
+
+def expand(ids: Iterable[int]) -> tuple[int, ...]:
+    """Single packet ids that a list of packet and group ids stands for, in wire order.
+
+    Raises:
+        ValueError: for an id that the Open Interface does not have.
+
+    """
+    single: list[int] = []
+    for packet_id in ids:
+        if packet_id in PACKETS:
+            single.append(packet_id)
+        elif packet_id in GROUPS:
+            first, last = GROUPS[packet_id]
+            single.extend(range(first, last + 1))
+        else:
+            raise ValueError(f"the Open Interface has no packet {packet_id}: use 7..58 or a group of {sorted(GROUPS)}")
+    return tuple(single)
+
+
+def data_size(packet_id: int) -> int:
+    """Bytes of data that a packet or group id brings. Raises ValueError for an unknown id."""
+    return sum(PACKETS[single].size for single in expand((packet_id,)))
+
+
+def stream_frame_size(ids: Sequence[int]) -> int:
+    """Bytes on the wire of one stream frame with these ids: header, length, ids, data, checksum."""
+    return 3 + sum(1 + data_size(packet_id) for packet_id in ids)
+
+
+def decode_packets(ids: Iterable[int], data: bytes) -> dict[int, int]:
+    """Decode the unframed answer to Sensors or Query List: packet id -> value.
+
+    Raises:
+        ValueError: if the number of bytes is not what the ids need, or an id is unknown.
+
+    """
+    single = expand(ids)
+    layout = struct.Struct(">" + "".join(_format(PACKETS[packet_id]) for packet_id in single))
+    if layout.size != len(data):
+        raise ValueError(f"packets {single} need {layout.size} bytes of data, got {len(data)}: the answer is cut")
+    return dict(zip(single, layout.unpack(data), strict=True))
+
+
+def _format(packet: Packet) -> str:
+    code = "b" if packet.size == 1 else "h"
+    return code if packet.signed else code.upper()
+
+
+# --- commands ---------------------------------------------------------------------------------------------------------
+
+
+def reset() -> bytes:
+    """Reboot the robot (7); it prints text, forgets its mode and its encoders, and needs seconds."""
+    return b"\x07"
+
+
+def start() -> bytes:
+    """Start the interface (128): Off -> Passive."""
+    return b"\x80"
+
+
+def safe() -> bytes:
+    """Take control with the robot's own protection on (131): -> Safe."""
+    return b"\x83"
+
+
+def power() -> bytes:
+    """Switch the robot off (133)."""
+    return b"\x85"
+
+
+def stop() -> bytes:
+    """Leave the interface (173): streams and wheels stop, -> Off."""
+    return b"\xad"
+
+
+def seek_dock() -> bytes:
+    """Let the firmware drive to its dock (143): -> Passive."""
+    return b"\x8f"
+
+
+def drive_direct(right_mm_s: int, left_mm_s: int) -> bytes:
+    """Drive each wheel at its own speed (145), right wheel first as on the wire, mm/s.
+
+    Raises:
+        ValueError: outside +-500 mm/s; `drive_wheels` scales instead.
+
+    """
+    for side, speed in (("right", right_mm_s), ("left", left_mm_s)):
+        if not -WHEEL_SPEED_MAX_MM_S <= speed <= WHEEL_SPEED_MAX_MM_S:
+            raise ValueError(f"{side} wheel: {speed} mm/s is outside +-{WHEEL_SPEED_MAX_MM_S}")
+    return struct.pack(">Bhh", 145, right_mm_s, left_mm_s)
+
+
+def drive_wheels(left_m_s: float, right_m_s: float) -> bytes:
+    """Drive Direct from speeds in m/s; beyond 0.5 both wheels are scaled alike, which keeps the curvature.
+
+    Raises:
+        ValueError: if a speed is not finite.
+
+    """
+    if not (math.isfinite(left_m_s) and math.isfinite(right_m_s)):
+        raise ValueError(f"wheel speeds must be finite: left {left_m_s}, right {right_m_s} m/s")
+    fastest = max(abs(left_m_s), abs(right_m_s)) * 1000.0
+    scale = 1000.0 * min(1.0, WHEEL_SPEED_MAX_MM_S / fastest) if fastest else 0.0
+    return drive_direct(round(right_m_s * scale), round(left_m_s * scale))
+
+
+def sensors(packet_id: int) -> bytes:
+    """Ask once for one packet or group (142). Raises ValueError for an unknown id."""
+    expand((packet_id,))
+    return bytes((142, packet_id))
+
+
+def query_list(ids: Sequence[int]) -> bytes:
+    """Ask once for several packets (149). Raises ValueError for an unknown id."""
+    expand(ids)
+    return bytes((149, len(ids), *ids))
+
+
+def stream(ids: Sequence[int]) -> bytes:
+    """Ask for a frame of these packets every 15 ms (148).
+
+    Raises:
+        ValueError: for an unknown id, or if the frames would not fit into 15 ms at 115200 baud.
+
+    """
+    size = stream_frame_size(ids)
+    if size > STREAM_BYTES_MAX:
+        raise ValueError(f"a stream frame of {size} bytes does not fit into 15 ms: at most {STREAM_BYTES_MAX}")
+    return bytes((148, len(ids), *ids))
+
+
+def pause_stream() -> bytes:
+    """Pause the stream, keeping its list of packets (150 0)."""
+    return b"\x96\x00"
+
+
+def resume_stream() -> bytes:
+    """Resume the stream with the list that was asked for last (150 1)."""
+    return b"\x96\x01"
+
+
+# --- the sensor stream ------------------------------------------------------------------------------------------------
+
+
+class MissingPacketError(LookupError):
+    """A frame was asked for a packet that the stream does not carry."""
+
+    def __init__(self, packet_id: int, present: Iterable[int]) -> None:
+        """Name the packet and what there is."""
+        super().__init__(
+            f"packet {packet_id} ({PACKETS[packet_id].name}) is not in this frame: it has {sorted(present)}; "
+            "add it to the ids given to stream()"
+        )
+        self.packet_id = packet_id
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One valid stream frame. Every property raises MissingPacketError if its packet was not streamed."""
+
+    packets: Mapping[int, int]
+
+    def __contains__(self, packet_id: int) -> bool:
+        return packet_id in self.packets
+
+    def __getitem__(self, packet_id: int) -> int:
+        try:
+            return self.packets[packet_id]
+        except KeyError:
+            raise MissingPacketError(packet_id, self.packets) from None
+
+    @property
+    def bump_right(self) -> bool:
+        """Right half of the bumper is pressed (packet 7, bit 0)."""
+        return bool(self[7] & 1)
+
+    @property
+    def bump_left(self) -> bool:
+        """Left half of the bumper is pressed (packet 7, bit 1)."""
+        return bool(self[7] & 2)
+
+    @property
+    def bumped(self) -> bool:
+        """Any half of the bumper is pressed."""
+        return bool(self[7] & 3)
+
+    @property
+    def wheel_drop_right(self) -> bool:
+        """Right wheel hangs (packet 7, bit 2)."""
+        return bool(self[7] & 4)
+
+    @property
+    def wheel_drop_left(self) -> bool:
+        """Left wheel hangs (packet 7, bit 3)."""
+        return bool(self[7] & 8)
+
+    @property
+    def wheel_dropped(self) -> bool:
+        """Any wheel hangs."""
+        return bool(self[7] & 12)
+
+    @property
+    def cliff_left(self) -> bool:
+        """No floor at the far left (packet 9)."""
+        return bool(self[9])
+
+    @property
+    def cliff_front_left(self) -> bool:
+        """No floor at the front left (packet 10)."""
+        return bool(self[10])
+
+    @property
+    def cliff_front_right(self) -> bool:
+        """No floor at the front right (packet 11)."""
+        return bool(self[11])
+
+    @property
+    def cliff_right(self) -> bool:
+        """No floor at the far right (packet 12)."""
+        return bool(self[12])
+
+    @property
+    def cliff(self) -> bool:
+        """No floor under any of the four cliff sensors."""
+        return self.cliff_left or self.cliff_front_left or self.cliff_front_right or self.cliff_right
+
+    @property
+    def virtual_wall(self) -> bool:
+        """A virtual wall is seen (packet 13)."""
+        return bool(self[13])
+
+    @property
+    def wheel_overcurrent(self) -> bool:
+        """A wheel motor draws too much: it is blocked (packet 14, bits 3 and 4)."""
+        return bool(self[14] & 0b11000)
+
+    @property
+    def charging_state(self) -> ChargingState | int:
+        """What the charger does (packet 21); a bare int for a value that the specification does not name."""
+        return _named(ChargingState, self[21])
+
+    @property
+    def voltage_v(self) -> float:
+        """Battery voltage, volts (packet 22)."""
+        return self[22] / 1000.0
+
+    @property
+    def current_a(self) -> float:
+        """Battery current, amperes, positive while charging (packet 23)."""
+        return self[23] / 1000.0
+
+    @property
+    def charge_fraction(self) -> float:
+        """Charge over capacity, 0..1 (packets 25 and 26); nan while the robot does not know its capacity."""
+        capacity = self[26]
+        return min(1.0, self[25] / capacity) if capacity else math.nan
+
+    @property
+    def on_charger(self) -> bool:
+        """Home Base or charger has contact (packet 34)."""
+        return bool(self[34] & 3)
+
+    @property
+    def mode(self) -> Mode | int:
+        """OI mode (packet 35); a bare int for a value that the specification does not name."""
+        return _named(Mode, self[35])
+
+    @property
+    def requested_wheels_m_s(self) -> tuple[float, float]:
+        """(left, right) speeds that the robot was last asked for, m/s (packets 42 and 41)."""
+        return self[42] / 1000.0, self[41] / 1000.0
+
+    @property
+    def encoders(self) -> tuple[int, int]:
+        """(left, right) wheel encoders, ticks, 16 bit, wrapping (packets 43 and 44)."""
+        return self[43], self[44]
+
+
+def _named(kind: type[_Enum], value: int) -> _Enum | int:
+    try:
+        return kind(value)
+    except ValueError:
+        return value
+
+
+class _Verdict(IntEnum):
+    MORE = 0
+    VALID = 1
+    NO_FRAME = 2
+    BAD_CHECKSUM = 3
+
+
+_SIZES: Final = {packet_id: data_size(packet_id) for packet_id in (*PACKETS, *GROUPS)}
+
+
+class StreamParser:
+    """Bytes of the sensor stream -> frames. Never raises on what it is fed; finds the next frame after garbage.
+
+    With `ids`, only frames that carry exactly these packets pass: the eight-bit checksum alone would let one in 256
+    damaged frames through, and the ids are further bytes that have to be right.
+
+    `corrupted` counts damaged frames (once per loss of the frame boundary, and every frame whose checksum is wrong);
+    `skipped_bytes` counts every byte that belonged to no valid frame.
+    """
+
+    def __init__(self, ids: Sequence[int] | None = None) -> None:
+        if ids is not None:
+            expand(ids)
+        self._ids = None if ids is None else tuple(ids)
+        self._length = None if ids is None else stream_frame_size(ids) - 3
+        self._buffer = bytearray()
+        self._events: deque[Frame] = deque()
+        self._synced = False
+        self.frames = 0
+        self.corrupted = 0
+        self.skipped_bytes = 0
+
+    def receive_data(self, data: bytes) -> None:
+        """Take what a port gave, in pieces of any size."""
+        self._buffer += data
+        at = 0
+        while at < len(self._buffer):
+            verdict = self._judge(at)
+            if verdict is _Verdict.MORE:
+                break
+            if verdict is _Verdict.VALID:
+                end = at + 2 + self._buffer[at + 1]
+                self._events.append(Frame(self._decode(at + 2, end)))
+                self.frames += 1
+                self._synced = True
+                at = end + 1
+                continue
+            if self._synced or verdict is _Verdict.BAD_CHECKSUM:
+                self.corrupted += 1
+            self._synced = False
+            found = self._buffer.find(STREAM_HEADER, at + 1)
+            following = len(self._buffer) if found < 0 else found
+            self.skipped_bytes += following - at
+            at = following
+        del self._buffer[:at]
+
+    def next_event(self) -> Frame | None:
+        """Oldest frame not yet taken, or None: feed more bytes."""
+        return self._events.popleft() if self._events else None
+
+    def reset(self) -> None:
+        """Forget half a frame, after the port was reopened; counters stay."""
+        self._buffer.clear()
+        self._events.clear()
+        self._synced = False
+
+    def _judge(self, at: int) -> _Verdict:
+        buffer = self._buffer
+        if buffer[at] != STREAM_HEADER:
+            return _Verdict.NO_FRAME
+        if at + 1 == len(buffer):
+            return _Verdict.MORE
+        length = buffer[at + 1]
+        if not length or (self._length is not None and length != self._length):
+            return _Verdict.NO_FRAME
+        # The ids must lead exactly to the checksum; a false header shows as soon as one does not.
+        cursor, end, index = at + 2, at + 2 + length, 0
+        while cursor < end:
+            if cursor >= len(buffer):
+                return _Verdict.MORE
+            size = _SIZES.get(buffer[cursor])
+            if size is None or (self._ids is not None and buffer[cursor] != self._ids[index]):
+                return _Verdict.NO_FRAME
+            cursor += 1 + size
+            index += 1
+        if cursor != end:
+            return _Verdict.NO_FRAME
+        if end >= len(buffer):
+            return _Verdict.MORE
+        return _Verdict.BAD_CHECKSUM if sum(buffer[at : end + 1]) & 0xFF else _Verdict.VALID
+
+    def _decode(self, cursor: int, end: int) -> dict[int, int]:
+        packets: dict[int, int] = {}
+        while cursor < end:
+            packet_id = self._buffer[cursor]
+            following = cursor + 1 + _SIZES[packet_id]
+            packets.update(decode_packets((packet_id,), bytes(self._buffer[cursor + 1 : following])))
+            cursor = following
+        return packets
+
+
+# --- encoders -> motion -----------------------------------------------------------------------------------------------
+
+
+def wheel_delta(new: int, old: int) -> int:
+    """Ticks from one 16-bit encoder reading to the next, -32768..32767, whichever way the counter wrapped."""
+    return ((new - old + 0x8000) & 0xFFFF) - 0x8000
+
+
+@dataclass(frozen=True, slots=True)
+class Geometry:
+    """What turns ticks into metres. Defaults: Roomba 600 (specification, packets 43 and 44)."""
+
+    ticks_per_turn: float = 508.8
+    wheel_diameter_m: float = 0.072
+    axle_m: float = 0.235
+    wheel_speed_max_m_s: float = WHEEL_SPEED_MAX_MM_S / 1000.0
+
+    @property
+    def metres_per_tick(self) -> float:
+        """Way of the wheel's rim per tick, metres."""
+        return math.pi * self.wheel_diameter_m / self.ticks_per_turn
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """One pair of encoder values (ticks, 16 bit) and its arrival, seconds on the caller's monotonic clock."""
+
+    left: int
+    right: int
+    at: float
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """A plausible step: ways of the wheels in metres, and the pose (x, y in metres, theta in radians) after it."""
+
+    left_m: float
+    right_m: float
+    x: float
+    y: float
+    theta: float
+
+
+@dataclass(frozen=True, slots=True)
+class EncoderFault:
+    """A step that no wheel can make. It moved nothing; the pose is the one before it."""
+
+    left_m: float
+    right_m: float
+    possible_m: float
+    elapsed_s: float
+
+    def __str__(self) -> str:
+        return (
+            f"encoders jumped by left {self.left_m:+.3f} m and right {self.right_m:+.3f} m in {self.elapsed_s:.3f} s, "
+            f"{self.possible_m:.3f} m is possible: a damaged frame, a robot that restarted, or a gap in the stream"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryState:
+    """Pose in the odometry frame (metres, radians, theta not wrapped) and the readings that it rests on."""
+
+    x: float = 0.0
+    y: float = 0.0
+    theta: float = 0.0
+    trusted: Reading | None = None
+    suspect: Reading | None = None
+
+
+def integrate(
+    x: float, y: float, theta: float, left_m: float, right_m: float, axle_m: float
+) -> tuple[float, float, float]:
+    """Pose after both wheels rolled along one arc of a circle, exact for constant speeds.
+
+    The chord of an arc of length s and angle a is s sin(a/2)/(a/2), at the mean heading (Siegwart and Nourbakhsh,
+    Introduction to Autonomous Mobile Robots, section 5.2.4, with the chord in place of the arc). Metres and radians.
+    """
+    turn = (right_m - left_m) / axle_m
+    half = 0.5 * turn
+    chord = 0.5 * (left_m + right_m) * (math.sin(half) / half if half else 1.0)
+    return x + chord * math.cos(theta + half), y + chord * math.sin(theta + half), theta + turn
+
+
+# Frames that the host reads late arrive together, 15 ms of motion with no time between them.
+_ARRIVAL_SLACK_S: Final = 0.1
+_SPEED_MARGIN: Final = 1.2
+
+
+def advance(state: OdometryState, reading: Reading, geometry: Geometry) -> tuple[OdometryState, Motion | EncoderFault]:
+    """Take one reading: the new state, and the motion or why it is none.
+
+    The first reading only sets the zero. A step beyond what the wheels can do (top speed and a fifth, over the time
+    since the last trusted reading and 0.1 s) is an EncoderFault. One wild reading costs nothing, the next good one
+    connects to the trusted one; if the readings after it agree with it instead (the robot restarted), they become
+    trusted, and the jump itself never counts as motion.
+    """
+    if state.trusted is None:
+        return replace(state, trusted=reading), Motion(0.0, 0.0, state.x, state.y, state.theta)
+    left_m, right_m, possible_m = _step(state.trusted, reading, geometry)
+    if max(abs(left_m), abs(right_m)) > possible_m:
+        fault = EncoderFault(left_m, right_m, possible_m, reading.at - state.trusted.at)
+        if state.suspect is None:
+            return replace(state, suspect=reading), fault
+        left_m, right_m, possible_m = _step(state.suspect, reading, geometry)
+        if max(abs(left_m), abs(right_m)) > possible_m:
+            return replace(state, suspect=reading), fault
+    x, y, theta = integrate(state.x, state.y, state.theta, left_m, right_m, geometry.axle_m)
+    return OdometryState(x, y, theta, trusted=reading), Motion(left_m, right_m, x, y, theta)
+
+
+def _step(old: Reading, new: Reading, geometry: Geometry) -> tuple[float, float, float]:
+    scale = geometry.metres_per_tick
+    span = max(0.0, new.at - old.at) + _ARRIVAL_SLACK_S
+    possible = _SPEED_MARGIN * geometry.wheel_speed_max_m_s * span
+    if possible > 0x4000 * scale:
+        # The counter may have gone around unseen: no step over such a gap can be told from another.
+        possible = -1.0
+    return wheel_delta(new.left, old.left) * scale, wheel_delta(new.right, old.right) * scale, possible
+
+
+class Odometry:
+    """The odometry of one base: `advance` with its state kept."""
+
+    def __init__(self, geometry: Geometry | None = None) -> None:
+        self._geometry = geometry or Geometry()
+        self._state = OdometryState()
+        self.faults = 0
+
+    @property
+    def pose(self) -> tuple[float, float, float]:
+        """(x, y, theta) in the odometry frame: metres, radians, theta not wrapped."""
+        return self._state.x, self._state.y, self._state.theta
+
+    def update(self, left: int, right: int, now: float) -> Motion | EncoderFault:
+        """Take the encoders of a frame that arrived at `now` (seconds, monotonic)."""
+        self._state, outcome = advance(self._state, Reading(left, right, now), self._geometry)
+        if isinstance(outcome, EncoderFault):
+            self.faults += 1
+        return outcome

@@ -1,0 +1,574 @@
+"""RPLidar A1: commands as bytes, the answer stream as typed events, nodes as whole turns.
+
+Nothing here touches a port or a clock: bytes and arrival times go in, values come out. Nodes are decoded in bulk by
+numpy, so that thousands of them a second cost a small computer little.
+Source: Slamtec, RPLIDAR interface protocol and application notes, A1 (protocol version 1.0, revision 2.x).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections import deque
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+BAUD: Final = 115200
+RANGE_MIN_M: Final = 0.15
+RANGE_MAX_M: Final = 12.0
+_FULL_TURN_Q6: Final = 360 * 64
+
+
+# --- commands ---------------------------------------------------------------------------------------------------------
+
+
+def stop() -> bytes:
+    """Stop scanning (25); the device answers nothing and wants 1 ms of peace."""
+    return b"\xa5\x25"
+
+
+def reset() -> bytes:
+    """Reboot the device (40); it prints text and wants 2 ms of peace."""
+    return b"\xa5\x40"
+
+
+def scan() -> bytes:
+    """Start a standard scan (20): 5-byte nodes."""
+    return b"\xa5\x20"
+
+
+def express_scan() -> bytes:
+    """Start an express scan in the legacy mode (82): 84-byte capsules, twice the nodes for the same bytes."""
+    return _with_payload(0x82, bytes(5))
+
+
+def get_info() -> bytes:
+    """Ask for model, versions and serial number (50)."""
+    return b"\xa5\x50"
+
+
+def get_health() -> bytes:
+    """Ask for the health (52)."""
+    return b"\xa5\x52"
+
+
+def get_sample_rate() -> bytes:
+    """Ask how long one sample takes (59)."""
+    return b"\xa5\x59"
+
+
+def _with_payload(command: int, payload: bytes) -> bytes:
+    packet = bytes((0xA5, command, len(payload))) + payload
+    checksum = 0
+    for byte in packet:
+        checksum ^= byte
+    return packet + bytes((checksum,))
+
+
+# --- events -----------------------------------------------------------------------------------------------------------
+
+
+class Answer(IntEnum):
+    """Type byte of the response descriptors that this driver understands."""
+
+    INFO = 0x04
+    HEALTH = 0x06
+    SAMPLE_RATE = 0x15
+    NODES = 0x81
+    CAPSULES = 0x82
+
+
+@dataclass(frozen=True, slots=True)
+class Descriptor:
+    """A response descriptor: what follows from here on."""
+
+    answer: Answer
+    length: int
+    repeats: bool
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceInfo:
+    """Who answers: model id, (major, minor) firmware, hardware revision, serial number in hexadecimal."""
+
+    model: int
+    firmware: tuple[int, int]
+    hardware: int
+    serial_number: str
+
+
+class HealthStatus(IntEnum):
+    """Status of the device; ERROR calls for a reset."""
+
+    GOOD = 0
+    WARNING = 1
+    ERROR = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Health:
+    """Health of the device; the status is a bare int if the protocol does not name it."""
+
+    status: HealthStatus | int
+    error_code: int
+
+
+@dataclass(frozen=True, slots=True)
+class SampleRate:
+    """Microseconds that one sample takes in standard and in express scans."""
+
+    standard_us: int
+    express_us: int
+
+
+class Nodes(NamedTuple):
+    """A batch of n measurements in order of arrival; how they are cut into batches means nothing.
+
+    start: bool[n], first node of a turn. quality: uint8[n], 0..63 (express: 63 for a return, 0 for none).
+    angle_q6: uint16[n], degrees / 64, clockwise seen from above, 0..23039.
+    distance_q2: uint16[n], millimetres / 4, 0 for no return.
+    """
+
+    start: NDArray[np.bool_]
+    quality: NDArray[np.uint8]
+    angle_q6: NDArray[np.uint16]
+    distance_q2: NDArray[np.uint16]
+
+
+Event = Descriptor | DeviceInfo | Health | SampleRate | Nodes
+
+
+# --- answers ----------------------------------------------------------------------------------------------------------
+
+_DESCRIPTORS: Final = {
+    b"\xa5\x5a\x14\x00\x00\x00\x04": Descriptor(Answer.INFO, 20, repeats=False),
+    b"\xa5\x5a\x03\x00\x00\x00\x06": Descriptor(Answer.HEALTH, 3, repeats=False),
+    b"\xa5\x5a\x04\x00\x00\x00\x15": Descriptor(Answer.SAMPLE_RATE, 4, repeats=False),
+    b"\xa5\x5a\x05\x00\x00\x40\x81": Descriptor(Answer.NODES, 5, repeats=True),
+    b"\xa5\x5a\x54\x00\x00\x40\x82": Descriptor(Answer.CAPSULES, 84, repeats=True),
+}
+_DESCRIPTOR_SIZE: Final = 7
+_ANY_DESCRIPTOR: Final = re.compile(b"|".join(re.escape(pattern) for pattern in _DESCRIPTORS), re.DOTALL)
+
+
+class _Decoder(Protocol):
+    """Takes what follows one descriptor. `last` says that another descriptor ends it here."""
+
+    def feed(self, data: bytes, *, last: bool) -> list[Event]: ...
+
+
+class Parser:
+    """Bytes from the device -> events. Never raises on what it is fed; finds its place again after damage.
+
+    A known descriptor always wins, wherever it stands: a new answer ends the one before, even in mid-node. What cannot
+    be the beginning of one goes to the decoder of the present answer; before the first descriptor (the tail of an old
+    scan, boot text) it is skipped.
+
+    `skipped_bytes` counts bytes that belonged to nothing, `resyncs` how often nodes or capsules lost their place,
+    `corrupted` capsules whose checksum was wrong.
+    """
+
+    def __init__(self) -> None:
+        self._held = b""
+        self._events: deque[Event] = deque()
+        self._decoder: _Decoder | None = None
+        self.skipped_bytes = 0
+        self.resyncs = 0
+        self.corrupted = 0
+
+    def receive_data(self, data: bytes) -> None:
+        """Take what a port gave, in pieces of any size."""
+        buffer = self._held + data
+        begin = 0
+        for match in _ANY_DESCRIPTOR.finditer(buffer):
+            self._pass_on(buffer[begin : match.start()], last=True)
+            begin = match.end()
+            descriptor = _DESCRIPTORS[match.group()]
+            self._events.append(descriptor)
+            self._decoder = self._decoder_for(descriptor)
+        keep = len(buffer) - _beginning_of_descriptor(buffer, begin)
+        self._pass_on(buffer[begin:keep], last=False)
+        self._held = buffer[keep:]
+
+    def next_event(self) -> Event | None:
+        """Oldest event not yet taken, or None: feed more bytes."""
+        return self._events.popleft() if self._events else None
+
+    def reset(self) -> None:
+        """Forget the present answer, after the port was reopened; counters stay."""
+        self._held = b""
+        self._events.clear()
+        self._decoder = None
+
+    def _pass_on(self, data: bytes, *, last: bool) -> None:
+        if self._decoder is None:
+            self.skipped_bytes += len(data)
+        elif data or last:
+            self._events.extend(self._decoder.feed(data, last=last))
+
+    def _decoder_for(self, descriptor: Descriptor) -> _Decoder:
+        if descriptor.answer is Answer.NODES:
+            return _NodeDecoder(self)
+        if descriptor.answer is Answer.CAPSULES:
+            return _CapsuleDecoder(self)
+        return _SingleDecoder(self, descriptor)
+
+
+def _beginning_of_descriptor(buffer: bytes, begin: int) -> int:
+    """How many bytes at the end of the buffer could be the beginning of a descriptor."""
+    for size in range(min(_DESCRIPTOR_SIZE - 1, len(buffer) - begin), 0, -1):
+        tail = buffer[-size:]
+        if any(pattern.startswith(tail) for pattern in _DESCRIPTORS):
+            return size
+    return 0
+
+
+class _SingleDecoder:
+    """One answer of a fixed size."""
+
+    def __init__(self, parser: Parser, descriptor: Descriptor) -> None:
+        self._parser = parser
+        self._descriptor = descriptor
+        self._buffer = b""
+        self._done = False
+
+    def feed(self, data: bytes, *, last: bool) -> list[Event]:
+        self._buffer += data
+        events: list[Event] = []
+        if not self._done and len(self._buffer) >= self._descriptor.length:
+            events.append(self._decode(self._buffer[: self._descriptor.length]))
+            self._buffer = self._buffer[self._descriptor.length :]
+            self._done = True
+        if self._done or last:
+            self._parser.skipped_bytes += len(self._buffer)
+            self._buffer = b""
+        return events
+
+    def _decode(self, data: bytes) -> Event:
+        if self._descriptor.answer is Answer.INFO:
+            return DeviceInfo(data[0], (data[2], data[1]), data[3], data[4:20].hex().upper())
+        if self._descriptor.answer is Answer.HEALTH:
+            return Health(_health_status(data[0]), int.from_bytes(data[1:3], "little"))
+        return SampleRate(int.from_bytes(data[0:2], "little"), int.from_bytes(data[2:4], "little"))
+
+
+def _health_status(value: int) -> HealthStatus | int:
+    try:
+        return HealthStatus(value)
+    except ValueError:
+        return value
+
+
+_NODE_SIZE: Final = 5
+# To find the node boundary again, this many nodes in a row must have right check bits and angles that turn onwards
+# like a spinning head's. Check bits alone are not enough: where no beam returns, the zeros and the even steps of the
+# angle look like nodes two bytes aside for seconds on end.
+_RESYNC_NODES: Final = 6
+_RESYNC_BACK_Q6: Final = 15 * 64
+_RESYNC_ON_Q6: Final = 30 * 64
+_RESYNC_TURN_Q6: Final = (32, 90 * 64)
+
+
+class _NodeDecoder:
+    """5-byte nodes: start bit and its inverse, quality, check bit, angle, distance."""
+
+    def __init__(self, parser: Parser) -> None:
+        self._parser = parser
+        self._buffer = b""
+        self._synced = True
+
+    def feed(self, data: bytes, *, last: bool) -> list[Event]:
+        self._buffer += data
+        events: list[Event] = []
+        while self._take_nodes(events) if self._synced else self._find_boundary():
+            pass
+        if last:
+            self._parser.skipped_bytes += len(self._buffer)
+            self._buffer = b""
+        return events
+
+    def _take_nodes(self, events: list[Event]) -> bool:
+        """Decode all whole nodes up to the first wrong one. True if there is one."""
+        count = len(self._buffer) // _NODE_SIZE
+        if not count:
+            return False
+        raw = np.frombuffer(self._buffer, np.uint8, count * _NODE_SIZE).reshape(count, _NODE_SIZE)
+        angle = _angles_q6(raw[:, 1], raw[:, 2])
+        right = _is_node(raw[:, 0], raw[:, 1], angle)
+        good = count if right.all() else int(np.argmin(right))
+        if good:
+            raw = raw[:good]
+            first = raw[:, 0]
+            distance = _u16(raw[:, 3]) | _u16(raw[:, 4]) << np.uint16(8)
+            events.append(Nodes((first & 1).astype(np.bool_), first >> np.uint8(2), angle[:good], distance))
+        self._buffer = self._buffer[good * _NODE_SIZE :]
+        if good == count:
+            return False
+        self._parser.resyncs += 1
+        self._synced = False
+        return True
+
+    def _find_boundary(self) -> bool:
+        """Drop bytes up to the next place where nodes begin. True if it was found."""
+        span = (_RESYNC_NODES - 1) * _NODE_SIZE
+        raw = np.frombuffer(self._buffer, np.uint8)
+        places = raw.size - span - _NODE_SIZE + 1
+        if places <= 0:
+            return False
+        angle = _angles_q6(raw[1:-3], raw[2:-2])
+        single = _is_node(raw[:-4], raw[1:-3], angle)
+        row = np.ones(places, np.bool_)
+        for node in range(_RESYNC_NODES):
+            row &= single[node * _NODE_SIZE : node * _NODE_SIZE + places]
+        drop = places
+        for place in np.flatnonzero(row):
+            if _turns_onwards(angle[place : place + span + 1 : _NODE_SIZE]):
+                drop = int(place)
+                self._synced = True
+                break
+        self._parser.skipped_bytes += drop
+        self._buffer = self._buffer[drop:]
+        return self._synced
+
+
+def _angles_q6(low: NDArray[np.uint8], high: NDArray[np.uint8]) -> NDArray[np.uint16]:
+    return (_u16(low) >> np.uint16(1)) | _u16(high) << np.uint16(7)
+
+
+def _u16(values: NDArray[np.uint8]) -> NDArray[np.uint16]:
+    return values.astype(np.uint16)
+
+
+def _is_node(first: NDArray[np.uint8], second: NDArray[np.uint8], angle: NDArray[np.uint16]) -> NDArray[np.bool_]:
+    one = np.uint8(1)
+    bits = (first ^ (first >> one)) & second & one
+    return bits.astype(np.bool_) & (angle < _FULL_TURN_Q6)
+
+
+def _turns_onwards(angles: NDArray[np.uint16]) -> bool:
+    turned = angles.astype(np.int32)
+    steps = (turned[1:] - turned[:-1] + _FULL_TURN_Q6 // 2) % _FULL_TURN_Q6 - _FULL_TURN_Q6 // 2
+    least, most = _RESYNC_TURN_Q6
+    return bool(
+        (steps >= -_RESYNC_BACK_Q6).all() and (steps <= _RESYNC_ON_Q6).all() and least <= int(steps.sum()) <= most
+    )
+
+
+_CAPSULE_SIZE: Final = 84
+_CAPSULE_NODES: Final = 32
+_NEW_SCAN: Final = 0x8000
+_RETURN_QUALITY: Final = 63
+
+
+class _CapsuleDecoder:
+    """84-byte express capsules: two sync nibbles, XOR of bytes 2..83, start angle, 16 cabins of two nodes each.
+
+    The angles of a capsule's nodes lie between its start angle and that of the next capsule, so nodes come out one
+    capsule late, and a damaged capsule takes the nodes of the one before with it.
+    """
+
+    def __init__(self, parser: Parser) -> None:
+        self._parser = parser
+        self._buffer = b""
+        self._synced = True
+        self._previous: bytes | None = None
+
+    def feed(self, data: bytes, *, last: bool) -> list[Event]:
+        self._buffer += data
+        events: list[Event] = []
+        at = 0
+        while at < len(self._buffer):
+            header = self._buffer[at : at + 2]
+            plausible = header[0] >> 4 == 0xA and (len(header) < 2 or header[1] >> 4 == 0x5)
+            if plausible and len(self._buffer) - at < _CAPSULE_SIZE:
+                break
+            if plausible:
+                capsule = self._buffer[at : at + _CAPSULE_SIZE]
+                if _xor(capsule[2:]) == (capsule[0] & 0xF) | (capsule[1] & 0xF) << 4:
+                    self._synced = True
+                    self._take(capsule, events)
+                    at += _CAPSULE_SIZE
+                    continue
+                self._parser.corrupted += 1
+            if self._synced:
+                self._parser.resyncs += 1
+                self._synced = False
+            self._previous = None
+            self._parser.skipped_bytes += 1
+            at += 1
+        self._buffer = self._buffer[at:]
+        if last:
+            self._parser.skipped_bytes += len(self._buffer)
+            self._buffer = b""
+        return events
+
+    def _take(self, capsule: bytes, events: list[Event]) -> None:
+        # The flag marks the first capsule of a scan, not of a turn: nothing before it belongs to it.
+        if self._previous is not None and not _start_angle(capsule) & _NEW_SCAN:
+            events.append(decode_capsule(self._previous, _start_angle(capsule)))
+        self._previous = capsule
+
+
+def _xor(data: bytes) -> int:
+    return int(np.bitwise_xor.reduce(np.frombuffer(data, np.uint8)))
+
+
+def _start_angle(capsule: bytes) -> int:
+    return int.from_bytes(capsule[2:4], "little")
+
+
+def decode_capsule(capsule: bytes, next_start: int) -> Nodes:
+    """Nodes of one legacy express capsule (84 bytes), given the start angle field of the next one.
+
+    Node k stands at start + k (next - start) / 32 minus its own correction (6 bits, degrees / 8); a turn begins where
+    that line passes 360 degrees. Source: Slamtec interface protocol, express scan, legacy capsules.
+    """
+    begin = _start_angle(capsule) & ~_NEW_SCAN
+    sweep = ((next_start & ~_NEW_SCAN) - begin) % _FULL_TURN_Q6
+    cabins = np.frombuffer(capsule, np.uint8, offset=4).reshape(16, 5).astype(np.int32)
+    fields = np.empty((16, 2), np.int32)
+    fields[:, 0] = cabins[:, 0] | cabins[:, 1] << 8
+    fields[:, 1] = cabins[:, 2] | cabins[:, 3] << 8
+    correction_q3 = (fields & 3) << 4
+    correction_q3[:, 0] |= cabins[:, 4] & 0xF
+    correction_q3[:, 1] |= cabins[:, 4] >> 4
+    distance = (fields & 0xFFFC).reshape(-1).astype(np.uint16)
+    # In degrees / 2048, so that the thirty-seconds of the sweep stay whole.
+    line = begin * 32 + sweep * np.arange(_CAPSULE_NODES)
+    angle = ((line - (correction_q3.reshape(-1) << 8)) >> 5) % _FULL_TURN_Q6
+    start = (line + sweep) % (_FULL_TURN_Q6 * 32) < sweep
+    quality = np.where(distance > 0, _RETURN_QUALITY, 0).astype(np.uint8)
+    return Nodes(start, quality, angle.astype(np.uint16), distance)
+
+
+# --- turns ------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Turn:
+    """One whole turn of the head, n nodes in order of arrival.
+
+    angles_rad: float64[n], counter-clockwise in the laser frame, 0 straight ahead, in (-pi, pi].
+    ranges_m: float64[n], metres, nan where nothing came back; not clipped to the rated 0.15..12 m, because a
+    too-near obstacle is an obstacle. quality: uint8[n].
+    started_at, ended_at: arrival of the first and last node, seconds on the caller's clock, interpolated in a batch.
+    digest: of all decoded fields. repeats: how many turns in a row had this digest, this one included; a live head
+    never gives two equal ones, a stuck link does.
+    """
+
+    angles_rad: NDArray[np.float64]
+    ranges_m: NDArray[np.float64]
+    quality: NDArray[np.uint8]
+    started_at: float
+    ended_at: float
+    digest: bytes
+    repeats: int
+
+
+_SECTORS: Final = 36
+_SECTORS_NEEDED: Final = 33
+_NODES_MAX: Final = 4096
+# Recorded heads start their turns between 350 and 360 degrees; a start flag far from zero is a damaged node.
+_START_WINDOW_Q6: Final = 45 * 64
+_ARRIVAL_GAP_S: Final = 0.5
+
+
+class ScanAssembler:
+    """Nodes -> whole turns. A turn runs from one start flag to the next and must have looked in nearly all directions.
+
+    `incomplete` counts turns that were thrown away because nodes were missing; the piece before the first start flag
+    does not count.
+    """
+
+    def __init__(self) -> None:
+        self._pieces: list[Nodes] = []
+        self._times: list[NDArray[np.float64]] = []
+        self._count = 0
+        self._started = False
+        self._arrived: float | None = None
+        self._digest = b""
+        self._repeats = 0
+        self.incomplete = 0
+
+    def feed(self, nodes: Nodes, now: float) -> list[Turn]:
+        """Take a batch that arrived at `now` (seconds, monotonic); the turns that it completes."""
+        times = self._arrival_times(len(nodes.start), now)
+        angle = nodes.angle_q6
+        near_zero = (angle < _START_WINDOW_Q6) | (angle >= _FULL_TURN_Q6 - _START_WINDOW_Q6)
+        turns: list[Turn] = []
+        begin = 0
+        for boundary in np.flatnonzero(nodes.start & near_zero):
+            self._append(nodes, times, begin, int(boundary))
+            turns.extend(self._finish())
+            begin = int(boundary)
+            self._started = True
+        self._append(nodes, times, begin, len(nodes.start))
+        return turns
+
+    def reset(self) -> None:
+        """Forget the turn at hand, after the scan was started anew."""
+        self._clear()
+        self._started = False
+        self._arrived = None
+
+    def _arrival_times(self, count: int, now: float) -> NDArray[np.float64]:
+        before = self._arrived
+        self._arrived = now
+        if before is None or not 0.0 <= now - before <= _ARRIVAL_GAP_S:
+            return np.full(count, now)
+        return before + (now - before) * np.arange(1, count + 1) / max(count, 1)
+
+    def _append(self, nodes: Nodes, times: NDArray[np.float64], begin: int, end: int) -> None:
+        if not self._started or begin == end:
+            return
+        part = slice(begin, end)
+        self._pieces.append(
+            Nodes(nodes.start[part], nodes.quality[part], nodes.angle_q6[part], nodes.distance_q2[part])
+        )
+        self._times.append(times[begin:end])
+        self._count += end - begin
+        if self._count > _NODES_MAX:
+            self.incomplete += 1
+            self._clear()
+            self._started = False
+
+    def _clear(self) -> None:
+        self._pieces, self._times, self._count = [], [], 0
+
+    def _finish(self) -> list[Turn]:
+        if not self._count:
+            return []
+        quality = np.concatenate([piece.quality for piece in self._pieces])
+        angle_q6 = np.concatenate([piece.angle_q6 for piece in self._pieces])
+        distance_q2 = np.concatenate([piece.distance_q2 for piece in self._pieces])
+        times = np.concatenate(self._times)
+        self._clear()
+        sectors = np.bincount(angle_q6 // (_FULL_TURN_Q6 // _SECTORS), minlength=_SECTORS)
+        if np.count_nonzero(sectors) < _SECTORS_NEEDED:
+            self.incomplete += 1
+            return []
+        digest = hashlib.blake2b(digest_size=16)
+        for field in (quality, angle_q6, distance_q2):
+            digest.update(field.tobytes())
+        self._repeats = self._repeats + 1 if digest.digest() == self._digest else 1
+        self._digest = digest.digest()
+        clockwise = angle_q6 * (np.pi / (180.0 * 64.0))
+        ranges = distance_q2 * 0.00025
+        ranges[distance_q2 == 0] = np.nan
+        return [
+            Turn(
+                angles_rad=np.where(clockwise < np.pi, 0.0, 2.0 * np.pi) - clockwise,
+                ranges_m=ranges,
+                quality=quality,
+                started_at=float(times[0]),
+                ended_at=float(times[-1]),
+                digest=self._digest,
+                repeats=self._repeats,
+            )
+        ]

@@ -1,0 +1,169 @@
+"""The edge: a serial device as a file descriptor. 115200 8N1, raw, never blocking.
+
+Plain termios, because the protocols above need nothing more and because an inherited descriptor (the watcher of the
+guardian) has to be a port as well.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import select
+import struct
+import termios
+from typing import Final, Self
+
+_READ_BYTES: Final = 65536
+_WRITE_WAIT_S: Final = 0.1
+
+
+class PortLost(Exception):  # noqa: N818 - named for what happened; it is an end of the link, not a mistake
+    """The serial device is not there, not ours, or not answering any more."""
+
+    def __init__(self, path: str, reason: str) -> None:
+        """Name the port, what happened to it and what to check."""
+        super().__init__(
+            f"{path}: {reason}; check that the device is plugged in and powered, that the cable sits, that this user "
+            "may use it (group dialout) and that no other process has it open"
+        )
+        self.path = path
+        self.reason = reason
+
+
+class Port:
+    """An open serial port. Close it yourself or use it in a `with` statement; nothing happens on garbage collection."""
+
+    def __init__(self, fd: int, path: str, *, owned: bool) -> None:
+        """Take a descriptor that is already set up; `open_port` and `from_fd` are the usual ways."""
+        self._fd = fd
+        self._owned = owned
+        self.path = path
+
+    @classmethod
+    def from_fd(cls, fd: int, path: str | None = None) -> Self:
+        """Use a descriptor that another process opened and set up; `close` leaves it open for them.
+
+        Raises:
+            PortLost: if the descriptor is not open.
+
+        """
+        name = path or f"inherited descriptor {fd}"
+        try:
+            os.set_blocking(fd, False)
+        except OSError as error:
+            raise PortLost(name, _reason(error)) from error
+        return cls(fd, name, owned=False)
+
+    def fileno(self) -> int:
+        """Descriptor for select, asyncio or a child process; -1 once closed."""
+        return self._fd
+
+    def read_available(self) -> bytes:
+        """Return what has arrived, at once; b"" if nothing has.
+
+        Raises:
+            PortLost: when the device is gone.
+
+        """
+        try:
+            data = os.read(self._fd, _READ_BYTES)
+        except BlockingIOError:
+            return b""
+        except OSError as error:
+            raise PortLost(self.path, _reason(error)) from error
+        if not data:
+            raise PortLost(self.path, "the device hung up")
+        return data
+
+    def write(self, data: bytes) -> None:
+        """Send all of it, so that no command is ever cut. A full buffer is waited for, 0.1 s at most.
+
+        Raises:
+            PortLost: when the device is gone or takes nothing.
+
+        """
+        rest = memoryview(data)
+        while rest:
+            try:
+                rest = rest[os.write(self._fd, rest) :]
+            except BlockingIOError:
+                if not select.select((), (self._fd,), (), _WRITE_WAIT_S)[1]:
+                    raise PortLost(self.path, f"the device has taken no byte for {_WRITE_WAIT_S} s") from None
+            except OSError as error:
+                raise PortLost(self.path, _reason(error)) from error
+
+    def set_dtr(self, *, on: bool) -> bool:
+        """Set or clear the DTR line (cleared lets an RPLidar A1's motor run). False where there is none, as on a pty.
+
+        Raises:
+            PortLost: when the device is gone.
+
+        """
+        request = termios.TIOCMBIS if on else termios.TIOCMBIC
+        try:
+            fcntl.ioctl(self._fd, request, struct.pack("i", termios.TIOCM_DTR))
+        except OSError as error:
+            if error.errno in {errno.ENOTTY, errno.EINVAL}:
+                return False
+            raise PortLost(self.path, _reason(error)) from error
+        return True
+
+    def discard_input(self) -> None:
+        """Throw away what has arrived and was not read. Raises PortLost when the device is gone."""
+        try:
+            termios.tcflush(self._fd, termios.TCIFLUSH)
+        except termios.error as error:
+            raise PortLost(self.path, str(error.args[-1])) from error
+
+    def close(self) -> None:
+        """Give the port back; harmless when done twice."""
+        fd, self._fd = self._fd, -1
+        if fd >= 0 and self._owned:
+            os.close(fd)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def open_port(path: str) -> Port:
+    """Open a serial device (or pty) for this process alone: 115200 8N1, raw, non-blocking.
+
+    Raises:
+        PortLost: if it is missing, forbidden, in use by another Port, or no terminal.
+
+    """
+    try:
+        fd = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError as error:
+        raise PortLost(path, _reason(error)) from error
+    try:
+        _set_up(fd, path)
+    except BaseException:
+        os.close(fd)
+        raise
+    return Port(fd, path, owned=True)
+
+
+def _set_up(fd: int, path: str) -> None:
+    try:
+        # Advisory, and shared by those who inherit the descriptor.
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        raise PortLost(path, "another process has locked it") from error
+    try:
+        control = termios.tcgetattr(fd)[6]
+        control[termios.VMIN] = 1
+        control[termios.VTIME] = 0
+        mode = termios.CS8 | termios.CREAD | termios.CLOCAL
+        speed = termios.B115200
+        termios.tcsetattr(fd, termios.TCSAFLUSH, [0, 0, mode, 0, speed, speed, control])
+    except termios.error as error:
+        raise PortLost(path, f"not a serial device ({error.args[-1]})") from error
+
+
+def _reason(error: OSError) -> str:
+    return error.strerror or str(error)

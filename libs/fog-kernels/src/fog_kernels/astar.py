@@ -1,0 +1,915 @@
+"""Shortest paths on costmaps: exact A* with integer costs, replanning with a goal field, shortcuts.
+
+Grid: 8-connected; a cell is traversable below 253 (inscribed); a diagonal needs both orthogonal cells traversable.
+An edge costs its length times the mean weight of its two end cells, `weight = neutral + factor * cost`, so costs are
+symmetric. Lengths are the integers 408 and 577 (577/408 is sqrt 2 within 2e-6), weights are rounded to integers: the
+search is exact for this integer problem, and no float rounding can make it depend on the order of expansion.
+
+Methods: A* (Hart, Nilsson and Raphael 1968) on a circular bucket queue (Dial 1969). A bucket spans several costs, so a
+cell is expanded again when a cheaper way to it appears; the search ends only when no open cell can lead to a cheaper
+path. Shortcuts integrate the cost along lines of sight cell by cell (Amanatides and Woo 1987).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numba import float64, int64, njit, types
+
+from fog_kernels import _arrays
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+INSCRIBED = 253
+STRAIGHT = 408
+DIAGONAL = 577
+BUCKETS = 1024  # heads fit the first-level cache; a power of two
+
+DEFAULT_NEUTRAL = 50
+DEFAULT_FACTOR = 0.8
+
+_FOUND = 0
+_NOT_FOUND = 1
+_TIMED_OUT = 2
+_OVERFLOW = 3
+_QUEUE_FULL = 4
+
+type_cells = _arrays.I32_FLAT
+type_scratch = _arrays.I32_OUT
+
+
+def _search_signature(costs: Any) -> Any:
+    read = types.Array(costs, 1, "C", readonly=True)
+    write = types.Array(costs, 1, "C")
+    return types.void(
+        _arrays.U8_FLAT,  # costmap
+        int64,  # width
+        _arrays.I32_FLAT,  # weight
+        int64,  # start
+        int64,  # goal
+        read,  # field
+        write,  # g
+        type_scratch,  # queue_cell
+        type_scratch,  # queue_next
+        type_scratch,  # heads
+        int64,  # shift
+        type_scratch,  # touched
+        int64,  # max_expansions
+        _arrays.I64_OUT,  # result
+    )
+
+
+@njit([_search_signature(types.int32), _search_signature(types.int64)], cache=True, nogil=True)
+def _search(
+    costmap: Any,
+    width: int,
+    weight: Any,
+    start: int,
+    goal: int,
+    field: Any,
+    g: Any,
+    queue_cell: Any,
+    queue_next: Any,
+    heads: Any,
+    shift: int,
+    touched: Any,
+    max_expansions: int,
+    result: Any,
+) -> None:
+    """Search from start to goal; an empty field means the octile heuristic.
+
+    `g` holds its largest value everywhere before and after. A negative g is the complement of an expanded cell's
+    cost. `result` receives status, cost, path length, expansions; the path itself ends in queue_cell, goal first.
+    """
+    unset = g[start]
+    highest = np.int64(2147483646) if g.itemsize == 4 else np.int64(1) << 61
+    height = costmap.size // width
+    mask = heads.size - 1
+    capacity = queue_cell.size
+    use_field = field.size > 0
+    goal_x = goal % width
+    goal_y = goal // width
+    cheapest = 2 * np.int64(weight[0])
+    step_straight = STRAIGHT * cheapest
+    step_extra = (DIAGONAL - STRAIGHT) * cheapest
+
+    result[0] = _NOT_FOUND
+    result[1] = 0
+    result[2] = 0
+    result[3] = 0
+    if weight[costmap[start]] == 0 or weight[costmap[goal]] == 0:
+        return
+    if start == goal:
+        queue_cell[0] = start
+        result[0] = _FOUND
+        result[2] = 1
+        return
+    if use_field:
+        if field[start] == unset:
+            return
+        bucket = np.int64(field[start]) >> shift
+    else:
+        dx = abs(start % width - goal_x)
+        dy = abs(start // width - goal_y)
+        bucket = (step_straight * max(dx, dy) + step_extra * min(dx, dy)) >> shift
+
+    offsets = np.empty(8, np.int64)
+    columns = np.empty(8, np.int64)
+    rows = np.empty(8, np.int64)
+    lengths = np.empty(8, np.int64)
+    for k, (cx, cy) in enumerate(((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1))):
+        columns[k] = cx
+        rows[k] = cy
+        offsets[k] = cy * width + cx
+        lengths[k] = STRAIGHT if k < 4 else DIAGONAL
+    around = np.empty(8, np.int64)
+
+    heads[:] = -1
+    free: Any = np.int64(-1)
+    used: Any = np.int64(1)
+    queue_cell[0] = start
+    queue_next[0] = -1
+    heads[bucket & mask] = 0
+    waiting = 1
+    g[start] = 0
+    touched[0] = start
+    n_touched = 1
+    best = highest
+    expansions = 0
+    status = _NOT_FOUND
+
+    while waiting > 0:
+        entry: Any = np.int64(heads[bucket & mask])
+        while entry == -1:
+            bucket += 1
+            entry = np.int64(heads[bucket & mask])
+        if (bucket << shift) >= best:
+            break
+        cell: Any = np.int64(queue_cell[entry])
+        heads[bucket & mask] = queue_next[entry]
+        queue_next[entry] = free
+        free = entry
+        waiting -= 1
+        here = np.int64(g[cell])
+        if here < 0:
+            continue  # a stale entry: expanded already at its present cost
+        y = cell // width
+        x = cell - y * width
+        if best != highest:
+            if use_field:
+                f = here + field[cell]
+            else:
+                dx = abs(x - goal_x)
+                dy = abs(y - goal_y)
+                f = here + step_straight * max(dx, dy) + step_extra * min(dx, dy)
+            if f >= best:
+                continue
+        g[cell] = ~here
+        expansions += 1
+        if max_expansions > 0 and expansions > max_expansions:
+            status = _TIMED_OUT
+            break
+        own = np.int64(weight[costmap[cell]])
+
+        right = x + 1 < width
+        left = x > 0
+        up = y + 1 < height
+        down = y > 0
+        w_right = np.int64(weight[costmap[cell + 1]]) if right else np.int64(0)
+        w_left = np.int64(weight[costmap[cell - 1]]) if left else np.int64(0)
+        w_up = np.int64(weight[costmap[cell + width]]) if up else np.int64(0)
+        w_down = np.int64(weight[costmap[cell - width]]) if down else np.int64(0)
+        around[0] = w_right
+        around[1] = w_left
+        around[2] = w_up
+        around[3] = w_down
+        around[4] = weight[costmap[cell + width + 1]] if w_right > 0 and w_up > 0 else 0
+        around[5] = weight[costmap[cell + width - 1]] if w_left > 0 and w_up > 0 else 0
+        around[6] = weight[costmap[cell - width + 1]] if w_right > 0 and w_down > 0 else 0
+        around[7] = weight[costmap[cell - width - 1]] if w_left > 0 and w_down > 0 else 0
+
+        for k in range(8):
+            other = around[k]
+            if other == 0:
+                continue
+            neighbour = cell + offsets[k]
+            reached = here + lengths[k] * (own + other)
+            old = np.int64(g[neighbour])
+            fresh = old == unset
+            if old < 0:
+                old = ~old
+            if reached >= old:
+                if reached >= highest:
+                    status = _OVERFLOW
+                    break
+                continue
+            if use_field:
+                remaining = np.int64(field[neighbour])
+                if remaining == unset:
+                    continue  # the goal can't be reached from there
+            else:
+                dx = abs(x + columns[k] - goal_x)
+                dy = abs(y + rows[k] - goal_y)
+                remaining = step_straight * max(dx, dy) + step_extra * min(dx, dy)
+            f = reached + remaining
+            if f >= highest:
+                status = _OVERFLOW
+                break
+            if f >= best:
+                continue
+            if fresh:
+                touched[n_touched] = neighbour
+                n_touched += 1
+            g[neighbour] = reached
+            if neighbour == goal:
+                best = reached
+                status = _FOUND
+                continue
+            if free >= 0:
+                entry = free
+                free = np.int64(queue_next[entry])
+            elif used < capacity:
+                entry = used
+                used += 1
+            else:
+                status = _QUEUE_FULL
+                break
+            slot = (f >> shift) & mask
+            queue_cell[entry] = neighbour
+            queue_next[entry] = heads[slot]
+            heads[slot] = entry
+            waiting += 1
+        if status in (_OVERFLOW, _QUEUE_FULL):
+            break
+
+    if status == _FOUND:
+        # No parents are stored: a predecessor is the neighbour whose cost and edge add up; straight on is preferred.
+        cell = goal
+        count = 0
+        direction = 0
+        while True:
+            queue_cell[count] = cell
+            count += 1
+            if cell == start:
+                break
+            here = np.int64(g[cell])
+            if here < 0:
+                here = ~here
+            y = cell // width
+            x = cell - y * width
+            own = np.int64(weight[costmap[cell]])
+            for turn in range(8):
+                k = (direction + turn) & 7
+                nx = x + columns[k]
+                ny = y + rows[k]
+                if nx < 0 or nx >= width or ny < 0 or ny >= height:
+                    continue
+                neighbour = cell + offsets[k]
+                there = np.int64(g[neighbour])
+                if there >= 0:
+                    continue  # never expanded
+                other = np.int64(weight[costmap[neighbour]])
+                if ~there + lengths[k] * (own + other) != here:
+                    continue
+                if k >= 4 and (weight[costmap[cell + columns[k]]] == 0 or weight[costmap[cell + rows[k] * width]] == 0):
+                    continue
+                cell = neighbour
+                direction = k
+                break
+        result[1] = best
+        result[2] = count
+    result[0] = status
+    result[3] = expansions
+    for i in range(n_touched):
+        g[touched[i]] = unset
+
+
+def _field_signature(costs: Any) -> Any:
+    return types.int64(
+        _arrays.U8_FLAT,
+        int64,
+        _arrays.I32_FLAT,
+        int64,
+        types.Array(costs, 1, "C"),
+        type_scratch,
+        type_scratch,
+        type_scratch,
+        int64,
+    )
+
+
+@njit([_field_signature(types.int32), _field_signature(types.int64)], cache=True, nogil=True)
+def _fill_field(
+    costmap: Any,
+    width: int,
+    weight: Any,
+    goal: int,
+    field: Any,
+    queue_cell: Any,
+    queue_next: Any,
+    heads: Any,
+    shift: int,
+) -> int:
+    """Write the exact cost from every cell to the goal; cells without a way keep the largest value.
+
+    A bucket is no wider than the cheapest edge, so whatever stands in the lowest bucket is final (Dinitz's caliber).
+    """
+    unset = field[goal]
+    highest = np.int64(2147483646) if field.itemsize == 4 else np.int64(1) << 61
+    height = costmap.size // width
+    mask = heads.size - 1
+    capacity = queue_cell.size
+    if weight[costmap[goal]] == 0:
+        return _NOT_FOUND
+    offsets = np.empty(8, np.int64)
+    lengths = np.empty(8, np.int64)
+    for k, (cx, cy) in enumerate(((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1))):
+        offsets[k] = cy * width + cx
+        lengths[k] = STRAIGHT if k < 4 else DIAGONAL
+    around = np.empty(8, np.int64)
+    heads[:] = -1
+    free: Any = np.int64(-1)
+    used: Any = np.int64(1)
+    queue_cell[0] = goal
+    queue_next[0] = -1
+    heads[0] = 0
+    waiting = 1
+    field[goal] = 0
+    bucket: Any = np.int64(0)
+    while waiting > 0:
+        entry: Any = np.int64(heads[bucket & mask])
+        while entry == -1:
+            bucket += 1
+            entry = np.int64(heads[bucket & mask])
+        cell: Any = np.int64(queue_cell[entry])
+        heads[bucket & mask] = queue_next[entry]
+        queue_next[entry] = free
+        free = entry
+        waiting -= 1
+        here = np.int64(field[cell])
+        if here >> shift != bucket:
+            continue  # a stale entry: its cell left from a lower bucket
+        y = cell // width
+        x = cell - y * width
+        own = np.int64(weight[costmap[cell]])
+        w_right = np.int64(weight[costmap[cell + 1]]) if x + 1 < width else np.int64(0)
+        w_left = np.int64(weight[costmap[cell - 1]]) if x > 0 else np.int64(0)
+        w_up = np.int64(weight[costmap[cell + width]]) if y + 1 < height else np.int64(0)
+        w_down = np.int64(weight[costmap[cell - width]]) if y > 0 else np.int64(0)
+        around[0] = w_right
+        around[1] = w_left
+        around[2] = w_up
+        around[3] = w_down
+        around[4] = weight[costmap[cell + width + 1]] if w_right > 0 and w_up > 0 else 0
+        around[5] = weight[costmap[cell + width - 1]] if w_left > 0 and w_up > 0 else 0
+        around[6] = weight[costmap[cell - width + 1]] if w_right > 0 and w_down > 0 else 0
+        around[7] = weight[costmap[cell - width - 1]] if w_left > 0 and w_down > 0 else 0
+        for k in range(8):
+            other = around[k]
+            if other == 0:
+                continue
+            neighbour = cell + offsets[k]
+            reached = here + lengths[k] * (own + other)
+            if reached >= highest:
+                return _OVERFLOW
+            if reached >= field[neighbour]:
+                continue
+            field[neighbour] = reached
+            if free >= 0:
+                entry = free
+                free = np.int64(queue_next[entry])
+            elif used < capacity:
+                entry = used
+                used += 1
+            else:
+                return _QUEUE_FULL
+            slot = (reached >> shift) & mask
+            queue_cell[entry] = neighbour
+            queue_next[entry] = heads[slot]
+            heads[slot] = entry
+            waiting += 1
+    # `unset` cells stay as they were: no way leads from them to the goal.
+    return _FOUND if unset != 0 else _NOT_FOUND
+
+
+@njit(types.boolean(_arrays.U8_FLAT, _arrays.U8_FLAT), cache=True, nogil=True)
+def _none_lower(costmap: Any, reference: Any) -> bool:
+    lower = 0
+    for i in range(costmap.size):
+        lower |= costmap[i] < reference[i]
+    return lower == 0
+
+
+@njit(int64(_arrays.U8_FLAT, int64, int64, int64, int64, _arrays.U8_GRID_OUT, type_scratch), cache=True, nogil=True)
+def _nearest_reachable(costmap: Any, width: int, start: int, goal_x: int, goal_y: int, seen: Any, stack: Any) -> Any:
+    # A diagonal needs both orthogonal cells, so 4-connectivity decides what can be reached.
+    height = costmap.size // width
+    nearest: Any = start
+    least: Any = (start % width - goal_x) ** 2 + (start // width - goal_y) ** 2
+    if costmap[start] >= INSCRIBED:
+        return start
+    stack[0] = start
+    seen[start // width, start % width] = 1
+    count = 1
+    while count > 0 and least > 0:
+        count -= 1
+        cell = np.int64(stack[count])
+        y = cell // width
+        x = cell - y * width
+        square = (x - goal_x) ** 2 + (y - goal_y) ** 2
+        if square < least or (square == least and cell < nearest):
+            least = square
+            nearest = cell
+        if x > 0 and seen[y, x - 1] == 0 and costmap[cell - 1] < INSCRIBED:
+            seen[y, x - 1] = 1
+            stack[count] = cell - 1
+            count += 1
+        if x + 1 < width and seen[y, x + 1] == 0 and costmap[cell + 1] < INSCRIBED:
+            seen[y, x + 1] = 1
+            stack[count] = cell + 1
+            count += 1
+        if y > 0 and seen[y - 1, x] == 0 and costmap[cell - width] < INSCRIBED:
+            seen[y - 1, x] = 1
+            stack[count] = cell - width
+            count += 1
+        if y + 1 < height and seen[y + 1, x] == 0 and costmap[cell + width] < INSCRIBED:
+            seen[y + 1, x] = 1
+            stack[count] = cell + width
+            count += 1
+    return nearest
+
+
+@njit(int64(_arrays.U8_GRID, int64, int64, int64), cache=True, nogil=True)
+def _nearest_traversable(costmap: Any, col: int, row: int, reach: int) -> int:
+    height, width = costmap.shape
+    nearest = -1
+    least = reach * reach + 1
+    for y in range(max(row - reach, 0), min(row + reach + 1, height)):
+        for x in range(max(col - reach, 0), min(col + reach + 1, width)):
+            square = (x - col) ** 2 + (y - row) ** 2
+            if square < least and costmap[y, x] < INSCRIBED:
+                least = square
+                nearest = y * width + x
+    return nearest
+
+
+@njit(float64(_arrays.U8_GRID, _arrays.I32_FLAT, float64, float64, float64, float64, float64), cache=True, nogil=True)
+def _line_cost(costmap: Any, weight: Any, x0: float, y0: float, x1: float, y1: float, limit: float) -> float:
+    """Integrate the weight along a line in cell coordinates; infinite if blocked, or as soon as it exceeds limit."""
+    height, width = costmap.shape
+    x = math.floor(x0 + 0.5)
+    y = math.floor(y0 + 0.5)
+    last_x = math.floor(x1 + 0.5)
+    last_y = math.floor(y1 + 0.5)
+    if min(x, last_x) < 0 or max(x, last_x) >= width or min(y, last_y) < 0 or max(y, last_y) >= height:
+        return math.inf
+    dx = x1 - x0
+    dy = y1 - y0
+    length = math.sqrt(dx * dx + dy * dy)
+    step_x = 1 if dx > 0.0 else -1
+    step_y = 1 if dy > 0.0 else -1
+    next_x = (x + 0.5 * step_x - x0) / dx if dx != 0.0 else math.inf
+    next_y = (y + 0.5 * step_y - y0) / dy if dy != 0.0 else math.inf
+    delta_x = abs(1.0 / dx) if dx != 0.0 else math.inf
+    delta_y = abs(1.0 / dy) if dy != 0.0 else math.inf
+    done = 0.0
+    total = 0.0
+    # Counting cells instead of parameters: rounding can't make the walk miss its last cell.
+    left_x = abs(last_x - x)
+    left_y = abs(last_y - y)
+    while True:
+        own = np.int64(weight[costmap[y, x]])
+        if own == 0:
+            return math.inf
+        if left_x == 0 and left_y == 0:
+            return total + max(1.0 - done, 0.0) * length * own
+        corner = left_x > 0 and left_y > 0 and abs(next_x - next_y) < 1e-9
+        if corner:
+            # Through a corner only where a diagonal step may go.
+            if weight[costmap[y, x + step_x]] == 0 or weight[costmap[y + step_y, x]] == 0:
+                return math.inf
+            until = next_x
+            x += step_x
+            y += step_y
+            next_x += delta_x
+            next_y += delta_y
+            left_x -= 1
+            left_y -= 1
+        elif left_y == 0 or (left_x > 0 and next_x < next_y):
+            until = next_x
+            x += step_x
+            next_x += delta_x
+            left_x -= 1
+        else:
+            until = next_y
+            y += step_y
+            next_y += delta_y
+            left_y -= 1
+        until = min(until, 1.0)
+        total += (until - done) * length * own
+        done = until
+        if total > limit:
+            return math.inf
+
+
+@njit(float64(_arrays.U8_GRID, _arrays.I32_FLAT, _arrays.I32_PAIRS, _arrays.F64_OUT), cache=True, nogil=True)
+def _cells_cost(costmap: Any, weight: Any, cells: Any, cumulated: Any) -> float:
+    """Fill cumulated[i] with the cost from the first cell to cell i; infinite if a step isn't one of the grid's."""
+    height, width = costmap.shape
+    total = 0.0
+    for i in range(cells.shape[0]):
+        x = np.int64(cells[i, 0])
+        y = np.int64(cells[i, 1])
+        if x < 0 or x >= width or y < 0 or y >= height or weight[costmap[y, x]] == 0:
+            return math.inf
+        if i > 0:
+            last_x = np.int64(cells[i - 1, 0])
+            last_y = np.int64(cells[i - 1, 1])
+            if abs(x - last_x) > 1 or abs(y - last_y) > 1:
+                return math.inf
+            if x != last_x and y != last_y:
+                if weight[costmap[last_y, x]] == 0 or weight[costmap[y, last_x]] == 0:
+                    return math.inf
+                length = float(DIAGONAL)
+            elif x != last_x or y != last_y:
+                length = float(STRAIGHT)
+            else:
+                length = 0.0
+            total += length * (np.int64(weight[costmap[y, x]]) + np.int64(weight[costmap[last_y, last_x]]))
+        cumulated[i] = total / (2.0 * STRAIGHT)
+    return total / (2.0 * STRAIGHT)
+
+
+@njit(
+    int64(_arrays.U8_GRID, _arrays.I32_FLAT, _arrays.I32_PAIRS, _arrays.F64_FLAT, float64, _arrays.I64_OUT),
+    cache=True,
+    nogil=True,
+)
+def _shortcut(costmap: Any, weight: Any, cells: Any, cumulated: Any, slack: float, kept: Any) -> int:
+    """Keep the cells between which lines are no dearer than the path: gallop forward, then bisect."""
+    last = cells.shape[0] - 1
+    kept[0] = 0
+    count = 1
+    anchor = 0
+    while anchor < last:
+        good = anchor + 1
+        stride = 2
+        bad = last + 1
+        while anchor + stride <= last or good < last:
+            probe = min(anchor + stride, last)
+            allowed = (cumulated[probe] - cumulated[anchor]) * (1.0 + slack) + 1e-9
+            cost = _line_cost(
+                costmap,
+                weight,
+                float(cells[anchor, 0]),
+                float(cells[anchor, 1]),
+                float(cells[probe, 0]),
+                float(cells[probe, 1]),
+                allowed,
+            )
+            if cost > allowed:
+                bad = probe
+                break
+            good = probe
+            if probe == last:
+                break
+            stride *= 2
+        while bad - good > 1 and bad <= last:
+            probe = (good + bad) // 2
+            allowed = (cumulated[probe] - cumulated[anchor]) * (1.0 + slack) + 1e-9
+            cost = _line_cost(
+                costmap,
+                weight,
+                float(cells[anchor, 0]),
+                float(cells[anchor, 1]),
+                float(cells[probe, 0]),
+                float(cells[probe, 1]),
+                allowed,
+            )
+            if cost > allowed:
+                bad = probe
+            else:
+                good = probe
+        kept[count] = good
+        count += 1
+        anchor = good
+    return count
+
+
+def _weights(neutral: int, factor: float) -> NDArray[np.int32]:
+    """Tabulate the weight of every cost; 0 marks what can't be crossed."""
+    if neutral < 1 or factor < 0.0 or not math.isfinite(factor):
+        raise ValueError(f"neutral must be at least 1 and factor at least 0, not {neutral} and {factor}")
+    weight = np.zeros(256, np.int32)
+    graded = neutral + factor * np.arange(INSCRIBED)
+    if graded[-1] > 100_000:
+        raise ValueError("neutral + factor * 252 must not exceed 100000")
+    weight[:INSCRIBED] = np.rint(graded)
+    weight.setflags(write=False)
+    return weight
+
+
+_DEFAULT_WEIGHTS = _weights(DEFAULT_NEUTRAL, DEFAULT_FACTOR)
+
+
+def _weights_of(neutral: int, factor: float) -> NDArray[np.int32]:
+    if neutral == DEFAULT_NEUTRAL and factor == DEFAULT_FACTOR:
+        return _DEFAULT_WEIGHTS
+    return _weights(neutral, factor)
+
+
+def _cells_array(cells: NDArray[np.int32]) -> NDArray[np.int32]:
+    _arrays.exact(cells, np.int32, 2, "cells")
+    if cells.shape[0] == 0 or cells.shape[1] != 2:
+        raise ValueError(f"cells must have shape (n, 2) with n >= 1, not {cells.shape}")
+    return cells
+
+
+@dataclass(frozen=True, slots=True)
+class PlanResult:
+    """What a search found.
+
+    `cost` is the sum over edges of length in cells times mean weight (infinite when nothing was found), `cells` the
+    path from start to goal, int32 (n, 2) as (column, row), empty when nothing was found. `timed_out` says that the
+    bound on expansions ended the search.
+    """
+
+    found: bool
+    cost: float
+    cells: NDArray[np.int32]
+    expansions: int
+    timed_out: bool = False
+
+
+class Planner:
+    """Exact A* on costmaps of one size; owns all memory that a search needs, so that plans allocate nothing large.
+
+    One thread may call `plan` at a time; `set_goal_field` uses memory of its own and may run in another thread.
+    `neutral` is the weight of a free cell, `factor` multiplies the cost (0..252) that is added to it: the defaults let
+    a robot pay for the corridor's middle with a detour of at most about five times the length in the dearest cells.
+    """
+
+    def __init__(self, width: int, height: int, neutral: int = DEFAULT_NEUTRAL, factor: float = DEFAULT_FACTOR) -> None:
+        if width < 1 or height < 1 or width * height > 2**31 - 2:
+            raise ValueError(f"width and height must be positive and below 2^31 cells in all, not {width} x {height}")
+        self.width = width
+        self.height = height
+        self.neutral = neutral
+        self.factor = factor
+        self._weight = _weights_of(neutral, factor)
+        dearest_edge = 2 * DIAGONAL * int(self._weight.max())
+        # The total estimate rises by at most twice the dearest edge per step: that many buckets are open at once.
+        self._shift = max(0, (2 * dearest_edge // (BUCKETS - 2)).bit_length())
+        self._field_shift = (2 * STRAIGHT * int(self._weight[0])).bit_length() - 1
+        open_buckets = (dearest_edge >> self._field_shift) + 3
+        self._field_buckets = 1 << open_buckets.bit_length()
+        self._costs: type[np.int32 | np.int64] = np.int32
+        self._capacity = width * height
+        self._allocate()
+        self._heads = np.empty(BUCKETS, np.int32)
+        self._touched = np.empty(width * height, np.int32)
+        self._result = np.zeros(4, np.int64)
+        self._goal: tuple[int, int] | None = None
+        self._static: NDArray[np.uint8] | None = None
+        self._field: NDArray[np.int32 | np.int64] = np.empty(0, np.int32)
+
+    def _allocate(self) -> None:
+        # Pages that no search touches cost no memory: np.empty only reserves them. g must hold its mark.
+        self._g: NDArray[np.int32 | np.int64] = np.full(
+            self.width * self.height, np.iinfo(self._costs).max, self._costs
+        )
+        self._no_field: NDArray[np.int32 | np.int64] = np.empty(0, self._costs)
+        self._queue_cell = np.empty(self._capacity, np.int32)
+        self._queue_next = np.empty(self._capacity, np.int32)
+
+    def _grid(self, costmap: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        costmap = _arrays.grid(costmap, "costmap")
+        if costmap.shape != (self.height, self.width):
+            raise ValueError(f"costmap must have shape {(self.height, self.width)}, not {costmap.shape}")
+        return costmap
+
+    def _index(self, cell: tuple[int, int], name: str) -> int:
+        col, row = int(cell[0]), int(cell[1])
+        if not (0 <= col < self.width and 0 <= row < self.height):
+            raise ValueError(f"{name} {col, row} lies outside the {self.width} x {self.height} grid")
+        return row * self.width + col
+
+    def plan(
+        self,
+        costmap: NDArray[np.uint8],
+        start: tuple[int, int],
+        goal: tuple[int, int],
+        max_expansions: int = 0,
+    ) -> PlanResult:
+        """Return a cheapest path from start to goal, both (column, row), on a uint8 (h, w) costmap.
+
+        While a goal field for this goal is set, it guides the search: still exact as long as no cell of the costmap is
+        lower than in the field's static costmap. `max_expansions` above 0 bounds the work. A start or goal that isn't
+        traversable gives `found=False`. Raises ValueError for cells outside and for a costmap of another shape.
+        """
+        costmap = self._grid(costmap)
+        first = self._index(start, "start")
+        last = self._index(goal, "goal")
+        while True:
+            guided = self._goal == (int(goal[0]), int(goal[1])) and self._field.dtype == self._g.dtype
+            _search(
+                costmap.ravel(),
+                self.width,
+                self._weight,
+                first,
+                last,
+                self._field if guided else self._no_field,
+                self._g,
+                self._queue_cell,
+                self._queue_next,
+                self._heads,
+                self._shift,
+                self._touched,
+                max_expansions,
+                self._result,
+            )
+            status, cost, length, expansions = (int(value) for value in self._result)
+            if status == _OVERFLOW:
+                self._widen()
+            elif status == _QUEUE_FULL:
+                self._capacity *= 2
+                self._allocate()
+            else:
+                break
+        if status != _FOUND:
+            return PlanResult(
+                found=False,
+                cost=math.inf,
+                cells=np.empty((0, 2), np.int32),
+                expansions=expansions,
+                timed_out=status == _TIMED_OUT,
+            )
+        flat = self._queue_cell[length - 1 :: -1] if length == self._capacity else self._queue_cell[:length][::-1]
+        cells = np.empty((length, 2), np.int32)
+        np.floor_divide(flat, self.width, out=cells[:, 1])
+        np.subtract(flat, cells[:, 1] * self.width, out=cells[:, 0])
+        return PlanResult(found=True, cost=cost / (2.0 * STRAIGHT), cells=cells, expansions=expansions)
+
+    def _widen(self) -> None:
+        """Go over to 64-bit costs for good: some path here is too dear for 32 bits."""
+        self._costs = np.int64
+        self._allocate()
+        if self._static is not None and self._goal is not None:
+            self.set_goal_field(self._static, self._goal)
+
+    def set_goal_field(self, static_costmap: NDArray[np.uint8], goal: tuple[int, int]) -> None:
+        """Compute the exact cost to the goal from every cell, to guide `plan` for this goal from now on.
+
+        Guided plans are exact as long as costs are only raised above the static costmap (see `raises_only`). Takes
+        about a full Dijkstra search; safe to run in a thread beside `plan`. Raises ValueError as `plan` does.
+        """
+        static = self._grid(static_costmap).copy()
+        target = self._index(goal, "goal")
+        capacity = self.width * self.height
+        costs = self._costs
+        while True:
+            field: NDArray[np.int32 | np.int64] = np.full(self.width * self.height, np.iinfo(costs).max, costs)
+            status = _fill_field(
+                static.ravel(),
+                self.width,
+                self._weight,
+                target,
+                field,
+                np.empty(capacity, np.int32),
+                np.empty(capacity, np.int32),
+                np.empty(self._field_buckets, np.int32),
+                self._field_shift,
+            )
+            if status == _OVERFLOW:
+                costs = np.int64
+            elif status == _QUEUE_FULL:
+                capacity *= 2
+            else:
+                break
+        # Without a goal in between, a plan in another thread never sees a field of one goal and the name of another.
+        self._goal = None
+        if costs is np.int64 and self._costs is np.int32:
+            self._costs = np.int64
+            self._allocate()
+        self._static = static
+        self._field = field
+        self._goal = (int(goal[0]), int(goal[1]))
+
+    def clear_goal_field(self) -> None:
+        """Forget the goal field: plans use the octile heuristic again."""
+        self._goal = None
+        self._static = None
+        self._field = np.empty(0, self._costs)
+
+    def raises_only(self, costmap: NDArray[np.uint8]) -> bool:
+        """Tell whether no cell is lower than in the static costmap of the goal field, so that guided plans are exact.
+
+        Raises RuntimeError when no goal field is set.
+        """
+        if self._static is None:
+            raise RuntimeError("no goal field is set: call set_goal_field first")
+        return bool(_none_lower(self._grid(costmap).ravel(), self._static.ravel()))
+
+    def nearest_reachable(
+        self, costmap: NDArray[np.uint8], start: tuple[int, int], goal: tuple[int, int]
+    ) -> tuple[int, int]:
+        """Return the (column, row) nearest to the goal (Euclid) that can be reached from start.
+
+        Among equals the lowest row, then column, wins. A start that isn't traversable is returned itself; the goal may
+        lie anywhere on the grid. Raises ValueError as `plan` does.
+        """
+        costmap = self._grid(costmap)
+        first = self._index(start, "start")
+        self._index(goal, "goal")
+        seen = np.zeros((self.height, self.width), np.uint8)
+        nearest = int(
+            _nearest_reachable(costmap.ravel(), self.width, first, int(goal[0]), int(goal[1]), seen, self._touched)
+        )
+        return nearest % self.width, nearest // self.width
+
+    def path_cost(self, costmap: NDArray[np.uint8], cells: NDArray[np.int32]) -> float:
+        """Return `path_cost` with this planner's weights."""
+        return path_cost(costmap, cells, self.neutral, self.factor)
+
+    def shortcut(self, costmap: NDArray[np.uint8], cells: NDArray[np.int32]) -> NDArray[np.float64]:
+        """Return `shortcut` with this planner's weights."""
+        return shortcut(costmap, cells, self.neutral, self.factor)
+
+
+def nearest_traversable(costmap: NDArray[np.uint8], cell: tuple[int, int], reach: int) -> tuple[int, int] | None:
+    """Return the traversable (column, row) nearest to a cell within `reach` cells, or None.
+
+    Walls between are not considered: this is for a robot whose own cell became impassable. Raises TypeError or
+    ValueError for a costmap of another type or shape.
+    """
+    costmap = _arrays.grid(costmap, "costmap")
+    found = int(_nearest_traversable(costmap, int(cell[0]), int(cell[1]), int(reach)))
+    if found < 0:
+        return None
+    return found % costmap.shape[1], found // costmap.shape[1]
+
+
+def line_cost(
+    costmap: NDArray[np.uint8],
+    x0: float,
+    y0: float,
+    x1: float,
+    y1: float,
+    neutral: int = DEFAULT_NEUTRAL,
+    factor: float = DEFAULT_FACTOR,
+) -> float:
+    """Return the integral of the weight along a straight line, in cells times weight.
+
+    Coordinates are columns and rows, whole numbers being the centres of cells. Infinite when the line touches a cell
+    that isn't traversable, cuts a corner that a diagonal step may not cut, or leaves the grid.
+    Raises TypeError or ValueError for a costmap of another type or shape.
+    """
+    costmap = _arrays.grid(costmap, "costmap")
+    weight = _weights_of(neutral, factor)
+    return float(_line_cost(costmap, weight, float(x0), float(y0), float(x1), float(y1), math.inf))
+
+
+def path_cost(
+    costmap: NDArray[np.uint8],
+    cells: NDArray[np.int32],
+    neutral: int = DEFAULT_NEUTRAL,
+    factor: float = DEFAULT_FACTOR,
+) -> float:
+    """Return what `Planner.plan` would call the cost of these cells, int32 (n, 2) as (column, row).
+
+    Infinite when a step isn't one that the planner may take. Raises TypeError or ValueError for wrong types or shapes.
+    """
+    costmap = _arrays.grid(costmap, "costmap")
+    cells = _cells_array(cells)
+    return float(_cells_cost(costmap, _weights_of(neutral, factor), cells, np.empty(len(cells))))
+
+
+def shortcut(
+    costmap: NDArray[np.uint8],
+    cells: NDArray[np.int32],
+    neutral: int = DEFAULT_NEUTRAL,
+    factor: float = DEFAULT_FACTOR,
+    slack: float = 0.01,
+) -> NDArray[np.float64]:
+    """Straighten a path along lines of sight that cost at most `1 + slack` times the part that they replace.
+
+    `cells` is int32 (n, 2) as (column, row), a path of `Planner.plan` on this costmap. Returns float64 (m, 2) in the
+    same coordinates, the first and last cell kept: corners to be joined by straight lines, none of which crosses a
+    cell that isn't traversable. Raises ValueError if the path itself crosses one or isn't connected, TypeError or
+    ValueError for wrong types or shapes.
+    """
+    costmap = _arrays.grid(costmap, "costmap")
+    cells = _cells_array(cells)
+    if slack < 0.0:
+        raise ValueError(f"slack must not be negative, not {slack}")
+    weight = _weights_of(neutral, factor)
+    cumulated = np.empty(len(cells))
+    if not math.isfinite(_cells_cost(costmap, weight, cells, cumulated)):
+        raise ValueError("cells aren't a path on this costmap: plan again before straightening")
+    kept = np.empty(len(cells), np.int64)
+    count = int(_shortcut(costmap, weight, cells, cumulated, slack, kept))
+    return cells[kept[:count]].astype(np.float64)

@@ -1,0 +1,296 @@
+"""A*: optimal against a plain Dijkstra and against published lengths, with and without the goal field."""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import math
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fog_kernels.astar import (
+    DIAGONAL,
+    STRAIGHT,
+    Planner,
+    line_cost,
+    nearest_traversable,
+    path_cost,
+    shortcut,
+)
+from fog_kernels.inflation import inflate, inflation_table
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+Cell = tuple[int, int]
+
+DATA = Path(os.environ.get("FOGNAV_DATA") or Path(__file__).resolve().parents[3].parent / "shared" / "data")
+
+
+def dijkstra(costmap: NDArray[np.uint8], start: Cell, neutral: int = 50, factor: float = 0.8) -> dict[Cell, int]:
+    """Integer costs from start to every reachable cell, by the definition."""
+    height, width = costmap.shape
+    weights = [round(neutral + factor * cost) if cost < 253 else 0 for cost in range(256)]
+
+    def weight(x: int, y: int) -> int:
+        return weights[costmap[y, x]] if 0 <= x < width and 0 <= y < height else 0
+
+    if not weight(*start):
+        return {}
+    costs = {start: 0}
+    queue = [(0, start)]
+    while queue:
+        cost, (x, y) = heapq.heappop(queue)
+        if cost > costs[x, y]:
+            continue
+        for dx in (-1, 0, 1):
+            for dy in (-1, 0, 1):
+                if (dx, dy) == (0, 0) or not weight(x + dx, y + dy):
+                    continue
+                if dx and dy and not (weight(x + dx, y) and weight(x, y + dy)):
+                    continue
+                edge = (DIAGONAL if dx and dy else STRAIGHT) * (weight(x, y) + weight(x + dx, y + dy))
+                reached = cost + edge
+                if reached < costs.get((x + dx, y + dy), 1 << 60):
+                    costs[x + dx, y + dy] = reached
+                    heapq.heappush(queue, (reached, (x + dx, y + dy)))
+    return costs
+
+
+@st.composite
+def costmaps(draw: st.DrawFn) -> NDArray[np.uint8]:
+    height = draw(st.integers(1, 22))
+    width = draw(st.integers(1, 22))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    graded = draw(st.booleans())
+    costmap = rng.integers(0, 253, (height, width)).astype(np.uint8) if graded else np.zeros((height, width), np.uint8)
+    share = draw(st.sampled_from([0.0, 0.1, 0.35, 0.5]))
+    walls = rng.random((height, width)) < share
+    costmap[walls] = rng.choice(np.array([253, 254, 255], np.uint8), int(walls.sum()))
+    return costmap
+
+
+def cell_of(data: st.DataObject, costmap: NDArray[np.uint8]) -> Cell:
+    height, width = costmap.shape
+    return data.draw(st.integers(0, width - 1)), data.draw(st.integers(0, height - 1))
+
+
+def assert_valid(costmap: NDArray[np.uint8], cells: NDArray[np.int32], start: Cell, goal: Cell, cost: float) -> None:
+    assert tuple(cells[0]) == start
+    assert tuple(cells[-1]) == goal
+    assert path_cost(costmap, cells) == pytest.approx(cost, abs=1e-6)
+
+
+@settings(max_examples=250, deadline=None)
+@given(costmaps(), st.data())
+def test_cost_equals_dijkstra_and_the_path_has_that_cost(costmap: NDArray[np.uint8], data: st.DataObject) -> None:
+    start, goal = cell_of(data, costmap), cell_of(data, costmap)
+    expected = dijkstra(costmap, start).get(goal)
+    planner = Planner(costmap.shape[1], costmap.shape[0])
+    for _ in range(2):  # the second search finds the scratch memory as the first did
+        result = planner.plan(costmap, start, goal)
+        assert result.found == (expected is not None)
+        assert not result.timed_out
+        if expected is None:
+            assert result.cost == math.inf
+            assert result.cells.shape == (0, 2)
+        else:
+            assert result.cost == expected / (2 * STRAIGHT)
+            assert_valid(costmap, result.cells, start, goal, result.cost)
+
+
+@settings(max_examples=60, deadline=None)
+@given(costmaps(), st.integers(1, 3000), st.floats(0, 20), st.data())
+def test_any_weights_are_exact(costmap: NDArray[np.uint8], neutral: int, factor: float, data: st.DataObject) -> None:
+    start, goal = cell_of(data, costmap), cell_of(data, costmap)
+    expected = dijkstra(costmap, start, neutral, factor).get(goal)
+    result = Planner(costmap.shape[1], costmap.shape[0], neutral, factor).plan(costmap, start, goal)
+    assert result.cost == (math.inf if expected is None else expected / (2 * STRAIGHT))
+
+
+@settings(max_examples=200, deadline=None)
+@given(costmaps(), st.data())
+def test_replanning_with_the_goal_field_equals_a_full_search(static: NDArray[np.uint8], data: st.DataObject) -> None:
+    start, goal = cell_of(data, static), cell_of(data, static)
+    planner = Planner(static.shape[1], static.shape[0])
+    planner.set_goal_field(static, goal)
+    height, width = static.shape
+    for _ in range(3):
+        costmap = static.copy()
+        x, y = cell_of(data, static)
+        patch = costmap[y : y + data.draw(st.integers(1, height)), x : x + data.draw(st.integers(1, width))]
+        np.maximum(patch, data.draw(st.sampled_from([0, 30, 200, 253, 254, 255])), out=patch)
+        assert planner.raises_only(costmap)
+        expected = dijkstra(costmap, start).get(goal)
+        result = planner.plan(costmap, start, goal)
+        assert result.cost == (math.inf if expected is None else expected / (2 * STRAIGHT))
+        if result.found:
+            assert_valid(costmap, result.cells, start, goal, result.cost)
+    other = cell_of(data, static)
+    expected = dijkstra(static, start).get(other)
+    assert planner.plan(static, start, other).cost == (math.inf if expected is None else expected / (2 * STRAIGHT))
+
+
+def test_a_lowered_cell_is_noticed() -> None:
+    static = np.full((4, 4), 7, np.uint8)
+    planner = Planner(4, 4)
+    planner.set_goal_field(static, (0, 0))
+    lowered = static.copy()
+    lowered[3, 2] = 6
+    assert planner.raises_only(static)
+    assert not planner.raises_only(lowered)
+    planner.clear_goal_field()
+    with pytest.raises(RuntimeError, match="set_goal_field"):
+        planner.raises_only(static)
+
+
+def test_costs_beyond_32_bits_are_exact() -> None:
+    """A serpentine of the dearest cells costs more than 2^31."""
+    costmap = np.full((101, 101), 252, np.uint8)
+    costmap[1::4, :-1] = 254
+    costmap[3::4, 1:] = 254
+    planner = Planner(101, 101, neutral=2000, factor=30.0)
+    start, goal = (0, 0), (100, 100)
+    weight = 2000 + 252 * 30
+    result = planner.plan(costmap, start, goal)
+    assert result.cost * 2 * STRAIGHT > 2**31
+    assert result.cost == weight * (len(result.cells) - 1)
+    planner.set_goal_field(costmap, goal)
+    guided = planner.plan(costmap, start, goal)
+    assert guided.cost == result.cost
+    assert guided.expansions < result.expansions + 1
+    fresh = Planner(101, 101, neutral=2000, factor=30.0)
+    fresh.set_goal_field(costmap, goal)
+    assert fresh.plan(costmap, start, goal).cost == result.cost
+
+
+def test_the_bound_on_expansions_ends_a_search_and_leaves_the_planner_usable() -> None:
+    costmap = np.zeros((60, 60), np.uint8)
+    costmap[:50, 30] = 254
+    planner = Planner(60, 60)
+    bounded = planner.plan(costmap, (0, 0), (59, 0), max_expansions=50)
+    assert bounded.timed_out
+    assert not bounded.found
+    result = planner.plan(costmap, (0, 0), (59, 0))
+    assert result.cost == dijkstra(costmap, (0, 0))[59, 0] / (2 * STRAIGHT)
+
+
+def test_cells_outside_and_wrong_shapes_are_refused() -> None:
+    planner = Planner(5, 4)
+    costmap = np.zeros((4, 5), np.uint8)
+    with pytest.raises(ValueError, match="goal"):
+        planner.plan(costmap, (0, 0), (5, 0))
+    with pytest.raises(ValueError, match="start"):
+        planner.plan(costmap, (-1, 0), (0, 0))
+    with pytest.raises(ValueError, match="shape"):
+        planner.plan(costmap.T.copy(), (0, 0), (0, 0))
+    with pytest.raises(ValueError, match="path"):
+        shortcut(costmap, np.array([[0, 0], [3, 3]], np.int32))
+
+
+@settings(max_examples=80, deadline=None)
+@given(costmaps(), st.data())
+def test_nearest_reachable_is_the_nearest_of_all_reachable(costmap: NDArray[np.uint8], data: st.DataObject) -> None:
+    start, goal = cell_of(data, costmap), cell_of(data, costmap)
+    reachable = set(dijkstra(costmap, start)) or {start}
+    nearest = Planner(costmap.shape[1], costmap.shape[0]).nearest_reachable(costmap, start, goal)
+    assert nearest in reachable
+    assert (nearest[0] - goal[0]) ** 2 + (nearest[1] - goal[1]) ** 2 == min(
+        (x - goal[0]) ** 2 + (y - goal[1]) ** 2 for x, y in reachable
+    )
+
+
+def test_nearest_traversable_looks_around_the_cell() -> None:
+    costmap = np.full((9, 9), 254, np.uint8)
+    costmap[2, 7] = 252
+    assert nearest_traversable(costmap, (4, 4), 3) is None
+    assert nearest_traversable(costmap, (4, 4), 4) == (7, 2)
+
+
+@settings(max_examples=200, deadline=None)
+@given(costmaps(), st.data())
+def test_a_shortcut_stays_off_walls_and_costs_no_more(costmap: NDArray[np.uint8], data: st.DataObject) -> None:
+    start, goal = cell_of(data, costmap), cell_of(data, costmap)
+    result = Planner(costmap.shape[1], costmap.shape[0]).plan(costmap, start, goal)
+    if not result.found:
+        return
+    corners = shortcut(costmap, result.cells)
+    assert tuple(corners[0]) == start
+    assert tuple(corners[-1]) == goal
+    total = 0.0
+    for (x0, y0), (x1, y1) in itertools.pairwise(corners):
+        total += line_cost(costmap, x0, y0, x1, y1)
+        for part in np.linspace(0.0, 1.0, 200):
+            x = int(np.floor(x0 + part * (x1 - x0) + 0.5))
+            y = int(np.floor(y0 + part * (y1 - y0) + 0.5))
+            assert costmap[y, x] < 253
+    assert total <= result.cost * 1.01 + 1e-6 * len(result.cells) + 1e-3
+
+
+def test_an_open_room_is_crossed_in_one_line() -> None:
+    costmap = np.zeros((40, 90), np.uint8)
+    result = Planner(90, 40).plan(costmap, (2, 3), (85, 30))
+    assert shortcut(costmap, result.cells).tolist() == [[2.0, 3.0], [85.0, 30.0]]
+
+
+def test_line_cost_is_the_integral_of_the_weight() -> None:
+    rng = np.random.default_rng(5)
+    costmap = rng.integers(0, 253, (30, 30)).astype(np.uint8)
+    for _ in range(20):
+        x0, y0, x1, y1 = rng.uniform(0, 29, 4)
+        parts = (np.arange(20000) + 0.5) / 20000
+        cols = np.floor(x0 + parts * (x1 - x0) + 0.5).astype(int)
+        rows = np.floor(y0 + parts * (y1 - y0) + 0.5).astype(int)
+        expected = np.rint(50 + 0.8 * costmap[rows, cols]).mean() * math.hypot(x1 - x0, y1 - y0)
+        assert line_cost(costmap, x0, y0, x1, y1) == pytest.approx(expected, rel=2e-3)
+        assert line_cost(costmap, x1, y1, x0, y0) == pytest.approx(line_cost(costmap, x0, y0, x1, y1), rel=1e-9)
+
+
+def test_a_line_between_two_diagonal_walls_is_blocked() -> None:
+    costmap = np.zeros((4, 4), np.uint8)
+    costmap[1, 2] = costmap[2, 1] = 254
+    assert line_cost(costmap, 0, 0, 3, 3) == math.inf
+    assert line_cost(costmap, 0, 0, 4, 0) == math.inf
+
+
+def test_the_path_keeps_to_the_middle_of_a_corridor() -> None:
+    raw = np.zeros((40, 200), np.uint8)
+    raw[:3] = raw[-3:] = 254
+    costmap = inflate(raw, inflation_table(0.05, 0.17, 0.55, 3.0))
+    result = Planner(200, 40).plan(costmap, (10, 8), (190, 31))
+    middle = result.cells[(result.cells[:, 0] > 40) & (result.cells[:, 0] < 160)]
+    distance_to_wall = np.minimum(middle[:, 1] - 2, 37 - middle[:, 1])
+    assert distance_to_wall.min() >= 11
+
+
+def read_movingai(path: Path) -> NDArray[np.uint8]:
+    lines = path.read_text().splitlines()
+    rows = lines[lines.index("map") + 1 :]
+    return np.array([[0 if c in ".GS" else 254 for c in row] for row in rows if row], np.uint8)
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    "scenario", sorted((DATA / "movingai").glob("*.scen")) or [None], ids=lambda path: path.stem if path else "none"
+)
+def test_published_lengths_are_reached(scenario: Path | None) -> None:
+    if scenario is None:
+        pytest.skip("no data")
+    lines = scenario.read_text().splitlines()[1:]
+    costmap: NDArray[np.uint8] | None = None
+    planner: Planner | None = None
+    for line in lines[:: max(1, len(lines) // 40)]:
+        _, name, _, _, start_x, start_y, goal_x, goal_y, length = line.split()
+        if costmap is None or planner is None:
+            costmap = read_movingai(scenario.parent / Path(name).name)
+            planner = Planner(costmap.shape[1], costmap.shape[0])
+        result = planner.plan(costmap, (int(start_x), int(start_y)), (int(goal_x), int(goal_y)))
+        steps = np.abs(np.diff(result.cells, axis=0)).sum(axis=1)
+        reached = float((steps == 1).sum() + (steps == 2).sum() * math.sqrt(2.0))
+        assert reached == pytest.approx(float(length), abs=5e-3, rel=1e-6)

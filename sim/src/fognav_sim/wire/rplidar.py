@@ -1,0 +1,233 @@
+"""An RPLidar A1 as its serial port shows it: descriptors, device data, standard nodes and express capsules.
+
+Pure: bytes and times go in, bytes come out; distances come from a function that the world gives.
+Source: Slamtec, RPLIDAR interface protocol and application notes, A1. Where it is silent: a request that has an answer
+ends a running scan; a head that starts to scan is somewhere in its turn.
+Not shown: the motor's start and the DTR line that switches it, because a pty has none: the head turns whenever a scan
+was asked for.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+Measure = Callable[["NDArray[np.float64]", float], "NDArray[np.float64]"]
+"""(angles in radians, counter-clockwise in the laser frame; time in seconds) -> ranges in metres, nan for no return."""
+
+NODES_PER_S: Final = 2000.0
+TURNS_PER_S: Final = 5.5
+RANGE_MIN_M: Final = 0.15
+RANGE_MAX_M: Final = 12.0
+BOOT_TEXT: Final = b"RP LIDAR System.\r\nFirmware Ver 1.29 - RP, HW Ver 7\r\nModel: 18\r\n"
+_TURN_Q6: Final = 360 * 64
+# Nodes that one call of the world's function measures: 16 ms of a standard scan.
+_CHUNK: Final = 32
+# A simulation that paused gives no burst of what it missed.
+_CATCH_UP_S: Final = 0.5
+
+
+class RplidarEmulator:
+    """The lidar's end of the serial line.
+
+    The port calls `receive` and `outgoing`; `now` is any monotonic clock, seconds. `health` and `error_code` are what
+    a health request gets. Two faults can be set at any time: `stalled` sends nothing more, `frozen` sends the bytes of
+    the last whole turn again and again, as a stuck bridge does.
+    """
+
+    def __init__(
+        self,
+        measure: Measure,
+        *,
+        nodes_per_s: float = NODES_PER_S,
+        turns_per_s: float = TURNS_PER_S,
+        start_angle_rad: float = 1.0,
+        serial_number: bytes = bytes(range(16)),
+    ) -> None:
+        """Take the world's measuring function; `start_angle_rad` is where, clockwise, the first scan begins.
+
+        An exact whole number of nodes per turn would give a resting robot equal turns, which hosts take for a fault.
+        """
+        if not (0.0 < turns_per_s <= 20.0 and 10.0 * turns_per_s <= nodes_per_s <= 2304.0):
+            raise ValueError(
+                f"{nodes_per_s} nodes/s at {turns_per_s} turns/s: 115200 baud carry 2304 nodes/s, a turn needs 10"
+            )
+        self._measure = measure
+        self._nodes_per_s = nodes_per_s
+        self._turns_per_s = turns_per_s
+        self._serial_number = serial_number[:16].ljust(16, b"\0")
+        self.health = 0
+        self.error_code = 0
+        self.stalled = False
+        self.frozen = False
+        self._incoming = bytearray()
+        self._outgoing = bytearray()
+        self._scanning = False
+        self._express = False
+        self._due_since = 0.0
+        self._position = start_angle_rad / math.tau
+        self._fresh_scan = False
+        self._turn = bytearray()
+        self._last_turn = b""
+        self._replayed = 0
+
+    @property
+    def scanning(self) -> bool:
+        """A scan was asked for and not stopped."""
+        return self._scanning
+
+    def receive(self, data: bytes, now: float) -> None:
+        """Take bytes from the host; whole requests act at once, wrong ones are skipped byte by byte."""
+        self._incoming += data
+        while self._incoming:
+            if self._incoming[0] != 0xA5:
+                del self._incoming[0]
+                continue
+            if len(self._incoming) < 2:
+                return
+            command = self._incoming[1]
+            size = 2
+            if command & 0x80:
+                if len(self._incoming) < 3:
+                    return
+                size = 4 + self._incoming[2]
+                if len(self._incoming) < size:
+                    return
+                if np.bitwise_xor.reduce(np.frombuffer(bytes(self._incoming[:size]), np.uint8)):
+                    del self._incoming[0]
+                    continue
+            payload = bytes(self._incoming[3 : size - 1])
+            del self._incoming[:size]
+            self._act(command, payload, now)
+
+    def outgoing(self, now: float) -> bytes:
+        """Return what the device has sent up to `now`, once; this is where the world is measured."""
+        if self._scanning:
+            self._scan_until(now)
+        sent = bytes(self._outgoing)
+        self._outgoing.clear()
+        return sent
+
+    def _act(self, command: int, payload: bytes, now: float) -> None:
+        if command == 0x25:
+            self._scanning = False
+        elif command == 0x40:
+            self._scanning = False
+            self._outgoing += BOOT_TEXT
+        elif command in {0x20, 0x21}:
+            self._answer(5, 0x81, repeats=True)
+            self._begin(now, express=False)
+        elif command == 0x82 and payload[:1] == b"\0":
+            self._answer(84, 0x82, repeats=True)
+            self._begin(now, express=True)
+        elif command == 0x50:
+            self._answer(20, 0x04, bytes((24, 29, 1, 7)) + self._serial_number)
+        elif command == 0x52:
+            self._answer(3, 0x06, bytes((self.health,)) + self.error_code.to_bytes(2, "little"))
+        elif command == 0x59:
+            standard = round(1e6 / self._nodes_per_s)
+            self._answer(4, 0x15, standard.to_bytes(2, "little") + (standard // 2).to_bytes(2, "little"))
+
+    def _answer(self, size: int, kind: int, data: bytes = b"", *, repeats: bool = False) -> None:
+        self._scanning = False
+        self._outgoing += b"\xa5\x5a" + (size | (1 << 30 if repeats else 0)).to_bytes(4, "little") + bytes((kind,))
+        self._outgoing += data
+
+    def _begin(self, now: float, *, express: bool) -> None:
+        # A device in error answers a scan request with its descriptor and nothing more.
+        self._scanning = self.health != 2
+        self._express = express
+        self._due_since = now
+        self._fresh_scan = True
+        self._turn.clear()
+        self._last_turn = b""
+
+    def _scan_until(self, now: float) -> None:
+        rate = self._nodes_per_s * (2 if self._express else 1)
+        if now - self._due_since > _CATCH_UP_S:
+            self._due_since = now - _CATCH_UP_S
+        unit = 32 if self._express else 1
+        units = math.floor((now - self._due_since) * rate / unit + 1e-9)
+        if units <= 0:
+            return
+        if self.stalled:
+            self._due_since += units * unit / rate
+        elif self.frozen and self._last_turn and not self._express:
+            self._replay(units * 5)
+            self._due_since += units / rate
+        elif self._express:
+            for _ in range(units):
+                self._due_since += unit / rate
+                self._capsule(self._due_since, rate)
+        else:
+            while units:
+                count = min(units, _CHUNK)
+                units -= count
+                self._due_since += count / rate
+                self._nodes(count, self._due_since, rate)
+
+    def _nodes(self, count: int, at: float, rate: float) -> None:
+        turned = self._position + np.arange(1, count + 1) * (self._turns_per_s / rate)
+        angle = np.floor(turned % 1.0 * _TURN_Q6).astype(np.int64) % _TURN_Q6
+        before = np.concatenate(((self._position,), turned[:-1]))
+        start = np.floor(turned) > np.floor(before)
+        self._position = float(turned[-1])
+        distance = self._distances(angle / 64.0, at)
+        quality = _quality(distance)
+        raw = np.empty((count, 5), np.uint8)
+        raw[:, 0] = quality << 2 | np.where(start, 1, 2)
+        raw[:, 1] = (angle << 1 | 1) & 0xFF
+        raw[:, 2] = angle >> 7
+        raw[:, 3] = distance & 0xFF
+        raw[:, 4] = distance >> 8
+        begin = 0
+        for boundary in np.flatnonzero(start):
+            self._turn += raw[begin:boundary].tobytes()
+            self._last_turn = bytes(self._turn)
+            self._turn.clear()
+            self._replayed = 0
+            begin = int(boundary)
+        self._turn += raw[begin:].tobytes()
+        self._outgoing += raw.tobytes()
+
+    def _replay(self, size: int) -> None:
+        for _ in range(size):
+            self._outgoing.append(self._last_turn[self._replayed % len(self._last_turn)])
+            self._replayed += 1
+
+    def _capsule(self, at: float, rate: float) -> None:
+        step = self._turns_per_s / rate
+        begin = math.floor(self._position % 1.0 * _TURN_Q6) % _TURN_Q6
+        # The host puts the nodes on a line from this start angle to the next capsule's: measure where it will look.
+        self._position += 32 * step
+        following = math.floor(self._position % 1.0 * _TURN_Q6) % _TURN_Q6
+        angles = begin + (following - begin) % _TURN_Q6 * np.arange(32) / 32.0
+        distance = self._distances(angles % _TURN_Q6 / 64.0, at) & ~3
+        cabins = np.zeros((16, 5), np.uint8)
+        for place in (0, 1):
+            cabins[:, 2 * place] = distance[place::2] & 0xFF
+            cabins[:, 2 * place + 1] = distance[place::2] >> 8
+        body = (begin | (0x8000 if self._fresh_scan else 0)).to_bytes(2, "little") + cabins.tobytes()
+        self._fresh_scan = False
+        checksum = int(np.bitwise_xor.reduce(np.frombuffer(body, np.uint8)))
+        self._outgoing += bytes((0xA0 | checksum & 0xF, 0x50 | checksum >> 4)) + body
+
+    def _distances(self, clockwise_deg: NDArray[np.float64], at: float) -> NDArray[np.int64]:
+        """Distances in quarters of a millimetre, 0 where nothing comes back or it is out of the rated range."""
+        angles = -np.deg2rad(clockwise_deg)
+        ranges = np.asarray(self._measure((angles + math.pi) % math.tau - math.pi, at), np.float64)
+        seen = np.isfinite(ranges) & (ranges >= RANGE_MIN_M) & (ranges <= RANGE_MAX_M)
+        return np.where(seen, np.rint(np.where(seen, ranges, 0.0) * 4000.0), 0.0).astype(np.int64)
+
+
+def _quality(distance_q2: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Strength of the return, 0..15: full up to 6 m, falling to 5 at 12 m, 0 for none."""
+    metres = distance_q2 / 4000.0
+    strength = np.clip(np.rint(15.0 - (metres - 6.0) * 10.0 / 6.0), 0.0, 15.0)
+    return np.where(distance_q2 > 0, strength, 0.0).astype(np.int64)

@@ -1,0 +1,123 @@
+from __future__ import annotations
+
+import os
+import pty
+import select
+import subprocess
+import sys
+import termios
+import tty
+
+import pytest
+
+from robot_agent.drivers.serial_port import Port, PortLost, open_port
+
+pytestmark = pytest.mark.live
+
+
+@pytest.fixture
+def line():
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    path = os.ttyname(slave)
+    os.close(slave)
+    ends = [master]
+    yield ends, path
+    for fd in ends:
+        os.close(fd)
+
+
+def read_some(port: Port) -> bytes:
+    assert select.select([port], [], [], 5.0)[0]
+    return port.read_available()
+
+
+def test_every_byte_value_passes_both_ways(line):
+    (master,), path = line
+    every = bytes(range(256))
+    with open_port(path) as port:
+        assert port.read_available() == b""
+        os.write(master, every)
+        got = b""
+        while len(got) < 256:
+            got += read_some(port)
+        assert got == every
+        port.write(every)
+        assert os.read(master, 4096) == every
+
+
+def test_the_line_is_115200_8n1_and_raw(line):
+    _, path = line
+    with open_port(path) as port:
+        iflag, oflag, cflag, lflag, ispeed, ospeed, _ = termios.tcgetattr(port.fileno())
+    assert (iflag, oflag, lflag) == (0, 0, 0)
+    assert cflag & termios.CSIZE == termios.CS8
+    assert not cflag & (termios.PARENB | termios.CSTOPB | termios.CRTSCTS)
+    assert (ispeed, ospeed) == (termios.B115200, termios.B115200)
+
+
+def test_a_pty_has_no_dtr_and_that_is_no_error(line):
+    _, path = line
+    with open_port(path) as port:
+        assert port.set_dtr(on=False) is False
+
+
+def test_losing_the_device_is_one_error_that_says_what_to_check(line):
+    ends, path = line
+    with open_port(path) as port:
+        os.close(ends.pop())
+        with pytest.raises(PortLost, match="plugged in") as lost:
+            port.read_available()
+        assert lost.value.path == path
+        with pytest.raises(PortLost):
+            port.write(b"\x80")
+
+
+def test_a_missing_device_and_a_file_that_is_none_are_refused(tmp_path):
+    with pytest.raises(PortLost, match="No such file"):
+        open_port(str(tmp_path / "none"))
+    plain = tmp_path / "plain"
+    plain.write_bytes(b"")
+    with pytest.raises(PortLost, match="not a serial device"):
+        open_port(str(plain))
+
+
+def test_a_port_in_use_is_refused_and_free_after_close(line):
+    _, path = line
+    with open_port(path), pytest.raises(PortLost, match="locked"):
+        open_port(path)
+    open_port(path).close()
+
+
+def test_a_device_that_takes_nothing_is_lost_and_does_not_hang(line):
+    _, path = line
+    with open_port(path) as port, pytest.raises(PortLost, match="no byte"):
+        port.write(bytes(1_000_000))
+
+
+def test_another_process_can_use_the_inherited_descriptor(line):
+    (master,), path = line
+    code = (
+        "import sys; from robot_agent.drivers.serial_port import Port; "
+        "port = Port.from_fd(int(sys.argv[1])); port.write(b'stop'); port.close()"
+    )
+    with open_port(path) as port:
+        subprocess.run(
+            [sys.executable, "-c", code, str(port.fileno())], pass_fds=(port.fileno(),), check=True, timeout=30
+        )
+        assert os.read(master, 100) == b"stop"
+        os.write(master, b"on")
+        assert read_some(port) == b"on"
+
+
+def test_a_descriptor_that_is_not_open_is_refused():
+    with pytest.raises(PortLost, match="inherited descriptor"):
+        Port.from_fd(987654)
+
+
+def test_closing_twice_is_harmless(line):
+    _, path = line
+    port = open_port(path)
+    port.close()
+    port.close()
+    assert port.fileno() == -1

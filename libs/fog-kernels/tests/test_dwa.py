@@ -1,0 +1,212 @@
+"""DWA in a closed loop: a unicycle follows paths through corridors, a doorway and about face, and brakes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from fog_kernels.dwa import DwaLimits, DwaResult, DwaSettings, dwa
+from fog_kernels.inflation import inflate, inflation_table
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+RESOLUTION = 0.05
+PERIOD = 0.2
+Point = tuple[float, float]
+
+
+def world(*rooms: tuple[float, float, float, float]) -> NDArray[np.uint8]:
+    """8 x 8 m of wall with free boxes x0, y0, x1, y1, inflated."""
+    raw = np.full((160, 160), 254, np.uint8)
+    for x0, y0, x1, y1 in rooms:
+        raw[round(y0 / RESOLUTION) : round(y1 / RESOLUTION), round(x0 / RESOLUTION) : round(x1 / RESOLUTION)] = 0
+    return inflate(raw, inflation_table(RESOLUTION, 0.17, 0.55, 3.0))
+
+
+L_CORRIDOR = world((0.5, 0.5, 6.0, 2.0), (4.5, 0.5, 6.0, 7.0))
+DOORWAY = world((0.5, 0.5, 4.0, 4.0), (4.0, 1.8, 4.3, 2.7), (4.3, 0.5, 7.5, 4.0))
+OPEN = world((0.5, 0.5, 7.5, 7.5))
+
+
+@dataclass
+class Drive:
+    """One row per decision: t, x, y, theta, v, w, cost under the centre, admissible arcs."""
+
+    log: NDArray[np.float64]
+
+    def distance_to(self, goal: Point) -> float:
+        return math.hypot(self.log[-1, 1] - goal[0], self.log[-1, 2] - goal[1])
+
+
+def decide(
+    costmap: NDArray[np.uint8],
+    pose: tuple[float, float, float],
+    speeds: tuple[float, float],
+    path: list[Point],
+    goal: Point,
+    goal_theta: float | None = None,
+    settings: DwaSettings | None = None,
+    limits: DwaLimits | None = None,
+) -> DwaResult:
+    x, y, theta = pose
+    column = max(int(x / RESOLUTION) - 20, 0)
+    row = max(int(y / RESOLUTION) - 20, 0)
+    window = np.ascontiguousarray(costmap[row : row + 40, column : column + 40])
+    return dwa(
+        *speeds, x, y, theta, window, RESOLUTION, column * RESOLUTION, row * RESOLUTION, path, *goal, goal_theta,
+        limits=limits or DwaLimits(), settings=settings or DwaSettings(),
+    )  # fmt: skip
+
+
+def drive(
+    costmap: NDArray[np.uint8],
+    pose: tuple[float, float, float],
+    path: list[Point],
+    goal: Point,
+    goal_theta: float | None = None,
+    noise: float = 0.0,
+    seconds: float = 90.0,
+) -> Drive:
+    """Decide at 5 Hz on noisy poses and integrate the unicycle at 100 Hz until it stands still."""
+    x, y, theta = pose
+    v = w = t = 0.0
+    rng = np.random.default_rng(1)
+    rows = []
+    while t < seconds:
+        seen = (x + noise * rng.normal(), y + noise * rng.normal(), theta + noise * rng.normal())
+        result = decide(costmap, seen, (v, w), path, goal, goal_theta)
+        assert result.v >= 0.0
+        assert result.v + 0.5 * 0.235 * abs(result.w) <= 0.5 + 1e-6
+        assert abs(result.v - v) <= 2.5 * PERIOD + 1e-9
+        rows.append((t, x, y, theta, result.v, result.w, costmap[int(y / 0.05), int(x / 0.05)], result.n_admissible))
+        v, w = result.v, result.w
+        if v == 0.0 and w == 0.0:
+            break
+        for _ in range(20):
+            theta += 0.5 * w * 0.01
+            x += v * math.cos(theta) * 0.01
+            y += v * math.sin(theta) * 0.01
+            theta += 0.5 * w * 0.01
+        t += PERIOD
+    return Drive(np.array(rows))
+
+
+def off_path(run: Drive, path: list[Point]) -> float:
+    points = np.array(path)
+    worst = 0.0
+    for position in run.log[:, 1:3]:
+        starts, ends = points[:-1], points[1:]
+        along = ends - starts
+        part = np.clip(((position - starts) * along).sum(1) / (along**2).sum(1), 0, 1)
+        worst = max(worst, float(np.hypot(*(starts + part[:, None] * along - position).T).min()))
+    return worst
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01, 0.03])
+@pytest.mark.parametrize("theta", [0.0, math.pi, -2.0])
+def test_an_l_shaped_corridor_is_followed_to_its_end(noise: float, theta: float) -> None:
+    path = [(1.0, 1.25), (5.25, 1.25), (5.25, 6.5)]
+    run = drive(L_CORRIDOR, (1.0, 1.25, theta), path, path[-1], noise=noise)
+    assert run.distance_to(path[-1]) < 0.10 + 2 * noise
+    assert run.log[:, 6].max() < 200  # never near a wall
+    assert off_path(run, path) < 0.25
+    assert run.log[-1, 0] < 9.5 / 0.3 + 6.0  # nearly as fast as the path at full speed
+    straight = run.log[(run.log[:, 1] > 2.0) & (run.log[:, 1] < 4.0)]
+    assert np.abs(straight[:, 4] - 0.3).max() < 1e-6
+    if noise == 0.0:
+        assert np.abs(straight[:, 5]).max() < 0.1  # no weaving
+
+
+def test_dense_and_sparse_paths_are_driven_alike() -> None:
+    sparse = [(1.0, 1.25), (5.25, 1.25), (5.25, 6.5)]
+    dense = [(1 + i * 0.05, 1.25) for i in range(85)] + [(5.25, 1.25 + i * 0.05) for i in range(105)]
+    runs = [drive(L_CORRIDOR, (1.0, 1.25, 0.0), path, (5.25, 6.5)) for path in (sparse, dense)]
+    assert abs(runs[0].log[-1, 0] - runs[1].log[-1, 0]) < 1.0
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01, 0.03])
+@pytest.mark.parametrize(
+    "path",
+    [
+        [(1.0, 3.2), (3.3, 2.25), (5.0, 2.25), (6.5, 1.2)],
+        [(2.0, 0.8), (3.7, 0.8), (3.7, 2.25), (5.0, 2.25)],  # hugs the wall, then a right angle into the doorway
+    ],
+)
+def test_a_doorway_of_90_cm_is_passed_without_touching(noise: float, path: list[Point]) -> None:
+    run = drive(DOORWAY, (*path[0], 1.5), path, path[-1], noise=noise)
+    assert run.distance_to(path[-1]) < 0.10 + 2 * noise
+    assert run.log[:, 6].max() < 254
+
+
+def test_a_path_that_starts_behind_is_turned_to_in_place() -> None:
+    run = drive(OPEN, (3.0, 3.0, math.pi), [(3.0, 3.0), (6.0, 3.0)], (6.0, 3.0))
+    moving = run.log[run.log[:, 4] > 0.02]
+    first = moving[0]
+    assert math.hypot(first[1] - 3.0, first[2] - 3.0) < 0.02
+    assert abs(math.remainder(first[3], 2 * math.pi)) < 1.1
+    assert run.distance_to((6.0, 3.0)) < 0.1
+
+
+def test_it_brakes_within_the_tolerance_and_turns_to_the_goals_heading() -> None:
+    run = drive(OPEN, (3.0, 3.0, 0.0), [(3.0, 3.0), (5.0, 3.0)], (5.0, 3.0), goal_theta=2.0)
+    assert run.distance_to((5.0, 3.0)) < 0.10
+    assert abs(math.remainder(run.log[-1, 3] - 2.0, 2 * math.pi)) < 0.17
+    assert run.log[-1, 4] == run.log[-1, 5] == 0.0
+
+
+def test_beside_the_paths_end_the_goal_is_still_reached() -> None:
+    run = drive(OPEN, (5.05, 3.3, 0.0), [(3.0, 3.0), (5.0, 3.0)], (5.0, 3.0))
+    assert run.distance_to((5.0, 3.0)) < 0.10
+
+
+def test_an_unmapped_wall_across_the_path_is_never_touched() -> None:
+    costmap = world((0.5, 0.5, 4.0, 7.5), (4.2, 0.5, 7.5, 7.5))
+    run = drive(costmap, (1.0, 3.0, 0.0), [(1.0, 3.0), (7.0, 3.0)], (7.0, 3.0), seconds=40)
+    assert run.log[:, 6].max() < 253
+    assert run.log[-1, 4] == pytest.approx(0.0, abs=0.02)
+    assert run.log[:, 7].min() > 0
+
+
+def test_weak_brakes_keep_a_longer_distance() -> None:
+    """With 0.05 m/s^2 of braking, 0.3 m/s needs 0.9 m: more than the arcs' 0.45 m."""
+    costmap = world((0.5, 2.7, 4.0, 3.3))  # a dead end too narrow to circle in
+    limits = DwaLimits(acc_v=0.05)
+    pose = (3.15, 3.0, 0.0)  # 0.68 m before the inscribed band
+    path = [(1.0, 3.0), (7.0, 3.0)]
+    assert decide(costmap, pose, (0.3, 0.0), path, (7.0, 3.0), limits=limits).n_admissible == 0
+    strong = decide(costmap, pose, (0.3, 0.0), path, (7.0, 3.0))
+    assert strong.n_admissible > 0
+    assert strong.v > 0.25
+
+
+@pytest.mark.parametrize("blocked", [254, 255])
+def test_a_robot_on_a_lethal_or_unknown_cell_may_not_move(blocked: int) -> None:
+    costmap = np.full((160, 160), blocked, np.uint8)
+    assert decide(costmap, (3.0, 3.0, 0.0), (0.2, 0.0), [(3.0, 3.0)], (5.0, 3.0)) == (0.0, 0.0, -math.inf, 0)
+
+
+def test_an_inscribed_cell_is_left_slowly_and_only_away_from_the_wall() -> None:
+    costmap = world((0.5, 0.5, 4.0, 7.5))
+    band = (3.88, 3.0)
+    assert costmap[int(band[1] / 0.05), int(band[0] / 0.05)] == 253
+    path = [(3.88, 3.0), (2.0, 3.0)]
+    away = decide(costmap, (*band, math.pi), (0.0, 0.0), path, path[-1])
+    assert 0.0 < away.v <= 0.1
+    towards = decide(costmap, (*band, 0.0), (0.0, 0.0), [(3.88, 3.0), (4.5, 3.0)], (4.5, 3.0))
+    assert towards.v == 0.0
+    strict = replace(DwaSettings(), escape_v=0.0)
+    assert decide(costmap, (*band, math.pi), (0.0, 0.0), path, path[-1], settings=strict).n_admissible == 0
+
+
+def test_what_cannot_be_judged_is_refused() -> None:
+    with pytest.raises(ValueError, match="finite"):
+        decide(OPEN, (3.0, 3.0, math.inf), (0.0, 0.0), [], (4.0, 3.0))
+    with pytest.raises(ValueError, match="acc_v"):
+        DwaLimits(acc_v=0.0)
+    with pytest.raises(ValueError, match="n_v"):
+        DwaSettings(n_v=1)

@@ -1,0 +1,294 @@
+"""The robot's drivers and the simulator's emulators know nothing of one another; here they have to agree."""
+
+from __future__ import annotations
+
+import math
+import select
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fognav_sim.wire.pty_port import PtyPort
+from fognav_sim.wire.roomba import RoombaEmulator
+from fognav_sim.wire.rplidar import RplidarEmulator
+from robot_agent.drivers import open_interface as oi
+from robot_agent.drivers import rplidar
+from robot_agent.drivers.serial_port import open_port
+
+
+def box(angles, now):
+    """Walls of a room 6 m by 4 m with a door without return ahead."""
+    ranges = 1.0 / np.maximum(np.abs(np.cos(angles)) / 3.0, np.abs(np.sin(angles)) / 2.0)
+    return np.where(np.abs(angles) < 0.1, np.nan, ranges)
+
+
+def events(parser):
+    while (event := parser.next_event()) is not None:
+        yield event
+
+
+# --- Roomba ---
+
+
+@pytest.mark.parametrize("packet_id", [*range(7, 59), *oi.GROUPS])
+def test_both_agree_on_the_size_of_every_packet_and_group(packet_id):
+    roomba = RoombaEmulator()
+    roomba.receive(oi.start() + oi.sensors(packet_id), 0.0)
+    oi.decode_packets([packet_id], roomba.outgoing(0.0))
+
+
+def test_the_stream_carries_what_the_world_shows():
+    roomba = RoombaEmulator(left_encoder=65530, right_encoder=3)
+    parser = oi.StreamParser(oi.GUARDIAN_STREAM)
+    roomba.receive(oi.start() + oi.safe() + oi.stream(oi.GUARDIAN_STREAM) + oi.drive_wheels(0.3, -0.2), 0.0)
+    roomba.world.bump_right = True
+    roomba.world.virtual_wall = True
+    roomba.world.overcurrent_left = True
+    roomba.add_wheel_travel(0.01, -0.01)
+    roomba.tick(0.015, 0.015)
+    parser.receive_data(roomba.outgoing(0.015))
+    (frame,) = events(parser)
+    assert frame.mode is oi.Mode.SAFE
+    assert (frame.bump_right, frame.bump_left, frame.wheel_dropped, frame.cliff) == (True, False, False, False)
+    assert frame.virtual_wall
+    assert frame.wheel_overcurrent
+    assert frame.requested_wheels_m_s == (0.3, -0.2)
+    assert frame.encoders == ((65530 + 22) & 0xFFFF, (3 - 23) & 0xFFFF)
+    assert 12.0 < frame.voltage_v < 17.0
+    assert frame.current_a < 0.0
+    assert 0.0 < frame.charge_fraction <= 1.0
+    assert not frame.on_charger
+
+
+@pytest.mark.parametrize(
+    ("field", "seen"),
+    [
+        ("bump_left", "bump_left"),
+        ("bump_right", "bump_right"),
+        ("wheel_drop_left", "wheel_drop_left"),
+        ("wheel_drop_right", "wheel_drop_right"),
+        ("cliff_left", "cliff_left"),
+        ("cliff_front_left", "cliff_front_left"),
+        ("cliff_front_right", "cliff_front_right"),
+        ("cliff_right", "cliff_right"),
+        ("home_base", "on_charger"),
+        ("charger", "on_charger"),
+    ],
+)
+def test_each_danger_arrives_as_itself_and_all_but_the_bumper_end_safe_mode(field, seen):
+    roomba = RoombaEmulator()
+    parser = oi.StreamParser(oi.GUARDIAN_STREAM)
+    roomba.receive(oi.start() + oi.safe() + oi.stream(oi.GUARDIAN_STREAM) + oi.drive_wheels(0.2, 0.2), 0.0)
+    setattr(roomba.world, field, True)
+    roomba.tick(0.02, 0.02)
+    parser.receive_data(roomba.outgoing(0.02))
+    (frame,) = events(parser)
+    flags = {"bump_left", "bump_right", "wheel_drop_left", "wheel_drop_right", "on_charger"} | {
+        f"cliff_{side}" for side in ("left", "front_left", "front_right", "right")
+    }
+    assert {flag for flag in flags if getattr(frame, flag)} == {seen}
+    bumper = seen.startswith("bump")
+    assert frame.mode is (oi.Mode.SAFE if bumper else oi.Mode.PASSIVE)
+    assert frame.requested_wheels_m_s == ((0.2, 0.2) if bumper else (0.0, 0.0))
+
+
+@settings(max_examples=25)
+@given(
+    st.lists(st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5)), min_size=1, max_size=8),
+    st.integers(0, 0xFFFF),
+    st.integers(0, 0xFFFF),
+)
+def test_odometry_follows_any_drive_through_any_encoder_wrap(legs, left, right):
+    roomba = RoombaEmulator(left_encoder=left, right_encoder=right)
+    parser, odometry = oi.StreamParser(oi.GUARDIAN_STREAM), oi.Odometry()
+    roomba.receive(oi.start() + oi.safe() + oi.stream(oi.GUARDIAN_STREAM), 0.0)
+    now, pose = 0.0, (0.0, 0.0, 0.0)
+    for leg in legs:
+        roomba.receive(oi.drive_wheels(*leg), now)
+        for _ in range(66):
+            now += 0.015
+            v_left, v_right = roomba.wheel_speeds_m_s
+            if now > 0.03:
+                roomba.add_wheel_travel(v_left * 0.015, v_right * 0.015)
+                # Independent of the driver's formula: many short straight pieces.
+                for _ in range(4):
+                    x, y, theta = pose
+                    theta += (v_right - v_left) * 0.015 / 4 / 0.235 / 2
+                    x += (v_left + v_right) / 2 * 0.015 / 4 * math.cos(theta)
+                    y += (v_left + v_right) / 2 * 0.015 / 4 * math.sin(theta)
+                    pose = (x, y, theta + (v_right - v_left) * 0.015 / 4 / 0.235 / 2)
+            roomba.tick(now, 0.015)
+            parser.receive_data(roomba.outgoing(now))
+            for frame in events(parser):
+                assert isinstance(odometry.update(*frame.encoders, now), oi.Motion)
+    # A tick is 0.44 mm of a wheel, 1.9 mrad of heading.
+    assert odometry.pose[2] == pytest.approx(pose[2], abs=0.006)
+    assert math.dist(odometry.pose[:2], pose[:2]) < 0.002 + 0.006 * len(legs)
+
+
+def test_a_reset_robot_is_noticed_by_text_mode_and_encoders():
+    roomba = RoombaEmulator(left_encoder=30000, right_encoder=30000)
+    parser, odometry = oi.StreamParser(oi.GUARDIAN_STREAM), oi.Odometry()
+    setup = oi.start() + oi.safe() + oi.stream(oi.GUARDIAN_STREAM)
+    roomba.receive(setup, 0.0)
+    parser.receive_data(roomba.outgoing(0.016))
+    (frame,) = events(parser)
+    odometry.update(*frame.encoders, 0.016)
+    roomba.receive(oi.reset(), 0.02)
+    parser.receive_data(roomba.outgoing(1.0))
+    assert list(events(parser)) == []
+    assert parser.skipped_bytes > 0
+    roomba.receive(setup, 1.0)
+    parser.receive_data(roomba.outgoing(1.016))
+    (frame,) = events(parser)
+    assert isinstance(odometry.update(*frame.encoders, 1.016), oi.EncoderFault)
+
+
+# --- RPLidar ---
+
+
+def test_identity_and_health_arrive():
+    lidar, parser = RplidarEmulator(box, serial_number=bytes(range(16, 32))), rplidar.Parser()
+    lidar.health, lidar.error_code = 1, 7
+    lidar.receive(rplidar.get_info() + rplidar.get_health() + rplidar.get_sample_rate(), 0.0)
+    parser.receive_data(lidar.outgoing(0.0))
+    answers = [event for event in events(parser) if not isinstance(event, rplidar.Descriptor)]
+    assert answers == [
+        rplidar.DeviceInfo(24, (1, 29), 7, bytes(range(16, 32)).hex().upper()),
+        rplidar.Health(rplidar.HealthStatus.WARNING, 7),
+        rplidar.SampleRate(500, 250),
+    ]
+
+
+def turns_of(lidar, request, seconds, step=0.013):
+    parser, assembler = rplidar.Parser(), rplidar.ScanAssembler()
+    lidar.receive(request, 0.0)
+    turns = []
+    for number in range(round(seconds / step)):
+        parser.receive_data(lidar.outgoing(number * step))
+        for event in events(parser):
+            if isinstance(event, rplidar.Nodes):
+                turns.extend(assembler.feed(event, number * step))
+    assert (parser.skipped_bytes, parser.resyncs, parser.corrupted, assembler.incomplete) == (0, 0, 0, 0)
+    return turns
+
+
+@pytest.mark.parametrize(
+    ("request_bytes", "nodes"), [(rplidar.scan(), 363.6), (rplidar.express_scan(), 727.3)], ids=["standard", "express"]
+)
+def test_turns_show_the_room_as_it_is(request_bytes, nodes):
+    turns = turns_of(RplidarEmulator(box), request_bytes, 2.0)
+    assert 9 <= len(turns) <= 11
+    for turn in turns:
+        assert abs(turn.angles_rad.size - nodes) < 2
+        truth = box(turn.angles_rad, 0.0)
+        # Angles come in 1/64 degree: at the edges of the door one node may fall to either side.
+        edge = np.abs(np.abs(turn.angles_rad) - 0.1) < 0.001
+        assert (np.isnan(turn.ranges_m) == np.isnan(truth))[~edge].all()
+        seen = ~np.isnan(turn.ranges_m) & ~edge
+        np.testing.assert_allclose(turn.ranges_m[seen], truth[seen], atol=0.003)
+        assert turn.repeats == 1
+        assert turn.ended_at - turn.started_at == pytest.approx(1 / 5.5, abs=0.02)
+
+
+def test_a_frozen_link_shows_as_equal_turns():
+    lidar = RplidarEmulator(box)
+    parser, assembler = rplidar.Parser(), rplidar.ScanAssembler()
+    lidar.receive(rplidar.scan(), 0.0)
+    repeats = []
+    for number in range(200):
+        lidar.frozen = number > 60
+        parser.receive_data(lidar.outgoing(number * 0.01))
+        for event in events(parser):
+            if isinstance(event, rplidar.Nodes):
+                repeats += [turn.repeats for turn in assembler.feed(event, number * 0.01)]
+    assert max(repeats[:2]) == 1
+    assert repeats[-1] >= 3
+
+
+def test_a_scan_begun_anew_in_mid_stream_gives_whole_turns_again():
+    lidar = RplidarEmulator(box)
+    parser, assembler = rplidar.Parser(), rplidar.ScanAssembler()
+    turns = []
+    for number in range(150):
+        if number in {0, 75}:
+            lidar.receive(rplidar.stop() + rplidar.get_health() + rplidar.scan(), number * 0.01)
+        parser.receive_data(lidar.outgoing(number * 0.01))
+        for event in events(parser):
+            if isinstance(event, rplidar.Descriptor):
+                assembler.reset()
+            elif isinstance(event, rplidar.Nodes):
+                turns += assembler.feed(event, number * 0.01)
+    assert parser.resyncs == 0
+    assert all(362 <= turn.angles_rad.size <= 365 for turn in turns)
+    assert turns[-1].ended_at > 1.2
+
+
+# --- over real ptys ---
+
+
+@pytest.mark.live
+def test_a_robot_is_driven_over_a_pty_and_survives_a_host_that_crashes(tmp_path):
+    roomba = RoombaEmulator(left_encoder=65000, right_encoder=65000)
+    link = tmp_path / "roomba"
+    begin = time.monotonic()
+    last = begin
+    parser, odometry = oi.StreamParser(oi.GUARDIAN_STREAM), oi.Odometry()
+
+    def simulate() -> None:
+        nonlocal last
+        select.select([line], [], [], 0.005)
+        now = time.monotonic()
+        roomba.receive(line.read(), now)
+        left, right = roomba.wheel_speeds_m_s
+        roomba.add_wheel_travel(left * (now - last), right * (now - last))
+        roomba.tick(now, now - last)
+        line.write(roomba.outgoing(now))
+        last = now
+
+    with PtyPort(link) as line:
+        with open_port(str(link)) as port:
+            port.write(oi.start() + oi.safe() + oi.stream(oi.GUARDIAN_STREAM) + oi.drive_wheels(0.2, 0.2))
+            while odometry.pose[0] < 0.05:
+                assert time.monotonic() - begin < 20.0
+                simulate()
+                parser.receive_data(port.read_available())
+                for frame in events(parser):
+                    odometry.update(*frame.encoders, time.monotonic())
+        assert (parser.corrupted, odometry.faults) == (0, 0)
+        # The host is gone without a word: the wheels keep turning. The next one stops them.
+        simulate()
+        assert roomba.wheel_speeds_m_s == (0.2, 0.2)
+        with open_port(str(link)) as port:
+            port.write(oi.drive_direct(0, 0))
+            while roomba.wheel_speeds_m_s != (0.0, 0.0):
+                assert time.monotonic() - begin < 20.0
+                simulate()
+    assert not link.is_symlink()
+
+
+@pytest.mark.live
+def test_whole_turns_arrive_over_a_pty():
+    lidar = RplidarEmulator(box)
+    parser, assembler = rplidar.Parser(), rplidar.ScanAssembler()
+    turns = []
+    deadline = time.monotonic() + 20.0
+    with PtyPort() as line, open_port(str(line.path)) as port:
+        port.set_dtr(on=False)
+        port.write(rplidar.stop() + rplidar.get_health() + rplidar.scan())
+        while len(turns) < 3:
+            assert time.monotonic() < deadline
+            select.select([line], [], [], 0.005)
+            now = time.monotonic()
+            lidar.receive(line.read(), now)
+            line.write(lidar.outgoing(now))
+            parser.receive_data(port.read_available())
+            for event in events(parser):
+                if isinstance(event, rplidar.Nodes):
+                    turns.extend(assembler.feed(event, now))
+    assert parser.resyncs == 0
+    for turn in turns:
+        assert turn.angles_rad.size > 300

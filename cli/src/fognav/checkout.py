@@ -1,0 +1,28 @@
+"""Where the checkout is: sites and tests live there, not in an installed package."""
+
+from functools import cache
+from pathlib import Path
+
+from fognav.output import WrongUseError
+
+
+@cache
+def root() -> Path:
+    """Return the checkout's folder; raises `WrongUseError` when this package was installed without one."""
+    for folder in Path(__file__).resolve().parents:
+        if (folder / "fognav").is_file() and (folder / "requirements").is_dir():
+            return folder
+    raise WrongUseError("this command works in a checkout of Fognav only: clone the repository and run ./fognav there")
+
+
+def site_folder(name: Path | None) -> Path:
+    """Return the folder of a site: a folder as given, or the name of one in `sites/`; `estig` when none is named."""
+    if name is None:
+        return root() / "sites" / "estig"
+    if (name / "site.toml").is_file():
+        return name.resolve()
+    if len(name.parts) == 1 and (root() / "sites" / name / "site.toml").is_file():
+        return root() / "sites" / name
+    raise WrongUseError(
+        f"{name} is no site: there is no {name / 'site.toml'}. Make one with: fognav site new --map MAP.yaml --out DIR"
+    )

@@ -1,0 +1,166 @@
+"""Programs that no Python package brings: where they are, and how to get the ones that are missing."""
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Protocol
+
+_EXTRA_FOLDERS: Final = ("/usr/sbin", "/usr/local/sbin", "/opt/homebrew/sbin", "/opt/homebrew/bin")
+"""Debian puts the broker into /usr/sbin, which is not on the PATH of everybody."""
+_INSTALL_TIMEOUT_S: Final = 600.0
+
+
+@dataclass(frozen=True)
+class Tool:
+    """A program: its possible names, Debian's package that brings it, and what it is for."""
+
+    name: str
+    executables: tuple[str, ...]
+    package: str
+    purpose: str
+    required: bool = True
+
+
+MOSQUITTO: Final = Tool("mosquitto", ("mosquitto",), "mosquitto", "MQTT broker between sensor nodes and fog")
+REDIS: Final = Tool("redis-server", ("redis-server",), "redis-server", "store of zones, goals and areas")
+CHROMIUM: Final = Tool(
+    "chromium", ("chromium", "chromium-browser", "google-chrome"), "chromium", "tests of the page", required=False
+)
+TOOLS: Final = (MOSQUITTO, REDIS, CHROMIUM)
+
+
+class MissingToolsError(RuntimeError):
+    """Programs are missing and were not installed; the message says which and how to get them."""
+
+
+class Provider(Protocol):
+    """A way to get programs that are missing; tried in the order of `PROVIDERS`."""
+
+    name: str
+
+    def available(self) -> bool:
+        """Whether it works on this system, for this user."""
+
+    def command(self, tools: Sequence[Tool]) -> str:
+        """Return what a person would type to get them."""
+
+    def install(self, tools: Sequence[Tool]) -> None:
+        """Get them; raises `MissingToolsError` with what went wrong."""
+
+
+def _run(arguments: Sequence[str], environment: Mapping[str, str]) -> tuple[int, str]:
+    done = subprocess.run(
+        arguments,
+        check=False,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env={**os.environ, **environment},
+        timeout=_INSTALL_TIMEOUT_S,
+    )
+    return done.returncode, done.stdout
+
+
+class AptProvider:
+    """The distribution's packages by apt-get, as root or by a sudo that asks for no password."""
+
+    name = "apt-get"
+
+    def __init__(self, run: Callable[[Sequence[str], Mapping[str, str]], tuple[int, str]] = _run) -> None:
+        self._run = run
+
+    def _prefix(self) -> list[str] | None:
+        if shutil.which("apt-get") is None:
+            return None
+        if os.geteuid() == 0:
+            return []
+        if shutil.which("sudo") is not None and self._run(["sudo", "-n", "true"], {})[0] == 0:
+            return ["sudo", "-n"]
+        return None
+
+    def available(self) -> bool:
+        """Whether apt-get is here and this user may use it."""
+        return self._prefix() is not None
+
+    def command(self, tools: Sequence[Tool]) -> str:
+        """Return the line to type."""
+        return "apt-get install --no-install-recommends " + " ".join(tool.package for tool in tools)
+
+    def install(self, tools: Sequence[Tool]) -> None:
+        """Install the packages; a stale package list is brought up to date first."""
+        prefix = self._prefix()
+        if prefix is None:
+            raise MissingToolsError("apt-get can't be used here: it needs root, or sudo without a password")
+        quiet = {"DEBIAN_FRONTEND": "noninteractive"}
+        install = [*prefix, "apt-get", "install", "-y", "-q", "--no-install-recommends"]
+        code, said = self._run([*prefix, "apt-get", "update", "-q"], quiet)
+        if code == 0:
+            code, said = self._run([*install, *(tool.package for tool in tools)], quiet)
+        if code != 0:
+            last = "\n".join(said.strip().splitlines()[-8:])
+            raise MissingToolsError(f"{self.command(tools)} failed with code {code}:\n{last}")
+
+
+PROVIDERS: Final[list[Provider]] = [AptProvider()]
+
+
+def find(tool: Tool) -> Path | None:
+    """Return where the program is, on the PATH or where systems keep their servers."""
+    folders = os.pathsep.join([os.environ.get("PATH", ""), *_EXTRA_FOLDERS])
+    for name in tool.executables:
+        if found := shutil.which(name, path=folders):
+            return Path(found)
+    return None
+
+
+def how_to_get(tools: Sequence[Tool]) -> str:
+    """Return a line to type that gets them."""
+    return AptProvider().command(tools)
+
+
+def agreed(yes: bool) -> bool:  # noqa: FBT001  # the only argument, and it is what the function is about
+    """Whether system packages may be installed without asking: `--yes`, or CI=true."""
+    return yes or os.environ.get("CI", "").lower() == "true"
+
+
+def _ask(question: str) -> bool:
+    if not (sys.stdin.isatty() and sys.stderr.isatty()):
+        return False
+    sys.stderr.write(f"{question} [y/N] ")
+    sys.stderr.flush()
+    return sys.stdin.readline().strip().lower() in {"y", "yes"}
+
+
+def ensure(
+    tools: Sequence[Tool],
+    *,
+    yes: bool,
+    say: Callable[[str], None],
+    ask: Callable[[str], bool] = _ask,
+    providers: Sequence[Provider] | None = None,
+) -> dict[str, Path]:
+    """Return the path of each program, after getting those that are missing from the first provider that can.
+
+    Raises `MissingToolsError` naming what is missing and what to type, when nobody agreed or nothing could be done.
+    """
+    missing = [tool for tool in tools if find(tool) is None]
+    if missing:
+        names = " and ".join(tool.name for tool in missing)
+        provider = next((p for p in (PROVIDERS if providers is None else providers) if p.available()), None)
+        if provider is None:
+            raise MissingToolsError(f"missing: {names}. Install with: sudo {how_to_get(missing)}")
+        if not (agreed(yes) or ask(f"Missing: {names}. Run '{provider.command(missing)}' now?")):
+            raise MissingToolsError(
+                f"missing: {names}. Install with: {provider.command(missing)}  (or run again with --yes)"
+            )
+        say(f"installing {names} ({provider.name})")
+        provider.install(missing)
+    paths = {tool.name: find(tool) for tool in tools}
+    if still := [name for name, path in paths.items() if path is None]:
+        raise MissingToolsError(f"{' and '.join(still)} can't be found although the installation went well")
+    return {name: path for name, path in paths.items() if path is not None}

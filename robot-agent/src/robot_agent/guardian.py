@@ -1,0 +1,200 @@
+"""The guardian process: owns the wheels, lets fresh commands of the agent through and stops for everything else.
+
+Started by the watcher, which passes the open serial port (FOGNAV_BASE_FD), the pipe for the guardian's beat
+(FOGNAV_BEAT_FD) and one whose end means that the watcher is gone (FOGNAV_WATCHER_FD). The agent connects to the Unix
+socket FOGNAV_GUARDIAN_SOCKET; the newest connection is the agent, an older one is dropped.
+"""
+
+from __future__ import annotations
+
+import os
+import selectors
+import signal
+import socket
+import sys
+from contextlib import suppress
+from typing import TYPE_CHECKING, Final, Literal
+
+import msgspec
+
+from fog_runtime import logs
+from fog_runtime.clock import SystemClock
+from fog_runtime.logs import Level
+from fog_runtime.settings import load
+from robot_agent.drivers.serial_port import Port, PortLost
+from robot_agent.guardian_core import GuardianCore, Output
+from robot_agent.link import PACKET_LIMIT, WheelCommand, decode_command, encode
+from robot_agent.watcher import PORT_LOST
+
+if TYPE_CHECKING:
+    from types import FrameType
+
+TICK_S: Final = 0.02
+BEAT_S: Final = 0.05
+
+
+class GuardianSettings(msgspec.Struct, frozen=True, kw_only=True):
+    """Environment of the guardian; the watcher fills in the descriptors."""
+
+    base_fd: int
+    beat_fd: int
+    watcher_fd: int
+    base_port: str = ""
+    guardian_socket: str
+    speed: float = 1.0
+    realtime_priority: int = 10
+    log_level: Level = "info"
+    log_format: Literal["json", "text"] = "json"
+
+
+class Guardian:
+    """The loop around the core: one serial port, one agent, one watcher."""
+
+    def __init__(self, settings: GuardianSettings) -> None:
+        self._settings = settings
+        self._clock = SystemClock(settings.speed)
+        self._core = GuardianCore()
+        self._port = Port.from_fd(settings.base_fd, settings.base_port or None)
+        self._selector = selectors.DefaultSelector()
+        self._agent: socket.socket | None = None
+        self._beat_at = -1.0
+        self._latched: str | None = None
+        self._log = logs.get("guardian")
+        self._ended = False
+
+    def run(self) -> int:
+        """Guard until the watcher or a signal ends it; returns the exit code."""
+        listener = _listen(self._settings.guardian_socket)
+        self._selector.register(self._port, selectors.EVENT_READ, self._read_base)
+        self._selector.register(self._settings.watcher_fd, selectors.EVENT_READ, self._watcher_gone)
+        self._selector.register(listener, selectors.EVENT_READ, lambda: self._accept(listener))
+        try:
+            while not self._ended:
+                for key, _ in self._selector.select(self._clock.real(TICK_S)):
+                    key.data()
+                self._do(self._core.tick(self._clock.now()))
+                self._beat()
+        except PortLost as error:
+            self._log.error("port_lost", reason=str(error))
+            return PORT_LOST
+        self._port.write(self._core.farewell())
+        return 0
+
+    def end(self, signum: int, _frame: FrameType | None) -> None:
+        """Finish the current round, stop the wheels, and end (signal handler)."""
+        self._log.info("ending", signal=signal.Signals(signum).name)
+        self._ended = True
+
+    def _read_base(self) -> None:
+        self._do(self._core.on_bytes(self._port.read_available(), self._clock.now()))
+
+    def _watcher_gone(self) -> None:
+        self._log.error("watcher_gone", remedy="the watcher ended; it must run whenever the guardian does")
+        self._ended = True
+
+    def _accept(self, listener: socket.socket) -> None:
+        fresh, _ = listener.accept()
+        fresh.settimeout(0)
+        self._drop_agent("another one connected")
+        self._agent = fresh
+        self._selector.register(fresh, selectors.EVENT_READ, self._read_agent)
+        self._log.info("agent_connected")
+
+    def _read_agent(self) -> None:
+        assert self._agent is not None
+        newest: WheelCommand | None = None
+        reset = False
+        while True:
+            try:
+                data = self._agent.recv(PACKET_LIMIT + 1)
+            except BlockingIOError:
+                break
+            except ConnectionError as error:
+                self._drop_agent(str(error))
+                return
+            if not data:
+                self._drop_agent("it closed the link")
+                return
+            try:
+                newest = decode_command(data)
+            except msgspec.DecodeError as error:
+                self._log.error("bad_command", reason=str(error))
+                continue
+            reset = reset or newest.reset
+        if newest is not None:
+            command = msgspec.structs.replace(newest, reset=reset)
+            self._do(self._core.on_command(command, self._clock.now()))
+
+    def _drop_agent(self, reason: str) -> None:
+        if self._agent is None:
+            return
+        self._selector.unregister(self._agent)
+        self._agent.close()
+        self._agent = None
+        self._log.warning("agent_lost", reason=reason)
+        self._do(self._core.on_agent_lost(self._clock.now()))
+
+    def _do(self, output: Output) -> None:
+        if output.data:
+            self._port.write(output.data)
+        if self._core.latched != self._latched:
+            self._latched = self._core.latched
+            self._log.warning("latched" if self._latched else "reset", reason=self._latched)
+        if self._agent is None:
+            return
+        for feedback in output.feedback:
+            try:
+                self._agent.send(encode(feedback))
+            except BlockingIOError:
+                # The agent does not read: it hangs, and its commands will go stale. News are worth nothing to it.
+                break
+            except ConnectionError as error:
+                self._drop_agent(str(error))
+                break
+
+    def _beat(self) -> None:
+        now = self._clock.now()
+        if now - self._beat_at < BEAT_S:
+            return
+        self._beat_at = now
+        # A full pipe means that the watcher hangs; it is no reason to drive any less safely. A broken one means that
+        # it is gone, which the other pipe tells too.
+        with suppress(BlockingIOError, BrokenPipeError):
+            os.write(self._settings.beat_fd, b".")
+
+
+def _listen(path: str) -> socket.socket:
+    with suppress(FileNotFoundError):
+        os.unlink(path)  # noqa: PTH108 - a socket of a guardian that is gone
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    listener.bind(path)
+    os.chmod(path, 0o660)  # noqa: PTH101 - same
+    listener.listen(1)
+    listener.settimeout(0)
+    return listener
+
+
+def _be_prompt(priority: int) -> str:
+    """Ask for a real-time priority, so that a busy machine can't delay a stop; say what came of it."""
+    if priority <= 0:
+        return "not asked for"
+    try:
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(priority))
+    except PermissionError:
+        return "refused: grant CAP_SYS_NICE or an rtprio limit"
+    return f"SCHED_RR {priority}"
+
+
+def main() -> int:
+    """Run one guardian for the watcher that started it."""
+    settings = load(GuardianSettings, environ=os.environ)
+    logs.configure("guardian", settings.log_level, settings.log_format)
+    guardian = Guardian(settings)
+    signal.signal(signal.SIGTERM, guardian.end)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    logs.get("guardian").info("started", port=settings.base_port, priority=_be_prompt(settings.realtime_priority))
+    return guardian.run()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

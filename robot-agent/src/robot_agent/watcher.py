@@ -1,0 +1,154 @@
+"""The watcher: opens the base's serial port, starts the guardian, and stops the wheels when the guardian dies or hangs.
+
+A Roomba keeps its last velocity when its host falls silent, so somebody has to outlive the guardian. This process does
+nothing else and imports next to nothing, so that next to nothing can end it. Run it as a service; it starts the
+guardian again after each end. Settings (environment): FOGNAV_BASE_PORT, FOGNAV_SPEED, and those of the guardian.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+import time
+from typing import TYPE_CHECKING, Final
+
+from robot_agent.drivers.serial_port import Port, PortLost, open_port
+
+if TYPE_CHECKING:
+    from types import FrameType
+
+SILENCE_S: Final = 0.15
+"""The guardian beats every 0.05 s; after this long without a beat it is taken for hung and killed."""
+RESTART_S: Final = 0.3
+REOPEN_S: Final = 1.0
+TERMINATE_S: Final = 1.0
+
+# Start, Safe, Drive Direct 0 0. Sent twice: the guardian may have died in the middle of a command, whose missing
+# bytes the base would take from the first copy.
+STOP_WHEELS: Final = bytes((128, 131, 145, 0, 0, 0, 0)) * 2
+
+
+class _Terminated(Exception):  # noqa: N818 - an end, not an error
+    """SIGTERM or SIGINT arrived."""
+
+
+def _log(event: str, **fields: object) -> None:
+    line = {"ts": time.time(), "process": "watcher", "event": event, **fields}
+    sys.stderr.write(json.dumps(line) + "\n")
+    sys.stderr.flush()
+
+
+def _terminate(signum: int, _frame: FrameType | None) -> None:
+    raise _Terminated(signal.Signals(signum).name)
+
+
+def stop_wheels(port: Port) -> bool:
+    """Write the stop; False (and logged) when the port takes nothing."""
+    try:
+        port.write(STOP_WHEELS)
+    except PortLost as error:
+        _log("stop_failed", reason=str(error))
+        return False
+    return True
+
+
+def _start_guardian(port: Port, beat_write: int, alive_read: int) -> subprocess.Popen[bytes]:
+    environment = {
+        **os.environ,
+        "FOGNAV_BASE_FD": str(port.fileno()),
+        "FOGNAV_BASE_PORT": port.path,
+        "FOGNAV_BEAT_FD": str(beat_write),
+        "FOGNAV_WATCHER_FD": str(alive_read),
+    }
+    return subprocess.Popen(
+        [sys.executable, "-m", "robot_agent.guardian"],
+        env=environment,
+        pass_fds=(port.fileno(), beat_write, alive_read),
+    )
+
+
+def _watch(guardian: subprocess.Popen[bytes], beat_read: int, silence_s: float) -> str:
+    """Return why the guardian can't be trusted any more. Until its first beat it may take as long as it needs."""
+    timeout: float | None = None
+    while True:
+        ready, _, _ = select.select((beat_read,), (), (), timeout)
+        if not ready:
+            guardian.kill()
+            return f"hung: no beat for {silence_s:.3f} s, killed"
+        if not os.read(beat_read, 4096):
+            return "ended"
+        timeout = silence_s
+
+
+def guard_once(port: Port, speed: float) -> int:
+    """Run the guardian until it ends or hangs; the wheels are stopped when this returns. Returns its exit code."""
+    beat_read, beat_write = os.pipe()
+    alive_read, alive_write = os.pipe()
+    os.set_blocking(beat_write, False)
+    guardian = _start_guardian(port, beat_write, alive_read)
+    os.close(beat_write)
+    os.close(alive_read)
+    try:
+        reason = _watch(guardian, beat_read, SILENCE_S / speed)
+        stopped = stop_wheels(port)
+        code = guardian.wait()
+        _log("guardian_lost", reason=reason, exit_code=code, wheels_stopped=stopped)
+        return code
+    finally:
+        # Closing `alive_write` tells a guardian that still lives (we were told to end) to stop the wheels and end.
+        os.close(alive_write)
+        os.close(beat_read)
+        _end(guardian)
+        stop_wheels(port)
+
+
+def _end(guardian: subprocess.Popen[bytes]) -> None:
+    if guardian.poll() is not None:
+        return
+    try:
+        guardian.wait(TERMINATE_S)
+    except subprocess.TimeoutExpired:
+        guardian.kill()
+        guardian.wait()
+
+
+def main() -> int:
+    """Guard until told to end."""
+    path = os.environ.get("FOGNAV_BASE_PORT", "")
+    if not path:
+        _log("bad_settings", reason="FOGNAV_BASE_PORT is not set: name the base's serial device, e.g. /dev/ttyUSB0")
+        return 2
+    try:
+        speed = float(os.environ.get("FOGNAV_SPEED", "1"))
+    except ValueError:
+        speed = -1.0
+    if not 0 < speed < 1000:
+        _log("bad_settings", reason="FOGNAV_SPEED must be a positive number such as 1 (simulated over wall time)")
+        return 2
+    signal.signal(signal.SIGTERM, _terminate)
+    signal.signal(signal.SIGINT, _terminate)
+    try:
+        while True:
+            try:
+                with open_port(path) as port:
+                    _log("port_open", path=path)
+                    stop_wheels(port)
+                    while guard_once(port, speed) != PORT_LOST:
+                        time.sleep(RESTART_S / speed)
+            except PortLost as error:
+                _log("port_lost", reason=str(error))
+            time.sleep(REOPEN_S / speed)
+    except _Terminated as end:
+        _log("ended", signal=str(end))
+        return 0
+
+
+PORT_LOST: Final = 3
+"""Exit code of the guardian when the port is gone: open it anew."""
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,1 +1,1 @@
-"""Edges of Fognav's processes: settings, MQTT, zenoh, clock, freshness, metrics, health, logs, sites, record and replay."""
+"""Edges of Fognav's processes: settings, MQTT, zenoh, clock, metrics, health, logs, sites, record and replay."""

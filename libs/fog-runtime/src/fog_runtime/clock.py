@@ -1,0 +1,165 @@
+"""Time as something that is handed in: the real clock, a faster one, and one that only tests move."""
+
+import asyncio
+import heapq
+import itertools
+import time
+from collections import deque
+from collections.abc import AsyncIterator
+from typing import Final, Protocol
+
+_KEPT_BEATS: Final = 1000
+"""Beats over which a ticker's lateness is judged: 50 s at 20 Hz."""
+
+
+class Clock(Protocol):
+    """What a process knows of time; all but `real` is in the clock's own, possibly faster, seconds."""
+
+    @property
+    def speed(self) -> float:
+        """How many seconds of this clock pass in one real second."""
+
+    def now(self) -> float:
+        """Monotonic seconds: for ages, periods and timeouts; the zero means nothing."""
+
+    def stamp(self) -> float:
+        """Seconds that all processes of a machine count alike: for messages, traces and people.
+
+        At speed 1 they count from the Unix epoch; at another speed they only keep the intervals right.
+        """
+
+    def real(self, seconds: float) -> float:
+        """Real seconds that `seconds` of this clock take: for timeouts of APIs that know real time only."""
+
+    async def sleep(self, seconds: float) -> None:
+        """Wait for `seconds` of this clock."""
+
+
+class SystemClock:
+    """The machine's clock, run `speed` times as fast; raises `ValueError` for a speed that is not positive."""
+
+    def __init__(self, speed: float = 1.0) -> None:
+        if not 0.0 < speed <= 100.0:
+            raise ValueError(f"the clock's speed must lie in (0, 100], not {speed}")
+        self._speed = speed
+
+    @property
+    def speed(self) -> float:
+        """How many seconds of this clock pass in one real second."""
+        return self._speed
+
+    def now(self) -> float:
+        """Monotonic seconds."""
+        return time.monotonic() * self._speed
+
+    def stamp(self) -> float:
+        """Seconds since the Unix epoch, times the speed."""
+        return time.time() * self._speed
+
+    def real(self, seconds: float) -> float:
+        """Real seconds that `seconds` of this clock take."""
+        return seconds / self._speed
+
+    async def sleep(self, seconds: float) -> None:
+        """Wait for `seconds` of this clock."""
+        await asyncio.sleep(max(0.0, self.real(seconds)))
+
+
+class ManualClock:
+    """A clock that moves only when told: tests and lockstep runs decide what time it is."""
+
+    def __init__(self, start: float = 0.0) -> None:
+        self._now = start
+        self._order = itertools.count()
+        self._sleepers: list[tuple[float, int, asyncio.Future[None]]] = []
+
+    @property
+    def speed(self) -> float:
+        """1: a manual clock has no relation to real time."""
+        return 1.0
+
+    def now(self) -> float:
+        """Return the seconds that it was set to."""
+        return self._now
+
+    def stamp(self) -> float:
+        """Return the same seconds as `now`."""
+        return self._now
+
+    def real(self, seconds: float) -> float:
+        """Return the seconds unchanged."""
+        return seconds
+
+    async def sleep(self, seconds: float) -> None:
+        """Wait until `advance` has moved the clock by `seconds`."""
+        if seconds <= 0.0:
+            await asyncio.sleep(0)
+            return
+        woken = asyncio.get_running_loop().create_future()
+        heapq.heappush(self._sleepers, (self._now + seconds, next(self._order), woken))
+        await woken
+
+    def advance(self, dt: float) -> None:
+        """Move the clock on by `dt` >= 0 seconds and wake, in order, all whose time has come."""
+        if dt < 0.0:
+            raise ValueError(f"time does not run backwards: dt must be >= 0, not {dt}")
+        self._now += dt
+        while self._sleepers and self._sleepers[0][0] <= self._now:
+            _, _, woken = heapq.heappop(self._sleepers)
+            if not woken.done():
+                woken.set_result(None)
+
+
+class Ticker:
+    """A periodic loop without drift: `async for now in Ticker(clock, period): ...`.
+
+    Beats lie at multiples of the period after the first. One that was missed (the body took too long) is skipped,
+    never made up for: a burst of control cycles would act several times on one state of the world.
+    """
+
+    def __init__(self, clock: Clock, period: float) -> None:
+        if period <= 0.0:
+            raise ValueError(f"a period must be positive, not {period} s")
+        self.clock = clock
+        self.period = period
+        self.beats = 0
+        self.late = 0
+        """Beats that were skipped, or came more than half a period after they were due."""
+        self._lateness: deque[float] = deque(maxlen=_KEPT_BEATS)
+
+    @property
+    def p99_s(self) -> float:
+        """99th percentile of the lateness (s of the clock) of the last 1000 beats; 0 before the first."""
+        if not self._lateness:
+            return 0.0
+        ordered = sorted(self._lateness)
+        return ordered[min(len(ordered) - 1, int(0.99 * len(ordered)))]
+
+    async def __aiter__(self) -> AsyncIterator[float]:
+        """Yield `clock.now()` at every beat, the first at once."""
+        due = self.clock.now()
+        while True:
+            wait = due - self.clock.now()
+            if wait > 0.0:
+                await self.clock.sleep(wait)
+            else:
+                # A body that never awaits must not starve the rest of the loop.
+                await asyncio.sleep(0)
+            now = self.clock.now()
+            lateness = max(0.0, now - due)
+            self.beats += 1
+            self._lateness.append(lateness)
+            if lateness > self.period / 2:
+                self.late += 1
+            yield now
+            due += self.period
+            behind = self.clock.now() - due
+            if behind >= self.period:
+                missed = int(behind // self.period)
+                self.late += missed
+                due += missed * self.period
+
+
+def ticker(clock: Clock, period: float) -> Ticker:
+    """Return a drift-free periodic loop with `period` in seconds of the clock."""
+    return Ticker(clock, period)

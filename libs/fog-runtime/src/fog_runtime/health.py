@@ -1,0 +1,110 @@
+"""Liveness and readiness: what a process needs, what it has, and a tiny HTTP server that tells."""
+
+import json
+import threading
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any, Self
+
+from fog_runtime import logs, metrics
+from fog_runtime.files import write_port_file
+
+_log = logs.get("health")
+
+
+class Health:
+    """Named conditions of readiness; any thread may set and read them."""
+
+    def __init__(self, *needed: str) -> None:
+        """Start with the `needed` conditions unmet, so that nothing is ready before it said so."""
+        self._lock = threading.Lock()
+        self._parts: dict[str, tuple[bool, str]] = dict.fromkeys(needed, (False, "not started"))
+
+    def set(self, name: str, ok: bool, detail: str = "") -> None:  # noqa: FBT001  # set("redis", True) reads well
+        """Say whether a condition is met, and why not."""
+        with self._lock:
+            before = self._parts.get(name)
+            self._parts[name] = (ok, detail)
+        if before is None or before[0] != ok:
+            _log.info("health", part=name, ok=ok, detail=detail)
+
+    @property
+    def ready(self) -> bool:
+        """Whether every condition is met."""
+        with self._lock:
+            return all(ok for ok, _ in self._parts.values())
+
+    def report(self) -> dict[str, Any]:
+        """Return readiness, the names of what is missing, and every condition with its detail."""
+        with self._lock:
+            parts = dict(self._parts)
+        missing = [name for name, (ok, _) in parts.items() if not ok]
+        return {
+            "ready": not missing,
+            "missing": missing,
+            "parts": {name: {"ok": ok, "detail": detail} for name, (ok, detail) in parts.items()},
+        }
+
+
+class PlainServer:
+    """A running health server; close it, or use it as a context manager."""
+
+    def __init__(self, server: ThreadingHTTPServer) -> None:
+        self._server = server
+        self._thread = threading.Thread(target=server.serve_forever, args=(0.1,), name="health", daemon=True)
+        self._thread.start()
+
+    @property
+    def port(self) -> int:
+        """The port it listens on."""
+        return self._server.server_port
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._server.shutdown()
+        self._thread.join()
+        self._server.server_close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def serve_plain(health: Health, host: str = "127.0.0.1", port: int = 0, port_file: Path | None = None) -> PlainServer:
+    """Serve /healthz, /readyz (503 names what is missing) and /metrics from a thread; port 0 takes a free one."""
+
+    class Handler(BaseHTTPRequestHandler):
+        timeout = 5.0  # seconds until a silent client is dropped
+
+        def do_GET(self) -> None:  # the name is http.server's
+            path = self.path.partition("?")[0]
+            if path == "/healthz":
+                self._send(HTTPStatus.OK, b'{"status":"ok"}')
+            elif path == "/readyz":
+                report = health.report()
+                status = HTTPStatus.OK if report["ready"] else HTTPStatus.SERVICE_UNAVAILABLE
+                self._send(status, json.dumps(report).encode())
+            elif path == "/metrics":
+                self._send(HTTPStatus.OK, *metrics.exposition())
+            else:
+                self._send(HTTPStatus.NOT_FOUND, b'{"status":404,"title":"Not Found"}', "application/problem+json")
+
+        def _send(self, status: HTTPStatus, body: bytes, kind: str = "application/json") -> None:
+            self.send_response(status)
+            self.send_header("Content-Type", kind)
+            self.send_header("Content-Length", str(len(body)))
+            self.end_headers()
+            self.wfile.write(body)
+
+        def log_message(self, format: str, *args: object) -> None:  # noqa: A002  # the name is http.server's
+            _log.debug("request", line=format % args)
+
+    server = ThreadingHTTPServer((host, port), Handler)
+    server.daemon_threads = True
+    running = PlainServer(server)
+    _log.info("listening", url=f"http://{host}:{running.port}", port=running.port)
+    write_port_file(port_file, running.port)
+    return running

@@ -1,0 +1,129 @@
+"""Structured logs: one event per line on standard error, as JSON or as text for people."""
+
+import json
+import logging
+import sys
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from types import TracebackType
+from typing import Final, Literal
+
+Format = Literal["json", "text"]
+Level = Literal["debug", "info", "warning", "error"]
+ExcInfo = BaseException | tuple[type[BaseException], BaseException, TracebackType | None] | None
+
+_FIELDS: Final = "fognav_fields"
+
+
+class Log:
+    """A named logger whose lines are an event's name and its fields: `log.info("listening", port=8080)`."""
+
+    def __init__(self, name: str, bound: Mapping[str, object] | None = None) -> None:
+        self._logger = logging.getLogger(name)
+        self._bound = dict(bound or {})
+
+    def bind(self, **fields: object) -> "Log":
+        """Return a logger that adds these fields to every event."""
+        return Log(self._logger.name, {**self._bound, **fields})
+
+    def debug(self, event: str, **fields: object) -> None:
+        """Log what only a developer wants to see."""
+        self._emit(logging.DEBUG, event, fields)
+
+    def info(self, event: str, **fields: object) -> None:
+        """Log what happened in the normal course of things."""
+        self._emit(logging.INFO, event, fields)
+
+    def warning(self, event: str, **fields: object) -> None:
+        """Log what somebody should look at."""
+        self._emit(logging.WARNING, event, fields)
+
+    def error(self, event: str, *, error: BaseException | None = None, **fields: object) -> None:
+        """Log what failed; `error` adds the exception with its traceback."""
+        self._emit(logging.ERROR, event, fields, error)
+
+    def _emit(self, level: int, event: str, fields: Mapping[str, object], error: BaseException | None = None) -> None:
+        if self._logger.isEnabledFor(level):
+            # "%s" keeps an event that holds a percent sign from being taken for a format.
+            self._logger.log(level, "%s", event, extra={_FIELDS: {**self._bound, **fields}}, exc_info=error)
+
+
+class _Formatter(logging.Formatter):
+    def __init__(self, process: str) -> None:
+        super().__init__()
+        self._process = process
+
+    def record(self, record: logging.LogRecord) -> dict[str, object]:
+        """Collect what a line says."""
+        fields: dict[str, object] = {
+            "ts": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
+            "level": record.levelname.lower(),
+            "process": self._process,
+            "logger": record.name,
+            "event": record.getMessage(),
+        }
+        extra = getattr(record, _FIELDS, {})
+        fields.update({(f"{name}_" if name in fields else name): value for name, value in extra.items()})
+        if record.exc_info and record.exc_info[1] is not None:
+            fields["error"] = f"{type(record.exc_info[1]).__name__}: {record.exc_info[1]}"
+            fields["traceback"] = self.formatException(record.exc_info)
+        return fields
+
+
+class _JsonFormatter(_Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        return json.dumps(self.record(record), default=str, ensure_ascii=False)
+
+
+class _TextFormatter(_Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        fields = self.record(record)
+        trace = fields.pop("traceback", None)
+        head = f"{str(fields.pop('ts'))[11:23]} {fields.pop('level')!s:7} {fields.pop('process')}"
+        logger, event = fields.pop("logger"), fields.pop("event")
+        rest = " ".join(f"{name}={value}" for name, value in fields.items())
+        line = f"{head} {logger}: {event} {rest}".rstrip()
+        return f"{line}\n{trace}" if trace else line
+
+
+def configure(process: str, level: Level = "info", fmt: Format = "json") -> None:
+    """Send all logs of this process, those of libraries too, to standard error; call once, first thing."""
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(_JsonFormatter(process) if fmt == "json" else _TextFormatter(process))
+    root = logging.getLogger()
+    root.handlers[:] = [handler]
+    root.setLevel(level.upper())
+    # Libraries report their successes at info level; only their troubles belong into our events.
+    for name in ("mqtt", "uvicorn", "asyncio", "httpx", "httpcore"):
+        logging.getLogger(name).setLevel(max(logging.WARNING, root.level))
+
+
+def get(name: str) -> Log:
+    """Return the logger of a module or part."""
+    return Log(name)
+
+
+class RateLimited:
+    """Logs the first of equal troubles at once, then at most one line per `period` seconds that counts the rest.
+
+    Keeps at most `max_keys` different troubles apart, so that a sender of ever new ones can't fill the memory.
+    """
+
+    def __init__(self, log: Log, period: float = 10.0, max_keys: int = 1000) -> None:
+        self._log = log
+        self._period = period
+        self._max_keys = max_keys
+        self._state: dict[str, tuple[float, int]] = {}
+
+    def warning(self, event: str, key: str, now: float, **fields: object) -> None:
+        """Log `event` unless the same `key` was logged less than a period ago (`now`: monotonic seconds)."""
+        if key not in self._state and len(self._state) >= self._max_keys:
+            key = "(others)"
+        logged_at, suppressed = self._state.get(key, (None, 0))
+        if logged_at is not None and now - logged_at < self._period:
+            self._state[key] = (logged_at, suppressed + 1)
+            return
+        self._state[key] = (now, 0)
+        if suppressed:
+            fields["not_logged_since"] = suppressed
+        self._log.warning(event, **fields)

@@ -1,0 +1,90 @@
+"""Prometheus metrics that all processes share; CPU and memory come from prometheus-client's process collector."""
+
+import os
+import resource
+from collections.abc import Collection
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from prometheus_client import (
+    CONTENT_TYPE_LATEST,
+    REGISTRY,
+    CollectorRegistry,
+    Counter,
+    Gauge,
+    Histogram,
+    generate_latest,
+)
+
+from fog_contracts.messages import Trace
+
+STAGES: Final = {
+    "debounce": ("first_reading", "confirmed"),
+    "costmap": ("confirmed", "costmap_published"),
+    "plan": ("costmap_published", "plan_published"),
+    "deliver": ("plan_published", "path_received"),
+    "command": ("path_received", "first_command"),
+    "total": ("first_reading", "first_command"),
+}
+"""Stages of a hazard's way, each between two stamps of its trace; `total` is the thesis's "around 3 seconds"."""
+
+STAGE_SECONDS: Final = Histogram(
+    "fognav_stage_seconds",
+    "Duration of one stage of a hazard's way, from the first disagreeing reading to the wheels",
+    ["stage"],
+    buckets=(0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0),
+)
+TRACE_SKEW: Final = Counter(
+    "fognav_trace_skew_total",
+    "Stages whose end is stamped before their beginning: clocks of two hosts differ",
+    ["stage"],
+)
+REFUSED: Final = Counter("fognav_refused_messages_total", "Messages that broke their channel's contract", ["channel"])
+RECEIVED: Final = Counter("fognav_received_messages_total", "Messages taken from a channel", ["channel"])
+PUBLISHED: Final = Counter("fognav_published_messages_total", "Messages given to a channel", ["channel"])
+DROPPED: Final = Counter(
+    "fognav_unsent_messages_total", "Messages that could not be sent because the connection was down", ["channel"]
+)
+HANDLER_ERRORS: Final = Counter(
+    "fognav_handler_errors_total", "Messages whose handler raised an exception: a bug in this process", ["channel"]
+)
+CONNECTED: Final = Gauge("fognav_connected", "Whether the connection is up (1) or down (0)", ["transport"])
+CONNECTS: Final = Counter("fognav_connects_total", "Connections made, the first one included", ["transport"])
+
+
+def observe_trace(trace: Trace, stages: Collection[str] = tuple(STAGES)) -> None:
+    """Take a trace's finished `stages` into the histogram; stages with a stamp missing are left out.
+
+    Each process observes the stages that it completes, so that none counts twice.
+    """
+    for stage in stages:
+        begin, end = (getattr(trace, name) for name in STAGES[stage])
+        if begin == 0.0 or end == 0.0:
+            continue
+        if end < begin:
+            TRACE_SKEW.labels(stage).inc()
+            continue
+        STAGE_SECONDS.labels(stage).observe(end - begin)
+
+
+def exposition(registry: CollectorRegistry = REGISTRY) -> tuple[bytes, str]:
+    """Return the metrics in Prometheus's text format, and their content type."""
+    return generate_latest(registry), CONTENT_TYPE_LATEST
+
+
+class ProcessUsage(NamedTuple):
+    """What this process has used so far: CPU seconds (user and system), resident bytes now."""
+
+    cpu_s: float
+    rss_bytes: int
+
+
+def process_usage() -> ProcessUsage:
+    """Return CPU time and resident memory of this process; other systems than Linux give the memory's peak."""
+    usage = resource.getrusage(resource.RUSAGE_SELF)
+    cpu = usage.ru_utime + usage.ru_stime
+    try:
+        pages = int(Path("/proc/self/statm").read_text("ascii").split()[1])
+    except FileNotFoundError:  # no Linux
+        return ProcessUsage(cpu, usage.ru_maxrss)
+    return ProcessUsage(cpu, pages * os.sysconf("SC_PAGE_SIZE"))

@@ -1,0 +1,78 @@
+"""The life of a process: start, run until told to stop, end cleanly."""
+
+import asyncio
+import ctypes
+import os
+import signal
+import sys
+from collections.abc import Awaitable, Callable
+from typing import Final
+
+from fog_runtime import logs
+
+_PR_SET_PDEATHSIG: Final = 1
+
+_log = logs.get("process")
+
+
+def die_with_parent() -> None:
+    """Ask the kernel to send SIGTERM to this process when its parent dies; does nothing but on Linux.
+
+    A launcher that is killed can't stop its children any more; without this they would keep ports and robots.
+    """
+    if sys.platform != "linux":
+        return
+    parent = os.getppid()
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0) != 0:
+        raise OSError(ctypes.get_errno(), "prctl(PR_SET_PDEATHSIG) failed")
+    if os.getppid() != parent:
+        # The parent died between the two calls: nobody will send the signal.
+        os.kill(os.getpid(), signal.SIGTERM)
+
+
+async def _supervise(main: Callable[[], Awaitable[None]]) -> None:
+    loop = asyncio.get_running_loop()
+    task = asyncio.ensure_future(main())
+    stopping = False
+
+    def stop(number: int) -> None:
+        nonlocal stopping
+        if stopping:
+            _log.warning("forced_exit", signal=signal.Signals(number).name)
+            os._exit(1)
+        stopping = True
+        _log.info("stopping", signal=signal.Signals(number).name)
+        task.cancel()
+
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, stop, number)
+    try:
+        await task
+    except asyncio.CancelledError:
+        if not stopping:
+            raise
+    finally:
+        for number in (signal.SIGTERM, signal.SIGINT):
+            loop.remove_signal_handler(number)
+
+
+def run(main: Callable[[], Awaitable[None]]) -> None:
+    """Run `main` until it returns or SIGTERM or SIGINT cancels it (a clean end, status 0).
+
+    An exception that `main` lets through is logged as one event, and the process exits with status 1. A second
+    signal ends the process at once.
+    """
+    try:
+        asyncio.run(_supervise(main))
+    except Exception as error:  # noqa: BLE001  # the last place that can say why the process ends
+        causes = _leaves(error)
+        _log.error("crashed", error=error, reason="; ".join(f"{type(c).__name__}: {c}" for c in causes))
+        raise SystemExit(1) from None
+    _log.info("stopped")
+
+
+def _leaves(error: BaseException) -> list[BaseException]:
+    if isinstance(error, BaseExceptionGroup):
+        return [leaf for inner in error.exceptions for leaf in _leaves(inner)]
+    return [error]

@@ -1,0 +1,100 @@
+import asyncio
+import time
+
+import pytest
+
+from fog_runtime.clock import ManualClock, SystemClock, ticker
+
+
+async def run_beats(clock: ManualClock, bodies: list[float], period: float = 0.1) -> list[float]:
+    """Beats' times when the n-th body takes bodies[n] seconds of the clock."""
+    times: list[float] = []
+
+    async def loop() -> None:
+        async for now in beat:
+            times.append(now)
+            if len(times) > len(bodies):
+                return
+            await clock.sleep(bodies[len(times) - 1])
+
+    beat = ticker(clock, period)
+    task = asyncio.create_task(loop())
+    while not task.done():
+        for _ in range(5):
+            await asyncio.sleep(0)
+        if not task.done():
+            clock.advance(0.005)
+    await task
+    return times
+
+
+async def test_beats_keep_to_multiples_of_the_period_whatever_the_body_takes():
+    times = await run_beats(ManualClock(), [0.03, 0.09, 0.0, 0.05])
+    assert times == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4], abs=0.006)
+
+
+async def test_missed_beats_are_skipped_and_counted_not_bunched():
+    clock = ManualClock()
+    beat = ticker(clock, 0.25)
+    times = []
+    async for now in beat:
+        times.append(now)
+        if len(times) == 3:
+            break
+        clock.advance(0.875 if len(times) == 1 else 0.125)
+    # The beats of 0.25 and 0.5 are gone, that of 0.75 comes 0.125 s late, and that of 1 is on time again.
+    assert times == [0.0, 0.875, 1.0]
+    assert beat.late == 2
+    assert beat.beats == 3
+
+
+async def test_p99_is_the_worst_lateness_of_few_beats():
+    clock = ManualClock()
+    beat = ticker(clock, 1.0)
+    assert beat.p99_s == 0.0
+    async for _ in beat:
+        if beat.beats == 3:
+            break
+        clock.advance(1.0 if beat.beats == 1 else 1.25)
+    assert beat.p99_s == pytest.approx(0.25)
+    assert beat.late == 0
+
+
+async def test_sleepers_wake_in_the_order_of_their_times():
+    clock, woken = ManualClock(10.0), []
+
+    async def sleeper(name: str, seconds: float) -> None:
+        await clock.sleep(seconds)
+        woken.append(name)
+
+    tasks = [asyncio.create_task(sleeper("b", 2.0)), asyncio.create_task(sleeper("a", 1.0))]
+    await asyncio.sleep(0)
+    clock.advance(0.5)
+    await asyncio.sleep(0)
+    assert woken == []
+    clock.advance(5.0)
+    await asyncio.gather(*tasks)
+    assert woken == ["a", "b"]
+    assert clock.now() == clock.stamp() == 15.5
+
+
+def test_manual_time_does_not_run_backwards():
+    with pytest.raises(ValueError, match="backwards"):
+        ManualClock().advance(-0.1)
+
+
+async def test_fast_clock_scales_time_and_timeouts():
+    clock = SystemClock(10.0)
+    began, real = clock.now(), time.monotonic()
+    await clock.sleep(0.5)
+    spent, spent_real = clock.now() - began, time.monotonic() - real
+    assert spent >= 0.5
+    assert spent == pytest.approx(10 * spent_real, rel=0.2, abs=0.05)
+    assert clock.real(5.0) == 0.5
+    assert clock.stamp() == pytest.approx(time.time() * 10, rel=1e-6)
+
+
+@pytest.mark.parametrize("speed", [0.0, -1.0, 1000.0, float("nan")])
+def test_impossible_speed_is_refused(speed):
+    with pytest.raises(ValueError, match="speed"):
+        SystemClock(speed)

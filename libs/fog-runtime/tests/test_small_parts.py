@@ -1,0 +1,221 @@
+"""Slots, logs, settings, health, metrics and files."""
+
+import asyncio
+import json
+import logging
+import math
+import urllib.error
+import urllib.request
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import pytest
+from prometheus_client import REGISTRY
+
+from fog_contracts.messages import Trace
+from fog_runtime import logs, metrics
+from fog_runtime.files import atomic_write
+from fog_runtime.health import Health, serve_plain
+from fog_runtime.settings import CommonSettings, Secret, SettingsError, describe, load
+from fog_runtime.slots import Slot
+
+
+async def test_slot_keeps_only_the_newest_and_knows_its_age():
+    slot: Slot[int] = Slot()
+    assert slot.get() is None
+    assert slot.age(100.0) == math.inf
+    assert not slot.fresh(100.0, None)
+    slot.put(1, 100.0)
+    slot.put(2, 101.0)
+    assert slot.get() == 2
+    assert slot.age(103.5) == 2.5
+    assert slot.fresh(103.5, 2.5)
+    assert not slot.fresh(103.6, 2.5)
+    assert slot.fresh(1e9, None)
+
+
+async def test_slot_wait_is_woken_by_a_newer_value_only():
+    slot: Slot[str] = Slot()
+    slot.put("old", 0.0)
+    waiting = asyncio.create_task(slot.wait())
+    await asyncio.sleep(0)
+    assert not waiting.done()
+    slot.put("newer", 1.0)
+    slot.put("newest", 1.0)
+    assert await waiting == "newest"
+
+
+class Example(CommonSettings, frozen=True, kw_only=True):
+    rate: float = 1.0
+    debug: bool = False
+    password: Secret = Secret("initial")  # immutable
+    mode: Annotated[str, msgspec.Meta(pattern="^[ab]$")] = "a"
+
+
+NEEDED = {"FOGNAV_SITE_DIR": "/s", "FOGNAV_DATA_DIR": "/d"}
+
+
+def test_environment_overrides_file_overrides_default(tmp_path):
+    file = tmp_path / "x.toml"
+    file.write_text('rate = 2.5\nmode = "b"\nsite_dir = "/from-file"\n')
+    settings = load(Example, file=file, environ={"FOGNAV_DATA_DIR": "/d", "FOGNAV_MODE": "a", "FOGNAV_DEBUG": "true"})
+    assert (settings.rate, settings.mode, settings.debug, settings.http_port) == (2.5, "a", True, 0)
+    assert settings.site_dir == Path("/from-file")
+
+
+def test_empty_variable_counts_as_not_set():
+    assert load(Example, environ={**NEEDED, "FOGNAV_RATE": "", "FOGNAV_PORT_FILE": ""}).rate == 1.0
+
+
+@pytest.mark.parametrize(
+    ("environ", "words"),
+    [
+        ({}, ["site_dir", "FOGNAV_SITE_DIR"]),
+        ({**NEEDED, "FOGNAV_RATE": "fast"}, ["FOGNAV_RATE", "float", "'fast'"]),
+        ({**NEEDED, "FOGNAV_MODE": "c"}, ["FOGNAV_MODE", "'c'"]),
+        ({**NEEDED, "FOGNAV_LOG_LEVEL": "loud"}, ["FOGNAV_LOG_LEVEL", "'loud'"]),
+    ],
+)
+def test_wrong_variable_is_named(environ, words):
+    with pytest.raises(SettingsError) as refused:
+        load(Example, environ=environ)
+    assert all(word in str(refused.value) for word in words), refused.value
+
+
+@pytest.mark.parametrize(
+    ("content", "word"), [("rate = 'x'", "rate"), ("ratte = 1", "'ratte'"), ("rate = ", "TOML"), (None, "read")]
+)
+def test_wrong_file_is_named(tmp_path, content, word):
+    file = tmp_path / "x.toml"
+    if content is not None:
+        file.write_text(content)
+    with pytest.raises(SettingsError, match=word) as refused:
+        load(Example, file=file, environ=NEEDED)
+    assert str(file) in str(refused.value)
+
+
+def test_secrets_show_nowhere():
+    environ = {**NEEDED, "FOGNAV_PASSWORD": "hush", "FOGNAV_MQTT_URL": "mqtt://user:hush@broker:1883"}
+    settings = load(Example, environ=environ)
+    assert settings.password.reveal() == "hush"
+    shown = f"{describe(settings)} {settings.password} {settings.password!r} {settings!r}"
+    assert "hush" not in shown.replace(settings.mqtt_url, "")
+    assert describe(settings)["mqtt_url"] == "mqtt://user:***@broker:1883"
+    with pytest.raises(SettingsError) as refused:
+        load(Example, environ={**environ, "FOGNAV_REDIS_URL": "x", "FOGNAV_SPEED": "redis://u:hush@h"})
+    assert "hush" not in str(refused.value)
+
+
+@pytest.fixture
+def lines(capsys):
+    """Return what was logged so far, line by line; the root logger is put back at the end."""
+    root = logging.getLogger()
+    before, level = root.handlers[:], root.level
+    seen: list[str] = []
+
+    def read() -> list[str]:
+        seen.extend(capsys.readouterr().err.splitlines())
+        return seen
+
+    yield read
+    root.handlers[:] = before
+    root.setLevel(level)
+
+
+def test_log_line_is_json_with_fields_and_errors(lines):
+    logs.configure("proc", "info", "json")
+    log = logs.get("part").bind(robot="r1")
+    log.info("100%s", level="mine", path=Path("/x"))
+    log.debug("unseen")
+    log.error("failed", error=ValueError("why"))
+    first, second = (json.loads(line) for line in lines())
+    assert (first["event"], first["process"], first["logger"], first["level"]) == ("100%s", "proc", "part", "info")
+    assert (first["robot"], first["level_"], first["path"]) == ("r1", "mine", "/x")
+    assert second["error"] == "ValueError: why"
+
+
+def test_text_log_names_event_and_fields(lines):
+    logs.configure("proc", "debug", "text")
+    logs.get("part").warning("odd", n=3)
+    assert lines()[0].endswith("warning proc part: odd n=3")
+
+
+def test_rate_limited_log_says_the_first_and_counts_the_rest(lines):
+    logs.configure("proc")
+    limited = logs.RateLimited(logs.get("part"), period=10.0, max_keys=2)
+    for now in (0.0, 1.0, 9.9, 10.5):
+        limited.warning("refused", "a", now)
+    assert [json.loads(line).get("not_logged_since") for line in lines()] == [None, 2]
+    for key in "bcdef":
+        limited.warning("refused", key, 11.0)
+    assert len(lines()) == 4, "b, and the first of those beyond the bound"
+
+
+def get(port, path):
+    try:
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}{path}", timeout=5) as answer:
+            return answer.status, answer.read().decode()
+    except urllib.error.HTTPError as error:
+        with error:
+            return error.code, error.read().decode()
+
+
+def test_health_server_names_what_is_missing(tmp_path):
+    health = Health("mqtt", "store")
+    health.set("mqtt", ok=True)
+    health.set("store", ok=False, detail="redis://x refuses")
+    with serve_plain(health, port_file=tmp_path / "run" / "port") as server:
+        assert int((tmp_path / "run" / "port").read_text()) == server.port
+        assert get(server.port, "/healthz")[0] == 200
+        status, body = get(server.port, "/readyz")
+        assert status == 503
+        assert json.loads(body)["missing"] == ["store"]
+        assert "redis://x refuses" in body
+        health.set("store", ok=True)
+        assert get(server.port, "/readyz?x=1")[0] == 200
+        assert "process_cpu_seconds_total" in get(server.port, "/metrics")[1]
+        assert get(server.port, "/nothing")[0] == 404
+
+
+def stage_sum(stage):
+    return REGISTRY.get_sample_value("fognav_stage_seconds_sum", {"stage": stage}) or 0.0
+
+
+def test_trace_fills_the_finished_stages_only():
+    before = {stage: stage_sum(stage) for stage in metrics.STAGES}
+    trace = Trace(area="a1", epoch=1, seq=1, first_reading=10.0, confirmed=10.5, costmap_published=10.75)
+    metrics.observe_trace(trace)
+    gained = {stage: stage_sum(stage) - before[stage] for stage in metrics.STAGES}
+    assert gained == pytest.approx(
+        {"debounce": 0.5, "costmap": 0.25, "plan": 0, "deliver": 0, "command": 0, "total": 0}
+    )
+
+
+def test_stage_that_ends_before_it_begins_is_counted_as_skew():
+    def skew():
+        return REGISTRY.get_sample_value("fognav_trace_skew_total", {"stage": "debounce"}) or 0.0
+
+    before, seconds = skew(), stage_sum("debounce")
+    metrics.observe_trace(Trace(area="a1", epoch=1, seq=1, first_reading=10.0, confirmed=9.0), ["debounce"])
+    assert skew() == before + 1
+    assert stage_sum("debounce") == seconds
+
+
+def test_process_usage_grows_with_work_and_memory():
+    before = metrics.process_usage()
+    ballast = bytearray(b"x" * 30_000_000)
+    sum(range(2_000_000))
+    after = metrics.process_usage()
+    assert after.cpu_s > before.cpu_s
+    assert after.rss_bytes > before.rss_bytes + 20_000_000
+    assert len(ballast) == 30_000_000
+
+
+def test_failed_atomic_write_leaves_the_old_file(tmp_path):
+    path = tmp_path / "f"
+    atomic_write(path, b"old")
+    with pytest.raises(TypeError):
+        atomic_write(path, "no bytes")  # type: ignore[arg-type]
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]

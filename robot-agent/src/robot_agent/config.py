@@ -1,0 +1,100 @@
+"""Settings of the robot's pure parts, as plain values; defaults are the thesis's where the base can do them.
+
+Lengths in m, angles in rad, times in s.
+"""
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SafetyConfig:
+    """Limits of the safety gate."""
+
+    speed_normal: float = 0.30
+    speed_degraded: float = 0.15
+    speed_egress: float = 0.10
+    relax_after: float = 2.0
+    map_late: float = 1.0
+    map_lost: float = 3.0
+    gap_lost: float = 1.0
+    plan_late: float = 1.5
+    lidar_node_lost: float = 0.3
+    turn_lost: float = 0.45
+    identical_turns: int = 3
+    base_lost: float = 0.3
+    hold_operator_after: float = 60.0
+    stops_to_fault: int = 3
+    stops_within: float = 60.0
+    ramp: float = 0.5
+    """Time in which a ramp brings the fastest possible wheel to rest."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LocalizationConfig:
+    """Particle filter (Thrun, Burgard, Fox 2005; KLD sampling by Fox 2003) and the likelihood field's model."""
+
+    particles_min: int = 500
+    particles_max: int = 2000
+    particles_start: int = 2000
+    kld_error: float = 0.05
+    kld_z: float = 2.326
+    bin_xy: float = 0.25
+    bin_theta: float = 0.1745
+    beams: int = 60
+    z_hit: float = 0.5
+    z_rand: float = 0.5
+    sigma_hit: float = 0.2
+    field_reach: float = 2.0
+    alphas: tuple[float, float, float, float] = (0.2, 0.2, 0.2, 0.2)
+    update_distance: float = 0.25
+    update_angle: float = 0.2
+    recovery_slow: float = 0.001
+    recovery_fast: float = 0.1
+    range_min: float = 0.15
+    range_max: float = 12.0
+    lidar_x: float = 0.0
+    lidar_y: float = 0.0
+    lidar_yaw: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MotionConfig:
+    """Path follower and dynamic window (Fox, Burgard, Thrun 1997)."""
+
+    speed: float = 0.30
+    turn_speed: float = 2.75
+    acceleration: float = 2.5
+    turn_acceleration: float = 3.2
+    wheel_speed: float = 0.5
+    axle: float = 0.235
+    samples_v: int = 25
+    samples_w: int = 35
+    horizon: float = 1.5
+    step: float = 0.05
+    period: float = 0.2
+    tolerance_xy: float = 0.10
+    tolerance_theta: float = 0.17
+    window: float = 2.0
+    look_ahead: float = 1.0
+    inscribed_radius: float = 0.17
+    inflation_radius: float = 0.45
+    cost_scaling: float = 8.0
+    stuck_after: float = 10.0
+    brake: float = 0.6
+    """Deceleration (m/s2) with which the end of the released part is approached."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AgentConfig:
+    """Everything that the agent's core needs to know of its robot."""
+
+    robot: str
+    operator_key: bytes
+    radius: float = 0.17
+    height: float = 0.35
+    decision_max_age: float = 0.4
+    obstacle_ttl: float = 30.0
+    obstacle_limit: int = 400
+    safety: SafetyConfig = field(default_factory=SafetyConfig)
+    localization: LocalizationConfig = field(default_factory=LocalizationConfig)
+    motion: MotionConfig = field(default_factory=MotionConfig)

@@ -1,0 +1,348 @@
+"""The safety gate: what each finding does, and what must hold in every state that can be reached."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from robot_agent.config import SafetyConfig
+from robot_agent.safety import (
+    Level,
+    SafetyInputs,
+    SafetyOutputs,
+    SafetyState,
+    judge,
+    limit_wheels,
+    ramp_down,
+    step,
+)
+
+CONFIG = SafetyConfig()
+DT = 0.05
+HEALTHY = {
+    "map_loaded": True,
+    "map_age": 0.1,
+    "localization": "good",
+    "lidar_node_age": 0.02,
+    "turn_age": 0.1,
+    "base_age": 0.02,
+}
+
+
+def inputs(**changes) -> SafetyInputs:
+    return SafetyInputs(**{**HEALTHY, **changes})
+
+
+class Gate:
+    def __init__(self) -> None:
+        self.state = SafetyState()
+        self.now = 100.0
+        self.out: SafetyOutputs | None = None
+
+    def run(self, seconds: float = DT, **changes) -> SafetyOutputs:
+        for _ in range(max(1, round(seconds / DT))):
+            self.now += DT
+            self.state, self.out = step(self.state, inputs(**changes), self.now)
+            changes.pop("request", None)
+        assert self.out is not None
+        return self.out
+
+    def enabled(self) -> Gate:
+        assert self.run(request="enable").refusal is None
+        assert self.run(2.5).mode == "NORMAL"
+        return self
+
+
+def test_a_robot_that_was_switched_on_waits_for_an_operator_however_healthy():
+    gate = Gate()
+    out = gate.run(60.0)
+    assert out.mode == "INIT"
+    assert out.cap == 0.0
+    assert out.reasons == ("waiting for an operator to enable",)
+
+
+@pytest.mark.parametrize(
+    ("missing", "word"),
+    [
+        ({"map_loaded": False}, "no map"),
+        ({"localization": "none"}, "pose"),
+        ({"turn_age": math.inf}, "turn"),
+        ({"base_age": math.inf}, "guardian"),
+        ({"inside_blocked": "the zone wet-floor"}, "wet-floor"),
+        ({"bumper": True}, "bumper"),
+    ],
+)
+def test_enable_is_refused_with_the_cause_while_something_is_missing(missing, word):
+    gate = Gate()
+    out = gate.run(request="enable", **missing)
+    assert out.refusal is not None
+    assert word in out.refusal
+    assert gate.run(5.0).mode == "INIT"
+
+
+def test_enable_works_once_all_is_there():
+    assert Gate().enabled().out.cap == 0.30
+
+
+@pytest.mark.parametrize(
+    ("trouble", "mode"),
+    [
+        ({"map_age": 1.1}, "DEGRADED"),
+        ({"map_age": 3.1}, "HOLD"),
+        ({"map_gap": 0.9}, "NORMAL"),
+        ({"map_gap": 1.1}, "HOLD"),
+        ({"localization": "weak"}, "DEGRADED"),
+        ({"localization": "lost"}, "PROTECTIVE_STOP"),
+        ({"mission": True, "plan_age": 1.6, "released_left": 5.0}, "DEGRADED"),
+        ({"mission": True, "plan_age": 1.6, "released_left": 0.0}, "HOLD"),
+        ({"mission": True, "path_problem": "goal blocked"}, "HOLD"),
+        ({"mission": False, "path_problem": "goal blocked", "plan_age": math.inf}, "NORMAL"),
+        ({"lidar_node_age": 0.31}, "PROTECTIVE_STOP"),
+        ({"turn_age": 0.46}, "PROTECTIVE_STOP"),
+        ({"identical_turns": 2}, "NORMAL"),
+        ({"identical_turns": 3}, "PROTECTIVE_STOP"),
+        ({"base_age": 0.31}, "PROTECTIVE_STOP"),
+        ({"base_silent": "connection closed"}, "PROTECTIVE_STOP"),
+        ({"base_stopped": "commands are stale"}, "PROTECTIVE_STOP"),
+        ({"inside_blocked": "zone x"}, "PROTECTIVE_STOP"),
+        ({"base_fault": "OI mode is PASSIVE"}, "FAULT"),
+        ({"bumper": True}, "FAULT"),
+        ({"cliff": True}, "FAULT"),
+        ({"wheel_drop": True}, "FAULT"),
+        ({"map_age": math.nan}, "HOLD"),
+        ({"turn_age": math.nan}, "PROTECTIVE_STOP"),
+        ({"base_age": math.nan}, "PROTECTIVE_STOP"),
+        ({"caution": "area z4 is unknown"}, "DEGRADED"),
+    ],
+)
+def test_a_finding_takes_effect_in_the_same_step_and_says_why(trouble, mode):
+    gate = Gate().enabled()
+    out = gate.run(DT, **trouble)
+    assert out.mode == mode
+    assert out.changed == (mode != "NORMAL")
+    assert bool(out.reasons) == (mode != "NORMAL")
+
+
+@pytest.mark.parametrize("trouble", [{"map_age": 2.0}, {"map_gap": 2.0}, {"turn_age": 1.0}])
+def test_relaxing_takes_two_seconds_of_unbroken_health(trouble):
+    gate = Gate().enabled()
+    stopped = gate.run(DT, **trouble).mode
+    assert gate.run(1.5).mode == stopped
+    assert gate.run(DT, **trouble).mode == stopped
+    assert gate.run(1.9).mode == stopped
+    assert gate.run(0.2).mode == "NORMAL"
+
+
+def test_health_of_the_last_two_seconds_counts_not_only_of_the_last_moment():
+    gate = Gate().enabled()
+    gate.run(DT, turn_age=1.0)
+    gate.run(1.8, map_age=3.5)
+    assert gate.run(0.3).mode == "HOLD"
+
+
+def test_after_a_stale_map_only_a_newer_plan_lets_the_robot_go_on():
+    gate = Gate().enabled()
+    driving = {"mission": True, "plan_age": 0.3, "released_left": 5.0}
+    assert gate.run(1.0, **driving).mode == "NORMAL"
+    assert gate.run(1.0, **{**driving, "map_age": 4.0}).mode == "HOLD"
+    for age in (0.9, 1.2):  # the plan from before the map was heard again
+        out = gate.run(DT, **{**driving, "plan_age": age})
+        assert out.mode == "HOLD"
+        assert "waiting for a plan on the fresh map" in out.reasons
+    assert gate.run(2.2, **{**driving, "plan_age": 0.0}).mode == "NORMAL"
+
+
+def test_a_short_hold_ends_by_itself_a_long_one_needs_an_operator():
+    gate = Gate().enabled()
+    gate.run(50.0, map_age=9.0)
+    assert gate.run(2.2).mode == "NORMAL"
+    gate.run(61.0, map_age=9.0)
+    out = gate.run(10.0)
+    assert out.mode == "HOLD"
+    assert out.operator
+    assert gate.run(request="enable", map_age=9.0).refusal is not None
+    gate.run(2.2)
+    assert gate.run(request="enable").refusal is None
+    assert gate.run(2.2).mode == "NORMAL"
+
+
+@pytest.mark.parametrize("trouble", [{"localization": "lost"}, {"inside_blocked": "zone x"}])
+def test_a_lost_pose_and_a_blocked_zone_need_an_operator_even_when_they_are_over(trouble):
+    gate = Gate().enabled()
+    gate.run(DT, **trouble)
+    assert gate.run(request="enable", **trouble).refusal is not None
+    out = gate.run(30.0)
+    assert out.mode == "PROTECTIVE_STOP"
+    assert out.operator
+    assert gate.run(request="enable").refusal is None
+    assert gate.run(2.2).mode == "NORMAL"
+
+
+def test_a_silent_lidar_ends_by_itself():
+    gate = Gate().enabled()
+    assert gate.run(1.0, turn_age=1.0).mode == "PROTECTIVE_STOP"
+    assert gate.run(2.2).mode == "NORMAL"
+
+
+def test_the_third_protective_stop_within_a_minute_is_a_fault():
+    gate = Gate().enabled()
+    for _ in range(2):
+        assert gate.run(DT, turn_age=1.0).mode == "PROTECTIVE_STOP"
+        assert gate.run(2.5).mode == "NORMAL"
+    out = gate.run(DT, turn_age=1.0)
+    assert out.mode == "FAULT"
+    assert "3 protective stops" in out.reasons[0]
+
+
+def test_protective_stops_that_lie_apart_are_no_fault():
+    gate = Gate().enabled()
+    for _ in range(4):
+        assert gate.run(DT, turn_age=1.0).mode == "PROTECTIVE_STOP"
+        assert gate.run(31.0).mode == "NORMAL"
+
+
+def test_a_fault_stays_until_a_reset_after_its_cause_is_gone_and_then_needs_an_enable():
+    gate = Gate().enabled()
+    gate.run(DT, bumper=True)
+    assert gate.run(100.0).mode == "FAULT"
+    assert gate.run(request="enable").refusal is not None
+    assert gate.run(request="reset", bumper=True).refusal is not None
+    assert gate.run(request="disable").mode == "FAULT"
+    out = gate.run(request="reset")
+    assert out.refusal is None
+    assert out.mode == "INIT"
+    assert gate.run(10.0).mode == "INIT"
+    gate.enabled()
+
+
+def test_disable_stops_at_once_and_lasts():
+    gate = Gate().enabled()
+    assert gate.run(request="disable").stop == "now"
+    assert gate.run(10.0).mode == "INIT"
+
+
+AGES = st.sampled_from([0.0, 0.2, 0.35, 0.5, 1.2, 2.0, 3.5, math.inf])
+TROUBLE = st.fixed_dictionaries(
+    {},
+    optional={
+        "map_loaded": st.booleans(),
+        "map_age": AGES,
+        "map_gap": AGES,
+        "localization": st.sampled_from(["good", "weak", "lost", "none"]),
+        "lidar_node_age": AGES,
+        "turn_age": AGES,
+        "identical_turns": st.integers(1, 4),
+        "base_age": AGES,
+        "base_silent": st.sampled_from([None, "gone"]),
+        "base_fault": st.sampled_from([None, None, None, "serial"]),
+        "base_stopped": st.sampled_from([None, None, "stale"]),
+        "bumper": st.sampled_from([False, False, False, True]),
+        "cliff": st.sampled_from([False, False, False, True]),
+        "wheel_drop": st.sampled_from([False, False, False, True]),
+        "mission": st.booleans(),
+        "plan_age": AGES,
+        "released_left": st.sampled_from([0.0, 3.0]),
+        "path_problem": st.sampled_from([None, "goal blocked"]),
+        "inside_blocked": st.sampled_from([None, None, "zone x"]),
+        "caution": st.sampled_from([None, "unknown"]),
+    },
+)
+EPISODE = st.tuples(
+    TROUBLE,
+    st.sampled_from([None, None, "enable", "enable", "reset", "disable"]),
+    st.sampled_from([1, 2, 10, 41]),
+    st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5)),
+)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(EPISODE, max_size=10))
+def test_invariants_of_every_reachable_state(episodes):
+    gate = Gate()
+    wheels = (0.0, 0.0)
+    levels: list[tuple[float, Level]] = []
+    rank = {"NORMAL": 0, "DEGRADED": 1, "HOLD": 2, "PROTECTIVE_STOP": 3, "FAULT": 4}
+    # Start enabled half of the time's worth: the first episode follows an enable of a healthy robot.
+    for trouble, request, ticks, wanted in [({}, "enable", 50, (0.3, 0.3)), *episodes]:
+        for tick in range(ticks):
+            asked = request if tick == 0 else None
+            given_inputs = inputs(**{**trouble, "request": asked})
+            before = gate.state.mode
+            was_enabled = gate.state.enabled
+            gate.now += DT
+            gate.state, out = step(gate.state, given_inputs, gate.now)
+            found = judge(given_inputs, CONFIG)
+            level = max((f.level for f in found), default=Level.NORMAL)
+            levels.append((gate.now, level))
+
+            last = wheels
+            wheels = limit_wheels(wanted, wheels, out, DT, acceleration=2.5, wheel_speed=0.5)
+            assert max(abs(wheels[0]), abs(wheels[1])) <= 0.5 + 1e-9
+            assert abs(sum(wheels)) / 2 <= max(0.30, abs(sum(last)) / 2) + 1e-9
+            assert out.cap <= 0.30
+            if out.mode in {"INIT", "PROTECTIVE_STOP", "FAULT"}:
+                assert wheels == (0.0, 0.0)
+            if out.stop == "ramp":
+                assert max(map(abs, wheels)) <= max(map(abs, last))
+            # the mode is never less careful than what is found right now
+            if out.mode in rank:
+                assert rank[out.mode] >= min(level, 4)
+                # ... nor than anything found in the last 2 s, unless an operator's enable or reset came between
+                if before in rank:
+                    recent = max(lv for at, lv in levels if gate.now - at < 2.0 - 1e-9)
+                    if not (before == "INIT" or recent == Level.FAULT):
+                        assert rank[out.mode] >= recent
+            if before == "FAULT" and out.mode != "FAULT":
+                assert asked == "reset"
+                assert out.refusal is None
+                assert level < Level.FAULT
+                assert out.mode == "INIT"
+            if before == "INIT" and out.mode != "INIT":
+                assert asked == "enable"
+                assert not was_enabled
+                assert level < Level.PROTECTIVE_STOP
+            if out.mode != "NORMAL":
+                assert out.reasons
+            if asked == "enable" and out.refusal is not None:
+                assert out.mode != "NORMAL"
+
+
+def test_no_word_of_the_fog_raises_the_cap():
+    fog = {
+        "map_loaded": [True, False],
+        "map_age": [0.0, 2.0, 9.0],
+        "map_gap": [0.0, 2.0],
+        "mission": [True, False],
+        "plan_age": [0.0, 2.0],
+        "released_left": [0.0, 99.0],
+        "path_problem": [None, "x"],
+        "inside_blocked": [None, "x"],
+        "caution": [None, "x"],
+    }
+    for values in itertools.product(*fog.values()):
+        for own, allowed in (({}, 0.30), ({"localization": "weak"}, 0.15), ({"turn_age": 9.0}, 0.0)):
+            gate = Gate().enabled()
+            assert gate.run(DT, **{**dict(zip(fog, values, strict=True)), **own}).cap <= allowed
+
+
+@given(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5))
+def test_a_ramp_ends_within_half_a_second_and_keeps_the_arc(left, right):
+    wheels = (left, right)
+    for _ in range(10):
+        after = ramp_down(wheels, DT, 0.5 / 0.5)
+        assert math.isclose(after[0] * wheels[1], after[1] * wheels[0], abs_tol=1e-9)
+        wheels = after
+    assert wheels == (0.0, 0.0)
+
+
+def test_wheels_that_are_no_numbers_become_a_stop():
+    gate = Gate().enabled()
+    out = gate.run()
+    wheels = (0.3, 0.3)
+    for _ in range(10):
+        wheels = limit_wheels((math.nan, 0.3), wheels, out, DT, acceleration=2.5, wheel_speed=0.5)
+    assert wheels == (0.0, 0.0)

@@ -1,0 +1,98 @@
+"""Ray casting: exact against a brute-force walk, inside and from outside the grid."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fog_kernels.raycast import cast
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+def walk(occupied: NDArray[np.bool_], x: float, y: float, angle: float, reach: float, step: float) -> float:
+    """First sampled distance (cells) inside an occupied cell."""
+    distances = np.arange(0.0, reach, step)
+    columns = np.floor(x + distances * math.cos(angle)).astype(int)
+    rows = np.floor(y + distances * math.sin(angle)).astype(int)
+    height, width = occupied.shape
+    inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+    hits = inside.copy()
+    hits[inside] = occupied[rows[inside], columns[inside]]
+    return float(distances[np.argmax(hits)]) if hits.any() else math.inf
+
+
+def box_distance(x: float, y: float, angle: float, column: int, row: int) -> float:
+    """Exact distance at which a ray enters one cell."""
+    dx, dy = math.cos(angle), math.sin(angle)
+    enter, leave = 0.0, math.inf
+    for start, direction, low in ((x, dx, column), (y, dy, row)):
+        if abs(direction) < 1e-300:
+            if not low <= start < low + 1:
+                return math.inf
+            continue
+        near, far = sorted(((low - start) / direction, (low + 1 - start) / direction))
+        enter, leave = max(enter, near), min(leave, far)
+    return enter if enter <= leave else math.inf
+
+
+@settings(max_examples=120, deadline=None)
+@given(
+    st.integers(0, 2**32 - 1),
+    st.integers(1, 14),
+    st.integers(1, 14),
+    st.floats(-6, 20),
+    st.floats(-6, 20),
+    st.floats(-10, 10),
+    st.sampled_from([0.02, 0.2, 0.6]),
+)
+def test_ranges_are_the_entry_into_the_first_occupied_cell(
+    seed: int, height: int, width: int, x: float, y: float, angle: float, density: float
+) -> None:
+    occupied = np.random.default_rng(seed).random((height, width)) < density
+    expected = min(
+        (box_distance(x, y, angle, int(column), int(row)) for row, column in np.argwhere(occupied)), default=math.inf
+    )
+    measured = cast(occupied, 1.0, 0.0, 0.0, x, y, [angle], 100.0)[0]
+    # A ray through a corner may pass on either side of it: compare with rays beside it, too.
+    beside = [
+        min((box_distance(x, y, angle + e, int(c), int(r)) for r, c in np.argwhere(occupied)), default=math.inf)
+        for e in (-1e-9, 1e-9)
+    ]
+    assert any(measured == pytest.approx(value, abs=1e-5) for value in [expected, *beside])
+
+
+def test_a_scan_equals_dense_sampling_in_metres_with_an_origin() -> None:
+    rng = np.random.default_rng(3)
+    occupied = rng.random((60, 80)) < 0.03
+    angles = np.linspace(-math.pi, math.pi, 181)
+    ranges = cast(occupied.view(np.uint8), 0.05, -1.0, 2.0, 0.983, 3.4817, angles, 2.5)
+    for angle, measured in zip(angles, ranges, strict=True):
+        sampled = 0.05 * walk(occupied, 1.983 / 0.05, 1.4817 / 0.05, angle, 50.0, 0.002)
+        if math.isinf(sampled) or math.isinf(measured):
+            assert min(sampled, measured) > 2.49 or measured == sampled
+        else:
+            assert sampled - 0.011 <= measured <= sampled + 1e-9
+
+
+def test_nothing_within_range_is_infinite_and_inside_a_wall_is_zero() -> None:
+    occupied = np.zeros((10, 10), bool)
+    occupied[5, 9] = True
+    assert cast(occupied, 0.1, 0.0, 0.0, 0.05, 0.55, [0.0], 2.0)[0] == pytest.approx(0.85)
+    assert cast(occupied, 0.1, 0.0, 0.0, 0.05, 0.55, [0.0], 0.8)[0] == math.inf
+    assert cast(occupied, 0.1, 0.0, 0.0, 0.05, 0.55, [math.pi], 2.0)[0] == math.inf
+    assert cast(occupied, 0.1, 0.0, 0.0, 0.95, 0.55, [1.0], 2.0)[0] == 0.0
+    assert cast(occupied, 0.1, 0.0, 0.0, 2.0, 0.55, [math.pi], 2.0)[0] == pytest.approx(1.0)
+
+
+def test_a_lost_pose_is_refused() -> None:
+    with pytest.raises(ValueError, match="finite"):
+        cast(np.zeros((2, 2), bool), 0.1, 0.0, 0.0, math.nan, 0.0, [0.0], 1.0)
+    with pytest.raises(TypeError, match="occupied"):
+        cast(np.zeros((2, 2), np.float64), 0.1, 0.0, 0.0, 0.0, 0.0, [0.0], 1.0)  # type: ignore[arg-type]  # tested

@@ -1,0 +1,87 @@
+"""Warm-up: a second process compiles nothing, and processes load only the kernels that they need."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from fog_kernels import warm
+
+RUN_ALL = """
+import numpy as np
+from fog_kernels import warm
+warm.warm()
+from fog_kernels import amcl, astar, distance, dwa, inflation, likelihood, raycast
+raw = np.zeros((60, 60), np.uint8)
+raw[0] = 254
+shut = raw.copy()
+shut.setflags(write=False)
+table = inflation.inflation_table(0.05, 0.17, 0.55, 3.0)
+for source in (raw, shut):
+    cost = inflation.inflate(source, table)
+    inflation.inflate_window(source, table, 3, 3, 4, 4, cost)
+    distance.squared_distance_capped(source, 5)
+    field = likelihood.likelihood_field(source == 254, 0.05)
+    planner = astar.Planner(60, 60)
+    planner.set_goal_field(cost, (50, 50))
+    cells = planner.plan(cost, (20, 20), (50, 50)).cells
+    planner.plan(cost, (np.int64(20), np.int32(20)), (40, 50), max_expansions=10)
+    planner.shortcut(cost, cells), planner.path_cost(cost, cells), planner.raises_only(cost)
+    planner.nearest_reachable(cost, (20, 20), (0, 0)), astar.nearest_traversable(cost, (0, 0), 20)
+    astar.line_cost(cost, 20, 20, 30, 30)
+    dwa.dwa(0, 0, 1, 1, np.float32(0), cost, 0.05, 0, 0, [(1, 1), (2, 1)], 2, 1)
+    ranges = raycast.cast(source, 0.05, 0, 0, 1, 1, [0, -1.5], 5)
+    state = amcl.rng_state(1)
+    x, y, theta = (np.ones(5, np.float32) for _ in range(3))
+    weights = np.full(5, 0.2)
+    amcl.motion_update(x, y, theta, 0, 1, 0, (1, 1, 1, 1), state)
+    amcl.measurement_update(x, y, theta, weights, field, 0.05, 0, 0, [0, 1], [1, 1])
+    amcl.score_poses(x, y, theta, field, 0.05, 0, 0, [0, 1], [1, 1])
+    amcl.estimate(*amcl.resample(x, y, theta, weights, 2, 5, 0.05, state))
+print(warm.cache_misses())
+"""
+
+
+def python(*arguments: str) -> str:
+    return subprocess.run(
+        [sys.executable, *arguments], check=True, capture_output=True, text=True, timeout=170
+    ).stdout.strip()
+
+
+def test_after_warming_a_process_that_calls_everything_compiles_nothing() -> None:
+    python("-m", "fog_kernels.warm")
+    assert python("-c", RUN_ALL) == "0"
+
+
+def test_misses_are_counted() -> None:
+    """The zero above means something: without a cache the same counter is not zero."""
+    code = (
+        "import tempfile, os; os.environ['NUMBA_CACHE_DIR'] = tempfile.mkdtemp()\n"
+        "from fog_kernels import warm, raycast\nprint(warm.cache_misses())"
+    )
+    assert int(python("-c", code)) >= 1
+
+
+@pytest.mark.parametrize(
+    ("module", "others"),
+    [
+        ("dwa", {"astar", "inflation", "amcl", "raycast", "likelihood", "distance"}),
+        ("amcl", {"astar", "inflation", "dwa", "raycast", "distance"}),
+        ("likelihood", {"astar", "inflation", "dwa", "raycast", "amcl"}),
+        ("astar", {"inflation", "dwa", "raycast", "amcl", "likelihood", "distance"}),
+    ],
+)
+def test_importing_one_module_loads_no_other_kernels(module: str, others: set[str]) -> None:
+    loaded = python("-c", f"import sys, fog_kernels.{module}\nprint(*sys.modules)").split()
+    assert not {f"fog_kernels.{other}" for other in others} & set(loaded)
+
+
+def test_the_robots_profile_has_no_planner() -> None:
+    code = "import sys; from fog_kernels import warm; warm.warm('fog-robot'); print(*sys.modules)"
+    loaded = python("-c", code).split()
+    assert "fog_kernels.dwa" in loaded
+    assert "fog_kernels.astar" not in loaded
+    with pytest.raises(ValueError, match="fog-robot"):
+        warm.warm("toaster")

@@ -1,0 +1,274 @@
+"""The whole system on one machine: real brokers, every process of fog and robot, and simulated hardware."""
+
+import asyncio
+import hashlib
+import os
+import secrets
+import shutil
+import sys
+import tempfile
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from types import TracebackType
+from typing import Final, Self
+
+from fognav import net, system
+from fognav.supervisor import Event, Program, Supervisor
+
+BROKER: Final = "mosquitto"
+REDIS: Final = "redis"
+ROUTER: Final = "zenoh-router"
+AGGREGATOR: Final = "hazard-aggregator"
+MAP_SERVICE: Final = "map-service"
+PLANNER: Final = "planner"
+SIMULATOR: Final = "simulator"
+WATCHER: Final = "robot-watcher"
+AGENT: Final = "robot-agent"
+
+SERVERS: Final = (BROKER, REDIS, ROUTER)
+SERVICES: Final = (AGGREGATOR, MAP_SERVICE, PLANNER)
+ROBOT: Final = (WATCHER, AGENT)
+ALL: Final = (*SERVERS, SIMULATOR, *SERVICES, *ROBOT)
+
+_SOCKET_PATH_LIMIT: Final = 80
+"""Unix socket paths end at 108 bytes; folders this long leave room for the file's name."""
+_KEY_BYTES: Final = 32
+
+Ready = Callable[[], Awaitable[str | None]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class StackConfig:
+    """What to run. `robot` is the id of the site's robot; `extra` are further FOGNAV_ settings for every process."""
+
+    site_dir: Path
+    robot: str
+    seed: int = 1
+    speed: float = 1.0
+    extra: Mapping[str, str] | None = None
+
+
+def _write_secret(path: Path, text: str) -> None:
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    with os.fdopen(descriptor, "w", encoding="utf-8") as file:
+        file.write(text)
+
+
+def _new_folder() -> Path:
+    folder = Path(tempfile.mkdtemp(prefix="fognav-"))
+    if len(str(folder)) > _SOCKET_PATH_LIMIT:
+        folder.rmdir()
+        folder = Path(tempfile.mkdtemp(prefix="fognav-", dir="/tmp"))  # mkdtemp makes it private
+    return folder
+
+
+async def _exists(path: Path) -> str | None:
+    there = await asyncio.to_thread(path.exists)
+    return None if there else f"{path} is not there yet"
+
+
+def _nothing() -> None:
+    pass
+
+
+class Stack:
+    """Every process of one demonstration, by name (`ALL`); leaving the context ends them and removes their files.
+
+    Ports, keys, tokens and files are this run's own, so that several stacks run side by side.
+    """
+
+    def __init__(self, config: StackConfig, on_event: Callable[[Event], None] = lambda _: None) -> None:
+        self.config = config
+        self.folder = _new_folder()
+        self.keep_files = False
+        self.token = secrets.token_urlsafe(24)
+        """Bearer token of an administrator of this run."""
+        self.operator_key = secrets.token_bytes(_KEY_BYTES)
+        taken: set[int] = set()
+        self.mqtt_port, self.redis_port, self.zenoh_port = (net.free_port(taken) for _ in range(3))
+        self.supervisor = Supervisor(on_event)
+        self._prepare()
+
+    @property
+    def zenoh_endpoint(self) -> str:
+        """Where the zenoh router listens."""
+        return f"tcp/{net.LOOPBACK}:{self.zenoh_port}"
+
+    @property
+    def mqtt_url(self) -> str:
+        """Where the MQTT broker listens."""
+        return f"mqtt://{net.LOOPBACK}:{self.mqtt_port}"
+
+    @property
+    def redis_url(self) -> str:
+        """Where Redis listens."""
+        return f"redis://{net.LOOPBACK}:{self.redis_port}/0"
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self.close()
+
+    async def start(self, timeout_s: float = 90.0) -> None:
+        """Start everything and wait until each process says that it is ready; raises `NotReadyError`."""
+        for name in SERVERS:
+            self.supervisor.start(name)
+        await self.supervisor.wait_ready(SERVERS, timeout_s)
+        for name in (SIMULATOR, *SERVICES):
+            self.supervisor.start(name)
+        # The simulator makes the robot's serial ports, so it comes before the robot.
+        await self.supervisor.wait_ready([SIMULATOR], timeout_s)
+        for name in ROBOT:
+            self.supervisor.start(name)
+        await self.supervisor.wait_ready([*SERVICES, WATCHER], timeout_s)
+
+    async def close(self) -> None:
+        """End every process and, unless `keep_files`, remove the run's folder."""
+        await self.supervisor.close()
+        if not self.keep_files:
+            shutil.rmtree(self.folder, ignore_errors=True)
+
+    def log(self, name: str) -> Path:
+        """Where a process logs."""
+        return self.folder / "logs" / f"{name}.log"
+
+    def port_file(self, name: str) -> Path:
+        """Where a process writes the port of its HTTP server."""
+        return self.folder / "ports" / name
+
+    def port(self, name: str) -> int | None:
+        """Port of a process's HTTP server, or None while it has none."""
+        return net.read_port(self.port_file(name))
+
+    def pids(self) -> dict[str, int]:
+        """Process ids of all that run."""
+        found = ((name, self.supervisor.pid(name)) for name in self.supervisor.names)
+        return {name: pid for name, pid in found if pid is not None}
+
+    def _prepare(self) -> None:
+        for name in ("logs", "ports", "data", "sim"):
+            (self.folder / name).mkdir(mode=0o700)
+        digest = hashlib.sha256(self.token.encode()).hexdigest()
+        tokens = f'[[tokens]]\nname = "demo"\nrole = "admin"\nsha256 = "{digest}"\n'
+        _write_secret(self.folder / "tokens.toml", tokens)
+        _write_secret(self.folder / "operator.key", self.operator_key.hex() + "\n")
+        self._add_servers()
+        self._add_python(SIMULATOR, "fognav_sim", {"RUN_DIR": str(self.folder / "sim")})
+        for name, module in zip(SERVICES, ("hazard_aggregator", "map_service", "planner"), strict=True):
+            self._add_python(name, module, {})
+        socket = self.folder / "guardian.sock"
+        wires = {
+            "ROBOT": self.config.robot,
+            "BASE_PORT": str(self.folder / "sim" / "roomba"),
+            "LIDAR_PORT": str(self.folder / "sim" / "lidar"),
+            "GUARDIAN_SOCKET": str(socket),
+        }
+        self._add_python(WATCHER, "robot_agent.watcher", wires, ready=partial(_exists, socket), rank=2)
+        self._add_python(AGENT, "robot_agent", wires, rank=2)
+
+    def _add_servers(self) -> None:
+        paths = {tool: system.find(tool) for tool in (system.MOSQUITTO, system.REDIS)}
+        if missing := [tool for tool, path in paths.items() if path is None]:
+            raise system.MissingToolsError(
+                f"missing: {' and '.join(t.name for t in missing)}. Install with: {system.how_to_get(missing)}"
+            )
+        data = self.folder / "data"
+        lines = [
+            f"listener {self.mqtt_port} {net.LOOPBACK}",
+            "allow_anonymous true",
+            "persistence false",
+            # A payload beyond every channel's limit must not even reach a subscriber's memory.
+            "message_size_limit 1048576",
+        ]
+        if os.geteuid() == 0:
+            lines.append("user root")  # else it becomes another user, who may not read this private folder
+        configuration = self.folder / "mosquitto.conf"
+        configuration.write_text("\n".join(lines) + "\n", "utf-8")
+        (data / REDIS).mkdir()
+        redis_options = {
+            "port": str(self.redis_port),
+            "bind": net.LOOPBACK,
+            "dir": str(data / REDIS),
+            "appendonly": "yes",
+            "appendfsync": "always",
+            "save": "",
+            "daemonize": "no",
+        }
+        redis_arguments = [part for key, value in redis_options.items() for part in (f"--{key}", value)]
+        mqtt, redis, zenoh = self.mqtt_port, self.redis_port, self.zenoh_port
+        self._add(
+            BROKER,
+            (str(paths[system.MOSQUITTO]), "-c", str(configuration)),
+            ready=partial(net.listens, mqtt),
+        )
+        self._add(
+            REDIS,
+            (str(paths[system.REDIS]), *redis_arguments),
+            ready=partial(net.listens, redis, b"PING\r\n", b"+PONG"),
+        )
+        router = (sys.executable, "-m", "fog_runtime.router", "--listen", self.zenoh_endpoint)
+        self._add(ROUTER, router, ready=partial(net.listens, zenoh))
+
+    def _add_python(
+        self,
+        name: str,
+        module: str,
+        own: Mapping[str, str],
+        *,
+        ready: Ready | None = None,
+        rank: int = 1,
+    ) -> None:
+        port_file = self.port_file(name)
+        data = self.folder / "data" / name
+        data.mkdir()
+        settings = {
+            "SITE_DIR": str(self.config.site_dir),
+            "SPEED": repr(self.config.speed),
+            "SEED": str(self.config.seed),
+            "MQTT_URL": self.mqtt_url,
+            "REDIS_URL": self.redis_url,
+            "ZENOH_CONNECT": self.zenoh_endpoint,
+            "PORT_FILE": str(port_file),
+            "DATA_DIR": str(data),
+            "TOKENS_FILE": str(self.folder / "tokens.toml"),
+            "OPERATOR_KEY_FILE": str(self.folder / "operator.key"),
+            **(self.config.extra or {}),
+            **own,
+        }
+        self._add(
+            name,
+            (sys.executable, "-m", module),
+            environment={f"FOGNAV_{key}": value for key, value in settings.items()},
+            ready=ready or partial(net.readiness, port_file),
+            before=partial(port_file.unlink, missing_ok=True),
+            rank=rank,
+        )
+
+    def _add(
+        self,
+        name: str,
+        arguments: tuple[str, ...],
+        *,
+        ready: Ready,
+        environment: Mapping[str, str] | None = None,
+        before: Callable[[], None] = _nothing,
+        rank: int = 0,
+    ) -> None:
+        # Settings of this shell must not leak into a run.
+        inherited = {key: value for key, value in os.environ.items() if not key.startswith("FOGNAV_")}
+        self.supervisor.add(
+            Program(
+                name=name,
+                arguments=arguments,
+                environment={**inherited, "PYTHONUNBUFFERED": "1", **(environment or {})},
+                log=self.log(name),
+                ready=ready,
+                before=before,
+                rank=rank,
+            )
+        )

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,9 @@ from fog_contracts.grid import GridGeometry, Window
 
 Point = tuple[float, float]
 Polygon = Sequence[Point]
+
+_COLLINEAR: Final = 1e-12
+"""Twice a triangle's area, relative to the square of its size, below which rounding decides about its sign."""
 
 
 class GeometryError(ValueError):
@@ -55,16 +59,22 @@ def normalized_polygon(points: Sequence[Sequence[float]]) -> list[Point]:
         ring.pop()
     if len(ring) < 3:
         raise GeometryError(f"a polygon needs at least three distinct vertices; this one has {len(ring)}")
-    area = signed_area(ring)
-    if abs(area) < 1e-9:
-        raise GeometryError("the polygon has no area: its vertices lie on one line")
     count = len(ring)
+    longest = max(math.dist(ring[0], vertex) for vertex in ring)
+    if all(abs(_cross(ring[0], ring[1], vertex)) <= _COLLINEAR * longest * longest for vertex in ring):
+        raise GeometryError("the polygon has no area: its vertices lie on one line")
     for i in range(count):
+        a, b, c = ring[i - 1], ring[i], ring[(i + 1) % count]
+        if _cross(a, b, c) == 0 and (a[0] - b[0]) * (c[0] - b[0]) + (a[1] - b[1]) * (c[1] - b[1]) > 0:
+            raise GeometryError(f"the polygon folds back on itself at {list(b)}")
         for j in range(i + 1, count):
             if j == i + 1 or (i == 0 and j == count - 1):
                 continue
             if segments_touch(ring[i], ring[i + 1], ring[j], ring[(j + 1) % count]):
                 raise GeometryError(f"the polygon crosses itself: side {i} meets side {j}")
+    area = signed_area(ring)
+    if abs(area) < 1e-9:
+        raise GeometryError(f"the polygon has next to no area ({abs(area):.1e} m2)")
     return ring if area > 0 else ring[::-1]
 
 

@@ -1,0 +1,162 @@
+"""A site's folder: `site.toml` with the map that it names, checked as a whole before anybody acts on it."""
+
+import re
+import tomllib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+
+from fog_contracts.costs import is_traversable
+from fog_contracts.geometry import GeometryError, normalized_polygon
+from fog_contracts.site import AreaSite, Place, Site
+from fog_runtime.maps import MapFileError, StaticMap, load_map
+
+SITE_FILE: Final = "site.toml"
+_BORDER: Final = 1e-6
+"""Metres by which a corner may lie off the map: what rounding does to a polygon drawn along its edge."""
+
+
+class SiteError(ValueError):
+    """A site that can't be used; the message names the file, the field and the remedy."""
+
+    def __init__(self, file: Path, field: str, problem: str, remedy: str) -> None:
+        super().__init__(f"{file}: {field}: {problem}. {remedy}")
+        self.file = file
+        self.field = field
+
+
+@dataclass(frozen=True)
+class LoadedSite:
+    """A site that was checked: what it says, its map, and the folder that it came from."""
+
+    site: Site
+    map: StaticMap
+    directory: Path
+
+
+def load_site(directory: Path) -> LoadedSite:
+    """Read and check a site's folder; raises `SiteError`.
+
+    Ids are unique and every id that is referred to exists; areas are simple polygons on the map (counter-clockwise in
+    the result), nodes lie on the map, places and starts on free cells of it.
+    """
+    file = directory / SITE_FILE
+    site = _read(file)
+    _check_ids(file, site)
+    try:
+        static = load_map(directory / site.map)
+    except MapFileError as error:
+        raise SiteError(file, "map", str(error), f"`map` is {site.map!r}, relative to {directory}") from error
+    areas = [_checked_area(file, area, f"areas[{n}]", static) for n, area in enumerate(site.areas)]
+    for index, node in enumerate(site.nodes):
+        _check_on_map(file, f"nodes[{index}] ({node.id})", node.x, node.y, static)
+    for name, place in site.places.items():
+        _check_free(file, f"places.{name}", place.x, place.y, static)
+    for index, robot in enumerate(site.robots):
+        _check_free(file, f"robots[{index}].start ({robot.id})", robot.start.x, robot.start.y, static)
+    return LoadedSite(msgspec.structs.replace(site, areas=areas), static, directory)
+
+
+def _read(file: Path) -> Site:
+    try:
+        data = tomllib.loads(file.read_text("utf-8"))
+    except OSError as error:
+        remedy = "A site is a folder with site.toml and its map; check the path"
+        raise SiteError(file, "file", f"can't be read ({error.strerror})", remedy) from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise SiteError(file, "file", f"is no valid TOML ({error})", "Correct the place it names") from error
+    try:
+        site = msgspec.convert(data, Site)
+    except msgspec.ValidationError as error:
+        problem, _, path = str(error).partition(" - at ")
+        path = path.replace("places[...]", f"places.{_bad_place(data)}")
+        missing = re.search(r"required field `(\w+)`", problem)
+        remedy = f"Add `{missing[1]}`" if missing else "Correct the value"
+        raise SiteError(file, path.strip("`").removeprefix("$").lstrip(".") or "file", problem, remedy) from error
+    if unknown := _unknown_key(data, msgspec.to_builtins(site), ""):
+        raise SiteError(file, unknown, "is no field that a site knows", "Correct its spelling or remove it")
+    return site
+
+
+def _bad_place(data: dict[str, Any]) -> str:
+    """Return the name of the place that can't be decoded: the decoder's own message leaves keys of tables out."""
+    for name, place in data["places"].items():
+        try:
+            msgspec.convert(place, Place)
+        except msgspec.ValidationError:
+            return str(name)
+    return "(a name)"
+
+
+def _unknown_key(given: object, known: object, path: str) -> str | None:
+    """Return the path of the first key that decoding ignored: a misspelt optional field would be lost in silence."""
+    if isinstance(given, dict) and isinstance(known, dict):
+        for key, value in given.items():
+            here = f"{path}.{key}" if path else key
+            if key not in known:
+                return here
+            if found := _unknown_key(value, known[key], here):
+                return found
+    elif isinstance(given, list) and isinstance(known, list | tuple):
+        for index, (value, other) in enumerate(zip(given, known, strict=True)):
+            if found := _unknown_key(value, other, f"{path}[{index}]"):
+                return found
+    return None
+
+
+def _check_unique(file: Path, field: str, names: Iterable[object]) -> None:
+    seen = set()
+    for name in names:
+        if name in seen:
+            raise SiteError(file, field, f"{name!r} stands there twice", "Give each its own")
+        seen.add(name)
+
+
+def _check_known(file: Path, field: str, name: str, known: Iterable[str]) -> None:
+    names = sorted(known)
+    if name not in names:
+        raise SiteError(file, field, f"there is no {name!r}", f"Use one of: {', '.join(names) or '(none defined)'}")
+
+
+def _check_ids(file: Path, site: Site) -> None:
+    _check_unique(file, "areas.id", (area.id for area in site.areas))
+    _check_unique(file, "areas.number", (area.number for area in site.areas if area.number is not None))
+    _check_unique(file, "nodes.id", (node.id for node in site.nodes))
+    _check_unique(file, "robots.id", (robot.id for robot in site.robots))
+    areas = [area.id for area in site.areas]
+    for index, node in enumerate(site.nodes):
+        _check_known(file, f"nodes[{index}].area", node.area, areas)
+    if site.demo:
+        _check_known(file, "demo.start", site.demo.start, site.places)
+        _check_known(file, "demo.goal", site.demo.goal, site.places)
+        for index, area in enumerate(site.demo.areas):
+            _check_known(file, f"demo.areas[{index}]", area, areas)
+
+
+def _checked_area(file: Path, area: AreaSite, field: str, static: StaticMap) -> AreaSite:
+    try:
+        ring = normalized_polygon(area.polygon)
+    except GeometryError as error:
+        raise SiteError(file, f"{field}.polygon ({area.id})", str(error), "Correct the vertices") from error
+    for index, (x, y) in enumerate(ring):
+        _check_on_map(file, f"{field}.polygon ({area.id}), corner {index}", x, y, static)
+    return msgspec.structs.replace(area, polygon=ring)
+
+
+def _check_on_map(file: Path, field: str, x: float, y: float, static: StaticMap) -> None:
+    left, bottom, right, top = static.geometry.bounds
+    if not (left - _BORDER <= x <= right + _BORDER and bottom - _BORDER <= y <= top + _BORDER):
+        extent = f"x {left:g} to {right:g}, y {bottom:g} to {top:g}"
+        raise SiteError(file, field, f"({x:g}, {y:g}) lies off the map ({extent})", "Move it onto the map")
+
+
+def _check_free(file: Path, field: str, x: float, y: float, static: StaticMap) -> None:
+    _check_on_map(file, field, x, y, static)
+    column, row = static.geometry.cell(x, y)
+    free = static.geometry.contains_cell(column, row) and is_traversable(int(static.cells[row, column]))
+    if not free:
+        problem = f"({x:g}, {y:g}) lies on a cell of the map that is occupied or unknown"
+        raise SiteError(file, field, problem, "Move it to where the floor is free")

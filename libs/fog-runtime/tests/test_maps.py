@@ -1,0 +1,212 @@
+import json
+import math
+import re
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from PIL import Image
+
+from fog_contracts.grid import GridGeometry
+from fog_runtime.maps import MapFileError, StaticMap, load_map, load_occupancy, save_map
+
+KEYS = {
+    "image": "m.png", "resolution": 0.05, "origin": "[1.0, -2.0, 0.0]", "negate": 0,
+    "occupied_thresh": 0.65, "free_thresh": 0.196,
+}  # fmt: skip
+
+
+def write(folder, pixels, name="m.png", **keys):
+    """Write a map whose top row of pixels is the first."""
+    Image.fromarray(np.array(pixels, dtype=np.uint8)).save(folder / name)
+    return describe(folder, image=name, **keys)
+
+
+def describe(folder, **keys):
+    path = folder / "m.yaml"
+    lines = [f"{key}: {value}" for key, value in {**KEYS, **keys}.items() if value is not None]
+    path.write_text("\n".join(lines))
+    return path
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("image", ["testmap.png", "testmap.bmp"])
+def test_map_servers_own_map_gives_its_expected_cells(maps_dir, tmp_path, image):
+    expected = json.loads((maps_dir / "map_server" / "expected_cells.json").read_text())["testmap"]
+    text = (maps_dir / "map_server" / "testmap.yaml").read_text()
+    path = tmp_path / "testmap.yaml"
+    path.write_text(text.replace("image: testmap.png", f"image: {maps_dir / 'map_server' / image}"))
+    occupancy = load_occupancy(path)
+    assert occupancy.geometry == GridGeometry(expected["width"], expected["height"], 0.1, 2.0, 3.0)
+    assert occupancy.yaw == 1.0
+    assert occupancy.values.ravel().tolist() == expected["data"]
+    turned = load_map(path)
+    row, column = np.nonzero(occupancy.values == 100)
+    for x, y in zip((column + 0.5) * 0.1, (row + 0.5) * 0.1, strict=True):
+        there = turned.geometry.cell(
+            2.0 + x * math.cos(1.0) - y * math.sin(1.0), 3.0 + x * math.sin(1.0) + y * math.cos(1.0)
+        )
+        assert turned.cells[there[1], there[0]] == 254
+
+
+@pytest.mark.data
+def test_every_recorded_map_loads_with_floor_and_walls(maps_dir):
+    files = [path for path in sorted(maps_dir.glob("*/*.yaml")) if "image:" in path.read_text()]
+    assert len(files) >= 11
+    for path in files:
+        static = load_map(path)
+        assert static.cells.shape == static.geometry.shape, path
+        counts = [(static.cells == value).mean() for value in (0, 254, 255)]
+        assert sum(counts) == pytest.approx(1.0), path
+        assert counts[0] > 0.02, path
+        assert counts[1] > 0.0005, path
+
+
+@pytest.mark.data
+def test_depots_grey_is_free_under_its_own_threshold(maps_dir):
+    with Image.open(maps_dir / "nav2" / "depot.pgm") as image:
+        grey = np.asarray(image)[::-1] == 205
+    assert grey.any()
+    assert (load_map(maps_dir / "nav2" / "depot.yaml").cells[grey] == 0).all()
+
+
+def test_first_row_of_cells_is_the_bottom_of_the_image(tmp_path):
+    static = load_map(write(tmp_path, [[0, 255, 255], [205, 205, 0]]))
+    assert static.cells.tolist() == [[255, 255, 254], [254, 0, 0]]
+    assert static.geometry == GridGeometry(3, 2, 0.05, 1.0, -2.0)
+
+
+def test_negated_map_is_free_where_it_is_dark(tmp_path):
+    assert load_map(write(tmp_path, [[0, 255, 128]], negate=1)).cells.tolist() == [[0, 254, 255]]
+
+
+@pytest.mark.parametrize("name", ["m.png", "m.pgm", "m.bmp"])
+def test_image_formats_agree(tmp_path, name):
+    assert load_map(write(tmp_path, [[0, 205, 254]], name)).cells.tolist() == [[254, 255, 0]]
+
+
+def test_ascii_pgm_with_comment_and_small_maximum(tmp_path):
+    (tmp_path / "m.pgm").write_text("P2\n# drawn by hand\n3 1\n15\n0 15 12\n")
+    assert load_map(describe(tmp_path, image="m.pgm")).cells.tolist() == [[254, 0, 255]]
+
+
+def test_colour_palette_and_16_bit_images(tmp_path):
+    assert load_map(write(tmp_path, [[[0, 0, 0], [255, 255, 255], [255, 0, 0]]])).cells.tolist() == [[254, 0, 254]]
+    Image.fromarray(np.array([[0, 255, 205]], dtype=np.uint8)).convert("P").save(tmp_path / "p.png")
+    assert load_map(describe(tmp_path, image="p.png")).cells.tolist() == [[254, 0, 255]]
+    Image.fromarray(np.array([[0, 65535, 52685]], dtype=np.uint16)).save(tmp_path / "d.png")
+    assert load_map(describe(tmp_path, image="d.png")).cells.tolist() == [[254, 0, 255]]
+
+
+def test_alpha_counts_as_one_of_four_channels_in_trinary_mode(tmp_path):
+    # Opaque black: shade 1/4; transparent white: 3/4; transparent black: 0; opaque white: 1.
+    pixels = [[[0, 255], [255, 0], [0, 0], [255, 255]]]
+    assert load_occupancy(write(tmp_path, pixels)).values.tolist() == [[100, -1, 100, 0]]
+    rgba = [[[v, v, v, a] for v, a in pixels[0]]]
+    assert load_occupancy(write(tmp_path, rgba)).values.tolist() == [[100, -1, 100, 0]]
+
+
+def test_scale_mode_grades_between_the_thresholds_and_transparent_is_unknown(tmp_path):
+    path = write(tmp_path, [[0, 255, 128]], mode_=None, mode=None)
+    path = describe(tmp_path, mode="scale", occupied_thresh=0.9, free_thresh=0.1)
+    assert load_occupancy(path).values.tolist() == [[100, 0, 50]]
+    assert load_map(path).cells.tolist() == [[254, 0, 255]]
+    Image.fromarray(np.array([[[0, 255], [255, 254]]], dtype=np.uint8)).save(tmp_path / "m.png")
+    assert load_occupancy(path).values.tolist() == [[100, -1]]
+
+
+def test_raw_mode_takes_pixels_as_percent(tmp_path):
+    write(tmp_path, [[0, 100, 101, 255, 50, 70, 10]])
+    path = describe(tmp_path, mode="raw")
+    assert load_occupancy(path).values.tolist() == [[0, 100, -1, -1, 50, 70, 10]]
+    assert load_map(path).cells.tolist() == [[0, 254, 255, 255, 255, 254, 0]]
+
+
+@pytest.mark.parametrize(
+    ("keys", "words"),
+    [
+        ({"image": "gone.png"}, ["image", "gone.png", "does not exist"]),
+        ({"image": None}, ["image: missing"]),
+        ({"resolution": 0}, ["resolution", "0 is no number"]),
+        ({"resolution": None}, ["resolution: missing"]),
+        ({"resolution": ".nan"}, ["resolution", "nan"]),
+        ({"origin": "[0, 0]"}, ["origin", "[x, y, yaw]"]),
+        ({"origin": "[0, 0, .inf]"}, ["origin"]),
+        ({"negate": 2}, ["negate", "neither 0 nor 1"]),
+        ({"occupied_thresh": 1.5}, ["occupied_thresh"]),
+        ({"free_thresh": 0.7}, ["free_thresh", "not below"]),
+        ({"mode": "quaternary"}, ["mode", "trinary, scale, raw"]),
+        ({"origin": "[1, 2"}, ["YAML"]),
+    ],
+)
+def test_error_names_file_key_and_what_is_wrong(tmp_path, keys, words):
+    write(tmp_path, [[0]])
+    path = describe(tmp_path, **keys)
+    with pytest.raises(MapFileError) as refused:
+        load_map(path)
+    assert all(word in str(refused.value) for word in [str(path), *words]), refused.value
+
+
+def test_missing_file_and_broken_image_are_refused(tmp_path):
+    with pytest.raises(MapFileError, match="can't be read"):
+        load_map(tmp_path / "none.yaml")
+    (tmp_path / "m.png").write_bytes(b"\x89PNG but not really")
+    with pytest.raises(MapFileError, match=re.escape("m.png can't be decoded")):
+        load_map(describe(tmp_path))
+    write(tmp_path, [[0, 255]] * 50)
+    whole = (tmp_path / "m.png").read_bytes()
+    (tmp_path / "m.png").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(MapFileError, match="can't be decoded"):
+        load_map(describe(tmp_path))
+
+
+cell_grids = hnp.arrays(
+    np.uint8, hnp.array_shapes(min_dims=2, max_dims=2, max_side=12), elements=st.sampled_from([0, 254, 255])
+)
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=50)
+@given(cells=cell_grids, x=st.floats(-1e3, 1e3), y=st.floats(-1e3, 1e3))
+def test_saved_map_reads_back_the_same(tmp_path, cells, x, y):
+    static = StaticMap(GridGeometry(cells.shape[1], cells.shape[0], 0.05, x, y), cells)
+    save_map(tmp_path / "saved", static)
+    again = load_map(tmp_path / "saved.yaml")
+    assert again.geometry == static.geometry
+    assert np.array_equal(again.cells, cells)
+
+
+def saved_with_yaw(folder, cells, yaw):
+    save_map(folder / "t", StaticMap(GridGeometry(cells.shape[1], cells.shape[0], 0.1, 5.0, 7.0), cells))
+    path = folder / "t.yaml"
+    path.write_text(path.read_text().replace(", 0.0]", f", {yaw!r}]"))
+    return path
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=30)
+@given(cells=cell_grids, turns=st.integers(-4, 4))
+def test_quarter_turns_move_cells_and_change_none(tmp_path, cells, turns):
+    turned = load_map(saved_with_yaw(tmp_path, cells, turns * math.pi / 2))
+    # numpy turns towards the first axis, which points up here: the other way round.
+    assert np.array_equal(turned.cells, np.rot90(cells, -turns))
+    left = {0: 0.0, 1: -0.1 * cells.shape[0], 2: -0.1 * cells.shape[1], 3: 0.0}[turns % 4]
+    assert turned.geometry.origin_x == pytest.approx(5.0 + left)
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=50)
+@given(cells=cell_grids, yaw=st.floats(-7, 7))
+def test_turning_loses_no_obstacle_and_invents_no_floor(tmp_path, cells, yaw):
+    turned = load_map(saved_with_yaw(tmp_path, cells, yaw))
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    for row, column in zip(*np.nonzero(cells == 254), strict=True):
+        x, y = 0.1 * (column + 0.5), 0.1 * (row + 0.5)
+        c, r = turned.geometry.cell(5.0 + x * cos - y * sin, 7.0 + x * sin + y * cos)
+        near = turned.cells[max(r - 1, 0) : r + 2, max(c - 1, 0) : c + 2]
+        assert (near == 254).any()
+    for row, column in zip(*np.nonzero(turned.cells == 0), strict=True):
+        x, y = turned.geometry.centre(column, row)
+        x, y = x - 5.0, y - 7.0
+        c, r = round((x * cos + y * sin) / 0.1 - 0.5), round((-x * sin + y * cos) / 0.1 - 0.5)
+        near = cells[max(r - 1, 0) : r + 2, max(c - 1, 0) : c + 2]
+        assert (near == 0).any()

@@ -1,0 +1,99 @@
+import numpy as np
+import pytest
+
+from fog_contracts.grid import GridGeometry
+from fog_runtime.maps import StaticMap, save_map
+from fog_runtime.site import SiteError, load_site
+
+SITE = """
+id = "lab"
+name = "A small lab"
+
+[places.door]
+x = 1.0
+y = 1.0
+
+[places.desk]
+x = 3.0
+y = 1.0
+theta = 1.5
+
+[[areas]]
+id = "a1"
+number = 1
+polygon = [[1.5, 1.5], [1.5, 0.5], [2.5, 0.5], [2.5, 1.5]]
+
+[[nodes]]
+id = "n1"
+area = "a1"
+x = 2.0
+y = 1.95
+theta = -1.57
+sonars = [{ range_limit = 1.5 }, { angle = 0.2, range_limit = 1.5, no_echo_is_clear = true }]
+
+[[robots]]
+id = "r1"
+start = { x = 0.5, y = 0.5, theta = 0 }
+
+[demo]
+start = "door"
+goal = "desk"
+areas = ["a1"]
+"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    cells = np.zeros((20, 40), dtype=np.uint8)
+    cells[-1, :] = 254
+    cells[:, -1] = 255
+    save_map(tmp_path / "map", StaticMap(GridGeometry(40, 20, 0.1, 0.0, 0.0), cells))
+    (tmp_path / "site.toml").write_text(SITE)
+    return tmp_path
+
+
+def test_site_loads_with_its_map_and_counter_clockwise_areas(folder):
+    loaded = load_site(folder)
+    assert loaded.directory == folder
+    assert loaded.map.geometry.bounds == (0.0, 0.0, 4.0, 2.0)
+    assert loaded.site.areas[0].polygon == [(2.5, 1.5), (2.5, 0.5), (1.5, 0.5), (1.5, 1.5)][::-1]
+    assert loaded.site.definitions()[0].nodes == ["n1"]
+    assert loaded.site.nodes[0].sonars[1].no_echo_is_clear
+    assert loaded.site.robots[0].start.x == 0.5
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "field", "words"),
+    [
+        ('id = "lab"', 'id = "The Lab"', "id", "a-z0-9"),
+        ("x = 1.0\n", "", "places.door", "`x`"),
+        ("x = 1.0\n", "x = 9.0\n", "places.door", "off the map"),
+        ("x = 1.0\n", "x = 3.95\n", "places.door", "occupied or unknown"),
+        ("x = 0.5, y = 0.5", "x = 0.5, y = 1.95", "robots[0].start (r1)", "occupied"),
+        ('area = "a1"', 'area = "a2"', "nodes[0].area", "one of: a1"),
+        ("y = 1.95", "y = 2.95", "nodes[0] (n1)", "off the map"),
+        ("[2.5, 0.5]", "[2.5, -0.5]", "areas[0].polygon (a1), corner", "off the map"),
+        ("[2.5, 0.5], [2.5, 1.5]", "[2.5, 1.5], [2.5, 0.5]", "areas[0].polygon (a1)", "crosses itself"),
+        ("number = 1", "nummber = 1", "areas[0].nummber", "spelling"),
+        ("angle = 0.2", "angel = 0.2", "nodes[0].sonars[1].angel", "spelling"),
+        ('goal = "desk"', 'goal = "roof"', "demo.goal", "one of: desk, door"),
+        ('areas = ["a1"]', 'areas = ["a7"]', "demo.areas[0]", "one of: a1"),
+        ("[demo]", '[[robots]]\nid = "r1"\nstart = { x = 1, y = 1, theta = 0 }\n[demo]', "robots.id", "twice"),
+        ('name = "A small lab"', 'map = "none.yaml"', "map", "none.yaml"),
+        ('name = "A small lab"', "name = A small lab", "file", "TOML"),
+        ("range_limit = 1.5 }, {", "range_limit = 9 }, {", "nodes[0].sonars[0].range_limit", "4.0"),
+    ],
+)
+def test_error_names_file_field_and_remedy(folder, old, new, field, words):
+    assert SITE.count(old) >= 1
+    (folder / "site.toml").write_text(SITE.replace(old, new, 1))
+    with pytest.raises(SiteError) as refused:
+        load_site(folder)
+    text = str(refused.value)
+    assert text.startswith(f"{folder / 'site.toml'}: {field}"), text
+    assert words in text, text
+
+
+def test_missing_folder_is_refused_with_a_remedy(tmp_path):
+    with pytest.raises(SiteError, match="check the path"):
+        load_site(tmp_path / "nowhere")

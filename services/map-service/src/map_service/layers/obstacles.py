@@ -1,0 +1,129 @@
+"""What robots' lidars see and the map doesn't know, until it has not been seen for a while.
+
+A point becomes a small lethal disc. Points under or beside a robot are that robot and are left out: a robot must never
+shut another one in by having looked at it.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fog_contracts.costs import LETHAL
+from fog_contracts.grid import Window
+from fog_contracts.messages import Cause
+from map_service.layers.protocol import Figure, Touch, paint_figure
+
+if TYPE_CHECKING:
+    from typing import Final
+
+    from fog_contracts.grid import GridGeometry
+    from fog_contracts.messages import RobotObstacles, RobotPose
+    from map_service.layers.protocol import Grid
+
+DISC_RADIUS: Final = 0.05
+"""Radius (m) of the disc that a point becomes."""
+ROBOT_MARGIN: Final = 0.22
+"""How far (m) around a robot's rim points count as the robot: its inscribed radius and what localization may be off."""
+POSE_FRESH_S: Final = 1.0
+MAX_CELLS: Final = 20_000
+"""How many cells may be held; a broken lidar must not fill the memory."""
+_PATCH: Final = 64
+
+
+class ObstaclesLayer:
+    """Holds cells that were seen, each with the time until which it counts."""
+
+    def __init__(self, geometry: GridGeometry) -> None:
+        self._geometry = geometry
+        self._until: dict[tuple[int, int], float] = {}
+        self._next_end = float("inf")
+        self._poses: dict[str, tuple[float, RobotPose]] = {}
+        reach = round(DISC_RADIUS / geometry.resolution)
+        span = range(-reach, reach + 1)
+        self._disc = [(dx, dy) for dy in span for dx in span if dx * dx + dy * dy <= reach * reach]
+        self._reach = reach
+        # How many discs cover a cell: with overlapping discs, a cell is free again only when the last one is gone.
+        self._cover = np.zeros(geometry.shape, dtype=np.int16)
+        self._touched: list[Touch] = []
+        self.refused = 0
+
+    def see(self, robot: str, seen: RobotObstacles, now: float) -> None:
+        """Take what a robot sees."""
+        robots = [pose for at, pose in self._poses.values() if now - at <= POSE_FRESH_S]
+        end = now + seen.ttl
+        added: list[tuple[int, int]] = []
+        for x, y in seen.points:
+            cell = self._geometry.cell(x, y)
+            if not self._geometry.contains_cell(*cell):
+                continue
+            if cell in self._until:
+                self._until[cell] = max(self._until[cell], end)
+                continue
+            if any(_beside(pose, x, y) for pose in robots):
+                continue
+            if len(self._until) >= MAX_CELLS:
+                self.refused += 1
+                continue
+            self._until[cell] = end
+            added.append(cell)
+        self._next_end = min(self._next_end, end)
+        self._change(added, 1, Cause(kind="obstacle", id=robot, state="seen"))
+
+    def robot_at(self, robot: str, pose: RobotPose, now: float) -> None:
+        """Take where a robot is: what was seen there was the robot."""
+        self._poses[robot] = (now, pose)
+        if not self._until:
+            return
+        reach = pose.radius + ROBOT_MARGIN
+        window = self._geometry.window_around(pose.x - reach, pose.y - reach, pose.x + reach, pose.y + reach)
+        if window.empty or not self._cover[window.rows, window.columns].any():
+            return
+        cells = [
+            (column, row)
+            for row in range(window.y, window.y + window.height)
+            for column in range(window.x, window.x + window.width)
+            if (column, row) in self._until and _beside(pose, *self._geometry.centre(column, row))
+        ]
+        self._drop(cells, Cause(kind="obstacle", id=robot, state="robot"))
+
+    def tick(self, now: float, stamp: float) -> None:  # noqa: ARG002  # the protocol's
+        """Forget what has not been seen for its time."""
+        if now < self._next_end:
+            return
+        over = [cell for cell, end in self._until.items() if end <= now]
+        self._drop(over, Cause(kind="obstacle", id="lidar", state="gone"))
+        self._next_end = min(self._until.values(), default=float("inf"))
+
+    def touched(self) -> list[Touch]:
+        """Return the windows around cells that came or went."""
+        touched, self._touched = self._touched, []
+        return touched
+
+    def paint(self, window: Window, cost: Grid, speed: Grid) -> None:  # noqa: ARG002  # the protocol's
+        """Write the discs; they set no speed limit."""
+        mask = self._cover[window.rows, window.columns] > 0
+        if mask.any():
+            paint_figure(Figure(window, mask), window, cost, LETHAL)
+
+    def _drop(self, cells: list[tuple[int, int]], cause: Cause) -> None:
+        for cell in cells:
+            del self._until[cell]
+        self._change(cells, -1, cause)
+
+    def _change(self, cells: list[tuple[int, int]], step: int, cause: Cause) -> None:
+        patches: dict[tuple[int, int], Window] = {}
+        for column, row in cells:
+            for dx, dy in self._disc:
+                if self._geometry.contains_cell(column + dx, row + dy):
+                    self._cover[row + dy, column + dx] += np.int16(step)
+            window = Window(column, row, 1, 1).grown(self._reach)
+            key = (column // _PATCH, row // _PATCH)
+            patches[key] = patches[key].union(window) if key in patches else window
+        self._touched += [Touch(self._geometry.clip(window), cause) for window in patches.values()]
+
+
+def _beside(pose: RobotPose, x: float, y: float) -> bool:
+    reach = pose.radius + ROBOT_MARGIN
+    return (x - pose.x) ** 2 + (y - pose.y) ** 2 <= reach * reach

@@ -1,0 +1,422 @@
+"""What the master costmap is: the layers' rules, versions that replicas can follow, and never a stale cell."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fog_contracts.costs import INSCRIBED, LETHAL, UNKNOWN
+from fog_contracts.grid import GridGeometry, Window
+from fog_contracts.messages import (
+    AreaDefinition,
+    AreaHazard,
+    CircleShape,
+    CorridorShape,
+    MapDelta,
+    PolygonShape,
+    RectangleShape,
+    RobotObstacles,
+    RobotPose,
+    Trace,
+    Zone,
+)
+from fog_contracts.replica import Applied, Replica
+from map_service.core import MapCore, merged
+from map_service.layers.zones import penalty_cost
+from map_service.shapes import ZoneError, checked_zone, rasterize_shape
+
+
+@dataclass
+class Plan:
+    geometry: GridGeometry
+    cells: np.ndarray
+
+
+def floor(width: int = 80, height: int = 60, *, origin: tuple[float, float] = (-1.0, -0.5)) -> Plan:
+    """A floor of 5 cm cells: free inside, a wall around it, a corner nobody knows."""
+    cells = np.zeros((height, width), dtype=np.uint8)
+    cells[[0, -1], :] = 254
+    cells[:, [0, -1]] = 254
+    cells[-8:, -8:] = 255
+    return Plan(GridGeometry(width, height, 0.05, *origin), cells)
+
+
+def core(plan: Plan | None = None) -> MapCore:
+    return MapCore("test", plan or floor(), 3)
+
+
+def definition(name: str = "hall", x: float = 0.5, y: float = 0.5, size: float = 0.5, **fields) -> AreaDefinition:
+    ring = [(x, y), (x + size, y), (x + size, y + size), (x, y + size)]
+    return AreaDefinition(id=name, polygon=ring, **fields)
+
+
+def hazard(state: str, seq: int = 1, *, area: str = "hall", epoch: int = 1, penalty: int | None = None) -> AreaHazard:
+    cost = {"blocked": 254, "unknown": 200, "clear": 0}[state] if penalty is None else penalty
+    trace = Trace(area=area, epoch=epoch, seq=seq, first_reading=1.0, confirmed=2.0) if state == "blocked" else None
+    return AreaHazard(
+        area=area, state=state, severity=0, penalty=cost, since=0.0, seq=seq, epoch=epoch, cause="test", trace=trace
+    )
+
+
+def at(map_core: MapCore, x: float, y: float) -> tuple[int, int]:
+    column, row = map_core.geometry.cell(x, y)
+    return int(map_core.cost[row, column]), int(map_core.speed[row, column])
+
+
+def zone(name: str = "z1", kind: str = "BLOCKED", **fields) -> Zone:
+    shape = fields.pop("shape", None) or CircleShape(centre=(1.0, 1.0), radius=0.3)
+    return Zone(id=name, kind=kind, shape=shape, **fields)
+
+
+def pose(x: float, y: float) -> RobotPose:
+    return RobotPose(x=x, y=y, theta=0.0, covariance=[0.0] * 9, v=0.0, w=0.0, radius=0.17, height=0.35, stamp=0.0)
+
+
+def seen(*points: tuple[float, float], ttl: float = 5.0) -> RobotObstacles:
+    return RobotObstacles(points=list(points), stamp=0.0, ttl=ttl)
+
+
+# --- Hazards --------------------------------------------------------------------------------------------------------
+
+
+def test_a_defined_area_counts_as_unknown_until_the_aggregator_speaks():
+    m = core()
+    change = m.on_definition(definition(), 0.0)
+    assert at(m, 0.75, 0.75) == (200, 15)
+    assert change.hazards[0].hazard.state == "unknown"
+    m.on_hazard(hazard("clear"), 0.0)
+    assert at(m, 0.75, 0.75) == (0, 0)
+
+
+def test_a_blocked_area_is_lethal_inflated_and_traced():
+    m = core()
+    m.on_definition(definition(), 0.0)
+    m.on_hazard(hazard("clear", 1), 1.0)
+    change = m.on_hazard(hazard("blocked", 2), 7.5)
+    assert at(m, 0.75, 0.75)[0] == LETHAL
+    assert at(m, 0.5 - 0.12, 0.75)[0] == INSCRIBED
+    assert 0 < at(m, 0.5 - 0.3, 0.75)[0] < INSCRIBED
+    (delta,) = [d for d in change.deltas if d.layer == "cost"]
+    assert [(c.kind, c.id, c.state) for c in delta.causes] == [("hazard", "hall", "blocked")]
+    assert delta.traces[0].costmap_published == 7.5
+    assert delta.traces[0].confirmed == 2.0
+    assert change.hazards[0].polygon == definition().polygon
+
+
+def test_an_unknown_area_is_graded_not_inflated_and_slow():
+    m = core()
+    m.on_definition(definition(), 0.0)
+    m.on_hazard(hazard("unknown"), 0.0)
+    assert at(m, 0.75, 0.75) == (200, 15)
+    assert at(m, 0.5 - 0.12, 0.75) == (0, 0)
+
+
+def test_an_unknown_area_that_was_blocked_stays_lethal_and_becomes_slow():
+    m = core()
+    m.on_definition(definition(), 0.0)
+    m.on_hazard(hazard("unknown", penalty=254), 0.0)
+    assert at(m, 0.75, 0.75) == (254, 15)
+
+
+def test_overtaken_hazards_are_ignored_and_a_new_epoch_counts():
+    m = core()
+    m.on_definition(definition(), 0.0)
+    m.on_hazard(hazard("blocked", 5), 0.0)
+    for late in (hazard("clear", 5), hazard("clear", 4), hazard("clear", 9, epoch=0)):
+        assert m.on_hazard(late, 0.0).deltas == []
+        assert at(m, 0.75, 0.75)[0] == LETHAL
+    m.on_hazard(hazard("clear", 1, epoch=2), 0.0)
+    assert at(m, 0.75, 0.75)[0] == 0
+    m.on_hazard(hazard("blocked", 1, epoch=1), 0.0)
+    assert at(m, 0.75, 0.75)[0] == LETHAL, "an old epoch may still raise the cost"
+
+
+def test_a_hazard_before_its_definition_waits_for_it():
+    m = core()
+    assert m.on_hazard(hazard("blocked"), 0.0).hazards == []
+    m.on_definition(definition(), 0.0)
+    assert at(m, 0.75, 0.75)[0] == LETHAL
+
+
+def test_an_area_that_moves_or_goes_leaves_nothing_behind():
+    m = core()
+    plain = m.cost.copy()
+    m.on_definition(definition(version=1), 0.0)
+    m.on_hazard(hazard("blocked"), 0.0)
+    m.on_definition(definition(x=1.5, version=2), 0.0)
+    assert at(m, 0.75, 0.75)[0] == 0
+    assert at(m, 1.75, 0.75)[0] == LETHAL
+    m.on_definition(definition(version=1), 0.0)
+    assert at(m, 1.75, 0.75)[0] == LETHAL, "an older version must not come back"
+    change = m.on_definition(definition(version=3, removed=True), 0.0)
+    assert change.hazards[0].hazard.state == "clear"
+    assert np.array_equal(m.cost, plain)
+
+
+def test_without_its_aggregator_no_area_counts_as_clear():
+    m = core()
+    m.on_definition(definition(), 0.0)
+    m.on_definition(definition("gate", x=1.5), 0.0)
+    m.on_hazard(hazard("clear"), 0.0)
+    m.on_hazard(hazard("blocked", area="gate"), 0.0)
+    change = m.on_aggregator(present=False, stamp=1.0)
+    assert at(m, 0.75, 0.75) == (200, 15)
+    assert at(m, 1.75, 0.75)[0] == LETHAL
+    assert [h.hazard.area for h in change.hazards] == ["hall"]
+    m.on_aggregator(present=True, stamp=2.0)
+    assert at(m, 0.75, 0.75) == (0, 0)
+
+
+# --- Zones ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("shape", "inside", "outside"),
+    [
+        (PolygonShape(points=[(0.5, 0.5), (0.5, 1.5), (1.5, 0.5)]), (0.8, 0.8), (1.4, 1.4)),
+        (RectangleShape(corner=(1.5, 1.0), opposite=(0.5, 0.5)), (1.4, 0.6), (1.4, 1.2)),
+        (CircleShape(centre=(1.0, 1.0), radius=0.3), (1.2, 1.2), (1.25, 1.25)),
+        (CorridorShape(line=[(0.0, 0.5), (1.0, 0.5), (1.0, 1.5)], width=0.4), (1.15, 1.2), (0.7, 1.0)),
+    ],
+)
+def test_every_shape_covers_its_cells(shape, inside, outside):
+    geometry = floor().geometry
+    window, mask = rasterize_shape(shape, geometry)
+    whole = np.zeros(geometry.shape, dtype=bool)
+    whole[window.rows, window.columns] = mask
+    assert whole[geometry.cell(*inside)[::-1]]
+    assert not whole[geometry.cell(*outside)[::-1]]
+
+
+def test_kinds_write_cost_or_speed():
+    m = core()
+    m.put_zone(zone("a", "PENALTY", factor=2.0), 0.0)
+    assert at(m, 1.0, 1.0) == (penalty_cost(2.0), 0)
+    m.put_zone(zone("b", "SPEED_LIMIT", speed=0.2), 0.0)
+    assert at(m, 1.0, 1.0) == (penalty_cost(2.0), 20)
+    change = m.put_zone(zone("c", "BLOCKED"), 0.0)
+    assert at(m, 1.0, 1.0) == (254, 20)
+    assert [z.id for z in change.zones.zones] == ["a", "b", "c"]
+    assert change.zones.seq == m.version.seq
+    m.remove_zone("c", 0.0)
+    assert at(m, 1.0, 1.0) == (penalty_cost(2.0), 20)
+
+
+def test_a_penalty_of_factor_f_weighs_as_f_free_cells_for_the_planner():
+    for factor in (1.0, 1.5, 2.0, 3.0, 5.0):
+        assert 50 + 0.8 * penalty_cost(factor) == pytest.approx(50 * factor, abs=0.5)
+    assert penalty_cost(100.0) == 252
+
+
+def test_no_zone_lowers_a_cost_or_opens_the_unknown():
+    m = core()
+    plain = m.cost.copy()
+    m.put_zone(zone("a", "PENALTY", factor=3.0, shape=RectangleShape(corner=(-5.0, -5.0), opposite=(9.0, 9.0))), 0.0)
+    assert (m.cost >= plain).all()
+    assert (m.cost[plain == UNKNOWN] == UNKNOWN).all()
+
+
+def test_zones_begin_and_end_by_the_stamp():
+    m = core()
+    m.put_zone(zone(starts_at=10.0, expires_at=20.0), 0.0)
+    for stamp, cost in ((9.9, 0), (10.0, 254), (19.9, 254), (20.0, 0)):
+        m.tick(stamp, stamp)
+        assert at(m, 1.0, 1.0)[0] == cost, stamp
+    assert m.tick(21.0, 21.0).zones is None
+    m.put_zone(zone(enabled=False), 0.0)
+    assert at(m, 1.0, 1.0)[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("bad", "field"),
+    [
+        (zone(shape=PolygonShape(points=[(0.0, 0.0), (1.0, 1.0), (1.0, 0.0), (0.0, 1.0)])), "shape.points"),
+        (zone(shape=PolygonShape(points=[(0.0, 0.0), (1.0, 1.0), (0.0, 0.0)])), "shape.points"),
+        (zone(shape=RectangleShape(corner=(0.0, 0.0), opposite=(0.0, 1.0))), "shape.opposite"),
+        (zone(shape=CorridorShape(line=[(0.0, 0.0), (0.0, 0.0)], width=1.0)), "shape.line"),
+        (zone(shape=CircleShape(centre=(50.0, 0.0), radius=1.0)), "shape"),
+        (zone(kind="PENALTY"), "factor"),
+        (zone(kind="SPEED_LIMIT"), "speed"),
+        (zone(factor=2.0), "factor"),
+        (zone(expires_at=5.0), "expires_at"),
+        (zone(starts_at=20.0, expires_at=15.0), "expires_at"),
+    ],
+)
+def test_a_zone_that_cannot_be_used_is_refused_by_field(bad, field):
+    with pytest.raises(ZoneError) as caught:
+        checked_zone(bad, floor().geometry, 10.0)
+    assert caught.value.field == field
+
+
+def test_a_polygon_is_stored_counter_clockwise():
+    clockwise = [(0.5, 0.5), (0.5, 1.5), (1.5, 0.5)]
+    stored = checked_zone(zone(shape=PolygonShape(points=clockwise)), floor().geometry, 0.0)
+    assert stored.shape.points == clockwise[::-1]
+
+
+# --- Obstacles ------------------------------------------------------------------------------------------------------
+
+
+def test_a_seen_point_is_lethal_until_it_has_not_been_seen_for_its_time():
+    m = core()
+    plain = m.cost.copy()
+    m.on_obstacles("r1", seen((1.0, 1.0)), 0.0, 0.0)
+    assert at(m, 1.0, 1.0)[0] == LETHAL
+    m.on_obstacles("r2", seen((1.0, 1.0)), 3.0, 3.0)
+    m.tick(5.5, 5.5)
+    assert at(m, 1.0, 1.0)[0] == LETHAL
+    m.tick(8.0, 8.0)
+    assert np.array_equal(m.cost, plain)
+
+
+def test_points_on_a_robot_are_the_robot():
+    m = core()
+    plain = m.cost.copy()
+    m.on_pose("r2", pose(1.0, 1.0), 0.0)
+    m.on_obstacles("r1", seen((0.85, 1.0), (1.0, 1.17)), 0.5, 0.5)
+    assert np.array_equal(m.cost, plain)
+    m.on_obstacles("r1", seen((0.85, 1.0)), 5.0, 5.0)
+    assert at(m, 0.85, 1.0)[0] == LETHAL, "a stale pose excuses nothing"
+    m.on_pose("r2", pose(1.0, 1.0), 5.1)
+    m.tick(5.1, 5.1)
+    assert np.array_equal(m.cost, plain)
+
+
+def test_an_obstacle_that_goes_uncovers_the_zone_beneath():
+    m = core()
+    m.put_zone(zone(), 0.0)
+    with_zone = m.cost.copy()
+    m.on_obstacles("r1", seen((1.0, 1.0), (1.5, 1.0)), 0.0, 0.0)
+    m.tick(6.0, 6.0)
+    assert np.array_equal(m.cost, with_zone)
+
+
+# --- Windows, versions ----------------------------------------------------------------------------------------------
+
+
+def test_only_what_an_input_touches_travels():
+    m = core(floor(400, 300))
+    change = m.put_zone(zone(), 0.0)
+    (delta,) = change.deltas
+    assert delta.w * delta.h < 40 * 40
+    assert m.put_zone(zone(), 0.0).deltas == []
+
+
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 40), st.integers(0, 40), st.integers(0, 12), st.integers(0, 12)).map(
+            lambda w: Window(*w)
+        ),
+        max_size=12,
+    )
+)
+@settings(deadline=None)
+def test_merged_windows_are_apart_and_cover_the_same(windows):
+    result = merged(windows)
+    count = np.zeros((60, 60), dtype=int)
+    for window in result:
+        count[window.rows, window.columns] += 1
+    assert count.max(initial=0) <= 1
+    for window in windows:
+        assert (count[window.rows, window.columns] == 1).all()
+
+
+coordinate = st.floats(-1.5, 3.5).map(lambda v: round(v, 2))
+point = st.tuples(coordinate, coordinate)
+shapes = st.one_of(
+    st.builds(lambda c, r: CircleShape(centre=c, radius=r), point, st.floats(0.05, 1.0)),
+    st.builds(lambda a, b, w: CorridorShape(line=[a, b], width=w), point, point, st.floats(0.05, 0.8)),
+    st.builds(
+        lambda a, w, h: RectangleShape(corner=a, opposite=(a[0] + w, a[1] + h)),
+        point,
+        st.floats(0.1, 2),
+        st.floats(0.1, 2),
+    ),
+)
+zones = st.builds(
+    lambda name, shape, kind, start, life: Zone(
+        id=name,
+        shape=shape,
+        kind=kind,
+        factor=3.0 if kind == "PENALTY" else None,
+        speed=0.25 if kind == "SPEED_LIMIT" else None,
+        starts_at=start,
+        expires_at=start + life,
+    ),
+    st.sampled_from(["z1", "z2", "z3"]),
+    shapes,
+    st.sampled_from(["BLOCKED", "PENALTY", "SPEED_LIMIT"]),
+    st.floats(0, 30),
+    st.floats(1, 30),
+)
+areas = st.sampled_from(["hall", "gate"])
+events = st.one_of(
+    st.tuples(st.just("zone"), zones),
+    st.tuples(st.just("unzone"), st.sampled_from(["z1", "z2", "z3"])),
+    st.tuples(st.just("define"), areas, coordinate, coordinate, st.floats(0.1, 1.5), st.booleans()),
+    st.tuples(st.just("hazard"), areas, st.sampled_from(["blocked", "unknown", "clear"]), st.integers(0, 254)),
+    st.tuples(st.just("see"), st.lists(point, max_size=8), st.floats(0.5, 10)),
+    st.tuples(st.just("pose"), point),
+    st.tuples(st.just("watched"), st.booleans()),
+    st.tuples(st.just("wait"), st.floats(0.1, 10)),
+)
+
+
+def play(m: MapCore, history: list[tuple]) -> list[MapDelta]:
+    now, deltas = 0.0, []
+    for seq, (kind, *rest) in enumerate(history, start=1):
+        if kind == "zone":
+            change = m.put_zone(rest[0], now)
+        elif kind == "unzone":
+            change = m.remove_zone(rest[0], now)
+        elif kind == "define":
+            change = m.on_definition(definition(*rest[:4], version=seq, removed=rest[4]), now)
+        elif kind == "hazard":
+            change = m.on_hazard(hazard(rest[1], seq, area=rest[0], penalty=rest[2]), now)
+        elif kind == "see":
+            change = m.on_obstacles("r1", seen(*rest[0], ttl=rest[1]), now, now)
+        elif kind == "pose":
+            m.on_pose("r2", pose(*rest[0]), now)
+            change = m.tick(now, now)
+        elif kind == "watched":
+            change = m.on_aggregator(rest[0], now)
+        else:
+            now += rest[0]
+            change = m.tick(now, now)
+        deltas += change.deltas
+    return deltas
+
+
+@given(st.lists(events, max_size=25))
+@settings(max_examples=150, deadline=None)
+def test_after_any_history_the_map_equals_a_full_recompute_and_its_replica(history):
+    m = core()
+    replica = Replica()
+    replica.load(m.snapshot())
+    for delta in play(m, history):
+        outcome = replica.apply(delta)
+        assert outcome == "waiting" or isinstance(outcome, Applied)
+    cost, speed = m.recomputed()
+    assert np.array_equal(m.cost, cost)
+    assert np.array_equal(m.speed, speed)
+    assert not replica.needs_snapshot
+    assert replica.version == m.version
+    assert np.array_equal(replica.cost, cost)
+    assert np.array_equal(replica.speed, speed)
+
+
+@given(st.lists(events, max_size=15))
+@settings(max_examples=50, deadline=None)
+def test_what_is_gone_leaves_the_plain_floor(history):
+    m = core()
+    plain = m.cost.copy()
+    play(m, history)
+    for name in ("z1", "z2", "z3"):
+        m.remove_zone(name, 1e6)
+    for name in ("hall", "gate"):
+        m.on_definition(definition(name, version=10_000, removed=True), 1e6)
+    m.tick(1e6, 1e6)
+    assert np.array_equal(m.cost, plain)
+    assert not m.speed.any()

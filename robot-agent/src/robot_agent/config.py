@@ -70,18 +70,15 @@ class MotionConfig:
     samples_v: int = 25
     samples_w: int = 35
     horizon: float = 1.5
-    step: float = 0.05
+    step: float = 0.1
     period: float = 0.2
     tolerance_xy: float = 0.10
     tolerance_theta: float = 0.17
     window: float = 2.0
-    look_ahead: float = 1.0
     inscribed_radius: float = 0.17
     inflation_radius: float = 0.45
     cost_scaling: float = 8.0
     stuck_after: float = 10.0
-    brake: float = 0.6
-    """Deceleration (m/s2) with which the end of the released part is approached."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

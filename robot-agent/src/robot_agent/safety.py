@@ -229,7 +229,7 @@ def step(
     demanded = max((finding.level for finding in findings), default=Level.NORMAL)
     asked = tuple(now if demanded >= level else last for level, last in zip(Level, state.asked, strict=True))
     state = replace(state, asked=asked, map_held=map_held)
-    state, refusal = _follow_request(state, inputs, findings)
+    state, refusal = _follow_request(state, inputs, findings, config)
 
     mode = state.mode
     if mode == "FAULT":
@@ -251,16 +251,18 @@ def step(
 
 
 def _follow_request(
-    state: SafetyState, inputs: SafetyInputs, findings: list[Finding]
+    state: SafetyState, inputs: SafetyInputs, findings: list[Finding], config: SafetyConfig
 ) -> tuple[SafetyState, str | None]:
     if inputs.request is None:
         return state, None
     if inputs.request == "disable":
         return replace(state, enabled=False), None
     if inputs.request == "reset":
-        if state.mode != "FAULT":
+        if state.mode != "FAULT" and inputs.base_fault is None:
             return state, f"there is no fault to reset: the mode is {state.mode}"
-        present = [finding.reason for finding in findings if finding.level == Level.FAULT]
+        # The base's own fault is latched by the guardian, which judges its cause again when it is told to reset.
+        causes = judge(replace(inputs, base_fault=None), config)
+        present = [finding.reason for finding in causes if finding.level == Level.FAULT]
         if present:
             return state, f"the cause is still there: {'; '.join(present)}"
         return replace(state, mode="INIT", enabled=False, latched=(), stops=()), None

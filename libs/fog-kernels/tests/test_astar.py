@@ -6,6 +6,7 @@ import heapq
 import itertools
 import math
 import os
+import threading
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -168,6 +169,48 @@ def test_costs_beyond_32_bits_are_exact() -> None:
     fresh = Planner(101, 101, neutral=2000, factor=30.0)
     fresh.set_goal_field(costmap, goal)
     assert fresh.plan(costmap, start, goal).cost == result.cost
+
+
+def test_a_goal_field_set_in_another_thread_never_misleads_a_plan() -> None:
+    """A plan sees the field of its goal or none, whatever is being set beside it."""
+    rng = np.random.default_rng(2)
+    costmap = rng.integers(0, 253, (80, 80)).astype(np.uint8)
+    goals = [(79, 79), (0, 79), (79, 0)]
+    planner = Planner(80, 80)
+    expected = {goal: dijkstra(costmap, (40, 40))[goal] / (2 * STRAIGHT) for goal in goals}
+    stop = threading.Event()
+
+    def keep_setting() -> None:
+        while not stop.is_set():
+            for goal in goals:
+                planner.set_goal_field(costmap, goal)
+
+    thread = threading.Thread(target=keep_setting)
+    thread.start()
+    try:
+        for _ in range(200):
+            for goal in goals:
+                assert planner.plan(costmap, (40, 40), goal).cost == expected[goal]
+    finally:
+        stop.set()
+        thread.join()
+
+
+def test_a_dear_plan_after_a_cheap_goal_field_stays_exact() -> None:
+    """Going over to 64-bit costs converts the field that is already set."""
+    static = np.zeros((101, 101), np.uint8)
+    static[1::4, :-1] = 254
+    static[3::4, 1:] = 254
+    planner = Planner(101, 101, neutral=100, factor=300.0)
+    planner.set_goal_field(static, (100, 100))
+    raised = np.maximum(static, 252)
+    result = planner.plan(raised, (0, 0), (100, 100))
+    assert result.cost * 2 * STRAIGHT > 2**31
+    fresh = Planner(101, 101, neutral=100, factor=300.0)
+    assert fresh.plan(raised, (0, 0), (100, 100)).cost == result.cost
+    cut = raised.copy()
+    cut[50, 50] = 254
+    assert not planner.plan(cut, (0, 0), (100, 100)).found
 
 
 def test_the_bound_on_expansions_ends_a_search_and_leaves_the_planner_usable() -> None:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numba import float64, int64, njit, types
@@ -63,7 +63,7 @@ def _search_signature(costs: Any) -> Any:
     )
 
 
-@njit([_search_signature(types.int32), _search_signature(types.int64)], cache=True, nogil=True)
+@njit([_search_signature(types.int32), _search_signature(types.int64)], cache=True, nogil=True, error_model="numpy")
 def _search(
     costmap: Any,
     width: int,
@@ -85,6 +85,7 @@ def _search(
     `g` holds its largest value everywhere before and after. A negative g is the complement of an expanded cell's
     cost. `result` receives status, cost, path length, expansions; the path itself ends in queue_cell, goal first.
     """
+    # Indices are unsigned because numba tests signed ones for being negative, a fifth of the time of the search.
     unset = g[start]
     highest = np.int64(2147483646) if g.itemsize == 4 else np.int64(1) << 61
     height = costmap.size // width
@@ -133,7 +134,7 @@ def _search(
     used: Any = np.int64(1)
     queue_cell[0] = start
     queue_next[0] = -1
-    heads[bucket & mask] = 0
+    heads[np.uint64(bucket & mask)] = 0
     waiting = 1
     g[start] = 0
     touched[0] = start
@@ -143,54 +144,54 @@ def _search(
     status = _NOT_FOUND
 
     while waiting > 0:
-        entry: Any = np.int64(heads[bucket & mask])
+        entry: Any = np.int64(heads[np.uint64(bucket & mask)])
         while entry == -1:
             bucket += 1
-            entry = np.int64(heads[bucket & mask])
+            entry = np.int64(heads[np.uint64(bucket & mask)])
         if (bucket << shift) >= best:
             break
-        cell: Any = np.int64(queue_cell[entry])
-        heads[bucket & mask] = queue_next[entry]
-        queue_next[entry] = free
+        cell: Any = np.int64(queue_cell[np.uint64(entry)])
+        heads[np.uint64(bucket & mask)] = queue_next[np.uint64(entry)]
+        queue_next[np.uint64(entry)] = free
         free = entry
         waiting -= 1
-        here = np.int64(g[cell])
+        here = np.int64(g[np.uint64(cell)])
         if here < 0:
             continue  # a stale entry: expanded already at its present cost
-        y = cell // width
+        y: Any = np.int64(np.uint32(cell) // np.uint32(width))
         x = cell - y * width
         if best != highest:
             if use_field:
-                f = here + field[cell]
+                f = here + field[np.uint64(cell)]
             else:
                 dx = abs(x - goal_x)
                 dy = abs(y - goal_y)
                 f = here + step_straight * max(dx, dy) + step_extra * min(dx, dy)
             if f >= best:
                 continue
-        g[cell] = ~here
+        g[np.uint64(cell)] = ~here
         expansions += 1
         if max_expansions > 0 and expansions > max_expansions:
             status = _TIMED_OUT
             break
-        own = np.int64(weight[costmap[cell]])
+        own = np.int64(weight[costmap[np.uint64(cell)]])
 
         right = x + 1 < width
         left = x > 0
         up = y + 1 < height
         down = y > 0
-        w_right = np.int64(weight[costmap[cell + 1]]) if right else np.int64(0)
-        w_left = np.int64(weight[costmap[cell - 1]]) if left else np.int64(0)
-        w_up = np.int64(weight[costmap[cell + width]]) if up else np.int64(0)
-        w_down = np.int64(weight[costmap[cell - width]]) if down else np.int64(0)
+        w_right = np.int64(weight[costmap[np.uint64(cell + 1)]]) if right else np.int64(0)
+        w_left = np.int64(weight[costmap[np.uint64(cell - 1)]]) if left else np.int64(0)
+        w_up = np.int64(weight[costmap[np.uint64(cell + width)]]) if up else np.int64(0)
+        w_down = np.int64(weight[costmap[np.uint64(cell - width)]]) if down else np.int64(0)
         around[0] = w_right
         around[1] = w_left
         around[2] = w_up
         around[3] = w_down
-        around[4] = weight[costmap[cell + width + 1]] if w_right > 0 and w_up > 0 else 0
-        around[5] = weight[costmap[cell + width - 1]] if w_left > 0 and w_up > 0 else 0
-        around[6] = weight[costmap[cell - width + 1]] if w_right > 0 and w_down > 0 else 0
-        around[7] = weight[costmap[cell - width - 1]] if w_left > 0 and w_down > 0 else 0
+        around[4] = weight[costmap[np.uint64(cell + width + 1)]] if w_right > 0 and w_up > 0 else 0
+        around[5] = weight[costmap[np.uint64(cell + width - 1)]] if w_left > 0 and w_up > 0 else 0
+        around[6] = weight[costmap[np.uint64(cell - width + 1)]] if w_right > 0 and w_down > 0 else 0
+        around[7] = weight[costmap[np.uint64(cell - width - 1)]] if w_left > 0 and w_down > 0 else 0
 
         for k in range(8):
             other = around[k]
@@ -198,7 +199,7 @@ def _search(
                 continue
             neighbour = cell + offsets[k]
             reached = here + lengths[k] * (own + other)
-            old = np.int64(g[neighbour])
+            old = np.int64(g[np.uint64(neighbour)])
             fresh = old == unset
             if old < 0:
                 old = ~old
@@ -208,7 +209,7 @@ def _search(
                     break
                 continue
             if use_field:
-                remaining = np.int64(field[neighbour])
+                remaining = np.int64(field[np.uint64(neighbour)])
                 if remaining == unset:
                     continue  # the goal can't be reached from there
             else:
@@ -224,14 +225,14 @@ def _search(
             if fresh:
                 touched[n_touched] = neighbour
                 n_touched += 1
-            g[neighbour] = reached
+            g[np.uint64(neighbour)] = reached
             if neighbour == goal:
                 best = reached
                 status = _FOUND
                 continue
             if free >= 0:
                 entry = free
-                free = np.int64(queue_next[entry])
+                free = np.int64(queue_next[np.uint64(entry)])
             elif used < capacity:
                 entry = used
                 used += 1
@@ -239,9 +240,9 @@ def _search(
                 status = _QUEUE_FULL
                 break
             slot = (f >> shift) & mask
-            queue_cell[entry] = neighbour
-            queue_next[entry] = heads[slot]
-            heads[slot] = entry
+            queue_cell[np.uint64(entry)] = neighbour
+            queue_next[np.uint64(entry)] = heads[np.uint64(slot)]
+            heads[np.uint64(slot)] = entry
             waiting += 1
         if status in (_OVERFLOW, _QUEUE_FULL):
             break
@@ -256,12 +257,12 @@ def _search(
             count += 1
             if cell == start:
                 break
-            here = np.int64(g[cell])
+            here = np.int64(g[np.uint64(cell)])
             if here < 0:
                 here = ~here
-            y = cell // width
+            y = np.int64(np.uint32(cell) // np.uint32(width))
             x = cell - y * width
-            own = np.int64(weight[costmap[cell]])
+            own = np.int64(weight[costmap[np.uint64(cell)]])
             for turn in range(8):
                 k = (direction + turn) & 7
                 nx = x + columns[k]
@@ -269,10 +270,10 @@ def _search(
                 if nx < 0 or nx >= width or ny < 0 or ny >= height:
                     continue
                 neighbour = cell + offsets[k]
-                there = np.int64(g[neighbour])
+                there = np.int64(g[np.uint64(neighbour)])
                 if there >= 0:
                     continue  # never expanded
-                other = np.int64(weight[costmap[neighbour]])
+                other = np.int64(weight[costmap[np.uint64(neighbour)]])
                 if ~there + lengths[k] * (own + other) != here:
                     continue
                 if k >= 4 and (weight[costmap[cell + columns[k]]] == 0 or weight[costmap[cell + rows[k] * width]] == 0):
@@ -302,7 +303,7 @@ def _field_signature(costs: Any) -> Any:
     )
 
 
-@njit([_field_signature(types.int32), _field_signature(types.int64)], cache=True, nogil=True)
+@njit([_field_signature(types.int32), _field_signature(types.int64)], cache=True, nogil=True, error_model="numpy")
 def _fill_field(
     costmap: Any,
     width: int,
@@ -341,33 +342,33 @@ def _fill_field(
     field[goal] = 0
     bucket: Any = np.int64(0)
     while waiting > 0:
-        entry: Any = np.int64(heads[bucket & mask])
+        entry: Any = np.int64(heads[np.uint64(bucket & mask)])
         while entry == -1:
             bucket += 1
-            entry = np.int64(heads[bucket & mask])
-        cell: Any = np.int64(queue_cell[entry])
-        heads[bucket & mask] = queue_next[entry]
-        queue_next[entry] = free
+            entry = np.int64(heads[np.uint64(bucket & mask)])
+        cell: Any = np.int64(queue_cell[np.uint64(entry)])
+        heads[np.uint64(bucket & mask)] = queue_next[np.uint64(entry)]
+        queue_next[np.uint64(entry)] = free
         free = entry
         waiting -= 1
-        here = np.int64(field[cell])
+        here = np.int64(field[np.uint64(cell)])
         if here >> shift != bucket:
             continue  # a stale entry: its cell left from a lower bucket
-        y = cell // width
+        y = np.int64(np.uint32(cell) // np.uint32(width))
         x = cell - y * width
-        own = np.int64(weight[costmap[cell]])
-        w_right = np.int64(weight[costmap[cell + 1]]) if x + 1 < width else np.int64(0)
-        w_left = np.int64(weight[costmap[cell - 1]]) if x > 0 else np.int64(0)
-        w_up = np.int64(weight[costmap[cell + width]]) if y + 1 < height else np.int64(0)
-        w_down = np.int64(weight[costmap[cell - width]]) if y > 0 else np.int64(0)
+        own = np.int64(weight[costmap[np.uint64(cell)]])
+        w_right = np.int64(weight[costmap[np.uint64(cell + 1)]]) if x + 1 < width else np.int64(0)
+        w_left = np.int64(weight[costmap[np.uint64(cell - 1)]]) if x > 0 else np.int64(0)
+        w_up = np.int64(weight[costmap[np.uint64(cell + width)]]) if y + 1 < height else np.int64(0)
+        w_down = np.int64(weight[costmap[np.uint64(cell - width)]]) if y > 0 else np.int64(0)
         around[0] = w_right
         around[1] = w_left
         around[2] = w_up
         around[3] = w_down
-        around[4] = weight[costmap[cell + width + 1]] if w_right > 0 and w_up > 0 else 0
-        around[5] = weight[costmap[cell + width - 1]] if w_left > 0 and w_up > 0 else 0
-        around[6] = weight[costmap[cell - width + 1]] if w_right > 0 and w_down > 0 else 0
-        around[7] = weight[costmap[cell - width - 1]] if w_left > 0 and w_down > 0 else 0
+        around[4] = weight[costmap[np.uint64(cell + width + 1)]] if w_right > 0 and w_up > 0 else 0
+        around[5] = weight[costmap[np.uint64(cell + width - 1)]] if w_left > 0 and w_up > 0 else 0
+        around[6] = weight[costmap[np.uint64(cell - width + 1)]] if w_right > 0 and w_down > 0 else 0
+        around[7] = weight[costmap[np.uint64(cell - width - 1)]] if w_left > 0 and w_down > 0 else 0
         for k in range(8):
             other = around[k]
             if other == 0:
@@ -376,21 +377,21 @@ def _fill_field(
             reached = here + lengths[k] * (own + other)
             if reached >= highest:
                 return _OVERFLOW
-            if reached >= field[neighbour]:
+            if reached >= field[np.uint64(neighbour)]:
                 continue
-            field[neighbour] = reached
+            field[np.uint64(neighbour)] = reached
             if free >= 0:
                 entry = free
-                free = np.int64(queue_next[entry])
+                free = np.int64(queue_next[np.uint64(entry)])
             elif used < capacity:
                 entry = used
                 used += 1
             else:
                 return _QUEUE_FULL
             slot = (reached >> shift) & mask
-            queue_cell[entry] = neighbour
-            queue_next[entry] = heads[slot]
-            heads[slot] = entry
+            queue_cell[np.uint64(entry)] = neighbour
+            queue_next[np.uint64(entry)] = heads[np.uint64(slot)]
+            heads[np.uint64(slot)] = entry
             waiting += 1
     # `unset` cells stay as they were: no way leads from them to the goal.
     return _FOUND if unset != 0 else _NOT_FOUND
@@ -645,6 +646,21 @@ class PlanResult:
     timed_out: bool = False
 
 
+class _Guide(NamedTuple):
+    """A goal, the static costmap and the exact cost from every cell to the goal."""
+
+    goal: tuple[int, int]
+    static: NDArray[np.uint8]
+    field: NDArray[np.int32 | np.int64]
+
+
+def _as_wide(field: NDArray[np.int32 | np.int64]) -> NDArray[np.int64]:
+    wide = field.astype(np.int64)
+    if field.dtype == np.int32:
+        wide[wide == np.iinfo(np.int32).max] = np.iinfo(np.int64).max
+    return wide
+
+
 class Planner:
     """Exact A* on costmaps of one size; owns all memory that a search needs, so that plans allocate nothing large.
 
@@ -673,9 +689,7 @@ class Planner:
         self._heads = np.empty(BUCKETS, np.int32)
         self._touched = np.empty(width * height, np.int32)
         self._result = np.zeros(4, np.int64)
-        self._goal: tuple[int, int] | None = None
-        self._static: NDArray[np.uint8] | None = None
-        self._field: NDArray[np.int32 | np.int64] = np.empty(0, np.int32)
+        self._guide: _Guide | None = None
 
     def _allocate(self) -> None:
         # Pages that no search touches cost no memory: np.empty only reserves them. g must hold its mark.
@@ -715,14 +729,20 @@ class Planner:
         first = self._index(start, "start")
         last = self._index(goal, "goal")
         while True:
-            guided = self._goal == (int(goal[0]), int(goal[1])) and self._field.dtype == self._g.dtype
+            guide = self._guide  # read once: another thread may set a new one meanwhile
+            field = self._no_field
+            if guide is not None and guide.goal == (int(goal[0]), int(goal[1])):
+                if guide.field.dtype != self._g.dtype:
+                    self._widen()
+                    continue
+                field = guide.field
             _search(
                 costmap.ravel(),
                 self.width,
                 self._weight,
                 first,
                 last,
-                self._field if guided else self._no_field,
+                field,
                 self._g,
                 self._queue_cell,
                 self._queue_next,
@@ -758,8 +778,9 @@ class Planner:
         """Go over to 64-bit costs for good: some path here is too dear for 32 bits."""
         self._costs = np.int64
         self._allocate()
-        if self._static is not None and self._goal is not None:
-            self.set_goal_field(self._static, self._goal)
+        guide = self._guide
+        if guide is not None:
+            self._guide = _Guide(guide.goal, guide.static, _as_wide(guide.field))
 
     def set_goal_field(self, static_costmap: NDArray[np.uint8], goal: tuple[int, int]) -> None:
         """Compute the exact cost to the goal from every cell, to guide `plan` for this goal from now on.
@@ -790,29 +811,21 @@ class Planner:
                 capacity *= 2
             else:
                 break
-        # Without a goal in between, a plan in another thread never sees a field of one goal and the name of another.
-        self._goal = None
-        if costs is np.int64 and self._costs is np.int32:
-            self._costs = np.int64
-            self._allocate()
-        self._static = static
-        self._field = field
-        self._goal = (int(goal[0]), int(goal[1]))
+        self._guide = _Guide((int(goal[0]), int(goal[1])), static, field)
 
     def clear_goal_field(self) -> None:
         """Forget the goal field: plans use the octile heuristic again."""
-        self._goal = None
-        self._static = None
-        self._field = np.empty(0, self._costs)
+        self._guide = None
 
     def raises_only(self, costmap: NDArray[np.uint8]) -> bool:
         """Tell whether no cell is lower than in the static costmap of the goal field, so that guided plans are exact.
 
         Raises RuntimeError when no goal field is set.
         """
-        if self._static is None:
+        guide = self._guide
+        if guide is None:
             raise RuntimeError("no goal field is set: call set_goal_field first")
-        return bool(_none_lower(self._grid(costmap).ravel(), self._static.ravel()))
+        return bool(_none_lower(self._grid(costmap).ravel(), guide.static.ravel()))
 
     def nearest_reachable(
         self, costmap: NDArray[np.uint8], start: tuple[int, int], goal: tuple[int, int]

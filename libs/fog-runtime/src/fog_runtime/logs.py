@@ -3,6 +3,7 @@
 import json
 import logging
 import sys
+import threading
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from types import TracebackType
@@ -114,16 +115,18 @@ class RateLimited:
         self._period = period
         self._max_keys = max_keys
         self._state: dict[str, tuple[float, int]] = {}
+        self._lock = threading.Lock()
 
-    def warning(self, event: str, key: str, now: float, **fields: object) -> None:
-        """Log `event` unless the same `key` was logged less than a period ago (`now`: monotonic seconds)."""
-        if key not in self._state and len(self._state) >= self._max_keys:
-            key = "(others)"
-        logged_at, suppressed = self._state.get(key, (None, 0))
-        if logged_at is not None and now - logged_at < self._period:
-            self._state[key] = (logged_at, suppressed + 1)
-            return
-        self._state[key] = (now, 0)
+    def warning(self, event: str, key: str, now: float, /, **fields: object) -> None:
+        """Log `event` unless the same `key` was logged less than a period before `now` (s); from any thread."""
+        with self._lock:
+            if key not in self._state and len(self._state) >= self._max_keys:
+                key = "(others)"
+            logged_at, suppressed = self._state.get(key, (None, 0))
+            if logged_at is not None and now - logged_at < self._period:
+                self._state[key] = (logged_at, suppressed + 1)
+                return
+            self._state[key] = (now, 0)
         if suppressed:
             fields["not_logged_since"] = suppressed
         self._log.warning(event, **fields)

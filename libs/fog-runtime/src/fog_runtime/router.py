@@ -1,0 +1,37 @@
+"""A zenoh router as a process of its own: `python -m fog_runtime.router --listen tcp/127.0.0.1:7447`."""
+
+import argparse
+import asyncio
+from collections.abc import Sequence
+
+import zenoh
+
+from fog_runtime import logs, process
+from fog_runtime.zenoh_edge import session_config
+
+_log = logs.get("router")
+
+
+async def run_router(*listen: str) -> None:
+    """Route between all who connect to `listen`, until cancelled; raises `zenoh.ZError` if an endpoint is taken."""
+    session = await asyncio.to_thread(zenoh.open, session_config("router", listen=listen))
+    try:
+        _log.info("listening", endpoints=list(listen), zid=str(session.zid()))
+        await asyncio.get_running_loop().create_future()
+    finally:
+        await asyncio.to_thread(session.close)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run a router until SIGTERM."""
+    parser = argparse.ArgumentParser(prog="fog_runtime.router", description=run_router.__doc__)
+    parser.add_argument("--listen", action="append", required=True, metavar="tcp/ADDRESS:PORT")
+    parser.add_argument("--log-level", default="info", choices=["debug", "info", "warning", "error"])
+    parser.add_argument("--log-format", default="json", choices=["json", "text"])
+    options = parser.parse_args(arguments)
+    logs.configure("router", options.log_level, options.log_format)
+    process.run(lambda: run_router(*options.listen))
+
+
+if __name__ == "__main__":
+    main()

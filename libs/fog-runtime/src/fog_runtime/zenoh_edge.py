@@ -1,0 +1,496 @@
+"""The robot side's transport: the table's zenoh channels as typed publishing, subscribing, asking and answering.
+
+A session is a client of the site's routers. Clients, unlike peers, are served by a router without knowing one another
+(zenoh 1.9 and later never route between peers), and a robot that comes and goes changes nobody else's routes. As a
+client's session can't be opened while no router is up, everything declared before is kept and done then.
+"""
+
+import asyncio
+import inspect
+import json
+import random
+import threading
+from collections import deque
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import asynccontextmanager
+from functools import partial
+from typing import Any, Final, Generic, Literal, TypeVar
+
+import zenoh
+from zenoh import ext
+
+from fog_contracts.channels import LIVE, Channel
+from fog_contracts.codec import ContractError, decode, encode
+from fog_contracts.messages import Message
+from fog_runtime import logs, metrics
+from fog_runtime.clock import Clock
+from fog_runtime.slots import Slot
+
+M = TypeVar("M", bound=Message)
+Ids = dict[str, str]
+
+RECOVERED_SAMPLES: Final = 256
+"""Messages of a recovered channel that its publisher keeps for those who lost them: 16 MiB of full deltas."""
+HEARTBEAT_S: Final = 0.5
+"""Real seconds between the announcements by which a subscriber notices that the last message was lost."""
+_QUEUE: Final = 4096
+"""Messages of a recovered channel that may wait for the loop; more are dropped, which the versions reveal."""
+_PENDING_QUERIES: Final = 64
+_RETRY_S: Final = (0.2, 1.0)
+
+_log = logs.get("zenoh")
+
+
+def session_config(
+    mode: Literal["client", "router", "peer"], *, connect: Sequence[str] = (), listen: Sequence[str] = ()
+) -> zenoh.Config:
+    """Build a configuration without scouting and shared memory: a session talks to the named endpoints alone."""
+    config = zenoh.Config()
+    values: dict[str, object] = {
+        "mode": mode,
+        "connect/endpoints": list(connect),
+        "listen/endpoints": list(listen),
+        "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5},
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "transport/shared_memory/enabled": False,
+        "timestamping/enabled": True,
+    }
+    for key, value in values.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+def _is_kept(channel: Channel) -> bool:
+    """Whether the latest value holds until another comes, so that late joiners must be given it."""
+    return channel.kind == "pub" and channel.rate_hz is None and channel.max_age_s is None and not channel.recovered
+
+
+def _finish(query: Any) -> None:
+    """Let the asker know that no answer of ours will come any more (`drop` has no types in zenoh's stubs)."""
+    query.drop()
+
+
+class _Publisher:
+    """Publishes on one key; what must not be lost waits for the session to be opened."""
+
+    def __init__(self, channel: Channel, key: str) -> None:
+        self._channel = channel
+        self._key = key
+        depth = RECOVERED_SAMPLES if channel.recovered else 1 if _is_kept(channel) else 0
+        self._depth = depth
+        self._waiting: deque[bytes] = deque(maxlen=depth)
+        self._put: Callable[[bytes], object] | None = None
+
+    def declare(self, session: zenoh.Session) -> None:
+        drop = zenoh.CongestionControl.DROP
+        if self._depth:
+            miss = ext.MissDetectionConfig(heartbeat=HEARTBEAT_S, sporadic_heartbeat=None)
+            advanced = ext.declare_advanced_publisher(
+                session,
+                self._key,
+                congestion_control=drop,
+                cache=ext.CacheConfig(self._depth),
+                sample_miss_detection=miss,
+                publisher_detection=True,
+            )
+            self._put = advanced.put
+        else:
+            self._put = session.declare_publisher(self._key, congestion_control=drop).put
+        while self._waiting:
+            self._put(self._waiting.popleft())
+
+    def put(self, data: bytes) -> None:
+        if self._put is not None:
+            self._put(data)
+            metrics.PUBLISHED.labels(self._channel.name).inc()
+        elif self._depth:
+            self._waiting.append(data)
+        else:
+            metrics.DROPPED.labels(self._channel.name).inc()
+
+
+class _Inbox(Generic[M]):
+    """Carries samples from zenoh's threads to the loop: all in order, or of each key the newest only."""
+
+    def __init__(
+        self, edge: "ZenohEdge", channel: Channel, kind: type[M], handler: Callable[[Ids, M], object], pattern: str
+    ) -> None:
+        self._edge = edge
+        self._channel = channel
+        self._kind = kind
+        self._handler = handler
+        self._pattern = pattern
+        self._lock = threading.Lock()
+        self._queue: deque[tuple[str, bytes]] = deque()
+        self._newest: dict[str, bytes] = {}
+        self._woken = False
+
+    def declare(self, session: zenoh.Session) -> object:
+        channel = self._channel
+        if not (channel.recovered or _is_kept(channel)):
+            return session.declare_subscriber(self._pattern, self._arrived)
+        depth = RECOVERED_SAMPLES if channel.recovered else 1
+        return ext.declare_advanced_subscriber(
+            session,
+            self._pattern,
+            self._arrived,
+            history=ext.HistoryConfig(detect_late_publishers=True, max_samples=depth),
+            recovery=ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
+        )
+
+    def _arrived(self, sample: zenoh.Sample) -> None:
+        """Take a sample in; runs on a thread of zenoh's and must be short."""
+        if sample.kind != zenoh.SampleKind.PUT:
+            return
+        key = str(sample.key_expr)
+        size = len(sample.payload)
+        if size > self._channel.limit:
+            self._edge.refuse(self._channel, key, f"{size} bytes are over the limit of {self._channel.limit}")
+            return
+        data = sample.payload.to_bytes()
+        with self._lock:
+            if self._channel.recovered:
+                if len(self._queue) >= _QUEUE:
+                    self._queue.popleft()
+                    metrics.DROPPED.labels(self._channel.name).inc()
+                self._queue.append((key, data))
+            elif key in self._newest or len(self._newest) < _QUEUE:
+                self._newest[key] = data
+            else:
+                metrics.DROPPED.labels(self._channel.name).inc()
+            wake = not self._woken
+            self._woken = True
+        if wake:
+            self._edge.call(self._drain)
+
+    def _drain(self) -> None:
+        with self._lock:
+            self._woken = False
+            samples = [*self._queue, *self._newest.items()]
+            self._queue.clear()
+            self._newest.clear()
+        for key, data in samples:
+            self._deliver(key, data)
+
+    def _deliver(self, key: str, data: bytes) -> None:
+        ids = self._edge.ids(self._channel, key)
+        if ids is None:
+            self._edge.refuse(self._channel, key, "the ids in the key are malformed")
+            return
+        try:
+            message = decode(self._channel, data, self._kind)
+        except ContractError as error:
+            self._edge.refuse(self._channel, key, error.reason)
+            return
+        metrics.RECEIVED.labels(self._channel.name).inc()
+        try:
+            self._handler(ids, message)
+        except Exception as error:  # noqa: BLE001  # one message must not end the process; the event tells of the bug
+            metrics.HANDLER_ERRORS.labels(self._channel.name).inc()
+            _log.error("handler_failed", error=error, channel=self._channel.name, key=key)
+
+
+Answer = Message | Awaitable[Message]
+
+
+class _Answerer:
+    """Answers queries on one key, with the handler on the loop's thread."""
+
+    def __init__(self, edge: "ZenohEdge", channel: Channel, handler: Callable[[Ids, Any], Answer], key: str) -> None:
+        self._edge = edge
+        self._channel = channel
+        self._handler = handler
+        self._key = key
+        self._ids = edge.ids(channel, key) or {}
+        self._pending = 0
+        self._last: tuple[Message, bytes] | None = None
+
+    def declare(self, session: zenoh.Session) -> object:
+        return session.declare_queryable(self._key, self._arrived)
+
+    def _arrived(self, query: zenoh.Query) -> None:
+        """Take a query in; runs on a thread of zenoh's."""
+        if not self._edge.call(self._begin, query):
+            _finish(query)
+
+    def _begin(self, query: zenoh.Query) -> None:
+        if self._pending >= _PENDING_QUERIES:
+            self._edge.refuse(self._channel, self._key, f"more than {_PENDING_QUERIES} queries at once")
+            _finish(query)
+            return
+        self._pending += 1
+        self._edge.spawn(self._answer(query))
+
+    async def _answer(self, query: zenoh.Query) -> None:
+        try:
+            try:
+                request = self._request(query)
+            except ContractError as error:
+                self._edge.refuse(self._channel, self._key, error.reason)
+                await self._edge.in_thread(partial(query.reply_err, error.reason.encode()))
+                return
+            metrics.RECEIVED.labels(self._channel.name).inc()
+            try:
+                answer = self._handler(self._ids, request)
+                message = await answer if inspect.isawaitable(answer) else answer
+                data = self._encoded(message)
+            except Exception as error:  # noqa: BLE001  # as for messages: the asker is told, the event tells of the bug
+                metrics.HANDLER_ERRORS.labels(self._channel.name).inc()
+                _log.error("handler_failed", error=error, channel=self._channel.name, key=self._key)
+                await self._edge.in_thread(partial(query.reply_err, b"the answering process failed; see its log"))
+                return
+            await self._edge.in_thread(partial(query.reply, self._key, data))
+        finally:
+            self._pending -= 1
+            _finish(query)
+
+    def _request(self, query: zenoh.Query) -> Message | None:
+        if self._channel.kind != "query" or self._channel.message is None:
+            return None
+        payload = query.payload
+        size = 0 if payload is None else len(payload)
+        if size > self._channel.limit:
+            raise ContractError(self._channel.name, f"{size} bytes are over the limit of {self._channel.limit}")
+        return decode(self._channel, b"" if payload is None else payload.to_bytes(), self._channel.message)
+
+    def _encoded(self, message: Message) -> bytes:
+        """Encode an answer; one that is the same object as the last (a snapshot) is not encoded again."""
+        if self._last is None or self._last[0] is not message:
+            self._last = (message, encode(self._channel, message, reply=self._channel.kind == "query"))
+        return self._last[1]
+
+
+class ZenohEdge:
+    """One process's session. All handlers run on the thread of the event loop that opened it."""
+
+    def __init__(self, clock: Clock, *, site: str, role: str, name: str) -> None:
+        """Prepare a session; use `ZenohEdge.open`."""
+        self._clock = clock
+        self._site = site
+        self._who = f"{role}/{name}"
+        self._loop = asyncio.get_running_loop()
+        self._session: zenoh.Session | None = None
+        self._closed = False
+        self._publishers: dict[str, _Publisher] = {}
+        self._declared: list[object] = []
+        self._undeclared: list[Callable[[zenoh.Session], object]] = []
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._limited = logs.RateLimited(_log)
+        # Requests and replies may block while a connection is congested: never on the loop's thread.
+        self._threads = ThreadPoolExecutor(4, thread_name_prefix="zenoh")
+
+    @classmethod
+    @asynccontextmanager
+    async def open(
+        cls,
+        *,
+        connect: Sequence[str],
+        clock: Clock,
+        role: str,
+        id: str,  # noqa: A002  # as in the channel `live`
+        site: str,
+    ) -> AsyncIterator["ZenohEdge"]:
+        """Open a session as a client of one of the routers `connect`; without any router it keeps trying.
+
+        `role` and `id` name the process in logs; `site` is filled into every key.
+        """
+        edge = cls(clock, site=site, role=role, name=id)
+        connecting: asyncio.Task[None] | None = None
+        try:
+            if not await edge._attempt(connect):
+                connecting = asyncio.create_task(edge._keep_trying(connect), name="zenoh connect")
+            yield edge
+        finally:
+            if connecting is not None:
+                connecting.cancel()
+                await asyncio.gather(connecting, return_exceptions=True)
+            await edge._close()
+
+    @property
+    def connected(self) -> bool:
+        """Whether a router is connected right now."""
+        return self._session is not None and not self._closed and bool(self._session.info.routers_zid())
+
+    def publish(self, channel: Channel, message: Message, **ids: str) -> None:
+        """Publish without waiting; raises `ContractError` when the message breaks the channel's contract.
+
+        Without a connection the message is lost, but for recovered channels, and the latest of those whose value
+        holds until the next (hazards, zones): these reach their subscribers as soon as there is one.
+        """
+        key = self._key(channel, ids)
+        data = encode(channel, message)
+        publisher = self._publishers.get(key)
+        if publisher is None:
+            publisher = self._publishers[key] = _Publisher(channel, key)
+            self._declare(publisher.declare)
+        publisher.put(data)
+
+    def subscribe(self, channel: Channel, kind: type[M], handler: Callable[[Ids, M], object], **ids: str) -> None:
+        """Have `handler(ids, message)` called for every id that is not given.
+
+        Of channels of which the latest value counts, only the newest message of each key is delivered when the loop
+        is behind; recovered channels are delivered completely and in order.
+        """
+        self._check(channel, ids)
+        pattern = channel.pattern(**self._with_site(channel, ids))
+        self._declare(_Inbox(self, channel, kind, handler, pattern).declare)
+
+    def latest(self, channel: Channel, kind: type[M], **ids: str) -> Slot[M]:
+        """Return a slot that always holds the newest message of one key."""
+        self._key(channel, ids)
+        slot: Slot[M] = Slot()
+        self.subscribe(channel, kind, lambda _, message: slot.put(message, self._clock.now()), **ids)
+        return slot
+
+    async def ask(
+        self, channel: Channel, request: Message | None, kind: type[M], timeout_s: float, **ids: str
+    ) -> M | None:
+        """Ask a queryable; return its first answer, or None when nobody answers within `timeout_s` of the clock.
+
+        Channels that are published (hazards, zones) are asked without a request. Raises `ContractError` for an
+        answer that breaks the contract, or when the answering side says that it refuses or has failed.
+        """
+        key = self._key(channel, ids)
+        data = None if request is None else encode(channel, request)
+        session = self._session
+        if session is None:
+            return None
+        answer: asyncio.Future[bytes | ContractError | None] = self._loop.create_future()
+        reply = channel.kind == "query"
+        limit = channel.reply_limit if reply else channel.limit
+
+        def settle(value: bytes | ContractError | None) -> None:
+            if not answer.done():
+                answer.set_result(value)
+
+        def arrived(got: zenoh.Reply) -> None:
+            if got.ok is not None:
+                size = len(got.ok.payload)
+                if size > limit:
+                    self.call(settle, ContractError(channel.name, f"{size} bytes are over the limit of {limit}"))
+                else:
+                    self.call(settle, got.ok.payload.to_bytes())
+            elif got.err is not None and (text := bytes(got.err.payload)[:500]) != b"Timeout":
+                # "Timeout" is zenoh's own word for an answer that never came: the same as none.
+                self.call(settle, ContractError(channel.name, f"refused: {text.decode('utf-8', 'replace')}"))
+
+        timeout = max(0.001, self._clock.real(timeout_s))
+        handler = zenoh.handlers.Callback(arrived, lambda: self.call(settle, None))
+        get = partial(session.get, key, handler, timeout=timeout, payload=data)
+        try:
+            async with asyncio.timeout(timeout):
+                await self.in_thread(get)
+                found = await answer
+        except TimeoutError:
+            return None
+        if isinstance(found, ContractError):
+            raise found
+        return None if found is None else decode(channel, found, kind, reply=reply)
+
+    def serve(self, channel: Channel, handler: Callable[[Ids, Any], Answer], **ids: str) -> None:
+        """Answer queries with `handler(ids, request)`, plain or async; `request` is None where the channel has none."""
+        self._declare(_Answerer(self, channel, handler, self._key(channel, ids)).declare)
+
+    def alive(self, role: str, id: str) -> None:  # noqa: A002  # as in the channel `live`
+        """Declare that this process is there, for as long as its session lives."""
+        key = LIVE.key(site=self._site, role=role, id=id)
+        self._declare(lambda session: session.liveliness().declare_token(key))
+
+    def watch_live(self, handler: Callable[[str, str, bool], object]) -> None:
+        """Have `handler(role, id, alive)` called for all who are there now, and whenever one comes or goes.
+
+        When this process itself loses its router, all go.
+        """
+
+        def arrived(sample: zenoh.Sample) -> None:
+            ids = LIVE.match(str(sample.key_expr))
+            if ids is not None:
+                self.call(handler, ids["role"], ids["id"], sample.kind == zenoh.SampleKind.PUT)
+
+        pattern = LIVE.pattern(site=self._site)
+        self._declare(lambda session: session.liveliness().declare_subscriber(pattern, arrived, history=True))
+
+    # --- for the parts of this module ---------------------------------------------------------------------------
+
+    def call(self, function: Callable[..., object], *arguments: object) -> bool:
+        """Call a function on the loop's thread, from any thread; False when the edge is closed already."""
+        if self._closed or self._loop.is_closed():
+            return False
+        self._loop.call_soon_threadsafe(function, *arguments)
+        return True
+
+    async def in_thread(self, function: Callable[[], object]) -> None:
+        """Run a call that may block on a thread of the edge's own."""
+        await self._loop.run_in_executor(self._threads, function)
+
+    def spawn(self, work: Any) -> None:
+        """Run a coroutine as a task of the edge; it is cancelled when the edge is closed."""
+        task: asyncio.Task[None] = self._loop.create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    def ids(self, channel: Channel, key: str) -> Ids | None:
+        """Return the ids in a key of the channel, without the site; None when it is malformed."""
+        found = channel.match(key)
+        if found is not None:
+            found.pop("site", None)
+        return found
+
+    def refuse(self, channel: Channel, key: str, reason: str) -> None:
+        """Count and report (rate-limited) what broke a contract; from any thread."""
+        metrics.REFUSED.labels(channel.name).inc()
+        self._limited.warning("refused", channel.name, self._clock.now(), channel=channel.name, key=key, reason=reason)
+
+    def _check(self, channel: Channel, ids: Ids) -> None:
+        if channel.transport != "zenoh":
+            raise ValueError(f"channel {channel.name} is carried by {channel.transport}, not by zenoh")
+        if "site" in ids:
+            raise ValueError("the edge fills the site in: leave it out")
+
+    def _with_site(self, channel: Channel, ids: Ids) -> Ids:
+        return {**ids, "site": self._site} if "site" in channel.fields else ids
+
+    def _key(self, channel: Channel, ids: Ids) -> str:
+        self._check(channel, ids)
+        return channel.key(**self._with_site(channel, ids))
+
+    def _declare(self, declare: Callable[[zenoh.Session], object]) -> None:
+        if self._session is None:
+            self._undeclared.append(declare)
+        else:
+            # zenoh undeclares what nobody refers to any more.
+            self._declared.append(declare(self._session))
+
+    async def _attempt(self, connect: Sequence[str]) -> bool:
+        try:
+            session = await asyncio.to_thread(zenoh.open, session_config("client", connect=connect))
+        except zenoh.ZError as error:
+            self._limited.warning("no_router", "no_router", self._clock.now(), connect=list(connect), reason=str(error))
+            return False
+        self._session = session
+        metrics.CONNECTED.labels("zenoh").set_function(lambda: float(self.connected))
+        metrics.CONNECTS.labels("zenoh").inc()
+        pending, self._undeclared = self._undeclared, []
+        for declare in pending:
+            self._declared.append(declare(session))
+        _log.info("zenoh_open", who=self._who, connect=list(connect), zid=str(session.zid()))
+        return True
+
+    async def _keep_trying(self, connect: Sequence[str]) -> None:
+        while True:
+            await asyncio.sleep(random.uniform(*_RETRY_S))
+            if await self._attempt(connect):
+                return
+
+    async def _close(self) -> None:
+        self._closed = True
+        for task in list(self._tasks):
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        if self._session is not None:
+            # Without this, callback subscribers would keep the interpreter from ending.
+            await asyncio.to_thread(self._session.close)
+            metrics.CONNECTED.labels("zenoh").set_function(lambda: 0.0)
+        self._threads.shutdown(wait=False, cancel_futures=True)

@@ -1,0 +1,332 @@
+"""The zenoh edge against real router processes."""
+
+import asyncio
+import contextlib
+import json
+import time
+
+import pytest
+import zenoh
+from prometheus_client import REGISTRY
+
+from fog_contracts import channels as ch
+from fog_contracts import messages as m
+from fog_contracts.codec import ContractError
+from fog_runtime.clock import SystemClock
+from fog_runtime.servers import free_port, start_router
+from fog_runtime.zenoh_edge import ZenohEdge, session_config
+
+pytestmark = pytest.mark.live
+
+
+@pytest.fixture(scope="module")
+def shared_router(tmp_path_factory):
+    with start_router(tmp_path_factory.mktemp("router")) as router:
+        yield router
+
+
+@pytest.fixture
+def router(shared_router):
+    """Return a running router, started again in case the last test killed it."""
+    shared_router.start()
+    return shared_router
+
+
+def edge(endpoint, name="e1", site="lab"):
+    return ZenohEdge.open(connect=[endpoint], clock=SystemClock(), role="test", id=name, site=site)
+
+
+async def until(condition, what, seconds=10.0):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, what
+        await asyncio.sleep(0.01)
+
+
+def pose(x):
+    return m.RobotPose(x=x, y=0.0, theta=0.0, covariance=[0.0] * 9, v=0.0, w=0.0, radius=0.2, height=0.3, stamp=1.0)
+
+
+def delta(seq, size=10):
+    return m.MapDelta(
+        epoch=1, seq=seq, part=0, parts=1, layer="cost", x=0, y=0, w=size, h=1, packing="raw", cells=bytes(size), hash=0
+    )
+
+
+def zones(seq):
+    return m.ZoneSet(epoch=1, seq=seq, zones=[])
+
+
+def counted(name, channel):
+    return REGISTRY.get_sample_value(name, {"channel": channel.name}) or 0.0
+
+
+async def publish_until(publisher, channel, make, condition, what, **ids):
+    """Publish again and again (a subscription takes a moment to reach the publisher)."""
+    deadline = time.monotonic() + 10.0
+    n = 0
+    while not condition():
+        assert time.monotonic() < deadline, what
+        publisher.publish(channel, make(n), **ids)
+        n += 1
+        await asyncio.sleep(0.02)
+
+
+async def test_messages_reach_subscribers_of_their_key_with_ids(router):
+    seen, one = [], []
+    async with edge(router.endpoint, "a") as a, edge(router.endpoint, "b") as b:
+        assert a.connected
+        b.subscribe(ch.ROBOT_POSE, m.RobotPose, lambda ids, message: seen.append((ids, message.x)))
+        b.subscribe(ch.ROBOT_POSE, m.RobotPose, lambda ids, _: one.append(ids), robot="r2")
+        slot = b.latest(ch.ROBOT_POSE, m.RobotPose, robot="r1")
+        await publish_until(a, ch.ROBOT_POSE, lambda n: pose(float(n)), slot.get, "no pose", robot="r1")
+        await publish_until(a, ch.ROBOT_POSE, lambda _: pose(-1.0), lambda: one, "no pose", robot="r2")
+    assert ({"robot": "r1"}, slot.get().x) in seen
+    assert all(ids == {"robot": "r2"} for ids in one)
+    assert not a.connected
+
+
+async def test_sites_do_not_hear_one_another(router):
+    other, own = [], []
+    async with edge(router.endpoint) as a, edge(router.endpoint, site="other") as b:
+        b.subscribe(ch.ZONES, m.ZoneSet, lambda _, message: other.append(message))
+        a.subscribe(ch.ZONES, m.ZoneSet, lambda _, message: own.append(message))
+        await publish_until(a, ch.ZONES, zones, lambda: own, "nothing came")
+    assert other == []
+
+
+async def test_a_busy_loop_gets_the_newest_value_only_and_recovered_ones_complete(router):
+    poses, deltas = [], []
+    async with edge(router.endpoint, "a") as a, edge(router.endpoint, "b") as b:
+        b.subscribe(ch.ROBOT_POSE, m.RobotPose, lambda _, message: poses.append(message.x))
+        b.subscribe(ch.MAP_DELTA, m.MapDelta, lambda _, message: deltas.append(message.seq))
+        await publish_until(a, ch.ROBOT_POSE, lambda _: pose(-1.0), lambda: poses, "no pose", robot="r1")
+        a.publish(ch.MAP_DELTA, delta(0))
+        await until(lambda: deltas, "no delta")
+        await asyncio.sleep(0.2)
+        poses.clear()
+        for n in range(1, 101):
+            a.publish(ch.ROBOT_POSE, pose(float(n)), robot="r1")
+            a.publish(ch.MAP_DELTA, delta(n))
+        time.sleep(0.5)  # noqa: ASYNC251  # the loop is meant to stand still while all arrive
+        await until(lambda: deltas == list(range(101)), "deltas are missing or out of order")
+        await until(lambda: poses and poses[-1] == 100.0, "the newest pose did not come")
+    assert len(poses) < 20
+
+
+async def test_late_subscriber_gets_kept_values_and_recent_deltas(router):
+    got, deltas = [], []
+    async with edge(router.endpoint, "a") as a:
+        for n in range(3):
+            a.publish(ch.ZONES, zones(n))
+            a.publish(ch.MAP_DELTA, delta(n))
+        async with edge(router.endpoint, "b") as b:
+            b.subscribe(ch.ZONES, m.ZoneSet, lambda _, message: got.append(message.seq))
+            b.subscribe(ch.MAP_DELTA, m.MapDelta, lambda _, message: deltas.append(message.seq))
+            await until(lambda: got and len(deltas) >= 3, "history did not come")
+    assert got == [2]
+    assert deltas == [0, 1, 2]
+
+
+async def test_router_killed_and_restarted_all_goes_on_and_no_delta_is_lost(router):
+    poses, deltas = [], []
+    async with edge(router.endpoint, "a") as a, edge(router.endpoint, "b") as b:
+        b.subscribe(ch.ROBOT_POSE, m.RobotPose, lambda _, message: poses.append(message.x))
+        b.subscribe(ch.MAP_DELTA, m.MapDelta, lambda _, message: deltas.append(message.seq))
+        a.serve(ch.PLANNER_PLAN, lambda _, request: m.PlanReply(length=request.goal.x))
+        await publish_until(a, ch.ROBOT_POSE, lambda _: pose(1.0), lambda: poses, "no pose", robot="r1")
+        a.publish(ch.MAP_DELTA, delta(0))
+        await until(lambda: deltas, "no delta")
+        router.kill()
+        await until(lambda: not a.connected and not b.connected, "the loss was not noticed")
+        for n in range(1, 21):
+            a.publish(ch.MAP_DELTA, delta(n))
+        assert await b.ask(ch.PLANNER_PLAN, plan(2.0), m.PlanReply, 0.5) is None
+        router.start()
+        await until(lambda: a.connected and b.connected, "no reconnection")
+        poses.clear()
+        await publish_until(a, ch.ROBOT_POSE, lambda _: pose(2.0), lambda: poses, "no pose again", robot="r1")
+        await until(lambda: deltas == list(range(21)), f"deltas are missing: {deltas}")
+        await answered(b, 3.0)
+
+
+def plan(x):
+    at = m.Pose(x=x, y=0.0, theta=0.0)
+    return m.PlanRequest(start=at, goal=at)
+
+
+async def answered(asker, x, seconds=10.0):
+    """Ask until somebody answers."""
+    deadline = time.monotonic() + seconds
+    while True:
+        reply = await asker.ask(ch.PLANNER_PLAN, plan(x), m.PlanReply, 1.0)
+        if reply is not None:
+            assert reply.length == x
+            return
+        assert time.monotonic() < deadline, "no answer"
+        await asyncio.sleep(0.02)
+
+
+async def test_edge_opened_before_any_router_does_all_once_there_is_one(tmp_path):
+    port = free_port()
+    endpoint = f"tcp/127.0.0.1:{port}"
+    got, deltas, live = [], [], []
+    async with edge(endpoint, "a") as a, edge(endpoint, "b") as b:
+        assert not a.connected
+        b.subscribe(ch.ZONES, m.ZoneSet, lambda _, message: got.append(message.seq))
+        b.subscribe(ch.MAP_DELTA, m.MapDelta, lambda _, message: deltas.append(message.seq))
+        b.watch_live(lambda *event: live.append(event))
+        a.alive("planner", "p1")
+        a.serve(ch.PLANNER_PLAN, lambda _, request: m.PlanReply(length=request.goal.x))
+        for n in range(3):
+            a.publish(ch.ZONES, zones(n))
+            a.publish(ch.MAP_DELTA, delta(n))
+        before = counted("fognav_unsent_messages_total", ch.ROBOT_POSE)
+        a.publish(ch.ROBOT_POSE, pose(1.0), robot="r1")
+        assert counted("fognav_unsent_messages_total", ch.ROBOT_POSE) == before + 1
+        assert await b.ask(ch.PLANNER_PLAN, plan(1.0), m.PlanReply, 0.5) is None
+        with start_router(tmp_path, port):
+            await until(lambda: a.connected and b.connected, "no connection")
+            await answered(b, 4.0)
+            await until(lambda: got == [2] and deltas == [0, 1, 2], f"missing: {got} {deltas}")
+            await until(lambda: live == [("planner", "p1", True)], f"live: {live}")
+
+
+async def test_queries_are_answered_by_plain_and_async_handlers_with_ids(router):
+    async def command(ids, request):
+        await asyncio.sleep(0)
+        return m.CommandReply(accepted=True, reason=f"{ids['robot']} {request.kind}")
+
+    snapshot = m.ZoneSet(epoch=1, seq=7, zones=[])
+    async with edge(router.endpoint, "a") as a, edge(router.endpoint, "b") as b:
+        a.serve(ch.ROBOT_COMMAND, command, robot="r1")
+        a.serve(ch.ZONES, lambda *_: snapshot)
+        a.serve(ch.PLANNER_PLAN, lambda _, request: m.PlanReply(length=request.goal.x))
+        await answered(b, 5.0)
+        order = m.RobotCommand(kind="enable", robot="r1", operator="o", nonce="n" * 16, issued_at=1.0)
+        reply = await b.ask(ch.ROBOT_COMMAND, order, m.CommandReply, 5.0, robot="r1")
+        assert reply == m.CommandReply(accepted=True, reason="r1 enable")
+        assert await b.ask(ch.ZONES, None, m.ZoneSet, 5.0) == snapshot
+        # Nobody serves r2: none comes, long before the time is over.
+        assert await b.ask(ch.ROBOT_COMMAND, order, m.CommandReply, 5.0, robot="r2") is None
+
+
+async def test_a_large_reply_arrives_whole(router):
+    big = m.MapSnapshot(
+        site="lab", epoch=1, seq=1, hash=1, cost=bytes(range(256)) * 40_000, speed=b"", static=b"",
+        geometry=m.MapGeometry(width=1, height=1, resolution=0.05, origin_x=0.0, origin_y=0.0),
+    )  # fmt: skip
+    async with edge(router.endpoint, "a") as a, edge(router.endpoint, "b") as b:
+        a.serve(ch.MAP_SNAPSHOT, lambda *_: big)
+        a.serve(ch.PLANNER_PLAN, lambda _, request: m.PlanReply(length=request.goal.x))
+        await answered(b, 1.0)
+        assert await b.ask(ch.MAP_SNAPSHOT, None, m.MapSnapshot, 20.0) == big
+
+
+async def test_asker_learns_of_failure_silence_and_broken_answers(router):
+    silent = asyncio.Event()
+
+    async def never(ids, request):
+        await silent.wait()
+
+    def fails(ids, request):
+        raise RuntimeError("a bug")
+
+    async with edge(router.endpoint, "a") as a, edge(router.endpoint, "b") as b:
+        a.serve(ch.MAP_SNAPSHOT, never)
+        a.serve(ch.PLANNER_EGRESS, fails)
+        a.serve(ch.PLANNER_PLAN, lambda _, request: m.PlanReply(length=request.goal.x))
+        await answered(b, 1.0)
+        assert await b.ask(ch.MAP_SNAPSHOT, None, m.MapSnapshot, 0.2) is None
+        with pytest.raises(ContractError, match="failed"):
+            await b.ask(ch.PLANNER_EGRESS, m.EgressRequest(robot="r1", pose=plan(0.0).start), m.PlanReply, 5.0)
+        await answered(b, 2.0)
+
+
+@contextlib.contextmanager
+def raw_session(endpoint):
+    session = zenoh.open(session_config("client", connect=[endpoint]))
+    try:
+        yield session
+    finally:
+        session.close()
+
+
+async def test_broken_messages_are_refused_counted_and_do_no_harm(router):
+    seen = []
+    channel = ch.ROBOT_POSE
+    before = counted("fognav_refused_messages_total", channel)
+    async with edge(router.endpoint, "a") as a, edge(router.endpoint, "b") as b:
+        b.subscribe(channel, m.RobotPose, lambda ids, _: seen.append(ids["robot"]))
+        await publish_until(a, channel, lambda _: pose(1.0), lambda: seen, "no pose", robot="r1")
+        with raw_session(router.endpoint) as raw:
+            raw.put("fog/lab/robots/r3/pose", b"\xc1 not msgpack")
+            raw.put("fog/lab/robots/r4/pose", b"x" * (channel.limit + 1))
+            raw.put("fog/lab/robots/R 5/pose", b"\x80")
+            raw.put("fog/lab/robots/r6/pose", b"\x80")
+            await until(lambda: counted("fognav_refused_messages_total", channel) == before + 4, "not all were refused")
+        seen.clear()
+        await publish_until(a, channel, lambda _: pose(1.0), lambda: seen, "deaf after broken messages", robot="r7")
+    assert set(seen) <= {"r1", "r7"}
+
+
+async def test_broken_and_oversized_requests_are_refused_in_words(router):
+    async with edge(router.endpoint, "a") as a, edge(router.endpoint, "b") as b:
+        a.serve(ch.PLANNER_PLAN, lambda _, request: m.PlanReply(length=request.goal.x))
+        await answered(b, 1.0)
+
+        def ask(payload):
+            with raw_session(router.endpoint) as raw:
+                return [bytes(r.err.payload).decode() for r in raw.get("fog/lab/planner/plan", payload=payload)]
+
+        assert "start" in (await asyncio.to_thread(ask, b"\x80"))[0]
+        assert "over the limit" in (await asyncio.to_thread(ask, b"x" * 2000))[0]
+
+
+async def test_handler_that_fails_does_not_silence_the_channel(router):
+    seen = []
+
+    def handler(ids, message):
+        seen.append(message.x)
+        raise RuntimeError("a bug")
+
+    before = counted("fognav_handler_errors_total", ch.ROBOT_POSE)
+    async with edge(router.endpoint, "a") as a, edge(router.endpoint, "b") as b:
+        b.subscribe(ch.ROBOT_POSE, m.RobotPose, handler)
+        await publish_until(a, ch.ROBOT_POSE, lambda _: pose(1.0), lambda: len(seen) > 2, "no pose", robot="r1")
+    assert counted("fognav_handler_errors_total", ch.ROBOT_POSE) >= before + 3
+
+
+async def test_liveliness_tells_who_comes_and_goes(router):
+    seen = []
+    async with edge(router.endpoint, "w") as watcher:
+        async with edge(router.endpoint, "early") as early:
+            early.alive("planner", "p1")
+            watcher.watch_live(lambda *event: seen.append(event))
+            await until(lambda: ("planner", "p1", True) in seen, "the early one is not seen")
+            async with edge(router.endpoint, "late") as late:
+                late.alive("robot-agent", "r1")
+                await until(lambda: ("robot-agent", "r1", True) in seen, "the late one is not seen")
+            await until(lambda: ("robot-agent", "r1", False) in seen, "its end is not seen")
+        assert ("planner", "p1", False) not in seen[:-1]
+
+
+async def test_wrong_use_is_an_error_at_once(router):
+    async with edge(router.endpoint) as a:
+        with pytest.raises(ValueError, match="mqtt"):
+            a.publish(ch.NODE_READING, pose(1.0), node="n1")
+        with pytest.raises(ValueError, match="robot"):
+            a.publish(ch.ROBOT_POSE, pose(1.0))
+        with pytest.raises(ValueError, match="site"):
+            a.publish(ch.ROBOT_POSE, pose(1.0), site="x", robot="r1")
+        with pytest.raises(ContractError, match="RobotPose"):
+            a.publish(ch.ROBOT_POSE, zones(1), robot="r1")
+
+
+async def test_router_logs_that_it_listens_and_ends_on_sigterm(tmp_path):
+    router = start_router(tmp_path)
+    await until(lambda: "listening" in router.log.read_text(), "no event")
+    router.stop()
+    events = [json.loads(line) for line in router.log.read_text().splitlines()]
+    assert [event["event"] for event in events] == ["listening", "stopping", "stopped"]
+    assert events[0]["endpoints"] == [router.endpoint]

@@ -2,6 +2,7 @@
 
 import os
 import platform
+import re
 import shutil
 import socket
 import subprocess
@@ -47,7 +48,8 @@ def _version(path: Path, *options: str) -> str:
         )
     except (OSError, subprocess.TimeoutExpired) as error:
         return f"does not run: {error}"
-    lines = done.stdout.strip().splitlines()
+    # A wrapper script may complain before the program speaks.
+    lines = [line for line in done.stdout.splitlines() if re.match(r"^[A-Za-z].*\d+\.\d+", line)]
     return lines[0] if lines else "(says no version)"
 
 

@@ -18,7 +18,7 @@ NOT_TRUE: Final = 1
 """The thing that was asked for did not come true."""
 WRONG_USE: Final = 2
 
-console = Console(stderr=True, highlight=False)
+console = Console(stderr=True, highlight=False, width=None if sys.stderr.isatty() else 200)
 
 
 class WrongUseError(ValueError):

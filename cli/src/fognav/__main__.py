@@ -1,0 +1,190 @@
+"""The command line: each command reads its options, calls what does the work, and turns the outcome into a code."""
+
+import asyncio
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Annotated, NoReturn
+
+import typer
+from rich.table import Table
+
+from fognav import __version__, checkout, doctor, kernels, system
+from fognav.output import NOT_TRUE, OK, WRONG_USE, WrongUseError, console, print_json, write_report
+
+app = typer.Typer(
+    name="fognav",
+    help="Keep a small indoor robot out of danger that it can't see yet.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+site_app = typer.Typer(help="Make and check sites.", no_args_is_help=True)
+app.add_typer(site_app, name="site")
+
+Yes = Annotated[
+    bool, typer.Option("--yes", help="Install missing system packages without asking (CI=true says so too).")
+]
+Json = Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")]
+
+
+def _say(text: str) -> None:
+    console.print(text, markup=False)
+
+
+def _fail(message: str, code: int = NOT_TRUE) -> NoReturn:
+    console.print(f"fognav: {message}", markup=False, style="red")
+    raise typer.Exit(code)
+
+
+def _version(show: bool) -> None:  # noqa: FBT001  # Typer calls it with its value alone
+    if show:
+        typer.echo(f"fognav {__version__}")
+        raise typer.Exit(OK)
+
+
+@app.callback()
+def _main(
+    *,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    del version  # its callback has done all
+
+
+@app.command("doctor", epilog="Example: fognav doctor --json")
+def doctor_command(*, json: Json = False) -> None:
+    """Say what is installed, what is missing and how to get it."""
+    found = list(doctor.checks())
+    if json:
+        print_json(doctor.as_json(found))
+    else:
+        table = Table(box=None, padding=(0, 2), show_header=False)
+        marks = {"ok": "[green]ok[/]", "missing": "[red]missing[/]", "optional": "[yellow]optional[/]"}
+        for check in found:
+            table.add_row(marks[check.state], check.name, check.found)
+            if check.remedy:
+                table.add_row("", "", f"[dim]to do: {check.remedy}[/]")
+        console.print(table)
+    raise typer.Exit(NOT_TRUE if any(check.state == "missing" for check in found) else OK)
+
+
+def _prepare(*, yes: bool) -> None:
+    try:
+        system.ensure([system.MOSQUITTO, system.REDIS], yes=yes, say=_say)
+        kernels.make_warm(_say)
+    except (system.MissingToolsError, kernels.KernelsError) as error:
+        _fail(str(error))
+
+
+@app.command(
+    "test",
+    context_settings={"allow_extra_args": True, "ignore_unknown_options": True},
+    epilog="Example: fognav test --yes -k replica",
+)
+def run_tests(context: typer.Context, *, yes: Yes = False) -> None:
+    """Set up what is missing and run all tests, those with real brokers included; further arguments go to pytest."""
+    _prepare(yes=yes)
+    command = [sys.executable, "-m", "pytest", *context.args]
+    done = subprocess.run(command, check=False, cwd=checkout.root())
+    raise typer.Exit(done.returncode)
+
+
+@app.command("demo", epilog="Example: fognav demo --headless --report report.json --seed 7")
+def demo_command(
+    *,
+    headless: Annotated[bool, typer.Option("--headless", help="No terminal view and no page: for machines.")] = False,
+    report: Annotated[Path | None, typer.Option("--report", metavar="F", help="Write the report (JSON) here.")] = None,
+    site: Annotated[
+        Path | None, typer.Option("--site", metavar="D", help="Folder of a site; sites/estig without it.")
+    ] = None,
+    seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of noise, area and moment.")] = 1,
+    speed: Annotated[
+        float,
+        typer.Option("--speed", metavar="K", min=0.1, max=50.0, help="Simulated time against wall time."),
+    ] = 1.0,
+    no_hazard: Annotated[bool, typer.Option("--no-hazard", help="Block nothing on the way.")] = False,
+    keep_running: Annotated[
+        bool, typer.Option("--keep-running", help="Leave everything running after the drive, until Ctrl-C.")
+    ] = False,
+    page_port: Annotated[
+        int, typer.Option("--page-port", metavar="P", min=0, max=65535, help="Port of the page; 0: any free one.")
+    ] = 0,
+    yes: Yes = False,
+    json: Json = False,
+) -> None:
+    """Start the whole system with simulated hardware, drive, block the way, and watch the robot go around.
+
+    Exit code 0 only if the goal was reached without touching anything, by a way that avoids the blocked area.
+    """
+    from fognav.demo.command import run_demo  # noqa: PLC0415  # the other commands need not wait for its imports
+    from fognav.demo.run import Options  # noqa: PLC0415  # same
+
+    try:
+        folder = checkout.site_folder(site)
+    except WrongUseError as error:
+        _fail(str(error), WRONG_USE)
+    _prepare(yes=yes)
+    options = Options(seed=seed, speed=speed, hazard=not no_hazard, keep_running=keep_running)
+    try:
+        values = asyncio.run(run_demo(folder, options, headless=headless, page_port=page_port, say=_say))
+        if report is not None:
+            write_report(report, values)
+    except WrongUseError as error:
+        _fail(str(error), WRONG_USE)
+    if json:
+        print_json(values)
+    raise typer.Exit(OK if values["success"] else NOT_TRUE)
+
+
+@site_app.command(
+    "new", epilog="Example: fognav site new --map floor.yaml --out sites/floor && fognav demo --site sites/floor"
+)
+def site_new(
+    *,
+    map_file: Annotated[Path, typer.Option("--map", metavar="MAP.yaml", help="map_server YAML; it stays where it is.")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to make; it must not hold a site yet.")],
+    seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Another seed proposes other places.")] = 1,
+    json: Json = False,
+) -> None:
+    """Write a commented starting point for a site on any map_server map, ready for a demonstration."""
+    from fognav.site_command import new_site  # noqa: PLC0415  # its kernels take time to load
+
+    try:
+        made = new_site(map_file, out, seed)
+    except WrongUseError as error:
+        _fail(str(error), WRONG_USE)
+    if json:
+        print_json(made)
+    else:
+        _say(f"wrote {made['file']}: {made['areas']} watched areas. Try it: fognav demo --site {out}")
+
+
+@site_app.command("check", epilog="Example: fognav site check sites/estig")
+def site_check(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder with site.toml.")], *, json: Json = False
+) -> None:
+    """Check a site: map, ids, and that everything lies on free floor."""
+    from fognav.site_command import check_site  # noqa: PLC0415  # same
+
+    found = check_site(folder)
+    if json:
+        print_json(found)
+    elif found["ok"]:
+        _say(f"{folder}: all is well ({found['areas']} areas, {found['nodes']} nodes, {found['places']} places)")
+    else:
+        _fail(str(found["problem"]))
+    raise typer.Exit(OK if found["ok"] else NOT_TRUE)
+
+
+def main() -> None:
+    """Run the command."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    app()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,57 @@
+"""Joins the demonstration with its audience: the terminal view, the page, or nobody."""
+
+import asyncio
+import contextlib
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+from fog_runtime import logs
+from fog_runtime.site import SiteError, load_site
+from fognav.demo.judge import Verdict
+from fognav.demo.run import Demo, Options
+from fognav.demo.view import show
+from fognav.output import WrongUseError, console
+from fognav.page.app import serve
+from fognav.supervisor import NotReadyError
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+async def run_demo(
+    folder: Path, options: Options, *, headless: bool, page_port: int, say: Callable[[str], None]
+) -> dict[str, object]:
+    """Run a demonstration on a site's folder until its verdict or a signal; return the report.
+
+    Raises `WrongUseError` for a site that can't be used.
+    """
+    logs.configure("demo", "warning", "text")
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in _SIGNALS:
+        loop.add_signal_handler(number, stop.set)
+    try:
+        site = load_site(folder)
+    except SiteError as error:
+        raise WrongUseError(str(error)) from error
+    shown = not headless and console.is_terminal
+    demo = Demo(site, options, None if shown else say)
+    try:
+        async with contextlib.AsyncExitStack() as audience:
+            if not headless:
+                demo.page_url = demo.scene.page_url = await audience.enter_async_context(serve(demo, page_port))
+                say(f"watch it at {demo.page_url}")
+            if shown:
+                view = asyncio.create_task(show(demo, console))
+                audience.push_async_callback(_end, view)
+            return await demo.run(stop)
+    except (NotReadyError, TimeoutError) as error:
+        say(str(error))
+        demo.scene.verdict = Verdict("stopped", str(error))
+        return demo.report()
+
+
+async def _end(view: asyncio.Task[None]) -> None:
+    view.cancel()
+    with contextlib.suppress(asyncio.CancelledError):
+        await view

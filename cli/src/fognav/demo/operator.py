@@ -1,0 +1,195 @@
+"""What a person at the console would do: watch, enable, send, and (for the simulation) put a barrier in the way."""
+
+import asyncio
+import http.client
+import secrets
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Final
+
+from fog_contracts import channels as ch
+from fog_contracts.codec import ContractError
+from fog_contracts.commands import sign
+from fog_contracts.messages import (
+    CommandKind,
+    CommandReply,
+    HazardArea,
+    Message,
+    RobotCommand,
+    RobotGoal,
+    RobotObstacles,
+    RobotPath,
+    RobotPose,
+    RobotState,
+    SimCommand,
+    SimTruth,
+)
+from fog_runtime.clock import Clock
+from fog_runtime.zenoh_edge import ZenohEdge
+from fognav import net
+from fognav.demo.danger import path_length
+from fognav.demo.scene import Scene
+from fognav.stack import PLANNER, Stack
+
+if TYPE_CHECKING:
+    from fognav.demo.judge import Judge
+
+_ASK_TIMEOUT_S: Final = 2.0
+_ENABLE_EVERY_S: Final = 1.0
+_STOPPED_S: Final = 5.0
+"""A robot that stands in a protective stop for this long is looked at, and enabled again."""
+_HELD_S: Final = 61.0
+"""After 60 s in HOLD a robot waits for an operator."""
+_FAULT_S: Final = 2.0
+
+
+class Operator:
+    """Feeds the scene from the channels, and acts. Everything runs on the loop's thread."""
+
+    def __init__(self, edge: ZenohEdge, stack: Stack, scene: Scene, clock: Clock) -> None:
+        self._edge = edge
+        self._stack = stack
+        self._scene = scene
+        self._clock = clock
+        self._robot = scene.robot
+        self.judge: Judge | None = None
+        self._mode = ""
+        self._mode_since = clock.now()
+        self._last_refusal = ""
+        self._enabled_once = False
+        robot = {"robot": self._robot}
+        edge.subscribe(ch.ROBOT_POSE, RobotPose, self._on_pose, **robot)
+        edge.subscribe(ch.ROBOT_STATE, RobotState, self._on_state, **robot)
+        edge.subscribe(ch.ROBOT_PATH, RobotPath, self._on_path, **robot)
+        edge.subscribe(ch.ROBOT_GOAL, RobotGoal, self._on_goal, **robot)
+        edge.subscribe(ch.ROBOT_OBSTACLES, RobotObstacles, self._on_obstacles, **robot)
+        edge.subscribe(ch.SIM_TRUTH, SimTruth, self._on_truth, **robot)
+        edge.subscribe(ch.HAZARD, HazardArea, self._on_hazard)
+
+    # --- watching ---------------------------------------------------------------------------------------------------
+
+    def _on_pose(self, _ids: Mapping[str, str], pose: RobotPose) -> None:
+        self._scene.pose = pose
+
+    def _on_goal(self, _ids: Mapping[str, str], goal: RobotGoal) -> None:
+        self._scene.goal = goal
+
+    def _on_obstacles(self, _ids: Mapping[str, str], obstacles: RobotObstacles) -> None:
+        self._scene.obstacles = obstacles
+
+    def _on_truth(self, _ids: Mapping[str, str], truth: SimTruth) -> None:
+        self._scene.take_truth(truth)
+        if self.judge is not None:
+            self.judge.on_truth(truth)
+
+    def _on_state(self, _ids: Mapping[str, str], state: RobotState) -> None:
+        if state.mode != self._mode:
+            why = f" ({'; '.join(state.reasons[:2])})" if state.reasons else ""
+            self._scene.say(f"robot: {state.mode}{why}")
+            self._mode, self._mode_since = state.mode, self._clock.now()
+        self._scene.state = state
+        self._scene.traces.take(state.traces)
+        if self.judge is not None:
+            self.judge.on_state(state, self._clock.now())
+
+    def _on_path(self, _ids: Mapping[str, str], path: RobotPath) -> None:
+        known = self._scene.path
+        if known is None or (known.planner_epoch, known.plan_id) != (path.planner_epoch, path.plan_id):
+            self._scene.say(_path_news(path))
+        self._scene.path = path
+        self._scene.traces.take(path.traces)
+        if self.judge is not None:
+            self.judge.on_path(path, self._clock.now())
+
+    def _on_hazard(self, ids: Mapping[str, str], hazard: HazardArea) -> None:
+        known = self._scene.hazards.get(ids["area"])
+        if known is None or known.hazard.state != hazard.hazard.state:
+            if known is not None or hazard.hazard.state != "clear":
+                self._scene.say(f"area {ids['area']}: {hazard.hazard.state} ({hazard.hazard.cause})")
+            self._scene.hazards[ids["area"]] = hazard
+        if hazard.hazard.trace is not None:
+            self._scene.traces.take([hazard.hazard.trace])
+
+    # --- acting -----------------------------------------------------------------------------------------------------
+
+    async def command(self, kind: CommandKind) -> CommandReply | None:
+        """Send the robot a signed command; None when it did not answer."""
+        unsigned = RobotCommand(
+            kind=kind,
+            robot=self._robot,
+            operator="demo",
+            nonce=secrets.token_hex(16),
+            issued_at=self._clock.stamp(),
+        )
+        signed = sign(unsigned, self._stack.operator_key)
+        return await self._ask(ch.ROBOT_COMMAND, signed)
+
+    async def simulate(self, command: SimCommand) -> CommandReply | None:
+        """Change the simulated world; None when the simulator did not answer."""
+        return await self._ask(ch.SIM_COMMAND, command)
+
+    async def _ask(self, channel: ch.Channel, request: Message) -> CommandReply | None:
+        try:
+            return await self._edge.ask(channel, request, CommandReply, _ASK_TIMEOUT_S, robot=self._robot)
+        except ContractError as error:
+            self._scene.say(f"an answer on {channel.name} can't be used: {error.reason}")
+            return None
+
+    async def put_goal(self, place: str) -> net.Answer:
+        """Give the robot its goal over the planner's REST interface; raises `OSError` when the planner is away."""
+        port = self._stack.port(PLANNER)
+        if port is None:
+            raise ConnectionError("the planner has not said where it listens")
+        try:
+            return await asyncio.to_thread(
+                net.request,
+                "PUT",
+                port,
+                f"/api/v1/robots/{self._robot}/goal",
+                body={"place": place},
+                token=self._stack.token,
+            )
+        except http.client.HTTPException as error:
+            raise ConnectionError(f"the planner broke off: {error!r}") from error
+
+    async def keep_enabled(self) -> None:
+        """Enable the robot whenever it asks for it, after a look at why it stands; runs until cancelled."""
+        while True:
+            kind = self._due()
+            if kind is not None:
+                await self._act(kind)
+            await asyncio.sleep(self._clock.real(_ENABLE_EVERY_S))
+
+    def _due(self) -> CommandKind | None:
+        state = self._scene.state
+        if state is None or (self.judge is None and self._scene.verdict is not None):
+            return None
+        stood = self._clock.now() - self._mode_since
+        if state.mode == "FAULT":
+            return "reset" if stood >= _FAULT_S else None
+        waits = state.mode == "INIT" or not state.enabled
+        waits = waits or (state.mode == "PROTECTIVE_STOP" and stood >= _STOPPED_S)
+        waits = waits or (state.mode == "HOLD" and stood >= _HELD_S)
+        return "enable" if waits else None
+
+    async def _act(self, kind: CommandKind) -> None:
+        reply = await self.command(kind)
+        if reply is None:
+            self._refused(f"{kind}: the robot did not answer")
+        elif reply.accepted:
+            self._last_refusal = ""
+            again = " again" if kind == "enable" and self._enabled_once else ""
+            self._enabled_once = self._enabled_once or kind == "enable"
+            self._scene.say(f"operator: {kind}{again}")
+        else:
+            self._refused(f"{kind}: the robot refuses, {reply.reason}")
+
+    def _refused(self, text: str) -> None:
+        if text != self._last_refusal:
+            self._last_refusal = text
+            self._scene.say(f"operator: {text}")
+
+
+def _path_news(path: RobotPath) -> str:
+    if path.refusal is not None:
+        return f"planner: no way, {path.refusal.name}: {path.refusal.reason}"
+    return f"planner: plan {path.plan_id}, {path_length(path.points):.1f} m"

@@ -1,0 +1,121 @@
+"""What is going on, gathered from all channels: the terminal and the page show it, the report sums it up."""
+
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from fog_contracts.messages import (
+    HazardArea,
+    RobotGoal,
+    RobotObstacles,
+    RobotPath,
+    RobotPose,
+    RobotState,
+    SimTruth,
+    Trace,
+)
+from fog_runtime.site import LoadedSite
+from fognav.demo.judge import Traces, Verdict, hazard_to_path_ms, stages_ms
+
+_EVENTS: Final = 200
+_TRAIL: Final = 20_000
+_TRAIL_STEP_M: Final = 0.1
+
+
+@dataclass
+class Scene:
+    """The newest of everything; written and read on the loop's thread only."""
+
+    site: LoadedSite
+    robot: str
+    seed: int
+    speed: float
+    phase: str = "starting"
+    page_url: str = ""
+    pose: RobotPose | None = None
+    truth: SimTruth | None = None
+    state: RobotState | None = None
+    path: RobotPath | None = None
+    goal: RobotGoal | None = None
+    obstacles: RobotObstacles | None = None
+    hazards: dict[str, HazardArea] = field(default_factory=dict)
+    traces: Traces = field(default_factory=Traces)
+    trace: Trace | None = None
+    usage: dict[str, tuple[float, float]] = field(default_factory=dict)
+    verdict: Verdict | None = None
+    events: deque[tuple[float, str]] = field(default_factory=lambda: deque(maxlen=_EVENTS))
+    trail: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=_TRAIL))
+    told: int = 0
+    """How many events there were in all."""
+    on_event: Callable[[str], None] | None = None
+    begun: float = field(default_factory=time.monotonic)
+
+    def say(self, text: str) -> None:
+        """Add a line to the log of events."""
+        self.events.append((time.monotonic() - self.begun, text))
+        self.told += 1
+        if self.on_event is not None:
+            self.on_event(text)
+
+    def take_truth(self, truth: SimTruth) -> None:
+        """Take the truth, and lengthen the trail."""
+        self.truth = truth
+        last = self.trail[-1] if self.trail else None
+        if last is None or abs(last[0] - truth.x) + abs(last[1] - truth.y) >= _TRAIL_STEP_M:
+            self.trail.append((round(truth.x, 2), round(truth.y, 2)))
+
+    def still(self) -> dict[str, Any]:
+        """Return what does not change during a run, as plain values for the page."""
+        geometry = self.site.map.geometry
+        site = self.site.site
+        return {
+            "site": site.name or site.id,
+            "robot": self.robot,
+            "radius": next((r.radius for r in site.robots if r.id == self.robot), 0.17),
+            "seed": self.seed,
+            "map": {
+                "width": geometry.width,
+                "height": geometry.height,
+                "resolution": geometry.resolution,
+                "x": geometry.origin_x,
+                "y": geometry.origin_y,
+            },
+            "areas": [{"id": a.id, "label": a.label or a.id, "polygon": a.polygon} for a in site.areas],
+            "nodes": [
+                {"id": n.id, "x": n.x, "y": n.y, "beams": [[n.theta + s.angle, s.range_limit] for s in n.sonars]}
+                for n in site.nodes
+            ],
+            "places": [{"id": i, "label": p.label or i, "x": p.x, "y": p.y} for i, p in site.places.items()],
+        }
+
+    def moving(self) -> dict[str, Any]:
+        """Return what changes, as plain values for the page."""
+        pose, truth, state, path = self.pose, self.truth, self.state, self.path
+        return {
+            "phase": self.phase,
+            "speed": self.speed,
+            "pose": pose and [round(pose.x, 3), round(pose.y, 3), round(pose.theta, 3), round(pose.v, 3)],
+            "localized": bool(pose and pose.localized),
+            "truth": truth and [round(truth.x, 3), round(truth.y, 3), round(truth.theta, 3)],
+            "distance": truth and round(truth.distance, 1),
+            "clearance": truth and round(truth.clearance, 2),
+            "barriers": [o.polygon for o in truth.obstacles] if truth else [],
+            "mode": state.mode if state else "",
+            "reasons": list(state.reasons[:4]) if state else [],
+            "battery": state.battery if state else None,
+            "goal": self.goal and self.goal.pose and [self.goal.pose.x, self.goal.pose.y],
+            "goal_distance": state and state.goal_distance,
+            "path": [[round(x, 2), round(y, 2)] for x, y in path.points] if path else [],
+            "released": path.released_length if path else 0.0,
+            "refusal": path.refusal.reason if path and path.refusal else "",
+            "hazards": {area: hazard.hazard.state for area, hazard in self.hazards.items()},
+            "seen": [[round(x, 2), round(y, 2)] for x, y in self.obstacles.points] if self.obstacles else [],
+            "stages": stages_ms(self.trace),
+            "hazard_to_path": hazard_to_path_ms(self.trace),
+            "processes": {name: [round(cpu, 1), round(rss, 1)] for name, (cpu, rss) in self.usage.items()},
+            "outcome": self.verdict and [self.verdict.outcome, self.verdict.reason],
+            "told": self.told,
+            "events": [[round(at, 1), text] for at, text in list(self.events)[-30:]],
+        }

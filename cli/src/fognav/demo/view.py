@@ -1,0 +1,116 @@
+"""The demonstration in a terminal: what the robot does and why, what it costs, and what happened."""
+
+import asyncio
+import math
+
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.panel import Panel
+from rich.table import Table
+from rich.text import Text
+
+from fognav.demo.danger import path_length
+from fognav.demo.judge import STAGES, hazard_to_path_ms, stages_ms
+from fognav.demo.run import Demo
+from fognav.demo.scene import Scene
+
+_PERIOD_S = 0.2
+_MODE_STYLES = {
+    "NORMAL": "bold green",
+    "DEGRADED": "bold yellow",
+    "INIT": "bold cyan",
+    "HOLD": "bold yellow",
+    "EGRESS": "bold magenta",
+    "DOCK": "bold magenta",
+}
+_STATE_STYLES = {"blocked": "bold red", "clear": "green", "unknown": "yellow"}
+
+
+def _pairs() -> Table:
+    table = Table.grid(padding=(0, 2))
+    table.add_column(style="dim", no_wrap=True)
+    table.add_column(overflow="fold")
+    return table
+
+
+def _robot(scene: Scene) -> Panel:
+    table = _pairs()
+    state, pose, truth, path = scene.state, scene.pose, scene.truth, scene.path
+    mode = state.mode if state else "no word yet"
+    table.add_row("mode", Text(mode, style=_MODE_STYLES.get(mode, "bold red")))
+    table.add_row("because", "; ".join(state.reasons[:3]) if state and state.reasons else "all is well")
+    if pose is not None:
+        table.add_row("pose", f"{pose.x:7.2f} m {pose.y:7.2f} m {math.degrees(pose.theta):6.0f}°   {pose.v:4.2f} m/s")
+    if truth is not None:
+        off = f"{math.hypot(truth.x - pose.x, truth.y - pose.y):.2f} m off its belief" if pose else ""
+        table.add_row("truth", f"{truth.x:7.2f} m {truth.y:7.2f} m   {off}")
+        table.add_row("driven", f"{truth.distance:.1f} m, {truth.clearance:.2f} m to the nearest thing")
+    if path is not None:
+        length = path_length(path.points)
+        table.add_row("path", path.refusal.reason if path.refusal else f"plan {path.plan_id}, {length:.1f} m")
+    if state is not None and state.goal_distance is not None:
+        table.add_row("to go", f"{state.goal_distance:.1f} m")
+    return Panel(table, title=f"Robot {scene.robot}", title_align="left")
+
+
+def _hazards(scene: Scene) -> Panel:
+    table = _pairs()
+    for area in scene.site.site.areas:
+        hazard = scene.hazards.get(area.id)
+        state = hazard.hazard.state if hazard else "no word"
+        table.add_row(area.label or area.id, Text(state, style=_STATE_STYLES.get(state, "dim")))
+    trace = scene.trace
+    took = stages_ms(trace)
+    if took:
+        table.add_row("", "")
+        for stage, _, _ in STAGES:
+            table.add_row(stage, f"{took[stage]:7.0f} ms" if stage in took else "      ...")
+        total = hazard_to_path_ms(trace)
+        if total is not None:
+            table.add_row(Text("reading to path", style="bold"), Text(f"{total:7.0f} ms", style="bold"))
+    return Panel(table, title="Watched areas", title_align="left")
+
+
+def _processes(scene: Scene) -> Panel:
+    table = Table(box=None, padding=(0, 1), header_style="dim")
+    table.add_column("process", no_wrap=True)
+    table.add_column("CPU", justify="right")
+    table.add_column("memory", justify="right")
+    for name, (cpu, rss) in scene.usage.items():
+        table.add_row(name, f"{cpu:.0f} %", f"{rss:.0f} MB")
+    return Panel(table, title="Processes", title_align="left")
+
+
+def _events(scene: Scene, lines: int) -> Panel:
+    table = _pairs()
+    for at, text in list(scene.events)[-lines:]:
+        table.add_row(f"{at:6.1f} s", text)
+    return Panel(table, title="Events", title_align="left")
+
+
+def render(scene: Scene, height: int) -> RenderableType:
+    """Lay the scene out for a terminal of `height` lines."""
+    speed = f", {scene.speed:g} times as fast" if scene.speed != 1.0 else ""
+    head = Text.assemble(
+        ("Fognav ", "bold"), f"{scene.site.site.name or scene.site.site.id}, seed {scene.seed}{speed}: "
+    )
+    head.append(scene.phase, style="bold cyan")
+    if scene.page_url:
+        head.append(f"    {scene.page_url}", style="underline")
+    columns = Table.grid(expand=True)
+    for ratio in (5, 3, 4):
+        columns.add_column(ratio=ratio)
+    columns.add_row(_robot(scene), _hazards(scene), _processes(scene))
+    used = 4 + max(len(scene.usage) + 3, len(scene.site.site.areas) + 9)
+    return Group(head, columns, _events(scene, max(5, height - used)))
+
+
+async def show(demo: Demo, console: Console) -> None:
+    """Keep the terminal up to date until cancelled."""
+    with Live(render(demo.scene, console.height), console=console, auto_refresh=False, screen=False) as live:
+        try:
+            while True:
+                live.update(render(demo.scene, console.height), refresh=True)
+                await asyncio.sleep(_PERIOD_S)
+        finally:
+            live.update(render(demo.scene, console.height), refresh=True)

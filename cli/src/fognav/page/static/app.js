@@ -1,0 +1,360 @@
+// The page of a running demo: draws the scene that the server streams. Metres everywhere, y up; pixels only at the end.
+"use strict";
+
+const canvas = document.getElementById("map");
+const context = canvas.getContext("2d");
+const by = (id) => document.getElementById(id);
+
+let still = null; // what does not change
+let now = null; // the newest of what moves
+let trail = [];
+let floor = null; // the map, coloured
+let picture = null;
+let view = null; // {x, y: the middle in metres, scale: pixels per metre}
+let follow = false;
+let drawn = false;
+
+const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
+let colours = {};
+function readColours() {
+  for (const name of ["floor", "wall", "unknown-cell", "robot", "path", "trail", "goal", "blocked", "unknown", "clear",
+    "seen", "barrier", "text", "card", "quiet"]) colours[name] = css(name);
+}
+
+function rgb(colour) {
+  const probe = document.createElement("canvas").getContext("2d");
+  probe.fillStyle = colour;
+  probe.fillRect(0, 0, 1, 1);
+  return probe.getImageData(0, 0, 1, 1).data;
+}
+
+// The picture says what each cell is: 0 free, 1 occupied, 2 unknown.
+function colourFloor() {
+  floor = document.createElement("canvas");
+  floor.width = picture.width;
+  floor.height = picture.height;
+  const surface = floor.getContext("2d", { willReadFrequently: true });
+  surface.drawImage(picture, 0, 0);
+  const image = surface.getImageData(0, 0, floor.width, floor.height);
+  const kinds = [rgb(colours.floor), rgb(colours.wall), rgb(colours["unknown-cell"])];
+  for (let i = 0; i < image.data.length; i += 4) image.data.set(kinds[image.data[i]] || kinds[1], i);
+  surface.putImageData(image, 0, 0);
+}
+
+function fit() {
+  const m = still.map;
+  const width = m.width * m.resolution;
+  const height = m.height * m.resolution;
+  const scale = 0.96 * Math.min(canvas.clientWidth / width, canvas.clientHeight / height);
+  view = { x: m.x + width / 2, y: m.y + height / 2, scale };
+}
+
+const px = (x) => (x - view.x) * view.scale + canvas.clientWidth / 2;
+const py = (y) => (view.y - y) * view.scale + canvas.clientHeight / 2;
+
+function line(points, close) {
+  context.beginPath();
+  points.forEach(([x, y], i) => (i ? context.lineTo(px(x), py(y)) : context.moveTo(px(x), py(y))));
+  if (close) context.closePath();
+}
+
+function drawAreas() {
+  for (const area of still.areas) {
+    const state = (now && now.hazards[area.id]) || "none";
+    const colour = { blocked: colours.blocked, unknown: colours.unknown, clear: colours.clear }[state] || colours.quiet;
+    line(area.polygon, true);
+    context.fillStyle = colour;
+    context.globalAlpha = state === "blocked" ? 0.4 : state === "unknown" ? 0.28 : 0.14;
+    context.fill();
+    context.globalAlpha = 1;
+    context.strokeStyle = colour;
+    context.lineWidth = state === "blocked" ? 2.5 : 1;
+    context.stroke();
+    const [x, y] = area.polygon.reduce(([a, b], [c, d]) => [a + c / area.polygon.length, b + d / area.polygon.length], [0, 0]);
+    label(area.label, px(x), py(y), colour);
+  }
+}
+
+function label(text, x, y, colour) {
+  context.font = "600 12px system-ui, 'DejaVu Sans', sans-serif";
+  context.textAlign = "center";
+  context.textBaseline = "middle";
+  context.lineWidth = 4;
+  context.strokeStyle = colours.card;
+  context.strokeText(text, x, y);
+  context.fillStyle = colour;
+  context.fillText(text, x, y);
+}
+
+function drawNodes() {
+  for (const node of still.nodes) {
+    context.strokeStyle = colours.quiet;
+    context.lineWidth = 1;
+    context.globalAlpha = 0.5;
+    for (const [direction, range] of node.beams) {
+      line([[node.x, node.y], [node.x + range * Math.cos(direction), node.y + range * Math.sin(direction)]]);
+      context.stroke();
+    }
+    context.globalAlpha = 1;
+    context.fillStyle = colours.quiet;
+    context.fillRect(px(node.x) - 3, py(node.y) - 3, 6, 6);
+  }
+}
+
+function drawPath() {
+  if (trail.length > 1) {
+    line(trail);
+    context.strokeStyle = colours.trail;
+    context.lineWidth = 2.5;
+    context.stroke();
+  }
+  if (now.path.length > 1) {
+    line(now.path);
+    context.strokeStyle = colours.path;
+    context.lineWidth = 2.5;
+    context.setLineDash([7, 5]);
+    context.stroke();
+    context.setLineDash([]);
+  }
+  if (now.goal) {
+    context.strokeStyle = colours.goal;
+    context.lineWidth = 3;
+    context.beginPath();
+    context.arc(px(now.goal[0]), py(now.goal[1]), 9, 0, 2 * Math.PI);
+    context.stroke();
+  }
+}
+
+function drawRobot() {
+  const at = now.pose || now.truth;
+  if (!at) return;
+  const [x, y, heading] = at;
+  const size = Math.max(8, still.radius * view.scale);
+  context.save();
+  context.translate(px(x), py(y));
+  context.rotate(-heading);
+  context.fillStyle = colours.robot;
+  context.strokeStyle = colours.card;
+  context.lineWidth = 2;
+  context.beginPath();
+  context.arc(0, 0, size, 0, 2 * Math.PI);
+  context.fill();
+  context.stroke();
+  context.beginPath();
+  context.moveTo(size * 0.75, 0);
+  context.lineTo(-size * 0.35, size * 0.5);
+  context.lineTo(-size * 0.35, -size * 0.5);
+  context.closePath();
+  context.fillStyle = colours.card;
+  context.fill();
+  context.restore();
+}
+
+function draw() {
+  drawn = false;
+  if (!still || !floor || !view) return;
+  const ratio = window.devicePixelRatio || 1;
+  const width = Math.round(canvas.clientWidth * ratio);
+  const height = Math.round(canvas.clientHeight * ratio);
+  if (canvas.width !== width || canvas.height !== height) {
+    canvas.width = width;
+    canvas.height = height;
+  }
+  context.setTransform(ratio, 0, 0, ratio, 0, 0);
+  context.fillStyle = colours["unknown-cell"];
+  context.fillRect(0, 0, canvas.clientWidth, canvas.clientHeight);
+  if (follow && now && now.pose) {
+    view.x = now.pose[0];
+    view.y = now.pose[1];
+  }
+  const m = still.map;
+  const w = m.width * m.resolution * view.scale;
+  const h = m.height * m.resolution * view.scale;
+  context.imageSmoothingEnabled = view.scale * m.resolution < 1;
+  context.drawImage(floor, px(m.x), py(m.y + m.height * m.resolution), w, h);
+  drawAreas();
+  drawNodes();
+  for (const place of still.places) {
+    context.fillStyle = colours.text;
+    context.beginPath();
+    context.arc(px(place.x), py(place.y), 3.5, 0, 2 * Math.PI);
+    context.fill();
+    label(place.label, px(place.x), py(place.y) - 14, colours.text);
+  }
+  if (!now) return;
+  for (const barrier of now.barriers) {
+    line(barrier, true);
+    context.fillStyle = colours.barrier;
+    context.fill();
+  }
+  drawPath();
+  context.fillStyle = colours.seen;
+  for (const [x, y] of now.seen) context.fillRect(px(x) - 1.5, py(y) - 1.5, 3, 3);
+  drawRobot();
+}
+
+function redraw() {
+  if (drawn) return;
+  drawn = true;
+  requestAnimationFrame(draw);
+}
+
+// --- beside the map ------------------------------------------------------------------------------------------------
+
+function put(id, text) {
+  const element = by(id);
+  if (element.textContent !== text) element.textContent = text;
+}
+
+const metres = (value, digits = 1) => (value === null || value === undefined ? "–" : `${value.toFixed(digits)} m`);
+const TONES = { NORMAL: "good", DEGRADED: "careful", INIT: "careful", HOLD: "careful", EGRESS: "careful", DOCK: "careful" };
+
+function bars() {
+  const most = Math.max(1, ...Object.values(now.stages));
+  const rows = Object.entries(now.stages).map(([stage, took]) => {
+    const row = document.createElement("div");
+    row.className = "bar";
+    const name = document.createElement("b");
+    name.textContent = stage;
+    const bar = document.createElement("progress");
+    bar.max = most;
+    bar.value = Math.max(0, took);
+    bar.setAttribute("aria-label", stage);
+    const value = document.createElement("span");
+    value.textContent = `${took.toFixed(0)} ms`;
+    row.append(name, bar, value);
+    return row;
+  });
+  by("stages").replaceChildren(...rows);
+  const total = by("total");
+  if (now.hazard_to_path !== null) {
+    const strong = document.createElement("strong");
+    strong.textContent = `${now.hazard_to_path.toFixed(0)} ms`;
+    total.replaceChildren("first reading to the robot's new path: ", strong);
+  } else total.textContent = rows.length ? "under way" : "no hazard yet";
+}
+
+function processes() {
+  const rows = Object.entries(now.processes).map(([name, [cpu, rss]]) => {
+    const row = document.createElement("tr");
+    for (const text of [name, `${cpu.toFixed(0)} %`, `${rss.toFixed(0)} MB`]) {
+      const cell = document.createElement("td");
+      cell.textContent = text;
+      row.append(cell);
+    }
+    return row;
+  });
+  by("processes").replaceChildren(...rows);
+}
+
+let told = -1;
+function events() {
+  if (told === now.told) return;
+  told = now.told;
+  const rows = [...now.events].reverse().map(([at, text]) => {
+    const row = document.createElement("li");
+    const time = document.createElement("time");
+    time.textContent = `${at.toFixed(1)} s`;
+    const words = document.createElement("span");
+    words.textContent = text;
+    row.append(time, words);
+    return row;
+  });
+  by("events").replaceChildren(...rows);
+}
+
+let listed = 0;
+function panel() {
+  put("phase", now.outcome ? `${now.outcome[0]}: ${now.outcome[1]}` : now.phase);
+  put("mode", now.mode || "no word yet");
+  by("mode").dataset.tone = now.mode ? TONES[now.mode] || "stopped" : "";
+  put("reasons", now.refusal || now.reasons.join("; ") || (now.mode === "NORMAL" ? "all is well" : ""));
+  put("v", now.pose ? `${now.pose[3].toFixed(2)} m/s` : "–");
+  put("distance", metres(now.distance));
+  put("togo", metres(now.goal_distance));
+  put("clearance", metres(now.clearance, 2));
+  events();
+  if (performance.now() - listed > 900) {
+    listed = performance.now();
+    bars();
+    processes();
+  }
+}
+
+// --- input ---------------------------------------------------------------------------------------------------------
+
+function setFollow(on) {
+  follow = on;
+  by("follow").setAttribute("aria-pressed", String(on));
+  if (on && view && still) view.scale = Math.max(view.scale, 30);
+  redraw();
+}
+
+function zoom(factor, x, y) {
+  const mx = view.x + (x - canvas.clientWidth / 2) / view.scale;
+  const my = view.y - (y - canvas.clientHeight / 2) / view.scale;
+  const scale = Math.min(400, Math.max(2, view.scale * factor));
+  view.x = mx + (view.x - mx) * (view.scale / scale);
+  view.y = my + (view.y - my) * (view.scale / scale);
+  view.scale = scale;
+  redraw();
+}
+
+canvas.addEventListener("pointerdown", (event) => canvas.setPointerCapture(event.pointerId));
+canvas.addEventListener("pointermove", (event) => {
+  if (!event.buttons || !view) return;
+  setFollow(false);
+  view.x -= event.movementX / view.scale;
+  view.y += event.movementY / view.scale;
+  redraw();
+});
+canvas.addEventListener("wheel", (event) => {
+  event.preventDefault();
+  if (view) zoom(Math.exp(-event.deltaY / 400), event.offsetX, event.offsetY);
+}, { passive: false });
+canvas.addEventListener("dblclick", () => { setFollow(false); fit(); redraw(); });
+canvas.addEventListener("keydown", (event) => {
+  if (!view) return;
+  const step = 60 / view.scale;
+  const moves = { ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, step], ArrowDown: [0, -step] };
+  const middle = [canvas.clientWidth / 2, canvas.clientHeight / 2];
+  if (moves[event.key]) {
+    setFollow(false);
+    view.x += moves[event.key][0];
+    view.y += moves[event.key][1];
+    redraw();
+  } else if (event.key === "+") zoom(1.25, ...middle);
+  else if (event.key === "-") zoom(0.8, ...middle);
+  else return;
+  event.preventDefault();
+});
+by("follow").addEventListener("click", () => setFollow(!follow));
+by("fit").addEventListener("click", () => { setFollow(false); fit(); redraw(); });
+new ResizeObserver(() => { if (still && !follow) fit(); redraw(); }).observe(canvas);
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { readColours(); colourFloor(); redraw(); });
+
+// --- start ---------------------------------------------------------------------------------------------------------
+
+async function start() {
+  readColours();
+  still = await (await fetch("scene.json")).json();
+  put("site", `${still.site}, robot ${still.robot}, seed ${still.seed}`);
+  picture = new Image();
+  picture.src = "map.png";
+  await picture.decode();
+  colourFloor();
+  fit();
+  redraw();
+  const source = new EventSource("events");
+  source.onopen = () => { by("link").hidden = true; };
+  source.onerror = () => { by("link").hidden = false; };
+  source.onmessage = (message) => {
+    now = JSON.parse(message.data);
+    if (now.trail_from === 0) trail = [];
+    trail.push(...now.trail);
+    panel();
+    redraw();
+  };
+}
+
+start();

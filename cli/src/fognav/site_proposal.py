@@ -1,0 +1,336 @@
+"""Proposes a site on any map: where to start and end, which corridors to watch, and from where. Pure, seeded.
+
+A proposal is a starting point: it knows walls, not what people do between them.
+"""
+
+import math
+import random
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fog_contracts.costs import FREE, LETHAL
+from fog_contracts.geometry import Point, rasterize
+from fog_contracts.grid import GridGeometry
+from fog_contracts.messages import Pose
+from fog_contracts.site import AreaSite, DemoPlan, NodeSite, Place, RobotSite, Site, Sonar
+from fog_kernels.astar import Planner
+from fog_kernels.distance import squared_distance_capped
+from fog_kernels.inflation import inflate, inflation_table
+from fog_kernels.raycast import cast
+
+ROBOT_RADIUS: Final = 0.17
+INFLATION_RADIUS: Final = 0.55
+COST_SCALING: Final = 5.0
+PLACE_CLEARANCE_M: Final = 0.45
+DRIVE_M: Final = (15.0, 60.0)
+"""Length of a good demonstration: long enough to see a danger coming, short enough to watch."""
+_ENDS_M: Final = (8.0, 3.0)
+"""No area nearer than this to the start and the goal."""
+_CORRIDOR_M: Final = (0.9, 4.2)
+_AREA_LENGTH_M: Final = 2.4
+_SONAR_ANGLES: Final = (-0.13, 0.13)
+_HALF_CONE: Final = math.radians(7.5)
+_SONAR_MAX_M: Final = 3.8
+"""A little less than what the sonar specifies (4 m): the far wall must echo reliably."""
+_WALL_MARGIN_M: Final = 0.35
+_MOUNT_GAP_M: Final = 0.06
+_NODE_HEIGHT_M: Final = 0.3
+_CANDIDATE_STEP_M: Final = 1.0
+_AREA_SPACING_M: Final = 4.0
+_MAX_DETOUR: Final = 4.0
+_MAX_AREAS: Final = 3
+_PAIRS: Final = 60
+_HEADINGS: Final = 36
+
+
+class NoSiteError(ValueError):
+    """The map offers no floor on which a robot could drive; the message says what was looked for."""
+
+
+@dataclass(frozen=True)
+class _Floor:
+    """The map with what the proposal needs of it."""
+
+    geometry: GridGeometry
+    raw: NDArray[np.uint8]
+    walls: NDArray[np.uint8]
+    cost: NDArray[np.uint8]
+    clearance: NDArray[np.float64]
+
+    def inflated(self, raw: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        table = inflation_table(self.geometry.resolution, ROBOT_RADIUS, INFLATION_RADIUS, COST_SCALING)
+        return inflate(raw, table)
+
+    def ranges(self, at: Point, angles: NDArray[np.float64], reach: float) -> NDArray[np.float64]:
+        """Return the distance (m) to the nearest wall in each direction, at most `reach`."""
+        g = self.geometry
+        found = cast(self.walls, g.resolution, g.origin_x, g.origin_y, *at, angles, reach)
+        return np.minimum(found, reach)
+
+
+@dataclass(frozen=True)
+class _Drive:
+    """A way with areas on it that can be driven around."""
+
+    start: Pose
+    goal: Point
+    areas: list[tuple[AreaSite, NodeSite]]
+    length: float
+
+
+def propose(name: str, map_path: str, geometry: GridGeometry, cells: NDArray[np.uint8], seed: int = 1) -> Site:
+    """Return a site on the map (`cells`: 0 free, 254 occupied, 255 unknown); raises `NoSiteError`.
+
+    The demo's areas are such that one of them blocked always leaves another way. A map without such places gets a
+    demo without areas.
+    """
+    floor = _floor(geometry, cells)
+    best: _Drive | None = None
+    for drive in _drives(floor, random.Random(seed)):
+        if best is None or _rank(drive) > _rank(best):
+            best = drive
+        if len(best.areas) >= 2:  # two make a choice
+            break
+    if best is None:
+        raise NoSiteError(
+            f"no way of {DRIVE_M[0]:.0f} m or more was found between two points with {PLACE_CLEARANCE_M} m around "
+            "them. Check the map's resolution and thresholds"
+        )
+    places = {
+        "a": Place(x=best.start.x, y=best.start.y, label="A"),
+        "b": Place(x=best.goal[0], y=best.goal[1], label="B"),
+    }
+    areas = [area for area, _ in best.areas]
+    return Site(
+        id=name,
+        name=name,
+        map=map_path,
+        places=places,
+        areas=areas,
+        nodes=[node for _, node in best.areas],
+        robots=[RobotSite(id="r1", start=best.start)],
+        demo=DemoPlan(start="a", goal="b", areas=[area.id for area in areas]),
+    )
+
+
+def _rank(drive: _Drive) -> tuple[int, float]:
+    return min(len(drive.areas), 2), -abs(drive.length - 30.0)
+
+
+def _floor(geometry: GridGeometry, cells: NDArray[np.uint8]) -> _Floor:
+    # What nobody has looked at may be a wall: a proposal keeps away from it.
+    raw = np.where(cells == FREE, np.uint8(FREE), np.uint8(LETHAL))
+    walls = (raw == LETHAL).astype(np.uint8)
+    cap = max(1, math.ceil(2.0 / geometry.resolution))
+    clearance = np.sqrt(squared_distance_capped(walls, cap).astype(np.float64)) * geometry.resolution
+    half = _Floor(geometry, raw, walls, raw, clearance)
+    return _Floor(geometry, raw, walls, half.inflated(raw), clearance)
+
+
+def _drives(floor: _Floor, generator: random.Random) -> Iterator[_Drive]:
+    rows, columns = np.nonzero(floor.clearance >= PLACE_CLEARANCE_M)
+    if rows.size == 0:
+        return
+    planner = Planner(floor.geometry.width, floor.geometry.height)
+    for _ in range(_PAIRS):
+        i, j = generator.randrange(rows.size), generator.randrange(rows.size)
+        start, goal = (int(columns[i]), int(rows[i])), (int(columns[j]), int(rows[j]))
+        apart = math.dist(start, goal) * floor.geometry.resolution
+        if not DRIVE_M[0] / 2 <= apart <= DRIVE_M[1]:
+            continue
+        found = planner.plan(floor.cost, start, goal)
+        if not found.found:
+            continue
+        path = [floor.geometry.centre(int(c), int(r)) for c, r in found.cells]
+        length = _length(path)
+        if not DRIVE_M[0] <= length <= DRIVE_M[1]:
+            continue
+        areas = _areas(floor, planner, path, length, start, goal)
+        ahead = path[min(len(path) - 1, round(1.0 / floor.geometry.resolution))]
+        heading = math.atan2(ahead[1] - path[0][1], ahead[0] - path[0][0])
+        pose = Pose(x=round(path[0][0], 3), y=round(path[0][1], 3), theta=round(heading, 3))
+        yield _Drive(pose, (round(path[-1][0], 3), round(path[-1][1], 3)), areas, length)
+
+
+def _length(path: list[Point]) -> float:
+    return sum(math.dist(a, b) for a, b in pairwise(path))
+
+
+def _areas(
+    floor: _Floor, planner: Planner, path: list[Point], length: float, start: tuple[int, int], goal: tuple[int, int]
+) -> list[tuple[AreaSite, NodeSite]]:
+    """Return watched areas along the path, each of which can be driven around when it is blocked."""
+    found: list[tuple[AreaSite, NodeSite]] = []
+    travelled, last, next_at = 0.0, -math.inf, _ENDS_M[0]
+    for here, there in pairwise(path):
+        travelled += math.dist(here, there)
+        if travelled < next_at:
+            continue
+        next_at = travelled + _CANDIDATE_STEP_M
+        if travelled > length - _ENDS_M[1] or travelled - last < _AREA_SPACING_M:
+            continue
+        candidate = _area_at(floor, there, len(found) + 1)
+        if candidate is None:
+            continue
+        detour = _detour(floor, planner, candidate[0].polygon, start, goal)
+        if detour is None or detour > _MAX_DETOUR * length:
+            continue
+        found.append(candidate)
+        last = travelled
+        if len(found) == _MAX_AREAS:
+            break
+    return found
+
+
+def _area_at(floor: _Floor, spot: Point, number: int) -> tuple[AreaSite, NodeSite] | None:
+    """Return an area across the corridor at a spot with a node on its nearer wall, or None when it is no corridor."""
+    headings = np.linspace(0.0, math.pi, _HEADINGS, endpoint=False, dtype=np.float64)
+    reach = _CORRIDOR_M[1]
+    one, other = floor.ranges(spot, headings, reach), floor.ranges(spot, headings + math.pi, reach)
+    narrowest = int(np.argmin(one + other))
+    width = float(one[narrowest] + other[narrowest])
+    if not _CORRIDOR_M[0] <= width <= _CORRIDOR_M[1]:
+        return None
+    across = float(headings[narrowest])
+    near, far = float(other[narrowest]), float(one[narrowest])
+    if near > far:
+        across, near, far = across + math.pi, far, near
+    # The same width half an area ahead and behind, or it is a door or a corner.
+    dx, dy = math.cos(across), math.sin(across)
+    half = _AREA_LENGTH_M / 2
+    for side in (-half, half):
+        beside = (spot[0] - dy * side, spot[1] + dx * side)
+        if not floor.geometry.contains(*beside):
+            return None
+        spread = floor.ranges(beside, np.array([across, across + math.pi]), reach)
+        if abs(float(spread.sum()) - width) > 0.25 * width:
+            return None
+    mount = (spot[0] - dx * (near - _MOUNT_GAP_M), spot[1] - dy * (near - _MOUNT_GAP_M))
+    sonars = []
+    for angle in _SONAR_ANGLES:
+        cone = across + angle + np.linspace(-_HALF_CONE, _HALF_CONE, 7)
+        echo = float(floor.ranges(mount, cone, _SONAR_MAX_M + 1.0).min())
+        limit = min(echo, _SONAR_MAX_M) - _WALL_MARGIN_M
+        if limit < _CORRIDOR_M[0] / 2:
+            return None
+        sonars.append(Sonar(angle=angle, range_limit=round(limit, 2), no_echo_is_clear=echo > _SONAR_MAX_M))
+    corners = [
+        (spot[0] + dx * u - dy * v, spot[1] + dy * u + dx * v)
+        for u, v in ((-near, -half), (far, -half), (far, half), (-near, half))
+    ]
+    left, bottom, right, top = floor.geometry.bounds
+    ring = [(round(min(max(x, left), right), 3), round(min(max(y, bottom), top), 3)) for x, y in corners]
+    identifier = f"z{number}"
+    area = AreaSite(id=identifier, label=identifier.upper(), number=number, polygon=ring)
+    node = NodeSite(
+        id=f"node-{number}",
+        area=identifier,
+        x=round(mount[0], 3),
+        y=round(mount[1], 3),
+        theta=round(math.remainder(across, math.tau), 4),
+        height=_NODE_HEIGHT_M,
+        sonars=sonars,
+    )
+    return area, node
+
+
+def _detour(
+    floor: _Floor, planner: Planner, polygon: list[Point], start: tuple[int, int], goal: tuple[int, int]
+) -> float | None:
+    """Return the length (m) of the way around a blocked area, or None when there is none."""
+    raw = floor.raw.copy()
+    window, mask = rasterize(polygon, floor.geometry)
+    raw[window.rows, window.columns][mask] = LETHAL
+    found = planner.plan(floor.inflated(raw), start, goal)
+    if not found.found:
+        return None
+    return _length([floor.geometry.centre(int(c), int(r)) for c, r in found.cells])
+
+
+def _number(value: float) -> str:
+    return repr(round(value, 4))
+
+
+def to_toml(site: Site) -> str:
+    """Spell a site as a commented `site.toml`."""
+    lines = [
+        "# A site: a map, named places, watched areas with their sensor nodes, robots, and a demonstration.",
+        "# Metres, radians; frame of the map: x right, y up. Check a change with: fognav site check DIR",
+        "",
+        f'id = "{site.id}"',
+        f'name = "{site.name}"',
+        "# map_server YAML, relative to this folder or absolute.",
+        f"map = {_quoted(site.map)}",
+        "",
+    ]
+    for identifier, place in site.places.items():
+        lines += [
+            f"[places.{identifier}]",
+            f'label = "{place.label}"',
+            f"x = {_number(place.x)}",
+            f"y = {_number(place.y)}",
+            "# theta = 0.0   # without it any heading will do",
+            "",
+        ]
+    lines.append("# A watched area: `number` is its name on the topics of older nodes; `debounce` (5 readings either")
+    lines.append("# way) and `unknown` (what silence costs) may be added as tables.")
+    for area in site.areas:
+        corners = ", ".join(f"[{_number(x)}, {_number(y)}]" for x, y in area.polygon)
+        lines += [
+            "[[areas]]",
+            f'id = "{area.id}"',
+            f'label = "{area.label}"',
+            f"number = {area.number}",
+            f"polygon = [{corners}]",
+            "",
+        ]
+    lines.append("# A sensor node on a wall: `range_limit` is the calibrated distance below which an echo means that")
+    lines.append("# something stands there; `no_echo_is_clear` only where no opposite wall is in range.")
+    for node in site.nodes:
+        lines += [
+            "[[nodes]]",
+            f'id = "{node.id}"',
+            f'area = "{node.area}"',
+            f"x = {_number(node.x)}",
+            f"y = {_number(node.y)}",
+            f"theta = {_number(node.theta)}",
+            f"height = {_number(node.height)}",
+            "sonars = [",
+        ]
+        lines += [
+            f"    {{ angle = {_number(s.angle)}, range_limit = {_number(s.range_limit)}, "
+            f"no_echo_is_clear = {str(s.no_echo_is_clear).lower()} }},"
+            for s in node.sonars
+        ]
+        lines += ["]", ""]
+    for robot in site.robots:
+        start = robot.start
+        lines += [
+            "[[robots]]",
+            f'id = "{robot.id}"',
+            f"start = {{ x = {_number(start.x)}, y = {_number(start.y)}, theta = {_number(start.theta)} }}",
+            f"radius = {_number(robot.radius)}",
+            f"height = {_number(robot.height)}",
+            "",
+        ]
+    if site.demo is not None:
+        areas = ", ".join(f'"{area}"' for area in site.demo.areas)
+        lines += [
+            "# `fognav demo` drives from start to goal and blocks one of these areas on the way. Without any it drives",
+            "# without a hazard.",
+            "[demo]",
+            f'start = "{site.demo.start}"',
+            f'goal = "{site.demo.goal}"',
+            f"areas = [{areas}]",
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def _quoted(text: str) -> str:
+    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
+    return f'"{escaped}"'

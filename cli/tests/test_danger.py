@@ -1,0 +1,97 @@
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fog_contracts.geometry import contains_point, distance_to_polygon
+from fog_contracts.site import AreaSite, DemoPlan, NodeSite, Site, Sonar
+from fognav.demo.danger import KEEP_AWAY_M, NoDangerError, along, barrier, choose, may_appear
+
+PATH = [(0.0, 0.0), (10.0, 0.0), (30.0, 0.0)]
+
+
+def area(name: str, x: float, width: float = 3.0) -> AreaSite:
+    return AreaSite(id=name, polygon=[(x, -1.0), (x + width, -1.0), (x + width, 1.0), (x, 1.0)])
+
+
+def node(name: str, x: float) -> NodeSite:
+    sonar = Sonar(angle=0.0, range_limit=1.7)
+    return NodeSite(id=f"node-{name}", area=name, x=x + 1.5, y=0.95, theta=-math.pi / 2, sonars=[sonar])
+
+
+def site(*names_and_places: tuple[str, float]) -> Site:
+    areas = [area(name, x) for name, x in names_and_places]
+    nodes = [node(name, x) for name, x in names_and_places]
+    demo = DemoPlan(start="a", goal="b", areas=[a.id for a in areas])
+    return Site(id="test", areas=areas, nodes=nodes, demo=demo)
+
+
+def anywhere(x: float, y: float) -> bool:
+    return abs(y) < 1.0
+
+
+def test_distance_to_an_area_is_counted_along_the_path() -> None:
+    corner = [(0.0, 0.0), (4.0, 0.0), (4.0, 6.0)]
+    polygon = [(3.0, 5.0), (5.0, 5.0), (5.0, 7.0), (3.0, 7.0)]
+    assert along(corner, polygon) == pytest.approx(9.0, abs=0.05)
+
+
+def test_an_area_beside_the_path_is_not_on_it() -> None:
+    assert along(PATH, [(5.0, 2.0), (8.0, 2.0), (8.0, 4.0)]) is None
+
+
+@given(x=st.floats(8.0, 26.0), limit=st.floats(0.8, 3.8), tilt=st.floats(-0.3, 0.3))
+def test_a_barrier_stands_in_the_area_across_the_path_and_within_the_nodes_range(
+    x: float, limit: float, tilt: float
+) -> None:
+    watched = area("z1", x)
+    mounted = NodeSite(
+        id="n", area="z1", x=x + 1.5, y=0.95, theta=-math.pi / 2, sonars=[Sonar(angle=tilt, range_limit=limit)]
+    )
+    made = barrier(watched, [mounted], PATH, anywhere)
+    for px, py in made.polygon:
+        assert distance_to_polygon(watched.polygon, px, py) < 0.25  # its thickness may stick out, its place may not
+    beam = [(mounted.x + d * math.sin(tilt), mounted.y - d * math.cos(tilt)) for d in (i / 100 for i in range(10, 400))]
+    hits = [math.dist((mounted.x, mounted.y), p) for p in beam if contains_point(made.polygon, *p)]
+    assert hits
+    assert 0.1 < min(hits) < limit
+
+
+def test_a_barrier_leaves_no_gap_through_which_a_robot_fits() -> None:
+    made = barrier(area("z1", 10.0), [node("z1", 10.0)], PATH, anywhere)
+    across = [y for _, y in made.polygon]
+    assert min(across) < -1.0 + 2 * 0.17
+    assert max(across) > 1.0 - 2 * 0.17 - 0.35  # what stands right before the node would be inside its sonar
+
+
+def test_an_area_without_a_node_is_refused_by_name() -> None:
+    with pytest.raises(NoDangerError, match="z1 has no node"):
+        barrier(area("z1", 10.0), [], PATH, anywhere)
+
+
+@given(seed=st.integers(0, 10_000))
+def test_the_draw_is_the_same_for_the_same_seed_and_early_enough(seed: int) -> None:
+    plan = site(("z1", 9.0), ("z2", 20.0), ("z3", 40.0))
+    drawn = choose(plan, PATH, seed, anywhere)
+    assert drawn == choose(plan, PATH, seed, anywhere)
+    assert drawn.area.id in {"z1", "z2"}
+    entry = along(PATH, drawn.area.polygon)
+    assert entry is not None
+    assert 0.0 <= drawn.trigger_m <= min(8.0, entry - KEEP_AWAY_M)
+    assert may_appear(drawn, (drawn.trigger_m, 0.0))
+
+
+def test_every_area_on_the_way_is_drawn_by_some_seed() -> None:
+    plan = site(("z1", 9.0), ("z2", 20.0))
+    assert {choose(plan, PATH, seed, anywhere).area.id for seed in range(30)} == {"z1", "z2"}
+
+
+def test_a_way_that_meets_no_area_says_why() -> None:
+    with pytest.raises(NoDangerError, match="does not cross far"):
+        choose(site(("far", 60.0)), PATH, 1, anywhere)
+
+
+def test_nothing_appears_near_the_robot() -> None:
+    drawn = choose(site(("z1", 12.0)), PATH, 1, anywhere)
+    assert not may_appear(drawn, (9.5, 0.0))

@@ -1,0 +1,129 @@
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from fog_contracts.geometry import rasterize
+from fog_contracts.grid import GridGeometry
+from fog_kernels.astar import Planner
+from fog_kernels.inflation import inflate, inflation_table
+from fog_kernels.raycast import cast
+from fog_runtime.maps import StaticMap, save_map
+from fog_runtime.site import load_site
+from fognav.demo.danger import choose
+from fognav.output import WrongUseError
+from fognav.site_command import check_site, identifier, new_site
+from fognav.site_proposal import NoSiteError, propose
+
+RESOLUTION = 0.05
+
+
+def ring_of_corridors(width: float = 2.0) -> tuple[GridGeometry, NDArray[np.uint8]]:
+    """24 m x 16 m of corridors around two blocks: every way has another one."""
+    geometry = GridGeometry(480, 320, RESOLUTION, -3.0, 4.0)
+    cells = np.full(geometry.shape, 254, dtype=np.uint8)
+    wide = round(width / RESOLUTION)
+    cells[4:-4, 4:-4] = 0
+    cells[4 + wide : -4 - wide, 4 + wide : 240 - wide // 2] = 254
+    cells[4 + wide : -4 - wide, 240 + wide // 2 : -4 - wide] = 254
+    return geometry, cells
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_proposal_can_be_driven_and_each_area_can_be_driven_around(seed: int) -> None:
+    geometry, cells = ring_of_corridors()
+    site = propose("ring", "map.yaml", geometry, cells, seed)
+    assert site.demo is not None
+    assert site.demo.areas
+    planner = Planner(geometry.width, geometry.height)
+    table = inflation_table(RESOLUTION, 0.17, 0.55, 5.0)
+    start, goal = site.robots[0].start, site.places["b"]
+    ends = geometry.cell(start.x, start.y), geometry.cell(goal.x, goal.y)
+    free = planner.plan(inflate(cells, table), *ends)
+    path = [geometry.centre(int(c), int(r)) for c, r in free.cells]
+    for area in site.areas:
+        raw = cells.copy()
+        window, mask = rasterize(area.polygon, geometry)
+        raw[window.rows, window.columns][mask] = 254
+        assert planner.plan(inflate(raw, table), *ends).found, f"{area.id} leaves no way"
+
+    def is_free(x: float, y: float) -> bool:
+        column, row = geometry.cell(x, y)
+        return bool(cells[row, column] == 0)
+
+    assert choose(site, path, seed, is_free).area.id in site.demo.areas
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_nodes_hang_on_a_wall_and_their_limits_end_before_the_other_wall(seed: int) -> None:
+    geometry, cells = ring_of_corridors()
+    site = propose("ring", "map.yaml", geometry, cells, seed)
+    walls = (cells == 254).astype(np.uint8)
+    for node in site.nodes:
+        column, row = geometry.cell(node.x, node.y)
+        assert cells[row, column] == 0
+        behind = cast(
+            walls, RESOLUTION, geometry.origin_x, geometry.origin_y, node.x, node.y, [node.theta + math.pi], 1.0
+        )
+        assert behind[0] < 0.15
+        for sonar in node.sonars:
+            cone = node.theta + sonar.angle + np.linspace(-0.13, 0.13, 9)
+            echoes = cast(walls, RESOLUTION, geometry.origin_x, geometry.origin_y, node.x, node.y, cone, 9.0)
+            assert sonar.range_limit < echoes.min()
+
+
+def test_a_map_without_a_second_way_gets_a_demo_without_areas() -> None:
+    geometry = GridGeometry(600, 48, RESOLUTION, 0.0, 0.0)
+    cells = np.full(geometry.shape, 254, dtype=np.uint8)
+    cells[4:-4, 4:-4] = 0
+    site = propose("corridor", "map.yaml", geometry, cells)
+    assert site.demo is not None
+    assert site.demo.areas == []
+
+
+def test_a_map_without_floor_is_refused() -> None:
+    geometry = GridGeometry(100, 100, RESOLUTION, 0.0, 0.0)
+    with pytest.raises(NoSiteError, match="no way of 15 m"):
+        propose("dark", "map.yaml", geometry, np.full(geometry.shape, 255, dtype=np.uint8))
+
+
+def test_what_is_written_is_read_back_as_a_valid_site(tmp_path: Path) -> None:
+    geometry, cells = ring_of_corridors()
+    save_map(tmp_path / "maps" / "floor", StaticMap(geometry, cells))
+    made = new_site(tmp_path / "maps" / "floor.yaml", tmp_path / "sites" / "My Floor (2)", seed=1)
+    loaded = load_site(tmp_path / "sites" / "My Floor (2)")
+    assert loaded.site.id == made["site"] == "my-floor-2"
+    assert loaded.site.map == "../../maps/floor.yaml"
+    proposed = propose("my-floor-2", loaded.site.map, geometry, loaded.map.cells, seed=1)
+    assert loaded.site.areas == proposed.areas
+    assert loaded.site.nodes == proposed.nodes
+    assert check_site(tmp_path / "sites" / "My Floor (2)")["ok"] is True
+
+
+def test_an_existing_site_is_not_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "site.toml").write_text("# mine\n")
+    with pytest.raises(WrongUseError, match="exists already"):
+        new_site(tmp_path / "map.yaml", tmp_path, seed=1)
+    assert (tmp_path / "site.toml").read_text() == "# mine\n"
+
+
+def test_an_unreadable_map_is_named(tmp_path: Path) -> None:
+    with pytest.raises(WrongUseError, match=r"nowhere\.yaml"):
+        new_site(tmp_path / "nowhere.yaml", tmp_path / "site", seed=1)
+    assert not (tmp_path / "site").exists()
+
+
+def test_a_broken_site_is_told_with_its_field(tmp_path: Path) -> None:
+    (tmp_path / "site.toml").write_text('id = "x"\n[[areas]]\nid = "z1"\npolygon = [[0, 0], [1, 0]]\n')
+    found = check_site(tmp_path)
+    assert found["ok"] is False
+    assert "areas" in str(found["problem"])
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"), [("Level 2", "level-2"), ("__", "site"), ("Ä" + "x" * 50, "x" * 32), ("a--b", "a-b")]
+)
+def test_any_folder_name_makes_an_id(name: str, expected: str) -> None:
+    assert identifier(name) == expected

@@ -1,0 +1,104 @@
+import asyncio
+import os
+import stat
+import time
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import psutil
+import pytest
+
+from fognav import net
+from fognav.stack import BROKER, REDIS, ROUTER, SERVERS, Stack, StackConfig
+
+if TYPE_CHECKING:
+    from fognav.supervisor import Event
+
+pytestmark = pytest.mark.live
+TIMEOUT_S = 20.0
+
+
+@pytest.fixture
+async def stack(tmp_path: Path) -> AsyncIterator[Stack]:
+    """A stack of which only the servers run; its site is not read by them."""
+    async with Stack(StackConfig(site_dir=tmp_path, robot="r1")) as made:
+        yield made
+
+
+async def start_servers(stack: Stack) -> None:
+    for name in SERVERS:
+        stack.supervisor.start(name)
+    await stack.supervisor.wait_ready(SERVERS, TIMEOUT_S)
+
+
+async def restarted(stack: Stack, name: str) -> None:
+    deadline = time.monotonic() + TIMEOUT_S
+    while stack.supervisor.starts(name) < 2:
+        assert time.monotonic() < deadline, f"{name} was not started again"
+        await asyncio.sleep(0.02)
+
+
+async def test_two_stacks_run_side_by_side_and_leave_nothing_behind(tmp_path: Path) -> None:
+    config = StackConfig(site_dir=tmp_path, robot="r1")
+    async with Stack(config) as one, Stack(config) as two:
+        await asyncio.gather(start_servers(one), start_servers(two))
+        ports = [one.mqtt_port, one.redis_port, one.zenoh_port, two.mqtt_port, two.redis_port, two.zenoh_port]
+        assert len(set(ports)) == 6
+        pids = [*one.pids().values(), *two.pids().values()]
+        assert len(pids) == 6
+        folders = (one.folder, two.folder)
+    assert not any(psutil.pid_exists(pid) for pid in pids)
+    assert not any(folder.exists() for folder in folders)
+    assert [await net.listens(port) is None for port in ports] == [False] * 6
+
+
+@pytest.mark.parametrize("name", SERVERS)
+async def test_a_killed_server_comes_back_on_its_port(tmp_path: Path, name: str) -> None:
+    events: list[Event] = []
+    async with Stack(StackConfig(site_dir=tmp_path, robot="r1"), events.append) as stack:
+        stack.supervisor.start(name)
+        await stack.supervisor.wait_ready([name], TIMEOUT_S)
+        first = stack.supervisor.kill(name)
+        await restarted(stack, name)
+        await stack.supervisor.wait_ready([name], TIMEOUT_S)
+        assert stack.supervisor.pid(name) != first
+    assert [event.what for event in events] == ["started", "killed", "died", "started", "stopped"]
+
+
+async def test_redis_keeps_over_a_kill_what_it_acknowledged(stack: Stack) -> None:
+    stack.supervisor.start(REDIS)
+    await stack.supervisor.wait_ready([REDIS], TIMEOUT_S)
+    assert await net.listens(stack.redis_port, b"SET zone kept\r\n", b"+OK") is None
+    stack.supervisor.kill(REDIS)
+    await restarted(stack, REDIS)
+    await stack.supervisor.wait_ready([REDIS], TIMEOUT_S)
+    assert await net.listens(stack.redis_port, b"GET zone\r\n", b"$4\r\nkept") is None
+
+
+async def test_the_servers_are_not_to_be_had_from_other_machines(stack: Stack) -> None:
+    await start_servers(stack)
+    for name in (BROKER, REDIS, ROUTER):
+        pid = stack.pids()[name]
+        listening = [c.laddr.ip for c in psutil.Process(pid).net_connections("tcp") if c.status == psutil.CONN_LISTEN]
+        assert listening == ["127.0.0.1"], name
+
+
+async def test_keys_and_tokens_are_private_and_of_this_run_only(tmp_path: Path) -> None:
+    config = StackConfig(site_dir=tmp_path, robot="r1")
+    async with Stack(config) as one, Stack(config) as two:
+        for name in ("operator.key", "tokens.toml"):
+            assert stat.S_IMODE((one.folder / name).stat().st_mode) == 0o600
+            assert (one.folder / name).read_text() != (two.folder / name).read_text()
+        assert one.token not in (one.folder / "tokens.toml").read_text()
+        assert stat.S_IMODE(one.folder.stat().st_mode) == 0o700
+
+
+async def test_settings_of_this_shell_do_not_leak_into_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FOGNAV_HTTP_PORT", "80")
+    async with Stack(StackConfig(site_dir=tmp_path, robot="r1")) as stack:
+        stack.supervisor.start(ROUTER)
+        await stack.supervisor.wait_ready([ROUTER], TIMEOUT_S)
+        environment = psutil.Process(stack.pids()[ROUTER]).environ()
+    assert "FOGNAV_HTTP_PORT" not in environment
+    assert os.environ["FOGNAV_HTTP_PORT"] == "80"

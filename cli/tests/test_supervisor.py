@@ -1,0 +1,190 @@
+import asyncio
+import os
+import signal
+import sys
+import time
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+
+import psutil
+import pytest
+
+from fognav.supervisor import Event, NotReadyError, Program, Supervisor, log_tail
+
+DEADLINE_S = 10.0
+
+
+async def until(condition: Callable[[], bool], what: str) -> None:
+    deadline = time.monotonic() + DEADLINE_S
+    while not condition():
+        assert time.monotonic() < deadline, f"{what} did not happen"
+        await asyncio.sleep(0.01)
+
+
+class Bench:
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.events: list[Event] = []
+        self.supervisor = Supervisor(self.events.append)
+
+    def add(self, name: str, code: str, ready: str | None = None, rank: int = 0) -> None:
+        async def is_ready() -> str | None:
+            return None if ready is None or (self.folder / ready).exists() else f"{ready} is missing"
+
+        self.supervisor.add(
+            Program(
+                name=name,
+                arguments=(sys.executable, "-S", "-c", code),
+                log=self.folder / f"{name}.log",
+                environment={"FOLDER": str(self.folder)},
+                ready=is_ready,
+                rank=rank,
+            )
+        )
+
+    def whats(self, name: str) -> list[str]:
+        return [event.what for event in self.events if event.program == name]
+
+
+@pytest.fixture
+async def bench(tmp_path: Path) -> AsyncIterator[Bench]:
+    made = Bench(tmp_path)
+    async with made.supervisor:
+        yield made
+
+
+SLEEPER = "import time\nprint('up', flush=True)\ntime.sleep(600)"
+STUBBORN = (
+    "import os, pathlib, signal, time\nsignal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
+    "(pathlib.Path(os.environ['FOLDER']) / 'deaf').touch()\ntime.sleep(600)"
+)
+PARENT = (
+    "import os, pathlib, subprocess, sys, time\n"
+    "child = subprocess.Popen([sys.executable, '-S', '-c', 'import time; time.sleep(600)'])\n"
+    "file = pathlib.Path(os.environ['FOLDER']) / 'child'\n"
+    "file.with_suffix('.new').write_text(str(child.pid))\n"
+    "file.with_suffix('.new').rename(file)\n"
+    "time.sleep(600)"
+)
+
+
+async def test_a_program_that_dies_is_started_again(bench: Bench) -> None:
+    bench.add("sleeper", SLEEPER)
+    bench.supervisor.start("sleeper")
+    await until(lambda: bench.supervisor.pid("sleeper") is not None, "the start")
+    first = bench.supervisor.kill("sleeper")
+    await until(lambda: bench.supervisor.pid("sleeper") not in {None, first}, "the restart")
+    assert bench.whats("sleeper") == ["started", "killed", "died", "started"]
+    assert not psutil.pid_exists(first)
+
+
+async def test_a_program_that_keeps_dying_is_started_ever_more_rarely(bench: Bench) -> None:
+    bench.add("broken", "raise SystemExit(3)")
+    bench.supervisor.start("broken")
+    await until(lambda: bench.whats("broken").count("died") == 3, "the third death")
+    deaths = [event for event in bench.events if event.what == "died"]
+    assert [event.detail for event in deaths] == [
+        "exit code 3; starting again in 0.2 s",
+        "exit code 3; starting again in 0.4 s",
+        "exit code 3; starting again in 0.8 s",
+    ]
+
+
+async def test_a_stopped_program_stays_stopped(bench: Bench) -> None:
+    bench.add("sleeper", SLEEPER)
+    bench.supervisor.start("sleeper")
+    await until(lambda: bench.supervisor.pid("sleeper") is not None, "the start")
+    await bench.supervisor.stop("sleeper")
+    assert bench.supervisor.pid("sleeper") is None
+    assert bench.whats("sleeper")[-1] == "stopped"
+    bench.supervisor.start("sleeper")
+    await until(lambda: bench.supervisor.starts("sleeper") == 2, "the second start")
+
+
+async def test_stopping_while_it_waits_for_its_restart_cancels_that(bench: Bench) -> None:
+    bench.add("broken", "raise SystemExit(3)")
+    bench.supervisor.start("broken")
+    await until(lambda: bench.whats("broken")[-1:] == ["died"], "the death")
+    await bench.supervisor.stop("broken")
+    starts = bench.supervisor.starts("broken")
+    await asyncio.sleep(0.5)  # longer than the backoff that was cancelled
+    assert bench.supervisor.starts("broken") == starts
+
+
+async def test_a_program_that_ignores_the_request_to_end_is_ended_by_force(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fognav.supervisor.END_TIMEOUT_S", 0.2)
+    bench.add("stubborn", STUBBORN, ready="deaf")
+    bench.supervisor.start("stubborn")
+    await bench.supervisor.wait_ready(["stubborn"], DEADLINE_S)
+    pid = bench.supervisor.pid("stubborn")
+    assert pid is not None
+    await bench.supervisor.stop("stubborn")
+    assert not psutil.pid_exists(pid)
+
+
+async def test_a_frozen_program_can_be_stopped(bench: Bench) -> None:
+    bench.add("sleeper", SLEEPER)
+    bench.supervisor.start("sleeper")
+    await until(lambda: bench.supervisor.pid("sleeper") is not None, "the start")
+    pid = bench.supervisor.kill("sleeper", signal.SIGSTOP)
+    await bench.supervisor.stop("sleeper")
+    assert not psutil.pid_exists(pid)
+
+
+async def test_nothing_that_a_program_started_outlives_it(bench: Bench) -> None:
+    bench.add("parent", PARENT, ready="child")
+    bench.supervisor.start("parent")
+    await bench.supervisor.wait_ready(["parent"], DEADLINE_S)
+    child = psutil.Process(int((bench.folder / "child").read_text()))
+    bench.supervisor.kill("parent")
+    await until(lambda: not child.is_running() or child.status() == psutil.STATUS_ZOMBIE, "the end of the child")
+
+
+async def test_who_does_not_get_ready_is_named_with_its_log(bench: Bench) -> None:
+    bench.add("sleeper", SLEEPER, ready="never")
+    bench.supervisor.start("sleeper")
+    await until(lambda: log_tail(bench.folder / "sleeper.log") == "up", "the log line")
+    with pytest.raises(NotReadyError, match=r"(?s)sleeper is not ready: never is missing.*up"):
+        await bench.supervisor.wait_ready(["sleeper"], 0.1)
+
+
+async def test_higher_ranks_end_first(bench: Bench) -> None:
+    bench.add("server", SLEEPER, rank=0)
+    bench.add("robot", SLEEPER, rank=2)
+    for name in ("server", "robot"):
+        bench.supervisor.start(name)
+    await until(lambda: bench.supervisor.starts("server") + bench.supervisor.starts("robot") == 2, "both starts")
+    await bench.supervisor.close()
+    assert [event.program for event in bench.events if event.what == "stopped"] == ["robot", "server"]
+
+
+def test_programs_die_with_the_command_even_when_it_is_killed(tmp_path: Path) -> None:
+    code = (
+        "import asyncio, os, pathlib, sys\n"
+        "from fognav.supervisor import Program, Supervisor\n"
+        "async def main():\n"
+        "    supervisor = Supervisor(lambda event: None)\n"
+        "    folder = pathlib.Path(sys.argv[1])\n"
+        "    arguments = (sys.executable, '-S', '-c', 'import time; time.sleep(600)')\n"
+        "    supervisor.add(Program(name='p', arguments=arguments, log=folder / 'log'))\n"
+        "    supervisor.start('p')\n"
+        "    while supervisor.pid('p') is None:\n"
+        "        await asyncio.sleep(0.01)\n"
+        "    (folder / 'new').write_text(str(supervisor.pid('p')))\n"
+        "    (folder / 'new').rename(folder / 'pid')\n"
+        "    await asyncio.sleep(600)\n"
+        "asyncio.run(main())\n"
+    )
+    pid_of_command = os.spawnv(os.P_NOWAIT, sys.executable, [sys.executable, "-c", code, str(tmp_path)])
+    deadline = time.monotonic() + DEADLINE_S
+    while not (tmp_path / "pid").exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    program = psutil.Process(int((tmp_path / "pid").read_text()))
+    os.kill(pid_of_command, signal.SIGKILL)
+    os.waitpid(pid_of_command, 0)
+    while program.is_running() and program.status() != psutil.STATUS_ZOMBIE:
+        assert time.monotonic() < deadline, "the program outlived its parent"
+        time.sleep(0.02)

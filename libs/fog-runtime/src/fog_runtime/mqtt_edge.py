@@ -1,0 +1,301 @@
+"""The sensor side's transport: the table's MQTT channels as typed publishing and subscribing over one connection.
+
+MQTT 5, so that a broker says why it refuses. Each connection starts clean and subscribes anew: what must survive is
+retained or published again by `on_connect`, never left to the broker's memory.
+"""
+
+import asyncio
+import random
+import ssl
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final, TypeVar, overload
+from urllib.parse import unquote, urlsplit
+
+import aiomqtt
+from paho.mqtt.reasoncodes import ReasonCode
+from paho.mqtt.subscribeoptions import SubscribeOptions
+
+from fog_contracts.channels import Channel
+from fog_contracts.codec import ContractError, decode, decode_text, encode
+from fog_contracts.messages import Message
+from fog_runtime import logs, metrics
+from fog_runtime.clock import Clock
+
+M = TypeVar("M", bound=Message)
+T = TypeVar("T")
+Ids = dict[str, str]
+
+BACKOFF_S: Final = (0.2, 2.0)
+"""Real seconds between attempts to connect: at first, and at most."""
+KEEPALIVE_S: Final = 10
+"""A broker that is silent for 1.5 times as long is taken for dead (and takes us for dead)."""
+_TIMEOUT_S: Final = 5.0
+_QUEUE: Final = 10_000
+
+_log = logs.get("mqtt_edge")
+
+
+@dataclass(frozen=True)
+class Will:
+    """What the broker publishes when this process vanishes without a goodbye."""
+
+    channel: Channel
+    message: Message | str
+    ids: Ids = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class _Registration:
+    channel: Channel
+    handler: Callable[[Ids, Any], object]
+    kind: type[Message] | None
+    topics: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Address:
+    host: str
+    port: int
+    user: str | None
+    password: str | None
+    tls: bool
+
+
+def _address(url: str) -> _Address:
+    parts = urlsplit(url)
+    if parts.scheme not in {"mqtt", "mqtts"} or not parts.hostname:
+        raise ValueError("the broker's address must look like mqtt://host:1883 or mqtts://user:password@host:8883")
+    tls = parts.scheme == "mqtts"
+    return _Address(
+        host=parts.hostname,
+        port=parts.port or (8883 if tls else 1883),
+        user=unquote(parts.username) if parts.username else None,
+        password=unquote(parts.password) if parts.password else None,
+        tls=tls,
+    )
+
+
+def _encoded(channel: Channel, message: Message | str) -> bytes:
+    if isinstance(message, Message):
+        return encode(channel, message)
+    if channel.message is not None:
+        raise ContractError(channel.name, f"carries {channel.message.__name__}, not text")
+    data = message.encode()
+    if len(data) > channel.limit:
+        raise ContractError(channel.name, f"{len(data)} bytes are over the limit of {channel.limit}")
+    return data
+
+
+def _mqtt_will(will: Will) -> aiomqtt.Will:
+    channel = will.channel
+    return aiomqtt.Will(channel.key(**will.ids), _encoded(channel, will.message), channel.qos, channel.retained)
+
+
+class MqttEdge:
+    """One process's connection to the broker. All handlers run on the event loop's thread."""
+
+    def __init__(self, url: str, client_id: str, clock: Clock, *, will: Will | None = None) -> None:
+        """Prepare a connection; nothing happens before `run`. Raises `ValueError` for an address that is none."""
+        self._address = _address(url)
+        self._client_id = client_id
+        self._clock = clock
+        self._will = will
+        self._registrations: list[_Registration] = []
+        self._on_connect: list[Callable[[], Awaitable[None]]] = []
+        self._client: aiomqtt.Client | None = None
+        self._changed = asyncio.Event()
+        self._tasks: set[asyncio.Future[Any]] = set()
+        self._limited = logs.RateLimited(_log)
+
+    @property
+    def connected(self) -> bool:
+        """Whether the connection is up and all subscriptions are made."""
+        return self._client is not None
+
+    async def wait_connected(self) -> None:
+        """Wait until the connection is up."""
+        while self._client is None:
+            self._changed.clear()
+            await self._changed.wait()
+
+    @overload
+    def on(self, channel: Channel, handler: Callable[[Ids, M], object], kind: type[M]) -> None: ...
+    @overload
+    def on(
+        self,
+        channel: Channel,
+        handler: Callable[[Ids, str], object],
+        kind: None = None,
+        *,
+        numbers: Sequence[str | int] = (),
+    ) -> None: ...
+
+    def on(
+        self,
+        channel: Channel,
+        handler: Callable[[Ids, Any], object],
+        kind: type[Message] | None = None,
+        *,
+        numbers: Sequence[str | int] = (),
+    ) -> None:
+        """Have `handler(ids, message)` called for each message of the channel; register before `run`.
+
+        Channels without a message type give their text. `numbers` names the areas of the thesis's topics, for which
+        MQTT has no wildcard.
+        """
+        if channel.transport != "mqtt" or channel.message is not kind:
+            expected = channel.message.__name__ if channel.message else "text"
+            raise ValueError(f"channel {channel.name} carries {expected} over {channel.transport}")
+        if "number" in channel.fields:
+            topics = tuple(channel.key(number=str(number)) for number in numbers)
+        else:
+            topics = (channel.pattern(),)
+        self._registrations.append(_Registration(channel, handler, kind, topics))
+
+    def on_connect(self, callback: Callable[[], Awaitable[None]]) -> None:
+        """Have `callback` run after every connection, once all subscriptions are made."""
+        self._on_connect.append(callback)
+
+    async def publish(self, channel: Channel, message: Message | str, *, wait: bool = False, **ids: str) -> bool:
+        """Publish; True when it was given to the connection or, with `wait`, acknowledged by the broker (QoS 1).
+
+        Without a connection nothing is kept: the answer is False, and whoever must not lose it publishes again in
+        `on_connect`. Raises `ContractError` when the message breaks the channel's contract.
+        """
+        return await self._send(channel, channel.key(**ids), _encoded(channel, message), wait=wait)
+
+    async def clear(self, channel: Channel, *, wait: bool = False, **ids: str) -> bool:
+        """Take a retained message away (MQTT: an empty retained payload)."""
+        return await self._send(channel, channel.key(**ids), b"", wait=wait)
+
+    async def run(self) -> None:
+        """Keep the connection until cancelled; a broker that is away, lost or unwilling is tried again."""
+        failures = 0
+        while True:
+            try:
+                async with self._make() as client:
+                    failures = 0
+                    await self._serve(client)
+            except aiomqtt.MqttError as error:
+                reason = str(error) or type(error).__name__
+                where = f"{self._address.host}:{self._address.port}"
+                self._limited.warning("broker_lost", "broker_lost", self._clock.now(), broker=where, reason=reason)
+            finally:
+                self._lost()
+            delay = random.uniform(BACKOFF_S[0], min(BACKOFF_S[1], BACKOFF_S[0] * 2 ** min(failures + 1, 10)))
+            failures += 1
+            await asyncio.sleep(delay)
+
+    def _make(self) -> aiomqtt.Client:
+        client = aiomqtt.Client(
+            self._address.host,
+            self._address.port,
+            username=self._address.user,
+            password=self._address.password,
+            identifier=self._client_id,
+            protocol=aiomqtt.ProtocolVersion.V5,
+            clean_start=True,
+            will=_mqtt_will(self._will) if self._will else None,
+            timeout=_TIMEOUT_S,
+            keepalive=KEEPALIVE_S,
+            max_queued_incoming_messages=_QUEUE,
+            tls_context=ssl.create_default_context() if self._address.tls else None,
+        )
+        client.pending_calls_threshold = 1000
+        return client
+
+    async def _serve(self, client: aiomqtt.Client) -> None:
+        wanted = {topic: r.channel.qos for r in self._registrations for topic in r.topics}
+        if wanted:
+            codes = await client.subscribe([(topic, SubscribeOptions(qos=qos)) for topic, qos in wanted.items()])
+            for topic, code in zip(wanted, codes, strict=True):
+                if isinstance(code, ReasonCode) and code.is_failure:
+                    _log.error("subscription_refused", topic=topic, reason=str(code))
+        self._client = client
+        self._changed.set()
+        metrics.CONNECTED.labels("mqtt").set(1)
+        metrics.CONNECTS.labels("mqtt").inc()
+        _log.info("broker_connected", broker=f"{self._address.host}:{self._address.port}", client=self._client_id)
+        for callback in self._on_connect:
+            self._spawn(callback(), "on_connect")
+        async for message in client.messages:
+            self._deliver(message)
+
+    def _lost(self) -> None:
+        self._client = None
+        metrics.CONNECTED.labels("mqtt").set(0)
+        for task in list(self._tasks):
+            task.cancel()
+
+    def _spawn(self, work: Awaitable[T], what: str) -> asyncio.Future[T]:
+        task = asyncio.ensure_future(work)
+        self._tasks.add(task)
+
+        def ended(done: asyncio.Future[T]) -> None:
+            self._tasks.discard(done)
+            if not done.cancelled() and (error := done.exception()) is not None:
+                _log.error("task_failed", error=error, what=what)
+
+        task.add_done_callback(ended)
+        return task
+
+    async def _send(self, channel: Channel, topic: str, data: bytes, *, wait: bool) -> bool:
+        client = self._client
+        if client is None:
+            metrics.DROPPED.labels(channel.name).inc()
+            return False
+        if channel.qos == 0:
+            return await self._give(client, channel, topic, data)
+        # Tasks begin in the order of their making: a message that is waited for must not overtake one that isn't.
+        task = self._spawn(self._give(client, channel, topic, data), topic)
+        if not wait:
+            return True
+        await asyncio.wait([task])
+        return not task.cancelled() and task.result()
+
+    async def _give(self, client: aiomqtt.Client, channel: Channel, topic: str, data: bytes) -> bool:
+        try:
+            await client.publish(topic, data, qos=channel.qos, retain=channel.retained)
+        except aiomqtt.MqttError as error:
+            metrics.DROPPED.labels(channel.name).inc()
+            self._limited.warning("unsent", channel.name, self._clock.now(), topic=topic, reason=str(error))
+            return False
+        metrics.PUBLISHED.labels(channel.name).inc()
+        return True
+
+    def _deliver(self, message: aiomqtt.Message) -> None:
+        topic = message.topic.value
+        for registration in self._registrations:
+            channel = registration.channel
+            ids = channel.match(topic)
+            if ids is None:
+                if any(message.topic.matches(pattern) for pattern in registration.topics):
+                    self._refuse(channel, topic, "the ids in the topic are malformed")
+                continue
+            data = message.payload
+            if message.retain and not channel.retained:
+                # It may be years old; a stale reading must never pass for a fresh one.
+                self._refuse(channel, topic, "retained, which this channel never is: somebody else's leftover")
+                continue
+            if channel.retained and not data:
+                continue  # a retained message that was taken away
+            try:
+                content = (
+                    decode_text(channel, data)
+                    if registration.kind is None
+                    else decode(channel, data, registration.kind)
+                )
+            except ContractError as error:
+                self._refuse(channel, topic, error.reason)
+                continue
+            metrics.RECEIVED.labels(channel.name).inc()
+            try:
+                registration.handler(ids, content)
+            except Exception as error:  # noqa: BLE001  # one message must not end the process; the event tells of the bug
+                metrics.HANDLER_ERRORS.labels(channel.name).inc()
+                _log.error("handler_failed", error=error, channel=channel.name, topic=topic)
+
+    def _refuse(self, channel: Channel, topic: str, reason: str) -> None:
+        metrics.REFUSED.labels(channel.name).inc()
+        self._limited.warning("refused", channel.name, self._clock.now(), topic=topic, reason=reason)

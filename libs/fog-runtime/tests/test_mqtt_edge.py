@@ -1,0 +1,272 @@
+"""The MQTT edge against a real Mosquitto."""
+
+import asyncio
+import contextlib
+import json
+import subprocess
+import time
+
+import aiomqtt
+import pytest
+from prometheus_client import REGISTRY
+
+from fog_contracts import channels as ch
+from fog_contracts import messages as m
+from fog_contracts.codec import ContractError
+from fog_runtime.clock import SystemClock
+from fog_runtime.mqtt_edge import MqttEdge, Will
+from fog_runtime.servers import start_mosquitto
+
+pytestmark = pytest.mark.live
+
+
+@pytest.fixture(scope="module")
+def shared_broker(tmp_path_factory):
+    with start_mosquitto(tmp_path_factory.mktemp("mosquitto"), extra="max_queued_messages 5000") as broker:
+        yield broker
+
+
+@pytest.fixture
+def broker(shared_broker):
+    """Return a running broker, started again in case the last test killed it."""
+    shared_broker.start()
+    return shared_broker
+
+
+@contextlib.asynccontextmanager
+async def running(*edges):
+    tasks = [asyncio.create_task(edge.run()) for edge in edges]
+    try:
+        async with asyncio.timeout(10):
+            for edge in edges:
+                await edge.wait_connected()
+        yield
+    finally:
+        for task in tasks:
+            task.cancel()
+        ended = await asyncio.gather(*tasks, return_exceptions=True)
+    assert all(isinstance(end, asyncio.CancelledError) for end in ended), ended
+
+
+def make(broker, name, **keys):
+    return MqttEdge(broker.url, name, SystemClock(), **keys)
+
+
+def reading(seq):
+    return m.NodeReading(seq=seq, boot=1, uptime_ms=5, range_m=[1.0, None], status=["ok", "no_echo"], state="clear")
+
+
+def hazard(seq, area="a1"):
+    return m.AreaHazard(
+        area=area, state="blocked", severity=1, penalty=254, since=1.0, seq=seq, epoch=1, cause="test", nodes={}
+    )
+
+
+def raw(broker):
+    return aiomqtt.Client("127.0.0.1", broker.port)
+
+
+async def until(condition, what, seconds=10.0):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, what
+        await asyncio.sleep(0.01)
+
+
+def counted(name, channel):
+    return REGISTRY.get_sample_value(name, {"channel": channel.name}) or 0.0
+
+
+async def test_messages_and_texts_arrive_with_their_ids_in_order(broker):
+    readings, texts, thesis = [], [], []
+    a, b = make(broker, "a"), make(broker, "b")
+    b.on(ch.NODE_READING, lambda ids, message: readings.append((ids["node"], message.seq)), m.NodeReading)
+    b.on(ch.NODE_AVAILABILITY, lambda ids, text: texts.append((ids["node"], text)))
+    b.on(ch.THESIS_AREA, lambda ids, text: thesis.append((ids["number"], text)), numbers=[1, "3"])
+    async with running(a, b):
+        for n in range(50):
+            assert await a.publish(ch.NODE_READING, reading(n), node="n1")
+        assert await a.publish(ch.NODE_AVAILABILITY, "online", wait=True, node="n2")
+        for number in ("1", "2", "3"):
+            assert await a.publish(ch.THESIS_AREA, "blocked", number=number)
+        await until(lambda: len(readings) == 50 and texts and len(thesis) == 2, "not all came")
+    assert readings == [("n1", n) for n in range(50)]
+    assert ("n2", "online") in texts
+    assert thesis == [("1", "blocked"), ("3", "blocked")]
+    assert not a.connected
+
+
+async def test_retained_state_reaches_late_subscribers_until_it_is_cleared(broker):
+    first, second, third = [], [], []
+    a = make(broker, "a")
+    async with running(a):
+        for n in range(20):
+            await a.publish(ch.AREA_HAZARD, hazard(n, "kept"), area="kept")
+        assert await a.publish(ch.AREA_HAZARD, hazard(20, "kept"), wait=True, area="kept")
+        b = make(broker, "b")
+        b.on(ch.AREA_HAZARD, lambda ids, message: first.append((ids["area"], message.seq)), m.AreaHazard)
+        async with running(b):
+            await until(lambda: ("kept", 20) in first, "the retained hazard did not come")
+        c = make(broker, "c")
+        c.on(ch.AREA_HAZARD, lambda ids, message: second.append((ids["area"], message.seq)), m.AreaHazard)
+        async with running(c):
+            assert await a.clear(ch.AREA_HAZARD, wait=True, area="kept")
+            await a.publish(ch.AREA_HAZARD, hazard(1, "last"), wait=True, area="last")
+            await until(lambda: ("last", 1) in second, "nothing after the clearing")
+            await a.clear(ch.AREA_HAZARD, wait=True, area="last")
+        d = make(broker, "d")
+        d.on(ch.AREA_HAZARD, lambda ids, _: third.append(ids["area"]), m.AreaHazard)
+        async with running(d):
+            await a.publish(ch.AREA_HAZARD, hazard(1, "mark"), wait=True, area="mark")
+            await until(lambda: third, "no mark")
+            await a.clear(ch.AREA_HAZARD, wait=True, area="mark")
+    assert first == [("kept", 20)]
+    assert third == ["mark"]
+
+
+async def test_broker_killed_and_restarted_subscriptions_and_publishing_go_on(broker):
+    seen, greetings = [], []
+    a, b = make(broker, "a"), make(broker, "b")
+    b.on(ch.NODE_READING, lambda _, message: seen.append(message.seq), m.NodeReading)
+
+    async def greet():
+        greetings.append(await a.publish(ch.AREA_HAZARD, hazard(len(greetings)), wait=True, area="a1"))
+
+    a.on_connect(greet)
+    async with running(a, b):
+        await a.publish(ch.NODE_READING, reading(1), node="n1")
+        await until(lambda: seen == [1] and greetings == [True], "nothing before the crash")
+        broker.kill()
+        await until(lambda: not a.connected and not b.connected, "the loss was not noticed")
+        before = counted("fognav_unsent_messages_total", ch.NODE_READING)
+        assert not await a.publish(ch.NODE_READING, reading(2), node="n1")
+        assert not await a.publish(ch.AREA_HAZARD, hazard(9), wait=True, area="a1")
+        assert counted("fognav_unsent_messages_total", ch.NODE_READING) == before + 1
+        broker.start()
+        await until(lambda: a.connected and b.connected and greetings == [True, True], "no reconnection")
+        assert await a.publish(ch.NODE_READING, reading(3), node="n1")
+        await until(lambda: seen == [1, 3], f"nothing after the restart: {seen}")
+
+
+async def test_edge_started_before_its_broker_connects_later(broker):
+    broker.stop()
+    edge = make(broker, "early")
+    task = asyncio.create_task(edge.run())
+    await asyncio.sleep(0.3)
+    assert not task.done()
+    assert not edge.connected
+    broker.start()
+    await until(lambda: edge.connected, "no connection")
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+
+
+async def test_will_is_published_when_the_process_vanishes(broker):
+    texts = []
+    watcher = make(broker, "w")
+    watcher.on(ch.NODE_AVAILABILITY, lambda ids, text: texts.append((ids["node"], text)))
+    edge = make(broker, "x", will=Will(ch.NODE_AVAILABILITY, "offline", {"node": "gone"}))
+    async with running(watcher):
+        async with running(edge):
+            await edge.publish(ch.NODE_AVAILABILITY, "online", wait=True, node="gone")
+            # A second client of the same name makes the broker cut the first one off, as a dead link would.
+            async with aiomqtt.Client("127.0.0.1", broker.port, identifier="x"):
+                await until(lambda: ("gone", "offline") in texts, "no will")
+        await watcher.clear(ch.NODE_AVAILABILITY, wait=True, node="gone")
+
+
+@pytest.mark.parametrize(
+    ("topic", "payload"),
+    [
+        ("fog/v1/nodes/n1/reading", b"no json"),
+        ("fog/v1/nodes/n1/reading", b"\xff\xfe"),
+        ("fog/v1/nodes/n1/reading", b""),
+        ("fog/v1/nodes/n1/reading", b"{}"),
+        ("fog/v1/nodes/n1/reading", b"x" * 2000),
+        ("fog/v1/nodes/N 1/reading", b"{}"),
+        ("fog/v1/nodes/n1/reading", json.dumps({"seq": 1, "boot": 1, "uptime_ms": 1, "range_m": [0.0],
+                                                "status": ["ok"], "state": "clear"}).encode()),
+    ],
+)  # fmt: skip
+async def test_broken_message_is_refused_counted_and_the_next_one_heard(broker, topic, payload):
+    seen = []
+    before = counted("fognav_refused_messages_total", ch.NODE_READING)
+    edge = make(broker, "e")
+    edge.on(ch.NODE_READING, lambda _, message: seen.append(message.seq), m.NodeReading)
+    async with running(edge), raw(broker) as client:
+        await client.publish(topic, payload)
+        await edge.publish(ch.NODE_READING, reading(5), node="n1")
+        await until(lambda: seen == [5], "deaf after a broken message")
+    assert counted("fognav_refused_messages_total", ch.NODE_READING) == before + 1
+
+
+async def test_retained_reading_is_never_taken_for_a_fresh_one(broker):
+    seen = []
+    before = counted("fognav_refused_messages_total", ch.NODE_READING)
+    async with raw(broker) as client:
+        await client.publish("fog/v1/nodes/old/reading", json.dumps({
+            "seq": 1, "boot": 1, "uptime_ms": 1, "range_m": [1.0], "status": ["ok"], "state": "clear",
+        }), retain=True, qos=1)  # fmt: skip
+        edge = make(broker, "e")
+        edge.on(ch.NODE_READING, lambda ids, _: seen.append(ids["node"]), m.NodeReading)
+        async with running(edge):
+            await until(lambda: counted("fognav_refused_messages_total", ch.NODE_READING) == before + 1, "not refused")
+            await edge.publish(ch.NODE_READING, reading(1), node="new")
+            await until(lambda: seen, "nothing came")
+        await client.publish("fog/v1/nodes/old/reading", b"", retain=True, qos=1)
+    assert seen == ["new"]
+
+
+async def test_handler_that_fails_does_not_silence_the_channel(broker):
+    seen = []
+
+    def handler(_, message):
+        seen.append(message.seq)
+        raise RuntimeError("a bug")
+
+    before = counted("fognav_handler_errors_total", ch.NODE_READING)
+    edge = make(broker, "e")
+    edge.on(ch.NODE_READING, handler, m.NodeReading)
+    async with running(edge):
+        await edge.publish(ch.NODE_READING, reading(1), node="n1")
+        await edge.publish(ch.NODE_READING, reading(2), node="n1")
+        await until(lambda: seen == [1, 2], "the second did not come")
+    assert counted("fognav_handler_errors_total", ch.NODE_READING) == before + 2
+
+
+@pytest.fixture
+def passwords(tmp_path):
+    """Return a password file with the user `fog`."""
+    file = tmp_path / "passwords"
+    subprocess.run(["mosquitto_passwd", "-b", "-c", str(file), "fog", "p@ss"], check=True, capture_output=True)
+    file.chmod(0o600)
+    return file
+
+
+async def test_password_in_the_address_is_used_and_a_wrong_one_is_tried_again(tmp_path, passwords):
+    extra = f"allow_anonymous false\npassword_file {passwords}"
+    with start_mosquitto(tmp_path / "broker", extra=extra) as broker:
+        good = MqttEdge(f"mqtt://fog:p%40ss@127.0.0.1:{broker.port}", "good", SystemClock())
+        bad = MqttEdge(f"mqtt://fog:wrong@127.0.0.1:{broker.port}", "bad", SystemClock())
+        async with running(good):
+            task = asyncio.create_task(bad.run())
+            done, _ = await asyncio.wait([task], timeout=0.5)
+            assert not done
+            assert not bad.connected
+            assert good.connected
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+
+
+async def test_wrong_use_is_an_error_at_once():
+    with pytest.raises(ValueError, match="mqtt://"):
+        MqttEdge("http://broker", "e", SystemClock())
+    edge = MqttEdge("mqtt://127.0.0.1", "e", SystemClock())
+    with pytest.raises(ValueError, match="NodeReading"):
+        edge.on(ch.NODE_READING, print)
+    with pytest.raises(ValueError, match="zenoh"):
+        edge.on(ch.ROBOT_POSE, print, m.RobotPose)
+    with pytest.raises(ContractError, match="over the limit"):
+        await edge.publish(ch.NODE_AVAILABILITY, "x" * 100, node="n1")
+    with pytest.raises(ContractError, match="not text"):
+        await edge.publish(ch.NODE_READING, "text", node="n1")

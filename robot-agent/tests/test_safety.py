@@ -308,7 +308,9 @@ def test_invariants_of_every_reachable_state(episodes):
             if before == "FAULT" and out.mode != "FAULT":
                 assert asked == "reset"
                 assert out.refusal is None
-                assert not (given_inputs.bumper or given_inputs.cliff or given_inputs.wheel_drop)
+                assert not (given_inputs.bumper)
+                assert not (given_inputs.cliff)
+                assert not (given_inputs.wheel_drop)
                 assert out.mode == "INIT"
             if before == "INIT" and out.mode != "INIT":
                 assert asked == "enable"

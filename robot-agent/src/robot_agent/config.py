@@ -18,6 +18,8 @@ class SafetyConfig:
     map_lost: float = 3.0
     gap_lost: float = 1.0
     plan_late: float = 1.5
+    released_end: float = 0.15
+    """With less released path ahead (m) the robot stands at its end, within the goal tolerance."""
     lidar_node_lost: float = 0.3
     turn_lost: float = 0.45
     identical_turns: int = 3
@@ -45,6 +47,8 @@ class LocalizationConfig:
     z_rand: float = 0.5
     sigma_hit: float = 0.2
     field_reach: float = 2.0
+    sharpness: float = 12.0
+    """Logarithm of the weight ratio between a pose that all beams fit and one that none fits."""
     alphas: tuple[float, float, float, float] = (0.2, 0.2, 0.2, 0.2)
     update_distance: float = 0.25
     update_angle: float = 0.2

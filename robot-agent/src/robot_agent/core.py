@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 
 from fog_contracts.commands import CommandGate
-from fog_contracts.costs import LETHAL
+from fog_contracts.costs import INSCRIBED, LETHAL
 from fog_contracts.geometry import contains_point, distance_to_segment
 from fog_contracts.messages import (
     CircleShape,
@@ -550,7 +550,8 @@ class AgentCore:
         if ahead is None:
             self._block = self._blocked_since = None
             return
-        goal_blocked = ahead >= follower.left - 0.3
+        end = replica.geometry.cell(*follower.points[-1])
+        goal_blocked = replica.geometry.contains_cell(*end) and replica.cost[end[1], end[0]] >= INSCRIBED
         what = "the goal is blocked" if goal_blocked else f"the path is blocked {ahead:.1f} m ahead"
         self._block = (follower.progress + ahead, f"{what} on the newest map; waiting for a new plan")
         if self._blocked_since is None:
@@ -607,7 +608,7 @@ class AgentCore:
         self._traces = [*self._traces, *done][-_TRACES:]
 
     def _unexplained(self, points: NDArray[np.float64], now: float) -> NDArray[np.bool_]:
-        """Tell which points (n, 2) lie on cells that nobody but this robot itself has called lethal."""
+        """Tell which points (n, 2) lie where nobody but this robot itself called something lethal or close to it."""
         geometry = self._replica.geometry
         assert geometry is not None
         columns = np.floor((points[:, 0] - geometry.origin_x) / geometry.resolution).astype(np.int64)
@@ -616,7 +617,7 @@ class AgentCore:
         free = np.zeros(len(points), dtype=np.bool_)
         cost = self._replica.cost[rows[inside], columns[inside]]
         known_floor = self._replica.static[rows[inside], columns[inside]] == 0
-        free[inside] = known_floor & (cost < LETHAL)
+        free[inside] = known_floor & (cost < INSCRIBED)
         return free | (self._is_own(points, now) & inside)
 
     def _is_own(self, points: NDArray[np.float64], now: float) -> NDArray[np.bool_]:

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from fog_contracts.costs import INSCRIBED, LETHAL, NO_SPEED_LIMIT
+from fog_contracts.costs import INSCRIBED, LETHAL, NO_SPEED_LIMIT, UNKNOWN
+from fog_kernels.astar import Planner
 from fog_kernels.dwa import DwaLimits, DwaSettings, dwa
 from fog_kernels.inflation import InflationTable, inflate, inflation_table
 from robot_agent.localization import Pose2, wrap
@@ -23,8 +24,10 @@ if TYPE_CHECKING:
     from fog_contracts.grid import GridGeometry
     from robot_agent.config import MotionConfig
 
-_AHEAD_M: Final = 1.6
-"""Path handed to the dynamic window: a little more than an arc can reach."""
+_AHEAD_M: Final = 2.5
+"""Path handed to a decision: more than an arc can reach, so that the way around something can be seen."""
+_REJOIN_M: Final = 0.2
+"""A detour ends this far behind the last blocked piece of the path."""
 _SEARCH_BACK_M: Final = 0.5
 _SEARCH_AHEAD_M: Final = 2.5
 _OFF_PATH_M: Final = 1.0
@@ -123,6 +126,7 @@ def decide(job: Job) -> Decision:
         goal_tolerance=c.tolerance_xy,
         heading_tolerance=c.tolerance_theta,
     )
+    path = detour(job.path, costs, job.window, job.pose)
     end = job.path[-1]
     wants_theta = job.goal_theta if job.ends_here else None
     chosen = dwa(
@@ -133,7 +137,7 @@ def decide(job: Job) -> Decision:
         resolution,
         job.window.origin_x,
         job.window.origin_y,
-        job.path,
+        path,
         float(end[0]),
         float(end[1]),
         wants_theta,
@@ -157,6 +161,44 @@ def decide(job: Job) -> Decision:
         at_goal=job.ends_here and near and turned,
         blocked=blocked,
     )
+
+
+def detour(
+    path: NDArray[np.float64], costs: NDArray[np.uint8], window: GridGeometry, pose: Pose2
+) -> NDArray[np.float64]:
+    """Lead a path (n, 2; m) around what blocks it inside the local window, if there is a way around in it.
+
+    `costs`: uint8 (h, w) over `window`. The dynamic window alone is greedy and stops in front of whatever stands on
+    its path; the exact search of the few metres at hand is the robot's own, all that lies beyond is the planner's.
+    """
+    route = PathFollower(path, math.inf)
+    points, ahead = route.ahead(0.5 * window.resolution)
+    cells = _cells_of(points, costs, window)
+    bad = np.flatnonzero((cells >= INSCRIBED) & (cells != UNKNOWN))
+    start = window.cell(pose.x, pose.y)
+    if not len(bad) or not window.contains_cell(*start) or costs[start[1], start[0]] >= INSCRIBED:
+        return path
+    clear = np.flatnonzero((ahead > ahead[bad[-1]] + _REJOIN_M) & (cells < INSCRIBED))
+    if not len(clear):
+        return path
+    rejoin = points[clear[0]]
+    search = Planner(window.width, window.height)
+    found = search.plan(costs, start, window.cell(float(rejoin[0]), float(rejoin[1])))
+    if not found.found:
+        return path
+    way = search.shortcut(costs, found.cells) if len(found.cells) > 1 else found.cells.astype(np.float64)
+    metres = (way + 0.5) * window.resolution + (window.origin_x, window.origin_y)
+    return np.vstack((metres, path[route.along > ahead[clear[0]]]))
+
+
+def _cells_of(points: NDArray[np.float64], costs: NDArray[np.uint8], geometry: GridGeometry) -> NDArray[np.uint8]:
+    """Return the cost at each point (n, 2; m); unknown off the grid."""
+    columns = np.floor((points[:, 0] - geometry.origin_x) / geometry.resolution).astype(np.int64)
+    rows = np.floor((points[:, 1] - geometry.origin_y) / geometry.resolution).astype(np.int64)
+    inside = (columns >= 0) & (rows >= 0) & (columns < geometry.width) & (rows < geometry.height)
+    cells = np.full(len(points), UNKNOWN, np.uint8)
+    cells[inside] = costs[rows[inside], columns[inside]]
+    return cells
 
 
 class PathFollower:
@@ -312,10 +354,6 @@ def first_blocked(
     have led the robot out of a tight place.
     """
     points, ahead = follower.ahead(0.5 * geometry.resolution)
-    columns = np.floor((points[:, 0] - geometry.origin_x) / geometry.resolution).astype(np.int64)
-    rows = np.floor((points[:, 1] - geometry.origin_y) / geometry.resolution).astype(np.int64)
-    inside = (columns >= 0) & (rows >= 0) & (columns < geometry.width) & (rows < geometry.height)
-    cells = np.full(len(points), 255, np.uint8)
-    cells[inside] = cost[rows[inside], columns[inside]]
+    cells = _cells_of(points, cost, geometry)
     bad = (cells == LETHAL) | ((cells >= INSCRIBED) & (ahead > skip))
     return float(ahead[int(bad.argmax())]) if bad.any() else None

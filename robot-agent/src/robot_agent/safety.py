@@ -204,7 +204,7 @@ def _judge_plan(inputs: SafetyInputs, config: SafetyConfig) -> list[Finding]:
         found.append(Finding(Level.HOLD, inputs.path_problem))
     if not inputs.plan_age <= config.plan_late:
         silent = f"the planner has been silent for {_seconds(inputs.plan_age)}"
-        if inputs.released_left > 0.0:
+        if inputs.released_left > config.released_end:
             found.append(Finding(Level.DEGRADED, silent))
         else:
             found.append(Finding(Level.HOLD, f"{silent} and no released path is left"))
@@ -304,7 +304,8 @@ def _advance(
             ),
         )
     if faults:
-        return replace(state, mode="FAULT", latched=faults, stops=stops, standing_since=math.inf)
+        words = tuple(finding.reason for finding in faults)
+        return replace(state, mode="FAULT", latched=faults, stops=stops, standing_since=math.inf, last_words=words)
 
     recent = max(level for level, at in zip(Level, state.asked, strict=True) if _is_recent(level, at, now, config))
     latch = max((finding.level for finding in latched), default=Level.NORMAL)

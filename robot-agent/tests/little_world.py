@@ -1,0 +1,264 @@
+"""A world that is just large enough to close the loop: a grid, a unicycle with encoders, a lidar by ray casting.
+
+It feeds an `AgentCore` as its edge would: feedback at 22 Hz, lidar turns at 5.5 Hz whose beams are taken one after
+another while the robot moves, decisions at 5 Hz, wheel commands at 20 Hz. Everything runs on emulated time.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from fog_contracts.commands import sign
+from fog_contracts.grid import GridGeometry, Window
+from fog_contracts.messages import Pose, RobotCommand, RobotGoal, RobotPath, RobotState, Trace
+from fog_contracts.replica import MasterMap
+from fog_kernels.inflation import inflate, inflation_table
+from fog_kernels.raycast import cast
+from robot_agent.config import AgentConfig
+from robot_agent.core import AgentCore, decide
+from robot_agent.drivers.rplidar import Turn
+from robot_agent.link import BaseFeedback
+
+KEY = b"k" * 32
+TICK_M = math.pi * 0.072 / 508.8
+AXLE = 0.235
+DT = 0.01
+BEAMS = 360
+TURN_S = 0.18
+START = 1_000.0
+STAMP = 1_700_000_000.0
+
+
+def grid_of(rooms, width_m, height_m, resolution=0.05):
+    """Static map: occupied everywhere but in the given rectangles (left, bottom, right, top in m)."""
+    geometry = GridGeometry(round(width_m / resolution), round(height_m / resolution), resolution, 0.0, 0.0)
+    static = np.full(geometry.shape, 254, np.uint8)
+    for left, bottom, right, top in rooms:
+        rows = slice(round(bottom / resolution), round(top / resolution))
+        static[rows, round(left / resolution) : round(right / resolution)] = 0
+    return static, geometry
+
+
+# An L of corridors with niches, so that no two places look alike.
+L_ROOMS = [(1, 1, 13, 3), (11, 1, 13, 11), (3, 3, 4, 4.4), (6.5, 3, 8.5, 3.6), (9.6, 6, 11, 7.2), (13, 8.5, 13.8, 9.3)]
+L_PATH = [(2.0, 2.0), (6.0, 2.0), (11.0, 2.0), (11.7, 2.3), (12.0, 3.0), (12.0, 6.0), (12.0, 10.0)]
+
+
+@dataclass
+class LittleWorld:
+    rooms: list = field(default_factory=lambda: L_ROOMS)
+    size: tuple = (15.0, 12.0)
+    pose: tuple = (2.0, 2.0, 0.0)
+    seed: int = 1
+    lidar_noise: float = 0.01
+
+    def __post_init__(self):
+        self.static, self.geometry = grid_of(self.rooms, *self.size)
+        self.solid = (self.static == 254).astype(np.uint8)
+        self.table = inflation_table(self.geometry.resolution, 0.17, 0.55, 6.0)
+        self.raw = self.static.copy()
+        self.master = MasterMap("lab", self.geometry, self.static, inflate(self.raw, self.table), epoch=7)
+        self.rng = np.random.default_rng(self.seed)
+        self.agent = AgentCore(AgentConfig(robot="r1", operator_key=KEY), seed=self.seed)
+        self.now = START
+        self.steps = 0
+        self.x, self.y, self.theta = self.pose
+        self.wheels = (0.0, 0.0)
+        self.ticks = [60_000.0, 10.0]
+        self.beams = []
+        self.turn_started = self.now
+        self.lidar_on = self.heartbeats_on = self.base_on = True
+        self.bumper = False
+        self.fault = None
+        self.path = None
+        self.path_on = True
+        self.goal = None
+        self.touched = False
+        self.travelled = 0.0
+        self.commands = []
+        self.nonce = 0
+        self.last_digest, self.repeats = b"", 1
+        self.frozen_turn = None
+        self.turns = []
+        self.decide_on = True
+        self.resets = 0
+        self.worst_error = (0.0, 0.0)
+
+    @property
+    def stamp(self):
+        return STAMP + self.now - START
+
+    def command(self, kind, **more):
+        self.nonce += 1
+        unsigned = RobotCommand(
+            kind=kind, robot="r1", operator="ann", nonce=f"nonce-{self.nonce:016d}", issued_at=self.stamp, **more
+        )
+        return self.agent.on_command(sign(unsigned, KEY), self.now, self.stamp)
+
+    def ready(self):
+        """Bring a new agent to NORMAL, as an operator would."""
+        self.agent.load(self.master.snapshot(), self.now)
+        self.run(0.6)
+        reply = self.command("initial_pose", pose=Pose(x=self.x + 0.2, y=self.y - 0.15, theta=self.theta + 0.1))
+        assert reply.accepted, reply
+        self.run(3.0)
+        reply = self.command("enable")
+        assert reply.accepted, reply
+        self.run(0.2)
+        assert self.state().mode == "NORMAL", self.state().reasons
+        return self
+
+    def drive_to(self, points, goal_id="g1", plan_id=1, released=None, theta=None, traces=()):
+        x, y = points[-1]
+        self.goal = RobotGoal(goal_id=goal_id, pose=Pose(x=x, y=y, theta=theta or 0.0))
+        self.path = RobotPath(
+            plan_id=plan_id,
+            planner_epoch=3,
+            goal_id=goal_id,
+            points=points,
+            map_epoch=self.master.version.epoch,
+            map_seq=self.master.version.seq,
+            released_length=1e3 if released is None else released,
+            goal_theta=theta,
+            traces=list(traces),
+        )
+        self.agent.on_goal(self.goal, self.now)
+        self.agent.on_path(self.path, self.now, self.stamp)
+
+    def block(self, left, bottom, right, top, *, solid=False, tell=True):
+        """Make a rectangle lethal in the master costmap and, if solid, stand something there."""
+        g = self.geometry
+        window = g.window_around(left, bottom, right - 1e-6, top - 1e-6)
+        if solid:
+            self.solid[window.rows, window.columns] = 1
+        self.raw[window.rows, window.columns] = 254
+        whole = Window(0, 0, g.width, g.height)
+        deltas = self.master.write([("cost", whole, inflate(self.raw, self.table))], [], [])
+        if tell:
+            for delta in deltas:
+                self.agent.on_delta(delta, self.now)
+
+    def restart(self):
+        """Kill the agent and start another one with what it had saved."""
+        saved = self.agent.save(self.now)
+        self.wheels = (0.0, 0.0)
+        self.agent = AgentCore(AgentConfig(robot="r1", operator_key=KEY), seed=self.seed + 1)
+        if saved is not None:
+            self.agent.restore(saved)
+        return saved
+
+    def state(self) -> RobotState:
+        return self.agent.state(self.stamp, self.now)
+
+    def error(self):
+        pose = self.agent.pose(self.stamp, self.now)
+        return math.hypot(pose.x - self.x, pose.y - self.y), abs(math.remainder(pose.theta - self.theta, 2 * math.pi))
+
+    def run(self, seconds, until=None):
+        for _ in range(round(seconds / DT)):
+            self._step()
+            if until is not None and until(self):
+                return True
+        return until is None
+
+    def _step(self):
+        self.steps += 1
+        self.now = START + self.steps * DT
+        self._move()
+        if self.base_on and self.steps % 4 == 0:
+            left, right = (int(t) & 0xFFFF for t in self.ticks)
+            self.agent.on_base(
+                BaseFeedback(
+                    seq=self.steps,
+                    left_ticks=left,
+                    right_ticks=right,
+                    oi_mode=2,
+                    bumper=self.bumper,
+                    cliff=False,
+                    wheel_drop=False,
+                    battery=0.8,
+                    charging=False,
+                    fault=self.fault,
+                    stopped=None,
+                ),
+                self.now,
+            )
+        self._scan()
+        if self.heartbeats_on and self.steps % 10 == 0:
+            self.agent.on_heartbeat(self.master.heartbeat(self.stamp), self.now)
+        if self.path is not None and self.path_on and self.steps % 50 == 0:
+            self.agent.on_goal(self.goal, self.now)
+            self.agent.on_path(self.path, self.now, self.stamp)
+        if self.decide_on and self.steps % 20 == 0 and (job := self.agent.control_job(self.now)) is not None:
+            self.agent.accept(decide(job), self.now)
+        if self.steps % 5 == 0:
+            command = self.agent.stream(self.now, self.stamp)
+            self.resets += command.reset
+            if command.reset:
+                self.fault = None
+            self.wheels = (command.left, command.right) if self.base_on else (0.0, 0.0)
+            self.commands.append((self.now, command.left, command.right))
+            if self.agent.localizer.status == "good":
+                self.worst_error = tuple(max(pair) for pair in zip(self.worst_error, self.error(), strict=True))
+
+    def _move(self):
+        left, right = self.wheels
+        v, w = (left + right) / 2, (right - left) / AXLE
+        self.theta += 0.5 * w * DT
+        nx, ny = self.x + v * DT * math.cos(self.theta), self.y + v * DT * math.sin(self.theta)
+        self.theta += 0.5 * w * DT
+        g = self.geometry
+        near = g.window_around(nx - 0.2, ny - 0.2, nx + 0.2, ny + 0.2)
+        rows, columns = np.nonzero(self.solid[near.rows, near.columns])
+        xs = g.origin_x + (columns + near.x + 0.5) * g.resolution
+        ys = g.origin_y + (rows + near.y + 0.5) * g.resolution
+        if len(xs) and np.hypot(xs - nx, ys - ny).min() < 0.16:
+            self.touched = True
+            return
+        self.travelled += math.hypot(nx - self.x, ny - self.y)
+        self.x, self.y = nx, ny
+        for wheel, speed in enumerate((left, right)):
+            self.ticks[wheel] += speed * DT * (1 + 0.02 * self.rng.standard_normal()) / TICK_M
+
+    def _scan(self):
+        """Cast the beams that the head passes during this step."""
+        if not self.lidar_on:
+            self.beams = []
+            self.turn_started = self.now
+            return
+        share = (self.now - self.turn_started) / TURN_S
+        due = min(BEAMS, round(share * BEAMS))
+        fresh = np.arange(len(self.beams), due)
+        if len(fresh):
+            angles = -(fresh + 0.5) * 2 * math.pi / BEAMS  # clockwise, as the real head turns
+            g = self.geometry
+            ranges = cast(self.solid, g.resolution, g.origin_x, g.origin_y, self.x, self.y, angles + self.theta, 12.0)
+            ranges += self.lidar_noise * self.rng.standard_normal(len(ranges))
+            ranges[~np.isfinite(ranges) | (self.rng.random(len(ranges)) < 0.02)] = math.nan
+            self.beams.extend(zip(angles, ranges, strict=True))
+            self.agent.on_lidar_nodes(self.now)
+        if len(self.beams) == BEAMS:
+            data = self.frozen_turn if self.frozen_turn is not None else np.array(self.beams)
+            digest = hashlib.blake2b(np.round(data, 4).tobytes(), digest_size=16).digest()
+            self.repeats = self.repeats + 1 if digest == self.last_digest else 1
+            self.last_digest = digest
+            turn = Turn(
+                angles_rad=np.array([math.remainder(a, 2 * math.pi) for a in data[:, 0]]),
+                ranges_m=data[:, 1].copy(),
+                quality=np.full(BEAMS, 40, np.uint8),
+                started_at=self.turn_started,
+                ended_at=self.now,
+                digest=digest,
+                repeats=self.repeats,
+            )
+            self.agent.on_turn(turn, self.now)
+            self.beams = []
+            self.turn_started = self.now
+
+
+def trace(area="z4"):
+    return Trace(area=area, epoch=1, seq=1, first_reading=STAMP, confirmed=STAMP + 0.5)

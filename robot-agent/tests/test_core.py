@@ -1,0 +1,470 @@
+"""The agent's core in a closed loop with a little world: it drives, and above all it stops."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec.structs
+import numpy as np
+import pytest
+from little_world import KEY, L_PATH, START, LittleWorld, trace
+
+from fog_contracts.commands import sign
+from fog_contracts.messages import (
+    AreaHazard,
+    Cause,
+    HazardArea,
+    PolygonShape,
+    Pose,
+    Refusal,
+    RobotCommand,
+    RobotPath,
+    Zone,
+    ZoneSet,
+)
+from fog_contracts.replica import MapError
+from robot_agent.core import decide
+
+
+@pytest.fixture
+def world():
+    return LittleWorld().ready()
+
+
+@pytest.fixture
+def driving(world):
+    world.drive_to(L_PATH)
+    world.run(5.0)
+    assert world.state().mode == "NORMAL"
+    assert sum(world.wheels) / 2 == pytest.approx(0.3, abs=0.02)
+    return world
+
+
+def seconds_to_rest(world, limit=3.0):
+    begin = world.now
+    assert world.run(limit, lambda w: w.wheels == (0.0, 0.0)), f"the wheels still turn after {limit} s"
+    return world.now - begin
+
+
+def test_it_drives_along_the_corridors_to_the_goal_and_says_so(world):
+    world.drive_to(L_PATH, theta=math.pi)
+    assert world.run(100, lambda w: w.state().goal_reached)
+    assert math.hypot(world.x - 12.0, world.y - 10.0) < 0.15
+    assert abs(math.remainder(world.theta - math.pi, 2 * math.pi)) < 0.25
+    assert not world.touched
+    assert world.worst_error[0] < 0.10
+    assert world.worst_error[1] < 0.06
+    assert world.travelled < 19.5
+    world.run(1.0)
+    assert world.wheels == (0.0, 0.0)
+    assert world.state().goal_id == "g1"
+    speeds = np.array(world.commands)[:, 1:]
+    assert np.abs(speeds).max() <= 0.5
+    assert np.abs(speeds.mean(axis=1)).max() <= 0.3 + 1e-9
+
+
+def test_the_same_seed_gives_the_same_drive_to_the_last_bit():
+    drives = []
+    for _ in range(2):
+        world = LittleWorld(seed=5).ready()
+        world.drive_to(L_PATH)
+        world.run(15.0)
+        drives.append(world.commands)
+    assert drives[0] == drives[1]
+
+
+def test_a_path_that_starts_behind_the_robot_is_begun_by_turning_on_the_spot():
+    world = LittleWorld(pose=(6.0, 2.0, math.pi)).ready()
+    world.drive_to([(6.0, 2.0), (9.0, 2.0)])
+    world.run(2.0)
+    assert math.hypot(world.x - 6.0, world.y - 2.0) < 0.2
+    assert world.run(30.0, lambda w: w.state().goal_reached)
+
+
+def test_it_stops_at_the_end_of_the_released_part_and_goes_on_when_more_is_released(world):
+    world.drive_to(L_PATH, released=2.0)
+    world.run(20.0)
+    assert 3.7 < world.x < 4.05
+    assert world.wheels == (0.0, 0.0)
+    assert not world.state().goal_reached
+    world.path = msgspec.structs.replace(world.path, released_length=4.0)
+    world.run(15.0)
+    assert 5.7 < world.x < 6.05
+
+
+@pytest.mark.parametrize("box", [(6.0, 1.5, 6.29, 1.94), (6.0, 1.8, 6.29, 2.3)])
+def test_a_thing_beside_or_on_the_path_that_only_the_lidar_knows_is_driven_around(world, box):
+    window = world.geometry.window_around(*box)
+    world.solid[window.rows, window.columns] = 1
+    world.drive_to(L_PATH)
+    assert world.run(30, lambda w: w.x > 7.5), world.state().reasons
+    assert not world.touched
+    assert abs(world.y - 2.0) < 0.15
+
+
+def test_a_wall_across_the_corridor_stops_it_without_touching(world):
+    g = world.geometry
+    window = g.window_around(6.0, 1.0, 6.2, 3.0)
+    world.solid[window.rows, window.columns] = 1
+    world.drive_to(L_PATH)
+    world.run(40.0)
+    assert not world.touched
+    assert not world.state().goal_reached
+    assert world.wheels[0] + world.wheels[1] == pytest.approx(0.0, abs=0.05)
+    assert any("no progress" in reason or "near" in reason for reason in world.state().reasons)
+
+
+def test_a_lethal_change_on_the_path_nearby_holds_it_until_a_new_plan(driving):
+    ahead = driving.x + 1.5
+    driving.block(ahead, 1.0, ahead + 0.5, 3.0)
+    assert seconds_to_rest(driving) <= 0.6
+    driving.run(1.0)
+    state = driving.state()
+    assert state.mode == "HOLD"
+    assert any("the path is blocked" in reason for reason in state.reasons)
+    assert driving.x < ahead - 0.8
+    back = [(driving.x, driving.y), (3.5, 2.0), (3.5, 3.8)]
+    driving.drive_to(back, plan_id=2)
+    assert driving.run(40.0, lambda w: w.state().goal_reached)
+    assert not driving.touched
+
+
+def test_a_lethal_change_far_ahead_leaves_the_planner_a_second(driving):
+    driving.block(12.0, 6.0, 12.5, 6.5)
+    driving.block(11.0, 6.5, 13.0, 7.0)
+    driving.run(0.8)
+    assert driving.state().mode == "NORMAL"
+    driving.run(0.5)
+    assert driving.state().mode == "HOLD"
+
+
+def test_a_blocked_goal_is_named_as_such(driving):
+    driving.block(11.7, 9.6, 12.3, 10.4)
+    driving.run(1.5)
+    assert any("goal is blocked" in reason for reason in driving.state().reasons)
+
+
+def test_a_refusal_holds_with_the_planners_sentence(driving):
+    sentence = "area Z4 cuts the only way"
+    refused = msgspec.structs.replace(
+        driving.path, plan_id=2, points=[], refusal=Refusal(code=208, reason=sentence, causes=[])
+    )
+    driving.path = refused
+    driving.agent.on_path(refused, driving.now, driving.stamp)
+    assert seconds_to_rest(driving) <= 0.6
+    assert driving.state().mode == "HOLD"
+    assert sentence in " ".join(driving.state().reasons)
+
+
+def test_heartbeats_that_stop_slow_the_robot_then_hold_it_and_it_recovers_by_itself(driving):
+    driving.heartbeats_on = False
+    driving.run(1.3)
+    assert driving.state().mode == "DEGRADED"
+    driving.run(1.0)
+    assert sum(driving.wheels) / 2 <= 0.15 + 1e-9
+    driving.run(1.0)
+    assert driving.state().mode == "HOLD"
+    driving.run(0.6)
+    assert driving.wheels == (0.0, 0.0)
+    stood = driving.x
+    driving.heartbeats_on = True
+    driving.run(1.5)
+    assert driving.state().mode == "HOLD"
+    assert driving.run(3.0, lambda w: w.state().mode == "NORMAL")
+    driving.run(3.0)
+    assert driving.x > stood + 0.3
+
+
+def test_a_missed_delta_that_nobody_heals_holds_the_robot_and_a_snapshot_mends_it(driving):
+    driving.block(3.0, 3.9, 3.2, 4.1, tell=False)
+    driving.run(0.9)
+    assert driving.state().mode == "NORMAL"
+    driving.run(0.5)
+    assert driving.state().mode == "HOLD"
+    driving.agent.load(driving.master.snapshot(), driving.now)
+    assert driving.run(4.0, lambda w: w.state().mode == "NORMAL")
+
+
+def test_a_silent_lidar_stops_the_wheels_at_once(driving):
+    driving.lidar_on = False
+    begin = driving.now
+    assert driving.run(1.0, lambda w: w.state().mode == "PROTECTIVE_STOP")
+    assert driving.now - begin <= 0.36
+    assert driving.wheels == (0.0, 0.0)
+    driving.lidar_on = True
+    driving.run(1.5)
+    assert driving.wheels == (0.0, 0.0)
+    assert driving.run(3.0, lambda w: w.state().mode == "NORMAL")
+
+
+def test_a_lidar_that_repeats_itself_stops_the_wheels(driving):
+    driving.frozen_turn = np.column_stack((-(np.arange(360) + 0.5) * math.pi / 180, np.full(360, 3.0)))
+    assert driving.run(0.8, lambda w: w.state().mode == "PROTECTIVE_STOP")
+    assert any("identical turns" in reason for reason in driving.state().reasons)
+
+
+def test_a_guardian_that_falls_silent_stops_the_wheels(driving):
+    driving.base_on = False
+    driving.run(0.4)
+    assert driving.state().mode == "PROTECTIVE_STOP"
+    assert driving.commands[-1][1:] == (0.0, 0.0)
+
+
+def test_a_hung_control_loop_stops_the_robot_within_a_second(driving):
+    driving.decide_on = False
+    assert seconds_to_rest(driving) <= 0.4 + 0.2 + 0.5 + 0.1
+
+
+def test_a_pressed_bumper_is_a_fault_until_an_operator_resets_it(driving):
+    driving.bumper = True
+    driving.run(0.1)
+    assert driving.wheels == (0.0, 0.0)
+    assert driving.state().mode == "FAULT"
+    assert "bumper" in driving.command("reset").reason
+    driving.bumper = False
+    driving.run(3.0)
+    assert driving.state().mode == "FAULT"
+    assert not driving.command("enable").accepted
+    assert driving.command("reset").accepted
+    driving.run(0.2)
+    assert driving.resets == 1
+    assert driving.state().mode == "INIT"
+    assert driving.command("enable").accepted
+    driving.run(2.5)
+    assert driving.state().mode == "NORMAL"
+
+
+def test_a_fault_that_the_guardian_latched_is_cleared_by_passing_the_reset_on(driving):
+    driving.fault = "the base left Safe mode by itself (now PASSIVE)"
+    driving.run(0.1)
+    assert driving.state().mode == "FAULT"
+    assert driving.command("reset").accepted
+    driving.run(0.3)
+    assert driving.fault is None
+    assert driving.command("enable").accepted
+
+
+def test_a_restarted_agent_finds_itself_and_waits_for_an_enable(driving):
+    assert driving.restart() is not None
+    driving.agent.load(driving.master.snapshot(), driving.now)
+    driving.run(2.0)
+    assert driving.wheels == (0.0, 0.0)
+    assert driving.error()[0] < 0.1
+    state = driving.state()
+    assert state.mode == "INIT"
+    assert state.reasons == ["waiting for an operator to enable"]
+    assert driving.command("enable").accepted
+    assert driving.run(80, lambda w: w.state().goal_reached)
+
+
+def test_a_restarted_agent_that_was_carried_away_does_not_trust_what_it_saved(driving):
+    driving.restart()
+    driving.x, driving.y, driving.theta = 12.0, 8.0, 2.0
+    driving.agent.load(driving.master.snapshot(), driving.now)
+    driving.run(0.8)
+    assert not driving.command("enable").accepted
+    assert driving.run(8.0, lambda w: w.agent.localizer.status == "good")
+    assert driving.error()[0] < 0.1
+
+
+def test_being_carried_away_is_noticed_and_only_an_operator_lets_the_robot_go_on(world):
+    world.x, world.y, world.theta = 12.0, 7.0, 1.0
+    assert world.run(3.0, lambda w: w.state().mode == "PROTECTIVE_STOP")
+    assert world.run(8.0, lambda w: w.agent.localizer.status == "good")
+    assert world.error()[0] < 0.1
+    world.run(3.0)
+    assert world.state().mode == "PROTECTIVE_STOP"
+    assert world.command("enable").accepted
+    world.run(2.5)
+    assert world.state().mode == "NORMAL"
+
+
+def hazard(state, polygon):
+    return HazardArea(
+        hazard=AreaHazard(
+            area="z4", state=state, severity=2, penalty=254, since=0.0, seq=1, epoch=1, cause="test", nodes={}
+        ),
+        polygon=polygon,
+        label="Z4",
+    )
+
+
+def test_a_hazard_over_the_robot_stops_it_until_an_operator_enables(driving):
+    x = driving.x
+    driving.agent.on_hazard(hazard("blocked", [(x - 1, 1), (x + 1, 1), (x + 1, 3), (x - 1, 3)]), driving.now)
+    driving.block(x - 1, 1.0, x + 1, 3.0)
+    driving.run(0.1)
+    assert driving.wheels == (0.0, 0.0)
+    state = driving.state()
+    assert state.mode == "PROTECTIVE_STOP"
+    assert any("blocked area Z4" in reason for reason in state.reasons)
+    reply = driving.command("enable")
+    assert not reply.accepted
+    assert "Z4" in reply.reason
+
+
+def test_a_no_go_zone_over_the_robot_is_named_with_its_reason(driving):
+    x = driving.x
+    shape = PolygonShape(points=[(x - 1, 1), (x + 1, 1), (x + 1, 3), (x - 1, 3)])
+    zone = Zone(id="wet-floor", kind="BLOCKED", shape=shape, reason="being mopped")
+    driving.agent.on_zones(ZoneSet(epoch=7, seq=1, zones=[zone]), driving.now)
+    driving.block(x - 1, 1.0, x + 1, 3.0)
+    driving.run(0.1)
+    assert any("wet-floor (being mopped)" in reason for reason in driving.state().reasons)
+
+
+def test_in_an_area_that_nobody_can_tell_it_drives_slowly(driving):
+    driving.agent.on_hazard(hazard("unknown", [(1, 1), (9, 1), (9, 3), (1, 3)]), driving.now)
+    driving.run(0.5)
+    assert driving.state().mode == "DEGRADED"
+    assert sum(driving.wheels) / 2 <= 0.15 + 1e-9
+
+
+def test_the_speed_layer_limits_the_robot(driving):
+    g = driving.geometry
+    everywhere = g.window_around(*g.bounds)
+    cells = np.full((everywhere.height, everywhere.width), 12, np.uint8)
+    for delta in driving.master.write([("speed", everywhere, cells)], [Cause(kind="zone", id="s", state="on")], []):
+        driving.agent.on_delta(delta, driving.now)
+    driving.run(1.0)
+    assert sum(driving.wheels) / 2 == pytest.approx(0.12, abs=0.005)
+
+
+def test_a_path_of_another_goal_or_an_older_plan_is_not_followed(world):
+    world.drive_to(L_PATH, plan_id=5)
+    followed = world.agent.state(world.stamp, world.now).plan_id
+    older = msgspec.structs.replace(world.path, plan_id=4)
+    foreign = msgspec.structs.replace(world.path, plan_id=9, goal_id="g0")
+    for path in (older, foreign, msgspec.structs.replace(world.path, planner_epoch=2, plan_id=99)):
+        world.agent.on_path(path, world.now, world.stamp)
+    assert world.agent.state(world.stamp, world.now).plan_id == followed == 5
+    restarted = msgspec.structs.replace(world.path, planner_epoch=4, plan_id=1)
+    world.agent.on_path(restarted, world.now, world.stamp)
+    assert world.agent.state(world.stamp, world.now).plan_id == 1
+
+
+def test_a_planner_that_falls_silent_lets_it_drive_slowly_to_the_end_of_the_released_part(world):
+    world.drive_to(L_PATH, released=3.0)
+    world.path_on = False
+    world.run(4.0)
+    assert world.state().mode == "DEGRADED"
+    world.run(25.0)
+    assert world.state().mode == "HOLD"
+    assert 4.5 < world.x < 5.05
+
+
+def test_a_decision_for_a_path_that_was_replaced_is_dropped(driving):
+    job = driving.agent.control_job(driving.now)
+    late = decide(job)
+    driving.decide_on = False
+    back = RobotPath(
+        plan_id=2, planner_epoch=3, goal_id="g1", points=[(driving.x, 2.0), (3.5, 2.0)], map_epoch=7, map_seq=0,
+        released_length=9.0,
+    )  # fmt: skip
+    driving.path = back
+    driving.agent.on_path(back, driving.now, driving.stamp)
+    driving.agent.accept(late, driving.now)
+    assert driving.agent._decision.plan_id == 1  # the old one runs out, the late one did not renew it
+    assert driving.agent._decision is not late
+    assert seconds_to_rest(driving) <= 1.2
+
+
+def test_cancel_stops_the_robot_and_lasts_while_the_planner_repeats_the_goal(driving):
+    assert driving.command("cancel").accepted
+    assert seconds_to_rest(driving) <= 0.6
+    driving.run(3.0)
+    assert driving.wheels == (0.0, 0.0)
+    assert not driving.command("cancel").accepted or driving.state().goal_id == "g1"
+
+
+def test_the_first_command_on_a_new_path_closes_its_trace_once(driving):
+    driving.drive_to([(driving.x, driving.y), *L_PATH[1:]], plan_id=2, traces=[trace()])
+    driving.run(1.0)
+    (closed,) = driving.state().traces
+    assert closed.area == "z4"
+    assert START < closed.path_received <= closed.first_command <= closed.path_received + 0.35
+    assert driving.agent.finished_traces() == [closed]
+    driving.run(1.0)
+    assert driving.agent.finished_traces() == []
+    assert driving.state().traces == [closed]
+
+
+def test_obstacles_are_what_the_lidar_sees_and_the_map_does_not_know(world):
+    assert world.agent.obstacles(world.now, world.stamp).points == []
+    g = world.geometry
+    window = g.window_around(5.0, 1.8, 5.3, 2.2)
+    world.solid[window.rows, window.columns] = 1
+    world.run(0.5)
+    seen = np.array(world.agent.obstacles(world.now, world.stamp).points)
+    assert len(seen) >= 3
+    assert np.abs(seen - (5.0, 2.0)).max() < 0.35
+    # once the map shows it because this robot said so, it is still reported: else it would expire while in sight
+    world.block(5.0, 1.8, 5.3, 2.2)
+    world.run(0.5)
+    assert len(world.agent.obstacles(world.now, world.stamp).points) >= 2
+
+
+def test_what_others_call_blocked_is_no_news(world):
+    world.block(5.0, 1.5, 5.4, 2.5, solid=True)
+    world.run(0.5)
+    assert world.agent.obstacles(world.now, world.stamp).points == []
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"signature": b"x" * 32}, "signature"),
+        ({"robot": "r2"}, "robot"),
+    ],
+)
+def test_a_command_that_is_not_an_operators_changes_nothing(world, change, word):
+    command = RobotCommand(kind="disable", robot="r1", operator="ann", nonce="n" * 16, issued_at=world.stamp)
+    bad = msgspec.structs.replace(sign(command, KEY), **change)
+    reply = world.agent.on_command(bad, world.now, world.stamp)
+    assert not reply.accepted
+    assert word in reply.reason
+    assert world.state().mode == "NORMAL"
+
+
+def test_a_command_that_is_too_old_changes_nothing(world):
+    command = RobotCommand(kind="disable", robot="r1", operator="ann", nonce="n" * 16, issued_at=world.stamp - 6.0)
+    reply = world.agent.on_command(sign(command, KEY), world.now, world.stamp)
+    assert not reply.accepted
+    assert "6.0 s old" in reply.reason
+    assert world.state().mode == "NORMAL"
+
+
+def test_a_command_counts_once(world):
+    command = sign(RobotCommand(kind="disable", robot="r1", operator="ann", nonce="n" * 16, issued_at=world.stamp), KEY)
+    assert world.agent.on_command(command, world.now, world.stamp).accepted
+    assert "already" in world.agent.on_command(command, world.now, world.stamp).reason
+
+
+def test_egress_is_refused_with_a_plain_reason(world):
+    reply = world.command("egress")
+    assert not reply.accepted
+    assert "by hand" in reply.reason
+
+
+@pytest.mark.parametrize(
+    ("pose", "word"),
+    [(None, "no pose"), (Pose(x=99.0, y=0.0, theta=0.0), "off the map"), (Pose(x=0.2, y=0.2, theta=0.0), "wall")],
+)
+def test_an_initial_pose_that_can_not_be_is_refused(world, pose, word):
+    reply = world.command("initial_pose", pose=pose)
+    assert not reply.accepted
+    assert word in reply.reason
+
+
+def test_an_initial_pose_is_refused_while_the_robot_drives(driving):
+    assert "disable it first" in driving.command("initial_pose", pose=Pose(x=2.0, y=2.0, theta=0.0)).reason
+
+
+def test_without_a_snapshot_there_is_no_enable_and_a_damaged_snapshot_is_refused():
+    world = LittleWorld()
+    world.run(1.0)
+    assert "map" in world.command("enable").reason
+    damaged = msgspec.structs.replace(world.master.snapshot(), hash=1)
+    with pytest.raises(MapError):
+        world.agent.load(damaged, world.now)
+    assert world.agent.needs_snapshot

@@ -84,6 +84,7 @@ class Demo:
             raise WrongUseError(f"{site.directory}/site.toml has no [demo]: name a start, a goal and areas there")
         if not site.site.robots:
             raise WrongUseError(f"{site.directory}/site.toml has no [[robots]]: say where the robot starts")
+        self._hazard = options.hazard and bool(demo.areas)
         self._place = demo.goal
         self._goal = site.site.places[demo.goal]
         self.robot = site.site.robots[0].id
@@ -149,6 +150,8 @@ class Demo:
         config = StackConfig(site_dir=self.site.directory, robot=self.robot, seed=self.options.seed, speed=speed)
         async with Stack(config, self._on_process) as stack:
             self.stack = stack
+            if self.options.hazard and not self._hazard:
+                self.scene.say("the site's [demo] lists no areas: nothing will be blocked")
             self.scene.say(f"starting {len(stack.supervisor.names)} processes, logs in {stack.folder / 'logs'}")
             await stack.start(READY_S)
             async with ZenohEdge.open(
@@ -250,7 +253,7 @@ class Demo:
                 self._end(verdict)
                 self._ended_at = clock.now()
                 return
-            if self.options.hazard and self._blocked_at is None:
+            if self._hazard and self._blocked_at is None:
                 await self._maybe_block(operator, judge, clock)
             if clock.now() - checked >= _SPEED_CHECK_S * clock.speed:
                 self._check_speed(clock.now() - checked, clock)
@@ -351,7 +354,7 @@ class Demo:
         judge, verdict = self._judge, self.scene.verdict
         if judge is None or verdict is None or not judge.success(verdict.outcome):
             return False
-        return not self.options.hazard or self._blocked_at is not None
+        return not self._hazard or self._blocked_at is not None
 
     def report(self) -> dict[str, object]:
         """Return the report (`fognav demo --report`)."""
@@ -368,7 +371,7 @@ class Demo:
             "distance_m": round(judge.distance_m, 2) if judge else 0.0,
             "time_s": round(ended - begun, 2) if judge and ended else None,
             "min_clearance_m": _finite(judge.min_clearance_m) if judge else None,
-            "hazard": self.options.hazard,
+            "hazard": self._hazard,
             "area": area,
             "area_entered": judge.entered_blocked if judge else False,
             "area_clearance_m": _finite(judge.blocked_clearance_m) if judge else None,

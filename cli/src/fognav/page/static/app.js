@@ -70,9 +70,19 @@ function drawAreas() {
     context.strokeStyle = colour;
     context.lineWidth = state === "blocked" ? 2.5 : 1;
     context.stroke();
-    const [x, y] = area.polygon.reduce(([a, b], [c, d]) => [a + c / area.polygon.length, b + d / area.polygon.length], [0, 0]);
-    label(area.label, px(x), py(y), colour);
   }
+}
+
+// Last, so that nothing hides the words; above an area, so that they hide nothing of it; ids where space is short.
+function drawLabels() {
+  for (const area of still.areas) {
+    const state = (now && now.hazards[area.id]) || "none";
+    const xs = area.polygon.map(([x]) => x);
+    const top = Math.max(...area.polygon.map(([, y]) => y));
+    const colour = { blocked: colours.blocked, unknown: colours.unknown, clear: colours.clear }[state] || colours.quiet;
+    label(view.scale < 6 ? area.id : area.label, px((Math.min(...xs) + Math.max(...xs)) / 2), py(top) - 11, colour);
+  }
+  for (const place of still.places) label(view.scale < 6 ? place.id : place.label, px(place.x), py(place.y) - 17, colours.text);
 }
 
 function label(text, x, y, colour) {
@@ -179,9 +189,12 @@ function draw() {
     context.beginPath();
     context.arc(px(place.x), py(place.y), 3.5, 0, 2 * Math.PI);
     context.fill();
-    label(place.label, px(place.x), py(place.y) - 14, colours.text);
   }
-  if (!now) return;
+  if (now) drawMoving();
+  drawLabels();
+}
+
+function drawMoving() {
   for (const barrier of now.barriers) {
     line(barrier, true);
     context.fillStyle = colours.barrier;
@@ -230,7 +243,7 @@ function bars() {
   if (now.hazard_to_path !== null) {
     const strong = document.createElement("strong");
     strong.textContent = `${now.hazard_to_path.toFixed(0)} ms`;
-    total.replaceChildren("first reading to the robot's new path: ", strong);
+    total.replaceChildren("altogether, to the robot: ", strong);
   } else total.textContent = rows.length ? "under way" : "no hazard yet";
 }
 
@@ -263,7 +276,7 @@ function events() {
   by("events").replaceChildren(...rows);
 }
 
-let listed = 0;
+let listed = -Infinity;
 function panel() {
   put("phase", now.outcome ? `${now.outcome[0]}: ${now.outcome[1]}` : now.phase);
   put("mode", now.mode || "no word yet");

@@ -1,0 +1,105 @@
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    """A checkout whose uv and python only tell what they are asked to do."""
+    folder = tmp_path / "check out"
+    (folder / "requirements").mkdir(parents=True)
+    (folder / "requirements" / "dev.txt").write_text("pinned==1 --hash=sha256:0\n")
+    for member in ("libs/one", "services/two", "cli"):
+        (folder / member).mkdir(parents=True)
+        (folder / member / "pyproject.toml").write_text(f'[project]\nname = "{member}"\n')
+    shutil.copy(ROOT / "fognav", folder / "fognav")
+    tools = tmp_path / "tools"
+    tools.mkdir()
+    uv = tools / "uv"
+    uv.write_text(
+        f'#!/bin/sh\n[ "$1" = --version ] && echo "uv 0.13.0" && exit\nprintf \'%s\\n\' "$*" >>"{tmp_path}/uv.log"\n'
+        'if [ "$1" = venv ]; then for last; do :; done; mkdir -p "$last/bin"\n'
+        'printf \'#!/bin/sh\\necho "ran: $*"\\n\' >"$last/bin/python"; chmod +x "$last/bin/python"; fi\n'
+    )
+    uv.chmod(0o755)
+    return folder
+
+
+def start(program: Path, checkout: Path, *arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "PATH": f"{checkout.parent / 'tools'}:{os.environ['PATH']}", "CI": ""}
+    return subprocess.run(
+        [program, *arguments], check=False, capture_output=True, text=True, cwd=cwd, env=environment, timeout=60
+    )
+
+
+def uv_log(checkout: Path) -> list[str]:
+    log = checkout.parent / "uv.log"
+    return log.read_text().splitlines() if log.exists() else []
+
+
+def test_the_first_start_installs_pins_with_hashes_then_the_members(checkout: Path) -> None:
+    done = start(checkout / "fognav", checkout, "doctor", "--json")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "ran: -m fognav doctor --json\n"
+    venv, pins, members = uv_log(checkout)
+    assert venv.startswith("venv")
+    assert f"--require-hashes -r {checkout}/requirements/dev.txt" in pins
+    assert "--no-deps --no-build-isolation" in members
+    for member in ("libs/one", "services/two", "cli"):
+        assert f"--editable {checkout}/{member}" in members
+
+
+def test_the_second_start_installs_nothing_and_says_nothing(checkout: Path) -> None:
+    start(checkout / "fognav", checkout)
+    calls = len(uv_log(checkout))
+    done = start(checkout / "fognav", checkout, "a b", "c")
+    assert (done.stdout, done.stderr) == ("ran: -m fognav a b c\n", "")
+    assert len(uv_log(checkout)) == calls
+
+
+def test_it_works_through_a_relative_symlink_from_another_folder(checkout: Path, tmp_path: Path) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / "link").symlink_to("../check out/fognav")
+    done = start(elsewhere / "link", checkout, cwd=elsewhere)
+    assert done.returncode == 0, done.stderr
+    assert (checkout / ".fognav" / "stamp").exists()
+    assert [path.name for path in elsewhere.iterdir()] == ["link"]
+
+
+@pytest.mark.parametrize("changed", ["requirements/dev.txt", "libs/one/pyproject.toml"])
+def test_a_change_of_what_it_was_made_from_sets_it_up_again(checkout: Path, changed: str) -> None:
+    start(checkout / "fognav", checkout)
+    calls = len(uv_log(checkout))
+    with (checkout / changed).open("a") as file:
+        file.write("# changed\n")
+    start(checkout / "fognav", checkout)
+    assert len(uv_log(checkout)) > calls
+
+
+def test_a_lock_of_a_process_that_is_gone_is_taken_over(checkout: Path) -> None:
+    ended = subprocess.Popen(["true"])
+    ended.wait()
+    (checkout / ".fognav" / "lock").mkdir(parents=True)
+    (checkout / ".fognav" / "lock" / "pid").write_text(f"{ended.pid}\n")
+    done = start(checkout / "fognav", checkout)
+    assert done.returncode == 0, done.stderr
+    assert not (checkout / ".fognav" / "lock").exists()
+
+
+def test_a_failing_step_shows_what_it_said_and_leaves_no_stamp(checkout: Path) -> None:
+    uv = checkout.parent / "tools" / "uv"
+    uv.write_text('#!/bin/sh\n[ "$1" = --version ] && echo "uv 0.13.0" && exit\necho "no route to the index"; exit 2\n')
+    (checkout / ".venv" / "bin").mkdir(parents=True)
+    shutil.copy("/bin/true", checkout / ".venv" / "bin" / "python")
+    done = start(checkout / "fognav", checkout)
+    assert done.returncode == 1
+    assert "no route to the index" in done.stderr
+    assert "this step failed" in done.stderr
+    assert not (checkout / ".fognav" / "stamp").exists()
+    assert not (checkout / ".fognav" / "lock").exists()

@@ -1,0 +1,217 @@
+"""The REST frame over a real socket."""
+
+import asyncio
+import contextlib
+from typing import Annotated
+
+import httpx
+import pytest
+from fastapi import Depends, Request
+from pydantic import BaseModel, Field
+
+from fog_contracts.messages import Zone
+from fog_runtime.health import Health
+from fog_runtime.http import (
+    Caller,
+    ProblemError,
+    TokensError,
+    answer_schema,
+    body_schema,
+    load_tokens,
+    make_app,
+    read_body,
+    require,
+    serve,
+    token_hash,
+)
+
+pytestmark = pytest.mark.live
+
+
+class Point(BaseModel):
+    x: Annotated[float, Field(ge=0)]
+
+
+@pytest.fixture
+def tokens(tmp_path):
+    file = tmp_path / "tokens.toml"
+    file.write_text(
+        "".join(
+            f'[[tokens]]\nname = "{name}"\nrole = "{role}"\nsha256 = "{token_hash(name + "-token")}"\n'
+            for name, role in (("vi", "viewer"), ("op", "operator"), ("ad", "admin"))
+        )
+    )
+    return load_tokens(file)
+
+
+@pytest.fixture
+async def client(tokens, tmp_path):
+    health = Health("store")
+    app = make_app("Test", "1.0", health, tokens, body_limit=1000)
+    app.state.health = health
+
+    @app.post("/points")
+    async def points(point: Point) -> Point:
+        return point
+
+    @app.put("/zones/{zone}", openapi_extra=body_schema(app, Zone), responses=answer_schema(app, Zone))
+    async def zones(zone: str, request: Request) -> dict[str, str]:
+        return {"kind": (await read_body(request, Zone)).kind}
+
+    @app.get("/secret")
+    async def secret(caller: Annotated[Caller, Depends(require("operator"))]) -> str:
+        return caller.name
+
+    @app.get("/stale")
+    async def stale() -> None:
+        raise ProblemError(412, "it has changed", field="header.if-match", headers={"ETag": '"2"'}, version=2)
+
+    @app.get("/bug")
+    async def bug() -> None:
+        raise RuntimeError("inner detail")
+
+    async with running(app, tmp_path) as url, httpx.AsyncClient(base_url=url) as http:
+        http.health = health
+        yield http
+
+
+@contextlib.asynccontextmanager
+async def running(app, folder):
+    task = asyncio.create_task(serve(app, port_file=folder / "port"))
+    try:
+        async with asyncio.timeout(10):
+            while not (folder / "port").exists():
+                assert not task.done()
+                await asyncio.sleep(0.01)
+        yield f"http://127.0.0.1:{int((folder / 'port').read_text())}"
+    finally:
+        task.cancel()
+        (ended,) = await asyncio.gather(task, return_exceptions=True)
+    assert isinstance(ended, asyncio.CancelledError), ended
+
+
+def is_problem(answer, status):
+    assert answer.status_code == status, answer.text
+    assert answer.headers["content-type"] == "application/problem+json"
+    body = answer.json()
+    assert body["status"] == status
+    assert body["title"]
+    assert body["detail"]
+    return body
+
+
+async def test_readiness_names_what_is_missing(client):
+    assert (await client.get("/healthz")).json() == {"status": "ok"}
+    answer = await client.get("/readyz")
+    assert (answer.status_code, answer.json()["missing"]) == (503, ["store"])
+    client.health.set("store", ok=True)
+    assert (await client.get("/readyz")).status_code == 200
+    assert "process_resident_memory_bytes" in (await client.get("/metrics")).text
+
+
+async def test_validation_error_is_a_problem_with_field_path_and_sentence(client):
+    assert (await client.post("/points", json={"x": 1})).json() == {"x": 1.0}
+    body = is_problem(await client.post("/points", json={"x": -1}), 422)
+    assert body["errors"] == [{"field": "body.x", "problem": "Input should be greater than or equal to 0"}]
+    is_problem(await client.post("/points", content=b"{", headers={"Content-Type": "application/json"}), 422)
+
+
+async def test_contract_body_is_checked_by_its_type(client):
+    zone = {"id": "z1", "kind": "BLOCKED", "shape": {"type": "circle", "centre": [1, 2], "radius": 1}}
+    assert (await client.put("/zones/z1", json=zone)).json() == {"kind": "BLOCKED"}
+    zone["shape"]["radius"] = -1
+    body = is_problem(await client.put("/zones/z1", json=zone), 422)
+    assert body["errors"][0]["field"] == "body.shape.radius"
+    assert is_problem(await client.put("/zones/z1", content=b"\xff{"), 422)["errors"][0]["field"] == "body"
+
+
+async def test_openapi_describes_contract_bodies_and_resolves_all_references(client):
+    described = (await client.get("/openapi.json")).json()
+    put = described["paths"]["/zones/{zone}"]["put"]
+    assert put["requestBody"]["content"]["application/json"]["schema"] == {"$ref": "#/components/schemas/Zone"}
+    schemas = described["components"]["schemas"]
+
+    def references(part):
+        if isinstance(part, dict):
+            yield from ([part["$ref"]] if "$ref" in part else [])
+            part = part.values()
+        if not isinstance(part, str | int | float | None):
+            for inner in part:
+                yield from references(inner)
+
+    found = set(references(described))
+    assert "#/components/schemas/CircleShape" in found
+    assert all(ref.rsplit("/", 1)[1] in schemas for ref in found)
+    assert "HTTPBearer" in described["components"]["securitySchemes"]
+
+
+@pytest.mark.parametrize(
+    ("header", "status", "words"),
+    [
+        (None, 401, "needs a token"),
+        ("Bearer wrong", 401, "nobody has"),
+        ("Basic b3A6eA==", 401, "needs a token"),
+        ("Bearer vi-token", 403, "needs the role operator; vi is viewer"),
+    ],
+)
+async def test_who_may_not_is_told_why(client, header, status, words):
+    answer = await client.get("/secret", headers={"Authorization": header} if header else {})
+    assert words in is_problem(answer, status)["detail"]
+    assert ("www-authenticate" in answer.headers) == (status == 401)
+
+
+@pytest.mark.parametrize("name", ["op", "ad"])
+async def test_role_or_higher_may(client, name):
+    assert (await client.get("/secret", headers={"Authorization": f"Bearer {name}-token"})).json() == name
+
+
+async def test_problems_carry_fields_headers_and_more(client):
+    answer = await client.get("/stale")
+    body = is_problem(answer, 412)
+    assert body["errors"] == [{"field": "header.if-match", "problem": "it has changed"}]
+    assert (answer.headers["etag"], body["version"]) == ('"2"', 2)
+    assert "/nowhere" in is_problem(await client.get("/nowhere"), 404)["detail"]
+    assert "GET" in (await client.delete("/secret")).headers["allow"]
+    assert "inner detail" not in is_problem(await client.get("/bug"), 500)["detail"]
+
+
+async def test_large_bodies_are_refused_announced_or_not(client):
+    async def chunks():
+        for _ in range(20):
+            yield b"x" * 100
+
+    is_problem(await client.post("/points", content=b"x" * 1001), 413)
+    is_problem(await client.post("/points", content=chunks()), 413)
+    assert (await client.get("/healthz")).status_code == 200
+
+
+async def test_taken_port_is_an_error(client):
+    port = client.base_url.port
+    with pytest.raises(OSError, match="in use"):
+        await serve(make_app("x", "1", Health(), load_tokens(None)), port=port)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ('[[tokens]]\nname = "x"\nrole = "king"\nsha256 = ""', "king"),
+        ('[[tokens]]\nname = "x"\nrole = "admin"\nsha256 = "abc"', "sha256"),
+        ("tokens = ", "TOML"),
+        ("[[token]]", "token"),
+    ],
+)
+def test_broken_tokens_file_is_named(tmp_path, content, words):
+    file = tmp_path / "t.toml"
+    file.write_text(content)
+    with pytest.raises(TokensError, match=words) as refused:
+        load_tokens(file)
+    assert str(file) in str(refused.value)
+
+
+def test_two_callers_never_share_a_token(tmp_path):
+    entry = f'[[tokens]]\nname = "x"\nrole = "admin"\nsha256 = "{token_hash("t")}"\n'
+    (tmp_path / "t.toml").write_text(entry * 2)
+    with pytest.raises(TokensError, match="same sha256"):
+        load_tokens(tmp_path / "t.toml")
+    with pytest.raises(TokensError, match="can't be read"):
+        load_tokens(tmp_path / "none.toml")

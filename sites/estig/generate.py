@@ -13,11 +13,12 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
+
 from fog_contracts.geometry import normalized_polygon, rasterize
 from fog_contracts.grid import GridGeometry
 from fog_contracts.site import NodeSite, Site, Sonar
-from msgspec import Meta
-from numpy.typing import NDArray
 
 HERE = Path(__file__).parent
 FREE, OCCUPIED, UNKNOWN = 254, 0, 205

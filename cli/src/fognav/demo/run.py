@@ -24,6 +24,7 @@ from fognav.supervisor import Event
 READY_S: Final = 90.0
 """Real seconds for everything to start."""
 LOCALIZED_S: Final = 60.0
+AREAS_S: Final = 60.0
 ENABLED_S: Final = 60.0
 GOAL_S: Final = 60.0
 _TICK_S: Final = 0.1
@@ -193,6 +194,9 @@ class Demo:
         await self._until(lambda: scene.truth is not None, READY_S, "the simulator said what is so", tasks)
         localized = "the robot knew its place"
         await self._until(lambda: scene.pose is not None and scene.pose.localized, LOCALIZED_S, localized, tasks)
+        # An area whose node was not heard yet is unknown, and the planner avoids it.
+        scene.phase = "waiting for the nodes"
+        await self._until(self._all_clear, AREAS_S, "every watched area was known to be clear", tasks)
         scene.phase = "enabling"
         await self._until(lambda: scene.state is not None and scene.state.enabled, ENABLED_S, "it was enabled", tasks)
         scene.phase = "sending the goal"
@@ -210,6 +214,11 @@ class Demo:
         scene.phase = "driving"
         self._usage.restart()
         await self._watch(operator, clock, self._judge, tasks)
+
+    def _all_clear(self) -> bool:
+        watched = {node.area for node in self.site.site.nodes}
+        states = {area: hazard.hazard.state for area, hazard in self.scene.hazards.items()}
+        return all(states.get(area) == "clear" for area in watched)
 
     def _span(self) -> float:
         """Rough length (m) of the way: right angles from where the robot is."""
@@ -340,6 +349,8 @@ class Demo:
             if time.monotonic() > deadline:
                 state = self.scene.state
                 heard = f"the robot says {state.mode}: {'; '.join(state.reasons)}" if state else "no word of the robot"
+                areas = ", ".join(f"{area} {hazard.hazard.state}" for area, hazard in self.scene.hazards.items())
+                heard += f"; areas: {areas or 'none heard of'}"
                 raise TimeoutError(f"{timeout_s:.0f} s passed before {what}; {heard}")
             await asyncio.sleep(_TICK_S / 2)
 

@@ -13,6 +13,7 @@ import signal
 import socket
 import sys
 from contextlib import suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
 import msgspec
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
 
 TICK_S: Final = 0.02
 BEAT_S: Final = 0.05
+PACKETS_A_ROUND: Final = 64
+"""A flood of packets must not keep the guardian from its sensors."""
 
 
 class GuardianSettings(msgspec.Struct, frozen=True, kw_only=True):
@@ -59,7 +62,10 @@ class Guardian:
         self._agent: socket.socket | None = None
         self._beat_at = -1.0
         self._latched: str | None = None
+        self._corrupted = 0
         self._log = logs.get("guardian")
+        self._seldom = logs.RateLimited(self._log)
+        self._signal: int | None = None
         self._ended = False
 
     def run(self) -> int:
@@ -69,44 +75,54 @@ class Guardian:
         self._selector.register(self._settings.watcher_fd, selectors.EVENT_READ, self._watcher_gone)
         self._selector.register(listener, selectors.EVENT_READ, lambda: self._accept(listener))
         try:
-            while not self._ended:
+            # What arrived while nobody read is of another time.
+            self._port.discard_input()
+            while not self._ended and self._signal is None:
                 for key, _ in self._selector.select(self._clock.real(TICK_S)):
                     key.data()
                 self._do(self._core.tick(self._clock.now()))
                 self._beat()
+            self._port.write(self._core.farewell())
         except PortLost as error:
             self._log.error("port_lost", reason=str(error))
             return PORT_LOST
-        self._port.write(self._core.farewell())
+        self._log.info("ended", signal=self._signal and signal.Signals(self._signal).name)
         return 0
 
     def end(self, signum: int, _frame: FrameType | None) -> None:
-        """Finish the current round, stop the wheels, and end (signal handler)."""
-        self._log.info("ending", signal=signal.Signals(signum).name)
-        self._ended = True
+        """Finish the current round, stop the wheels, and end (signal handler: it may interrupt anything)."""
+        self._signal = signum
 
     def _read_base(self) -> None:
-        self._do(self._core.on_bytes(self._port.read_available(), self._clock.now()))
+        now = self._clock.now()
+        self._do(self._core.on_bytes(self._port.read_available(), now))
+        if self._core.corrupted != self._corrupted:
+            self._corrupted = self._core.corrupted
+            self._seldom.warning("damaged_frames", "damaged_frames", now, total=self._corrupted)
 
     def _watcher_gone(self) -> None:
         self._log.error("watcher_gone", remedy="the watcher ended; it must run whenever the guardian does")
         self._ended = True
 
     def _accept(self, listener: socket.socket) -> None:
-        fresh, _ = listener.accept()
+        try:
+            fresh, _ = listener.accept()
+        except (BlockingIOError, ConnectionError):
+            return  # it went away again
         fresh.settimeout(0)
         self._drop_agent("another one connected")
         self._agent = fresh
-        self._selector.register(fresh, selectors.EVENT_READ, self._read_agent)
+        self._selector.register(fresh, selectors.EVENT_READ, lambda: self._read_agent(fresh))
         self._log.info("agent_connected")
 
-    def _read_agent(self) -> None:
-        assert self._agent is not None
+    def _read_agent(self, agent: socket.socket) -> None:
+        if agent is not self._agent:
+            return  # dropped earlier in this round
         newest: WheelCommand | None = None
         reset = False
-        while True:
+        for _ in range(PACKETS_A_ROUND):
             try:
-                data = self._agent.recv(PACKET_LIMIT + 1)
+                data = agent.recv(PACKET_LIMIT + 1)
             except BlockingIOError:
                 break
             except ConnectionError as error:
@@ -117,8 +133,8 @@ class Guardian:
                 return
             try:
                 newest = decode_command(data)
-            except msgspec.DecodeError as error:
-                self._log.error("bad_command", reason=str(error))
+            except (msgspec.DecodeError, UnicodeDecodeError) as error:
+                self._seldom.warning("bad_command", "bad_command", self._clock.now(), reason=str(error))
                 continue
             reset = reset or newest.reset
         if newest is not None:
@@ -164,11 +180,11 @@ class Guardian:
 
 
 def _listen(path: str) -> socket.socket:
-    with suppress(FileNotFoundError):
-        os.unlink(path)  # noqa: PTH108 - a socket of a guardian that is gone
+    # A guardian that is gone leaves its socket behind.
+    Path(path).unlink(missing_ok=True)
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     listener.bind(path)
-    os.chmod(path, 0o660)  # noqa: PTH101 - same
+    Path(path).chmod(0o660)
     listener.listen(1)
     listener.settimeout(0)
     return listener

@@ -20,10 +20,16 @@ BASE_SILENT_S: Final = 0.3
 """No valid sensor frame for this long is a fault: 20 frames of 15 ms are missing."""
 HANDSHAKE_S: Final = 1.0
 """How long the base may take to report Safe mode before the handshake is sent again."""
+SETTLE_S: Final = 0.1
+"""Frames that come sooner after a handshake may stem from before it: they don't tell the mode that it led to."""
+OVERCURRENT_S: Final = 0.3
+"""A wheel motor that starts on a carpet draws much for a moment; one that is blocked keeps drawing."""
 REPEAT_S: Final = 0.05
 """The wheel command is repeated this often even when it does not change: a byte may have been lost."""
 FEEDBACK_S: Final = 0.045
 """The agent gets every third sensor frame, and at once whatever is news."""
+STEP_S: Final = 0.06
+"""A wheel gains speed for at most this long at once: a guardian that was away must not make up for it in one leap."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +56,8 @@ class _Base:
     frame: oi.Frame | None = None
     frame_at: float = -1.0e9
     safe: bool = False
-    handshake_at: float = -1.0e9
-    handshakes: int = 0
+    handshake_at: float | None = None
+    overcurrent_since: float | None = None
 
 
 @dataclass
@@ -114,35 +120,48 @@ class GuardianCore:
     def tick(self, now: float) -> Output:
         """Let time pass (50 Hz or more): stale commands, a silent base, repeated stops."""
         base = self._base
-        if not base.safe and self._latched is None and now - base.handshake_at > HANDSHAKE_S:
-            return Output(self._handshake(now))
-        if base.frame is not None and base.safe and now - base.frame_at > BASE_SILENT_S:
-            silent = now - base.frame_at
+        if not base.safe:
+            due = base.handshake_at is None or now - base.handshake_at > HANDSHAKE_S
+            # On its charger the base falls out of Safe mode at once, and asking again would only disturb the charging.
+            if due and not self._charging(now):
+                return Output(self._handshake(now), self._reminder(now))
+            # The handshake may have got lost, and the base may still roll as somebody else left it.
+            again = now - self._sent_at >= REPEAT_S
+            return Output(self._send((0.0, 0.0), now) if again else b"", self._reminder(now))
+        silent = now - base.frame_at
+        if silent > BASE_SILENT_S:
             data = self._latch(f"the base has sent no valid frame for {silent:.1f} s: check cable and power", now)
-            if now - self._feedback_at < FEEDBACK_S:
-                return Output(data)
-            return Output(data, (self._report(base.frame, now),))
+            return Output(data, self._reminder(now))
         return self._drive(now)
 
     def farewell(self) -> bytes:
         """Return the bytes that stop the wheels when the guardian ends in good order; the base stays in Safe mode."""
         return oi.drive_direct(0, 0)
 
+    def _charging(self, now: float) -> bool:
+        base = self._base
+        return base.frame is not None and now - base.frame_at <= BASE_SILENT_S and base.frame.on_charger
+
     def _handshake(self, now: float) -> bytes:
         # Start puts the OI into Passive mode, which stops the wheels by itself; the zero after Safe is for a base
         # whose receiver was in the middle of a command and swallowed the Start.
         self._base.handshake_at = now
-        self._base.handshakes += 1
         self._wheels, self._sent, self._sent_at = (0.0, 0.0), (0.0, 0.0), now
         return oi.start() + oi.safe() + oi.drive_direct(0, 0) + oi.stream(oi.GUARDIAN_STREAM)
 
     def _judge(self, frame: oi.Frame, now: float) -> bytes:
         base = self._base
         if not base.safe:
-            base.safe = frame.mode == oi.Mode.SAFE
-            return b""
+            settled = base.handshake_at is not None and now - base.handshake_at >= SETTLE_S
+            if not settled or frame.mode != oi.Mode.SAFE:
+                return b""
+            base.safe, base.overcurrent_since, self._stepped_at = True, None, now
         if self._latched is not None:
             return b""
+        if not frame.wheel_overcurrent:
+            base.overcurrent_since = None
+        elif base.overcurrent_since is None:
+            base.overcurrent_since = now
         # Safe mode itself falls back to Passive on cliff, wheel drop or charger: those say more than the mode does.
         if frame.cliff:
             return self._latch("a cliff sensor sees no floor", now)
@@ -151,18 +170,20 @@ class GuardianCore:
         if frame.bumped:
             side = "both sides" if frame.bump_left and frame.bump_right else "left" if frame.bump_left else "right"
             return self._latch(f"the bumper is pressed ({side})", now)
-        if frame.wheel_overcurrent:
+        if base.overcurrent_since is not None and now - base.overcurrent_since >= OVERCURRENT_S:
             return self._latch("a wheel motor draws too much current: it is blocked", now)
         if frame.mode != oi.Mode.SAFE:
             name = frame.mode.name if isinstance(frame.mode, oi.Mode) else str(frame.mode)
-            return self._latch(f"the base left Safe mode by itself (now {name})", now)
+            why = "it has contact to a charger" if frame.on_charger else "by itself"
+            return self._latch(f"the base left Safe mode (now {name}): {why}", now)
         return b""
 
     def _latch(self, reason: str, now: float) -> bytes:
-        if self._latched is None:
+        news = self._latched is None
+        if news:
             self._latched = reason
-        self._wheels = (0.0, 0.0)
-        if self._sent == self._wheels and now - self._sent_at < REPEAT_S:
+        self._wheels, self._stepped_at = (0.0, 0.0), now
+        if not news and self._sent == self._wheels and now - self._sent_at < REPEAT_S:
             return b""
         return self._send(self._wheels, now)
 
@@ -170,7 +191,7 @@ class GuardianCore:
         base = self._base
         if not base.safe:
             return Output()
-        elapsed = 0.0 if self._stepped_at is None else max(0.0, min(now - self._stepped_at, 0.1))
+        elapsed = 0.0 if self._stepped_at is None else max(0.0, min(now - self._stepped_at, STEP_S))
         self._stepped_at = now
         wanted = self._wanted(now)
         gain = self.limits.acceleration * elapsed
@@ -207,12 +228,18 @@ class GuardianCore:
         self._feedback_key = key
         return self._report(frame, now)
 
+    def _reminder(self, now: float) -> tuple[BaseFeedback, ...]:
+        """Repeat the last frame while the base says nothing new, so that the agent knows what it waits for."""
+        frame = self._base.frame
+        return () if frame is None or now - self._feedback_at < FEEDBACK_S else (self._report(frame, now),)
+
     def _report(self, frame: oi.Frame, now: float) -> BaseFeedback:
         self._seq += 1
         self._feedback_at = now
         stopped = None
         if not self._base.safe:
-            stopped = "the base is not in Safe mode yet"
+            on_charger = "the base stands on its charger"
+            stopped = on_charger if self._charging(now) else "the base is not in Safe mode yet"
         elif self._command is None or now - self._command_at > COMMAND_FRESH_S:
             stopped = "no fresh command of the agent"
         left, right = frame.encoders

@@ -14,6 +14,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
 from robot_agent.drivers.serial_port import Port, PortLost, open_port
@@ -21,15 +22,23 @@ from robot_agent.drivers.serial_port import Port, PortLost, open_port
 if TYPE_CHECKING:
     from types import FrameType
 
+PORT_LOST: Final = 3
+"""Exit code of the guardian when the port is gone: open it anew."""
 SILENCE_S: Final = 0.15
 """The guardian beats every 0.05 s; after this long without a beat it is taken for hung and killed."""
+SILENCE_LEAST_S: Final = 0.05
+"""Real seconds: a simulation that runs faster than time must not take the scheduler's delays for a hang."""
+STARTUP_S: Final = 15.0
+"""Real seconds until a guardian that has never beaten is taken for hung; the wheels stand meanwhile."""
+REPEAT_S: Final = 0.1
 RESTART_S: Final = 0.3
 REOPEN_S: Final = 1.0
 TERMINATE_S: Final = 1.0
 
 # Start, Safe, Drive Direct 0 0. Sent twice: the guardian may have died in the middle of a command, whose missing
 # bytes the base would take from the first copy.
-STOP_WHEELS: Final = bytes((128, 131, 145, 0, 0, 0, 0)) * 2
+ZERO_SPEED: Final = bytes((145, 0, 0, 0, 0))
+STOP_WHEELS: Final = (bytes((128, 131)) + ZERO_SPEED) * 2
 
 
 class _Terminated(Exception):  # noqa: N818 - an end, not an error
@@ -38,22 +47,40 @@ class _Terminated(Exception):  # noqa: N818 - an end, not an error
 
 def _log(event: str, **fields: object) -> None:
     line = {"ts": time.time(), "process": "watcher", "event": event, **fields}
-    sys.stderr.write(json.dumps(line) + "\n")
-    sys.stderr.flush()
+    # Nobody may be left who reads the log; that must not end the one who stops the wheels.
+    with suppress(OSError):
+        sys.stderr.write(json.dumps(line) + "\n")
+        sys.stderr.flush()
 
 
 def _terminate(signum: int, _frame: FrameType | None) -> None:
+    # Once is enough: a second signal must not interrupt the stop that the first one asked for.
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, signal.SIG_IGN)
     raise _Terminated(signal.Signals(signum).name)
 
 
-def stop_wheels(port: Port) -> bool:
+def stop_wheels(port: Port, command: bytes = STOP_WHEELS) -> bool:
     """Write the stop; False (and logged) when the port takes nothing."""
     try:
-        port.write(STOP_WHEELS)
+        port.write(command)
     except PortLost as error:
         _log("stop_failed", reason=str(error))
         return False
     return True
+
+
+def hold(port: Port, seconds: float) -> None:
+    """Wait with the wheels held at zero: a stop may get lost on the line, and nobody else repeats it now.
+
+    Raises:
+        PortLost: when the port is gone.
+
+    """
+    until = time.monotonic() + seconds
+    while (left := until - time.monotonic()) > 0:
+        port.write(ZERO_SPEED)
+        time.sleep(min(left, REPEAT_S))
 
 
 def _start_guardian(port: Port, beat_write: int, alive_read: int) -> subprocess.Popen[bytes]:
@@ -71,21 +98,31 @@ def _start_guardian(port: Port, beat_write: int, alive_read: int) -> subprocess.
     )
 
 
-def _watch(guardian: subprocess.Popen[bytes], beat_read: int, silence_s: float) -> str:
-    """Return why the guardian can't be trusted any more. Until its first beat it may take as long as it needs."""
-    timeout: float | None = None
+def _watch(guardian: subprocess.Popen[bytes], beat_read: int, port: Port, silence_s: float) -> str:
+    """Return why the guardian can't be trusted any more. Until its first beat the wheels are held at zero from here."""
+    starts_until: float | None = time.monotonic() + STARTUP_S
     while True:
-        ready, _, _ = select.select((beat_read,), (), (), timeout)
-        if not ready:
+        if starts_until is None:
+            timeout = silence_s
+        else:
+            port.write(ZERO_SPEED)
+            timeout = REPEAT_S
+        if select.select((beat_read,), (), (), timeout)[0]:
+            if not os.read(beat_read, 4096):
+                return "ended"
+            starts_until = None
+        elif starts_until is None or time.monotonic() > starts_until:
             guardian.kill()
-            return f"hung: no beat for {silence_s:.3f} s, killed"
-        if not os.read(beat_read, 4096):
-            return "ended"
-        timeout = silence_s
+            return f"hung: no beat for {silence_s if starts_until is None else STARTUP_S:.3f} s, killed"
 
 
-def guard_once(port: Port, speed: float) -> int:
-    """Run the guardian until it ends or hangs; the wheels are stopped when this returns. Returns its exit code."""
+def guard_once(port: Port, silence_s: float) -> int:
+    """Run the guardian until it ends or hangs; the wheels are stopped when this returns. Returns its exit code.
+
+    Raises:
+        PortLost: when the port is gone before the guardian's first beat.
+
+    """
     beat_read, beat_write = os.pipe()
     alive_read, alive_write = os.pipe()
     os.set_blocking(beat_write, False)
@@ -93,9 +130,9 @@ def guard_once(port: Port, speed: float) -> int:
     os.close(beat_write)
     os.close(alive_read)
     try:
-        reason = _watch(guardian, beat_read, SILENCE_S / speed)
+        reason = _watch(guardian, beat_read, port, silence_s)
         stopped = stop_wheels(port)
-        code = guardian.wait()
+        code = _end(guardian)
         _log("guardian_lost", reason=reason, exit_code=code, wheels_stopped=stopped)
         return code
     finally:
@@ -106,14 +143,13 @@ def guard_once(port: Port, speed: float) -> int:
         stop_wheels(port)
 
 
-def _end(guardian: subprocess.Popen[bytes]) -> None:
-    if guardian.poll() is not None:
-        return
+def _end(guardian: subprocess.Popen[bytes]) -> int:
+    """Wait for the end of the guardian, which knows of it; kill it when it does not end."""
     try:
-        guardian.wait(TERMINATE_S)
+        return guardian.wait(TERMINATE_S)
     except subprocess.TimeoutExpired:
         guardian.kill()
-        guardian.wait()
+        return guardian.wait()
 
 
 def main() -> int:
@@ -131,24 +167,26 @@ def main() -> int:
         return 2
     signal.signal(signal.SIGTERM, _terminate)
     signal.signal(signal.SIGINT, _terminate)
+    silence_s = max(SILENCE_S / speed, SILENCE_LEAST_S)
+    told = ""
     try:
         while True:
             try:
                 with open_port(path) as port:
                     _log("port_open", path=path)
+                    told = ""
                     stop_wheels(port)
-                    while guard_once(port, speed) != PORT_LOST:
-                        time.sleep(RESTART_S / speed)
+                    while guard_once(port, silence_s) != PORT_LOST:
+                        hold(port, RESTART_S / speed)
             except PortLost as error:
-                _log("port_lost", reason=str(error))
+                if str(error) != told:
+                    told = str(error)
+                    _log("port_lost", reason=told)
             time.sleep(REOPEN_S / speed)
     except _Terminated as end:
         _log("ended", signal=str(end))
         return 0
 
-
-PORT_LOST: Final = 3
-"""Exit code of the guardian when the port is gone: open it anew."""
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -1,0 +1,175 @@
+from __future__ import annotations
+
+import os
+import random
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import guardian_rig as rigs
+import pytest
+from guardian_rig import STOP_S, wait_for
+
+pytestmark = [pytest.mark.live, pytest.mark.timeout(120)]
+
+
+@pytest.fixture
+def rig(tmp_path):
+    with rigs.Rig(tmp_path) as running:
+        yield running
+
+
+def alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+def test_wheels_stop_each_time_the_guardian_is_killed_and_drive_again(rig):
+    for _ in range(3):
+        rig.drive()
+        dead = rig.watcher.guardian()
+        begun = rig.end_guardian(signal.SIGKILL)
+        assert rig.base.stopped_within(begun) < STOP_S
+        wait_for(lambda dead=dead: rig.watcher.guardian() not in {None, dead}, "another guardian runs")
+
+
+def test_wheels_stop_when_the_guardian_hangs_and_drive_again(rig):
+    rig.drive()
+    hung = rig.watcher.guardian()
+    begun = rig.end_guardian(signal.SIGSTOP)
+    assert rig.base.stopped_within(begun) < STOP_S
+    wait_for(lambda: not alive(hung), "the hung guardian is gone")
+    rig.drive()
+    assert any("hung" in line.get("reason", "") for line in rig.watcher.events)
+
+
+def test_wheels_stop_when_the_agent_falls_silent(rig):
+    rig.drive()
+    rig.agent.wheels = None
+    assert rig.base.stopped_within(time.monotonic()) < STOP_S
+    wait_for(lambda: rig.agent.feedback.stopped == "no fresh command of the agent", "the agent is told")
+    rig.drive()
+
+
+AGENT = """
+import socket, sys, time
+from robot_agent.link import WheelCommand, encode
+with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as link:
+    link.connect(sys.argv[1])
+    for seq in range(10_000):
+        link.send(encode(WheelCommand(seq=seq, left=0.2, right=0.2)))
+        time.sleep(0.05)
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_wheels_stop_when_the_agent_is_killed_or_hangs(rig, number):
+    rig.drive()
+    rig.agent.__exit__()
+    other = subprocess.Popen([sys.executable, "-c", AGENT, str(rig.watcher.socket)])
+    try:
+        wait_for(lambda: rig.base.speeds == (0.2, 0.2), "the other agent drives")
+        other.send_signal(number)
+        assert rig.base.stopped_within(time.monotonic()) < STOP_S
+    finally:
+        other.kill()
+        other.wait()
+
+
+def test_wheels_stop_and_the_guardian_ends_when_the_watcher_is_killed(rig):
+    rig.drive()
+    guardian = rig.watcher.guardian()
+    rig.watcher.process.kill()
+    assert rig.base.stopped_within(time.monotonic()) < STOP_S
+    wait_for(lambda: not alive(guardian), "the guardian is gone")
+    rig.watcher.process.wait()
+    rig.watcher.start()
+    rig.drive()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_both_processes_cleanly_with_the_wheels_at_rest(rig, number):
+    rig.drive()
+    guardian = rig.watcher.guardian()
+    rig.watcher.process.send_signal(number)
+    assert rig.base.stopped_within(time.monotonic()) < STOP_S
+    assert rig.watcher.process.wait(10.0) == 0
+    assert not alive(guardian)
+    assert rig.watcher.events[-1]["event"] == "ended"
+
+
+def test_a_port_that_comes_back_is_opened_again(rig):
+    rig.drive()
+    rig.base.unplug()
+    wait_for(lambda: rig.watcher.count("port_lost"), "the loss is noticed")
+    # The cable cut the robot off while it was driving: it rolls on until somebody reaches it again.
+    assert rig.base.moving
+    rig.base.plug_in()
+    rig.agent.wheels = (0.0, 0.0)
+    assert rig.base.stopped_within(time.monotonic()) < 5.0
+    rig.drive()
+
+
+def test_garbage_on_the_line_neither_drives_nor_ends_anything(rig):
+    rig.drive()
+    rig.agent.wheels = (0.0, 0.0)
+    wait_for(lambda: not rig.base.moving, "the base stands")
+    guardian, rng = rig.watcher.guardian(), random.Random(5)
+    for _ in range(50):
+        rig.base.send(rng.randbytes(300))
+        time.sleep(0.005)
+        assert not rig.base.moving
+    assert rig.watcher.guardian() == guardian
+    wait_for(lambda: rig.agent.feedback.left_ticks == rig.base.robot.encoders[0], "frames are understood again")
+    rig.agent.reset = True
+    rig.drive()
+
+
+def test_a_bumper_latches_until_a_reset_even_over_a_new_agent(rig):
+    rig.drive()
+    rig.base.robot.world.bump_left = True
+    assert rig.base.stopped_within(time.monotonic()) < STOP_S
+    rig.base.robot.world.bump_left = False
+    rig.agent.__exit__()
+    rig.agent = rigs.Agent(rig.watcher.socket)
+    with rig.agent:
+        rig.agent.wheels = (0.3, 0.3)
+        wait_for(lambda: rig.agent.feedback and "bumper" in (rig.agent.feedback.fault or ""), "the fault is told")
+        assert not rig.base.moving
+        rig.agent.reset = True
+        wait_for(lambda: rig.base.moving, "the reset lets it drive")
+
+
+def test_the_newest_agent_drives_and_bad_packets_are_refused(rig):
+    rig.drive()
+    rig.agent.__exit__()
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as old:
+        old.connect(str(rig.watcher.socket))
+        rig.agent = rigs.Agent(rig.watcher.socket)
+        with rig.agent:
+            rig.drive()
+            old.settimeout(5.0)
+            while old.recv(4096):
+                pass
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as strange:
+        strange.connect(str(rig.watcher.socket))
+        for packet in (b"\xff", os.urandom(4000), b"\x80", b"\x00" * 5000):
+            strange.send(packet)
+        assert strange.recv(4096)
+    wait_for(lambda: rig.watcher.count("bad_command"), "the refusal is logged")
+    assert rig.watcher.count("guardian_lost") == 0
+
+
+def test_a_second_watcher_keeps_off_a_port_in_use(rig, tmp_path):
+    rig.drive()
+    folder = tmp_path / "second"
+    folder.mkdir()
+    with rigs.Watcher(folder, rig.base.link) as second:
+        wait_for(lambda: second.count("port_lost"), "the second one is refused")
+        assert "locked" in second.events[0]["reason"]
+        assert rig.base.speeds == (0.3, 0.3)

@@ -1,0 +1,222 @@
+"""An emulated base on a real pty, the watcher with its guardian as real processes, and an agent to talk to them."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fognav_sim.wire.pty_port import PtyPort
+from fognav_sim.wire.roomba import RoombaEmulator
+from robot_agent.link import WheelCommand, decode_feedback, encode
+
+if TYPE_CHECKING:
+    import signal
+
+DEADLINE_S = 20.0
+STOP_S = 0.3
+"""The limit that the robot's design sets to everything that must stop the wheels."""
+
+
+def wait_for(condition, what: str, deadline_s: float = DEADLINE_S):
+    until = time.monotonic() + deadline_s
+    while time.monotonic() < until:
+        if value := condition():
+            return value
+        time.sleep(0.005)
+    raise AssertionError(f"not within {deadline_s} s: {what}")
+
+
+class Base:
+    """A Roomba behind a pty, run by a thread; it remembers since when its wheels have been at rest."""
+
+    def __init__(self, link: Path) -> None:
+        self.link = link
+        self.robot = RoombaEmulator()
+        self.lock = threading.Lock()
+        self.stopped_at: float | None = time.monotonic()
+        self._port: PtyPort | None = None
+        self._ends = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def __enter__(self):
+        self.plug_in()
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_):
+        self._ends.set()
+        self._thread.join()
+        self.unplug()
+
+    def plug_in(self) -> None:
+        with self.lock:
+            self._port = PtyPort(self.link)
+
+    def unplug(self) -> None:
+        with self.lock:
+            if self._port is not None:
+                self._port.close()
+                self._port = None
+
+    def send(self, data: bytes) -> None:
+        with self.lock:
+            self._port.write(data)
+
+    @property
+    def moving(self) -> bool:
+        return self.stopped_at is None
+
+    @property
+    def speeds(self) -> tuple[float, float]:
+        return self.robot.wheel_speeds_m_s
+
+    def stopped_within(self, begun: float) -> float:
+        """Seconds from `begun` until the wheels stood; they still stand."""
+        stopped = wait_for(lambda: self.stopped_at, "the wheels stand", 5.0)
+        return stopped - begun
+
+    def _run(self) -> None:
+        before = time.monotonic()
+        while not self._ends.wait(0.004):
+            now = time.monotonic()
+            with self.lock:
+                if self._port is not None:
+                    if data := self._port.read():
+                        self.robot.receive(data, now)
+                    left, right = self.robot.wheel_speeds_m_s
+                    self.robot.add_wheel_travel(left * (now - before), right * (now - before))
+                    self.robot.tick(now, now - before)
+                    self._port.write(self.robot.outgoing(now))
+            before = now
+            if self.robot.wheel_speeds_m_s != (0.0, 0.0):
+                self.stopped_at = None
+            elif self.stopped_at is None:
+                self.stopped_at = now
+
+
+class Watcher:
+    """`python -m robot_agent.watcher` and what it says."""
+
+    def __init__(self, folder: Path, base_port: Path) -> None:
+        self.log_file = folder / "watcher.log"
+        self.socket = folder / "guardian.sock"
+        self._environment = {
+            **os.environ,
+            "FOGNAV_BASE_PORT": str(base_port),
+            "FOGNAV_GUARDIAN_SOCKET": str(self.socket),
+        }
+        self.process: subprocess.Popen[bytes] | None = None
+
+    def __enter__(self):
+        self.start()
+        return self
+
+    def start(self) -> None:
+        with self.log_file.open("ab") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "robot_agent.watcher"], env=self._environment, stderr=log, stdout=log
+            )
+
+    def __exit__(self, *_):
+        if self.process.poll() is None:
+            self.process.terminate()
+        try:
+            self.process.wait(5.0)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+
+    @property
+    def events(self) -> list[dict]:
+        return [json.loads(line) for line in self.log_file.read_text().splitlines() if line.startswith("{")]
+
+    def count(self, event: str) -> int:
+        return sum(line["event"] == event for line in self.events)
+
+    def guardian(self) -> int | None:
+        """Process id of the guardian that runs now."""
+        children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text().split()
+        return int(children[0]) if children else None
+
+
+class Agent:
+    """What the real agent does on the guardian's socket: a stream of commands at 20 Hz, feedback read back."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.wheels: tuple[float, float] | None = (0.0, 0.0)
+        self.reset = False
+        self.feedback = None
+        self._ends = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def __enter__(self):
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_):
+        self._ends.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        seq = 0
+        while not self._ends.is_set():
+            with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as link:
+                try:
+                    link.connect(str(self.path))
+                    link.settimeout(0.05)
+                    due = time.monotonic()
+                    while not self._ends.is_set():
+                        if self.wheels is not None and time.monotonic() >= due:
+                            seq += 1
+                            due = time.monotonic() + 0.05
+                            reset, self.reset = self.reset, False
+                            left, right = self.wheels
+                            link.send(encode(WheelCommand(seq=seq, left=left, right=right, reset=reset)))
+                        try:
+                            data = link.recv(4096)
+                        except TimeoutError:
+                            continue
+                        if not data:
+                            break
+                        self.feedback = decode_feedback(data)
+                except OSError:
+                    pass
+            self._ends.wait(0.05)
+
+
+class Rig:
+    """Base, watcher, guardian and agent, ready to drive."""
+
+    def __init__(self, folder: Path) -> None:
+        self.base = Base(folder / "roomba")
+        self.watcher = Watcher(folder, self.base.link)
+        self.agent = Agent(self.watcher.socket)
+        self._stack = ExitStack()
+
+    def __enter__(self):
+        for part in (self.base, self.watcher, self.agent):
+            self._stack.enter_context(part)
+        return self
+
+    def __exit__(self, *details):
+        self._stack.__exit__(*details)
+
+    def drive(self) -> None:
+        """Drive at 0.3 m/s, however the guardian has to be found first."""
+        self.agent.wheels = (0.3, 0.3)
+        wait_for(lambda: self.base.speeds == (0.3, 0.3), "the base drives")
+
+    def end_guardian(self, number: signal.Signals) -> float:
+        """Send the guardian a signal; return when that was."""
+        pid = self.watcher.guardian()
+        os.kill(pid, number)
+        return time.monotonic()

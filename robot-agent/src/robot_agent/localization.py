@@ -41,6 +41,8 @@ _NEAR_M: Final = 0.25
 """A beam that ends this near to a wall of the map agrees with it."""
 _DOUBT: Final = 0.2
 """Share of contradicting beams from which the pose is doubted."""
+_DOUBT_AT_FIRST: Final = 0.08
+"""The same for a pose that has not proved itself yet: corridors look alike, a wrong one may fit by nine tenths."""
 _DOUBTED_TURNS: Final = 25
 """As many turns in a row (some 4.5 s) with doubt and the pose is lost, however the rest fits."""
 _SHALLOW_M: Final = 0.40
@@ -146,6 +148,7 @@ class Localizer:
         self._settle: tuple[float, float] | None = None
         self._checking = 0
         self._doubted = 0
+        self._proven = False
         self._search: _Search | None = None
         self._search_again_at = -math.inf
         self._verdicts: deque[Localization] = deque(maxlen=9)
@@ -405,6 +408,7 @@ class Localizer:
         self._settle = (sigma_xy, sigma_theta)
         self._verdicts.clear()
         self._doubted = 0
+        self._proven = False
         self._slow = self._fast = 0.0
         self._status, self._detail = "none", detail
         self._spread(pose, sigma_xy, sigma_theta, self._config.particles_start)
@@ -509,6 +513,8 @@ class Localizer:
         self.fit = fit = self.judge_fit(pose, self._beams(self.sweep.points, 120))
         sigma_xy, sigma_theta = self._sigmas()
         verdict, why = _verdict(fit, sigma_xy, sigma_theta)
+        if verdict == "good" and not self._proven and fit.contradict > _DOUBT_AT_FIRST:
+            verdict, why = "weak", f"{fit.contradict:.0%} of the beams look through walls of the map"
         self._doubted = self._doubted + 1 if fit.contradict > _DOUBT else 0
         if self._doubted >= _DOUBTED_TURNS:
             verdict = "lost"
@@ -519,6 +525,7 @@ class Localizer:
             status: Localization = "lost"
         elif recent[-2:] == ["good", "good"]:
             status, why = "good", ""
+            self._proven = True
         elif self._status in {"none", "lost"}:
             status = self._status
             why = why or self._detail
@@ -598,6 +605,7 @@ class Localizer:
         self._anchor = search.odom
         self._verdicts.clear()
         self._doubted = 0
+        self._proven = False
         self._slow = self._fast = 0.0
         self._settle = None
         self._take(fitting[order[0]][1], 0.1, 0.05)

@@ -1,0 +1,157 @@
+"""Following a path: progress, what is handed to a decision, ways around things."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fog_contracts.grid import GridGeometry
+from robot_agent.config import MotionConfig
+from robot_agent.localization import Pose2
+from robot_agent.motion import PathFollower, decide, detour, first_blocked, make_job, twist, wheels
+
+GRID = GridGeometry(200, 120, 0.05, 0.0, 0.0)
+CONFIG = MotionConfig()
+EIGHT = np.array([(1.0, 1.0), (4.0, 4.0), (4.0, 1.0), (1.0, 4.0)])
+
+
+def job(follower, pose, *, cost=None, speed=None, seen=(), cap=0.3, speeds=(0.2, 0.0), theta=None):
+    return make_job(
+        follower,
+        plan_id=1,
+        planner_epoch=1,
+        now=0.0,
+        pose=pose,
+        speeds=speeds,
+        goal_theta=theta,
+        cap=cap,
+        cost=np.zeros(GRID.shape, np.uint8) if cost is None else cost,
+        speed_limits=np.zeros(GRID.shape, np.uint8) if speed is None else speed,
+        geometry=GRID,
+        seen=np.array(seen, dtype=np.float64).reshape(-1, 2),
+        config=CONFIG,
+    )
+
+
+@given(st.floats(-0.3, 0.3), st.floats(-2.0, 2.0))
+def test_wheels_and_twist_are_each_others_inverse(v, w):
+    assert twist(*wheels(v, w, 0.235), 0.235) == pytest.approx((v, w), abs=1e-12)
+
+
+def test_where_a_path_crosses_itself_progress_does_not_jump():
+    follower = PathFollower(EIGHT, math.inf)
+    seen = []
+    for along in np.linspace(0.0, follower.length, 200):
+        x, y = (np.interp(along, follower.along, EIGHT[:, i]) for i in (0, 1))
+        follower.advance(x, y, 0.0)
+        seen.append(follower.progress)
+    assert np.diff(seen).min() > -1e-9
+    assert np.abs(np.array(seen) - np.linspace(0.0, follower.length, 200)).max() < 0.01
+
+
+def test_only_the_released_part_is_handed_out_and_the_rest_follows_when_released():
+    follower = PathFollower(np.array([(1.0, 1.0), (9.0, 1.0)]), 3.0)
+    follower.advance(3.5, 1.0, 0.0)
+    points, ends = follower.rest(2.5)
+    assert points[-1] == pytest.approx((4.0, 1.0))
+    assert not ends
+    assert follower.released_left == pytest.approx(0.5)
+    follower.release(100.0)
+    points, ends = follower.rest(2.5)
+    assert points[-1] == pytest.approx((6.0, 1.0))
+    assert follower.rest(50.0)[1]
+
+
+def test_driving_past_the_released_end_hands_out_no_way_back():
+    follower = PathFollower(np.array([(1.0, 1.0), (9.0, 1.0)]), 2.0)
+    follower.advance(3.3, 1.0, 0.0)
+    points, _ = follower.rest(2.5)
+    assert np.ptp(points[:, 0]) == pytest.approx(0.0)
+    assert follower.released_left == 0.0
+
+
+def test_being_stuck_is_counted_from_the_last_progress():
+    follower = PathFollower(np.array([(1.0, 1.0), (9.0, 1.0)]), math.inf)
+    follower.advance(1.0, 1.0, 0.0)
+    follower.advance(2.0, 1.0, 5.0)
+    follower.advance(2.05, 1.0, 9.0)
+    assert follower.stuck_for(15.0) == 10.0
+    follower.rest_clock(15.0)
+    assert follower.stuck_for(16.0) == 1.0
+
+
+def test_a_decision_never_exceeds_the_cap_nor_the_speed_layer():
+    follower = PathFollower(np.array([(2.0, 3.0), (9.0, 3.0)]), math.inf)
+    pose = Pose2(2.5, 3.0, 0.0)
+    follower.advance(pose.x, pose.y, 0.0)
+    assert decide(job(follower, pose)).v == pytest.approx(0.3, abs=0.01)
+    assert decide(job(follower, pose, cap=0.15, speeds=(0.1, 0.0))).v <= 0.15
+    limited = np.zeros(GRID.shape, np.uint8)
+    limited[50:70, 40:60] = 8
+    assert decide(job(follower, pose, speed=limited, speeds=(0.05, 0.0))).v <= 0.08 + 1e-9
+
+
+def test_off_the_map_there_is_nothing_to_decide():
+    follower = PathFollower(np.array([(2.0, 3.0), (9.0, 3.0)]), math.inf)
+    assert job(follower, Pose2(-1.0, 3.0, 0.0)) is None
+
+
+@given(st.floats(-math.pi, math.pi), st.floats(0.16, 0.5), st.floats(0.0, 0.3))
+def test_no_decision_drives_into_what_the_lidar_sees(bearing, distance, v):
+    follower = PathFollower(np.array([(2.0, 3.0), (9.0, 3.0)]), math.inf)
+    pose = Pose2(4.0, 3.0, 0.0)
+    follower.advance(pose.x, pose.y, 0.0)
+    thing = np.array([(pose.x + distance * math.cos(bearing), pose.y + distance * math.sin(bearing))])
+    decision = decide(job(follower, pose, seen=thing, speeds=(v, 0.0)))
+    ahead = abs(bearing) < math.radians(20) and distance < 0.2
+    if ahead:
+        assert decision.v <= 0.11
+    assert max(abs(decision.left), abs(decision.right)) <= 0.5 + 1e-9
+    turned, x, y = 0.0, pose.x, pose.y
+    nearest = math.inf
+    for _ in range(20):
+        turned += decision.w * 0.01
+        x, y = x + decision.v * 0.01 * math.cos(turned), y + decision.v * 0.01 * math.sin(turned)
+        nearest = min(nearest, math.hypot(x - thing[0, 0], y - thing[0, 1]))
+    assert nearest >= min(distance, 0.12) - 0.045
+
+
+def test_a_detour_leads_around_and_back_and_where_there_is_none_the_path_stays():
+    follower = PathFollower(np.array([(2.0, 3.0), (9.0, 3.0)]), math.inf)
+    follower.advance(2.5, 3.0, 0.0)
+    path, _ = follower.rest(2.5)
+    costs = np.zeros(GRID.shape, np.uint8)
+    costs[50:70, 70:76] = 254
+    around = detour(path, costs, GRID, Pose2(2.5, 3.0, 0.0))
+    assert first_blocked(costs, GRID, PathFollower(around, math.inf), skip=0.0) is None
+    assert around[-1] == pytest.approx(path[-1])
+    costs[:, 70:76] = 254
+    assert detour(path, costs, GRID, Pose2(2.5, 3.0, 0.0)) is path
+
+
+def test_the_first_blocked_cell_is_found_and_an_inscribed_start_is_forgiven():
+    follower = PathFollower(np.array([(2.0, 3.0), (9.0, 3.0)]), math.inf)
+    follower.advance(2.0, 3.0, 0.0)
+    costs = np.zeros(GRID.shape, np.uint8)
+    assert first_blocked(costs, GRID, follower) is None
+    costs[:, 40:48] = 253
+    assert first_blocked(costs, GRID, follower) is None
+    costs[:, 100] = 253
+    assert first_blocked(costs, GRID, follower) == pytest.approx(3.0, abs=0.05)
+    costs[:, 45] = 254
+    assert first_blocked(costs, GRID, follower) == pytest.approx(0.25, abs=0.05)
+
+
+def test_at_the_goal_the_heading_is_turned_to_before_it_counts_as_reached():
+    follower = PathFollower(np.array([(2.0, 3.0), (5.0, 3.0)]), math.inf)
+    follower.advance(4.97, 3.0, 0.0)
+    pose = Pose2(4.97, 3.0, 0.0)
+    assert decide(job(follower, pose, speeds=(0.0, 0.0))).at_goal
+    turning = decide(job(follower, pose, speeds=(0.0, 0.0), theta=1.5))
+    assert not turning.at_goal
+    assert turning.v == 0.0
+    assert turning.w > 0.0

@@ -309,6 +309,11 @@ class ZenohEdge:
             await edge._close()
 
     @property
+    def site(self) -> str:
+        """The site that is filled into every key."""
+        return self._site
+
+    @property
     def connected(self) -> bool:
         """Whether a router is connected right now."""
         return self._session is not None and not self._closed and bool(self._session.info.routers_zid())

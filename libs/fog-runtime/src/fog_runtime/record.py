@@ -1,0 +1,223 @@
+"""Record what crosses the channels into MCAP files, which Foxglove opens as they are, and read or replay them.
+
+Messages are stored as JSON with their JSON schema, under their real topic or key.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from typing import TYPE_CHECKING, Any, BinaryIO, Final, Self, cast
+
+import msgspec
+from mcap.exceptions import EndOfFile, McapError
+from mcap.opcode import Opcode
+from mcap.reader import NonSeekingReader
+from mcap.stream_reader import MAGIC_SIZE
+from mcap.writer import Writer
+
+from fog_contracts.channels import CHANNELS, Channel
+from fog_contracts.messages import Message
+from fog_runtime import logs
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Iterator, Sequence
+    from pathlib import Path
+
+    from fog_runtime.clock import Clock
+    from fog_runtime.mqtt_edge import MqttEdge
+    from fog_runtime.zenoh_edge import ZenohEdge
+
+_CHUNK: Final = 64 * 1024
+"""Bytes that a crash may cost."""
+
+_FRAME: Final = 9
+
+_log = logs.get("record")
+
+
+class RecordError(ValueError):
+    """A file that is no recording of ours; the message names it and what is wrong."""
+
+
+class _Text(Message, frozen=True, kw_only=True):
+    """How a channel of plain text is stored."""
+
+    text: str
+
+
+def _schema(kind: type[Message]) -> bytes:
+    (described,), components = msgspec.json.schema_components([kind], ref_template="#/$defs/{name}")
+    # Foxglove wants an object at the top, not a reference to one.
+    root = components.pop(described["$ref"].rsplit("/", 1)[1]) if "$ref" in described else described
+    return msgspec.json.encode({**root, "$defs": components})
+
+
+def _finish(writer: Any) -> None:
+    """Write the index and the end of the file (mcap leaves this method untyped)."""
+    writer.finish()
+
+
+class Recorder:
+    """Writes messages to an MCAP file; close it, or use it as a context manager. For one thread."""
+
+    def __init__(self, path: Path, *, site: str = "") -> None:
+        """Begin a new file at `path` (an old one is replaced); `site` is filled in where a key needs it."""
+        self._site = site
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._file = path.open("wb")
+        self._writer = Writer(self._file, chunk_size=_CHUNK)
+        self._writer.start(profile="fognav", library="fog-runtime")
+        self._schemas: dict[type[Message], int] = {}
+        self._channels: dict[str, int] = {}
+        self._counts: dict[str, int] = {}
+
+    def write(self, channel: Channel, ids: dict[str, str], message: Message | str, log_time_ns: int) -> None:
+        """Write one message; raises `ValueError` when an id is missing."""
+        if "site" in channel.fields and "site" not in ids:
+            ids = {**ids, "site": self._site}
+        key = channel.key(**ids)
+        content = _Text(text=message) if isinstance(message, str) else message
+        number = self._channels.get(key)
+        if number is None:
+            number = self._channels[key] = self._register(channel, key, type(content))
+        self._counts[key] = self._counts.get(key, 0) + 1
+        self._writer.add_message(
+            channel_id=number,
+            log_time=log_time_ns,
+            publish_time=log_time_ns,
+            sequence=self._counts[key],
+            data=msgspec.json.encode(content),
+        )
+
+    def _register(self, channel: Channel, key: str, kind: type[Message]) -> int:
+        if kind not in self._schemas:
+            self._schemas[kind] = self._writer.register_schema(
+                name=f"fognav.{kind.__name__.lstrip('_')}", encoding="jsonschema", data=_schema(kind)
+            )
+        return int(
+            self._writer.register_channel(
+                topic=key, message_encoding="json", schema_id=self._schemas[kind], metadata={"channel": channel.name}
+            )
+        )
+
+    def close(self) -> None:
+        """Write the index and close the file."""
+        _finish(self._writer)
+        self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def read(path: Path) -> Iterator[tuple[int, Channel, dict[str, str], Message | str]]:
+    """Yield (time in ns, channel, ids without the site, message) in the order of recording.
+
+    A file that a crash cut short gives all that is whole. Raises `RecordError` for what is no recording.
+    """
+    size = path.stat().st_size
+    if size < MAGIC_SIZE:
+        raise RecordError(f"{path}: is no MCAP file ({size} bytes)")
+    with path.open("rb") as file:
+        whole = _whole_records(file)
+        if whole < size:
+            _log.warning("recording_cut_short", path=str(path), bytes_lost=size - whole)
+        reader = NonSeekingReader(cast("BinaryIO", _Head(file, whole)))
+        try:
+            # Not by the index: a file without an end has none.
+            for _, info, record in reader.iter_messages(log_time_order=False):
+                channel = CHANNELS.get(info.metadata.get("channel", ""))
+                ids = channel.match(info.topic) if channel else None
+                if channel is None or ids is None:
+                    raise RecordError(f"{path}: {info.topic!r} belongs to no channel of this version of the contracts")
+                ids.pop("site", None)
+                yield record.log_time, channel, ids, _decoded(path, channel, record.data)
+        except EndOfFile:
+            return  # between two records: all that is whole was read
+        except McapError as error:
+            raise RecordError(f"{path}: is no MCAP file ({error!r})") from error
+
+
+def _whole_records(file: BinaryIO) -> int:
+    """Return where the last whole record ends: each is an opcode, a length of 8 bytes and its content."""
+    size = file.seek(0, os.SEEK_END)
+    end = MAGIC_SIZE
+    while end + _FRAME <= size:
+        file.seek(end)
+        opcode, length = struct.unpack("<BQ", file.read(_FRAME))
+        footer = opcode == Opcode.FOOTER
+        after = end + _FRAME + length + (MAGIC_SIZE if footer else 0)  # the closing magic belongs to the footer
+        if after > size:
+            break
+        end = after
+        if footer:
+            break
+    file.seek(0)
+    return end
+
+
+class _Head:
+    """The first `size` bytes of a file."""
+
+    def __init__(self, file: BinaryIO, size: int) -> None:
+        self._file = file
+        self._left = size
+
+    def read(self, size: int = -1) -> bytes:
+        data = self._file.read(self._left if size < 0 else min(size, self._left))
+        self._left -= len(data)
+        return data
+
+
+def _decoded(path: Path, channel: Channel, data: bytes) -> Message | str:
+    try:
+        if channel.message is None:
+            return msgspec.json.decode(data, type=_Text).text
+        return msgspec.json.decode(data, type=channel.message)
+    except msgspec.DecodeError as error:
+        raise RecordError(f"{path}: a message of {channel.name} breaks its contract: {error}") from error
+
+
+def record_all(
+    mqtt: MqttEdge, zenoh: ZenohEdge, recorder: Recorder, clock: Clock, *, numbers: Sequence[str | int] = ()
+) -> None:
+    """Record every published channel of both transports, stamped by `clock`; call before `mqtt.run()`.
+
+    `numbers` names the areas of the thesis's topics.
+    """
+
+    def writer(channel: Channel) -> Callable[[dict[str, str], Any], None]:
+        def write(ids: dict[str, str], message: Message | str) -> None:
+            known = {**ids, "site": zenoh.site} if "site" in channel.fields else ids
+            recorder.write(channel, known, message, int(clock.stamp() * 1e9))
+
+        return write
+
+    for channel in CHANNELS.values():
+        if channel.transport == "mqtt" and channel.message is None:
+            mqtt.on(channel, writer(channel), numbers=numbers)
+        elif channel.transport == "mqtt" and channel.message is not None:
+            mqtt.on(channel, writer(channel), channel.message)
+        elif channel.kind == "pub" and channel.message is not None:
+            zenoh.subscribe(channel, channel.message, writer(channel))
+
+
+async def replay(
+    path: Path, clock: Clock, send: Callable[[Channel, dict[str, str], Message | str], Awaitable[object]]
+) -> int:
+    """Hand every recorded message to `send` at its time after the first, by `clock`; return how many there were."""
+    count = 0
+    begin_ns = 0
+    begin = clock.now()
+    for log_time, channel, ids, message in read(path):
+        if count == 0:
+            begin_ns = log_time
+        wait = begin + (log_time - begin_ns) / 1e9 - clock.now()
+        if wait > 0.0:
+            await clock.sleep(wait)
+        await send(channel, ids, message)
+        count += 1
+    return count

@@ -1,0 +1,131 @@
+import asyncio
+import json
+import time
+
+import pytest
+from mcap.reader import make_reader
+
+from fog_contracts import channels as ch
+from fog_contracts import messages as m
+from fog_runtime.clock import ManualClock, SystemClock
+from fog_runtime.mqtt_edge import MqttEdge
+from fog_runtime.record import Recorder, RecordError, read, record_all, replay
+from fog_runtime.servers import start_mosquitto, start_router
+from fog_runtime.zenoh_edge import ZenohEdge
+
+
+def reading(seq):
+    return m.NodeReading(seq=seq, boot=1, uptime_ms=5, range_m=[1.0, None], status=["ok", "no_echo"], state="clear")
+
+
+def delta(seq):
+    return m.MapDelta(
+        epoch=1,
+        seq=seq,
+        part=0,
+        parts=1,
+        layer="cost",
+        x=0,
+        y=0,
+        w=3,
+        h=1,
+        packing="raw",
+        cells=b"\x00\xfe\xff",
+        hash=5,
+    )
+
+
+EVENTS = [
+    (1_000_000_000, ch.NODE_READING, {"node": "n1"}, reading(1)),
+    (1_500_000_000, ch.NODE_AVAILABILITY, {"node": "n1"}, "offline"),
+    (2_500_000_000, ch.MAP_DELTA, {}, delta(1)),
+    (2_500_000_000, ch.NODE_READING, {"node": "n2"}, reading(2)),
+]
+
+
+def record(path, events):
+    with Recorder(path, site="lab") as recorder:
+        for log_time, channel, ids, message in events:
+            recorder.write(channel, ids, message, log_time)
+
+
+def test_recording_reads_back_the_same_in_order(tmp_path):
+    record(tmp_path / "a" / "r.mcap", EVENTS)
+    assert list(read(tmp_path / "a" / "r.mcap")) == EVENTS
+
+
+def test_other_readers_find_topics_schemas_and_json(tmp_path):
+    record(tmp_path / "r.mcap", EVENTS)
+    with (tmp_path / "r.mcap").open("rb") as file:
+        found = list(make_reader(file).iter_messages())
+    assert {info.topic for _, info, _ in found} == {
+        "fog/v1/nodes/n1/reading", "fog/v1/nodes/n1/availability", "fog/lab/map/delta", "fog/v1/nodes/n2/reading",
+    }  # fmt: skip
+    for schema, info, record_ in found:
+        assert (schema.encoding, info.message_encoding) == ("jsonschema", "json")
+        described = json.loads(schema.data)
+        assert described["type"] == "object"
+        assert set(json.loads(record_.data)) <= set(described["properties"])
+
+
+@pytest.mark.parametrize("lost", [1, 8, 9, 100, 5_000, 20_000])
+def test_recording_cut_short_by_a_crash_gives_what_is_whole(tmp_path, lost):
+    path = tmp_path / "r.mcap"
+    record(path, [(n, ch.NODE_READING, {"node": "n1"}, reading(n)) for n in range(5000)])
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-lost])
+    got = [message.seq for _, _, _, message in read(path)]
+    assert 100 < len(got) <= 5000
+    assert got == list(range(len(got)))
+
+
+@pytest.mark.parametrize("content", [b"", b"nothing of the kind, but long enough to look at"])
+def test_what_is_no_recording_is_named(tmp_path, content):
+    path = tmp_path / "x.mcap"
+    path.write_bytes(content)
+    with pytest.raises(RecordError, match=r"x\.mcap"):
+        list(read(path))
+
+
+async def test_replay_keeps_the_intervals_of_its_clock(tmp_path):
+    record(tmp_path / "r.mcap", EVENTS)
+    clock, sent = ManualClock(100.0), []
+
+    async def send(channel, ids, message):
+        sent.append((clock.now(), channel, ids, message))
+
+    task = asyncio.create_task(replay(tmp_path / "r.mcap", clock, send))
+    while not task.done():
+        for _ in range(3):
+            await asyncio.sleep(0)
+        clock.advance(0.25)
+    assert await task == 4
+    assert [at for at, *_ in sent] == [100.0, 100.5, 101.5, 101.5]
+    assert [tuple(rest) for _, *rest in sent] == [tuple(rest) for _, *rest in EVENTS]
+
+
+@pytest.mark.live
+async def test_record_all_takes_both_transports(tmp_path):
+    clock = SystemClock()
+    with start_mosquitto(tmp_path / "m") as broker, start_router(tmp_path / "z") as router:
+        mqtt = MqttEdge(broker.url, "rec", clock)
+        async with ZenohEdge.open(connect=[router.endpoint], clock=clock, role="test", id="t", site="lab") as zenoh:
+            with Recorder(tmp_path / "r.mcap") as recorder:
+                record_all(mqtt, zenoh, recorder, clock, numbers=[1])
+                task = asyncio.create_task(mqtt.run())
+                await asyncio.wait_for(mqtt.wait_connected(), 10)
+                zenoh.publish(ch.MAP_DELTA, delta(1))
+                await mqtt.publish(ch.NODE_READING, reading(1), node="n1")
+                await mqtt.publish(ch.THESIS_AREA, "blocked", number="1")
+                deadline = time.monotonic() + 10
+                while len(recorder._counts) < 3:
+                    assert time.monotonic() < deadline, recorder._counts
+                    await asyncio.sleep(0.01)
+                task.cancel()
+                await asyncio.gather(task, return_exceptions=True)
+    got = {channel.name: (ids, message) for _, channel, ids, message in read(tmp_path / "r.mcap")}
+    assert got == {
+        "map_delta": ({}, delta(1)),
+        "node_reading": ({"node": "n1"}, reading(1)),
+        "thesis_area": ({"number": "1"}, "blocked"),
+    }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-import msgspec.structs
+import msgspec
 import numpy as np
 import pytest
 from little_world import KEY, L_PATH, START, LittleWorld, trace
@@ -468,3 +468,15 @@ def test_without_a_snapshot_there_is_no_enable_and_a_damaged_snapshot_is_refused
     with pytest.raises(MapError):
         world.agent.load(damaged, world.now)
     assert world.agent.needs_snapshot
+
+
+def test_what_others_hear_can_be_sent_and_read_again(driving):
+    g = driving.geometry
+    window = g.window_around(driving.x + 1.5, 2.3, driving.x + 1.8, 2.6)
+    driving.solid[window.rows, window.columns] = 1
+    driving.run(1.0)
+    agent, now, stamp = driving.agent, driving.now, driving.stamp
+    said = [agent.pose(stamp, now), agent.state(stamp, now), agent.obstacles(now, stamp), agent.stream(now, stamp)]
+    for message in [*said, agent.save(now)]:
+        assert msgspec.msgpack.decode(msgspec.msgpack.encode(message), type=type(message)) == message
+    assert said[2].points

@@ -74,7 +74,7 @@ class Floor:
                 raw[window.rows, window.columns][mask] = 254
             costs = inflate(raw, self.table)
             result = self.planner.plan(costs, self.geometry.cell(*start), self.geometry.cell(*goal))
-            points = (result.cells + 0.5) * self.geometry.resolution
+            points = (result.cells.astype(np.float64) + 0.5) * self.geometry.resolution
             points += (self.geometry.origin_x, self.geometry.origin_y)
             self._known[key] = Way(points) if result.found else None
         return self._known[key]

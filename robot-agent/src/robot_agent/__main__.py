@@ -1,0 +1,62 @@
+"""The robot's agent: `python -m robot_agent`, told by FOGNAV_* in the environment. Safe to kill and start at any time.
+
+It drives through the guardian (`python -m robot_agent.watcher` starts one), which stops the wheels without it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from dataclasses import replace
+
+from fog_runtime import logs, process
+from fog_runtime.clock import SystemClock
+from fog_runtime.health import Health, serve_plain
+from fog_runtime.settings import describe, load
+from fog_runtime.zenoh_edge import ZenohEdge
+from robot_agent.base_link import BaseLink
+from robot_agent.config import AgentConfig
+from robot_agent.core import AgentCore
+from robot_agent.lidar import LidarEdge
+from robot_agent.service import Service
+from robot_agent.settings import Settings, read_operator_key, read_site
+from robot_agent.store import Store
+
+_log = logs.get("agent")
+
+
+async def main() -> None:
+    """Connect, restore what was stored, then localize, follow and judge until cancelled."""
+    settings = load(Settings, environ=os.environ)
+    logs.configure("robot-agent", settings.log_level, settings.log_format)
+    _log.info("settings", **describe(settings))
+    site, body = read_site(settings)
+    config = AgentConfig(robot=settings.robot, operator_key=read_operator_key(settings.operator_key_file))
+    if body is not None:
+        motion = replace(config.motion, inscribed_radius=body.radius)
+        config = replace(config, radius=body.radius, height=body.height, motion=motion)
+    clock = SystemClock(settings.speed)
+    core = AgentCore(config, settings.seed)
+    health = Health("map", "pose", "lidar", "base")
+    async with ZenohEdge.open(
+        connect=settings.zenoh_endpoints, clock=clock, role="robot-agent", id=settings.robot, site=site
+    ) as zenoh:
+        agent = Service(core, zenoh, Store(settings.data_dir), clock, health, robot=settings.robot, site=site)
+        link = BaseLink(settings.guardian_socket, clock, agent.on_feedback, agent.on_base_lost)
+        lidar = LidarEdge(settings.lidar_port, clock, core.on_lidar_nodes, agent.on_turn)
+        agent.restore(body)
+        agent.listen()
+        zenoh.alive("robot-agent", settings.robot)
+        with serve_plain(health, settings.http_host, settings.http_port, settings.port_file):
+            async with asyncio.TaskGroup() as tasks:
+                tasks.create_task(link.run(), name="base")
+                tasks.create_task(lidar.run(), name="lidar")
+                tasks.create_task(agent.stream_loop(link), name="stream")
+                tasks.create_task(agent.control_loop(), name="control")
+                tasks.create_task(agent.map_loop(), name="map")
+                tasks.create_task(agent.tell_loop(), name="tell")
+                tasks.create_task(agent.keep_loop(lidar), name="keep")
+
+
+if __name__ == "__main__":
+    process.run(main)

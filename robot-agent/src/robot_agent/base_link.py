@@ -1,0 +1,107 @@
+"""The agent's end of the guardian's socket: feedback in, wheel commands out, connected again whenever it breaks."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import socket
+from typing import TYPE_CHECKING, Final
+
+import msgspec
+
+from fog_runtime import logs
+from robot_agent.link import PACKET_LIMIT, BaseFeedback, WheelCommand, decode_feedback, encode
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from fog_runtime.clock import Clock
+
+RETRY_S: Final = 0.2
+QUIET_S: Final = 1.0
+"""A guardian that says nothing for so long has heard nothing from its base."""
+RESET_VALID_S: Final = 1.0
+"""An operator's reset that could not be passed on within this time is void: it must not clear a later fault."""
+
+_log = logs.get("base")
+
+
+class BaseLink:
+    """One connection to the guardian at a time; the callbacks run on the loop."""
+
+    def __init__(
+        self,
+        path: Path,
+        clock: Clock,
+        on_feedback: Callable[[BaseFeedback, float], object],
+        on_lost: Callable[[float, str], object],
+    ) -> None:
+        self._path = path
+        self._clock = clock
+        self._on_feedback = on_feedback
+        self._on_lost = on_lost
+        self._socket: socket.socket | None = None
+        self._reset_until = -math.inf
+        self._told = ""
+        self._limited = logs.RateLimited(_log)
+
+    def send(self, command: WheelCommand) -> bool:
+        """Send a command without waiting; False when there is no guardian, or one that does not read."""
+        now = self._clock.now()
+        if command.reset:
+            self._reset_until = now + RESET_VALID_S
+        if self._socket is None:
+            return False
+        reset = now <= self._reset_until
+        try:
+            self._socket.send(encode(msgspec.structs.replace(command, reset=reset)))
+        except (BlockingIOError, ConnectionError):
+            # Full: the guardian hangs, and its watcher ends it. Broken: whoever reads notices and connects again.
+            return False
+        self._reset_until = -math.inf
+        return True
+
+    async def run(self) -> None:
+        """Stay connected until cancelled."""
+        while True:
+            try:
+                with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as link:
+                    link.settimeout(0)
+                    await asyncio.get_running_loop().sock_connect(link, str(self._path))
+                    self._socket, self._told = link, ""
+                    _log.info("guardian_found", socket=str(self._path))
+                    reason = await self._read(link)
+            except OSError as error:
+                reason = f"{self._path}: {error.strerror or error}; does the watcher run?"
+            finally:
+                self._socket = None
+            self._lost(reason)
+            await self._clock.sleep(RETRY_S)
+
+    async def _read(self, link: socket.socket) -> str:
+        """Pass feedback on until the link breaks; return why it did."""
+        loop = asyncio.get_running_loop()
+        while True:
+            try:
+                async with asyncio.timeout(self._clock.real(QUIET_S)):
+                    data = await loop.sock_recv(link, PACKET_LIMIT + 1)
+            except TimeoutError:
+                self._lost("the guardian hears nothing from the base; check its cable and power")
+                continue
+            if not data:
+                return "the guardian closed the link"
+            now = self._clock.now()
+            try:
+                feedback = decode_feedback(data)
+            except (msgspec.DecodeError, UnicodeDecodeError) as error:
+                self._limited.warning("bad_feedback", "bad_feedback", now, reason=str(error))
+                continue
+            self._told = ""
+            self._on_feedback(feedback, now)
+
+    def _lost(self, reason: str) -> None:
+        if reason != self._told:
+            self._told = reason
+            _log.warning("base_lost", reason=reason)
+        self._on_lost(self._clock.now(), reason)

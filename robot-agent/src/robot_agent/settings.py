@@ -1,0 +1,75 @@
+"""What the agent can be told (environment FOGNAV_*), beside what all processes can, and what it reads from files."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final
+
+import msgspec
+from msgspec import Meta
+
+from fog_contracts.commands import KEY_BYTES
+from fog_contracts.messages import Id
+from fog_contracts.site import Site
+from fog_runtime.settings import CommonSettings, SettingsError
+
+if TYPE_CHECKING:
+    from fog_contracts.site import RobotSite
+
+SITE_FILE: Final = "site.toml"
+
+
+class Settings(CommonSettings, frozen=True, kw_only=True):
+    """The robot's id, its wires, and the seed of its particle filter.
+
+    `site_dir` is optional here: a robot without the site's folder is told its `site` and asks for a pose or searches.
+    """
+
+    robot: Id
+    lidar_port: str
+    guardian_socket: Path
+    site_dir: Path = Path()
+    seed: Annotated[int, Meta(ge=0)] = 0
+
+
+def read_site(settings: Settings) -> tuple[str, RobotSite | None]:
+    """Return the site's id and, if the site's folder is there, what it says of this robot; raises `SettingsError`.
+
+    The map itself comes from the map-service: no robot drives by a copy of its own.
+    """
+    file = settings.site_dir / SITE_FILE
+    if settings.site_dir == Path() and not file.is_file():
+        if not settings.site:
+            raise SettingsError("the site is not known. Set FOGNAV_SITE to its id, or FOGNAV_SITE_DIR to its folder")
+        return settings.site, None
+    try:
+        site = msgspec.convert(tomllib.loads(file.read_text("utf-8")), Site)
+    except OSError as error:
+        raise SettingsError(f"{file} can't be read: {error.strerror}. Correct FOGNAV_SITE_DIR") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, msgspec.ValidationError) as error:
+        raise SettingsError(f"{file}: {error}. Correct the place it names") from error
+    for robot in site.robots:
+        if robot.id == settings.robot:
+            return settings.site or site.id, robot
+    known = ", ".join(robot.id for robot in site.robots) or "none"
+    raise SettingsError(f"{file}: robots: there is no {settings.robot!r} (known: {known}). Add it, or set FOGNAV_ROBOT")
+
+
+def read_operator_key(file: Path | None) -> bytes:
+    """Return the operators' key from a file with its hexadecimal digits; raises `SettingsError`."""
+    if file is None:
+        raise SettingsError(
+            "there is no operators' key, so nobody could enable the robot. Set FOGNAV_OPERATOR_KEY_FILE to a file "
+            f"with {2 * KEY_BYTES} or more hexadecimal digits (openssl rand -hex {KEY_BYTES})"
+        )
+    remedy = f"Write {2 * KEY_BYTES} or more hexadecimal digits into it (openssl rand -hex {KEY_BYTES})"
+    try:
+        key = bytes.fromhex(file.read_text("ascii").strip())
+    except OSError as error:
+        raise SettingsError(f"the operators' key {file} can't be read: {error.strerror}. {remedy}") from error
+    except ValueError as error:
+        raise SettingsError(f"the operators' key {file} is not hexadecimal. {remedy}") from error
+    if len(key) < KEY_BYTES:
+        raise SettingsError(f"the operators' key {file} is only {len(key)} bytes long. {remedy}")
+    return key

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fog_contracts.costs import INSCRIBED, LETHAL, UNKNOWN
+from fog_contracts.geometry import GeometryError, normalized_polygon, rasterize
 from fog_contracts.grid import GridGeometry, Window
 from fog_contracts.messages import (
     AreaDefinition,
@@ -420,3 +421,20 @@ def test_what_is_gone_leaves_the_plain_floor(history):
     m.tick(1e6, 1e6)
     assert np.array_equal(m.cost, plain)
     assert not m.speed.any()
+
+
+@given(st.lists(point, min_size=3, max_size=9))
+@settings(max_examples=200, deadline=None)
+def test_polygons_get_the_cells_that_the_contracts_give_them(points):
+    try:
+        ring = normalized_polygon(points)
+    except GeometryError:
+        return
+    geometry = floor().geometry
+    window, mask = rasterize(ring, geometry)
+    expected = np.zeros(geometry.shape, dtype=bool)
+    expected[window.rows, window.columns] = mask
+    window, mask = rasterize_shape(PolygonShape(points=points), geometry)
+    found = np.zeros(geometry.shape, dtype=bool)
+    found[window.rows, window.columns] = mask
+    assert np.array_equal(found, expected)

@@ -1,0 +1,60 @@
+"""The hazard aggregator: `python -m hazard_aggregator`, told by FOGNAV_* in the environment. Safe to kill any time."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+
+from fog_runtime import logs, process
+from fog_runtime.clock import SystemClock
+from fog_runtime.health import Health
+from fog_runtime.http import load_tokens, serve
+from fog_runtime.mqtt_edge import MqttEdge
+from fog_runtime.settings import describe, load
+from fog_runtime.site import load_site
+from fog_runtime.zenoh_edge import ZenohEdge
+from hazard_aggregator import debounce
+from hazard_aggregator.api import make_api
+from hazard_aggregator.core import Aggregator
+from hazard_aggregator.service import Service
+from hazard_aggregator.settings import Settings
+from hazard_aggregator.store import Store, load_or_begin
+
+_log = logs.get("aggregator")
+
+
+async def main() -> None:
+    """Connect, recall what was stored, then judge readings until cancelled."""
+    settings = load(Settings, environ=os.environ)
+    logs.configure("hazard-aggregator", settings.log_level, settings.log_format)
+    _log.info("settings", **describe(settings))
+    loaded = load_site(settings.site_dir)
+    site = settings.site or loaded.site.id
+    clock = SystemClock(settings.speed)
+    health = Health("store", "mqtt")
+    async with Store(settings.redis_url, site) as store:
+        stored, was_read = await load_or_begin(store)
+        definitions = {d.id: d for d in [*loaded.site.definitions(), *stored.definitions]}
+        rule = debounce.find(settings.debounce)
+        core = Aggregator(definitions.values(), loaded.site.nodes, stored.epoch, stored.hazards, rule=rule)
+        service = Service(core, loaded.site, store, clock, health)
+        if was_read:
+            service.store_was_read()
+        mqtt = MqttEdge(settings.mqtt_url, "hazard-aggregator", clock)
+        async with ZenohEdge.open(
+            connect=settings.zenoh_endpoints, clock=clock, role="hazard-aggregator", id=site, site=site
+        ) as zenoh:
+            service.listen(mqtt, zenoh)
+            zenoh.alive("hazard-aggregator", site)
+            app = make_api(service, loaded.map.geometry, clock, health, load_tokens(settings.tokens_file))
+            async with asyncio.TaskGroup() as tasks:
+                tasks.create_task(mqtt.run(), name="mqtt")
+                tasks.create_task(service.tick_loop(), name="tick")
+                tasks.create_task(service.send_loop(), name="send")
+                tasks.create_task(service.write_loop(), name="write")
+                tasks.create_task(service.read_loop(), name="read")
+                tasks.create_task(serve(app, settings.http_host, settings.http_port, settings.port_file), name="http")
+
+
+if __name__ == "__main__":
+    process.run(main)

@@ -1,0 +1,165 @@
+"""REST under /api/v1: areas with their state, and the health of nodes. Reading needs no token, PUT the operator's."""
+
+from typing import Annotated, Final
+
+import msgspec
+from fastapi import Depends, FastAPI, Header, Request, Response
+
+from fog_contracts.geometry import GeometryError, normalized_polygon
+from fog_contracts.grid import GridGeometry
+from fog_contracts.messages import (
+    AreaDefinition,
+    AreaHazard,
+    AreaState,
+    Debounce,
+    Id,
+    Message,
+    Ring,
+    UnknownPolicy,
+)
+from fog_runtime.clock import Clock
+from fog_runtime.health import Health
+from fog_runtime.http import Caller, ProblemError, Tokens, answer_schema, body_schema, make_app, read_body, require
+from hazard_aggregator.service import Service
+from hazard_aggregator.store import StoreError
+
+RETRY_AFTER: Final = {"Retry-After": "1"}
+
+
+class AreaBody(Message, frozen=True, kw_only=True):
+    """What an operator decides about an area; polygon in m, frame `map`."""
+
+    label: Annotated[str, msgspec.Meta(max_length=100)] = ""
+    polygon: Ring
+    nodes: list[Id] = msgspec.field(default_factory=list)
+    number: Annotated[int, msgspec.Meta(ge=0, le=9999)] | None = None
+    debounce: Debounce = Debounce()
+    unknown: UnknownPolicy = UnknownPolicy()
+    removed: bool = False
+
+
+class AreaView(Message, frozen=True, kw_only=True):
+    """An area with the hazard that was announced; `withheld`: a relief is decided but not stored yet."""
+
+    definition: AreaDefinition
+    hazard: AreaHazard | None
+    withheld: bool
+
+
+class NodeView(Message, frozen=True, kw_only=True):
+    """Health of a node; `age_s` is since its last reading, null when it was never heard."""
+
+    id: str
+    area: str
+    state: AreaState
+    reason: str
+    online: bool | None
+    age_s: float | None
+    received: int
+    ignored: int
+
+
+def make_api(service: Service, geometry: GridGeometry, clock: Clock, health: Health, tokens: Tokens) -> FastAPI:
+    """Return the app over a running service; areas must lie on the map of this geometry."""
+    app = make_app("Fognav hazard-aggregator", "1", health, tokens)
+
+    def views() -> dict[str, AreaView]:
+        announced = {hazard.area: hazard for hazard in service.outbox.announced()}
+        withheld = service.outbox.withheld()
+        return {
+            d.id: AreaView(definition=d, hazard=announced.get(d.id), withheld=d.id in withheld)
+            for d in service.core.definitions()
+            if not d.removed
+        }
+
+    def known(area_id: str) -> AreaView:
+        view = views().get(area_id)
+        if view is None:
+            raise ProblemError(404, f"there is no area {area_id}")
+        return view
+
+    @app.get("/api/v1/areas", tags=["areas"], responses=answer_schema(app, list[AreaView]))
+    async def list_areas() -> Response:
+        """List all areas with their state."""
+        return _json(list(views().values()))
+
+    @app.get("/api/v1/areas/{area_id}", tags=["areas"], responses=answer_schema(app, AreaView))
+    async def get_area(area_id: str) -> Response:
+        """Return one area with its ETag."""
+        view = known(area_id)
+        return _json(view, {"ETag": f'"{view.definition.version}"'})
+
+    @app.put("/api/v1/areas/{area_id}", tags=["areas"], openapi_extra=body_schema(app, AreaBody))
+    async def put_area(
+        request: Request,
+        area_id: str,
+        caller: Annotated[Caller, Depends(require("operator"))],
+        if_match: Annotated[str | None, Header(alias="If-Match")] = None,
+    ) -> Response:
+        """Change or add an area; the answer comes once it is stored for good. With If-Match only if unchanged."""
+        body = await read_body(request, AreaBody)
+        old = next((d for d in service.core.definitions() if d.id == area_id), None)
+        if if_match is not None and if_match != "*" and (old is None or if_match != f'"{old.version}"'):
+            raise ProblemError(412, f"area {area_id} was changed by somebody else: read it again and decide")
+        definition = _checked(area_id, body, (old.version if old else 0) + 1, service, geometry)
+        audit = {
+            "at": f"{clock.stamp():.3f}",
+            "who": caller.name,
+            "action": "put",
+            "area": area_id,
+            "before": msgspec.json.encode(old).decode() if old else "",
+            "after": msgspec.json.encode(definition).decode(),
+        }
+        try:
+            await service.put_area(definition, audit)
+        except StoreError as error:
+            detail = f"the store does not answer, so nothing was changed for certain: try again ({error})"
+            raise ProblemError(503, detail, headers=RETRY_AFTER) from error
+        return _json(definition, {"ETag": f'"{definition.version}"'})
+
+    @app.get("/api/v1/nodes", tags=["nodes"], responses=answer_schema(app, list[NodeView]))
+    async def nodes() -> Response:
+        """Return the health of every node in every area that it watches."""
+        return _json(
+            [
+                NodeView(
+                    id=node.id,
+                    area=node.area,
+                    state=node.state,
+                    reason=node.reason,
+                    online=node.online,
+                    age_s=node.age,
+                    received=node.received,
+                    ignored=node.ignored,
+                )
+                for node in service.core.node_reports(clock.now())
+            ]
+        )
+
+    return app
+
+
+def _checked(area_id: str, body: AreaBody, version: int, service: Service, geometry: GridGeometry) -> AreaDefinition:
+    try:
+        polygon = normalized_polygon(body.polygon)
+    except GeometryError as error:
+        raise ProblemError(422, f"{error}; draw one simple outline", field="body.polygon") from error
+    for index, (x, y) in enumerate(polygon):
+        if not geometry.contains(x, y):
+            left, bottom, right, top = geometry.bounds
+            reach = f"the map reaches from ({left:.2f}, {bottom:.2f}) to ({right:.2f}, {top:.2f}) m"
+            raise ProblemError(422, f"({x:.2f}, {y:.2f}) is off the map: {reach}", field=f"body.polygon.{index}")
+    for index, node in enumerate(body.nodes):
+        if node not in service.nodes:
+            detail = f"the site has no node {node}: add it to site.toml first, with its place and its limits"
+            raise ProblemError(422, detail, field=f"body.nodes.{index}")
+    try:
+        return msgspec.convert(
+            {**msgspec.to_builtins(body), "id": area_id, "polygon": polygon, "version": version}, AreaDefinition
+        )
+    except msgspec.ValidationError as error:  # the id comes from the path
+        raise ProblemError(422, f"{area_id!r} is no id: use a to z, 0 to 9 and -, at most 32", field="path") from error
+
+
+def _json(content: object, headers: dict[str, str] | None = None) -> Response:
+    return Response(msgspec.json.encode(content), 200, headers, media_type="application/json")

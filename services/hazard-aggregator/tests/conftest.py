@@ -1,0 +1,169 @@
+"""A fog of its own for each test: broker, Redis and router on free loopback ports, and the processes under test."""
+
+import asyncio
+import hashlib
+import os
+import subprocess
+import sys
+import time
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import AsyncExitStack, asynccontextmanager
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+
+from fog_contracts.grid import GridGeometry
+from fog_runtime.clock import SystemClock
+from fog_runtime.maps import StaticMap, save_map
+from fog_runtime.mqtt_edge import MqttEdge
+from fog_runtime.servers import Server, start_mosquitto, start_redis, start_router
+from fog_runtime.zenoh_edge import ZenohEdge
+
+SITE = """
+id = "test"
+map = "map.yaml"
+
+[[areas]]
+id = "hall"
+label = "the hall"
+polygon = [[3.0, 2.0], [4.0, 2.0], [4.0, 4.0], [3.0, 4.0]]
+number = 7
+
+[[nodes]]
+id = "n1"
+area = "hall"
+x = 3.5
+y = 4.5
+theta = -1.5707963
+sonars = [{ range_limit = 1.5, no_echo_is_clear = true }, { angle = 0.2, range_limit = 1.5, no_echo_is_clear = true }]
+"""
+TOKEN = "an-operators-token"
+VIEWER = "a-viewers-token"
+
+
+class Fog:
+    """The servers, a site, and processes that can be started and killed."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.mosquitto: Server = start_mosquitto(folder / "mosquitto")
+        self.redis: Server = start_redis(folder / "redis")
+        self.router: Server = start_router(folder / "router")
+        self.site = folder / "site"
+        self.site.mkdir()
+        (self.site / "site.toml").write_text(SITE)
+        cells = np.zeros((120, 160), dtype=np.uint8)
+        cells[[0, -1], :] = 254
+        cells[:, [0, -1]] = 254
+        save_map(self.site / "map", StaticMap(GridGeometry(160, 120, 0.05, 0.0, 0.0), cells))
+        tokens = folder / "tokens.toml"
+        lines = []
+        for name, role, token in (("anna", "operator", TOKEN), ("vera", "viewer", VIEWER)):
+            digest = hashlib.sha256(token.encode()).hexdigest()
+            lines += ["[[tokens]]", f'name = "{name}"', f'role = "{role}"', f'sha256 = "{digest}"']
+        tokens.write_text("\n".join(lines))
+        self.environment = {
+            **os.environ,
+            "FOGNAV_SITE_DIR": str(self.site),
+            "FOGNAV_DATA_DIR": str(folder / "data"),
+            "FOGNAV_MQTT_URL": self.mosquitto.url,
+            "FOGNAV_REDIS_URL": self.redis.url,
+            "FOGNAV_ZENOH_CONNECT": self.router.endpoint,
+            "FOGNAV_TOKENS_FILE": str(tokens),
+        }
+        self.processes: dict[str, subprocess.Popen[bytes]] = {}
+
+    def start(self, module: str) -> None:
+        """Start `python -m module`, again after a kill."""
+        port_file = self.folder / f"{module}.port"
+        port_file.unlink(missing_ok=True)
+        with (self.folder / f"{module}.log").open("ab") as log:
+            self.processes[module] = subprocess.Popen(
+                [sys.executable, "-m", module],
+                env={**self.environment, "FOGNAV_PORT_FILE": str(port_file)},
+                stdout=log,
+                stderr=log,
+            )
+
+    def kill(self, module: str) -> None:
+        """End a process as a crash would."""
+        process = self.processes.pop(module)
+        process.kill()
+        process.wait()
+
+    def log(self, module: str) -> str:
+        """Everything that a process printed."""
+        return (self.folder / f"{module}.log").read_text()
+
+    async def url(self, module: str) -> str:
+        """Return the address of its REST interface, once it listens."""
+        port_file = self.folder / f"{module}.port"
+        await until(port_file.exists, f"{module} listens", lambda: self.log(module))
+        return f"http://127.0.0.1:{port_file.read_text().strip()}"
+
+    async def ready(self, module: str) -> str:
+        """Return its address once it says that it is ready."""
+        url = await self.url(module)
+        async with httpx.AsyncClient() as client:
+            deadline = time.monotonic() + 15
+            while (answer := await client.get(f"{url}/readyz")).status_code != 200:
+                assert time.monotonic() < deadline, (answer.text, self.log(module))
+                await asyncio.sleep(0.05)
+        return url
+
+    @asynccontextmanager
+    async def edges(self) -> AsyncIterator[tuple[MqttEdge, ZenohEdge, Callable[[], None]]]:
+        """Give a connection to each side; register on the broker's before calling the third, which connects it."""
+        clock = SystemClock()
+        mqtt = MqttEdge(self.mosquitto.url, "test", clock)
+        tasks: list[asyncio.Task[None]] = []
+        async with AsyncExitStack() as stack:
+            zenoh = await stack.enter_async_context(
+                ZenohEdge.open(connect=[self.router.endpoint], clock=clock, role="test", id="test", site="test")
+            )
+            yield mqtt, zenoh, lambda: tasks.append(asyncio.create_task(mqtt.run()))
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+
+    def close(self) -> None:
+        """Stop everything that was started."""
+        for process in self.processes.values():
+            process.terminate()
+        for process in self.processes.values():
+            try:
+                process.wait(5)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+        for server in (self.mosquitto, self.redis, self.router):
+            server.stop()
+
+
+async def until(condition: Callable[[], object], what: str, why: Callable[[], str] = str) -> None:
+    """Wait until something is so."""
+    deadline = time.monotonic() + 15.0
+    while not condition():
+        assert time.monotonic() < deadline, f"not within 15 s: {what}\n{why()}"
+        await asyncio.sleep(0.01)
+
+
+@pytest.fixture(name="until")
+def until_fixture():
+    return until
+
+
+@pytest.fixture(name="tokens")
+def tokens_fixture() -> dict[str, dict[str, str]]:
+    return {name: {"Authorization": f"Bearer {token}"} for name, token in (("operator", TOKEN), ("viewer", VIEWER))}
+
+
+@pytest.fixture
+def fog(tmp_path: Path) -> Iterator[Fog]:
+    running = Fog(tmp_path)
+    try:
+        yield running
+    finally:
+        running.close()

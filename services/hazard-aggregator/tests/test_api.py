@@ -1,0 +1,54 @@
+"""Areas and nodes over REST, with a running aggregator."""
+
+import httpx
+import pytest
+
+pytestmark = pytest.mark.live
+POLYGON = [[1.0, 1.0], [2.0, 1.0], [2.0, 2.0], [1.0, 2.0]]
+
+
+@pytest.fixture
+async def client(fog):
+    fog.start("hazard_aggregator")
+    async with httpx.AsyncClient(base_url=await fog.ready("hazard_aggregator"), timeout=15) as client:
+        yield client
+
+
+async def test_areas_are_changed_by_version_and_survive_a_kill(fog, client, tokens):
+    (area,) = (await client.get("/api/v1/areas")).json()
+    assert (area["definition"]["id"], area["hazard"]["state"], area["withheld"]) == ("hall", "unknown", False)
+    body = {"polygon": POLYGON, "nodes": ["n1"], "debounce": {"to_blocked": 3}}
+    assert (await client.put("/api/v1/areas/hall", json=body)).status_code == 401
+    put = await client.put("/api/v1/areas/hall", json=body, headers={**tokens["operator"], "If-Match": '"0"'})
+    assert (put.status_code, put.headers["etag"]) == (200, '"1"'), put.text
+    stale = await client.put("/api/v1/areas/hall", json=body, headers={**tokens["operator"], "If-Match": '"0"'})
+    assert stale.status_code == 412
+    fog.kill("hazard_aggregator")
+    fog.start("hazard_aggregator")
+    async with httpx.AsyncClient(base_url=await fog.ready("hazard_aggregator")) as again:
+        kept = (await again.get("/api/v1/areas/hall")).json()["definition"]
+    assert (kept["polygon"], kept["debounce"]["to_blocked"], kept["version"]) == (POLYGON, 3, 1)
+
+
+async def test_bad_areas_are_refused_by_field_and_a_dead_store_is_said(fog, client, tokens):
+    for body, field in (
+        ({"polygon": [[1, 1], [2, 2], [2, 1], [1, 2]]}, "body.polygon"),
+        ({"polygon": [[1, 1], [90, 1], [2, 2]]}, "body.polygon.1"),
+        ({"polygon": POLYGON, "nodes": ["n9"]}, "body.nodes.0"),
+        ({"polygon": POLYGON, "unknown": {"penalty": 255}}, "body.unknown.penalty"),
+    ):
+        answer = await client.put("/api/v1/areas/hall", json=body, headers=tokens["operator"])
+        assert answer.status_code == 422
+        assert answer.json()["errors"][0]["field"] == field
+    assert (await client.get("/api/v1/areas/gate")).status_code == 404
+    fog.redis.kill()
+    answer = await client.put("/api/v1/areas/hall", json={"polygon": POLYGON}, headers=tokens["operator"])
+    assert answer.status_code == 503
+    assert (await client.get("/api/v1/areas/hall")).json()["definition"]["version"] == 0
+
+
+async def test_nodes_tell_their_health(client):
+    (node,) = (await client.get("/api/v1/nodes")).json()
+    assert (node["id"], node["area"], node["state"], node["age_s"]) == ("n1", "hall", "unknown", None)
+    described = (await client.get("/openapi.json")).json()
+    assert {"/api/v1/areas", "/api/v1/areas/{area_id}", "/api/v1/nodes"} <= set(described["paths"])

@@ -1,0 +1,179 @@
+"""The running aggregator with a real broker, Redis and router: what survives which death."""
+
+import asyncio
+from contextlib import asynccontextmanager
+
+import httpx
+import pytest
+
+from fog_contracts import channels as ch
+from fog_contracts.messages import AreaDefinition, AreaHazard, NodeConfig, NodeReading, RobotPose
+
+pytestmark = pytest.mark.live
+
+
+class Watch:
+    """Plays a node, and notes what the aggregator says."""
+
+    def __init__(self, mqtt) -> None:
+        self.mqtt = mqtt
+        self.hazards: list[AreaHazard] = []
+        self.definitions: list[AreaDefinition] = []
+        self.configs: list[NodeConfig] = []
+        self.lines: list[str] = []
+        self.seq = 0
+        self.boot = 1
+        mqtt.on(ch.AREA_HAZARD, lambda _, m: self.hazards.append(m), AreaHazard)
+        mqtt.on(ch.AREA_DEFINITION, lambda _, m: self.definitions.append(m), AreaDefinition)
+        mqtt.on(ch.NODE_CONFIG, lambda _, m: self.configs.append(m), NodeConfig)
+        mqtt.on(ch.THESIS_WSN, lambda _, text: self.lines.append(text))
+
+    async def read(self, distance: float, times: int = 1) -> None:
+        for _ in range(times):
+            self.seq += 1
+            reading = NodeReading(
+                seq=self.seq,
+                boot=self.boot,
+                uptime_ms=self.seq,
+                range_m=[distance, 3.0],
+                status=["ok", "ok"],
+                state="blocked" if distance < 1.5 else "clear",
+            )
+            await self.mqtt.publish(ch.NODE_READING, reading, node="n1")
+
+    @property
+    def state(self) -> str | None:
+        return self.hazards[-1].state if self.hazards else None
+
+
+@asynccontextmanager
+async def watching(fog):
+    async with fog.edges() as (mqtt, zenoh, connect):
+        watch = Watch(mqtt)
+        connect()
+        await mqtt.wait_connected()
+        yield watch, zenoh
+
+
+async def test_five_readings_block_an_area_and_five_clear_it(fog, until):
+    fog.start("hazard_aggregator")
+    await fog.ready("hazard_aggregator")
+    async with watching(fog) as (watch, _):
+        await until(lambda: watch.definitions and watch.hazards and watch.configs, "everything is retained")
+        assert watch.hazards[0].state == "unknown"
+        assert watch.configs[0].range_limit_m == [1.5, 1.5]
+        await watch.read(0.8, 5)
+        await until(lambda: watch.state == "blocked", "blocked", lambda: fog.log("hazard_aggregator"))
+        trace = watch.hazards[-1].trace
+        assert 0 < trace.first_reading <= trace.confirmed
+        await watch.read(3.0, 5)
+        await until(lambda: watch.state == "clear", "clear", lambda: fog.log("hazard_aggregator"))
+        await until(lambda: watch.lines[-2:] == ["7,3.500,4.500", "7,-999,-999"], "the thesis's lines")
+
+
+async def test_a_killed_aggregator_comes_back_with_the_block(fog, until):
+    fog.start("hazard_aggregator")
+    await fog.ready("hazard_aggregator")
+    async with watching(fog) as (watch, _):
+        await watch.read(0.8, 5)
+        await until(lambda: watch.state == "blocked", "blocked")
+        epoch = watch.hazards[-1].epoch
+        fog.kill("hazard_aggregator")
+        fog.start("hazard_aggregator")
+        await until(lambda: watch.hazards[-1].epoch > epoch, "it is back", lambda: fog.log("hazard_aggregator"))
+        assert watch.state == "blocked"
+        await until(lambda: watch.state == "unknown", "its node is silent")
+        assert watch.hazards[-1].penalty == 254
+
+
+async def test_a_broker_that_lost_everything_is_told_everything_again(fog, until):
+    fog.start("hazard_aggregator")
+    await fog.ready("hazard_aggregator")
+    async with watching(fog) as (watch, _):
+        await watch.read(0.8, 5)
+        await until(lambda: watch.state == "blocked", "blocked")
+        fog.mosquitto.kill()
+        (fog.mosquitto.folder / "mosquitto.db").unlink(missing_ok=True)
+        watch.hazards.clear()
+        watch.definitions.clear()
+        fog.mosquitto.start()
+        await until(lambda: watch.hazards and watch.definitions, "said again", lambda: fog.log("hazard_aggregator"))
+        assert watch.hazards[-1].penalty == 254
+
+
+async def test_without_redis_danger_is_announced_and_relief_waits(fog, until):
+    fog.start("hazard_aggregator")
+    url = await fog.ready("hazard_aggregator")
+    async with watching(fog) as (watch, _), httpx.AsyncClient() as client:
+        await until(lambda: watch.hazards, "the first word")
+        fog.redis.kill()
+        await watch.read(0.8, 5)
+        await until(lambda: watch.state == "blocked", "danger needs no store")
+        await watch.read(3.0, 5)
+        async with asyncio.timeout(15):
+            for _ in iter(int, 1):
+                if "fognav_hazards_withheld 1.0" in (await client.get(f"{url}/metrics")).text:
+                    break
+                await asyncio.sleep(0.02)
+        assert watch.state == "blocked"
+        assert (await client.get(f"{url}/readyz")).json()["missing"] == ["store"]
+        fog.redis.start()
+        await watch.read(3.0, 5)
+        await until(lambda: watch.state == "clear", "relief once it is stored", lambda: fog.log("hazard_aggregator"))
+
+
+async def test_a_start_without_redis_and_broker_recalls_the_block_later(fog, until):
+    fog.start("hazard_aggregator")
+    await fog.ready("hazard_aggregator")
+    async with watching(fog) as (watch, _):
+        await watch.read(0.8, 5)
+        await until(lambda: watch.state == "blocked", "blocked")
+        await until(lambda: fog_stored(fog), "stored")
+        fog.kill("hazard_aggregator")
+        fog.redis.kill()
+        fog.mosquitto.kill()
+        (fog.mosquitto.folder / "mosquitto.db").unlink(missing_ok=True)
+        watch.hazards.clear()
+        fog.mosquitto.start()
+        fog.start("hazard_aggregator")
+        await until(lambda: watch.state == "unknown", "unknown without memory", lambda: fog.log("hazard_aggregator"))
+        assert watch.hazards[-1].penalty == 200
+        fog.redis.start()
+        await until(lambda: watch.hazards[-1].penalty == 254, "recalled", lambda: fog.log("hazard_aggregator"))
+
+
+def fog_stored(fog) -> bool:
+    return any(b"blocked" in path.read_bytes() for path in fog.redis.folder.glob("appendonlydir/*.aof"))
+
+
+async def test_a_robot_in_the_cone_blocks_nothing(fog, until):
+    fog.start("hazard_aggregator")
+    await fog.ready("hazard_aggregator")
+    async with watching(fog) as (watch, zenoh):
+        await watch.read(3.0, 5)
+        await until(lambda: watch.state == "clear", "clear")
+        robot = RobotPose(
+            x=3.5, y=3.5, theta=0.0, covariance=[0.0] * 9, v=0.0, w=0.0, radius=0.17, height=0.35, stamp=1.0
+        )
+        while watch.hazards[-1].explained_by is None:
+            zenoh.publish(ch.ROBOT_POSE, robot, robot="r1")
+            await watch.read(0.83)
+            await asyncio.sleep(0.05)
+            assert watch.state == "clear" or watch.seq < 12  # the pose may come after the first readings
+        assert watch.hazards[-1].explained_by == "r1"
+
+
+async def test_garbage_is_refused_and_nothing_stops(fog, until):
+    fog.start("hazard_aggregator")
+    url = await fog.ready("hazard_aggregator")
+    async with watching(fog) as (watch, _), httpx.AsyncClient() as client:
+        raw = watch.mqtt._client
+        topic = ch.NODE_READING.key(node="n1")
+        for payload in (b"x" * 10_000_000, b"{", b'{"seq":-1}', b"\xff\xfe"):
+            await raw.publish(topic, payload, qos=0, timeout=30)
+        await raw.publish(ch.NODE_AVAILABILITY.key(node="n1"), b"maybe", qos=1)
+        await watch.read(0.8, 5)
+        await until(lambda: watch.state == "blocked", "still works", lambda: fog.log("hazard_aggregator"))
+        metrics = (await client.get(f"{url}/metrics")).text
+        assert 'fognav_refused_messages_total{channel="node_reading"} 4.0' in metrics
+        assert 'fognav_refused_messages_total{channel="node_availability"} 1.0' in metrics

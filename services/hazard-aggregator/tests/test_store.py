@@ -1,0 +1,50 @@
+"""The aggregator's record in a real Redis."""
+
+import asyncio
+from pathlib import Path
+
+import pytest
+from redis.asyncio import Redis
+
+from fog_contracts.messages import AreaDefinition, AreaHazard
+from fog_runtime.servers import Server, start_redis
+from hazard_aggregator.store import Store, StoreError
+
+pytestmark = pytest.mark.live
+
+
+@pytest.fixture
+def redis(tmp_path: Path):
+    with start_redis(tmp_path) as server:
+        yield server
+
+
+def hazard(seq: int) -> AreaHazard:
+    return AreaHazard(area="hall", state="blocked", severity=3, penalty=254, since=0, seq=seq, epoch=1, cause="")
+
+
+async def test_stored_hazards_and_areas_survive_kills(redis: Server):
+    area = AreaDefinition(id="hall", polygon=[(0, 0), (1, 0), (1, 1)], version=4)
+    async with Store(redis.url, "test", timeout_s=5.0) as store:
+        first = await store.load()
+        assert (first.definitions, first.hazards) == ([], [])
+        await store.save_area(area, {"who": "anna"})
+        for seq in range(1, 6):
+            await store.save_hazards([hazard(seq)])
+            await asyncio.to_thread(redis.kill)
+            await asyncio.to_thread(redis.start)
+            assert (await store.load()).hazards == [hazard(seq)]
+        again = await store.load()
+        assert again.definitions == [area]
+        assert again.epoch > first.epoch
+        assert await store.weakness() == ""
+        await asyncio.to_thread(redis.kill)
+        with pytest.raises(StoreError):
+            await store.save_hazards([hazard(9)])
+
+
+async def test_a_record_that_cannot_be_read_does_not_hide_the_others(redis: Server):
+    async with Store(redis.url, "test") as store, Redis.from_url(redis.url) as raw:
+        await store.save_hazards([hazard(1)])
+        await raw.hset("fog:test:hazards", "gate", b"nonsense")
+        assert (await store.load()).hazards == [hazard(1)]

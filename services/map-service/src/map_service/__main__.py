@@ -1,0 +1,60 @@
+"""The map-service: `python -m map_service`, told by FOGNAV_* in the environment. Safe to kill and start at any time."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+
+from fog_runtime import logs, process
+from fog_runtime.clock import SystemClock
+from fog_runtime.health import Health
+from fog_runtime.http import load_tokens, serve
+from fog_runtime.mqtt_edge import MqttEdge
+from fog_runtime.settings import describe, load
+from fog_runtime.site import load_site
+from fog_runtime.zenoh_edge import ZenohEdge
+from map_service.api import make_api
+from map_service.core import MapCore
+from map_service.service import Service
+from map_service.settings import Settings
+from map_service.store import Store
+
+_log = logs.get("map")
+
+
+async def main() -> None:
+    """Connect, read what is stored, then keep the map until cancelled."""
+    settings = load(Settings, environ=os.environ)
+    logs.configure("map-service", settings.log_level, settings.log_format)
+    _log.info("settings", **describe(settings))
+    loaded = load_site(settings.site_dir)
+    site = settings.site or loaded.site.id
+    clock = SystemClock(settings.speed)
+    health = Health("store", "zones", "mqtt", "map")
+    async with Store(settings.redis_url, site) as store:
+        core = MapCore(
+            site,
+            loaded.map,
+            await store.begin_epoch(),
+            settings.inscribed_radius,
+            settings.inflation_radius,
+            settings.cost_scaling,
+            definitions=loaded.site.definitions(),
+        )
+        mqtt = MqttEdge(settings.mqtt_url, "map-service", clock)
+        async with ZenohEdge.open(
+            connect=settings.zenoh_endpoints, clock=clock, role="map-service", id=site, site=site
+        ) as zenoh:
+            service = Service(core, store, mqtt, zenoh, clock, health)
+            service.listen()
+            zenoh.alive("map-service", site)
+            app = make_api(service, loaded.site, clock, health, load_tokens(settings.tokens_file))
+            async with asyncio.TaskGroup() as tasks:
+                tasks.create_task(mqtt.run(), name="mqtt")
+                tasks.create_task(service.store_loop(), name="store")
+                tasks.create_task(service.beat_loop(settings.hazards_wait_s), name="beat")
+                tasks.create_task(serve(app, settings.http_host, settings.http_port, settings.port_file), name="http")
+
+
+if __name__ == "__main__":
+    process.run(main)

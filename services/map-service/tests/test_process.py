@@ -1,0 +1,281 @@
+"""The running map-service with a real broker, Redis and router: what arrives, and what survives which death."""
+
+import asyncio
+import io
+import json
+from contextlib import asynccontextmanager
+from functools import partial
+
+import httpx
+import numpy as np
+import pytest
+from PIL import Image
+
+from fog_contracts import channels as ch
+from fog_contracts.costs import LETHAL
+from fog_contracts.messages import (
+    AreaHazard,
+    HazardArea,
+    MapDelta,
+    MapHeartbeat,
+    MapSnapshot,
+    NodeReading,
+    RobotObstacles,
+    ZoneSet,
+)
+from fog_contracts.replica import Applied, Replica
+
+pytestmark = pytest.mark.live
+CIRCLE = {"kind": "BLOCKED", "shape": {"type": "circle", "centre": [6.0, 3.0], "radius": 0.5}, "reason": "wet floor"}
+
+
+async def first(ask, good):
+    """Ask until the answer is good, and return it."""
+    async with asyncio.timeout(15):
+        while True:
+            answer = await ask()
+            if good(answer):
+                return answer
+            await asyncio.sleep(0.02)
+
+
+class Robot:
+    """Keeps a replica as a robot does, and notes what came."""
+
+    def __init__(self, zenoh) -> None:
+        self.zenoh = zenoh
+        self.replica = Replica()
+        self.deltas: list[MapDelta] = []
+        self.beats: list[MapHeartbeat] = []
+        self.hazards: list[HazardArea] = []
+        self.zones: list[ZoneSet] = []
+        zenoh.subscribe(ch.MAP_DELTA, MapDelta, self._on_delta)
+        zenoh.subscribe(ch.MAP_HEARTBEAT, MapHeartbeat, lambda _, m: self.beats.append(m))
+        zenoh.subscribe(ch.HAZARD, HazardArea, lambda _, m: self.hazards.append(m))
+        zenoh.subscribe(ch.ZONES, ZoneSet, lambda _, m: self.zones.append(m))
+
+    def _on_delta(self, _, delta: MapDelta) -> None:
+        if isinstance(self.replica.apply(delta), Applied):
+            self.deltas.append(delta)
+
+    async def load(self) -> None:
+        ask = partial(self.zenoh.ask, ch.MAP_SNAPSHOT, None, MapSnapshot, 1.0)
+        self.replica.load(await first(ask, lambda snapshot: snapshot is not None))
+
+    def cost(self, x: float, y: float) -> int:
+        column, row = self.replica.geometry.cell(x, y)
+        return int(self.replica.cost[row, column])
+
+
+@asynccontextmanager
+async def running(fog, *others: str):
+    """Start the map-service (and others); give its client, a robot, and a connected broker's side."""
+    for module in (*others, "map_service"):
+        fog.start(module)
+    url = await fog.ready("map_service")
+    async with (
+        fog.edges() as (mqtt, zenoh, connect),
+        httpx.AsyncClient(base_url=url, timeout=15) as client,
+    ):
+        robot = Robot(zenoh)
+        connect()
+        await mqtt.wait_connected()
+        await robot.load()
+        yield client, robot, mqtt
+
+
+def hazard(state: str, seq: int) -> AreaHazard:
+    penalty = {"blocked": 254, "unknown": 200, "clear": 0}[state]
+    return AreaHazard(area="hall", state=state, severity=3, penalty=penalty, since=0, seq=seq, epoch=1, cause="test")
+
+
+async def test_five_readings_in_the_corridor_become_lethal_cells_at_the_robot(fog, until):
+    pytest.importorskip("hazard_aggregator")
+    async with running(fog, "hazard_aggregator") as (_, robot, mqtt):
+        await fog.ready("hazard_aggregator")
+        for seq in range(5):
+            reading = NodeReading(
+                seq=seq, boot=1, uptime_ms=0, range_m=[0.8, 3.0], status=["ok", "ok"], state="blocked"
+            )
+            await mqtt.publish(ch.NODE_READING, reading, node="n1")
+        await until(lambda: robot.cost(3.5, 3.0) == LETHAL, "lethal", lambda: fog.log("map_service"))
+        delta = robot.deltas[-1]
+        assert [(cause.id, cause.state) for cause in delta.causes] == [("hall", "blocked")]
+        trace = delta.traces[0]
+        assert trace.first_reading <= trace.confirmed <= trace.costmap_published
+        await until(lambda: robot.hazards and robot.hazards[-1].hazard.state == "blocked", "the reason")
+        asked = await robot.zenoh.ask(ch.HAZARD, None, HazardArea, 5.0, area="hall")
+        assert asked.hazard.state == "blocked"
+
+
+async def test_a_map_service_that_never_hears_an_aggregator_calls_nothing_clear(fog, until):
+    async with running(fog) as (client, robot, mqtt):
+        await mqtt.publish(ch.AREA_HAZARD, hazard("clear", 1), area="hall")
+        ask = partial(client.get, "/api/v1/hazards")
+        answer = await first(ask, lambda got: "aggregator is gone" in got.json()[0]["hazard"]["cause"])
+        assert answer.json()[0]["hazard"]["state"] == "unknown"
+        await until(lambda: robot.beats, "it beats all the same")
+        await mqtt.publish(ch.AREA_HAZARD, hazard("blocked", 2), area="hall")
+        await until(lambda: robot.cost(3.5, 3.0) == LETHAL, "lethal", lambda: fog.log("map_service"))
+
+
+async def test_a_drawn_zone_reaches_the_robot_and_survives_a_kill(fog, until, tokens):
+    async with running(fog) as (client, robot, _):
+        answer = await client.post("/api/v1/zones", json=CIRCLE, headers=tokens["operator"])
+        assert answer.status_code == 201, answer.text
+        zone = answer.json()
+        assert (zone["author"], zone["version"], answer.headers["etag"]) == ("anna", 1, '"1"')
+        await until(lambda: robot.cost(6.0, 3.0) == LETHAL, "the delta", lambda: fog.log("map_service"))
+        await until(lambda: robot.zones and robot.zones[-1].zones, "the reason")
+        assert robot.deltas[-1].causes[0].id == zone["id"]
+        epoch = robot.replica.version.epoch
+        fog.kill("map_service")
+        fog.start("map_service")
+        await fog.ready("map_service")
+        await until(lambda: robot.beats[-1].epoch > epoch, "a new epoch")
+        assert not robot.replica.check(robot.beats[-1])
+        await robot.load()
+        assert robot.cost(6.0, 3.0) == LETHAL
+
+
+async def test_zones_are_changed_by_version_and_audited(fog, tokens):
+    async with running(fog) as (client, _, _):
+        operator = tokens["operator"]
+        body = {**CIRCLE, "id": "wet"}
+        assert (await client.post("/api/v1/zones", json=body, headers=operator)).status_code == 201
+        assert (await client.post("/api/v1/zones", json=body, headers=operator)).status_code == 409
+        changed = {**CIRCLE, "reason": "drying"}
+        answer = await client.put("/api/v1/zones/wet", json=changed, headers={**operator, "If-Match": '"1"'})
+        assert (answer.status_code, answer.headers["etag"]) == (200, '"2"')
+        for method in ("PUT", "DELETE"):
+            stale = await client.request(
+                method, "/api/v1/zones/wet", json=changed, headers={**operator, "If-Match": '"1"'}
+            )
+            assert stale.status_code == 412
+            assert stale.headers["content-type"] == "application/problem+json"
+        listed = (await client.get("/api/v1/zones")).json()
+        assert ([zone["reason"] for zone in listed["zones"]], listed["active"]) == (["drying"], ["wet"])
+        assert (await client.delete("/api/v1/zones/wet", headers=operator)).status_code == 204
+        assert (await client.get("/api/v1/zones/wet")).status_code == 404
+        entries = (await client.get("/api/v1/audit", headers=tokens["viewer"])).json()
+        assert [(e["who"], e["action"]) for e in entries] == [("anna", a) for a in ("delete", "replace", "create")]
+        assert entries[1]["before"]["reason"] == "wet floor"
+
+
+async def test_a_zone_that_cannot_be_is_refused_by_field(shared, tokens):
+    bowtie = [[1, 1], [2, 2], [2, 1], [1, 2]]
+    for change, field, words in (
+        ({"shape": {"type": "polygon", "points": [[1, 1], [2, 2]]}}, "body.shape.points", "three corners"),
+        ({"shape": {"type": "polygon", "points": bowtie}}, "body.shape.points", "crosses itself"),
+        ({"shape": {"type": "circle", "centre": [90, 3], "radius": 1}}, "body.shape", "off the map"),
+        ({"kind": "PENALTY"}, "body.factor", "needs a factor"),
+        ({"kind": "CLOSED"}, "body.kind", "CLOSED"),
+        ({"ttl_s": 5, "expires_at": 5}, "body.ttl_s", "not both"),
+    ):
+        answer = await shared.post("/api/v1/zones", json={**CIRCLE, **change}, headers=tokens["operator"])
+        assert answer.status_code == 422
+        assert answer.headers["content-type"] == "application/problem+json"
+        (error,) = answer.json()["errors"]
+        assert error["field"] == field
+        assert words in error["problem"]
+    assert (await shared.get("/api/v1/zones")).json()["zones"] == []
+
+
+@pytest.fixture
+async def shared(fog):
+    fog.start("map_service")
+    url = await fog.url("map_service")
+    async with httpx.AsyncClient(base_url=url, timeout=15) as client:
+        await first(partial(client.get, "/api/v1/zones"), lambda answer: answer.status_code == 200)
+        yield client
+
+
+async def test_only_operators_write_and_the_interface_is_described(shared, tokens):
+    assert (await shared.post("/api/v1/zones", json=CIRCLE)).status_code == 401
+    assert (await shared.post("/api/v1/zones", json=CIRCLE, headers=tokens["viewer"])).status_code == 403
+    assert (await shared.get("/api/v1/zones")).json()["zones"] == []
+    described = (await shared.get("/openapi.json")).json()
+    assert {"/api/v1/zones", "/api/v1/zones/{zone_id}", "/api/v1/hazards", "/api/v1/map"} <= set(described["paths"])
+    assert "ZoneBody" in described["components"]["schemas"]
+    info = (await shared.get("/api/v1/map")).json()
+    assert info["geometry"]["width"] == 160
+    for name in ("map", "costmap"):
+        picture = Image.open(io.BytesIO((await shared.get(f"/api/v1/{name}.png")).content))
+        assert picture.size == (160, 120)
+        assert np.asarray(picture)[0, 0] == LETHAL
+    assert (await shared.get("/api/v1/places")).json() == {}
+
+
+async def test_without_redis_zones_stay_writes_wait_and_a_restart_serves_nothing_until_they_are_read(
+    fog, until, tokens
+):
+    async with running(fog) as (client, robot, _):
+        assert (await client.post("/api/v1/zones", json=CIRCLE, headers=tokens["operator"])).status_code == 201
+        fog.redis.kill()
+        refused = await client.post("/api/v1/zones", json={**CIRCLE, "id": "other"}, headers=tokens["operator"])
+        assert refused.status_code == 503
+        assert refused.headers["content-type"] == "application/problem+json"
+        assert len((await client.get("/api/v1/zones")).json()["zones"]) == 1
+        fog.kill("map_service")
+        fog.start("map_service")
+        url = await fog.url("map_service")
+        async with httpx.AsyncClient(base_url=url) as restarted:
+            report = (await restarted.get("/readyz")).json()
+            assert {"store", "zones", "map"} <= set(report["missing"])
+            assert (await restarted.get("/api/v1/zones")).status_code == 503
+            robot.beats.clear()
+            # It has tried to read the zones several times and waited long enough for hazards: only they hold it back.
+            tries = partial(restarted.get, "/readyz")
+            for _ in range(15):
+                assert "zones" in (await tries()).json()["missing"]
+                await asyncio.sleep(0.1)
+            assert robot.beats == []
+            fog.redis.start()
+            await until(lambda: robot.beats, "the heart beats again", lambda: fog.log("map_service"))
+            await robot.load()
+            assert robot.cost(6.0, 3.0) == LETHAL
+
+
+async def test_hazards_are_back_after_the_broker_was_killed_and_garbage_stops_nothing(fog, until):
+    async with running(fog, "hazard_aggregator") as (client, robot, mqtt):
+        await fog.ready("hazard_aggregator")
+        await mqtt._client.publish(ch.AREA_HAZARD.key(area="hall"), b"x" * 10_000_000, qos=1, timeout=30)
+        await mqtt._client.publish(ch.AREA_DEFINITION.key(area="hall"), json.dumps({"id": "hall"}).encode(), qos=1)
+        fog.mosquitto.kill()
+        (fog.mosquitto.folder / "mosquitto.db").unlink(missing_ok=True)
+        fog.mosquitto.start()
+        await mqtt.wait_connected()
+        for seq in range(600):
+            if robot.cost(3.5, 3.0) == LETHAL:
+                break
+            reading = NodeReading(
+                seq=seq, boot=1, uptime_ms=0, range_m=[0.8, 3.0], status=["ok", "ok"], state="blocked"
+            )
+            await mqtt.publish(ch.NODE_READING, reading, node="n1")
+            await asyncio.sleep(0.02)
+        assert robot.cost(3.5, 3.0) == LETHAL, fog.log("map_service")
+        metrics = (await client.get("/metrics")).text
+        assert 'fognav_refused_messages_total{channel="area_hazard"} 1.0' in metrics
+        assert 'fognav_refused_messages_total{channel="area_definition"} 1.0' in metrics
+
+
+async def test_a_robots_obstacles_are_shared_and_vanish(fog, until):
+    async with running(fog) as (_, robot, _):
+        seen = RobotObstacles(points=[(6.0, 3.0)], stamp=1.0, ttl=0.5)
+        robot.zenoh.publish(ch.ROBOT_OBSTACLES, seen, robot="r1")
+        await until(lambda: robot.cost(6.0, 3.0) == LETHAL, "seen", lambda: fog.log("map_service"))
+        await until(lambda: robot.cost(6.0, 3.0) == 0, "gone")
+
+
+async def test_an_aggregator_that_dies_leaves_no_area_clear(fog, until):
+    async with running(fog, "hazard_aggregator") as (_, robot, mqtt):
+        await fog.ready("hazard_aggregator")
+        for seq in range(300):
+            if robot.cost(3.5, 3.0) == 0:
+                break
+            reading = NodeReading(seq=seq, boot=1, uptime_ms=0, range_m=[3, 3], status=["ok", "ok"], state="clear")
+            await mqtt.publish(ch.NODE_READING, reading, node="n1")
+            await asyncio.sleep(0.02)
+        assert robot.cost(3.5, 3.0) == 0
+        fog.kill("hazard_aggregator")
+        await until(lambda: robot.cost(3.5, 3.0) == 200, "unknown", lambda: fog.log("map_service"))

@@ -1,0 +1,74 @@
+"""Zones in a real Redis: versions, repeated writes, crashes."""
+
+import asyncio
+from pathlib import Path
+
+import pytest
+from redis.asyncio import Redis
+
+from fog_contracts.messages import CircleShape, Zone
+from fog_runtime.servers import Server, start_redis
+from map_service.store import Audit, Store, StoreError
+
+pytestmark = pytest.mark.live
+AUDIT = Audit(at=1.0, who="anna", action="create")
+
+
+@pytest.fixture
+def redis(tmp_path: Path):
+    with start_redis(tmp_path) as server:
+        yield server
+
+
+def zone(version: int = 1, radius: float = 0.5) -> Zone:
+    return Zone(id="z1", kind="BLOCKED", shape=CircleShape(centre=(1.0, 1.0), radius=radius), version=version)
+
+
+async def test_a_version_is_written_once_and_a_stale_one_is_refused(redis: Server):
+    async with Store(redis.url, "test") as store:
+        assert await store.put(zone(), expected=0, audit=AUDIT) == "ok"
+        assert await store.put(zone(radius=0.7), expected=0, audit=AUDIT) == "exists"
+        assert await store.put(zone(2, 0.7), expected=1, audit=AUDIT) == "ok"
+        assert await store.put(zone(2, 0.9), expected=1, audit=AUDIT) == "stale"
+        assert await store.zones() == [zone(2, 0.7)]
+        assert await store.delete(zone(1), AUDIT) == "stale"
+        assert await store.delete(zone(2), AUDIT) == "ok"
+        assert await store.zones() == []
+
+
+async def test_a_repeated_write_counts_once(redis: Server):
+    async with Store(redis.url, "test") as store, Redis.from_url(redis.url) as raw:
+        for _ in range(2):
+            assert await store.put(zone(), expected=0, audit=AUDIT) == "ok"
+        assert await raw.xlen("fog:test:audit") == 1
+        for _ in range(2):
+            assert await store.delete(zone(), AUDIT) == "ok"
+        entries = await raw.xrange("fog:test:audit")
+        assert {fields[b"who"] for _, fields in entries} == {b"anna"}
+
+
+async def test_acknowledged_zones_survive_kills_of_redis(redis: Server):
+    async with Store(redis.url, "test", timeout_s=5.0) as store:
+        for version in range(1, 6):
+            assert await store.put(zone(version), expected=version - 1, audit=AUDIT) == "ok"
+            await asyncio.to_thread(redis.kill)
+            await asyncio.to_thread(redis.start)
+            assert await store.zones() == [zone(version)]
+
+
+async def test_a_dead_redis_is_a_store_error_and_epochs_go_on(redis: Server):
+    async with Store(redis.url, "test") as store:
+        first = await store.begin_epoch()
+        assert await store.begin_epoch() > first
+        assert await store.weakness() == ""
+        await asyncio.to_thread(redis.kill)
+        with pytest.raises(StoreError):
+            await store.put(zone(), expected=0, audit=AUDIT)
+        assert await store.begin_epoch() > first
+
+
+async def test_what_is_no_zone_is_an_error_not_a_missing_zone(redis: Server):
+    async with Store(redis.url, "test") as store, Redis.from_url(redis.url) as raw:
+        await raw.hset("fog:test:zones", "z1", b'{"id": "z1"}')
+        with pytest.raises(StoreError, match="fog:test:zones"):
+            await store.zones()

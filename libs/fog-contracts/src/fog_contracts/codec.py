@@ -53,7 +53,8 @@ def decode(channel: Channel, data: bytes, kind: type[M], *, reply: bool = False)
         raise ContractError(channel.name, f"{len(data)} bytes are over the limit of {limit}")
     try:
         return _decoder(channel.encoding, kind).decode(data)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        # An unknown field is skipped, but one that nests without end exhausts the decoder's stack.
         raise ContractError(channel.name, str(error)) from error
 
 

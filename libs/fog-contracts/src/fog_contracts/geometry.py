@@ -64,9 +64,6 @@ def normalized_polygon(points: Sequence[Sequence[float]]) -> list[Point]:
     if all(abs(_cross(ring[0], ring[1], vertex)) <= _COLLINEAR * longest * longest for vertex in ring):
         raise GeometryError("the polygon has no area: its vertices lie on one line")
     for i in range(count):
-        a, b, c = ring[i - 1], ring[i], ring[(i + 1) % count]
-        if _cross(a, b, c) == 0 and (a[0] - b[0]) * (c[0] - b[0]) + (a[1] - b[1]) * (c[1] - b[1]) > 0:
-            raise GeometryError(f"the polygon folds back on itself at {list(b)}")
         for j in range(i + 1, count):
             if j == i + 1 or (i == 0 and j == count - 1):
                 continue

@@ -8,7 +8,10 @@ from typing import Annotated, Literal
 
 from msgspec import Meta, Struct
 
-Id = Annotated[str, Meta(pattern=r"^[a-z0-9][a-z0-9-]{0,31}$")]
+# The last part says "not before a line feed either": a bare $ would let one pass at the end.
+Id = Annotated[str, Meta(pattern=r"^[a-z0-9][a-z0-9-]{0,31}$(?!\n)")]
+# Bounds keep NaN and infinity out: no comparison with a bound holds for NaN.
+Finite = Annotated[float, Meta(ge=-1e12, le=1e12)]
 Metres = Annotated[float, Meta(ge=-100_000.0, le=100_000.0)]
 Radians = Annotated[float, Meta(ge=-1_000.0, le=1_000.0)]
 Speed = Annotated[float, Meta(ge=-10.0, le=10.0)]
@@ -133,6 +136,9 @@ class AreaDefinition(Message, frozen=True, kw_only=True):
     removed: bool = False
 
 
+MAX_CELLS = 50_000_000
+"""More cells than any map has (350 m x 350 m at 5 cm): a broken or hostile snapshot must not fill the memory."""
+
 # --- Map (zenoh, msgpack) -------------------------------------------------------------------------------------------
 
 
@@ -144,6 +150,10 @@ class MapGeometry(Message, frozen=True, kw_only=True):
     resolution: Annotated[float, Meta(gt=0.0, le=10.0)]
     origin_x: Metres
     origin_y: Metres
+
+    def __post_init__(self) -> None:
+        if self.width * self.height > MAX_CELLS:
+            raise ValueError(f"{self.width} x {self.height} cells are more than {MAX_CELLS}")
 
 
 class Cause(Message, frozen=True, kw_only=True):
@@ -358,7 +368,7 @@ class RobotPose(Message, frozen=True, kw_only=True):
     x: Metres
     y: Metres
     theta: Radians
-    covariance: Annotated[list[float], Meta(min_length=9, max_length=9)]
+    covariance: Annotated[list[Finite], Meta(min_length=9, max_length=9)]
     v: Speed
     w: Speed
     radius: Annotated[float, Meta(gt=0.0, le=2.0)]
@@ -373,8 +383,8 @@ Mode = Literal["INIT", "NORMAL", "DEGRADED", "HOLD", "PROTECTIVE_STOP", "FAULT",
 class LoopHealth(Message, frozen=True, kw_only=True):
     """How well the agent's loops keep their periods (seconds) since its start."""
 
-    control_p99_s: float = 0.0
-    stream_p99_s: float = 0.0
+    control_p99_s: Finite = 0.0
+    stream_p99_s: Finite = 0.0
     late: Count = 0
 
 
@@ -391,7 +401,7 @@ class RobotState(Message, frozen=True, kw_only=True):
     plan_id: Count | None
     planner_epoch: Count | None = None
     goal_reached: bool = False
-    goal_distance: float | None = None
+    goal_distance: Finite | None = None
     loop: LoopHealth = LoopHealth()
     traces: list[Trace] = []
     stamp: Stamp = 0.0

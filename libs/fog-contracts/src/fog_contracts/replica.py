@@ -324,7 +324,7 @@ class Replica:
         assert self.geometry is not None
         parts = [self._parts[index] for index in sorted(self._parts)]
         self._parts = {}
-        windows: list[tuple[Layer, Window]] = []
+        pieces: list[tuple[Layer, Window, Grid]] = []
         for part in parts:
             window = Window(part.x, part.y, part.w, part.h)
             if self.geometry.clip(window) != window:
@@ -334,14 +334,25 @@ class Replica:
             except MapError:
                 # Damaged cells are the same to a replica as lost ones: only a snapshot helps.
                 return self._broken()
-            grid = self.layers[part.layer]
-            grid[window.rows, window.columns] = cells
-            self._hashes.update(part.layer, grid, window)
-            windows.append((part.layer, window))
+            pieces.append((part.layer, window, cells))
+        before = [(layer, window, self._write(layer, window, cells)) for layer, window, cells in pieces]
         if self._hashes.value != delta.hash:
+            # Whoever goes on with the copy while it waits for a snapshot must see the old version, not a mixture.
+            for layer, window, cells in reversed(before):
+                self._write(layer, window, cells)
             return self._broken()
         self.version = Version(delta.epoch, delta.seq, delta.hash)
+        windows = [(layer, window) for layer, window, _ in pieces]
         return Applied(self.version, windows, list(parts[0].causes), list(parts[0].traces))
+
+    def _write(self, layer: Layer, window: Window, cells: Grid) -> Grid:
+        """Write cells and return those that were there."""
+        assert self._hashes is not None
+        grid = self.layers[layer]
+        old = grid[window.rows, window.columns].copy()
+        grid[window.rows, window.columns] = cells
+        self._hashes.update(layer, grid, window)
+        return old
 
     def _broken(self) -> Literal["gap"]:
         self.needs_snapshot = True

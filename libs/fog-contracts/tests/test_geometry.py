@@ -1,0 +1,163 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import strategies as st
+
+from fog_contracts.geometry import (
+    GeometryError,
+    bounding_box,
+    contains_point,
+    distance_to_polygon,
+    normalized_polygon,
+    rasterize,
+    signed_area,
+)
+from fog_contracts.grid import GridGeometry, Window
+
+SQUARE = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)]
+GRID = GridGeometry(40, 30, 0.1, -2.0, -1.0)
+
+
+@st.composite
+def stars(draw):
+    """Simple polygons: vertices at growing angles around a centre, clockwise or not, closed or open."""
+    count = draw(st.integers(3, 12))
+    angles = sorted(draw(st.lists(st.integers(0, 359), min_size=count, max_size=count, unique=True)))
+    gaps = [(b - a) % 360 for a, b in zip(angles, [*angles[1:], angles[0]], strict=True)]
+    assume(max(gaps) < 170)
+    x, y = draw(st.floats(-3, 3)), draw(st.floats(-2, 3))
+    ring = []
+    for angle in angles:
+        radius = draw(st.floats(0.2, 1.5))
+        ring.append((x + radius * math.cos(math.radians(angle)), y + radius * math.sin(math.radians(angle))))
+    if draw(st.booleans()):
+        ring.reverse()
+    if draw(st.booleans()):
+        ring.append(ring[0])
+    return ring
+
+
+@given(ring=stars())
+def test_normalizing_orients_opens_and_keeps_the_shape(ring):
+    got = normalized_polygon(ring)
+    assert signed_area(got) > 0
+    assert got[0] != got[-1]
+    assert set(got) == set(ring)
+    assert normalized_polygon(got) == got
+    assert signed_area(got) == pytest.approx(abs(signed_area(got[::-1])))
+
+
+@given(ring=stars(), start=st.integers(0, 11))
+def test_where_the_ring_begins_does_not_matter(ring, start):
+    got = normalized_polygon(ring)
+    turned = got[start % len(got) :] + got[: start % len(got)]
+    assert set(normalized_polygon(turned)) == set(got)
+
+
+@pytest.mark.parametrize(
+    ("points", "words"),
+    [
+        ([], "three distinct"),
+        ([(0, 0), (1, 1)], "three distinct"),
+        ([(0, 0), (1, 1), (0, 0)], "three distinct"),
+        ([(0, 0), (1, 1), (2, 2)], "one line"),
+        ([(0, 0), (1, 0), (3, 0), (2, 0)], "one line"),
+        ([(0, 0), (1, 1), (1, 0), (0, 1)], "crosses itself"),  # a bow tie: no area in sum
+        ([(0, 0), (4, 0), (4, 4), (1, -1)], "crosses itself"),
+        ([(0, 0), (2, 0), (2, 2), (1, 0), (0, 2)], "crosses itself"),  # touches its own side
+        ([(0, 0), (2, 0), (1, 0), (1, 1)], "crosses itself"),  # folds back on its own side
+        ([(0, 0), (2, 0), (2, 2), (2, -1)], "crosses itself"),
+        ([(0, 0), (1, 0), (math.nan, 1)], "vertex 2"),
+        ([(0, 0), (1, 0), (math.inf, 1)], "vertex 2"),
+        ([(0, 0), (1, 0), (1, 1, 1)], "vertex 2"),
+    ],
+)
+def test_unusable_polygon_is_refused_in_words(points, words):
+    with pytest.raises(GeometryError, match=words):
+        normalized_polygon(points)
+
+
+def test_straight_vertices_and_shared_doubles_are_fine():
+    assert normalized_polygon([(0, 0), (1, 0), (2, 0), (2, 2), (2, 2), (0, 2)]) == [
+        (0, 0),
+        (1, 0),
+        (2, 0),
+        (2, 2),
+        (0, 2),
+    ]
+
+
+@given(ring=stars())
+def test_raster_holds_every_cell_inside_or_touched_and_no_other(ring):
+    polygon = normalized_polygon(ring)
+    window, mask = rasterize(polygon, GRID)
+    assert GRID.clip(window) == window
+    assert mask.shape == (window.height, window.width) or window.empty
+    drawn = np.zeros(GRID.shape, dtype=bool)
+    if not window.empty:
+        drawn[window.rows, window.columns] = mask
+    reach = GRID.resolution * math.sqrt(0.5)
+    for row in range(0, GRID.height, 2):
+        for column in range(0, GRID.width, 2):
+            distance = distance_to_polygon(polygon, *GRID.centre(column, row))
+            if abs(distance - reach) > 1e-9:
+                assert drawn[row, column] == (distance < reach), (column, row)
+
+
+# Half of all points in a bounding box lie outside the polygon or the grid.
+@settings(suppress_health_check=[HealthCheck.filter_too_much])
+@given(ring=stars(), x=st.floats(0, 1), y=st.floats(0, 1))
+def test_every_point_of_a_polygon_lies_on_a_drawn_cell(ring, x, y):
+    polygon = normalized_polygon(ring)
+    left, bottom, right, top = bounding_box(polygon)
+    px, py = left + x * (right - left), bottom + y * (top - bottom)
+    assume(contains_point(polygon, px, py))
+    assume(GRID.contains(px, py))
+    window, mask = rasterize(polygon, GRID)
+    column, row = GRID.cell(px, py)
+    assert mask[row - window.y, column - window.x]
+
+
+def test_polygon_off_the_grid_has_an_empty_raster():
+    window, mask = rasterize([(x + 100, y) for x, y in SQUARE], GRID)
+    assert window.empty
+    assert mask.size == 0
+
+
+@given(ring=stars(), x=st.floats(-5, 5), y=st.floats(-5, 5))
+def test_distance_is_zero_inside_and_bounded_by_the_vertices_outside(ring, x, y):
+    polygon = normalized_polygon(ring)
+    distance = distance_to_polygon(polygon, x, y)
+    if contains_point(polygon, x, y):
+        assert distance == 0.0
+    assert distance <= min(math.dist((x, y), vertex) for vertex in polygon) + 1e-9
+
+
+@given(column=st.integers(-100, 100), row=st.integers(-100, 100))
+def test_centre_of_a_cell_lies_in_it(column, row):
+    assert GRID.cell(*GRID.centre(column, row)) == (column, row)
+    assert GRID.contains(*GRID.centre(column, row)) == GRID.contains_cell(column, row)
+
+
+windows = st.builds(Window, st.integers(-50, 60), st.integers(-50, 60), st.integers(0, 60), st.integers(0, 60))
+
+
+@given(a=windows, b=windows)
+def test_windows_clip_and_join(a, b):
+    clipped = GRID.clip(a)
+    assert GRID.clip(clipped) == clipped or clipped.empty
+    joined = a.union(b)
+    for part in (a, b):
+        if not part.empty:
+            assert joined.union(part) == joined
+    grid = np.zeros(GRID.shape, dtype=np.uint8)
+    assert grid[clipped.rows, clipped.columns].shape == (clipped.height, clipped.width) or clipped.empty
+
+
+@pytest.mark.parametrize("wrong", [{"width": 0}, {"resolution": 0.0}, {"resolution": math.nan}, {"origin_x": math.inf}])
+def test_impossible_grid_is_refused(wrong):
+    good = {"width": 2, "height": 2, "resolution": 0.1, "origin_x": 0.0, "origin_y": 0.0}
+    with pytest.raises(ValueError, match=r"grid|resolution|origin"):
+        GridGeometry(**{**good, **wrong})

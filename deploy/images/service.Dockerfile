@@ -15,7 +15,7 @@ ARG NAME
 ARG MODULE
 ARG KERNELS=none
 RUN useradd --system --uid 10001 --home-dir /var/lib/fognav --create-home fognav \
-    && mkdir -p /var/cache/fognav && chown fognav: /var/cache/fognav
+    && mkdir -p /var/cache/fognav /run/fognav && chown fognav: /var/cache/fognav /run/fognav
 COPY requirements/${NAME}.txt /tmp/requirements.txt
 RUN pip install --no-cache-dir --require-hashes -r /tmp/requirements.txt
 COPY --from=wheels /wheels /tmp/wheels

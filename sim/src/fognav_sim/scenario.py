@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from fog_contracts.costs import LETHAL
-from fog_contracts.geometry import contains_point
+from fog_contracts.geometry import contains_point, distance_to_polygon
 from fog_contracts.messages import SimObstacle
 from fog_kernels.raycast import cast
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
+
+    from numpy.typing import NDArray
 
     from fog_contracts.site import AreaSite, NodeSite, Site
     from fog_runtime.maps import StaticMap
@@ -47,7 +48,7 @@ class Event:
 
     It is due when the robot has driven `at_distance` (m), when `at_time` (s since the start) has come, or when
     somebody says `on_word`; all that are given must hold. It waits until nothing that it places would stand nearer to
-    the robot than `keep_away` (m).
+    the robot's centre than `keep_away` (m).
     """
 
     name: str
@@ -86,26 +87,27 @@ class Scenario:
         """Let the events that wait for this word come true."""
         self._words.add(word)
 
-    def step(self, world: World) -> list[Happened]:
-        """Let come true what is due now; returns it."""
+    def step(self, world: World, now: float) -> list[Happened]:
+        """Let come true what is due at `now` (s); returns it."""
         happened: list[Happened] = []
         for event in self._waiting[:]:
-            if not self._due(event, world):
+            if not self._due(event, world, now):
                 continue
             for obstacle in event.place:
                 world.place(obstacle)
             for identifier in event.remove:
                 world.remove(identifier)
             self._waiting.remove(event)
-            happened.append(Happened(event.name, world.now - self._start, world.distance - self._begun_at))
+            happened.append(Happened(event.name, now - self._start, world.distance - self._begun_at))
         return happened
 
-    def _due(self, event: Event, world: World) -> bool:
+    def _due(self, event: Event, world: World, now: float) -> bool:
+        x, y, _ = world.pose
         return (
-            world.now - self._start >= event.at_time
+            now - self._start >= event.at_time
             and world.distance - self._begun_at >= event.at_distance
             and (event.on_word is None or event.on_word in self._words)
-            and all(world.distance_to(obstacle) >= event.keep_away for obstacle in event.place)
+            and all(distance_to_polygon(thing.polygon, x, y) >= event.keep_away for thing in event.place)
         )
 
 
@@ -151,7 +153,9 @@ def _before_node(node: NodeSite, static: StaticMap, thickness: float, shift: flo
     return _box(static, x, y, direction, thickness, begin=_SEEN_FROM_M)
 
 
-def _at_narrowest(area: AreaSite, static: StaticMap, thickness: float, share: float) -> list[tuple[float, float]] | None:
+def _at_narrowest(
+    area: AreaSite, static: StaticMap, thickness: float, share: float
+) -> list[tuple[float, float]] | None:
     xs, ys = [x for x, _ in area.polygon], [y for _, y in area.polygon]
     x = min(xs) + share * (max(xs) - min(xs))
     y = min(ys) + share * (max(ys) - min(ys))
@@ -190,6 +194,7 @@ def _box(
     ]
 
 
-def _reach(static: StaticMap, x: float, y: float, angles: np.ndarray[tuple[int], np.dtype[np.float64]]) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+def _reach(static: StaticMap, x: float, y: float, angles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Cast rays that end at whatever is not known to be free floor."""
     grid = static.geometry
-    return cast(static.cells == LETHAL, grid.resolution, grid.origin_x, grid.origin_y, x, y, angles, _REACH_M)
+    return cast(static.cells, grid.resolution, grid.origin_x, grid.origin_y, x, y, angles, _REACH_M)

@@ -161,6 +161,17 @@ def tokens_fixture() -> dict[str, dict[str, str]]:
     return {name: {"Authorization": f"Bearer {token}"} for name, token in (("operator", TOKEN), ("viewer", VIEWER))}
 
 
+@pytest.fixture(scope="module")
+def calm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fog]:
+    """Give a fog with a running map-service to all tests of a module that neither kill nor restart anything."""
+    running = Fog(tmp_path_factory.mktemp("fog"))
+    try:
+        running.start("map_service")
+        yield running
+    finally:
+        running.close()
+
+
 @pytest.fixture
 def fog(tmp_path: Path) -> Iterator[Fog]:
     running = Fog(tmp_path)

@@ -68,9 +68,9 @@ class Robot:
 
 
 @asynccontextmanager
-async def running(fog, *others: str):
-    """Start the map-service (and others); give its client, a robot, and a connected broker's side."""
-    for module in (*others, "map_service"):
+async def running(fog, *modules: str):
+    """Start processes (the map-service among them or before); give its client, a robot, and the broker's side."""
+    for module in modules:
         fog.start(module)
     url = await fog.ready("map_service")
     async with (
@@ -91,7 +91,7 @@ def hazard(state: str, seq: int) -> AreaHazard:
 
 async def test_five_readings_in_the_corridor_become_lethal_cells_at_the_robot(fog, until):
     pytest.importorskip("hazard_aggregator")
-    async with running(fog, "hazard_aggregator") as (_, robot, mqtt):
+    async with running(fog, "hazard_aggregator", "map_service") as (_, robot, mqtt):
         await fog.ready("hazard_aggregator")
         for seq in range(5):
             reading = NodeReading(
@@ -109,7 +109,7 @@ async def test_five_readings_in_the_corridor_become_lethal_cells_at_the_robot(fo
 
 
 async def test_a_map_service_that_never_hears_an_aggregator_calls_nothing_clear(fog, until):
-    async with running(fog) as (client, robot, mqtt):
+    async with running(fog, "map_service") as (client, robot, mqtt):
         await mqtt.publish(ch.AREA_HAZARD, hazard("clear", 1), area="hall")
         ask = partial(client.get, "/api/v1/hazards")
         answer = await first(ask, lambda got: "aggregator is gone" in got.json()[0]["hazard"]["cause"])
@@ -120,7 +120,7 @@ async def test_a_map_service_that_never_hears_an_aggregator_calls_nothing_clear(
 
 
 async def test_a_drawn_zone_reaches_the_robot_and_survives_a_kill(fog, until, tokens):
-    async with running(fog) as (client, robot, _):
+    async with running(fog, "map_service") as (client, robot, _):
         answer = await client.post("/api/v1/zones", json=CIRCLE, headers=tokens["operator"])
         assert answer.status_code == 201, answer.text
         zone = answer.json()
@@ -138,8 +138,8 @@ async def test_a_drawn_zone_reaches_the_robot_and_survives_a_kill(fog, until, to
         assert robot.cost(6.0, 3.0) == LETHAL
 
 
-async def test_zones_are_changed_by_version_and_audited(fog, tokens):
-    async with running(fog) as (client, _, _):
+async def test_zones_are_changed_by_version_and_audited(calm, tokens):
+    async with running(calm) as (client, _, _):
         operator = tokens["operator"]
         body = {**CIRCLE, "id": "wet"}
         assert (await client.post("/api/v1/zones", json=body, headers=operator)).status_code == 201
@@ -154,11 +154,12 @@ async def test_zones_are_changed_by_version_and_audited(fog, tokens):
             assert stale.status_code == 412
             assert stale.headers["content-type"] == "application/problem+json"
         listed = (await client.get("/api/v1/zones")).json()
-        assert ([zone["reason"] for zone in listed["zones"]], listed["active"]) == (["drying"], ["wet"])
+        assert [zone["reason"] for zone in listed["zones"] if zone["id"] == "wet"] == ["drying"]
+        assert "wet" in listed["active"]
         assert (await client.delete("/api/v1/zones/wet", headers=operator)).status_code == 204
         assert (await client.get("/api/v1/zones/wet")).status_code == 404
         entries = (await client.get("/api/v1/audit", headers=tokens["viewer"])).json()
-        assert [(e["who"], e["action"]) for e in entries] == [("anna", a) for a in ("delete", "replace", "create")]
+        assert [(e["who"], e["action"]) for e in entries[:3]] == [("anna", a) for a in ("delete", "replace", "create")]
         assert entries[1]["before"]["reason"] == "wet floor"
 
 
@@ -178,22 +179,18 @@ async def test_a_zone_that_cannot_be_is_refused_by_field(shared, tokens):
         (error,) = answer.json()["errors"]
         assert error["field"] == field
         assert words in error["problem"]
-    assert (await shared.get("/api/v1/zones")).json()["zones"] == []
 
 
 @pytest.fixture
-async def shared(fog):
-    fog.start("map_service")
-    url = await fog.url("map_service")
+async def shared(calm):
+    url = await calm.ready("map_service")
     async with httpx.AsyncClient(base_url=url, timeout=15) as client:
-        await first(partial(client.get, "/api/v1/zones"), lambda answer: answer.status_code == 200)
         yield client
 
 
 async def test_only_operators_write_and_the_interface_is_described(shared, tokens):
     assert (await shared.post("/api/v1/zones", json=CIRCLE)).status_code == 401
     assert (await shared.post("/api/v1/zones", json=CIRCLE, headers=tokens["viewer"])).status_code == 403
-    assert (await shared.get("/api/v1/zones")).json()["zones"] == []
     described = (await shared.get("/openapi.json")).json()
     assert {"/api/v1/zones", "/api/v1/zones/{zone_id}", "/api/v1/hazards", "/api/v1/map"} <= set(described["paths"])
     assert "ZoneBody" in described["components"]["schemas"]
@@ -209,7 +206,7 @@ async def test_only_operators_write_and_the_interface_is_described(shared, token
 async def test_without_redis_zones_stay_writes_wait_and_a_restart_serves_nothing_until_they_are_read(
     fog, until, tokens
 ):
-    async with running(fog) as (client, robot, _):
+    async with running(fog, "map_service") as (client, robot, _):
         assert (await client.post("/api/v1/zones", json=CIRCLE, headers=tokens["operator"])).status_code == 201
         fog.redis.kill()
         refused = await client.post("/api/v1/zones", json={**CIRCLE, "id": "other"}, headers=tokens["operator"])
@@ -237,10 +234,13 @@ async def test_without_redis_zones_stay_writes_wait_and_a_restart_serves_nothing
 
 
 async def test_hazards_are_back_after_the_broker_was_killed_and_garbage_stops_nothing(fog, until):
-    async with running(fog, "hazard_aggregator") as (client, robot, mqtt):
+    async with running(fog, "hazard_aggregator", "map_service") as (client, robot, mqtt):
         await fog.ready("hazard_aggregator")
         await mqtt._client.publish(ch.AREA_HAZARD.key(area="hall"), b"x" * 10_000_000, qos=1, timeout=30)
         await mqtt._client.publish(ch.AREA_DEFINITION.key(area="hall"), json.dumps({"id": "hall"}).encode(), qos=1)
+        refused = ('{channel="area_hazard"} 1.0', '{channel="area_definition"} 1.0')
+        ask = partial(client.get, "/metrics")
+        await first(ask, lambda answer: all(f"fognav_refused_messages_total{line}" in answer.text for line in refused))
         fog.mosquitto.kill()
         (fog.mosquitto.folder / "mosquitto.db").unlink(missing_ok=True)
         fog.mosquitto.start()
@@ -254,21 +254,18 @@ async def test_hazards_are_back_after_the_broker_was_killed_and_garbage_stops_no
             await mqtt.publish(ch.NODE_READING, reading, node="n1")
             await asyncio.sleep(0.02)
         assert robot.cost(3.5, 3.0) == LETHAL, fog.log("map_service")
-        metrics = (await client.get("/metrics")).text
-        assert 'fognav_refused_messages_total{channel="area_hazard"} 1.0' in metrics
-        assert 'fognav_refused_messages_total{channel="area_definition"} 1.0' in metrics
 
 
-async def test_a_robots_obstacles_are_shared_and_vanish(fog, until):
-    async with running(fog) as (_, robot, _):
-        seen = RobotObstacles(points=[(6.0, 3.0)], stamp=1.0, ttl=0.5)
+async def test_a_robots_obstacles_are_shared_and_vanish(calm, until):
+    async with running(calm) as (_, robot, _):
+        seen = RobotObstacles(points=[(1.0, 1.0)], stamp=1.0, ttl=0.5)
         robot.zenoh.publish(ch.ROBOT_OBSTACLES, seen, robot="r1")
-        await until(lambda: robot.cost(6.0, 3.0) == LETHAL, "seen", lambda: fog.log("map_service"))
-        await until(lambda: robot.cost(6.0, 3.0) == 0, "gone")
+        await until(lambda: robot.cost(1.0, 1.0) == LETHAL, "seen", lambda: calm.log("map_service"))
+        await until(lambda: robot.cost(1.0, 1.0) == 0, "gone")
 
 
 async def test_an_aggregator_that_dies_leaves_no_area_clear(fog, until):
-    async with running(fog, "hazard_aggregator") as (_, robot, mqtt):
+    async with running(fog, "hazard_aggregator", "map_service") as (_, robot, mqtt):
         await fog.ready("hazard_aggregator")
         for seq in range(300):
             if robot.cost(3.5, 3.0) == 0:

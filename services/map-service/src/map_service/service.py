@@ -196,6 +196,8 @@ class Service:
             try:
                 if self._in_doubt or not self._zones_read.is_set():
                     await self.read_zones()
+                    if weakness := await self._store.weakness():
+                        _log.warning("store_is_weak", remedy=weakness)
                 else:
                     await self._store.ping()
                     self._health.set("store", ok=True)

@@ -123,7 +123,7 @@ class Store:
         """Return why Redis's acknowledgements can't be trusted, or an empty text (a server may refuse to tell)."""
         try:
             config = await self._redis.config_get("appendonly", "appendfsync")
-        except RedisError:
+        except (RedisError, OSError):
             return ""
         values = {_text(name): _text(value) for name, value in config.items()}
         if values.get("appendonly") != "yes" or values.get("appendfsync") != "always":

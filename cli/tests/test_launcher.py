@@ -17,6 +17,7 @@ def checkout(tmp_path: Path) -> Path:
     for member in ("libs/one", "services/two", "cli"):
         (folder / member).mkdir(parents=True)
         (folder / member / "pyproject.toml").write_text(f'[project]\nname = "{member}"\n')
+    (folder / "cli" / "build.txt").write_text("builder==1 --hash=sha256:0\n")
     shutil.copy(ROOT / "fognav", folder / "fognav")
     tools = tmp_path / "tools"
     tools.mkdir()
@@ -48,7 +49,7 @@ def test_the_first_start_installs_pins_with_hashes_then_the_members(checkout: Pa
     assert done.stdout == "ran: -m fognav doctor --json\n"
     venv, pins, members = uv_log(checkout)
     assert venv.startswith("venv")
-    assert f"--require-hashes -r {checkout}/requirements/dev.txt" in pins
+    assert f"--require-hashes -r {checkout}/requirements/dev.txt -r {checkout}/cli/build.txt" in pins
     assert "--no-deps --no-build-isolation" in members
     for member in ("libs/one", "services/two", "cli"):
         assert f"--editable {checkout}/{member}" in members
@@ -72,7 +73,7 @@ def test_it_works_through_a_relative_symlink_from_another_folder(checkout: Path,
     assert [path.name for path in elsewhere.iterdir()] == ["link"]
 
 
-@pytest.mark.parametrize("changed", ["requirements/dev.txt", "libs/one/pyproject.toml"])
+@pytest.mark.parametrize("changed", ["requirements/dev.txt", "cli/build.txt", "libs/one/pyproject.toml"])
 def test_a_change_of_what_it_was_made_from_sets_it_up_again(checkout: Path, changed: str) -> None:
     start(checkout / "fognav", checkout)
     calls = len(uv_log(checkout))

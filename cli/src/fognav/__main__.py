@@ -110,6 +110,9 @@ def demo_command(
     keep_running: Annotated[
         bool, typer.Option("--keep-running", help="Leave everything running after the drive, until Ctrl-C.")
     ] = False,
+    record: Annotated[
+        Path | None, typer.Option("--record", metavar="F", help="Record every channel to this MCAP file.")
+    ] = None,
     page_port: Annotated[
         int, typer.Option("--page-port", metavar="P", min=0, max=65535, help="Port of the page; 0: any free one.")
     ] = 0,
@@ -128,7 +131,7 @@ def demo_command(
     except WrongUseError as error:
         _fail(str(error), WRONG_USE)
     _prepare(yes=yes)
-    options = Options(seed=seed, speed=speed, hazard=not no_hazard, keep_running=keep_running)
+    options = Options(seed=seed, speed=speed, hazard=not no_hazard, keep_running=keep_running, record=record)
     try:
         values = asyncio.run(run_demo(folder, options, headless=headless, page_port=page_port, say=_say))
         if report is not None:

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import AsyncIterator, Callable, Coroutine
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final
 
 from fog_contracts.messages import SimCommand
@@ -18,6 +19,7 @@ from fognav.demo.judge import Judge, Verdict, hazard_to_path_ms, stages_ms
 from fognav.demo.operator import Operator
 from fognav.demo.scene import Scene
 from fognav.output import WrongUseError
+from fognav.recording import recording
 from fognav.stack import WATCHER, Stack, StackConfig
 from fognav.supervisor import Event
 
@@ -51,6 +53,7 @@ class Options:
     speed: float = 1.0
     hazard: bool = True
     keep_running: bool = False
+    record: Path | None = None
 
 
 class _TooFastError(Exception):
@@ -155,19 +158,27 @@ class Demo:
                 self.scene.say("the site's [demo] lists no areas: nothing will be blocked")
             self.scene.say(f"starting {len(stack.supervisor.names)} processes, logs in {stack.folder / 'logs'}")
             await stack.start(READY_S)
-            async with ZenohEdge.open(
-                connect=[stack.zenoh_endpoint],
-                clock=clock,
-                role="console",
-                id="demo",
-                site=self.site.site.id,
-            ) as edge:
+            async with contextlib.AsyncExitStack() as ends:
+                edge = await ends.enter_async_context(self._open(stack, clock, "demo"))
+                if self.options.record is not None:
+                    # A session of its own: what is recorded is what any listener hears.
+                    ears = await ends.enter_async_context(self._open(stack, clock, "record"))
+                    numbers = [area.number for area in self.site.site.areas if area.number is not None]
+                    await ends.enter_async_context(
+                        recording(
+                            self.options.record, mqtt_url=stack.mqtt_url, zenoh=ears, clock=clock, numbers=numbers
+                        )
+                    )
                 operator = Operator(edge, stack, self.scene, clock)
                 async with _background(operator.keep_enabled(), self._sample(stack)) as tasks:
                     await self._drive(operator, clock, tasks)
                     if self.options.keep_running:
                         self.scene.say("still running: Ctrl-C ends everything")
                         await stop.wait()
+
+    def _open(self, stack: Stack, clock: SystemClock, name: str) -> contextlib.AbstractAsyncContextManager[ZenohEdge]:
+        site = self.site.site.id
+        return ZenohEdge.open(connect=[stack.zenoh_endpoint], clock=clock, role="console", id=name, site=site)
 
     def _on_process(self, event: Event) -> None:
         if event.what == "died":

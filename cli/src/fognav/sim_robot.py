@@ -1,0 +1,176 @@
+"""A simulated robot for a fog node that runs elsewhere: `python -m fognav.sim_robot`, as in docker-compose.yml.
+
+Runs simulator, watcher, guardian and agent as one unit, because ptys don't cross containers, and acts as the operator:
+it enables the robot whenever that asks for it, and sends it back and forth between the demo's two places.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import secrets
+import sys
+import urllib.error
+import urllib.request
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from fog_contracts import channels as ch
+from fog_contracts.codec import ContractError
+from fog_contracts.commands import sign
+from fog_contracts.messages import CommandReply, RobotCommand, RobotState
+from fog_runtime import logs, process
+from fog_runtime.clock import SystemClock, ticker
+from fog_runtime.settings import CommonSettings, SettingsError, describe, load
+from fog_runtime.site import load_site
+from fog_runtime.zenoh_edge import ZenohEdge
+from fognav.supervisor import Event, Program, Supervisor
+
+_LOOK_S: Final = 1.0
+_TIMEOUT_S: Final = 5.0
+_log = logs.get("sim-robot")
+
+
+class Settings(CommonSettings, frozen=True, kw_only=True):
+    """What the unit needs to know besides what all processes do."""
+
+    run_dir: Path
+    planner_url: str
+    token_file: Path
+    robot: str = ""
+    seed: int = 1
+    agent_http_port: int = 9100
+
+
+class _Drive:
+    """The operator's part: what the robot last said, and where it is to go next."""
+
+    def __init__(self, settings: Settings, robot: str, places: tuple[str, str], edge: ZenohEdge) -> None:
+        self._settings = settings
+        self._robot = robot
+        self._places = places
+        self._edge = edge
+        self._clock = SystemClock(settings.speed)
+        assert settings.operator_key_file is not None
+        self._key = bytes.fromhex(settings.operator_key_file.read_text("ascii"))
+        self._token = settings.token_file.read_text("ascii").strip()
+        self._state = edge.latest(ch.ROBOT_STATE, RobotState, robot=robot)
+        self._legs = 0
+        self._sent = False
+
+    async def run(self) -> None:
+        """Enable and send, once a second as needed, until cancelled."""
+        async for _ in ticker(self._clock, _LOOK_S):
+            state = self._state.get()
+            if state is None:
+                continue
+            if not state.enabled or state.mode == "INIT":
+                await self._enable()
+            elif self._sent and state.goal_reached:
+                self._sent = False
+                self._legs += 1
+                _log.info("arrived", place=self._next_place(-1), legs=self._legs)
+            if state.enabled and not self._sent:
+                await self._send()
+
+    def _next_place(self, ahead: int = 0) -> str:
+        return self._places[(self._legs + ahead + 1) % 2]
+
+    async def _enable(self) -> None:
+        unsigned = RobotCommand(
+            kind="enable",
+            robot=self._robot,
+            operator="sim-robot",
+            nonce=secrets.token_hex(16),
+            issued_at=self._clock.stamp(),
+        )
+        try:
+            command = sign(unsigned, self._key)
+            reply = await self._edge.ask(ch.ROBOT_COMMAND, command, CommandReply, _TIMEOUT_S, robot=self._robot)
+        except ContractError as error:
+            _log.warning("enable_failed", reason=str(error))
+            return
+        _log.info("enable", accepted=reply is not None and reply.accepted, reason=reply.reason if reply else "silent")
+
+    async def _send(self) -> None:
+        place = self._next_place()
+        try:
+            await asyncio.to_thread(self._put_goal, place)
+        except (OSError, urllib.error.URLError) as error:
+            _log.warning("goal_failed", place=place, reason=str(error), url=self._settings.planner_url)
+            return
+        self._sent = True
+        _log.info("goal", place=place)
+
+    def _put_goal(self, place: str) -> None:
+        request = urllib.request.Request(  # noqa: S310  # the address is the operator's own setting
+            f"{self._settings.planner_url}/api/v1/robots/{self._robot}/goal",
+            data=msgspec.json.encode({"place": place}),
+            method="PUT",
+            headers={"Content-Type": "application/json", "Authorization": f"Bearer {self._token}"},
+        )
+        with urllib.request.urlopen(request, timeout=_TIMEOUT_S) as answer:  # noqa: S310  # same
+            answer.read()
+
+
+def _programs(settings: Settings, robot: str) -> list[Program]:
+    run = settings.run_dir
+    logs_folder = run / "logs"
+    own = {
+        "RUN_DIR": run / "wires",
+        "BASE_PORT": run / "wires" / "roomba",
+        "LIDAR_PORT": run / "wires" / "lidar",
+        "GUARDIAN_SOCKET": run / "guardian.sock",
+        "ROBOT": robot,
+    }
+    programs = []
+    for name, module, http_port in (
+        ("simulator", "fognav_sim", 0),
+        ("watcher", "robot_agent.watcher", 0),
+        ("robot-agent", "robot_agent", settings.agent_http_port),
+    ):
+        data = settings.data_dir / name
+        for folder in (data, logs_folder, run / "wires"):
+            folder.mkdir(parents=True, exist_ok=True)
+        mine = {**own, "DATA_DIR": data, "HTTP_PORT": http_port}
+        environment = {**os.environ, **{f"FOGNAV_{key}": str(value) for key, value in mine.items()}}
+        arguments = (sys.executable, "-m", module)
+        programs.append(Program(name=name, arguments=arguments, log=logs_folder / name, environment=environment))
+    return programs
+
+
+def _say(event: Event) -> None:
+    _log.info(event.what, program=event.program, detail=event.detail)
+
+
+async def main() -> None:
+    """Start the robot's programs and drive until told to end."""
+    settings = load(Settings, environ=os.environ)
+    logs.configure("sim-robot", settings.log_level, settings.log_format)
+    _log.info("settings", **describe(settings))
+    site = load_site(settings.site_dir).site
+    if site.demo is None or not site.robots:
+        raise SettingsError(f"{settings.site_dir}/site.toml needs [demo] and one of [[robots]] for a simulated drive")
+    if settings.operator_key_file is None:
+        raise SettingsError("FOGNAV_OPERATOR_KEY_FILE is missing: name the site's operator.key")
+    robot = settings.robot or site.robots[0].id
+    async with (
+        ZenohEdge.open(
+            connect=settings.zenoh_endpoints,
+            clock=SystemClock(settings.speed),
+            role="sim-robot",
+            id=robot,
+            site=settings.site or site.id,
+        ) as edge,
+        Supervisor(_say) as supervisor,
+    ):
+        for program in _programs(settings, robot):
+            supervisor.add(program)
+            supervisor.start(program.name)
+        await _Drive(settings, robot, (site.demo.start, site.demo.goal), edge).run()
+
+
+if __name__ == "__main__":
+    process.run(main)

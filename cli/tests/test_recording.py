@@ -1,0 +1,70 @@
+import asyncio
+from pathlib import Path
+
+import pytest
+
+from fog_contracts import channels as ch
+from fog_contracts.messages import AreaHazard, RobotPose
+from fog_runtime.clock import SystemClock
+from fog_runtime.mqtt_edge import MqttEdge
+from fog_runtime.zenoh_edge import ZenohEdge
+from fognav import recording
+from fognav.output import WrongUseError
+from fognav.stack import BROKER, ROUTER, Stack, StackConfig
+
+pytestmark = pytest.mark.live
+TIMEOUT_S = 15.0
+
+HAZARD = AreaHazard(area="z1", state="clear", severity=0, penalty=0, since=1.0, seq=1, epoch=1, cause="test")
+POSE = RobotPose(x=1.0, y=2.0, theta=0.5, covariance=[0.0] * 9, v=0.1, w=0.0, radius=0.17, height=0.35, stamp=1.0)
+
+
+async def record_some(file: Path, mqtt: MqttEdge, zenoh: ZenohEdge, mqtt_url: str) -> dict[str, int]:
+    """Record until both kinds are in the file: nobody says when a subscription has reached the router."""
+    while True:
+        async with recording.recording(file, mqtt_url=mqtt_url, zenoh=zenoh, clock=SystemClock()):
+            for _ in range(10):
+                await mqtt.publish(ch.AREA_HAZARD, HAZARD, area="z1")
+                zenoh.publish(ch.ROBOT_POSE, POSE, robot="r1")
+                await asyncio.sleep(0.05)
+        held = recording.summary(file)["messages"]
+        assert isinstance(held, dict)
+        if set(held) == {"area_hazard", "robot_pose"}:
+            return held
+
+
+async def test_what_crosses_both_transports_is_recorded_and_sent_again(tmp_path: Path) -> None:
+    file = tmp_path / "run.mcap"
+    clock = SystemClock()
+    async with Stack(StackConfig(site_dir=tmp_path, robot="r1")) as stack, asyncio.timeout(3 * TIMEOUT_S):
+        for name in (BROKER, ROUTER):
+            stack.supervisor.start(name)
+        await stack.supervisor.wait_ready([BROKER, ROUTER], TIMEOUT_S)
+        heard: asyncio.Queue[object] = asyncio.Queue()
+        mqtt = MqttEdge(stack.mqtt_url, "test", clock)
+        mqtt.on(ch.AREA_HAZARD, lambda _, hazard: heard.put_nowait(hazard), AreaHazard)
+        opened = ZenohEdge.open(connect=[stack.zenoh_endpoint], clock=clock, role="console", id="test", site="here")
+        async with opened as zenoh:
+            task = asyncio.create_task(mqtt.run())
+            await mqtt.wait_connected()
+            held = await record_some(file, mqtt, zenoh, stack.mqtt_url)
+            while not heard.empty():
+                heard.get_nowait()
+            zenoh.subscribe(ch.ROBOT_POSE, RobotPose, lambda _, pose: heard.put_nowait(pose))
+            told = await recording.play(
+                file, mqtt_url=stack.mqtt_url, zenoh_endpoint=stack.zenoh_endpoint, site="here", speed=2.0
+            )
+            assert told["sent"] == sum(held.values())
+            again = set()
+            while len(again) < 2:
+                again.add(type(await heard.get()))
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+    assert again == {AreaHazard, RobotPose}
+
+
+def test_a_file_that_is_no_recording_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "notes.mcap"
+    file.write_text("not a recording, but long enough to be one")
+    with pytest.raises(WrongUseError, match=r"notes\.mcap"):
+        recording.summary(file)

@@ -1,0 +1,273 @@
+"""A robot in a tiny world: emulated base and lidar on ptys, a zenoh router, and a map-service and planner by hand.
+
+The world lives in a thread; the robot's three processes are the real ones.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+import os
+import subprocess
+import sys
+import threading
+import time
+import urllib.error
+import urllib.request
+import uuid
+from contextlib import ExitStack
+from typing import TYPE_CHECKING
+
+import numpy as np
+from guardian_rig import DEADLINE_S, Base, Watcher
+from little_world import KEY, L_PATH, L_ROOMS, grid_of
+
+from fog_contracts import channels as ch
+from fog_contracts.commands import sign
+from fog_contracts.messages import (
+    CommandReply,
+    Pose,
+    RobotCommand,
+    RobotGoal,
+    RobotObstacles,
+    RobotPath,
+    RobotPose,
+    RobotState,
+)
+from fog_contracts.replica import MasterMap
+from fog_kernels.inflation import inflate, inflation_table
+from fog_kernels.raycast import cast
+from fog_runtime.clock import SystemClock
+from fog_runtime.zenoh_edge import ZenohEdge
+from fognav_sim.wire.pty_port import PtyPort
+from fognav_sim.wire.rplidar import RplidarEmulator
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from fog_runtime.slots import Slot
+
+SITE = "lab"
+ROBOT = "r1"
+AXLE = 0.235
+
+
+class Body(Base):
+    """The base and the lidar of a robot that stands in the L of corridors."""
+
+    def __init__(self, folder: Path, pose=(2.0, 2.0, 0.0)) -> None:
+        super().__init__(folder / "roomba")
+        self.static, self.geometry = grid_of(L_ROOMS, 15.0, 12.0)
+        self.solid = (self.static == 254).astype(np.uint8)
+        self.pose = pose
+        self.scanner = RplidarEmulator(self._measure)
+        self.lidar_link = folder / "lidar"
+        self.lidar_port = PtyPort(self.lidar_link)
+        self._rng = np.random.default_rng(3)
+        self._world = threading.Thread(target=self._turn, daemon=True)
+
+    def __enter__(self):
+        super().__enter__()
+        self._world.start()
+        return self
+
+    def __exit__(self, *details):
+        super().__exit__(*details)
+        self._world.join()
+        self.lidar_port.close()
+
+    def _measure(self, angles, _at):
+        g, (x, y, theta) = self.geometry, self.pose
+        ranges = cast(self.solid, g.resolution, g.origin_x, g.origin_y, x, y, angles + theta, 12.0)
+        return ranges + 0.01 * self._rng.standard_normal(len(ranges))
+
+    def _turn(self) -> None:
+        before = time.monotonic()
+        while not self._ends.wait(0.01):
+            now = time.monotonic()
+            left, right = self.speeds
+            x, y, theta = self.pose
+            way, turned = (left + right) / 2 * (now - before), (right - left) / AXLE * (now - before)
+            middle = theta + turned / 2
+            self.pose = (x + way * math.cos(middle), y + way * math.sin(middle), theta + turned)
+            if data := self.lidar_port.read():
+                self.scanner.receive(data, now)
+            self.lidar_port.write(self.scanner.outgoing(now))
+            before = now
+
+
+class Fog:
+    """What the robot hears of the fog: a map with its heartbeat, and a planner that knows one path."""
+
+    def __init__(self, edge: ZenohEdge, clock: SystemClock, body: Body) -> None:
+        self.edge = edge
+        self.clock = clock
+        table = inflation_table(body.geometry.resolution, 0.17, 0.55, 6.0)
+        cost = inflate(body.static.copy(), table)
+        self.master = MasterMap(SITE, body.geometry, body.static, cost, epoch=7)
+        self.goal: RobotGoal | None = None
+        self.points: list[tuple[float, float]] = []
+        self.serves = True
+        self.snapshots = 0
+        self.states: list[RobotState] = []
+        self.poses: Slot[RobotPose] = edge.latest(ch.ROBOT_POSE, RobotPose, robot=ROBOT)
+        self.obstacles: Slot[RobotObstacles] = edge.latest(ch.ROBOT_OBSTACLES, RobotObstacles, robot=ROBOT)
+        edge.subscribe(ch.ROBOT_STATE, RobotState, lambda _, state: self.states.append(state), robot=ROBOT)
+        edge.serve(ch.MAP_SNAPSHOT, self._snapshot)
+
+    def _snapshot(self, _ids, _request):
+        self.snapshots += 1
+        return self.master.snapshot()
+
+    @property
+    def state(self) -> RobotState | None:
+        return self.states[-1] if self.states else None
+
+    async def run(self) -> None:
+        beats = 0
+        while True:
+            beats += 1
+            if self.serves:
+                self.edge.publish(ch.MAP_HEARTBEAT, self.master.heartbeat(self.clock.stamp()))
+                if self.goal is not None and beats % 5 == 0:
+                    self.plan()
+            await asyncio.sleep(0.1)
+
+    def plan(self) -> None:
+        version = self.master.version
+        self.edge.publish(ch.ROBOT_GOAL, self.goal, robot=ROBOT)
+        path = RobotPath(
+            plan_id=1,
+            planner_epoch=3,
+            goal_id=self.goal.goal_id,
+            points=self.points,
+            map_epoch=version.epoch,
+            map_seq=version.seq,
+            released_length=1e3,
+            stamp=self.clock.stamp(),
+        )
+        self.edge.publish(ch.ROBOT_PATH, path, robot=ROBOT)
+
+    def send_robot_to_the_corner(self) -> None:
+        self.points = L_PATH[:3]
+        x, y = self.points[-1]
+        self.goal = RobotGoal(goal_id="g1", pose=Pose(x=x, y=y, theta=0.0), stamp=self.clock.stamp())
+        self.plan()
+
+    async def command(self, kind: str, *, key: bytes = KEY) -> CommandReply | None:
+        unsigned = RobotCommand(
+            kind=kind, robot=ROBOT, operator="ann", nonce=uuid.uuid4().hex, issued_at=self.clock.stamp()
+        )
+        return await self.edge.ask(ch.ROBOT_COMMAND, sign(unsigned, key), CommandReply, 3.0, robot=ROBOT)
+
+
+class AgentProcess:
+    """`python -m robot_agent`."""
+
+    def __init__(self, folder: Path, router: str, watcher: Watcher, body: Body, start=(2.0, 2.0, 0.0)) -> None:
+        self.log_file = folder / "agent.log"
+        self.data = folder / "data"
+        self._port_file = folder / "agent.port"
+        site, key = folder / "site", folder / "operator.key"
+        site.mkdir(exist_ok=True)
+        x, y, theta = start
+        start_pose = f"start = {{ x = {x}, y = {y}, theta = {theta} }}"
+        (site / "site.toml").write_text(f'id = "{SITE}"\n[[robots]]\nid = "{ROBOT}"\n{start_pose}\n')
+        key.write_text(KEY.hex() + "\n")
+        self._environment = {
+            **os.environ,
+            "FOGNAV_ROBOT": ROBOT,
+            "FOGNAV_SITE_DIR": str(site),
+            "FOGNAV_DATA_DIR": str(self.data),
+            "FOGNAV_LIDAR_PORT": str(body.lidar_link),
+            "FOGNAV_GUARDIAN_SOCKET": str(watcher.socket),
+            "FOGNAV_OPERATOR_KEY_FILE": str(key),
+            "FOGNAV_ZENOH_CONNECT": router,
+            "FOGNAV_PORT_FILE": str(self._port_file),
+            "FOGNAV_SEED": "1",
+        }
+        self.process: subprocess.Popen[bytes] | None = None
+
+    def __enter__(self):
+        self.start()
+        return self
+
+    def start(self) -> None:
+        self._port_file.unlink(missing_ok=True)
+        with self.log_file.open("ab") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "robot_agent"], env=self._environment, stderr=log, stdout=log
+            )
+
+    def __exit__(self, *_):
+        if self.process.poll() is None:
+            self.process.terminate()
+        try:
+            self.process.wait(10.0)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+
+    def get(self, path: str) -> tuple[int, str]:
+        """GET from the agent's health server; status 0 while it is not there."""
+        try:
+            port = int(self._port_file.read_text())
+            with urllib.request.urlopen(f"http://127.0.0.1:{port}{path}", timeout=2.0) as answer:
+                return answer.status, answer.read().decode()
+        except urllib.error.HTTPError as error:
+            with error:
+                return error.code, error.read().decode()
+        except (OSError, ValueError):
+            return 0, ""
+
+    @property
+    def events(self) -> list[dict]:
+        return [json.loads(line) for line in self.log_file.read_text().splitlines() if line.startswith("{")]
+
+
+async def until(condition, what: str, deadline_s: float = DEADLINE_S):
+    end = time.monotonic() + deadline_s
+    while time.monotonic() < end:
+        if value := condition():
+            return value
+        await asyncio.sleep(0.01)
+    raise AssertionError(f"not within {deadline_s} s: {what}")
+
+
+class Robot:
+    """All of it, started; `fog` is None until `async with`."""
+
+    def __init__(self, folder: Path, router: str) -> None:
+        self.body = Body(folder)
+        self.watcher = Watcher(folder, self.body.link)
+        self.agent = AgentProcess(folder, router, self.watcher, self.body)
+        self.fog: Fog | None = None
+        self._router = router
+        self._parts = ExitStack()
+
+    async def __aenter__(self):
+        for part in (self.body, self.watcher, self.agent):
+            self._parts.enter_context(part)
+        clock = SystemClock()
+        self._open = ZenohEdge.open(connect=[self._router], clock=clock, role="fog", id="test", site=SITE)
+        edge = await self._open.__aenter__()
+        self.fog = Fog(edge, clock, self.body)
+        self._beats = asyncio.create_task(self.fog.run())
+        return self
+
+    async def __aexit__(self, *details):
+        self._beats.cancel()
+        await asyncio.gather(self._beats, return_exceptions=True)
+        await self._open.__aexit__(*details)
+        await asyncio.to_thread(self._parts.close)
+
+    async def localized(self) -> None:
+        """Wait until the only thing missing is an operator."""
+        waits = ["waiting for an operator to enable"]
+        await until(lambda: self.fog.state and self.fog.state.reasons == waits, "the robot waits for its enable")
+
+    def error(self) -> float:
+        """Metres between where the robot believes to be and where it is."""
+        told, (x, y, _) = self.fog.poses.get(), self.body.pose
+        return math.hypot(told.x - x, told.y - y)

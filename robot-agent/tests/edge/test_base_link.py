@@ -1,0 +1,142 @@
+from __future__ import annotations
+
+import asyncio
+import socket
+import time
+
+import pytest
+from guardian_rig import DEADLINE_S
+
+from fog_runtime.clock import SystemClock
+from robot_agent.base_link import QUIET_S, RESET_VALID_S, BaseLink
+from robot_agent.link import BaseFeedback, WheelCommand, decode_command, encode
+
+pytestmark = pytest.mark.live
+
+FEEDBACK = BaseFeedback(
+    seq=1, left_ticks=5, right_ticks=6, oi_mode=2, bumper=False, cliff=False, wheel_drop=False,
+    battery=0.5, charging=False, fault=None, stopped=None,
+)  # fmt: skip
+
+
+class SkippingClock(SystemClock):
+    """Real time with leaps forward."""
+
+    skipped = 0.0
+
+    def now(self):
+        return super().now() + self.skipped
+
+
+class Guardian:
+    """The other end of the socket."""
+
+    def __init__(self, path):
+        self.path = path
+        self.listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.listener.bind(str(path))
+        self.listener.listen(1)
+        self.listener.settimeout(0)
+        self.link = None
+
+    async def accept(self):
+        self.link, _ = await asyncio.get_running_loop().sock_accept(self.listener)
+        self.link.settimeout(0)
+
+    async def receive(self):
+        data = await asyncio.get_running_loop().sock_recv(self.link, 4096)
+        return decode_command(data)
+
+    def close(self):
+        for end in (self.link, self.listener):
+            if end is not None:
+                end.close()
+        self.path.unlink(missing_ok=True)
+
+
+class Rig:
+    def __init__(self, path):
+        self.path = path
+        self.clock = SkippingClock()
+        self.feedback = []
+        self.losses = []
+        self.link = BaseLink(
+            path, self.clock, lambda feedback, _: self.feedback.append(feedback), lambda _, why: self.losses.append(why)
+        )
+
+    async def until(self, condition):
+        end = time.monotonic() + DEADLINE_S
+        while not condition():
+            assert time.monotonic() < end
+            await asyncio.sleep(0.01)
+
+
+def command(seq=1, **more):
+    return WheelCommand(seq=seq, left=0.1, right=0.2, **more)
+
+
+@pytest.fixture
+async def rig(tmp_path):
+    made = Rig(tmp_path / "guardian.sock")
+    task = asyncio.create_task(made.link.run())
+    yield made
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+
+
+async def test_a_missing_guardian_is_told_and_found_when_it_comes(rig):
+    await rig.until(lambda: rig.losses)
+    assert "does the watcher run?" in rig.losses[0]
+    assert not rig.link.send(command())
+    guardian = Guardian(rig.path)
+    await guardian.accept()
+    await rig.until(lambda: rig.link.send(command(seq=7)))
+    assert (await guardian.receive()).seq == 7
+    guardian.link.send(encode(FEEDBACK))
+    await rig.until(lambda: rig.feedback == [FEEDBACK])
+    guardian.close()
+    await rig.until(lambda: "the guardian closed the link" in rig.losses)
+
+
+async def test_bad_feedback_is_left_out_and_a_quiet_base_is_told(rig):
+    guardian = Guardian(rig.path)
+    await guardian.accept()
+    guardian.link.send(b"\xc1 nonsense")
+    guardian.link.send(encode(FEEDBACK))
+    await rig.until(lambda: rig.feedback == [FEEDBACK])
+    begun = time.monotonic()
+    rig.losses.clear()
+    await rig.until(lambda: rig.losses)
+    assert time.monotonic() - begun > 0.5 * QUIET_S
+    assert "hears nothing from the base" in rig.losses[0]
+    guardian.close()
+
+
+async def test_a_reset_that_met_no_guardian_is_passed_on_soon_after_or_never(rig):
+    rig.link.send(command(reset=True))
+    guardian = Guardian(rig.path)
+    await guardian.accept()
+    await rig.until(lambda: rig.link.send(command()))
+    assert (await guardian.receive()).reset
+    rig.link.send(command())
+    assert not (await guardian.receive()).reset
+    guardian.close()
+    await rig.until(lambda: not rig.link.send(command()))
+    rig.link.send(command(reset=True))
+    rig.clock.skipped = RESET_VALID_S + 0.1
+    guardian = Guardian(rig.path)
+    await guardian.accept()
+    await rig.until(lambda: rig.link.send(command()))
+    assert not (await guardian.receive()).reset
+    guardian.close()
+
+
+async def test_a_guardian_that_does_not_read_never_blocks_the_agent(rig):
+    guardian = Guardian(rig.path)
+    await guardian.accept()
+    await rig.until(lambda: rig.link.send(command()))
+    sent = 0
+    while rig.link.send(command()):
+        sent += 1
+        assert sent < 100_000
+    guardian.close()

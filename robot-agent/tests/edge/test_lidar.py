@@ -1,0 +1,128 @@
+from __future__ import annotations
+
+import asyncio
+import time
+
+import numpy as np
+import pytest
+from guardian_rig import DEADLINE_S
+
+from fog_runtime.clock import SystemClock
+from fognav_sim.wire.pty_port import PtyPort
+from fognav_sim.wire.rplidar import RplidarEmulator
+from robot_agent.drivers import rplidar
+from robot_agent.lidar import ANSWER_S, RESET_S, SILENT_S, STOP_S, LidarEdge, ScanSession
+
+STEP = 0.02
+
+
+def round_room(angles, _at):
+    return 2.0 + 0.5 * np.cos(3 * np.asarray(angles))
+
+
+class Line:
+    """A session and an emulated lidar on one line, in emulated time."""
+
+    def __init__(self):
+        self.device = RplidarEmulator(round_room)
+        self.session = ScanSession()
+        self.now = 50.0
+        self.turns = []
+        self.sent = b""
+        self.cut = False
+        self.write(self.session.begin(self.now))
+
+    def write(self, data):
+        self.sent += data
+        if data and not self.cut:
+            self.device.receive(data, self.now)
+
+    def run(self, seconds):
+        for _ in range(round(seconds / STEP)):
+            self.now += STEP
+            data = self.device.outgoing(self.now)
+            received = self.session.receive(b"" if self.cut else data, self.now)
+            self.turns += received.turns
+            self.write(received.data + self.session.tick(self.now))
+
+
+def test_stop_then_health_then_scan_and_turns_come():
+    line = Line()
+    line.run(2.0)
+    assert line.sent == rplidar.stop() + rplidar.get_health() + rplidar.scan()
+    assert 8 <= len(line.turns) <= 10
+    assert np.nanmax(line.turns[0].ranges_m) == pytest.approx(2.5, abs=0.01)
+    assert line.session.trouble == ""
+
+
+def test_a_lidar_that_scans_already_is_stopped_first_and_its_old_nodes_make_no_turn():
+    line = Line()
+    line.device.receive(rplidar.scan(), line.now)
+    line.run(1.0)
+    assert line.turns
+    assert line.session.incomplete == 0
+    assert all(turn.started_at > 50.0 + STOP_S for turn in line.turns)
+
+
+def test_silence_leads_to_a_new_scan():
+    line = Line()
+    line.run(1.0)
+    line.device.stalled = True
+    line.run(SILENT_S + 0.1)
+    assert "no measurement" in line.session.trouble
+    line.device.stalled = False
+    before = len(line.turns)
+    line.run(1.0)
+    assert len(line.turns) > before
+    assert line.session.trouble == ""
+
+
+def test_a_lidar_that_does_not_answer_is_asked_again_and_again():
+    line = Line()
+    line.cut = True
+    line.run(3 * (ANSWER_S + STOP_S) + 0.2)
+    assert line.sent.count(rplidar.get_health()) >= 3
+    assert "does not answer" in line.session.trouble
+    line.cut = False
+    line.run(3.0)
+    assert line.turns
+
+
+def test_a_lidar_in_error_is_reset_and_tried_again():
+    line = Line()
+    line.device.health, line.device.error_code = 2, 7
+    line.run(0.5)
+    assert line.sent.endswith(rplidar.reset())
+    assert "error 7" in line.session.trouble
+    line.device.health = 0
+    line.run(RESET_S + 1.0)
+    assert line.turns
+
+
+@pytest.mark.live
+async def test_the_edge_waits_for_its_port_and_opens_it_again(tmp_path):
+    link = tmp_path / "lidar"
+    turns = []
+    edge = LidarEdge(str(link), SystemClock(), lambda _: None, lambda turn, _: turns.append(turn))
+    task = asyncio.create_task(edge.run())
+
+    async def until(condition, port=None, device=None):
+        end = time.monotonic() + DEADLINE_S
+        while not condition():
+            assert time.monotonic() < end
+            await asyncio.sleep(0.01)
+            if port is not None:
+                device.receive(port.read(), time.monotonic())
+                port.write(device.outgoing(time.monotonic()))
+
+    try:
+        await until(lambda: "lidar" in edge.trouble and "No such file" in edge.trouble)
+        for _ in range(2):
+            turns.clear()
+            with PtyPort(link) as port:
+                await until(lambda: len(turns) >= 2, port, RplidarEmulator(round_room))
+                assert edge.trouble == ""
+            await until(lambda: edge.trouble)
+    finally:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)

@@ -1,0 +1,154 @@
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+
+import msgspec
+import numpy as np
+import pytest
+from guardian_rig import DEADLINE_S
+from little_world import KEY, LittleWorld
+
+from fog_contracts.grid import Window
+from fog_contracts.messages import MapSnapshot
+from fog_runtime.clock import SystemClock
+from fog_runtime.health import Health
+from robot_agent import service as service_module
+from robot_agent.config import AgentConfig
+from robot_agent.core import AgentCore
+from robot_agent.service import BEHIND_S, Service
+from robot_agent.store import Store
+
+
+class Fog:
+    """A map-service that answers when the test lets it."""
+
+    def __init__(self):
+        self.answers = asyncio.Queue()
+        self.asked = 0
+
+    async def ask(self, _channel, _request, kind, _timeout):
+        assert kind is MapSnapshot
+        self.asked += 1
+        return await self.answers.get()
+
+
+class Link:
+    def __init__(self):
+        self.sent = []
+
+    def send(self, command):
+        self.sent.append((time.monotonic(), command))
+
+
+class Rig:
+    def __init__(self, tmp_path):
+        self.world = LittleWorld()
+        self.master = self.world.master
+        self.fog = Fog()
+        self.core = AgentCore(AgentConfig(robot="r1", operator_key=KEY), seed=1)
+        self.service = Service(
+            self.core, self.fog, Store(tmp_path), SystemClock(), Health(), robot="r1", site=self.master.site
+        )
+        self.changes = 0
+
+    def change(self):
+        self.changes += 1
+        return self.master.write([("cost", Window(3, 3, 2, 2), np.full((2, 2), 100 + self.changes, np.uint8))], [], [])
+
+    def deliver(self, deltas):
+        for delta in deltas:
+            self.service._on_delta({}, delta)
+
+    def beat(self):
+        self.service._on_heartbeat({}, self.master.heartbeat(1.0))
+
+    async def until(self, condition):
+        end = time.monotonic() + DEADLINE_S
+        while not condition():
+            assert time.monotonic() < end
+            await asyncio.sleep(0.01)
+
+
+@pytest.fixture
+def rig(tmp_path):
+    return Rig(tmp_path)
+
+
+@pytest.fixture
+async def mapping(rig):
+    task = asyncio.create_task(rig.service.map_loop())
+    yield rig
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+
+
+async def test_changes_during_the_fetch_of_a_snapshot_are_applied_after_it(mapping):
+    await mapping.until(lambda: mapping.fog.asked == 1)
+    old = mapping.master.snapshot()
+    mapping.deliver(mapping.change())
+    mapping.deliver(mapping.change())
+    mapping.fog.answers.put_nowait(old)
+    await mapping.until(lambda: mapping.core.replica.version == mapping.master.version)
+    assert mapping.fog.asked == 1
+    assert not mapping.core.needs_snapshot
+
+
+async def test_changes_of_a_map_service_that_is_gone_do_not_spoil_the_new_map(mapping):
+    await mapping.until(lambda: mapping.fog.asked == 1)
+    mapping.deliver(mapping.change())
+    fresh = LittleWorld()
+    fresh.master._version = type(fresh.master.version)(8, 0, fresh.master.version.hash)
+    mapping.fog.answers.put_nowait(fresh.master.snapshot())
+    await mapping.until(lambda: mapping.core.replica.version == fresh.master.version)
+    assert not mapping.core.needs_snapshot
+
+
+async def test_a_last_change_that_got_lost_is_noticed_by_the_heartbeat_after_a_grace(mapping):
+    mapping.fog.answers.put_nowait(mapping.master.snapshot())
+    await mapping.until(lambda: mapping.core.replica.version == mapping.master.version)
+    mapping.change()
+    mapping.fog.answers.put_nowait(mapping.master.snapshot())
+    begun = time.monotonic()
+
+    def caught_up():
+        mapping.beat()
+        return mapping.core.replica.version == mapping.master.version
+
+    await mapping.until(caught_up)
+    assert time.monotonic() - begun >= BEHIND_S
+    assert mapping.fog.asked == 2
+
+
+async def test_unanswered_and_damaged_snapshots_are_asked_for_again(mapping):
+    good = mapping.master.snapshot()
+    mapping.fog.answers.put_nowait(None)
+    mapping.fog.answers.put_nowait(msgspec.structs.replace(good, hash=1))
+    mapping.fog.answers.put_nowait(good)
+    await mapping.until(lambda: mapping.core.replica.version is not None)
+    assert mapping.fog.asked == 3
+
+
+async def test_a_decision_that_hangs_leaves_the_stream_alive(rig, monkeypatch):
+    release, begun = threading.Event(), threading.Event()
+
+    def hang(_job):
+        begun.set()
+        release.wait(DEADLINE_S)
+        raise AssertionError("nobody asked for the rest")
+
+    monkeypatch.setattr(service_module, "decide", hang)
+    monkeypatch.setattr(rig.core, "control_job", lambda _now: object())
+    link = Link()
+    tasks = [asyncio.create_task(rig.service.control_loop()), asyncio.create_task(rig.service.stream_loop(link))]
+    try:
+        await rig.until(begun.is_set)
+        before = len(link.sent)
+        await rig.until(lambda: len(link.sent) >= before + 20)
+        assert [command.seq for _, command in link.sent] == list(range(1, len(link.sent) + 1))
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        release.set()

@@ -1,0 +1,73 @@
+from __future__ import annotations
+
+import pytest
+
+from fog_runtime.settings import SettingsError, load
+from robot_agent.settings import Settings, read_operator_key, read_site
+
+SITE = """
+id = "lab"
+[[robots]]
+id = "r1"
+start = { x = 1.0, y = 2.0, theta = 0.5 }
+radius = 0.2
+"""
+
+
+def settings(tmp_path, **more):
+    environ = {
+        "FOGNAV_ROBOT": "r1",
+        "FOGNAV_LIDAR_PORT": "/dev/null",
+        "FOGNAV_GUARDIAN_SOCKET": str(tmp_path / "socket"),
+        "FOGNAV_DATA_DIR": str(tmp_path),
+        **{f"FOGNAV_{name.upper()}": str(value) for name, value in more.items()},
+    }
+    return load(Settings, environ=environ)
+
+
+def test_the_site_folder_tells_id_start_and_body(tmp_path):
+    (tmp_path / "site.toml").write_text(SITE)
+    site, body = read_site(settings(tmp_path, site_dir=tmp_path))
+    assert (site, body.start.x, body.radius) == ("lab", 1.0, 0.2)
+    site, _ = read_site(settings(tmp_path, site_dir=tmp_path, site="other"))
+    assert site == "other"
+
+
+def test_a_robot_without_the_folder_needs_the_id_alone(tmp_path):
+    assert read_site(settings(tmp_path, site="lab")) == ("lab", None)
+    with pytest.raises(SettingsError, match="FOGNAV_SITE "):
+        read_site(settings(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (None, "can't be read"),
+        ("id = ", "site.toml: "),
+        (SITE.replace('"r1"', '"r2"'), "there is no 'r1' .known: r2."),
+        (SITE.replace('"lab"', "3"), "Expected `str`"),
+    ],
+)
+def test_a_wrong_site_file_is_named_with_its_remedy(tmp_path, text, words):
+    if text is not None:
+        (tmp_path / "site.toml").write_text(text)
+    with pytest.raises(SettingsError, match=words):
+        read_site(settings(tmp_path, site_dir=tmp_path))
+
+
+def test_a_robot_id_that_no_channel_could_carry_is_refused(tmp_path):
+    with pytest.raises(SettingsError, match="FOGNAV_ROBOT"):
+        settings(tmp_path, robot="Robot 1")
+
+
+def test_the_operators_key_is_hexadecimal_and_long_enough(tmp_path):
+    file = tmp_path / "key"
+    file.write_text("ab" * 32 + "\n")
+    assert read_operator_key(file) == b"\xab" * 32
+    for text in ("ab" * 31, "no key", "ü" * 64):
+        file.write_text(text)
+        with pytest.raises(SettingsError, match="hexadecimal digits"):
+            read_operator_key(file)
+    for missing in (None, tmp_path / "nowhere"):
+        with pytest.raises(SettingsError, match="openssl rand"):
+            read_operator_key(missing)

@@ -1,0 +1,58 @@
+"""The planner: `python -m planner`, told by FOGNAV_* in the environment. Safe to kill and start at any time."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+
+from fog_runtime import logs, process
+from fog_runtime.clock import SystemClock
+from fog_runtime.health import Health
+from fog_runtime.http import load_tokens, serve
+from fog_runtime.settings import describe, load
+from fog_runtime.site import load_site
+from fog_runtime.zenoh_edge import ZenohEdge
+from planner.api import make_api
+from planner.core import PlannerConfig, PlannerCore
+from planner.service import Service
+from planner.settings import Settings
+from planner.store import Store
+
+_log = logs.get("planner")
+
+
+async def main() -> None:
+    """Connect, read the missions, then plan until cancelled."""
+    settings = load(Settings, environ=os.environ)
+    logs.configure("planner", settings.log_level, settings.log_format)
+    _log.info("settings", **describe(settings))
+    loaded = load_site(settings.site_dir)
+    site = settings.site or loaded.site.id
+    clock = SystemClock(settings.speed)
+    health = Health("store", "goals", "map", "zenoh")
+    config = PlannerConfig(
+        inscribed_radius=settings.inscribed_radius,
+        inflation_radius=settings.inflation_radius,
+        cost_scaling=settings.cost_scaling,
+        release=settings.release_m,
+    )
+    async with (
+        Store(settings.redis_url, site) as store,
+        ZenohEdge.open(connect=settings.zenoh_endpoints, clock=clock, role="planner", id=site, site=site) as zenoh,
+    ):
+        service = Service(PlannerCore(await store.begin_epoch(), config), store, zenoh, clock, health)
+        service.listen()
+        zenoh.alive("planner", site)
+        app = make_api(service, loaded.site, health, load_tokens(settings.tokens_file))
+        try:
+            async with asyncio.TaskGroup() as tasks:
+                tasks.create_task(service.store_loop(), name="store")
+                tasks.create_task(service.map_loop(), name="map")
+                tasks.create_task(service.plan_loop(), name="plan")
+                tasks.create_task(serve(app, settings.http_host, settings.http_port, settings.port_file), name="http")
+        finally:
+            service.close()
+
+
+if __name__ == "__main__":
+    process.run(main)

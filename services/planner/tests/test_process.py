@@ -1,0 +1,290 @@
+"""The planner as a process, between a real router, a real Redis, a map-service and a robot made of edges."""
+
+import asyncio
+import os
+import subprocess
+import sys
+import time
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+
+from fog_contracts import channels as ch
+from fog_contracts.grid import GridGeometry, Window
+from fog_contracts.messages import (
+    AreaHazard,
+    Cause,
+    EgressRequest,
+    HazardArea,
+    MapSnapshot,
+    PlanReply,
+    PlanRequest,
+    Pose,
+    RobotGoal,
+    RobotPath,
+    RobotPose,
+    RobotState,
+    Trace,
+)
+from fog_contracts.replica import MasterMap
+from fog_kernels.inflation import inflate, inflation_table
+from fog_runtime.clock import SystemClock, ticker
+from fog_runtime.http import token_hash
+from fog_runtime.servers import Server, start_redis, start_router
+from fog_runtime.zenoh_edge import ZenohEdge
+
+pytestmark = pytest.mark.live
+
+SITE = """
+id = "test"
+map = "map.yaml"
+[places.left]
+x = 1.0
+y = 7.0
+[places.right]
+x = 19.0
+y = 7.0
+theta = 1.5
+[[robots]]
+id = "r1"
+start = { x = 1.0, y = 7.0, theta = 0.0 }
+"""
+MAP = """
+image: map.pgm
+mode: trinary
+resolution: 0.1
+origin: [0.0, 0.0, 0.0]
+negate: 0
+occupied_thresh: 0.65
+free_thresh: 0.196
+"""
+OPERATOR = {"Authorization": "Bearer operator-token"}
+VIEWER = {"Authorization": "Bearer viewer-token"}
+UPPER = [(9.0, 10.0), (11.0, 10.0), (11.0, 12.0), (9.0, 12.0)]
+
+
+def static_map() -> np.ndarray[tuple[int, int], np.dtype[np.uint8]]:
+    cells = np.zeros((120, 200), np.uint8)
+    cells[[0, -1], :] = 254
+    cells[:, [0, -1]] = 254
+    cells[20:100, 20:180] = 254
+    return cells
+
+
+def write_site(folder: Path) -> None:
+    folder.mkdir()
+    (folder / "site.toml").write_text(SITE)
+    (folder / "map.yaml").write_text(MAP)
+    image = np.where(static_map() == 0, 254, 0).astype(np.uint8)[::-1]
+    (folder / "map.pgm").write_bytes(b"P5\n200 120\n255\n" + image.tobytes())
+    tokens = "\n".join(
+        f'[[tokens]]\nname = "{role}"\nrole = "{role}"\nsha256 = "{token_hash(f"{role}-token")}"'
+        for role in ("operator", "viewer")
+    )
+    (folder / "tokens.toml").write_text(tokens)
+
+
+class World:
+    """What stands around the planner."""
+
+    def __init__(self, folder: Path, router: Server, redis: Server, edge: ZenohEdge, clock: SystemClock) -> None:
+        self.folder, self.router, self.redis, self.edge, self.clock = folder, router, redis, edge, clock
+        self.geometry = GridGeometry(200, 120, 0.1, 0.0, 0.0)
+        self.static = static_map()
+        self.table = inflation_table(0.1, 0.17, 0.55, 3.0)
+        self.master = MasterMap("test", self.geometry, self.static, inflate(self.static, self.table), 5)
+        self.paths: list[RobotPath] = []
+        self.goals: list[RobotGoal] = []
+        self.process: subprocess.Popen[bytes] | None = None
+        edge.serve(ch.MAP_SNAPSHOT, lambda _ids, _request: self.master.snapshot())
+        edge.subscribe(ch.ROBOT_PATH, RobotPath, lambda _, path: self.paths.append(path), robot="r1")
+        edge.subscribe(ch.ROBOT_GOAL, RobotGoal, lambda _, goal: self.goals.append(goal), robot="r1")
+
+    def start(self) -> None:
+        port_file = self.folder / "port"
+        port_file.unlink(missing_ok=True)
+        environ = os.environ | {
+            "FOGNAV_SITE_DIR": str(self.folder),
+            "FOGNAV_DATA_DIR": str(self.folder),
+            "FOGNAV_REDIS_URL": self.redis.url,
+            "FOGNAV_ZENOH_CONNECT": self.router.endpoint,
+            "FOGNAV_PORT_FILE": str(port_file),
+            "FOGNAV_TOKENS_FILE": str(self.folder / "tokens.toml"),
+        }
+        with (self.folder / "planner.log").open("ab") as log:
+            self.process = subprocess.Popen([sys.executable, "-m", "planner"], env=environ, stdout=log, stderr=log)
+
+    def stop(self, *, kill: bool = False) -> int:
+        assert self.process
+        (self.process.kill if kill else self.process.terminate)()
+        return self.process.wait(10)
+
+    @asynccontextmanager
+    async def ready(self) -> AsyncIterator[httpx.AsyncClient]:
+        port_file = self.folder / "port"
+        await self.until(port_file.exists)
+        async with httpx.AsyncClient(base_url=f"http://127.0.0.1:{port_file.read_text().strip()}") as client:
+            deadline = time.monotonic() + 15.0
+            while (answer := await client.get("/readyz")).status_code != 200:
+                assert time.monotonic() < deadline, answer.text
+                await asyncio.sleep(0.05)
+            yield client
+
+    async def until(self, what: Callable[[], object], seconds: float = 15.0) -> None:
+        deadline = time.monotonic() + seconds
+        while not what():
+            assert time.monotonic() < deadline, (self.folder / "planner.log").read_text()[-3000:]
+            assert self.process is None or self.process.poll() is None, (self.folder / "planner.log").read_text()
+            await asyncio.sleep(0.01)
+
+    async def beat(self) -> None:
+        async for _ in ticker(self.clock, 0.1):
+            stamp = self.clock.stamp()
+            self.edge.publish(ch.MAP_HEARTBEAT, self.master.heartbeat(stamp))
+            pose = RobotPose(
+                x=1.0, y=7.0, theta=0.0, covariance=[0.0] * 9, v=0.0, w=0.0, radius=0.17, height=0.1, stamp=stamp
+            )
+            self.edge.publish(ch.ROBOT_POSE, pose, robot="r1")
+
+    def block(self) -> None:
+        raw = self.static.copy()
+        raw[100:, 90:110] = 254
+        whole = Window(0, 0, 200, 120)
+        trace = Trace(area="z1", epoch=1, seq=1, confirmed=1.0, costmap_published=self.clock.stamp())
+        causes = [Cause(kind="hazard", id="z1", state="blocked")]
+        for delta in self.master.write([("cost", whole, inflate(raw, self.table))], causes, [trace]):
+            self.edge.publish(ch.MAP_DELTA, delta)
+        hazard = AreaHazard(
+            area="z1", state="blocked", severity=2, penalty=254, since=0.0, seq=1, epoch=1, cause="test"
+        )
+        self.edge.publish(ch.HAZARD, HazardArea(hazard=hazard, polygon=UPPER), area="z1")
+
+    def reached(self, goal_id: str) -> None:
+        state = RobotState(
+            mode="NORMAL", reasons=[], enabled=True, battery=None, goal_id=goal_id, map_epoch=5, map_seq=0, plan_id=1,
+            goal_reached=True,
+        )  # fmt: skip
+        self.edge.publish(ch.ROBOT_STATE, state, robot="r1")
+
+
+@asynccontextmanager
+async def world(folder: Path) -> AsyncIterator[World]:
+    write_site(folder / "site")
+    clock = SystemClock()
+    with start_router(folder / "router") as router, start_redis(folder / "redis") as redis:
+        async with ZenohEdge.open(connect=[router.endpoint], clock=clock, role="test", id="test", site="test") as edge:
+            made = World(folder / "site", router, redis, edge, clock)
+            made.start()
+            beat = asyncio.create_task(made.beat())
+            try:
+                yield made
+            finally:
+                beat.cancel()
+                await asyncio.gather(beat, return_exceptions=True)
+                if made.process and made.process.poll() is None:
+                    made.stop(kill=True)
+
+
+def via(path: RobotPath) -> str:
+    return "upper" if max(y for _, y in path.points) > 10.0 else "lower"
+
+
+async def test_a_mission_is_planned_led_round_a_hazard_survives_a_crash_and_ends_when_reached(tmp_path: Path) -> None:
+    async with world(tmp_path) as here:
+        async with here.ready() as client:
+            answer = await client.put("/api/v1/robots/r1/goal", json={"place": "right"}, headers=OPERATOR)
+            assert answer.status_code == 200
+            goal_id = answer.json()["goal_id"]
+            await here.until(lambda: here.paths and here.goals)
+            assert (here.paths[-1].goal_id, here.goals[-1].goal_id) == (goal_id, goal_id)
+            assert here.paths[-1].goal_theta == 1.5
+            assert via(here.paths[-1]) == "upper"
+
+            here.block()
+            await here.until(lambda: via(here.paths[-1]) == "lower")
+            path = here.paths[-1]
+            assert [trace.area for trace in path.traces] == ["z1"]
+            assert path.traces[0].plan_published >= path.traces[0].costmap_published > 0.0
+            (robot,) = (await client.get("/api/v1/robots")).json()
+            assert (robot["id"], robot["goal"]["goal_id"], robot["pose"]["x"]) == ("r1", goal_id, 1.0)
+            metrics = (await client.get("/metrics")).text
+            assert 'fognav_plans_total{reason="map"} 1.0' in metrics
+            assert 'fognav_stage_seconds_count{stage="plan"} 1.0' in metrics
+
+        here.stop(kill=True)
+        here.paths.clear()
+        here.start()
+        await here.until(lambda: here.paths)
+        assert here.paths[-1].goal_id == goal_id
+        assert here.paths[-1].planner_epoch > path.planner_epoch
+        assert via(here.paths[-1]) == "lower"
+
+        async with here.ready() as client:
+            here.reached(goal_id)
+            await here.until(lambda: here.goals[-1].pose is None)
+            assert (await client.get("/api/v1/robots/r1/goal")).status_code == 404
+            assert here.stop() == 0
+
+
+async def test_what_cannot_be_is_refused_with_a_reason_and_nothing_is_promised_without_a_store(tmp_path: Path) -> None:
+    async with world(tmp_path) as here, here.ready() as client:
+        url = "/api/v1/robots/r1/goal"
+
+        async def put(body: object, headers: dict[str, str] = OPERATOR, url: str = url) -> httpx.Response:
+            return await client.put(url, json=body, headers=headers)
+
+        wall = await put({"pose": {"x": 10.0, "y": 6.0}})
+        assert (wall.status_code, wall.headers["content-type"]) == (422, "application/problem+json")
+        problem = wall.json()
+        assert (problem["code"], problem["name"]) == (206, "GOAL_OCCUPIED")
+        assert problem["errors"][0]["field"] == "body.pose"
+        assert (await put({"pose": {"x": 99.0, "y": 6.0}})).json()["code"] == 204
+        assert (await put({"place": "nowhere"})).json()["errors"][0]["field"] == "body.place"
+        assert (await put({})).status_code == 422
+        assert (await put({"place": "right"}, url="/api/v1/robots/r9/goal")).status_code == 404
+        assert (await put({"place": "right"}, {})).status_code == 401
+        assert (await put({"place": "right"}, VIEWER)).status_code == 403
+        assert (await client.delete(url, headers=OPERATOR)).status_code == 404
+
+        here.redis.stop()
+        unstored = await put({"place": "right"})
+        assert unstored.status_code == 503
+        assert "retry-after" in unstored.headers
+        assert (await client.get(url)).status_code == 404
+        here.redis.start()
+        assert (await put({"place": "right"})).status_code == 200
+        await here.until(lambda: here.paths)
+        assert (await client.delete(url, headers=OPERATOR)).status_code == 204
+        await here.until(lambda: here.goals[-1].pose is None)
+
+
+async def test_questions_are_answered_without_side_effects_over_both_transports(tmp_path: Path) -> None:
+    async with world(tmp_path) as here, here.ready() as client:
+        request = PlanRequest(start=Pose(x=1.0, y=7.0, theta=0.0), goal=Pose(x=19.0, y=7.0, theta=0.0))
+        reply = await here.edge.ask(ch.PLANNER_PLAN, request, PlanReply, 5.0)
+        assert reply
+        assert reply.refusal is None
+        body = {"start": {"x": 1.0, "y": 7.0, "theta": 0.0}, "goal": {"x": 10.0, "y": 6.0, "theta": 0.0}}
+        refused = (await client.post("/api/v1/plan", json=body)).json()
+        assert refused["refusal"]["code"] == 206
+
+        here.block()
+
+        async def way_out() -> PlanReply | None:
+            asked = EgressRequest(robot="r1", pose=Pose(x=9.5, y=11.0, theta=0.0))
+            return await here.edge.ask(ch.PLANNER_EGRESS, asked, PlanReply, 5.0)
+
+        deadline = time.monotonic() + 10.0
+        while not (out := await way_out()) or len(out.points) < 5:
+            assert time.monotonic() < deadline, out
+            await asyncio.sleep(0.05)
+        assert out.points[-1][0] < 9.0
+        assert here.paths == []
+        assert (await client.get("/openapi.json")).status_code == 200
+        snapshot = await here.edge.ask(ch.MAP_SNAPSHOT, None, MapSnapshot, 5.0)
+        assert snapshot
+        assert snapshot.seq == out.map_seq

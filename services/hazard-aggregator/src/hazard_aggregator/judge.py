@@ -19,6 +19,9 @@ CONE_HALF_ANGLE: Final = math.radians(7.5)
 """Half of the beam's width: the HC-SR04 sees 15 degrees (Mendes 2022, section 3.3)."""
 EXPLAINED_WITHIN: Final = 0.3
 """How far (m) a measured range may be from where a robot's rim should be and still be that robot."""
+DOUBT_SIGMAS: Final = 2.0
+DOUBT_LIMIT: Final = 0.3
+"""How far (m) off the beam a robot may be believed that is in it: two standard deviations of its pose, this at most."""
 SHORTEST_RANGE: Final = 0.02
 """Below this (m) an HC-SR04 measures its own ringing (datasheet: 2 cm to 4 m)."""
 LIMIT_TOLERANCE: Final = 0.01
@@ -58,8 +61,9 @@ def judge_sonar(sonar: Sonar, status: str, measured: float | None, shift: float 
 def expected_range(site: NodeSite, sonar: Sonar, pose: RobotPose) -> float | None:
     """Return where (m) this sonar should see the robot's rim, or None when the robot is not in its cone.
 
-    The footprint is a circle; it is in the cone when any part of it is within half the beam's width of the axis. A
-    robot that is lower than the node hangs is not seen.
+    The footprint is a circle; it is in the cone when any part of it may be within half the beam's width of the axis,
+    as far as the robot's own doubt about its pose across the beam goes: along a bare corridor that can be decimetres.
+    A robot that is lower than the node hangs is not seen.
     """
     if site.height >= pose.height:
         return None
@@ -68,9 +72,17 @@ def expected_range(site: NodeSite, sonar: Sonar, pose: RobotPose) -> float | Non
     if distance <= pose.radius:
         return 0.0
     off_axis = abs(math.remainder(math.atan2(dy, dx) - site.theta - sonar.angle, math.tau))
-    if off_axis - math.asin(pose.radius / distance) > CONE_HALF_ANGLE:
+    reach = pose.radius + _doubt_across(pose, -dy / distance, dx / distance)
+    if off_axis - math.asin(min(1.0, reach / distance)) > CONE_HALF_ANGLE:
         return None
     return distance - pose.radius
+
+
+def _doubt_across(pose: RobotPose, nx: float, ny: float) -> float:
+    """Return how far (m) the robot may be off its pose in the direction (nx, ny) of unit length."""
+    xx, xy, yx, yy = pose.covariance[0], pose.covariance[1], pose.covariance[3], pose.covariance[4]
+    variance = nx * nx * xx + nx * ny * (xy + yx) + ny * ny * yy
+    return min(DOUBT_LIMIT, DOUBT_SIGMAS * math.sqrt(max(0.0, variance)))
 
 
 def explaining_robot(

@@ -1,0 +1,281 @@
+"""The system in two halves for one thread and one emulated clock: all real cores, real encoders, decoders and parsers.
+
+Each rig does what the edges of its processes do, in the same order and at the same periods, with messages as the bytes
+of their channels. What it leaves out is what a lockstep cannot have: sockets, threads and the time that computing takes.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, TypeVar
+
+from fog_contracts import channels as ch
+from fog_contracts.codec import decode, encode
+from fog_contracts.commands import sign
+from fog_contracts.messages import (
+    AreaDefinition,
+    AreaHazard,
+    CommandReply,
+    HazardArea,
+    MapDelta,
+    MapHeartbeat,
+    Message,
+    NodeReading,
+    RobotCommand,
+    RobotGoal,
+    RobotObstacles,
+    RobotPath,
+    RobotPose,
+    RobotState,
+    ZoneSet,
+)
+from fognav_sim.hardware import STEP_S, Hardware
+from fognav_sim.node import SonarNode
+from hazard_aggregator.core import Aggregator
+from map_service.core import MapCore
+from planner.core import PlannerCore
+from robot_agent import link
+from robot_agent.config import AgentConfig
+from robot_agent.core import AgentCore, SavedPose, decide
+from robot_agent.guardian_core import GuardianCore
+from robot_agent.lidar import ScanSession
+
+if TYPE_CHECKING:
+    from fog_contracts.channels import Channel
+    from fog_contracts.messages import CommandKind, MapSnapshot
+    from fog_contracts.site import RobotSite
+    from fog_runtime.site import LoadedSite
+    from fognav_sim.world import World
+    from map_service.core import MapChange
+
+M = TypeVar("M", bound=Message)
+
+STAMP: Final = 1_700_000_000.0
+"""Where the emulated wall clock stands at time zero: runs must not depend on when they are made."""
+_KEY: Final = b"lockstep operator key, no secret"
+_GUARDIAN_STEPS: Final = 2
+_LIDAR_STEPS: Final = 2
+_STREAM_STEPS: Final = 5
+_BEAT_STEPS: Final = 10
+_CONTROL_STEPS: Final = 20
+_SECOND_STEPS: Final = 100
+
+
+def carry(channel: Channel, message: M) -> M:
+    """Send a message over its channel: through its bytes, with every limit enforced."""
+    return decode(channel, encode(channel, message), type(message))
+
+
+class RobotRig:
+    """Simulated hardware, guardian and agent of one robot, as its three processes connect them."""
+
+    def __init__(self, site: LoadedSite, robot: RobotSite, world: World, seed: int, start: float) -> None:
+        self.id = robot.id
+        self.world = world
+        self.hardware = Hardware(world, start, left_encoder=65_000, right_encoder=100)
+        self.guardian = GuardianCore()
+        self.agent = AgentCore(
+            AgentConfig(robot=robot.id, operator_key=_KEY, radius=robot.radius, height=robot.height), seed
+        )
+        begin = robot.start
+        self.agent.restore(
+            SavedPose(site=site.site.id, x=begin.x, y=begin.y, theta=begin.theta, sigma_xy=0.25, sigma_theta=0.15)
+        )
+        self._scan = ScanSession()
+        self._to_base = b""
+        self._to_lidar = self._scan.begin(start)
+        self._from_lidar = b""
+        self._steps = 0
+        self._nonce = 0
+        self._obstacles_due = False
+        self.state: RobotState | None = None
+        self.pose: RobotPose | None = None
+
+    @property
+    def now(self) -> float:
+        """The emulated time, s."""
+        return self.hardware.now
+
+    def step(self, load: MapSnapshot | None) -> None:
+        """Let 10 ms pass; `load` is the snapshot to be had, for when the agent needs one."""
+        self._steps += 1
+        self.hardware.receive(self._to_base, self._to_lidar)
+        self._to_base = self._to_lidar = b""
+        base, lidar = self.hardware.step(STEP_S)
+        now = self.now
+        if load is not None and self.agent.needs_snapshot:
+            self.agent.load(load, now)
+        self._guard(base, now)
+        self._look(lidar, now)
+        if self._steps % _CONTROL_STEPS == 0 and (job := self.agent.control_job(now)) is not None:
+            self.agent.accept(decide(job), now)
+        if self._steps % _STREAM_STEPS == 0:
+            command = link.decode_command(link.encode(self.agent.stream(now, STAMP + now)))
+            self._to_base += self.guardian.on_command(command, now).data
+
+    def _guard(self, data: bytes, now: float) -> None:
+        output = self.guardian.on_bytes(data, now)
+        told = list(output.feedback)
+        self._to_base += output.data
+        if self._steps % _GUARDIAN_STEPS == 0:
+            output = self.guardian.tick(now)
+            told += output.feedback
+            self._to_base += output.data
+        for feedback in told:
+            self.agent.on_base(link.decode_feedback(link.encode(feedback)), now)
+
+    def _look(self, data: bytes, now: float) -> None:
+        self._from_lidar += data
+        if self._steps % _LIDAR_STEPS:
+            return
+        received = self._scan.receive(self._from_lidar, now)
+        self._from_lidar = b""
+        if received.nodes:
+            self.agent.on_lidar_nodes(now)
+        for turn in received.turns:
+            self.agent.on_turn(turn, now)
+        self._to_lidar += received.data + self._scan.tick(now)
+
+    def tell(self) -> tuple[RobotPose | None, RobotState | None, RobotObstacles | None]:
+        """Return what the agent publishes in this step: pose at 10 Hz, state at 10 Hz at most, obstacles at 1 Hz."""
+        if self._steps % _BEAT_STEPS:
+            return None, None, None
+        now = self.now
+        pose = self.agent.pose(STAMP + now, now)
+        state = carry(ch.ROBOT_STATE, self.agent.state(STAMP + now, now))
+        self.pose = None if pose is None else carry(ch.ROBOT_POSE, pose)
+        self.state = state
+        obstacles = self.agent.obstacles(now, STAMP + now) if self._steps % _SECOND_STEPS == 0 else None
+        return self.pose, state, None if obstacles is None else carry(ch.ROBOT_OBSTACLES, obstacles)
+
+    def command(self, kind: CommandKind) -> CommandReply:
+        """Give an operator's signed command."""
+        self._nonce += 1
+        unsigned = RobotCommand(
+            kind=kind,
+            robot=self.id,
+            operator="lockstep",
+            nonce=f"lockstep-{self._nonce:08d}",
+            issued_at=STAMP + self.now,
+        )
+        command = carry(ch.ROBOT_COMMAND, sign(unsigned, _KEY))
+        return self.agent.on_command(command, self.now, STAMP + self.now)
+
+
+class FogRig:
+    """Sensor nodes, aggregator, map-service and planner, as their processes connect them."""
+
+    def __init__(self, site: LoadedSite, world: World, seed: int, start: float) -> None:
+        definitions = site.site.definitions()
+        self.world = world
+        # Each node was switched on at a time of its own.
+        self.nodes = [
+            SonarNode(node, boot=seed + index, start=start + 0.013 * (index % 8))
+            for index, node in enumerate(site.site.nodes)
+        ]
+        self.aggregator = Aggregator(definitions, site.site.nodes, epoch=1)
+        self.map = MapCore(site.site.id, site.map, epoch=1, definitions=definitions)
+        self.planner = PlannerCore(epoch=1)
+        self.hazards: dict[str, HazardArea] = {}
+        self._told: list[HazardArea] = []
+        self._deltas: list[MapDelta] = []
+        self._heartbeats: list[MapHeartbeat] = []
+        self._zones: list[ZoneSet] = []
+        self._steps = 0
+        self._change(self.map.on_aggregator(present=True, stamp=STAMP + start))
+        for definition in definitions:
+            taken = carry(ch.AREA_DEFINITION, definition)
+            assert isinstance(taken, AreaDefinition)
+            self._change(self.map.on_definition(taken, STAMP + start))
+        self.planner.load(self.map.snapshot())
+
+    @property
+    def snapshot(self) -> MapSnapshot:
+        """The map-service's snapshot."""
+        return self.map.snapshot()
+
+    def step(self, now: float) -> None:
+        """Let time pass up to `now`: nodes measure, and every 0.1 s aggregator, map-service and planner beat."""
+        self._steps += 1
+        stamp = STAMP + now
+        for node in self.nodes:
+            for reading in node.poll(self.world, now):
+                told = carry(ch.NODE_READING, reading)
+                assert isinstance(told, NodeReading)
+                self._hazards(self.aggregator.on_reading(node.node.id, told, now, stamp), now)
+        if self._steps % _BEAT_STEPS == 0:
+            self._hazards(self.aggregator.tick(now, stamp), now)
+            self._change(self.map.tick(now, stamp))
+            self._heartbeats.append(carry(ch.MAP_HEARTBEAT, self.map.heartbeat(stamp)))
+        self._plan_inputs(now)
+
+    def _plan_inputs(self, now: float) -> None:
+        """Give the planner the map's news; the robot gets the same from `deliver`."""
+        planner = self.planner
+        for told in self._told:
+            planner.on_hazard(told)
+        for zones in self._zones:
+            planner.on_zones(zones)
+        for delta in self._deltas:
+            planner.on_delta(delta, now)
+        for heartbeat in self._heartbeats:
+            planner.on_heartbeat(heartbeat, now)
+        if planner.needs_snapshot:
+            planner.load(self.map.snapshot())
+        for job in planner.field_jobs():
+            job.run()
+            planner.take_field(job)
+
+    def hear(
+        self, robot: str, told: tuple[RobotPose | None, RobotState | None, RobotObstacles | None], now: float
+    ) -> None:
+        """Take what a robot publishes."""
+        pose, state, obstacles = told
+        if pose is not None:
+            self._hazards(self.aggregator.on_pose(robot, pose, now), now)
+            self.map.on_pose(robot, pose, now)
+            self.planner.on_pose(robot, pose, now)
+        if state is not None:
+            self.planner.on_state(robot, state, now)
+        if obstacles is not None:
+            self._change(self.map.on_obstacles(robot, obstacles, now, STAMP + now))
+
+    def deliver(self, robot: RobotRig) -> list[RobotPath | RobotGoal]:
+        """Bring the robot what the fog published since the last time; return its paths and goals."""
+        now, stamp, agent = robot.now, STAMP + robot.now, robot.agent
+        for told in self._told:
+            agent.on_hazard(told, now)
+        for zones in self._zones:
+            agent.on_zones(zones, now)
+        for delta in self._deltas:
+            agent.on_delta(delta, now)
+        for heartbeat in self._heartbeats:
+            agent.on_heartbeat(heartbeat, now)
+        self._told, self._zones, self._deltas, self._heartbeats = [], [], [], []
+        published: list[RobotPath | RobotGoal] = []
+        for name, message in self.planner.tick(now, stamp):
+            if name != robot.id:
+                continue
+            if isinstance(message, RobotPath):
+                path = carry(ch.ROBOT_PATH, message)
+                agent.on_path(path, now, stamp)
+                published.append(path)
+            else:
+                goal = carry(ch.ROBOT_GOAL, message)
+                agent.on_goal(goal, now)
+                published.append(goal)
+        return published
+
+    def _hazards(self, changed: list[AreaHazard], now: float) -> None:
+        for hazard in changed:
+            taken = carry(ch.AREA_HAZARD, hazard)
+            assert isinstance(taken, AreaHazard)
+            self._change(self.map.on_hazard(taken, STAMP + now))
+
+    def _change(self, change: MapChange) -> None:
+        self._deltas += [carry(ch.MAP_DELTA, delta) for delta in change.deltas]
+        for told in change.hazards:
+            taken = carry(ch.HAZARD, told)
+            self._told.append(taken)
+            self.hazards[taken.hazard.area] = taken
+        if change.zones is not None:
+            self._zones.append(carry(ch.ZONES, change.zones))

@@ -1,0 +1,64 @@
+"""The simulator: `python -m fognav_sim`, told by FOGNAV_* in the environment.
+
+Offers the devices RUN_DIR/roomba and RUN_DIR/lidar, publishes as every sensor node of the site, and tells the truth.
+"""
+
+import asyncio
+import os
+
+from fog_contracts.site import RobotSite
+from fog_runtime import logs, process
+from fog_runtime.clock import SystemClock
+from fog_runtime.health import Health, serve_plain
+from fog_runtime.settings import SettingsError, describe, load
+from fog_runtime.site import LoadedSite, load_site
+from fog_runtime.zenoh_edge import ZenohEdge
+from fognav_sim.live import Floor, Node, run_nodes
+from fognav_sim.node import SonarNode
+from fognav_sim.settings import Settings
+from fognav_sim.world import World
+
+_log = logs.get("sim")
+
+
+def _robot(loaded: LoadedSite, wanted: str) -> RobotSite:
+    robots = {robot.id: robot for robot in loaded.site.robots}
+    if not robots:
+        raise SettingsError(f"{loaded.directory}/site.toml has no [[robots]]: add one with its start")
+    if wanted and wanted not in robots:
+        raise SettingsError(f"FOGNAV_ROBOT: the site has no robot {wanted!r}, only {', '.join(robots)}")
+    return robots[wanted] if wanted else loaded.site.robots[0]
+
+
+async def main() -> None:
+    """Simulate until cancelled."""
+    settings = load(Settings, environ=os.environ)
+    logs.configure("sim", settings.log_level, settings.log_format)
+    _log.info("settings", **describe(settings))
+    loaded = load_site(settings.site_dir)
+    robot = _robot(loaded, settings.robot)
+    clock = SystemClock(settings.speed)
+    world = World(loaded.map.geometry, loaded.map.cells, robot, settings.seed)
+    boot = int(clock.stamp())
+    health = Health("devices", "zenoh")
+    site = settings.site or loaded.site.id
+    with Floor(world, clock, settings.run_dir, settings.truth_log) as floor:
+        health.set("devices", ok=True)
+        async with ZenohEdge.open(
+            connect=settings.zenoh_endpoints, clock=clock, role="sim", id=robot.id, site=site
+        ) as edge:
+            floor.serve(edge, robot.id)
+            with serve_plain(health, settings.http_host, settings.http_port, settings.port_file):
+                async with asyncio.TaskGroup() as tasks:
+                    tasks.create_task(floor.run(), name="world")
+                    tasks.create_task(floor.tell(edge, robot.id), name="truth")
+                    sonars = [SonarNode(node, boot, clock.now()) for node in loaded.site.nodes]
+                    nodes = [Node(each, floor, settings.mqtt_url, clock) for each in sonars]
+                    tasks.create_task(run_nodes(nodes, clock), name="nodes")
+                    while True:
+                        health.set("zenoh", ok=edge.connected, detail="no router: is it running?")
+                        await asyncio.sleep(clock.real(1.0))
+
+
+if __name__ == "__main__":
+    process.run(main)

@@ -1,0 +1,213 @@
+"""The edge of the simulator: pace, ptys, MQTT nodes, truth and commands over zenoh."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections import deque
+from contextlib import ExitStack
+from typing import TYPE_CHECKING, Final, Self
+
+import msgspec
+from prometheus_client import Gauge
+
+from fog_contracts import channels as ch
+from fog_contracts.geometry import GeometryError
+from fog_contracts.messages import CommandReply, NodeConfig, SimCommand
+from fog_runtime import logs
+from fog_runtime.clock import Ticker
+from fog_runtime.mqtt_edge import MqttEdge, Will
+from fognav_sim.hardware import STEP_S, Hardware
+from fognav_sim.wire.pty_port import PtyPort
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+    from types import TracebackType
+
+    from fog_runtime.clock import Clock
+    from fog_runtime.zenoh_edge import ZenohEdge
+    from fognav_sim.node import SonarNode
+    from fognav_sim.world import World
+
+TRUTH_S: Final = 0.1
+LOG_S: Final = 0.01
+CATCH_UP_S: Final = 0.25
+"""A simulation that is further behind than this lets the time pass unsimulated, and says so in its sustained speed."""
+_SPEED_OVER_S: Final = 5.0
+
+_log = logs.get("sim")
+_SUSTAINED = Gauge("fognav_sim_sustained_speed", "Simulated seconds per wall second, over the last 5 s")
+
+
+class SpeedMeter:
+    """How fast the simulation really runs: simulated over wall time, in a window of 5 s of wall time."""
+
+    def __init__(self) -> None:
+        self._marks: deque[tuple[float, float]] = deque()
+
+    def mark(self, wall: float, simulated: float) -> float:
+        """Take in how much was simulated until now; return the speed."""
+        self._marks.append((wall, simulated))
+        while wall - self._marks[0][0] > _SPEED_OVER_S and len(self._marks) > 2:
+            self._marks.popleft()
+        passed = wall - self._marks[0][0]
+        return (simulated - self._marks[0][1]) / passed if passed > 0 else 0.0
+
+
+class TruthLog:
+    """Lines of JSON, 100 a simulated second, written through at once: a test reads them after a kill."""
+
+    def __init__(self, path: Path | None) -> None:
+        self._file = None if path is None else path.open("ab", buffering=0)
+        self._next = 0.0
+
+    def write(self, hardware: Hardware, wheels: tuple[float, float], now: float) -> None:
+        """Write a line if one is due. `wheels` are the speeds that the base was commanded last (m/s)."""
+        if self._file is None or now < self._next:
+            return
+        self._next = now + LOG_S
+        world = hardware.world
+        x, y, theta = world.pose
+        line = {
+            "t_mono": time.monotonic(),
+            "now": now,
+            "x": x,
+            "y": y,
+            "theta": theta,
+            "left": wheels[0],
+            "right": wheels[1],
+            "contacts": world.contacts,
+            "distance": world.distance,
+        }
+        self._file.write(msgspec.json.encode(line) + b"\n")
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._file is not None:
+            self._file.close()
+
+
+class Floor:
+    """The world at its pace, with its two serial devices; the nodes look at it, and commands change it."""
+
+    def __init__(self, world: World, clock: Clock, run_dir: Path, truth_log: Path | None) -> None:
+        self.world = world
+        self._clock = clock
+        self._hardware = Hardware(world, clock.now(), left_encoder=64_000, right_encoder=1_000)
+        self._stack = ExitStack()
+        self._base = self._stack.enter_context(PtyPort(run_dir / "roomba"))
+        self._lidar = self._stack.enter_context(PtyPort(run_dir / "lidar"))
+        self._truth_log = TruthLog(truth_log)
+        self._stack.callback(self._truth_log.close)
+        self.sustained_speed = clock.speed
+        self.lidar_silent = False
+        self.silent_nodes: frozenset[str] = frozenset()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.close()
+
+    @property
+    def now(self) -> float:
+        """Until when the world is simulated (s of the clock)."""
+        return self._hardware.now
+
+    async def run(self) -> None:
+        """Simulate in steps of 10 ms as time goes by, until cancelled."""
+        meter = SpeedMeter()
+        simulated = 0.0
+        async for now in Ticker(self._clock, STEP_S):
+            behind = now - self._hardware.now
+            if behind > CATCH_UP_S:
+                _log.warning("behind", skipped_s=round(behind, 3))
+                self._hardware.now = now - STEP_S
+            while self._hardware.now + STEP_S <= now:
+                self._step()
+                simulated += STEP_S
+            self.sustained_speed = meter.mark(time.monotonic(), simulated)
+            _SUSTAINED.set(self.sustained_speed)
+
+    def _step(self) -> None:
+        hardware = self._hardware
+        hardware.receive(self._base.read(), self._lidar.read())
+        to_host, scan = hardware.step()
+        if to_host:
+            self._base.write(to_host)
+        if scan and not self.lidar_silent:
+            self._lidar.write(scan)
+        self._truth_log.write(hardware, hardware.base.wheel_speeds_m_s, hardware.now)
+
+    def serve(self, edge: ZenohEdge, robot: str) -> None:
+        """Answer commands that change the world."""
+        edge.serve(ch.SIM_COMMAND, lambda _, command: self._on_command(command), robot=robot)
+
+    def _on_command(self, command: SimCommand) -> CommandReply:
+        missing = [name for name in command.remove if not self.world.remove(name)]
+        try:
+            for obstacle in command.place:
+                self.world.place(obstacle)
+                _log.info("placed", id=obstacle.id)
+            if command.kidnap is not None:
+                self.world.kidnap(command.kidnap)
+        except (GeometryError, ValueError) as error:
+            return CommandReply(accepted=False, reason=str(error))
+        if command.lidar_silent is not None:
+            self.lidar_silent = command.lidar_silent
+        if command.nodes_silent is not None:
+            self.silent_nodes = frozenset(command.nodes_silent)
+        if missing:
+            return CommandReply(accepted=False, reason=f"there is no obstacle {', '.join(missing)} to remove")
+        return CommandReply(accepted=True, reason="")
+
+    async def tell(self, edge: ZenohEdge, robot: str) -> None:
+        """Publish the truth ten times a second, until cancelled."""
+        async for _ in Ticker(self._clock, TRUTH_S):
+            truth = self.world.truth(self._clock.stamp(), self.sustained_speed)
+            edge.publish(ch.SIM_TRUTH, truth, robot=robot)
+
+
+class Node:
+    """A virtual sensor node with an MQTT connection of its own, as a real one has."""
+
+    def __init__(self, sonars: SonarNode, floor: Floor, url: str, clock: Clock) -> None:
+        self._sonars = sonars
+        self._floor = floor
+        self._clock = clock
+        self._id = sonars.node.id
+        will = Will(ch.NODE_AVAILABILITY, "offline", {"node": self._id})
+        self._mqtt = MqttEdge(url, f"node-{self._id}", clock, will=will)
+        self._mqtt.on(ch.NODE_CONFIG, self._on_config, NodeConfig)
+        self._mqtt.on_connect(self._announce)
+
+    async def connect(self) -> None:
+        """Keep the connection until cancelled."""
+        await self._mqtt.run()
+
+    async def _announce(self) -> None:
+        await self._mqtt.publish(ch.NODE_AVAILABILITY, "online", node=self._id)
+
+    def _on_config(self, ids: Mapping[str, str], config: NodeConfig) -> None:
+        if ids["node"] == self._id and not self._sonars.configure(config):
+            _log.warning("config_ignored", node=self._id, reason="it is for another number of sonars")
+
+    async def measure(self) -> None:
+        """Publish the readings that are due."""
+        for reading in self._sonars.poll(self._floor.world, self._floor.now):
+            # A node without a connection, or one that a scenario has silenced, measures and tells nobody.
+            if self._mqtt.connected and self._id not in self._floor.silent_nodes:
+                await self._mqtt.publish(ch.NODE_READING, reading, node=self._id)
+
+
+async def run_nodes(nodes: list[Node], clock: Clock) -> None:
+    """Let all nodes measure and publish, until cancelled."""
+    async with asyncio.TaskGroup() as tasks:
+        for node in nodes:
+            tasks.create_task(node.connect())
+        async for _ in Ticker(clock, STEP_S):
+            for node in nodes:
+                await node.measure()

@@ -108,7 +108,7 @@ class Watcher:
     def __init__(self, folder: Path, base_port: Path) -> None:
         self.log_file = folder / "watcher.log"
         self.socket = folder / "guardian.sock"
-        self._environment = {
+        self.environment = {
             **os.environ,
             "FOGNAV_BASE_PORT": str(base_port),
             "FOGNAV_GUARDIAN_SOCKET": str(self.socket),
@@ -122,7 +122,7 @@ class Watcher:
     def start(self) -> None:
         with self.log_file.open("ab") as log:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "robot_agent.watcher"], env=self._environment, stderr=log, stdout=log
+                [sys.executable, "-m", "robot_agent.watcher"], env=self.environment, stderr=log, stdout=log
             )
 
     def __exit__(self, *_):

@@ -21,11 +21,11 @@ import msgspec
 from fog_runtime import logs
 from fog_runtime.clock import SystemClock
 from fog_runtime.logs import Level
-from fog_runtime.settings import load
+from fog_runtime.settings import SettingsError, load
 from robot_agent.drivers.serial_port import Port, PortLost
 from robot_agent.guardian_core import GuardianCore, Output
 from robot_agent.link import PACKET_LIMIT, WheelCommand, decode_command, encode
-from robot_agent.watcher import PORT_LOST
+from robot_agent.watcher import BAD_SETTINGS, PORT_LOST
 
 if TYPE_CHECKING:
     from types import FrameType
@@ -53,8 +53,9 @@ class GuardianSettings(msgspec.Struct, frozen=True, kw_only=True):
 class Guardian:
     """The loop around the core: one serial port, one agent, one watcher."""
 
-    def __init__(self, settings: GuardianSettings) -> None:
+    def __init__(self, settings: GuardianSettings, listener: socket.socket) -> None:
         self._settings = settings
+        self._listener = listener
         self._clock = SystemClock(settings.speed)
         self._core = GuardianCore()
         self._port = Port.from_fd(settings.base_fd, settings.base_port or None)
@@ -70,7 +71,7 @@ class Guardian:
 
     def run(self) -> int:
         """Guard until the watcher or a signal ends it; returns the exit code."""
-        listener = _listen(self._settings.guardian_socket)
+        listener = self._listener
         self._selector.register(self._port, selectors.EVENT_READ, self._read_base)
         self._selector.register(self._settings.watcher_fd, selectors.EVENT_READ, self._watcher_gone)
         self._selector.register(listener, selectors.EVENT_READ, lambda: self._accept(listener))
@@ -180,11 +181,18 @@ class Guardian:
 
 
 def _listen(path: str) -> socket.socket:
-    # A guardian that is gone leaves its socket behind.
-    Path(path).unlink(missing_ok=True)
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    listener.bind(path)
-    Path(path).chmod(0o660)
+    try:
+        # A guardian that is gone leaves its socket behind.
+        Path(path).unlink(missing_ok=True)
+        listener.bind(path)
+        Path(path).chmod(0o660)
+    except OSError as error:
+        listener.close()
+        reason = error.strerror or error
+        raise SettingsError(
+            f"FOGNAV_GUARDIAN_SOCKET: {path}: {reason}. Name a path of at most 100 characters in a folder that exists"
+        ) from error
     listener.listen(1)
     listener.settimeout(0)
     return listener
@@ -203,9 +211,15 @@ def _be_prompt(priority: int) -> str:
 
 def main() -> int:
     """Run one guardian for the watcher that started it."""
-    settings = load(GuardianSettings, environ=os.environ)
+    try:
+        settings = load(GuardianSettings, environ=os.environ)
+        listener = _listen(settings.guardian_socket)
+    except SettingsError as error:
+        logs.configure("guardian", "info", "json")
+        logs.get("guardian").error("bad_settings", reason=str(error))
+        return BAD_SETTINGS
     logs.configure("guardian", settings.log_level, settings.log_format)
-    guardian = Guardian(settings)
+    guardian = Guardian(settings, listener)
     signal.signal(signal.SIGTERM, guardian.end)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     logs.get("guardian").info("started", port=settings.base_port, priority=_be_prompt(settings.realtime_priority))

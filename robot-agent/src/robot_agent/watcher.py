@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 PORT_LOST: Final = 3
 """Exit code of the guardian when the port is gone: open it anew."""
+BAD_SETTINGS: Final = 78
+"""Exit code of the guardian (EX_CONFIG of sysexits.h) when another start would fail just the same."""
 SILENCE_S: Final = 0.15
 """The guardian beats every 0.05 s; after this long without a beat it is taken for hung and killed."""
 SILENCE_LEAST_S: Final = 0.05
@@ -157,14 +159,14 @@ def main() -> int:
     path = os.environ.get("FOGNAV_BASE_PORT", "")
     if not path:
         _log("bad_settings", reason="FOGNAV_BASE_PORT is not set: name the base's serial device, e.g. /dev/ttyUSB0")
-        return 2
+        return BAD_SETTINGS
     try:
         speed = float(os.environ.get("FOGNAV_SPEED", "1"))
     except ValueError:
         speed = -1.0
     if not 0 < speed < 1000:
         _log("bad_settings", reason="FOGNAV_SPEED must be a positive number such as 1 (simulated over wall time)")
-        return 2
+        return BAD_SETTINGS
     signal.signal(signal.SIGTERM, _terminate)
     signal.signal(signal.SIGINT, _terminate)
     silence_s = max(SILENCE_S / speed, SILENCE_LEAST_S)
@@ -176,7 +178,9 @@ def main() -> int:
                     _log("port_open", path=path)
                     told = ""
                     stop_wheels(port)
-                    while guard_once(port, silence_s) != PORT_LOST:
+                    while (code := guard_once(port, silence_s)) != PORT_LOST:
+                        if code == BAD_SETTINGS:
+                            return code
                         hold(port, RESTART_S / speed)
             except PortLost as error:
                 if str(error) != told:

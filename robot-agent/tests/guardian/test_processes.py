@@ -173,3 +173,23 @@ def test_a_second_watcher_keeps_off_a_port_in_use(rig, tmp_path):
         wait_for(lambda: second.count("port_lost"), "the second one is refused")
         assert "locked" in second.events[0]["reason"]
         assert rig.base.speeds == (0.3, 0.3)
+
+
+@pytest.mark.parametrize(
+    ("setting", "value", "words"),
+    [
+        ("BASE_PORT", "", "FOGNAV_BASE_PORT is not set"),
+        ("SPEED", "fast", "positive number"),
+        ("GUARDIAN_SOCKET", "", "FOGNAV_GUARDIAN_SOCKET"),
+        ("GUARDIAN_SOCKET", "/tmp/nowhere/guardian.sock", "No such file or directory. Name a path"),
+        ("LOG_LEVEL", "loud", "FOGNAV_LOG_LEVEL"),
+    ],
+)
+def test_wrong_settings_end_the_watcher_with_words_instead_of_a_loop(tmp_path, setting, value, words):
+    with rigs.Base(tmp_path / "roomba") as base, rigs.Watcher(tmp_path, base.link) as watcher:
+        watcher.__exit__()
+        watcher.log_file.unlink()
+        watcher.environment[f"FOGNAV_{setting}"] = value
+        watcher.start()
+        assert watcher.process.wait(15.0) == 78
+        assert any(line["event"] == "bad_settings" and words in line["reason"] for line in watcher.events)

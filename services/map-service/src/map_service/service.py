@@ -266,7 +266,11 @@ class Service:
     async def _wait_until_whole(self, hazards_wait_s: float) -> None:
         """Return when the zones are read and every area is heard of; after the wait, the others count as unknown."""
         self._health.set("map", ok=False, detail="the zones are not read yet")
-        begun = self._aggregator_left = self._clock.now()
+        begun = self._clock.now()
+        if not self._aggregators:
+            # An aggregator that never appears is as good as one that left. One may be there already: its news can
+            # arrive before this runs.
+            self._aggregator_left = begun
         await self._zones_read.wait()
         while (unheard := self.core.unheard_areas()) and self._clock.now() - begun < hazards_wait_s:
             self._health.set("map", ok=False, detail=f"waiting for the hazards of {', '.join(unheard)}")

@@ -155,3 +155,12 @@ def test_at_the_goal_the_heading_is_turned_to_before_it_counts_as_reached():
     assert not turning.at_goal
     assert turning.v == 0.0
     assert turning.w > 0.0
+
+
+def test_a_path_released_whole_ends_at_its_goal_although_its_points_were_rounded():
+    points = np.array([(0.0, 0.0), (3.0, 0.0), (3.0, 2.0)])
+    follower = PathFollower(points, released_length=4.9996)
+    follower.advance(3.0, 1.9, 0.0)
+    assert follower.rest(2.5)[1]
+    follower.release(4.5)
+    assert not follower.rest(2.5)[1]

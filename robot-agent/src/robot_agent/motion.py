@@ -32,6 +32,8 @@ _SEARCH_BACK_M: Final = 0.5
 _SEARCH_AHEAD_M: Final = 2.5
 _OFF_PATH_M: Final = 1.0
 _PROGRESS_M: Final = 0.1
+_END_M: Final = 0.05
+"""A path released to within this of its end is released whole: rounded points make another length."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -209,7 +211,8 @@ class PathFollower:
         steps = np.hypot(*np.diff(points, axis=0).T) if len(points) > 1 else np.zeros(0)
         self.along = np.concatenate(([0.0], np.cumsum(steps)))
         """Metres from the path's start to each point."""
-        self.released = min(released_length, self.length)
+        self.released = 0.0
+        self.release(released_length)
         self.progress = 0.0
         self.distance = 0.0
         """Metres from the robot to the path, as of the last `advance`."""
@@ -234,7 +237,7 @@ class PathFollower:
 
     def release(self, length: float) -> None:
         """Take the planner's newest word on how much of the path is released."""
-        self.released = min(length, self.length)
+        self.released = length if length < self.length - _END_M else self.length
 
     def advance(self, x: float, y: float, now: float) -> None:
         """Note where the robot is (m)."""

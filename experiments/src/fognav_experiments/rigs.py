@@ -1,7 +1,7 @@
 """The system in two halves for one thread and one emulated clock: all real cores, real encoders, decoders and parsers.
 
 Each rig does what the edges of its processes do, in the same order and at the same periods, with messages as the bytes
-of their channels. What it leaves out is what a lockstep cannot have: sockets, threads and the time that computing takes.
+of their channels. What it leaves out is what lockstep cannot have: sockets, threads and the time that computing takes.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 
 from fog_contracts.geometry import contains_point, distance_to_polygon
-from fog_contracts.messages import RobotGoal, RobotPath, SimObstacle
+from fog_contracts.messages import PlanRequest, RobotGoal, RobotPath, SimObstacle
 from fog_runtime.site import LoadedSite, load_site
 from fognav_experiments.rigs import FogRig, RobotRig
 from fognav_sim.hardware import STEP_S
@@ -359,8 +359,7 @@ def _free_way(site: LoadedSite, start: Pose, goal: Place, seed: int) -> list[tup
     fog = FogRig(site, World(site.map.geometry, site.map.cells, robot, seed), seed, 0.0)
     for step in range(200):
         fog.step((step + 1) * STEP_S)
-    from fog_contracts.messages import PlanRequest  # noqa: PLC0415
-
+        fog.inform_planner((step + 1) * STEP_S)
     assert mission.pose is not None
     reply = fog.planner.plan(PlanRequest(start=start, goal=mission.pose))
     if reply.refusal is not None:

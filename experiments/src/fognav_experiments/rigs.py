@@ -206,10 +206,9 @@ class FogRig:
             self._hazards(self.aggregator.tick(now, stamp), now)
             self._change(self.map.tick(now, stamp))
             self._heartbeats.append(carry(ch.MAP_HEARTBEAT, self.map.heartbeat(stamp)))
-        self._plan_inputs(now)
 
-    def _plan_inputs(self, now: float) -> None:
-        """Give the planner the map's news; the robot gets the same from `deliver`."""
+    def inform_planner(self, now: float) -> None:
+        """Give the planner the map's news; the robot gets the same right after."""
         planner = self.planner
         for told in self._told:
             planner.on_hazard(told)
@@ -242,6 +241,7 @@ class FogRig:
     def deliver(self, robot: RobotRig) -> list[RobotPath | RobotGoal]:
         """Bring the robot what the fog published since the last time; return its paths and goals."""
         now, stamp, agent = robot.now, STAMP + robot.now, robot.agent
+        self.inform_planner(now)
         for told in self._told:
             agent.on_hazard(told, now)
         for zones in self._zones:

@@ -1,0 +1,39 @@
+"""A site of 15 x 8 m: a ring of corridors around a block, with two ways from west to east, the southern one watched."""
+
+from pathlib import Path
+
+import numpy as np
+
+from fog_contracts.grid import GridGeometry
+from fog_contracts.messages import Pose
+from fog_contracts.site import AreaSite, DemoPlan, NodeSite, Place, RobotSite, Site, Sonar
+from fog_runtime.maps import StaticMap
+from fog_runtime.site import LoadedSite
+
+RESOLUTION = 0.05
+FREE = [  # left, bottom, right, top (m): the ring, and niches so that no two places look alike
+    (0.5, 0.5, 14.5, 2.5), (0.5, 5.5, 14.5, 7.5), (0.5, 0.5, 2.5, 7.5), (12.5, 0.5, 14.5, 7.5),
+    (3.6, 2.5, 4.6, 3.2), (9.9, 2.5, 10.5, 3.6), (5.2, 5.0, 6.9, 5.5), (10.8, 4.7, 11.6, 5.5), (2.5, 3.9, 3.1, 4.7),
+]  # fmt: skip
+START = Pose(x=1.5, y=3.0, theta=-1.5707963)
+GOAL = Place(x=13.5, y=3.2, theta=None)
+
+
+def little_site():
+    geometry = GridGeometry(300, 160, RESOLUTION, 0.0, 0.0)
+    cells = np.full(geometry.shape, 254, np.uint8)
+    for box in FREE:
+        left, bottom, right, top = (round(value / RESOLUTION) for value in box)
+        cells[bottom:top, left:right] = 0
+    area = AreaSite(id="z1", label="South", polygon=[(6.5, 0.5), (8.5, 0.5), (8.5, 2.5), (6.5, 2.5)], number=1)
+    sonars = [Sonar(angle=angle, range_limit=1.65) for angle in (-0.22, 0.22)]
+    node = NodeSite(id="n1", area="z1", x=7.5, y=0.55, theta=1.5707963, sonars=sonars)
+    site = Site(
+        id="little",
+        places={"west": Place(x=START.x, y=START.y, theta=START.theta), "east": GOAL},
+        areas=[area],
+        nodes=[node],
+        robots=[RobotSite(id="r1", start=START)],
+        demo=DemoPlan(start="west", goal="east", areas=["z1"]),
+    )
+    return LoadedSite(site, StaticMap(geometry, cells), Path())

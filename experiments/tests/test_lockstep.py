@@ -1,0 +1,74 @@
+"""The loop closes: nodes to aggregator to map to planner to robot to wheels, judged by the simulated truth."""
+
+import importlib.util
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from fog_contracts.geometry import contains_point
+from fognav_experiments.lockstep import draw_area, run_lockstep
+from fognav_sim.scenario import ScenarioError
+
+_spec = importlib.util.spec_from_file_location("little_site", Path(__file__).parent / "little_site.py")
+little = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(little)
+
+
+def drive(seed, area=None, **more):
+    return run_lockstep(little.little_site(), little.START, little.GOAL, seed, area, timeout_s=200.0, **more)
+
+
+@pytest.fixture(scope="module")
+def free():
+    return drive(3)
+
+
+@pytest.fixture(scope="module")
+def warned():
+    return drive(3, "z1", hazard_at_m=0.5)
+
+
+def test_without_a_hazard_the_robot_takes_the_short_way_through_the_watched_area(free):
+    assert (free.outcome, free.contacts, free.crossed) == ("reached", 0, ["z1"]), free.detail
+    assert free.min_clearance_m > 0.1
+    assert free.distance_m == pytest.approx(free.planned_m, abs=1.0)
+
+
+def test_a_robot_that_crosses_a_watched_area_raises_no_hazard(free):
+    assert not [event for event in free.events if event.what.startswith("area z1: blocked")]
+    assert free.replans == 0
+
+
+def test_a_blocked_area_sends_the_robot_around_before_its_lidar_could_know(warned, free):
+    assert (warned.outcome, warned.contacts, warned.crossed) == ("reached", 0, []), warned.detail
+    area = little.little_site().site.areas[0]
+    assert not any(contains_point(area.polygon, *point) for point in warned.track)
+    assert warned.replans >= 1
+    assert warned.distance_m > free.distance_m
+    assert warned.min_clearance_m > 0.1
+    assert warned.hazard_clearance_m > 1.0
+
+
+def test_the_hazard_reaches_the_wheels_within_three_seconds_and_every_stage_is_stamped(warned):
+    stages = warned.stages_ms
+    assert set(stages) == {"debounce", "costmap", "plan", "deliver", "command", "total"}
+    assert stages["total"] == pytest.approx(sum(v for k, v in stages.items() if k != "total"), abs=0.5)
+    # Five readings at 8 to 10 a second, then the next decision and wheel command.
+    assert 380.0 < stages["debounce"] < 600.0
+    assert stages["total"] < 1000.0
+
+
+def test_the_same_seed_gives_the_same_run_bit_for_bit_and_another_seed_another(warned, free):
+    assert msgspec.json.encode(drive(3, "z1", hazard_at_m=0.5)) == msgspec.json.encode(warned)
+    assert drive(4).track != free.track
+
+
+def test_an_area_is_drawn_only_where_the_way_enters_it_late_enough():
+    site = little.little_site()
+    near, far = [(5.0, 1.5), (7.0, 1.5)], [(x / 2 - 8.0, 1.5) for x in range(32)]
+    assert draw_area(site, far, ["z1"], seed=1) == "z1"
+    with pytest.raises(ScenarioError, match="late enough"):
+        draw_area(site, near, ["z1"], seed=1)
+    with pytest.raises(ScenarioError, match="no area 'z9'"):
+        draw_area(site, far, ["z9"], seed=1)

@@ -101,7 +101,7 @@ class World:
         squared = squared_distance_capped(self._occupied, math.ceil(_FAR_M / geometry.resolution))
         self._distance = np.sqrt(squared.astype(np.float64)) * geometry.resolution
         self._rng = np.random.default_rng(seed)
-        self._scale = 1.0 + self.noise.wheel_diameter * self._rng.standard_normal(2)
+        self._scale = [1.0 + self.noise.wheel_diameter * float(self._rng.standard_normal()) for _ in range(2)]
         self._obstacles: dict[str, SimObstacle] = {}
         self._outlines: dict[str, list[Point]] = {}
         self._edges: dict[str, NDArray[np.float64]] = {}
@@ -182,7 +182,7 @@ class World:
         if turned == (0.0, 0.0):
             return turned
         ground = [
-            travel * scale + self.noise.slip * math.sqrt(abs(travel)) * self._rng.standard_normal()
+            travel * scale + self.noise.slip * math.sqrt(abs(travel)) * float(self._rng.standard_normal())
             for travel, scale in zip(turned, self._scale, strict=True)
         ]
         self._move(ground[0], ground[1])

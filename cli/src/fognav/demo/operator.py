@@ -2,6 +2,7 @@
 
 import asyncio
 import http.client
+import re
 import secrets
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Final
@@ -184,8 +185,10 @@ class Operator:
             self._refused(f"{kind}: the robot refuses, {reply.reason}")
 
     def _refused(self, text: str) -> None:
-        if text != self._last_refusal:
-            self._last_refusal = text
+        # Seconds in a reason run on: only other words are news.
+        words = re.sub(r"\d+(\.\d+)?", "#", text)
+        if words != self._last_refusal:
+            self._last_refusal = words
             self._scene.say(f"operator: {text}")
 
 

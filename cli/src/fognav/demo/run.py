@@ -26,7 +26,7 @@ from fognav.supervisor import Event
 READY_S: Final = 90.0
 """Real seconds for everything to start."""
 LOCALIZED_S: Final = 60.0
-AREAS_S: Final = 60.0
+AREAS_S: Final = 30.0
 ENABLED_S: Final = 60.0
 GOAL_S: Final = 60.0
 _TICK_S: Final = 0.1
@@ -152,7 +152,7 @@ class Demo:
     async def _attempt(self, speed: float, stop: asyncio.Event) -> None:
         clock = SystemClock(speed)
         config = StackConfig(site_dir=self.site.directory, robot=self.robot, seed=self.options.seed, speed=speed)
-        async with Stack(config, self._on_process) as stack:
+        async with Stack(config, self._on_process) as stack, self._keeping_logs(stack):
             self.stack = stack
             if self.options.hazard and not self._hazard:
                 self.scene.say("the site's [demo] lists no areas: nothing will be blocked")
@@ -175,6 +175,22 @@ class Demo:
                     if self.options.keep_running:
                         self.scene.say("still running: Ctrl-C ends everything")
                         await stop.wait()
+
+    @contextlib.asynccontextmanager
+    async def _keeping_logs(self, stack: Stack) -> AsyncIterator[None]:
+        """Keep the logs of an attempt that went wrong by itself."""
+        try:
+            yield
+        except (asyncio.CancelledError, _TooFastError, WrongUseError):
+            raise
+        except Exception:
+            stack.keep_files = True
+            raise
+        else:
+            stack.keep_files = not self.success()
+        finally:
+            if stack.keep_files:
+                self.scene.say(f"its logs are kept in {stack.folder / 'logs'}")
 
     def _open(self, stack: Stack, clock: SystemClock, name: str) -> contextlib.AbstractAsyncContextManager[ZenohEdge]:
         site = self.site.site.id

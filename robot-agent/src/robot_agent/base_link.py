@@ -43,16 +43,22 @@ class BaseLink:
         self._on_lost = on_lost
         self._socket: socket.socket | None = None
         self._reset_until = -math.inf
+        self._heard_at = -math.inf
         self._told = ""
         self._limited = logs.RateLimited(_log)
 
     def send(self, command: WheelCommand) -> bool:
-        """Send a command without waiting; False when there is no guardian, or one that does not read."""
+        """Send a command without waiting; False when there is no guardian, or one that does not read.
+
+        Called at a steady rate, it also notices a guardian that has nothing to say.
+        """
         now = self._clock.now()
         if command.reset:
             self._reset_until = now + RESET_VALID_S
         if self._socket is None:
             return False
+        if now - self._heard_at > QUIET_S:
+            self._lost("the guardian hears nothing from the base; check its cable and power")
         reset = now <= self._reset_until
         try:
             self._socket.send(encode(msgspec.structs.replace(command, reset=reset)))
@@ -69,7 +75,7 @@ class BaseLink:
                 with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as link:
                     link.settimeout(0)
                     await asyncio.get_running_loop().sock_connect(link, str(self._path))
-                    self._socket, self._told = link, ""
+                    self._socket, self._heard_at, self._told = link, self._clock.now(), ""
                     _log.info("guardian_found", socket=str(self._path))
                     reason = await self._read(link)
             except OSError as error:
@@ -83,12 +89,7 @@ class BaseLink:
         """Pass feedback on until the link breaks; return why it did."""
         loop = asyncio.get_running_loop()
         while True:
-            try:
-                async with asyncio.timeout(self._clock.real(QUIET_S)):
-                    data = await loop.sock_recv(link, PACKET_LIMIT + 1)
-            except TimeoutError:
-                self._lost("the guardian hears nothing from the base; check its cable and power")
-                continue
+            data = await loop.sock_recv(link, PACKET_LIMIT + 1)
             if not data:
                 return "the guardian closed the link"
             now = self._clock.now()
@@ -97,7 +98,7 @@ class BaseLink:
             except (msgspec.DecodeError, UnicodeDecodeError) as error:
                 self._limited.warning("bad_feedback", "bad_feedback", now, reason=str(error))
                 continue
-            self._told = ""
+            self._heard_at, self._told = now, ""
             self._on_feedback(feedback, now)
 
     def _lost(self, reason: str) -> None:

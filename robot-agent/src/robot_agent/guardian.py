@@ -102,7 +102,8 @@ class Guardian:
             self._seldom.warning("damaged_frames", "damaged_frames", now, total=self._corrupted)
 
     def _watcher_gone(self) -> None:
-        self._log.error("watcher_gone", remedy="the watcher ended; it must run whenever the guardian does")
+        if self._signal is None:
+            self._log.error("watcher_gone", remedy="the watcher ended; it must run whenever the guardian does")
         self._ended = True
 
     def _accept(self, listener: socket.socket) -> None:

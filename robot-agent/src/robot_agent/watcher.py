@@ -138,7 +138,9 @@ def guard_once(port: Port, silence_s: float) -> int:
         _log("guardian_lost", reason=reason, exit_code=code, wheels_stopped=stopped)
         return code
     finally:
-        # Closing `alive_write` tells a guardian that still lives (we were told to end) to stop the wheels and end.
+        # We were told to end, and so is a guardian that still lives: it stops the wheels first.
+        if guardian.poll() is None:
+            guardian.terminate()
         os.close(alive_write)
         os.close(beat_read)
         _end(guardian)

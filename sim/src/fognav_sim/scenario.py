@@ -34,6 +34,7 @@ _SEEN_FROM_M: Final = 0.20
 _WALL_GAP_M: Final = 0.02
 _THICKNESS_M: Final = (0.4, 0.8)
 _SHIFT_M: Final = 0.1
+_BEYOND_M: Final = 0.4
 _REACH_M: Final = 20.0
 _DRAWS: Final = 40
 
@@ -142,9 +143,10 @@ def barrier_across(area: AreaSite, site: Site, static: StaticMap, seed: int, *, 
 
 
 def _shrunk(box: Sequence[tuple[float, float]], corner: tuple[float, float]) -> tuple[float, float]:
-    """Move a corner a hand towards the middle: an area ends at the walls, as the barrier does."""
+    """Move a corner towards the middle: an area may end before the walls and their recesses, where a barrier ends."""
     mx, my = sum(x for x, _ in box) / len(box), sum(y for _, y in box) / len(box)
-    return corner[0] + 0.1 * (mx - corner[0]), corner[1] + 0.1 * (my - corner[1])
+    share = min(1.0, _BEYOND_M / math.dist(corner, (mx, my)))
+    return corner[0] + share * (mx - corner[0]), corner[1] + share * (my - corner[1])
 
 
 def _before_node(node: NodeSite, static: StaticMap, thickness: float, shift: float) -> list[tuple[float, float]] | None:

@@ -38,6 +38,8 @@ LIDAR_MIN_M: Final = 0.15
 LIDAR_MAX_M: Final = 12.0
 LIDAR_HEIGHT_M: Final = 0.25
 _NEAR_M: Final = 0.6
+_RELEASED_M: Final = 0.01
+"""A touch has ended when the robot is this far off again."""
 _FAR_M: Final = 2.0
 
 
@@ -204,7 +206,8 @@ class World:
         else:
             body.distance += math.hypot(x - body.x, y - body.y)
             body.x, body.y = x, y
-            if clearance >= 0:
+            # A robot that pushes against something trembles by its wheels' slip: that is one touch.
+            if clearance > _RELEASED_M:
                 body.touching = body.bump_left = body.bump_right = False
         body.min_clearance = min(body.min_clearance, clearance)
 

@@ -1,0 +1,89 @@
+"""The world as bytes: what the base is told moves the robot, and nothing is faster than its line."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fog_contracts.grid import GridGeometry
+from fog_contracts.messages import Pose
+from fog_contracts.site import RobotSite
+from fognav_sim.hardware import LINE_BYTES_S, Hardware, Line
+from fognav_sim.world import World
+
+DRIVE_200 = bytes([128, 131, 145, 0, 200, 0, 200])
+STREAM = bytes([148, 3, 7, 43, 44])
+SCAN = bytes([0xA5, 0x20])
+
+
+def hall():
+    geometry = GridGeometry(120, 80, 0.05, 0.0, 0.0)
+    cells = np.zeros(geometry.shape, np.uint8)
+    cells[:2], cells[-2:], cells[:, :2], cells[:, -2:] = 254, 254, 254, 254
+    return World(geometry, cells, RobotSite(id="r1", start=Pose(x=1.0, y=2.0, theta=0.0)), seed=1)
+
+
+@given(chunks=st.lists(st.integers(0, 400), min_size=1, max_size=60))
+def test_a_line_keeps_order_loses_nothing_below_its_rate_and_is_never_faster(chunks):
+    line, sent, given_, at = Line(), b"", b"", 0.0
+    for size in chunks:
+        data = bytes(len(given_) + n & 0xFF for n in range(size))
+        given_ += data
+        sent += line.send(data, 0.01)
+        at += 0.01
+        assert len(sent) <= LINE_BYTES_S * at + 1e-6
+        assert sent == given_[: len(sent)] or line.lost
+    if not line.lost:
+        for _ in range(1000):
+            sent += line.send(b"", 0.01)
+        assert sent == given_
+
+
+def test_a_line_that_is_too_slow_drops_the_oldest_bytes_and_counts_them():
+    line = Line()
+    data = bytes(6000)
+    line.send(data, 0.0)
+    assert line.lost == 6000 - 4096
+
+
+def test_drive_direct_moves_the_robot_and_its_encoders():
+    world = hall()
+    hardware = Hardware(world, 5.0, left_encoder=65_500)
+    hardware.receive(DRIVE_200, b"")
+    for _ in range(200):
+        hardware.step()
+    assert hardware.now == pytest.approx(7.0)
+    assert world.distance == pytest.approx(0.4, abs=0.02)
+    ticks = (hardware.base.encoders[0] - 65_500) & 0xFFFF
+    assert ticks == pytest.approx(0.4 * 508.8 / (np.pi * 0.072), rel=0.05)
+
+
+def test_a_wall_stops_the_robot_counts_once_and_presses_the_bumper_in_the_stream():
+    world = hall()
+    hardware = Hardware(world, 0.0)
+    hardware.receive(DRIVE_200 + STREAM, b"")
+    received = b""
+    for _ in range(3000):
+        received += hardware.step()[0]
+    assert world.contacts == 1
+    assert world.pose[0] < 6.0 - 0.1 - 0.17 + 0.01
+    frame = received[received.rindex(b"\x13\x08\x07") :]
+    assert frame[3] & 3 == 3  # both halves: it drove straight into the wall
+    moved = world.pose[0]
+    hardware.receive(bytes([145, 0xFF, 0x38, 0xFF, 0x38]), b"")
+    for _ in range(200):
+        hardware.step()
+    assert world.pose[0] < moved - 0.2
+    assert (world.contacts, world.bumpers) == (1, (False, False))
+
+
+def test_a_scan_and_the_stream_fit_on_their_lines():
+    hardware = Hardware(hall(), 0.0)
+    hardware.receive(DRIVE_200 + STREAM, SCAN)
+    base, lidar = 0, 0
+    for _ in range(1000):
+        from_base, from_lidar = hardware.step()
+        base, lidar = base + len(from_base), lidar + len(from_lidar)
+    assert hardware.lost_bytes == 0
+    assert base == pytest.approx(10.0 / 0.015 * 11, rel=0.02)
+    assert lidar == pytest.approx(10.0 * 10_000, rel=0.02)

@@ -56,7 +56,8 @@ async def main() -> None:
                     nodes = [Node(each, floor, settings.mqtt_url, clock) for each in sonars]
                     tasks.create_task(run_nodes(nodes, clock), name="nodes")
                     while True:
-                        health.set("zenoh", ok=edge.connected, detail="no router: is it running?")
+                        there = edge.connected
+                        health.set("zenoh", ok=there, detail="" if there else "no router: is it running?")
                         await asyncio.sleep(clock.real(1.0))
 
 

@@ -78,6 +78,7 @@ class TruthLog:
             "left": wheels[0],
             "right": wheels[1],
             "contacts": world.contacts,
+            "clearance": world.clearance(),
             "distance": world.distance,
         }
         self._file.write(msgspec.json.encode(line) + b"\n")

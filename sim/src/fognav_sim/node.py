@@ -1,6 +1,6 @@
 """A sensor node: the firmware's cycle and judgement, with the real sonar's timing. Pure.
 
-One sonar after the other, each for the time of flight (38 ms when no echo comes) but at least as long as its echoes
+One sonar after the other, each for the time of flight (36 ms when no echo comes) but at least as long as its echoes
 take to die away; then the reading is published and the firmware pauses. With echoes this gives about 9 readings a
 second, without about 8. Source of the timing: HC-SR04 data sheet; the pause is the thesis's (section 3.3).
 """
@@ -15,7 +15,8 @@ from fognav_sim.world import SOUND_M_S, World
 if TYPE_CHECKING:
     from fog_contracts.site import NodeSite
 
-NO_ECHO_S: Final = 0.038
+NO_ECHO_S: Final = 0.036
+"""The module ends its pulse by itself after some 38 ms without an echo; the firmware gives up just before."""
 SETTLE_S: Final = 0.027
 PUBLISH_S: Final = 0.002
 FIRMWARE: Final = "sim-1"

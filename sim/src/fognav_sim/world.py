@@ -126,8 +126,13 @@ class World:
         return list(self._obstacles.values())
 
     def place(self, obstacle: SimObstacle) -> None:
-        """Put an obstacle there, in place of one with the same id; raises `GeometryError` for a shape that is none."""
+        """Put an obstacle there, in place of one with the same id.
+
+        Raises `GeometryError` for a shape that is none, `ValueError` where it would stand on the robot.
+        """
         outline = normalized_polygon(obstacle.polygon)
+        if distance_to_polygon(outline, self._body.x, self._body.y) <= self.robot.radius:
+            raise ValueError(f"{obstacle.id} would stand on robot {self.robot.id}: place it elsewhere")
         points = np.array(outline)
         self._obstacles[obstacle.id] = obstacle
         self._outlines[obstacle.id] = outline

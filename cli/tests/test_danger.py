@@ -4,9 +4,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fog_contracts.geometry import contains_point, distance_to_polygon
+from fog_contracts.messages import SimObstacle
 from fog_contracts.site import AreaSite, DemoPlan, NodeSite, Site, Sonar
-from fognav.demo.danger import KEEP_AWAY_M, NoDangerError, along, barrier, choose, may_appear
+from fognav.demo.danger import KEEP_AWAY_M, NoDangerError, along, choose, may_appear
+from fognav_sim.scenario import ScenarioError
 
 PATH = [(0.0, 0.0), (10.0, 0.0), (30.0, 0.0)]
 
@@ -27,8 +28,8 @@ def site(*names_and_places: tuple[str, float]) -> Site:
     return Site(id="test", areas=areas, nodes=nodes, demo=demo)
 
 
-def anywhere(x: float, y: float) -> bool:
-    return abs(y) < 1.0
+def anywhere(area: AreaSite) -> SimObstacle:
+    return SimObstacle(id="barrier", polygon=area.polygon)
 
 
 def test_distance_to_an_area_is_counted_along_the_path() -> None:
@@ -41,33 +42,12 @@ def test_an_area_beside_the_path_is_not_on_it() -> None:
     assert along(PATH, [(5.0, 2.0), (8.0, 2.0), (8.0, 4.0)]) is None
 
 
-@given(x=st.floats(8.0, 26.0), limit=st.floats(0.8, 3.8), tilt=st.floats(-0.3, 0.3))
-def test_a_barrier_stands_in_the_area_across_the_path_and_within_the_nodes_range(
-    x: float, limit: float, tilt: float
-) -> None:
-    watched = area("z1", x)
-    mounted = NodeSite(
-        id="n", area="z1", x=x + 1.5, y=0.95, theta=-math.pi / 2, sonars=[Sonar(angle=tilt, range_limit=limit)]
-    )
-    made = barrier(watched, [mounted], PATH, anywhere)
-    for px, py in made.polygon:
-        assert distance_to_polygon(watched.polygon, px, py) < 0.25  # its thickness may stick out, its place may not
-    beam = [(mounted.x + d * math.sin(tilt), mounted.y - d * math.cos(tilt)) for d in (i / 100 for i in range(10, 400))]
-    hits = [math.dist((mounted.x, mounted.y), p) for p in beam if contains_point(made.polygon, *p)]
-    assert hits
-    assert 0.1 < min(hits) < limit
+def test_an_area_that_can_t_be_closed_is_left_out_and_said_so() -> None:
+    def nowhere(area: AreaSite) -> SimObstacle:
+        raise ScenarioError(f"area {area.id}: no barrier fits")
 
-
-def test_a_barrier_leaves_no_gap_through_which_a_robot_fits() -> None:
-    made = barrier(area("z1", 10.0), [node("z1", 10.0)], PATH, anywhere)
-    across = [y for _, y in made.polygon]
-    assert min(across) < -1.0 + 2 * 0.17
-    assert max(across) > 1.0 - 2 * 0.17 - 0.35  # what stands right before the node would be inside its sonar
-
-
-def test_an_area_without_a_node_is_refused_by_name() -> None:
-    with pytest.raises(NoDangerError, match="z1 has no node"):
-        barrier(area("z1", 10.0), [], PATH, anywhere)
+    with pytest.raises(NoDangerError, match="z1: no barrier fits"):
+        choose(site(("z1", 12.0)), PATH, 1, nowhere)
 
 
 @given(seed=st.integers(0, 10_000))

@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 
 from fog_contracts.geometry import rasterize
 from fog_contracts.grid import GridGeometry
+from fog_contracts.messages import SimObstacle
+from fog_contracts.site import AreaSite
 from fog_kernels.astar import Planner
 from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.raycast import cast
@@ -16,6 +18,7 @@ from fognav.demo.danger import choose
 from fognav.output import WrongUseError
 from fognav.site_command import check_site, identifier, new_site
 from fognav.site_proposal import NoSiteError, propose
+from fognav_sim.scenario import barrier_across
 
 RESOLUTION = 0.05
 
@@ -49,11 +52,10 @@ def test_a_proposal_can_be_driven_and_each_area_can_be_driven_around(seed: int) 
         raw[window.rows, window.columns][mask] = 254
         assert planner.plan(inflate(raw, table), *ends).found, f"{area.id} leaves no way"
 
-    def is_free(x: float, y: float) -> bool:
-        column, row = geometry.cell(x, y)
-        return bool(cells[row, column] == 0)
+    def barrier_in(area: AreaSite) -> SimObstacle:
+        return barrier_across(area, site, StaticMap(geometry, cells), seed)
 
-    assert choose(site, path, seed, is_free).area.id in site.demo.areas
+    assert choose(site, path, seed, barrier_in).area.id in site.demo.areas
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from fog_contracts.messages import SimCommand
+from fog_contracts.messages import SimCommand, SimObstacle
+from fog_contracts.site import AreaSite
 from fog_runtime.clock import SystemClock
 from fog_runtime.site import LoadedSite
 from fog_runtime.zenoh_edge import ZenohEdge
@@ -22,6 +23,7 @@ from fognav.output import WrongUseError
 from fognav.recording import recording
 from fognav.stack import WATCHER, Stack, StackConfig
 from fognav.supervisor import Event
+from fognav_sim.scenario import barrier_across
 
 READY_S: Final = 90.0
 """Real seconds for everything to start."""
@@ -327,14 +329,11 @@ class Demo:
         self.scene.say(f"a barrier stands in {self._danger.area.label or self._danger.area.id} now")
 
     def _choose(self, points: list[tuple[float, float]]) -> Danger:
-        grid, cells = self.site.map.geometry, self.site.map.cells
-
-        def is_free(x: float, y: float) -> bool:
-            column, row = grid.cell(x, y)
-            return grid.contains_cell(column, row) and bool(cells[row, column] == 0)
+        def barrier_in(area: AreaSite) -> SimObstacle:
+            return barrier_across(area, self.site.site, self.site.map, self.options.seed)
 
         try:
-            return choose(self.site.site, points, self.options.seed, is_free)
+            return choose(self.site.site, points, self.options.seed, barrier_in)
         except NoDangerError as error:
             raise WrongUseError(str(error)) from error
 

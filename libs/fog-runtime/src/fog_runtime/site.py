@@ -72,7 +72,8 @@ def _read(file: Path) -> Site:
         site = msgspec.convert(data, Site)
     except msgspec.ValidationError as error:
         problem, _, path = str(error).partition(" - at ")
-        path = path.replace("places[...]", f"places.{_bad_place(data)}")
+        if "places[...]" in path:
+            path = path.replace("places[...]", f"places.{_bad_place(data)}")
         missing = re.search(r"required field `(\w+)`", problem)
         remedy = f"Add `{missing[1]}`" if missing else "Correct the value"
         raise SiteError(file, path.strip("`").removeprefix("$").lstrip(".") or "file", problem, remedy) from error

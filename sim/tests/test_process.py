@@ -1,0 +1,173 @@
+"""The simulator as others meet it: devices, nodes on a real broker, truth and commands over a real router."""
+
+import asyncio
+import contextlib
+import json
+import os
+import signal
+import sys
+import time
+import urllib.request
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fog_contracts import channels as ch
+from fog_contracts.grid import GridGeometry
+from fog_contracts.messages import CommandReply, NodeReading, Pose, SimCommand, SimObstacle, SimTruth
+from fog_runtime.clock import SystemClock
+from fog_runtime.maps import StaticMap, save_map
+from fog_runtime.mqtt_edge import MqttEdge
+from fog_runtime.servers import start_mosquitto, start_router
+from fog_runtime.zenoh_edge import ZenohEdge
+
+pytestmark = pytest.mark.live
+
+SITE = """
+id = "lab"
+[[areas]]
+id = "z1"
+polygon = [[3.0, 0.2], [5.0, 0.2], [5.0, 2.8], [3.0, 2.8]]
+[[nodes]]
+id = "n1"
+area = "z1"
+x = 4.0
+y = 0.25
+theta = 1.5707963
+sonars = [{ angle = -0.1, range_limit = 2.2 }, { angle = 0.1, range_limit = 2.2 }]
+[[robots]]
+id = "r1"
+start = { x = 1.0, y = 1.5, theta = 0.0 }
+"""
+BOX = SimObstacle(id="box", polygon=[(3.5, 1.0), (4.5, 1.0), (4.5, 1.4), (3.5, 1.4)], height=1.0)
+
+
+async def until(condition, what, seconds=20.0):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, what
+        await asyncio.sleep(0.02)
+
+
+class Rig:
+    """What surrounds the simulator, and what was heard of it."""
+
+    def __init__(self, folder, mqtt_url, zenoh):
+        self.folder, self.mqtt_url, self.zenoh = folder, mqtt_url, zenoh
+        self.run, self.truth_log, self.port_file = folder / "run", folder / "truth.jsonl", folder / "port"
+        self.readings, self.availability, self.truths = [], [], []
+        self.edge = None
+
+    async def spawn(self, speed):
+        values = {
+            "SITE_DIR": self.folder / "site",
+            "DATA_DIR": self.folder,
+            "RUN_DIR": self.run,
+            "TRUTH_LOG": self.truth_log,
+            "PORT_FILE": self.port_file,
+            "MQTT_URL": self.mqtt_url,
+            "ZENOH_CONNECT": self.zenoh,
+            "SPEED": speed,
+        }
+        environment = os.environ | {f"FOGNAV_{key}": str(value) for key, value in values.items()}
+        return await asyncio.create_subprocess_exec(sys.executable, "-m", "fognav_sim", env=environment)
+
+    async def ask(self, **command):
+        return await self.edge.ask(ch.SIM_COMMAND, SimCommand(**command), CommandReply, 5.0, robot="r1")
+
+    def log(self):
+        return [json.loads(line) for line in self.truth_log.read_bytes().splitlines()]
+
+
+def write_site(folder):
+    folder.mkdir()
+    (folder / "site.toml").write_text(SITE, "utf-8")
+    geometry = GridGeometry(160, 60, 0.05, 0.0, 0.0)
+    cells = np.zeros(geometry.shape, np.uint8)
+    cells[:4], cells[-4:], cells[:, :4], cells[:, -4:] = 254, 254, 254, 254
+    save_map(folder / "map", StaticMap(geometry, cells))
+
+
+@contextlib.asynccontextmanager
+async def simulator(folder: Path, speed=1):
+    write_site(folder / "site")
+    with start_mosquitto(folder / "mosquitto") as broker, start_router(folder / "router") as router:
+        url = broker.endpoint if "://" in broker.endpoint else f"mqtt://{broker.endpoint}"
+        rig = Rig(folder, url, router.endpoint)
+        clock = SystemClock()
+        mqtt = MqttEdge(url, "test", clock)
+        mqtt.on(ch.NODE_READING, lambda _, reading: rig.readings.append(reading), NodeReading)
+        mqtt.on(ch.NODE_AVAILABILITY, lambda _, text: rig.availability.append(text))
+        listening = asyncio.create_task(mqtt.run())
+        async with ZenohEdge.open(connect=[router.endpoint], clock=clock, role="test", id="t", site="lab") as rig.edge:
+            rig.edge.subscribe(ch.SIM_TRUTH, SimTruth, lambda _, truth: rig.truths.append(truth), robot="r1")
+            await mqtt.wait_connected()
+            process = await rig.spawn(speed)
+            try:
+                await until(lambda: rig.truths and rig.readings, "the simulator came up")
+                yield rig, process
+            finally:
+                if process.returncode is None:
+                    process.kill()
+                await process.wait()
+                listening.cancel()
+                await asyncio.gather(listening, return_exceptions=True)
+
+
+async def test_commands_drive_the_robot_and_the_truth_tells_it(tmp_path):
+    async with simulator(tmp_path) as (rig, process):
+        port = rig.port_file.read_text("utf-8").split()[0]
+        answer = await asyncio.to_thread(urllib.request.urlopen, f"http://127.0.0.1:{port}/readyz")
+        assert json.loads(answer.read())["ready"]
+        base = os.open(rig.run / "roomba", os.O_RDWR | os.O_NOCTTY)
+        try:
+            os.write(base, bytes([128, 131, 145, 0, 200, 0, 200, 148, 2, 43, 44]))
+            await until(lambda: rig.truths[-1].distance > 0.3, "the robot drove")
+            assert rig.truths[-1].left == pytest.approx(0.2)
+            assert os.read(base, 4096)[:2] == b"\x13\x06"
+            os.write(base, bytes([145, 0, 0, 0, 0]))
+            await until(lambda: rig.truths[-1].left == 0.0, "the robot stopped")
+        finally:
+            os.close(base)
+        assert rig.truths[-1].sustained_speed == pytest.approx(1.0, abs=0.2)
+        process.send_signal(signal.SIGTERM)
+        assert await process.wait() == 0
+        assert not (rig.run / "roomba").exists()
+    log = rig.log()
+    assert any(line["left"] == 0.2 for line in log)
+    assert log[-1]["x"] == pytest.approx(rig.truths[-1].x, abs=1e-6)
+    assert {"t_mono", "x", "y", "theta", "left", "right", "contacts", "clearance"} <= set(log[-1])
+    # At least 50 lines a second.
+    assert len(log) / (log[-1]["now"] - log[0]["now"]) > 50.0
+
+
+async def test_what_is_placed_is_seen_by_the_nodes_and_told_by_the_truth(tmp_path):
+    async with simulator(tmp_path, speed=4) as (rig, _):
+        await until(lambda: rig.readings[-1].state == "clear", "the floor is clear")
+        assert (await rig.ask(place=[BOX])).accepted
+        await until(lambda: rig.readings[-1].state == "blocked", "the node sees the box")
+        await until(lambda: [o.id for o in rig.truths[-1].obstacles] == ["box"], "the truth tells of it")
+        trap = SimObstacle(id="trap", polygon=[(0.9, 1.4), (1.1, 1.4), (1.1, 1.6)], height=1.0)
+        reply = await rig.ask(place=[trap])
+        assert not reply.accepted
+        assert "would stand on robot r1" in reply.reason
+        assert (await rig.ask(remove=["box"], kidnap=Pose(x=6.0, y=1.0, theta=1.0))).accepted
+        await until(lambda: rig.readings[-1].state == "clear", "the box is gone")
+        await until(lambda: abs(rig.truths[-1].x - 6.0) < 0.01, "the robot was carried away")
+        reply = await rig.ask(remove=["nothing"])
+        assert not reply.accepted
+
+
+async def test_a_silent_node_sends_nothing_and_a_killed_one_leaves_its_last_will(tmp_path):
+    async with simulator(tmp_path) as (rig, process):
+        assert rig.availability == ["online"]
+        assert (await rig.ask(nodes_silent=["n1"])).accepted
+        count = len(rig.readings)
+        truths = len(rig.truths)
+        await until(lambda: len(rig.truths) > truths + 10, "a second passed")
+        assert len(rig.readings) <= count + 1
+        assert (await rig.ask(nodes_silent=[])).accepted
+        await until(lambda: len(rig.readings) > count + 5, "the node speaks again")
+        process.kill()
+        await until(lambda: rig.availability[-1] == "offline", "the last will")

@@ -68,6 +68,7 @@ class Happening(msgspec.Struct, frozen=True, kw_only=True):
 class LockstepResult(msgspec.Struct, frozen=True, kw_only=True):
     """How a drive went, judged by the simulated truth; lengths in m, times in s of the emulated clock.
 
+    `operator_commands` counts the commands that were accepted, the first enable included.
     `crossed` lists the areas that the robot really entered, `hazard_clearance_m` how near its rim came to the
     barrier, `stages_ms` the blocked hazard's way, `track` the true way every 0.25 m.
     """
@@ -143,7 +144,7 @@ class _Drive:
         robot.step(fog.snapshot if robot.agent.needs_snapshot else None)
         for happened in self.scenario.step(self.world, self.now):
             self.barrier_since = self.now
-            self.say(f"{happened.name} appears")
+            self.say(happened.name)
         known = {area: told.hazard.state for area, told in fog.hazards.items()}
         fog.step(self.now)
         fog.hear(robot.id, robot.tell(), self.now)
@@ -203,9 +204,9 @@ class _Drive:
         waits = waits or (state.mode == "HOLD" and stood >= HELD_S)
         if not waits:
             return
-        self.commands += 1
         reply = self.robot.command("enable")
         if reply.accepted:
+            self.commands += 1
             self.say("operator: enable")
 
     def warm_up(self) -> str | None:
@@ -249,7 +250,7 @@ class _Drive:
 
     def result(self, outcome: Outcome, detail: str, area: str | None) -> LockstepResult:
         """Put together what is known."""
-        happened = next((event for event in self.events if event.what.endswith("appears")), None)
+        happened = next((event for event in self.events if event.what.startswith("barrier appears")), None)
         return LockstepResult(
             outcome=outcome,
             detail=detail,
@@ -311,7 +312,7 @@ def run_lockstep(
     if barrier is not None:
         drive.barrier = barrier
         at = hazard_at_m if hazard_at_m is not None else float(np.random.default_rng((seed, 1)).uniform(*TRIGGER_M))
-        event = Event(name=f"barrier in {hazard_area}", place=(barrier,), at_distance=at)
+        event = Event(name=f"barrier appears in {hazard_area}", place=(barrier,), at_distance=at)
         drive.scenario = Scenario([event], start=drive.now, distance=drive.world.distance)
     drive.fog.planner.set_goal(drive.robot.id, mission, any_heading=goal.theta is None)
     steps = 0

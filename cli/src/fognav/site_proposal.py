@@ -22,6 +22,8 @@ from fog_kernels.astar import Planner
 from fog_kernels.distance import squared_distance_capped
 from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.raycast import cast
+from fog_runtime.maps import StaticMap
+from fognav_sim.scenario import ScenarioError, barrier_across
 
 ROBOT_RADIUS: Final = 0.17
 INFLATION_RADIUS: Final = 0.55
@@ -46,6 +48,7 @@ _MAX_DETOUR: Final = 4.0
 _MAX_AREAS: Final = 3
 _PAIRS: Final = 60
 _HEADINGS: Final = 36
+_BARRIERS: Final = 8
 
 
 class NoSiteError(ValueError):
@@ -175,7 +178,7 @@ def _areas(
         if travelled > length - _ENDS_M[1] or travelled - last < _AREA_SPACING_M:
             continue
         candidate = _area_at(floor, there, len(found) + 1)
-        if candidate is None:
+        if candidate is None or not _can_be_closed(floor, *candidate):
             continue
         detour = _detour(floor, planner, candidate[0].polygon, start, goal)
         if detour is None or detour > _MAX_DETOUR * length:
@@ -237,6 +240,18 @@ def _area_at(floor: _Floor, spot: Point, number: int) -> tuple[AreaSite, NodeSit
         sonars=sonars,
     )
     return area, node
+
+
+def _can_be_closed(floor: _Floor, area: AreaSite, node: NodeSite) -> bool:
+    """Whether a barrier that the node sees fits in, whatever the demo's seed: walls may be too ragged for one."""
+    alone = Site(id="site", areas=[area], nodes=[node])
+    static = StaticMap(floor.geometry, floor.raw)
+    try:
+        for seed in range(_BARRIERS):
+            barrier_across(area, alone, static, seed)
+    except ScenarioError:
+        return False
+    return True
 
 
 def _detour(

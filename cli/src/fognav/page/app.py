@@ -38,8 +38,8 @@ def map_png(static: StaticMap) -> bytes:
     return buffer.getvalue()
 
 
-def make_app(demo: Demo) -> FastAPI:
-    """Return the page's application; it shows whatever attempt the demo is at."""
+def make_app(demo: Demo, closing: asyncio.Event) -> FastAPI:
+    """Return the page's application; it shows whatever attempt the demo is at, until `closing` is set."""
     app = FastAPI(title="Fognav demo", docs_url=None, redoc_url=None, openapi_url=None)
     picture = map_png(demo.site.map)
 
@@ -53,7 +53,9 @@ def make_app(demo: Demo) -> FastAPI:
 
     @app.get("/events")
     async def events() -> StreamingResponse:
-        return StreamingResponse(_stream(demo), media_type="text/event-stream", headers={"Cache-Control": "no-store"})
+        return StreamingResponse(
+            _stream(demo, closing), media_type="text/event-stream", headers={"Cache-Control": "no-store"}
+        )
 
     @app.get("/{name:path}")
     async def static(name: str) -> Response:
@@ -65,11 +67,11 @@ def make_app(demo: Demo) -> FastAPI:
     return app
 
 
-async def _stream(demo: Demo) -> AsyncIterator[str]:
+async def _stream(demo: Demo, closing: asyncio.Event) -> AsyncIterator[str]:
     """Send the whole moving scene again and again: a browser that lost some needs no history."""
     trail_from = 0
     scene = demo.scene
-    while True:
+    while not closing.is_set():
         if scene is not demo.scene:
             scene, trail_from = demo.scene, 0
         moving = scene.moving()
@@ -79,17 +81,19 @@ async def _stream(demo: Demo) -> AsyncIterator[str]:
         moving["trail"] = trail[trail_from:]
         trail_from = len(trail)
         yield f"data: {json.dumps(moving, separators=(',', ':'))}\n\n"
-        await asyncio.sleep(_PERIOD_S)
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(closing.wait(), _PERIOD_S)
 
 
 @contextlib.asynccontextmanager
 async def serve(demo: Demo, port: int = 0) -> AsyncIterator[str]:
     """Serve the page beside the body; yields its address. Port 0 takes a free one."""
     chosen = port or net.free_port(set())
+    closing = asyncio.Event()
     config = uvicorn.Config(
-        make_app(demo), host=net.LOOPBACK, port=chosen, log_level="warning", access_log=False, lifespan="off"
+        make_app(demo, closing), host=net.LOOPBACK, port=chosen, log_level="warning", access_log=False, lifespan="off"
     )
-    config.timeout_graceful_shutdown = 1
+    config.timeout_graceful_shutdown = 2
     server = uvicorn.Server(config)
     # The command handles its signals itself.
     server.capture_signals = contextlib.nullcontext  # type: ignore[method-assign,assignment]  # a context manager too
@@ -102,5 +106,7 @@ async def serve(demo: Demo, port: int = 0) -> AsyncIterator[str]:
             await asyncio.sleep(0.02)
         yield f"http://{net.LOOPBACK}:{chosen}/"
     finally:
+        # A stream that ends by itself; uvicorn would cancel one that goes on, and complain.
+        closing.set()
         server.should_exit = True
         await asyncio.gather(task, return_exceptions=True)

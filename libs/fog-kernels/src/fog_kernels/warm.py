@@ -13,11 +13,10 @@ import sys
 from numba.core.dispatcher import Dispatcher
 
 PROFILES: dict[str, tuple[str, ...]] = {
-    "fog-robot": ("distance", "inflation", "likelihood", "amcl", "dwa"),
-    "default-robot": ("distance", "inflation", "likelihood", "amcl", "dwa", "astar"),
-    "planner": ("astar",),
+    "robot": ("amcl", "astar", "distance", "dwa", "inflation", "likelihood", "raycast"),
+    "planner": ("astar", "distance", "inflation"),
     "map": ("distance", "inflation"),
-    "sim": ("raycast",),
+    "sim": ("distance", "raycast"),
     "all": ("amcl", "astar", "distance", "dwa", "inflation", "likelihood", "raycast"),
 }
 

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import itertools
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from msgspec import structs
 
 from fog_contracts.geometry import GeometryError, bounding_box, normalized_polygon
 from fog_contracts.messages import CircleShape, CorridorShape, PolygonShape, RectangleShape
-from map_service.layers.protocol import Figure
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -21,6 +20,13 @@ if TYPE_CHECKING:
     from fog_contracts.messages import Shape, Zone
 
     Axis = NDArray[np.float64]
+
+
+class Figure(NamedTuple):
+    """The cells of a shape: a window of the grid and a mask (window height, window width) inside it."""
+
+    window: Window
+    mask: NDArray[np.bool_]
 
 
 class ZoneError(ValueError):

@@ -13,7 +13,8 @@ from msgspec import structs
 
 from fog_contracts.geometry import normalized_polygon, rasterize
 from fog_contracts.messages import AreaHazard, Cause, HazardArea
-from map_service.layers.protocol import Figure, Touch, paint_figure
+from map_service.layers.protocol import Touch, paint_figure
+from map_service.shapes import Figure
 
 if TYPE_CHECKING:
     from typing import Final

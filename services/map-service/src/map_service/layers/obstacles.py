@@ -13,7 +13,8 @@ import numpy as np
 from fog_contracts.costs import LETHAL
 from fog_contracts.grid import Window
 from fog_contracts.messages import Cause
-from map_service.layers.protocol import Figure, Touch, paint_figure
+from map_service.layers.protocol import Touch, paint_figure
+from map_service.shapes import Figure
 
 if TYPE_CHECKING:
     from typing import Final

@@ -12,9 +12,9 @@ from fog_contracts.grid import Window
 
 if TYPE_CHECKING:
     from fog_contracts.messages import Cause, Trace
+    from map_service.shapes import Figure
 
 Grid = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 
 
 class Touch(NamedTuple):
@@ -36,13 +36,6 @@ class Layer(Protocol):
 
     def paint(self, window: Window, cost: Grid, speed: Grid) -> None:
         """Write into `cost` and `speed`, both uint8 (window.height, window.width): the map inside the window."""
-
-
-class Figure(NamedTuple):
-    """The cells of a shape: a window of the grid and a mask (window height, window width) inside it."""
-
-    window: Window
-    mask: Mask
 
 
 def overlap(a: Window, b: Window) -> Window:

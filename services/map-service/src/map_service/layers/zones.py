@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
     from fog_contracts.grid import GridGeometry, Window
     from fog_contracts.messages import Zone
-    from map_service.layers.protocol import Figure, Grid
+    from map_service.layers.protocol import Grid
+    from map_service.shapes import Figure
 
 COST_PER_FACTOR: Final = 62.5
 

@@ -6,6 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+import numpy as np
+
+from fog_contracts.costs import UNKNOWN
 from fog_contracts.messages import (
     HazardArea,
     RobotGoal,
@@ -16,6 +19,7 @@ from fog_contracts.messages import (
     SimTruth,
     Trace,
 )
+from fog_runtime.maps import StaticMap
 from fog_runtime.site import LoadedSite
 from fognav.demo.judge import Traces, Verdict, hazard_to_path_ms, stages_ms
 
@@ -82,6 +86,7 @@ class Scene:
                 "x": geometry.origin_x,
                 "y": geometry.origin_y,
             },
+            "extent": _extent(self.site.map),
             "areas": [{"id": a.id, "label": a.label or a.id, "polygon": a.polygon} for a in site.areas],
             "nodes": [
                 {"id": n.id, "x": n.x, "y": n.y, "beams": [[n.theta + s.angle, s.range_limit] for s in n.sonars]}
@@ -119,3 +124,15 @@ class Scene:
             "told": self.told,
             "events": [[round(at, 1), text] for at, text in list(self.events)[-30:]],
         }
+
+
+def _extent(static: StaticMap) -> list[float]:
+    """Return left, bottom, right and top (m) of what is known of the map: some have wide unknown margins."""
+    known = static.cells != UNKNOWN
+    rows, columns = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
+    g = static.geometry
+    if rows.size == 0:
+        return list(g.bounds)
+    x = [g.origin_x + edge * g.resolution for edge in (int(columns[0]), int(columns[-1]) + 1)]
+    y = [g.origin_y + edge * g.resolution for edge in (int(rows[0]), int(rows[-1]) + 1)]
+    return [x[0], y[0], x[1], y[1]]

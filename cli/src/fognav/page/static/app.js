@@ -42,11 +42,9 @@ function colourFloor() {
 }
 
 function fit() {
-  const m = still.map;
-  const width = m.width * m.resolution;
-  const height = m.height * m.resolution;
-  const scale = 0.96 * Math.min(canvas.clientWidth / width, canvas.clientHeight / height);
-  view = { x: m.x + width / 2, y: m.y + height / 2, scale };
+  const [left, bottom, right, top] = still.extent;
+  const scale = 0.94 * Math.min(canvas.clientWidth / (right - left), canvas.clientHeight / (top - bottom));
+  view = { x: (left + right) / 2, y: (bottom + top) / 2, scale };
 }
 
 const px = (x) => (x - view.x) * view.scale + canvas.clientWidth / 2;

@@ -154,12 +154,15 @@ def site_new(
     json: Json = False,
 ) -> None:
     """Write a commented starting point for a site on any map_server map, ready for a demonstration."""
-    from fognav.site_command import new_site  # noqa: PLC0415  # its kernels take time to load
+    from fognav.site_command import new_site  # noqa: PLC0415  # the other commands need not wait for its imports
 
     try:
+        kernels.make_warm(_say)
         made = new_site(map_file, out, seed)
     except WrongUseError as error:
         _fail(str(error), WRONG_USE)
+    except kernels.KernelsError as error:
+        _fail(str(error))
     if json:
         print_json(made)
     else:

@@ -8,7 +8,6 @@ from fog_runtime.files import atomic_write
 from fog_runtime.maps import MapFileError, load_map
 from fog_runtime.site import SITE_FILE, SiteError, load_site
 from fognav.output import WrongUseError
-from fognav.site_proposal import NoSiteError, propose, to_toml
 
 _ID_LENGTH = 32
 
@@ -21,6 +20,9 @@ def identifier(name: str) -> str:
 
 def new_site(map_file: Path, out: Path, seed: int) -> dict[str, object]:
     """Write `out`/site.toml on a map; raises `WrongUseError`, and then writes nothing."""
+    # A check must not wait for the kernels that a proposal needs.
+    from fognav.site_proposal import NoSiteError, propose, to_toml  # noqa: PLC0415  # see above
+
     target = out / SITE_FILE
     if target.exists():
         raise WrongUseError(f"{target} exists already: name another folder with --out, or remove it")

@@ -23,7 +23,10 @@ _CONNECT_S: Final = 10.0
 async def recording(
     path: Path, *, mqtt_url: str, zenoh: ZenohEdge, clock: Clock, numbers: Sequence[int] = ()
 ) -> AsyncIterator[None]:
-    """Record every channel beside the body; raises `WrongUseError` when the file can't be written."""
+    """Record every channel beside the body, which begins when the broker is heard.
+
+    Raises `WrongUseError` when the file can't be written or the broker can't be reached.
+    """
     try:
         recorder = Recorder(path, site=zenoh.site)
     except OSError as error:
@@ -33,6 +36,7 @@ async def recording(
         record_all(mqtt, zenoh, recorder, clock, numbers=numbers)
         task = asyncio.create_task(mqtt.run())
         try:
+            await _connected(mqtt, mqtt_url)
             yield
         finally:
             task.cancel()
@@ -82,10 +86,15 @@ async def play(path: Path, *, mqtt_url: str, zenoh_endpoint: str, site: str, spe
 
         task = asyncio.create_task(mqtt.run())
         try:
-            await asyncio.wait_for(mqtt.wait_connected(), _CONNECT_S)
+            await _connected(mqtt, mqtt_url)
             return {"file": str(path), "sent": await replay(path, clock, send)}
-        except TimeoutError as error:
-            raise WrongUseError(f"the broker {mqtt_url} can't be reached: start it, or name another") from error
         finally:
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)
+
+
+async def _connected(mqtt: MqttEdge, url: str) -> None:
+    try:
+        await asyncio.wait_for(mqtt.wait_connected(), _CONNECT_S)
+    except TimeoutError as error:
+        raise WrongUseError(f"the broker {url} can't be reached: start it, or name another") from error

@@ -2,6 +2,7 @@
 
 import asyncio
 import math
+from typing import Final
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
@@ -24,6 +25,10 @@ _MODE_STYLES = {
     "DOCK": "bold magenta",
 }
 _STATE_STYLES = {"blocked": "bold red", "clear": "green", "unknown": "yellow"}
+
+
+_VALUE_WIDTH: Final = 8
+"""Of the widest state and of a time in ms: narrower terminals cut names before values."""
 
 
 def _pairs() -> Table:
@@ -54,7 +59,9 @@ def _robot(scene: Scene) -> Panel:
 
 
 def _hazards(scene: Scene) -> Panel:
-    table = _pairs()
+    table = Table.grid(padding=(0, 2))
+    table.add_column(style="dim", no_wrap=True, overflow="ellipsis")
+    table.add_column(no_wrap=True, justify="right", min_width=_VALUE_WIDTH)
     for area in scene.site.site.areas:
         hazard = scene.hazards.get(area.id)
         state = hazard.hazard.state if hazard else "no word"
@@ -64,10 +71,10 @@ def _hazards(scene: Scene) -> Panel:
     if took:
         table.add_row("", "")
         for stage, _, _ in STAGES:
-            table.add_row(stage, f"{took[stage]:7.0f} ms" if stage in took else "      ...")
+            table.add_row(stage, f"{took[stage]:.0f} ms" if stage in took else "...")
         total = hazard_to_path_ms(trace)
         if total is not None:
-            table.add_row(Text("reading to path", style="bold"), Text(f"{total:7.0f} ms", style="bold"))
+            table.add_row(Text("reading to path", style="bold"), Text(f"{total:.0f} ms", style="bold"))
     return Panel(table, title="Watched areas", title_align="left")
 
 

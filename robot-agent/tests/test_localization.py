@@ -205,3 +205,23 @@ def test_the_number_of_particles_stays_within_its_bounds_and_the_seed_decides_ev
     assert max(counts) <= 2000
     assert drive(7) == (counts, found)
     assert drive(8)[1] != found
+
+
+def test_readings_that_were_held_up_and_arrive_together_make_no_speed():
+    localizer = Localizer(seed=1)
+    for i in range(20):
+        localizer.on_odometry(0.015 * i, 0.3 * 0.015 * i, 0.0, 0.0)
+    begin, moved = 0.015 * 19, 0.3 * 0.015 * 19
+    for i in range(1, 41):  # 0.6 s of motion, read within 4 ms
+        localizer.on_odometry(begin + 0.6 + 0.0001 * i, moved + 0.3 * 0.015 * i, 0.0, 0.0)
+    assert localizer.twist()[0] == pytest.approx(0.3, rel=0.02)
+    late = localizer.odom_at(begin + 0.7)
+    assert late is not None
+    assert late.x == pytest.approx(moved + 0.3 * 0.7, abs=0.02)
+
+
+def test_a_bunch_of_readings_without_a_past_makes_no_speed():
+    localizer = Localizer(seed=1)
+    for i in range(40):
+        localizer.on_odometry(0.0001 * i, 0.3 * 0.015 * i, 0.0, 0.0)
+    assert localizer.twist() == (0.0, 0.0)

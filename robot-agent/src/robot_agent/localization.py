@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
 _HISTORY_S: Final = 3.0
 _EXTRAPOLATE_S: Final = 0.15
+_TWIST_OVER_S: Final = 0.15
+_TWIST_LEAST_S: Final = 0.03
 _OCCUPIED: Final = 254
 _FREE: Final = 0
 _CHUNK: Final = 40_000
@@ -280,14 +282,19 @@ class Localizer:
         return self._covariance
 
     def twist(self) -> tuple[float, float]:
-        """Measured forward speed (m/s) and turning rate (rad/s) over the last 0.15 s; zeros without two readings."""
+        """Measured forward speed (m/s) and turning rate (rad/s) over the last 0.15 s or more; zeros without that.
+
+        Readings that were held up arrive together: between them no time passes, so a stretch must not begin within
+        such a bunch.
+        """
         if len(self._history) < 2:
             return 0.0, 0.0
         at, x, y, theta = self._history[-1]
-        old = next(entry for entry in self._history if entry[0] >= at - 0.15)
-        if old[0] == at:
-            old = self._history[-2]
+        earlier = (entry for entry in reversed(self._history) if entry[0] <= at - _TWIST_OVER_S)
+        old = next(earlier, self._history[0])
         span = at - old[0]
+        if span < _TWIST_LEAST_S:
+            return 0.0, 0.0
         heading = 0.5 * (theta + old[3])
         forward = (x - old[1]) * math.cos(heading) + (y - old[2]) * math.sin(heading)
         return forward / span, (theta - old[3]) / span

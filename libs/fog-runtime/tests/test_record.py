@@ -105,8 +105,9 @@ async def test_replay_keeps_the_intervals_of_its_clock(tmp_path):
 
 
 @pytest.mark.live
-async def test_record_all_takes_both_transports(tmp_path):
-    clock = SystemClock()
+@pytest.mark.parametrize("speed", [1.0, 100.0])
+async def test_record_all_takes_both_transports_at_any_speed(tmp_path, speed):
+    clock, begun = SystemClock(speed), time.time()
     with start_mosquitto(tmp_path / "m") as broker, start_router(tmp_path / "z") as router:
         mqtt = MqttEdge(broker.url, "rec", clock)
         async with ZenohEdge.open(connect=[router.endpoint], clock=clock, role="test", id="t", site="lab") as zenoh:
@@ -123,7 +124,10 @@ async def test_record_all_takes_both_transports(tmp_path):
                     await asyncio.sleep(0.01)
                 task.cancel()
                 await asyncio.gather(task, return_exceptions=True)
-    got = {channel.name: (ids, message) for _, channel, ids, message in read(tmp_path / "r.mcap")}
+    events = list(read(tmp_path / "r.mcap"))
+    # However fast its clock runs, a recording begins when it was made.
+    assert all(begun <= at_ns * 1e-9 <= begun + speed * (time.time() - begun) for at_ns, *_ in events)
+    got = {channel.name: (ids, message) for _, channel, ids, message in events}
     assert got == {
         "map_delta": ({}, delta(1)),
         "node_reading": ({"node": "n1"}, reading(1)),

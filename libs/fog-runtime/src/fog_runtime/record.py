@@ -184,15 +184,18 @@ def _decoded(path: Path, channel: Channel, data: bytes) -> Message | str:
 def record_all(
     mqtt: MqttEdge, zenoh: ZenohEdge, recorder: Recorder, clock: Clock, *, numbers: Sequence[str | int] = ()
 ) -> None:
-    """Record every published channel of both transports, stamped by `clock`; call before `mqtt.run()`.
+    """Record every published channel of both transports; call before `mqtt.run()`.
 
-    `numbers` names the areas of the thesis's topics.
+    The log's times begin at the real time and go on in seconds of `clock`: a fast clock's own stamps lie centuries
+    ahead, and soon beyond what a file can hold. `numbers` names the areas of the thesis's topics.
     """
+    begin = clock.stamp()
+    real_begin = begin / clock.speed
 
     def writer(channel: Channel) -> Callable[[dict[str, str], Any], None]:
         def write(ids: dict[str, str], message: Message | str) -> None:
             known = {**ids, "site": zenoh.site} if "site" in channel.fields else ids
-            recorder.write(channel, known, message, int(clock.stamp() * 1e9))
+            recorder.write(channel, known, message, int((real_begin + clock.stamp() - begin) * 1e9))
 
         return write
 

@@ -10,7 +10,7 @@ import struct
 from typing import TYPE_CHECKING, Any, BinaryIO, Final, Self, cast
 
 import msgspec
-from mcap.exceptions import EndOfFile, McapError
+from mcap.exceptions import EndOfFile, InvalidMagic
 from mcap.opcode import Opcode
 from mcap.reader import NonSeekingReader
 from mcap.stream_reader import MAGIC_SIZE
@@ -32,6 +32,7 @@ _CHUNK: Final = 64 * 1024
 """Bytes that a crash may cost."""
 
 _FRAME: Final = 9
+_NO_OPCODE: Final = 0
 
 _log = logs.get("record")
 
@@ -116,38 +117,52 @@ class Recorder:
 def read(path: Path) -> Iterator[tuple[int, Channel, dict[str, str], Message | str]]:
     """Yield (time in ns, channel, ids without the site, message) in the order of recording.
 
-    A file that a crash cut short gives all that is whole. Raises `RecordError` for what is no recording.
+    A file that a crash cut short gives all that is whole. Raises `RecordError` for what is no recording, or
+    when it comes to bytes that are damaged.
     """
     size = path.stat().st_size
     if size < MAGIC_SIZE:
         raise RecordError(f"{path}: is no MCAP file ({size} bytes)")
     with path.open("rb") as file:
-        whole = _whole_records(file)
+        whole = _whole_records(path, file)
         if whole < size:
             _log.warning("recording_cut_short", path=str(path), bytes_lost=size - whole)
-        reader = NonSeekingReader(cast("BinaryIO", _Head(file, whole)))
-        try:
-            # Not by the index: a file without an end has none.
-            for _, info, record in reader.iter_messages(log_time_order=False):
-                channel = CHANNELS.get(info.metadata.get("channel", ""))
-                ids = channel.match(info.topic) if channel else None
-                if channel is None or ids is None:
-                    raise RecordError(f"{path}: {info.topic!r} belongs to no channel of this version of the contracts")
-                ids.pop("site", None)
-                yield record.log_time, channel, ids, _decoded(path, channel, record.data)
-        except EndOfFile:
-            return  # between two records: all that is whole was read
-        except McapError as error:
-            raise RecordError(f"{path}: is no MCAP file ({error!r})") from error
+        reader = NonSeekingReader(cast("BinaryIO", _Head(file, whole)), validate_crcs=True)
+        for info, record in _messages(path, reader):
+            channel = CHANNELS.get(info.metadata.get("channel", ""))
+            ids = channel.match(info.topic) if channel else None
+            if channel is None or ids is None:
+                raise RecordError(f"{path}: {info.topic!r} belongs to no channel of this version of the contracts")
+            ids.pop("site", None)
+            yield record.log_time, channel, ids, _decoded(path, channel, record.data)
 
 
-def _whole_records(file: BinaryIO) -> int:
-    """Return where the last whole record ends: each is an opcode, a length of 8 bytes and its content."""
+def _messages(path: Path, reader: NonSeekingReader) -> Iterator[tuple[Any, Any]]:
+    """Yield channel and message of all that is whole; raises `RecordError` for damage."""
+    try:
+        # Not by the index: a file without an end has none.
+        for _, info, record in reader.iter_messages(log_time_order=False):
+            yield info, record
+    except EndOfFile:
+        return  # between two records: all that is whole was read
+    except InvalidMagic as error:
+        raise RecordError(f"{path}: is no MCAP file") from error
+    except Exception as error:  # its parser has no error of its own for most damage
+        raise RecordError(f"{path}: is damaged, or no MCAP file ({error!r})") from error
+
+
+def _whole_records(path: Path, file: BinaryIO) -> int:
+    """Return where the last whole record ends: each is an opcode, a length of 8 bytes and its content.
+
+    Raises `RecordError` where none can begin.
+    """
     size = file.seek(0, os.SEEK_END)
     end = MAGIC_SIZE
     while end + _FRAME <= size:
         file.seek(end)
         opcode, length = struct.unpack("<BQ", file.read(_FRAME))
+        if opcode == _NO_OPCODE and end > MAGIC_SIZE:
+            raise RecordError(f"{path}: is damaged before byte {end}: no record begins there")
         footer = opcode == Opcode.FOOTER
         after = end + _FRAME + length + (MAGIC_SIZE if footer else 0)  # the closing magic belongs to the footer
         if after > size:

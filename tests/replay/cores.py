@@ -1,0 +1,252 @@
+"""Feed a recording to fresh cores and write down all that they say: `python cores.py RECORDING SITE OUT`.
+
+Time is the recording's: an input is taken when it was recorded, and every core beats each 0.1 s of recorded time.
+A program of its own, so that a test can run it twice with other hash seeds.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import msgspec
+
+from fog_contracts import channels as ch
+from fog_contracts.messages import (
+    AreaDefinition,
+    AreaHazard,
+    HazardArea,
+    MapDelta,
+    MapHeartbeat,
+    MapSnapshot,
+    Message,
+    NodeReading,
+    PlanRequest,
+    Pose,
+    RobotGoal,
+    RobotObstacles,
+    RobotPath,
+    RobotPose,
+    RobotState,
+    ZoneSet,
+)
+from fog_contracts.replica import Applied, Replica
+from fog_runtime.record import read
+from fog_runtime.site import LoadedSite, load_site
+from hazard_aggregator.core import Aggregator
+from hazard_aggregator.outbox import Outbox
+from map_service.core import MapChange, MapCore
+from planner.core import PlannerCore
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+Heard = tuple[float, ch.Channel, dict[str, str], Message | str]
+
+BEAT_S: Final = 0.1
+
+
+class ReplayError(Exception):
+    """The recording lacks what a replay needs, or contradicts itself."""
+
+
+def hear(recording: Path) -> list[Heard]:
+    """Return all messages in the order of recording, with their times in seconds."""
+    return [(time_ns * 1e-9, channel, ids, message) for time_ns, channel, ids, message in read(recording)]
+
+
+def first(heard: list[Heard], channel: ch.Channel) -> tuple[float, Message]:
+    """Return time and content of a channel's first message."""
+    for at, told_on, _, message in heard:
+        if told_on is channel and isinstance(message, Message):
+            return at, message
+    raise ReplayError(f"no message of {channel.name} was recorded")
+
+
+def beating(heard: list[Heard], begin: float) -> Iterator[tuple[float, Heard | None]]:
+    """Yield the messages since `begin`, and None at every beat between them."""
+    due = begin
+    for message in heard:
+        at = message[0]
+        if at < begin:
+            continue
+        while due <= at:
+            yield due, None
+            due += BEAT_S
+        yield at, message
+
+
+def aggregate(heard: list[Heard], site: LoadedSite) -> list[AreaHazard]:
+    """Return the hazards that an aggregator announces, with a store that answers at once."""
+    begin, hazard = first(heard, ch.AREA_HAZARD)
+    assert isinstance(hazard, AreaHazard)
+    core, outbox = Aggregator(site.site.definitions(), site.site.nodes, hazard.epoch), Outbox()
+    announced: list[AreaHazard] = []
+    for at, event in beating(heard, begin):
+        if event is None:
+            changed = core.tick(at, at)
+        else:
+            _, channel, ids, message = event
+            if isinstance(message, NodeReading):
+                changed = core.on_reading(ids["node"], message, at, at)
+            elif channel is ch.NODE_AVAILABILITY:
+                changed = core.on_availability(ids["node"], message == "online", at, at)
+            elif isinstance(message, RobotPose):
+                changed = core.on_pose(ids["robot"], message, at)
+            else:
+                continue
+        announced += outbox.offer(changed)
+        announced += outbox.stored(outbox.unstored())
+    return announced
+
+
+def empty_map(heard: list[Heard], site: LoadedSite) -> MapCore:
+    """Return a map-service's core as it stands at its start: what no recording holds comes from the site."""
+    _, heartbeat = first(heard, ch.MAP_HEARTBEAT)
+    assert isinstance(heartbeat, MapHeartbeat)
+    return MapCore(site.site.id, site.map, heartbeat.epoch, definitions=site.site.definitions())
+
+
+def draw(heard: list[Heard], site: LoadedSite) -> tuple[list[MapDelta], MapSnapshot]:
+    """Return the deltas that a map-service publishes, and its last map."""
+    core, deltas = empty_map(heard, site), []
+
+    def take(change: MapChange) -> None:
+        deltas.extend(change.deltas)
+
+    for at, event in beating(heard, heard[0][0]):
+        if event is None:
+            take(core.tick(at, at))
+            continue
+        _, _, ids, message = event
+        if isinstance(message, AreaDefinition):
+            take(core.on_definition(message, at))
+        elif isinstance(message, AreaHazard):
+            take(core.on_hazard(message, at))
+        elif isinstance(message, RobotObstacles):
+            take(core.on_obstacles(ids["robot"], message, at, at))
+        elif isinstance(message, RobotPose):
+            core.on_pose(ids["robot"], message, at)
+        elif isinstance(message, ZoneSet):
+            kept = {zone.id for zone in message.zones}
+            for zone in core.zones():
+                if zone.id not in kept:
+                    take(core.remove_zone(zone.id, at))
+            for zone in message.zones:
+                take(core.put_zone(zone, at))
+    return deltas, core.snapshot()
+
+
+def copy(heard: list[Heard], site: LoadedSite) -> list[MapHeartbeat]:
+    """Return every version that a replica reaches by the recorded deltas; raises `ReplayError` if one does not fit."""
+    replica, versions = Replica(), []
+    replica.load(empty_map(heard, site).snapshot())
+    for at, _, _, message in heard:
+        if isinstance(message, MapDelta):
+            outcome = replica.apply(message)
+            if outcome == "gap":
+                raise ReplayError(f"recorded delta {message.seq} part {message.part} does not fit {replica.version}")
+            if isinstance(outcome, Applied):
+                version = outcome.version
+                versions.append(MapHeartbeat(epoch=version.epoch, seq=version.seq, hash=version.hash, stamp=at))
+    return versions
+
+
+def inform(core: PlannerCore, event: Heard) -> bool:
+    """Give a planner a recorded input; return whether it wakes it."""
+    at, _, ids, message = event
+    if isinstance(message, MapDelta):
+        core.on_delta(message, at)
+        return True
+    if isinstance(message, MapHeartbeat):
+        core.on_heartbeat(message, at)
+    elif isinstance(message, HazardArea):
+        core.on_hazard(message)
+    elif isinstance(message, ZoneSet):
+        core.on_zones(message)
+    elif isinstance(message, RobotPose):
+        core.on_pose(ids["robot"], message, at)
+    elif isinstance(message, RobotState):
+        core.on_state(ids["robot"], message, at)
+    elif isinstance(message, RobotGoal):
+        # The recorded goal is what the planner made of a person's wish: a place that asks for no heading is not in it.
+        core.set_goal(ids["robot"], message, any_heading=True)
+        return True
+    return False
+
+
+def guide(core: PlannerCore) -> None:
+    """Compute the distance fields that it wants, as its process does after a turn."""
+    for job in core.field_jobs():
+        job.run()
+        core.take_field(job)
+
+
+def new_planner(heard: list[Heard], site: LoadedSite) -> PlannerCore:
+    """Return a planner that knows the first map."""
+    _, path = first(heard, ch.ROBOT_PATH)
+    assert isinstance(path, RobotPath)
+    core = PlannerCore(path.planner_epoch)
+    core.load(empty_map(heard, site).snapshot())
+    return core
+
+
+def decide(heard: list[Heard], site: LoadedSite) -> list[RobotPath | RobotGoal]:
+    """Return what a planner tells the robots."""
+    core, told = new_planner(heard, site), []
+    for at, event in beating(heard, heard[0][0]):
+        if event is not None and not inform(core, event):
+            continue
+        told += [message for _, message in core.tick(at, at)]
+        guide(core)
+    return told
+
+
+def plan_again(heard: list[Heard], site: LoadedSite) -> list[RobotPath]:
+    """Return each recorded plan anew: from where it begins, on the map version that it names."""
+    core, known, goal, again = new_planner(heard, site), 0, None, []
+    for event in heard:
+        message = event[3]
+        if isinstance(message, (MapDelta, HazardArea, ZoneSet)):
+            inform(core, event)
+            guide(core)
+        elif isinstance(message, RobotGoal):
+            goal = message.pose or goal
+        elif isinstance(message, RobotPath) and message.plan_id != known and message.points and goal is not None:
+            known = message.plan_id
+            x, y = message.points[0]
+            reply = core.plan(PlanRequest(start=Pose(x=x, y=y, theta=0.0), goal=goal))
+            again.append(
+                msgspec.structs.replace(
+                    message,
+                    points=reply.points,
+                    map_epoch=reply.map_epoch,
+                    map_seq=reply.map_seq,
+                    refusal=reply.refusal,
+                )
+            )
+            core.set_goal("r", RobotGoal(goal_id="again", pose=goal))
+            guide(core)
+    return again
+
+
+def main() -> None:
+    """Replay, and write one file of JSON lines per core."""
+    recording, folder, out = (Path(argument) for argument in sys.argv[1:])
+    heard, site = hear(recording), load_site(folder)
+    deltas, snapshot = draw(heard, site)
+    said: dict[str, list[Message]] = {
+        "hazards": [*aggregate(heard, site)],
+        "deltas": [*deltas],
+        "snapshot": [snapshot],
+        "versions": [*copy(heard, site)],
+        "told": [*decide(heard, site)],
+        "again": [*plan_again(heard, site)],
+    }
+    for name, messages in said.items():
+        (out / f"{name}.jsonl").write_bytes(b"".join(msgspec.json.encode(message) + b"\n" for message in messages))
+
+
+if __name__ == "__main__":
+    main()

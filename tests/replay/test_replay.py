@@ -1,0 +1,367 @@
+"""Traffic recorded from a demo, fed to fresh cores, gives what the live processes said.
+
+A real demo (real brokers, all processes, emulated hardware) is recorded from before its first service starts, so that
+every input of aggregator, map-service and planner is in the file; what is no message (floor plan, nodes, areas) comes
+from the site. Two replays in processes of their own, with different hash seeds, must give the same bytes.
+
+What a replay can't know in principle is when a live process took an input between two others, and the phase of its
+0.1 s beats: MQTT and zenoh are two streams, and the recorder is a third listener. So of the live outputs exactly that
+is compared which this can't touch:
+
+- per area the states in order, with the reading that decided each (its cause names it), and the last hazard;
+- the map at the end, cell for cell by its hash, after obstacles have faded (a robot that moved 3 cm between a pose and
+  an obstacle leaves out another cell beside it); the versions between must be those of the recorded deltas;
+- each plan, computed again on the map version that it names and from the point where it begins, point for point;
+- which way the replayed planner goes, by where it leads.
+
+The robot-agent is not replayed: bytes of base and lidar cross no channel.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import json
+import math
+import os
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+import pytest
+from mcap.reader import make_reader
+
+from fog_contracts import channels as ch
+from fog_contracts.geometry import contains_point
+from fog_contracts.messages import (
+    AreaHazard,
+    CommandReply,
+    MapDelta,
+    MapHeartbeat,
+    MapSnapshot,
+    NodeReading,
+    RobotObstacles,
+    RobotPath,
+    SimCommand,
+    SimObstacle,
+)
+from fog_runtime.clock import SystemClock
+from fog_runtime.record import RecordError, read
+from fog_runtime.site import load_site
+from fog_runtime.zenoh_edge import ZenohEdge
+from fognav import net
+from fognav.demo.operator import Operator
+from fognav.demo.run import Demo, Options
+from fognav.output import WrongUseError
+from fognav.recording import recording, summary
+from fognav.stack import AGENT, MAP_SERVICE, SERVERS, SERVICES, SIMULATOR, WATCHER, Stack, StackConfig
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+pytestmark = [pytest.mark.live, pytest.mark.timeout(300)]
+
+HERE = Path(__file__).parent
+SITE = HERE.parents[1] / "sites" / "estig"
+SPEED = 3.0
+READY_S = 60.0
+DRIVE_S = 120.0
+BOX = SimObstacle(id="box", polygon=[(4.8, 23.4), (5.2, 23.4), (5.2, 23.8), (4.8, 23.8)])
+"""Behind the robot's back at its start: lidars see it, and no way leads over it."""
+AFTER_M = 1.5
+"""How far the robot drives on after its new path."""
+FADED_S = 3.0
+"""How long (s of the clock) after the last obstacle's end the map is looked at."""
+ZONES: tuple[dict[str, Any], ...] = (
+    {"id": "wet", "kind": "BLOCKED", "shape": {"type": "circle", "centre": [48.5, 15.0], "radius": 1.0}},
+    {"id": "slow", "kind": "SPEED_LIMIT", "speed": 0.2,
+     "shape": {"type": "rectangle", "corner": [8.0, 41.0], "opposite": [10.0, 43.0]}},
+)  # fmt: skip
+
+
+class UnhurriedDemo(Demo):
+    """A demo that takes a machine too slow for the speed: nobody judges how well the robot drives here."""
+
+    def _check_speed(self, elapsed, clock):
+        pass
+
+    def _judge_speed(self, verdict, clock):
+        pass
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A recorded demo; `last` is the map that the live map-service gave at the end."""
+
+    path: Path
+    last: MapSnapshot
+    blocked: str
+    heard: list[tuple[int, ch.Channel, dict[str, str], Any]]
+
+    def of(self, channel: ch.Channel) -> list[Any]:
+        return [message for _, told_on, _, message in self.heard if told_on is channel]
+
+
+async def until(condition: Callable[[], bool], what: str, timeout_s: float) -> None:
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline, f"{timeout_s:.0f} s passed before {what}"
+        await asyncio.sleep(0.05)
+
+
+async def ask_map_service(stack: Stack, method: str, path: str, body: dict[str, Any] | None = None) -> None:
+    port = stack.port(MAP_SERVICE)
+    assert port is not None
+    answer = await asyncio.to_thread(net.request, method, port, path, body=body, token=stack.token)
+    assert answer.status < 300, answer.reason
+
+
+async def drive(demo: Demo, stack: Stack, edge: ZenohEdge, clock: SystemClock) -> None:
+    """Drive until the robot follows a path around the barrier."""
+    operator = Operator(edge, stack, demo.scene, clock)
+    helping = asyncio.create_task(operator.keep_enabled())
+    driving = asyncio.create_task(demo._drive(operator, clock, [helping]))
+
+    def beyond(distance: float) -> bool:
+        assert not driving.done(), (demo.scene.verdict, list(demo.scene.events))
+        return demo._judge is not None and demo._judge.distance_m >= distance
+
+    def avoids() -> bool:
+        return beyond(0.0) and demo._blocked_at is not None and demo._judge is not None and demo._judge.paths >= 2
+
+    try:
+        await until(avoids, f"the way was blocked and planned anew: {list(demo.scene.events)}", DRIVE_S)
+        assert demo._judge is not None
+        there = demo._judge.distance_m + AFTER_M
+        await until(lambda: beyond(there), "the robot followed its new path", DRIVE_S)
+    finally:
+        for task in (driving, helping):
+            task.cancel()
+        await asyncio.gather(driving, helping, return_exceptions=True)
+
+
+async def record(path: Path) -> tuple[MapSnapshot, str]:
+    """Record a demo; return the last map and the area that was blocked."""
+    site = load_site(SITE)
+    clock = SystemClock(SPEED)
+    demo = UnhurriedDemo(site, Options(seed=1, speed=SPEED))
+    faded_at = 0.0
+
+    def on_obstacles(_: dict[str, str], seen: RobotObstacles) -> None:
+        nonlocal faded_at
+        faded_at = clock.now() + seen.ttl + FADED_S
+
+    async with Stack(StackConfig(site_dir=SITE, robot=demo.robot, seed=1, speed=SPEED)) as stack:
+        keeper = stack.supervisor
+        for name in SERVERS:
+            keeper.start(name)
+        await keeper.wait_ready(SERVERS, READY_S)
+        opened = ZenohEdge.open(
+            connect=[stack.zenoh_endpoint], clock=clock, role="console", id="replay", site=site.site.id
+        )
+        async with opened as edge, recording(path, mqtt_url=stack.mqtt_url, zenoh=edge, clock=clock):
+            # Before there are nodes and robots, the services stand at their beginning.
+            for names in (SERVICES, [SIMULATOR], [WATCHER, AGENT]):
+                for name in names:
+                    keeper.start(name)
+                await keeper.wait_ready([name for name in names if name != AGENT], READY_S)
+            edge.subscribe(ch.ROBOT_OBSTACLES, RobotObstacles, on_obstacles)
+            stood = await edge.ask(ch.SIM_COMMAND, SimCommand(place=[BOX]), CommandReply, 10.0, robot=demo.robot)
+            assert stood is not None
+            assert stood.accepted, stood.reason
+            for zone in ZONES:
+                await ask_map_service(stack, "POST", "/api/v1/zones", zone)
+            await drive(demo, stack, edge, clock)
+            for name in (AGENT, WATCHER):
+                await keeper.stop(name)
+            await ask_map_service(stack, "DELETE", "/api/v1/zones/wet")
+            await until(lambda: clock.now() > faded_at, "all obstacles had faded", READY_S)
+            last = await edge.ask(ch.MAP_SNAPSHOT, None, MapSnapshot, 10.0)
+            assert last is not None
+    assert demo._danger is not None
+    return last, demo._danger.area.id
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    path = tmp_path_factory.mktemp("recording") / "demo.mcap"
+    last, blocked = asyncio.run(record(path))
+    return Recording(path, last, blocked, list(read(path)))
+
+
+def run_cores(recording: Path, out: Path, hash_seed: int) -> Path:
+    out.mkdir()
+    command = [sys.executable, str(HERE / "cores.py"), str(recording), str(SITE), str(out)]
+    environment = {**os.environ, "PYTHONHASHSEED": str(hash_seed)}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    return out
+
+
+@pytest.fixture(scope="module")
+def replayed(recorded: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return run_cores(recorded.path, tmp_path_factory.mktemp("replay") / "first", 1)
+
+
+def said(replayed: Path, name: str, kind: Any) -> list[Any]:
+    return [msgspec.json.decode(line, type=kind) for line in (replayed / f"{name}.jsonl").read_bytes().splitlines()]
+
+
+def by_area(hazards: list[AreaHazard]) -> dict[str, list[AreaHazard]]:
+    found: dict[str, list[AreaHazard]] = {}
+    for hazard in hazards:
+        found.setdefault(hazard.area, []).append(hazard)
+    return found
+
+
+def turns(hazards: list[AreaHazard]) -> list[tuple[str, int, str]]:
+    """Return the states in order, each with its cost and the cause that brought it."""
+    grouped = itertools.groupby(hazards, key=lambda hazard: (hazard.state, hazard.penalty))
+    return [(state, penalty, next(group).cause) for (state, penalty), group in grouped]
+
+
+# --- The replays ---
+
+
+def test_the_recording_holds_a_demo_worth_replaying(recorded):
+    assert {"blocked", "clear", "unknown"} == {hazard.state for hazard in recorded.of(ch.AREA_HAZARD)}
+    assert len(recorded.of(ch.NODE_READING)) > 500
+    assert len({path.plan_id for path in recorded.of(ch.ROBOT_PATH)}) >= 2
+    assert any(zones.zones for zones in recorded.of(ch.ZONES))
+    assert any(seen.points for seen in recorded.of(ch.ROBOT_OBSTACLES))
+
+
+def test_two_replays_give_the_same_bytes(recorded, replayed, tmp_path):
+    again = run_cores(recorded.path, tmp_path / "second", 2)
+    names = sorted(path.name for path in replayed.iterdir())
+    assert names == ["again.jsonl", "deltas.jsonl", "hazards.jsonl", "snapshot.jsonl", "told.jsonl", "versions.jsonl"]
+    for name in names:
+        first = (replayed / name).read_bytes()
+        assert first, name
+        assert first == (again / name).read_bytes(), name
+
+
+def test_recorded_readings_bring_every_area_through_the_recorded_states(recorded, replayed):
+    live, replay = by_area(recorded.of(ch.AREA_HAZARD)), by_area(said(replayed, "hazards", AreaHazard))
+    assert live.keys() == replay.keys()
+    for area, hazards in live.items():
+        assert turns(hazards) == turns(replay[area]), area
+        assert hazards[-1].nodes == replay[area][-1].nodes
+
+
+def test_recorded_deltas_lead_a_replica_to_the_last_live_map(recorded, replayed):
+    reached = said(replayed, "versions", MapHeartbeat)[-1]
+    heartbeat = recorded.of(ch.MAP_HEARTBEAT)[-1]
+    for version in (heartbeat, recorded.last):
+        assert (reached.epoch, reached.seq, reached.hash) == (version.epoch, version.seq, version.hash)
+
+
+def test_recorded_inputs_draw_the_last_live_map(recorded, replayed):
+    (drawn,) = said(replayed, "snapshot", MapSnapshot)
+    assert drawn.hash == recorded.last.hash
+    assert (drawn.cost, drawn.speed, drawn.static) == (recorded.last.cost, recorded.last.speed, recorded.last.static)
+
+
+def test_recorded_inputs_close_the_blocked_area_with_the_recorded_cells(recorded, replayed):
+    def closing(deltas: list[MapDelta]) -> list[tuple[int, int, int, int]]:
+        return [
+            (delta.x, delta.y, delta.w, delta.h)
+            for delta in deltas
+            if any(cause.id == recorded.blocked and cause.state == "blocked" for cause in delta.causes)
+            and delta.layer == "cost"
+        ]
+
+    live = closing(recorded.of(ch.MAP_DELTA))
+    assert live
+    assert live == closing(said(replayed, "deltas", MapDelta))
+
+
+def test_every_recorded_plan_is_found_again_point_for_point(recorded, replayed):
+    plans = {path.plan_id: path for path in reversed(recorded.of(ch.ROBOT_PATH)) if path.points}
+    again = said(replayed, "again", RobotPath)
+    assert [path.plan_id for path in again] == sorted(plans)
+    for path in again:
+        live = plans[path.plan_id]
+        assert (path.map_epoch, path.map_seq, path.refusal) == (live.map_epoch, live.map_seq, None)
+        assert len(path.points) == len(live.points)
+        # Recorded points are rounded to 0.1 mm, the first one too, from which all is planned again.
+        off = max(math.dist(a, b) for a, b in zip(path.points, live.points, strict=True))
+        assert off < 0.001, path.plan_id
+
+
+def test_the_replayed_planner_leads_around_the_area_for_the_recorded_reason(recorded, replayed):
+    area = next(area for area in load_site(SITE).site.areas if area.id == recorded.blocked)
+
+    def crosses(path: RobotPath) -> bool:
+        return any(contains_point(area.polygon, *point) for point in path.points)
+
+    live = recorded.of(ch.ROBOT_PATH)
+    told = [msgspec.convert(path, RobotPath) for path in said(replayed, "told", dict) if "plan_id" in path]
+    for paths in (live, told):
+        assert crosses(paths[0])
+        assert not crosses(paths[-1])
+        turn = next(path for path in paths if not crosses(path))
+        assert [trace.area for trace in turn.traces] == [area.id]
+        assert all(path.refusal is None for path in paths)
+    assert told[-1].points[-1] == live[-1].points[-1]
+
+
+# --- The file ---
+
+
+def test_any_reader_finds_a_schema_for_every_channel_and_json_that_fits_it(recorded):
+    with recorded.path.open("rb") as file:
+        reader = make_reader(file)
+        found = reader.get_summary()
+        assert found is not None
+        assert len({channel.topic for channel in found.channels.values()}) == len(found.channels) > 30
+        for channel in found.channels.values():
+            schema = found.schemas[channel.schema_id]
+            assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
+            described = json.loads(schema.data)
+            assert described["type"] == "object"
+            assert described["properties"]
+        count = 0
+        for schema, channel, message in reader.iter_messages():
+            assert schema is not None
+            assert set(json.loads(message.data)) <= set(json.loads(schema.data)["properties"]), channel.topic
+            count += 1
+    assert count == len(recorded.heard)
+    kinds = {type(message) for *_, message in recorded.heard}
+    assert {NodeReading, AreaHazard, MapDelta, RobotPath} <= kinds
+
+
+def test_damaged_bytes_inside_a_recording_are_told_with_its_name(recorded, tmp_path):
+    data = bytearray(recorded.path.read_bytes())
+    with recorded.path.open("rb") as file:
+        found = make_reader(file).get_summary()
+    assert found is not None
+    chunk = found.chunk_indexes[len(found.chunk_indexes) // 2]
+    middle = chunk.chunk_start_offset + chunk.chunk_length // 2
+    data[middle : middle + 64] = bytes(64)
+    damaged = tmp_path / "damaged.mcap"
+    damaged.write_bytes(data)
+    with pytest.raises(RecordError, match=r"damaged\.mcap"):
+        list(read(damaged))
+    with pytest.raises(WrongUseError, match=r"damaged\.mcap"):
+        summary(damaged)
+
+
+def test_a_recording_that_lost_its_beginning_is_told_with_its_name(recorded, tmp_path):
+    beheaded = tmp_path / "beheaded.mcap"
+    beheaded.write_bytes(recorded.path.read_bytes()[4096:])
+    with pytest.raises(RecordError, match=r"beheaded\.mcap"):
+        list(read(beheaded))
+
+
+def test_a_recording_that_lost_its_end_gives_what_is_whole(recorded, tmp_path):
+    data = recorded.path.read_bytes()
+    short = tmp_path / "short.mcap"
+    short.write_bytes(data[: len(data) * 2 // 3])
+    got = list(read(short))
+    assert len(recorded.heard) // 3 < len(got) < len(recorded.heard)
+    assert got == recorded.heard[: len(got)]

@@ -15,6 +15,7 @@ from fog_contracts.messages import (
     CommandReply,
     HazardArea,
     Message,
+    Pose,
     RobotCommand,
     RobotGoal,
     RobotObstacles,
@@ -112,10 +113,11 @@ class Operator:
 
     # --- acting -----------------------------------------------------------------------------------------------------
 
-    async def command(self, kind: CommandKind) -> CommandReply | None:
-        """Send the robot a signed command; None when it did not answer."""
+    async def command(self, kind: CommandKind, pose: Pose | None = None) -> CommandReply | None:
+        """Send the robot a signed command (`initial_pose` with a pose); None when it did not answer."""
         unsigned = RobotCommand(
             kind=kind,
+            pose=pose,
             robot=self._robot,
             operator="demo",
             nonce=secrets.token_hex(16),

@@ -1,0 +1,270 @@
+"""The whole stack on the site `estig`, driven by the demo's operator, with what these tests need to watch and break."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+import re
+import shutil
+import time
+from contextlib import AsyncExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Self
+
+from fog_contracts import channels as ch
+from fog_contracts.messages import NodeReading, SimCommand
+from fog_runtime.clock import SystemClock
+from fog_runtime.mqtt_edge import MqttEdge
+from fog_runtime.site import load_site
+from fog_runtime.zenoh_edge import ZenohEdge
+from fognav import net
+from fognav.demo.operator import Operator
+from fognav.demo.scene import Scene
+from fognav.demo.usage import children
+from fognav.stack import AGENT, MAP_SERVICE, PLANNER, WATCHER, Stack, StackConfig
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from fog_contracts.messages import RobotState, SimTruth
+    from fognav.supervisor import Event
+
+ESTIG = Path(__file__).parents[2] / "sites" / "estig"
+ROBOT = "r1"
+START = (36.0, 28.4)
+"""In the middle corridor, two metres before the area z1."""
+MOVING = 0.15
+"""A robot whose both wheels together make more than this (m/s) drives."""
+
+
+def site_that_starts_at(folder: Path, x: float, y: float) -> Path:
+    """Copy the site, with its robot elsewhere."""
+    shutil.copytree(ESTIG, folder, ignore=shutil.ignore_patterns("__pycache__"))
+    file = folder / "site.toml"
+    text, changes = re.subn(r"start = \{.*\}", f"start = {{ x = {x}, y = {y}, theta = 0.0 }}", file.read_text("utf-8"))
+    assert changes == 1
+    file.write_text(text, "utf-8")
+    return folder
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line of the truth log."""
+
+    at: float
+    left: float
+    right: float
+    x: float
+    y: float
+    contacts: int
+
+    @property
+    def stands(self) -> bool:
+        """Whether both wheels are commanded to stand."""
+        return self.left == 0.0 and self.right == 0.0
+
+    @property
+    def speed(self) -> float:
+        """Commanded speed of the robot (m/s)."""
+        return abs(self.left + self.right) / 2
+
+
+class Floor:
+    """A running stack and its only operator."""
+
+    def __init__(self, folder: Path) -> None:
+        self.events: list[Event] = []
+        self.readings: list[NodeReading] = []
+        self._truth_log = folder / "truth.jsonl"
+        self._site = load_site(site_that_starts_at(folder / "site", *START))
+        config = StackConfig(site_dir=self._site.directory, robot=ROBOT, extra={"TRUTH_LOG": str(self._truth_log)})
+        self.stack = Stack(config, self.events.append)
+        self.clock = SystemClock()
+        self.scene = Scene(self._site, ROBOT, 1, 1.0)
+        self._ends = AsyncExitStack()
+        self._enabling: asyncio.Task[None] | None = None
+
+    async def __aenter__(self) -> Self:
+        try:
+            await self._ends.enter_async_context(self.stack)
+            await self.stack.start()
+            edge = await self._ends.enter_async_context(
+                ZenohEdge.open(
+                    connect=[self.stack.zenoh_endpoint],
+                    clock=self.clock,
+                    role="console",
+                    id="test",
+                    site=self._site.site.id,
+                )
+            )
+            self.operator = Operator(edge, self.stack, self.scene, self.clock)
+            mqtt = MqttEdge(self.stack.mqtt_url, "live-test", self.clock)
+            mqtt.on(ch.NODE_READING, self._on_reading, NodeReading)
+            listening = asyncio.create_task(mqtt.run())
+            self._ends.push_async_callback(_end, listening)
+            self.attend()
+            await self.until(lambda: self.scene.truth is not None, 10, "the simulator says what is so")
+            await self.until(lambda: bool(self.scene.pose and self.scene.pose.localized), 30, "it knows its place")
+            await self.all_clear(20)
+        except BaseException:
+            await self.__aexit__(None, None, None)
+            raise
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.leave()
+        await self._ends.aclose()
+
+    def _on_reading(self, ids: dict[str, str], reading: NodeReading) -> None:
+        if ids["node"] == "n1":
+            self.readings.append(reading)
+
+    # --- the operator ---
+
+    def attend(self) -> None:
+        """Let the operator enable the robot whenever it asks for it."""
+        if self._enabling is None:
+            self._enabling = asyncio.create_task(self.operator.keep_enabled())
+
+    async def leave(self) -> None:
+        """Leave the robot without an operator."""
+        if self._enabling is not None:
+            await _end(self._enabling)
+            self._enabling = None
+
+    async def goal(self, x: float, y: float) -> net.Answer:
+        """Send the robot somewhere; any heading will do."""
+        body = {"pose": {"x": x, "y": y}}
+        return await self.rest(PLANNER, "PUT", f"/api/v1/robots/{ROBOT}/goal", body)
+
+    async def rest(self, service: str, method: str, path: str, body: object) -> net.Answer:
+        """Ask a service over HTTP as the administrator."""
+        port = self.stack.port(service)
+        assert port is not None
+        return await asyncio.to_thread(net.request, method, port, path, body=body, token=self.stack.token)
+
+    async def zone(self, body: object) -> net.Answer:
+        """Draw a zone."""
+        return await self.rest(MAP_SERVICE, "POST", "/api/v1/zones", body)
+
+    async def simulate(self, command: SimCommand) -> None:
+        """Change the simulated world."""
+        reply = await self.operator.simulate(command)
+        assert reply is not None
+        assert reply.accepted, reply.reason
+
+    # --- watching ---
+
+    @property
+    def truth(self) -> SimTruth:
+        """What is so."""
+        assert self.scene.truth is not None
+        return self.scene.truth
+
+    @property
+    def state(self) -> RobotState:
+        """What the robot said last."""
+        assert self.scene.state is not None
+        return self.scene.state
+
+    @property
+    def off(self) -> float:
+        """How far (m) the robot's belief is from the truth."""
+        pose = self.scene.pose
+        assert pose is not None
+        return math.hypot(pose.x - self.truth.x, pose.y - self.truth.y)
+
+    def hazard(self, area: str) -> str:
+        """Return an area's state as the fog tells it."""
+        known = self.scene.hazards.get(area)
+        return known.hazard.state if known else "no word"
+
+    @property
+    def guardian(self) -> int | None:
+        """Process id of the guardian."""
+        watcher = self.stack.supervisor.pid(WATCHER)
+        return next(iter(children(watcher)), None) if watcher is not None else None
+
+    def starts(self) -> dict[str, int]:
+        """How often each process was started."""
+        return {name: self.stack.supervisor.starts(name) for name in self.stack.supervisor.names}
+
+    def log_lines(self, since: float) -> list[Line]:
+        """Return the truth since a moment (monotonic s)."""
+        found = []
+        with self._truth_log.open("rb") as file:
+            # 100 lines a second of at most some 300 bytes.
+            file.seek(0, 2)
+            file.seek(max(0, file.tell() - int((time.monotonic() - since + 1.0) * 100 * 300)))
+            rows = file.read().split(b"\n")[1:-1]
+        for row in rows:
+            line = json.loads(row)
+            if line["t_mono"] >= since:
+                found.append(Line(line["t_mono"], line["left"], line["right"], line["x"], line["y"], line["contacts"]))
+        return found
+
+    def stood_after(self, moment: float) -> float:
+        """Return after how many seconds the wheels stood, and stood from then on until now."""
+        lines = self.log_lines(moment)
+        assert lines
+        assert lines[-1].stands, "the wheels turn"
+        last = max((line.at for line in lines if not line.stands), default=moment)
+        return last - moment
+
+    # --- waiting ---
+
+    async def until(self, condition: Callable[[], bool], timeout_s: float, what: str) -> None:
+        """Wait until the condition holds."""
+        deadline = time.monotonic() + timeout_s
+        while not condition():
+            if time.monotonic() > deadline:
+                raise AssertionError(f"{timeout_s:.0f} s passed before {what}; {self.story()}")
+            await asyncio.sleep(0.02)
+
+    def story(self) -> str:
+        """Return what was going on, for the message of a failure."""
+        told = "\n".join(f"{at:7.1f} {text}" for at, text in list(self.scene.events)[-25:])
+        return (
+            f"the robot is {self.state.mode} at ({self.truth.x:.2f}, {self.truth.y:.2f}): {self.state.reasons}\n{told}"
+        )
+
+    async def all_clear(self, timeout_s: float) -> None:
+        """Wait until every watched area is known to be clear."""
+        areas = {node.area for node in self._site.site.nodes}
+        await self.until(lambda: all(self.hazard(area) == "clear" for area in areas), timeout_s, "all areas are clear")
+
+    async def drive_to(self, x: float, y: float, timeout_s: float = 30) -> None:
+        """Send the robot somewhere, and wait until it drives in NORMAL mode."""
+        answer = await self.goal(x, y)
+        assert answer.status == 200, answer
+        await self.drives(timeout_s)
+
+    async def drives(self, timeout_s: float = 30) -> None:
+        """Wait until the robot drives on in NORMAL mode."""
+        await self.until(
+            lambda: self.state.mode == "NORMAL" and self.truth.left + self.truth.right > 2 * MOVING,
+            timeout_s,
+            "it drives",
+        )
+
+    async def goes_on(self, timeout_s: float = 40) -> None:
+        """Wait until the robot has come a metre nearer to its goal (by its way)."""
+        await self.until(lambda: self.state.goal_distance is not None, timeout_s, "it has a way again")
+        begun = self.state.goal_distance or 0.0
+        await self.until(
+            lambda: (self.state.goal_distance or math.inf) < begun - 1.0, timeout_s, f"it is 1 m nearer ({begun:.1f} m)"
+        )
+
+    async def agent_is_back(self, starts: int, timeout_s: float = 30) -> None:
+        """Wait until the agent was started again and talks."""
+        supervisor = self.stack.supervisor
+        await self.until(lambda: supervisor.starts(AGENT) > starts, timeout_s, "the agent was started again")
+        stamp = self.clock.stamp()
+        await self.until(lambda: self.state.stamp > stamp, timeout_s, "the new agent speaks")
+
+
+async def _end(task: asyncio.Task[None]) -> None:
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)

@@ -10,7 +10,9 @@ from fognav.__main__ import app
 runner = CliRunner()
 
 
-@pytest.mark.parametrize("command", [["doctor"], ["test"], ["demo"], ["site", "new"], ["site", "check"]])
+@pytest.mark.parametrize(
+    "command", [["doctor"], ["test"], ["demo"], ["site", "new"], ["site", "check"], ["record"], ["replay"]]
+)
 def test_every_command_has_help_with_an_example(command: list[str]) -> None:
     done = runner.invoke(app, [*command, "--help"])
     assert done.exit_code == 0
@@ -59,3 +61,18 @@ def test_a_broken_site_is_not_true_rather_than_wrong_use(tmp_path: Path) -> None
     done = runner.invoke(app, ["site", "check", str(tmp_path), "--json"])
     assert done.exit_code == 1
     assert json.loads(done.stdout)["ok"] is False
+
+
+@pytest.mark.parametrize("option", ["--report", "--record"])
+def test_a_file_that_can_t_be_written_is_refused_before_anything_starts(option: str, tmp_path: Path) -> None:
+    done = runner.invoke(app, ["demo", "--headless", option, str(tmp_path / "nowhere" / "file")])
+    assert done.exit_code == 2
+    assert f"there is no folder {tmp_path / 'nowhere'}" in done.output.replace("\n", "")
+
+
+def test_replaying_what_is_no_recording_names_the_file(tmp_path: Path) -> None:
+    file = tmp_path / "no.mcap"
+    file.write_bytes(b"this is no recording")
+    done = runner.invoke(app, ["replay", str(file)])
+    assert done.exit_code == 2
+    assert "no.mcap" in done.output

@@ -167,3 +167,22 @@ def test_what_was_never_measured_is_no_number() -> None:
     assert math.isinf(j.blocked_clearance_m)
     with pytest.raises(ValueError, match="Out of range"):
         json.dumps(j.blocked_clearance_m, allow_nan=False)
+
+
+def test_each_entry_into_a_mode_is_counted() -> None:
+    judge = Judge(goal=(1.0, 0.0), goal_id="g", areas=[], begun=0.0, timeout_s=60.0)
+    for now, mode in enumerate(["INIT", "NORMAL", "NORMAL", "PROTECTIVE_STOP", "NORMAL"]):
+        judge.on_state(
+            RobotState(
+                mode=mode,
+                reasons=[],
+                enabled=True,
+                battery=None,
+                goal_id="g",
+                map_epoch=1,
+                map_seq=1,
+                plan_id=None,
+            ),
+            float(now),
+        )
+    assert judge.modes == {"INIT": 1, "NORMAL": 2, "PROTECTIVE_STOP": 1}

@@ -11,7 +11,7 @@ import typer
 from rich.table import Table
 
 from fognav import __version__, checkout, doctor, kernels, system
-from fognav.output import NOT_TRUE, OK, WRONG_USE, WrongUseError, console, print_json, write_report
+from fognav.output import NOT_TRUE, OK, WRONG_USE, WrongUseError, check_writable, console, print_json, write_report
 
 app = typer.Typer(
     name="fognav",
@@ -128,6 +128,8 @@ def demo_command(
 
     try:
         folder = checkout.site_folder(site)
+        for file in (report, record):
+            check_writable(file)
     except WrongUseError as error:
         _fail(str(error), WRONG_USE)
     _prepare(yes=yes)
@@ -141,6 +143,57 @@ def demo_command(
     if json:
         print_json(values)
     raise typer.Exit(OK if values["success"] else NOT_TRUE)
+
+
+Broker = Annotated[str, typer.Option("--mqtt", metavar="URL", help="The broker.")]
+Router = Annotated[str, typer.Option("--zenoh", metavar="ENDPOINT", help="The zenoh router.")]
+SiteId = Annotated[str, typer.Option("--site", metavar="ID", help="Id of the site, the second part of every key.")]
+
+
+@app.command("record", epilog="Example: fognav record drive.mcap --seconds 60")
+def record_command(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="MCAP file to write.")],
+    *,
+    mqtt: Broker = "mqtt://127.0.0.1:1883",
+    zenoh: Router = "tcp/127.0.0.1:7447",
+    site: SiteId = "estig",
+    seconds: Annotated[float, typer.Option("--seconds", min=0.0, help="How long; 0: until Ctrl-C.")] = 0.0,
+    json: Json = False,
+) -> None:
+    """Record every channel of a running system to an MCAP file, which Foxglove opens."""
+    from fognav import recording  # noqa: PLC0415  # the other commands need not wait for its imports
+
+    try:
+        made = asyncio.run(recording.record(file, mqtt_url=mqtt, zenoh_endpoint=zenoh, site=site, seconds=seconds))
+    except WrongUseError as error:
+        _fail(str(error), WRONG_USE)
+    if json:
+        print_json(made)
+    else:
+        _say(f"wrote {file}: {made['seconds']} s, {made['messages']}")
+
+
+@app.command("replay", epilog="Example: fognav replay drive.mcap --speed 2")
+def replay_command(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="MCAP file that was recorded.")],
+    *,
+    mqtt: Broker = "mqtt://127.0.0.1:1883",
+    zenoh: Router = "tcp/127.0.0.1:7447",
+    site: SiteId = "estig",
+    speed: Annotated[float, typer.Option("--speed", min=0.1, max=50.0, help="How many times as fast.")] = 1.0,
+    json: Json = False,
+) -> None:
+    """Send a recording's messages again, at their times, to a broker and a router."""
+    from fognav import recording  # noqa: PLC0415  # the other commands need not wait for its imports
+
+    try:
+        sent = asyncio.run(recording.play(file, mqtt_url=mqtt, zenoh_endpoint=zenoh, site=site, speed=speed))
+    except WrongUseError as error:
+        _fail(str(error), WRONG_USE)
+    if json:
+        print_json(sent)
+    else:
+        _say(f"sent {sent['sent']} messages of {file}")
 
 
 @site_app.command(

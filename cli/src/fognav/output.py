@@ -1,6 +1,7 @@
 """What the command says: people read standard error, machines read one JSON object on standard output."""
 
 import json
+import os
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -48,3 +49,13 @@ def write_report(path: Path, values: Mapping[str, object]) -> None:
         path.write_text(to_json(values) + "\n", encoding="utf-8")
     except OSError as error:
         raise WrongUseError(f"the report can't be written to {path}: {error.strerror}. Name another file") from error
+
+
+def check_writable(path: Path | None) -> None:
+    """Refuse a file that can't be written before the work whose outcome it is to hold; None is no file."""
+    if path is None:
+        return
+    if not path.parent.is_dir():
+        raise WrongUseError(f"{path} can't be written: there is no folder {path.parent}. Make it, or name another file")
+    if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
+        raise WrongUseError(f"{path} can't be written: it is a folder, or you may not write there. Name another file")

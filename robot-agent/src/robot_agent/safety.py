@@ -189,7 +189,7 @@ def _judge_map(inputs: SafetyInputs, config: SafetyConfig) -> list[Finding]:
         found.append(Finding(Level.HOLD, f"the map is {_seconds(inputs.map_age)} old"))
     elif not inputs.map_age <= config.map_late:
         found.append(Finding(Level.DEGRADED, f"the map is {_seconds(inputs.map_age)} old"))
-    if inputs.map_gap > config.gap_lost:
+    if not inputs.map_gap <= config.gap_lost:
         found.append(Finding(Level.HOLD, f"changes of the map have been missing for {_seconds(inputs.map_gap)}"))
     return found
 

@@ -156,6 +156,17 @@ def _end(guardian: subprocess.Popen[bytes]) -> int:
         return guardian.wait()
 
 
+def refuse_speed(speed: float, device: str) -> str | None:
+    """Return why this device must not be guarded on a clock of this speed, or None.
+
+    All limits are in seconds of the clock. On a simulated base, a pty, the clock may be faster or slower; on a real
+    one a slow clock would let the wheels turn longer than any limit says.
+    """
+    if speed == 1.0 or device.startswith("/dev/pts/"):
+        return None
+    return f"FOGNAV_SPEED is {speed:g}, but {device} is no simulated device: unset it, real wheels need real seconds"
+
+
 def main() -> int:
     """Guard until told to end."""
     path = os.environ.get("FOGNAV_BASE_PORT", "")
@@ -177,9 +188,13 @@ def main() -> int:
         while True:
             try:
                 with open_port(path) as port:
+                    # First of all: a log that nobody reads must not keep the wheels turning.
+                    stop_wheels(port)
+                    if (refusal := refuse_speed(speed, os.ttyname(port.fileno()))) is not None:
+                        _log("bad_settings", reason=refusal)
+                        return BAD_SETTINGS
                     _log("port_open", path=path)
                     told = ""
-                    stop_wheels(port)
                     while (code := guard_once(port, silence_s)) != PORT_LOST:
                         if code == BAD_SETTINGS:
                             return code

@@ -1,6 +1,7 @@
 """Did it go well? Judged by the truth of the simulated world, not by what the robot believes. Pure."""
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final, Literal
@@ -102,6 +103,9 @@ class Judge:
     min_clearance_m: float = math.inf
     route_areas: list[str] = field(default_factory=list)
     paths: int = 0
+    modes: Counter[str] = field(default_factory=Counter)
+    """How often the robot entered each of its modes."""
+    _mode: str = ""
     _truth: SimTruth | None = None
     _begun_at_m: float | None = None
     _contacts_before: int | None = None
@@ -138,6 +142,9 @@ class Judge:
 
     def on_state(self, state: RobotState, now: float) -> None:
         """Take what the robot says of itself."""
+        if state.mode != self._mode:
+            self._mode = state.mode
+            self.modes[state.mode] += 1
         if state.goal_reached and state.goal_id in {self.goal_id, None}:
             self._claimed_at = now if self._claimed_at is None else self._claimed_at
         else:

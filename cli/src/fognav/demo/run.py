@@ -96,6 +96,7 @@ class Demo:
         self.robot = site.site.robots[0].id
         self.page_url = ""
         self.scene = self._new_scene(options.speed)
+        self._given_up: list[dict[str, object]] = []
         self._reset()
 
     def _new_scene(self, speed: float) -> Scene:
@@ -122,6 +123,7 @@ class Demo:
         Raises `NotReadyError` when a process does not start, and `WrongUseError` when the site can't be used so.
         """
         speed = self.options.speed
+        self._given_up.clear()
         while True:
             self._reset()
             self.scene = self._new_scene(speed)
@@ -129,6 +131,7 @@ class Demo:
                 await self._until_stop(stop, speed)
             except _TooFastError as slow:
                 slower = max(1.0, round(min(speed * _SLOWER, slow.sustained), 1))
+                self._given_up.append({"speed": speed, "why": str(slow), "modes": self._modes()})
                 self.scene.say(f"speed {speed:g} is too much for this machine ({slow}): once more at {slower:g}")
                 speed = slower
                 continue
@@ -353,8 +356,13 @@ class Demo:
             raise _TooFastError(truth.sustained_speed, why)
 
     def _judge_speed(self, verdict: Verdict, clock: SystemClock) -> None:
-        """Blame the haste, not the robot, for a run that failed while something was late."""
-        if clock.speed > 1.0 and verdict.outcome != "reached" and self._strikes:
+        """Blame the haste, not the robot, for a run that failed while something was late.
+
+        A touch or a blocked area entered is never excused: what stops the robot must work at any speed.
+        """
+        entered = self._judge is not None and self._judge.entered_blocked
+        excusable = verdict.outcome not in {"reached", "contact"} and not entered
+        if clock.speed > 1.0 and excusable and self._strikes:
             sustained = self.scene.truth.sustained_speed if self.scene.truth else 1.0
             raise _TooFastError(sustained, f"{verdict.outcome}: {verdict.reason}")
 
@@ -393,6 +401,10 @@ class Demo:
             return False
         return not self._hazard or self._blocked_at is not None
 
+    def _modes(self) -> dict[str, int]:
+        """How often the robot entered each mode on its drive."""
+        return dict(self._judge.modes) if self._judge else {}
+
     def report(self) -> dict[str, object]:
         """Return the report (`fognav demo --report`)."""
         judge, verdict = self._judge, self.scene.verdict
@@ -418,6 +430,8 @@ class Demo:
             "hazard_to_path_ms": hazard_to_path_ms(trace),
             "processes": self._usage.report(),
             "restarts": self._restarts,
+            "modes": self._modes(),
+            "given_up": self._given_up,
             "speed": self.scene.speed,
             "asked_speed": self.options.speed,
             "sustained_speed": round(sum(self._speeds) / len(self._speeds), 2) if self._speeds else None,

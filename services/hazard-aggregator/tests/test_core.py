@@ -449,7 +449,7 @@ def test_nothing_but_a_row_of_clear_readings_ever_clears_a_blocked_area(events):
             rig.wait(3.5)
             row = 0
         elif event == "offline":
-            rig.core.on_availability("n1", online=False, now=rig.now, stamp=rig.now)
+            rig.seen += rig.core.on_availability("n1", online=False, now=rig.now, stamp=rig.now)
         else:
             rig.seq -= 1
             rig.read(3.0, 3.0)

@@ -38,7 +38,7 @@ BEAT_S = 0.1
 RETRY_S = 0.5
 AGGREGATOR = "hazard-aggregator"
 ABSENT_S = 3.0
-"""How long (s) the aggregator may be gone until its areas no longer count as clear."""
+"""How long (s) the aggregator, or the broker, may be gone until no area counts as clear any more."""
 
 VERSION = Gauge("fognav_map_seq", "Version (seq) of the map within this epoch")
 DELTA_BYTES = Histogram(
@@ -76,7 +76,7 @@ class Service:
         self._in_doubt = False
         self._answered: set[str] = set()
         self._aggregators: set[str] = set()
-        self._aggregator_left: float | None = None
+        self._unvouched_since: float | None = None
 
     # --- What comes in ----------------------------------------------------------------------------------------------
 
@@ -108,11 +108,17 @@ class Service:
         if role != AGGREGATOR:
             return
         (self._aggregators.add if alive else self._aggregators.discard)(name)
-        if self._aggregators:
-            self._aggregator_left = None
+        self._judge_word()
+
+    def _judge_word(self) -> None:
+        """Let areas count as clear only while the aggregator is there, and the broker that carries its word."""
+        if self._aggregators and self._mqtt.connected:
+            self._unvouched_since = None
             self._emit(self.core.on_aggregator(present=True, stamp=self._clock.stamp()))
-        elif self._aggregator_left is None:
-            self._aggregator_left = self._clock.now()
+        elif self._unvouched_since is None:
+            self._unvouched_since = self._clock.now()
+        elif self._clock.now() - self._unvouched_since > ABSENT_S:
+            self._emit(self.core.on_aggregator(present=False, stamp=self._clock.stamp()))
 
     # --- Zones: stored first, then they count -----------------------------------------------------------------------
 
@@ -257,8 +263,7 @@ class Service:
         self._health.set("map", ok=True)
         async for now in ticker(self._clock, BEAT_S):
             stamp = self._clock.stamp()
-            if self._aggregator_left is not None and now - self._aggregator_left > ABSENT_S:
-                self._emit(self.core.on_aggregator(present=False, stamp=stamp))
+            self._judge_word()
             self._emit(self.core.tick(now, stamp))
             self._zenoh.publish(ch.MAP_HEARTBEAT, self.core.heartbeat(stamp))
             self._health.set("mqtt", ok=self._mqtt.connected, detail="" if self._mqtt.connected else "no broker")
@@ -270,7 +275,7 @@ class Service:
         if not self._aggregators:
             # An aggregator that never appears is as good as one that left. One may be there already: its news can
             # arrive before this runs.
-            self._aggregator_left = begun
+            self._unvouched_since = begun
         await self._zones_read.wait()
         while (unheard := self.core.unheard_areas()) and self._clock.now() - begun < hazards_wait_s:
             self._health.set("map", ok=False, detail=f"waiting for the hazards of {', '.join(unheard)}")

@@ -141,7 +141,9 @@ class HazardsLayer:
             since=heard.since if heard else 0.0,
             seq=heard.seq if heard else 0,
             epoch=heard.epoch if heard else 0,
-            cause="the hazard aggregator is gone" if heard else "the hazard aggregator has not spoken of it yet",
+            cause="the hazard aggregator is gone, or the broker between"
+            if heard
+            else "the hazard aggregator has not spoken of it yet",
         )
 
 

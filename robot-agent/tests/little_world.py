@@ -141,6 +141,7 @@ class LittleWorld:
         if tell:
             for delta in deltas:
                 self.agent.on_delta(delta, self.now)
+        return deltas
 
     def restart(self):
         """Kill the agent and start another one with what it had saved."""

@@ -185,6 +185,35 @@ def test_a_missed_delta_that_nobody_heals_holds_the_robot_and_a_snapshot_mends_i
     assert driving.run(4.0, lambda w: w.state().mode == "NORMAL")
 
 
+def test_old_changes_that_trickle_in_do_not_make_the_map_fresh_while_newer_ones_are_told_of(driving):
+    boxes = [(3.0 + 0.2 * i, 3.9, 3.1 + 0.2 * i, 4.0) for i in range(4)]
+    late = [delta for box in boxes for delta in driving.block(*box, tell=False)]
+    for delta in late[:-1]:
+        driving.run(0.5)
+        driving.agent.on_delta(delta, driving.now)
+    assert driving.state().mode == "HOLD"
+    assert any("have been missing" in reason for reason in driving.state().reasons)
+    driving.agent.on_delta(late[-1], driving.now)
+    assert driving.run(4.0, lambda w: w.state().mode == "NORMAL")
+
+
+def test_a_snapshot_older_than_what_heartbeats_tell_of_does_not_make_the_map_fresh(driving):
+    old = driving.master.snapshot()
+    driving.block(3.0, 3.9, 3.2, 4.1, tell=False)
+    driving.run(0.9)
+    driving.agent.load(old, driving.now)
+    driving.run(0.3)
+    assert driving.state().mode == "HOLD"
+
+
+def test_a_path_through_a_wall_that_its_planner_should_have_known_holds_it(world):
+    world.drive_to([(2.0, 2.0), (3.5, 3.8)])
+    world.run(1.5)
+    assert world.path.map_seq == world.state().map_seq
+    assert world.state().mode == "HOLD"
+    assert any("the path is blocked" in reason for reason in world.state().reasons)
+
+
 def test_a_silent_lidar_stops_the_wheels_at_once(driving):
     driving.lidar_on = False
     begin = driving.now

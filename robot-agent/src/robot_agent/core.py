@@ -91,6 +91,7 @@ class AgentCore:
         self._safety = SafetyState()
         self._verdict = step(self._safety, SafetyInputs(), 0.0, config.safety)[1]
 
+        self._told: MapHeartbeat | None = None
         self._map_confirmed_at = _NEVER
         self._gap_since: float | None = None
         self._hazards: dict[str, HazardArea] = {}
@@ -153,7 +154,8 @@ class AgentCore:
         applied = self._replica.load(snapshot)
         assert self._replica.geometry is not None
         self._localizer.load_map(self._replica.static, self._replica.geometry)
-        self._gap_since = None
+        if not self._is_behind():
+            self._gap_since = None
         if self._saved is not None and self._saved.site == snapshot.site:
             self._localizer.restore(self._saved)
         self._saved = None
@@ -161,11 +163,10 @@ class AgentCore:
         return applied
 
     def on_delta(self, delta: MapDelta, now: float) -> Outcome:
-        """Take one change of the map."""
+        """Take one change of the map; it makes the map fresh only if no heartbeat told of a still newer one."""
         outcome = self._replica.apply(delta)
         if isinstance(outcome, Applied):
-            self._gap_since = None
-            self._map_confirmed_at = now
+            self._weigh_map(now)
             self._check_path(now)
         elif outcome == "gap" and self._gap_since is None:
             self._gap_since = now
@@ -173,11 +174,13 @@ class AgentCore:
 
     def on_heartbeat(self, heartbeat: MapHeartbeat, now: float) -> None:
         """Take the map-service's word on which version is the newest."""
-        if self._replica.check(heartbeat):
-            self._map_confirmed_at = now
-            self._gap_since = None
-        elif self._gap_since is None:
-            self._gap_since = now
+        self._told = heartbeat
+        self._replica.check(heartbeat)
+        self._weigh_map(now)
+
+    def map_gap(self, now: float) -> float:
+        """Return for how long (s) changes have been missing that the map-service told of; 0 when none are."""
+        return 0.0 if self._gap_since is None else now - self._gap_since
 
     def on_hazard(self, hazard: HazardArea, now: float) -> None:
         """Take the reason behind cells: the state and place of a watched area."""
@@ -468,6 +471,19 @@ class AgentCore:
 
     # --- inside ---
 
+    def _is_behind(self) -> bool:
+        """Whether the copy of the map is broken, or another than the newest that a heartbeat told of."""
+        told, version = self._told, self._replica.version
+        if self._replica.needs_snapshot or version is None:
+            return True
+        return told is not None and (told.epoch != version.epoch or told.seq > version.seq)
+
+    def _weigh_map(self, now: float) -> None:
+        if not self._is_behind():
+            self._map_confirmed_at, self._gap_since = now, None
+        elif self._gap_since is None:
+            self._gap_since = now
+
     def _on_mission(self) -> bool:
         goal = self._goal
         return goal is not None and goal.pose is not None and goal.goal_id not in {self._reached, self._cancelled}
@@ -492,7 +508,7 @@ class AgentCore:
         return SafetyInputs(
             map_loaded=self._replica.version is not None,
             map_age=now - self._map_confirmed_at,
-            map_gap=0.0 if self._gap_since is None else now - self._gap_since,
+            map_gap=self.map_gap(now),
             localization=self._localizer.status,
             localization_detail=self._localizer.detail,
             lidar_node_age=now - self._node_at,
@@ -543,10 +559,14 @@ class AgentCore:
         if key == self._checked:
             return
         self._checked = key
-        if path.map_epoch == replica.version.epoch and path.map_seq >= replica.version.seq:
+        same_map = path.map_epoch == replica.version.epoch
+        if same_map and path.map_seq > replica.version.seq:
+            # Judged as soon as the robot's map has caught up; how long it may lag is the gate's matter.
             self._block = self._blocked_since = None
             return
-        ahead = first_blocked(replica.cost, replica.geometry, follower)
+        # A planner that knew all of this map may lead the robot out over what its lidar took for an obstacle.
+        known = same_map and path.map_seq == replica.version.seq
+        ahead = first_blocked(replica.cost, replica.geometry, follower, led_out=known)
         if ahead is None:
             self._block = self._blocked_since = None
             return

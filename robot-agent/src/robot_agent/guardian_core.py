@@ -3,6 +3,9 @@
 The guardian trusts nobody. A command of the agent moves the wheels only while it is fresh; bumper, cliff, wheel drop,
 an unexpected OI mode or a silent base stop them within one sensor frame, latched until the agent passes on an
 operator's reset. A Roomba keeps its last velocity when the host is silent, so "stop" is always a command, repeated.
+
+The agent keeps a fault of its own as soon as it hears of the latch, so either of the two may die without the fault
+being forgotten. When both die, the robot starts in INIT, and an operator must enable it as after any boot.
 """
 
 from __future__ import annotations

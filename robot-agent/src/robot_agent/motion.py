@@ -349,14 +349,21 @@ def _speed_limit(speed_limits: NDArray[np.uint8], geometry: GridGeometry, pose: 
 
 
 def first_blocked(
-    cost: NDArray[np.uint8], geometry: GridGeometry, follower: PathFollower, skip: float = 0.5
+    cost: NDArray[np.uint8],
+    geometry: GridGeometry,
+    follower: PathFollower,
+    skip: float = 0.5,
+    *,
+    led_out: bool = False,
 ) -> float | None:
     """Return how far ahead (m) the rest of the path first meets a cell that the robot must not enter, or None.
 
-    Lethal cells count everywhere; inscribed and unknown ones beyond the first `skip` metres, where the planner may
-    have led the robot out of a tight place.
+    Inscribed and unknown cells count beyond the first `skip` metres, where the planner may have led the robot out of a
+    tight place. Lethal ones count everywhere, unless the planner knew of them too (`led_out`).
     """
     points, ahead = follower.ahead(0.5 * geometry.resolution)
     cells = _cells_of(points, cost, geometry)
-    bad = (cells == LETHAL) | ((cells >= INSCRIBED) & (ahead > skip))
+    bad = (cells >= INSCRIBED) & (ahead > skip)
+    if not led_out:
+        bad |= cells == LETHAL
     return float(ahead[int(bad.argmax())]) if bad.any() else None

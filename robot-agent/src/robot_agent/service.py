@@ -79,7 +79,6 @@ class Service:
         self._stream = Ticker(clock, STREAM_S)
         self._control = Ticker(clock, CONTROL_S)
         self._held: deque[MapDelta] = deque(maxlen=HELD_DELTAS)
-        self._behind_since: float | None = None
         self._told: object = None
         self._told_at = self._seen_at = -math.inf
         self._mode = ""
@@ -207,17 +206,10 @@ class Service:
         self._core.on_delta(delta, self._clock.now())
 
     def _on_heartbeat(self, _ids: dict[str, str], heartbeat: MapHeartbeat) -> None:
-        now, version = self._clock.now(), self._core.replica.version
-        self._core.on_heartbeat(heartbeat, now)
-        if version is None or heartbeat.epoch != version.epoch or heartbeat.seq <= version.seq:
-            self._behind_since = None
-        elif self._behind_since is None:
-            self._behind_since = now
+        self._core.on_heartbeat(heartbeat, self._clock.now())
 
     def _wants_snapshot(self) -> bool:
-        if self._core.needs_snapshot:
-            return True
-        return self._behind_since is not None and self._clock.now() - self._behind_since > BEHIND_S
+        return self._core.needs_snapshot or self._core.map_gap(self._clock.now()) > BEHIND_S
 
     async def map_loop(self) -> None:
         """Ask for a snapshot whenever only that helps, less and less often while nobody answers."""
@@ -239,7 +231,6 @@ class Service:
         except (ContractError, MapError) as error:
             _log.warning("snapshot_refused", reason=str(error))
             return False
-        self._behind_since = None
         held = [delta for delta in self._held if delta.epoch == snapshot.epoch]
         self._held.clear()
         for delta in held:

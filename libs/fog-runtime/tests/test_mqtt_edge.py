@@ -96,6 +96,24 @@ async def test_messages_and_texts_arrive_with_their_ids_in_order(broker):
     assert not a.connected
 
 
+async def test_an_area_of_the_thesis_that_is_numbered_later_is_heard_now_and_after_a_reconnect(broker):
+    heard = []
+    a, b = make(broker, "a"), make(broker, "b")
+    b.on(ch.THESIS_AREA, lambda ids, text: heard.append((ids["number"], text)), numbers=[])
+    async with running(a, b):
+        await b.add_number(ch.THESIS_AREA, 9)
+        assert await a.publish(ch.THESIS_AREA, "blocked", wait=True, number="9")
+        assert await a.publish(ch.THESIS_AREA, "blocked", wait=True, number="8")
+        await until(lambda: heard, "it is not heard")
+        broker.kill()
+        await until(lambda: not a.connected and not b.connected, "the broker's death goes unseen")
+        broker.start()
+        await asyncio.gather(a.wait_connected(), b.wait_connected())
+        assert await a.publish(ch.THESIS_AREA, "clear", wait=True, number="9")
+        await until(lambda: len(heard) == 2, "it is not heard after the reconnect")
+    assert heard == [("9", "blocked"), ("9", "clear")]
+
+
 async def test_retained_state_reaches_late_subscribers_until_it_is_cleared(broker):
     first, second, third = [], [], []
     a = make(broker, "a")

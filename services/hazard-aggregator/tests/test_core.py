@@ -348,12 +348,18 @@ def stored(state: str, penalty: int) -> AreaHazard:
     return AreaHazard(area="hall", state=state, severity=3, penalty=penalty, since=1.0, seq=9, epoch=0, cause="")
 
 
-@pytest.mark.parametrize(("state", "penalty"), [("blocked", 254), ("clear", 0)])
-def test_a_restart_keeps_the_state_until_readings_or_silence_say_otherwise(state, penalty):
-    rig = Rig(site("n1"), restored=[stored(state, penalty)])
-    assert (rig.hazard.state, rig.hazard.penalty, rig.hazard.epoch) == (state, penalty, 1)
+def test_a_restart_keeps_a_blocked_area_blocked_until_silence_makes_it_unknown_and_impassable():
+    rig = Rig(site("n1"), restored=[stored("blocked", 254)])
+    assert (rig.hazard.state, rig.hazard.penalty, rig.hazard.epoch) == ("blocked", 254, 1)
     rig.wait(3.2)
-    assert (rig.hazard.state, rig.hazard.penalty) == ("unknown", 254 if state == "blocked" else 200)
+    assert (rig.hazard.state, rig.hazard.penalty) == ("unknown", 254)
+
+
+def test_no_area_is_clear_after_a_restart_before_readings_say_so():
+    rig = Rig(site("n1"), restored=[stored("clear", 0)])
+    assert (rig.hazard.state, rig.hazard.penalty) == ("unknown", 200)
+    rig.read(3.0, 3.0, times=5)
+    assert rig.hazard.state == "clear"
 
 
 def test_a_reading_before_the_first_tick_does_not_break_a_restored_state():

@@ -163,6 +163,22 @@ async def test_a_robot_in_the_cone_blocks_nothing(fog, until):
         assert watch.hazards[-1].explained_by == "r1"
 
 
+async def test_a_thesiss_node_of_an_area_that_was_drawn_later_counts_without_a_restart(fog, until, tokens):
+    fog.start("hazard_aggregator")
+    url = await fog.ready("hazard_aggregator")
+    async with watching(fog) as (watch, _), httpx.AsyncClient() as client:
+        body = {"polygon": [[1.0, 1.0], [2.0, 1.0], [2.0, 2.0]], "number": 8}
+        put = await client.put(f"{url}/api/v1/areas/gate", json=body, headers=tokens["operator"])
+        assert put.status_code == 200, put.text
+        for _ in range(5):
+            assert await watch.mqtt.publish(ch.THESIS_AREA, "blocked", wait=True, number="8")
+        await until(
+            lambda: any(h.area == "gate" and h.state == "blocked" for h in watch.hazards),
+            "the area is blocked",
+            lambda: fog.log("hazard_aggregator"),
+        )
+
+
 async def test_garbage_is_refused_and_nothing_stops(fog, until):
     fog.start("hazard_aggregator")
     url = await fog.ready("hazard_aggregator")

@@ -45,12 +45,12 @@ class Will:
     ids: Ids = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Registration:
     channel: Channel
     handler: Callable[[Ids, Any], object]
     kind: type[Message] | None
-    topics: tuple[str, ...]
+    topics: list[str]
 
 
 @dataclass(frozen=True)
@@ -90,6 +90,12 @@ def _encoded(channel: Channel, message: Message | str) -> bytes:
 def _mqtt_will(will: Will) -> aiomqtt.Will:
     channel = will.channel
     return aiomqtt.Will(channel.key(**will.ids), _encoded(channel, will.message), channel.qos, channel.retained)
+
+
+def _tell_refused(topics: Sequence[str], codes: Sequence[object]) -> None:
+    for topic, code in zip(topics, codes, strict=True):
+        if isinstance(code, ReasonCode) and code.is_failure:
+            _log.error("subscription_refused", topic=topic, reason=str(code))
 
 
 class MqttEdge:
@@ -148,10 +154,29 @@ class MqttEdge:
             expected = channel.message.__name__ if channel.message else "text"
             raise ValueError(f"channel {channel.name} carries {expected} over {channel.transport}")
         if "number" in channel.fields:
-            topics = tuple(channel.key(number=str(number)) for number in numbers)
+            topics = [channel.key(number=str(number)) for number in numbers]
         else:
-            topics = (channel.pattern(),)
+            topics = [channel.pattern()]
         self._registrations.append(_Registration(channel, handler, kind, topics))
+
+    async def add_number(self, channel: Channel, number: str | int) -> None:
+        """Have the handlers of one of the thesis's channels hear one more area, now and after every connection.
+
+        A broker that is lost meanwhile is told at the next connection.
+        """
+        topic = channel.key(number=str(number))
+        deaf = [r for r in self._registrations if r.channel == channel and topic not in r.topics]
+        for registration in deaf:
+            registration.topics.append(topic)
+        client = self._client
+        if not deaf or client is None:
+            return
+        try:
+            codes = await client.subscribe([(topic, SubscribeOptions(qos=channel.qos))])
+        except aiomqtt.MqttError as error:
+            self._limited.warning("unsubscribed", topic, self._clock.now(), topic=topic, reason=str(error))
+            return
+        _tell_refused([topic], codes)
 
     def on_connect(self, callback: Callable[[], Awaitable[None]]) -> None:
         """Have `callback` run after every connection, once all subscriptions are made."""
@@ -209,9 +234,7 @@ class MqttEdge:
         wanted = {topic: r.channel.qos for r in self._registrations for topic in r.topics}
         if wanted:
             codes = await client.subscribe([(topic, SubscribeOptions(qos=qos)) for topic, qos in wanted.items()])
-            for topic, code in zip(wanted, codes, strict=True):
-                if isinstance(code, ReasonCode) and code.is_failure:
-                    _log.error("subscription_refused", topic=topic, reason=str(code))
+            _tell_refused(list(wanted), codes)
         self._client = client
         self._changed.set()
         metrics.CONNECTED.labels("mqtt").set(1)

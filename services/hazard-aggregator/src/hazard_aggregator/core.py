@@ -90,8 +90,9 @@ class NodeReport:
 class Aggregator:
     """Holds every area's state; each input returns the hazards that changed.
 
-    `restored` are the hazards that were stored last: a blocked area stays blocked, the others keep their state until
-    readings or silence say otherwise. Areas without one start as unknown. `rule` makes the debounce rule of a node.
+    `restored` are the hazards that were stored last: a blocked area stays blocked until readings or silence say
+    otherwise. All others start as unknown: nobody has looked since, and clear is only what readings of this run say.
+    `rule` makes the debounce rule of a node.
     """
 
     def __init__(
@@ -258,10 +259,10 @@ class Aggregator:
         if area is None:
             return
         area.danger = _is_danger(hazard)
-        if hazard.state != "unknown":
+        if hazard.state == "blocked":
             for node in area.nodes.values():
                 node.state = hazard.state
-                node.reason = f"the area was {hazard.state} before the restart"
+                node.reason = "the area was blocked before the restart"
 
     def _fresh_poses(self, now: float) -> Iterator[tuple[str, RobotPose]]:
         for robot, (seen, pose) in self._poses.items():

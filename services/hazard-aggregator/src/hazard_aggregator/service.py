@@ -61,8 +61,7 @@ class Service:
         mqtt.on(ch.NODE_READING, self._on_reading, NodeReading)
         mqtt.on(ch.NODE_AVAILABILITY, self._on_availability)
         numbers = sorted({d.number for d in self.core.definitions() if d.number is not None})
-        if numbers:
-            mqtt.on(ch.THESIS_AREA, self._on_thesis_state, numbers=numbers)
+        mqtt.on(ch.THESIS_AREA, self._on_thesis_state, numbers=numbers)
         # Its own last words: they outlive a restart without Redis.
         mqtt.on(ch.AREA_HAZARD, self._on_own_hazard, AreaHazard)
         mqtt.on_connect(self._say_everything)
@@ -96,6 +95,8 @@ class Service:
         if definition.removed:
             self.outbox.forget(definition.id)
             self._to_send.pop(definition.id, None)
+        if self._mqtt is not None and definition.number is not None and not definition.removed:
+            await self._mqtt.add_number(ch.THESIS_AREA, definition.number)
         await self._publish(ch.AREA_DEFINITION, definition, area=definition.id)
 
     # --- What goes out ----------------------------------------------------------------------------------------------
@@ -163,6 +164,8 @@ class Service:
             stamp = self._clock.stamp()
             for definition in stored.definitions:
                 self._take(self.core.put_area(definition, stamp))
+                if self._mqtt is not None and definition.number is not None:
+                    await self._mqtt.add_number(ch.THESIS_AREA, definition.number)
             self._take(self.core.recall(stored.hazards, stamp))
             self.store_was_read()
             await self._say_everything()

@@ -38,7 +38,8 @@ if TYPE_CHECKING:
 _ASK_TIMEOUT_S: Final = 2.0
 _ENABLE_EVERY_S: Final = 1.0
 _STOPPED_S: Final = 5.0
-"""A robot that stands in a protective stop for this long is looked at, and enabled again."""
+"""A robot that stands in a protective stop for this long is looked at, and enabled again; one that just started is
+given as long to come by what it says that it lacks."""
 _HELD_S: Final = 61.0
 """After 60 s in HOLD a robot waits for an operator."""
 _FAULT_S: Final = 2.0
@@ -54,8 +55,12 @@ class Operator:
         self._clock = clock
         self._robot = scene.robot
         self.judge: Judge | None = None
+        self.held_back = False
+        """While this is so, nobody wants the robot to drive yet: it is not enabled."""
         self._mode = ""
         self._mode_since = clock.now()
+        self._lacked_at = clock.now()
+        self._spoke_of: set[str] = set()
         self._last_refusal = ""
         self._enabled_once = False
         robot = {"robot": self._robot}
@@ -84,14 +89,16 @@ class Operator:
             self.judge.on_truth(truth)
 
     def _on_state(self, _ids: Mapping[str, str], state: RobotState) -> None:
+        now = self._clock.now()
         if state.mode != self._mode:
-            why = f" ({'; '.join(state.reasons[:2])})" if state.reasons else ""
-            self._scene.say(f"robot: {state.mode}{why}")
-            self._mode, self._mode_since = state.mode, self._clock.now()
+            self._scene.say(_mode_news(state, first=not self._mode))
+            self._mode, self._mode_since = state.mode, now
+        if not _lacks_only_us(state):
+            self._lacked_at = now
         self._scene.state = state
         self._scene.traces.take(state.traces)
         if self.judge is not None:
-            self.judge.on_state(state, self._clock.now())
+            self.judge.on_state(state, now)
 
     def _on_path(self, _ids: Mapping[str, str], path: RobotPath) -> None:
         known = self._scene.path
@@ -103,13 +110,23 @@ class Operator:
             self.judge.on_path(path, self._clock.now())
 
     def _on_hazard(self, ids: Mapping[str, str], hazard: HazardArea) -> None:
-        known = self._scene.hazards.get(ids["area"])
-        if known is None or known.hazard.state != hazard.hazard.state:
-            if known is not None or hazard.hazard.state != "clear":
-                self._scene.say(f"area {ids['area']}: {hazard.hazard.state} ({hazard.hazard.cause})")
-            self._scene.hazards[ids["area"]] = hazard
+        area, state = ids["area"], hazard.hazard.state
+        known = self._scene.hazards.get(area)
+        if known is None or known.hazard.state != state:
+            # That nothing was heard of an area yet, and then that it is clear, is how every area begins.
+            if area in self._spoke_of or state == "blocked":
+                self._scene.say(f"area {area}: {state} ({hazard.hazard.cause})")
+            if state != "unknown":
+                self._spoke_of.add(area)
+            self._scene.hazards[area] = hazard
         if hazard.hazard.trace is not None:
             self._scene.traces.take([hazard.hazard.trace])
+
+    @property
+    def ready_s(self) -> float:
+        """For how long (s of the clock) the robot has lacked nothing but an operator who enables it."""
+        state = self._scene.state
+        return self._clock.now() - self._lacked_at if state is not None and _lacks_only_us(state) else 0.0
 
     # --- acting -----------------------------------------------------------------------------------------------------
 
@@ -164,12 +181,13 @@ class Operator:
 
     def _due(self) -> CommandKind | None:
         state = self._scene.state
-        if state is None or (self.judge is None and self._scene.verdict is not None):
+        if state is None or self.held_back or (self.judge is None and self._scene.verdict is not None):
             return None
         stood = self._clock.now() - self._mode_since
         if state.mode == "FAULT":
             return "reset" if stood >= _FAULT_S else None
-        waits = state.mode == "INIT" or not state.enabled
+        # One that lacks more is asked as well in the end: its refusal says what keeps it.
+        waits = state.mode == "INIT" and (_lacks_only_us(state) or stood >= _STOPPED_S)
         waits = waits or (state.mode == "PROTECTIVE_STOP" and stood >= _STOPPED_S)
         waits = waits or (state.mode == "HOLD" and stood >= _HELD_S)
         return "enable" if waits else None
@@ -192,6 +210,18 @@ class Operator:
         if words != self._last_refusal:
             self._last_refusal = words
             self._scene.say(f"operator: {text}")
+
+
+def _lacks_only_us(state: RobotState) -> bool:
+    """Whether a robot that is not enabled names one reason alone: then that is the missing operator."""
+    return state.mode == "INIT" and len(state.reasons) <= 1
+
+
+def _mode_news(state: RobotState, *, first: bool) -> str:
+    if first and state.mode == "INIT":
+        return "robot: INIT, it has just started, looks for where it is, and stands until somebody enables it"
+    why = f" ({'; '.join(state.reasons[:2])})" if state.reasons else ""
+    return f"robot: {state.mode}{why}"
 
 
 def _path_news(path: RobotPath) -> str:

@@ -24,12 +24,18 @@ from fognav.recording import recording
 from fognav.stack import WATCHER, Stack, StackConfig
 from fognav.supervisor import Event
 from fognav_sim.scenario import barrier_across
+from robot_agent.config import SafetyConfig
+from robot_agent.safety import STOP_AT_ONCE
 
 READY_S: Final = 90.0
 """Real seconds for everything to start."""
 LOCALIZED_S: Final = 60.0
 AREAS_S: Final = 30.0
 ENABLED_S: Final = 60.0
+_HEALTHY_S: Final = SafetyConfig().relax_after + 0.5
+"""A robot that lacked something within this time would begin its drive in a stop; the margin is its states' period."""
+_SETTLE_S: Final = 10.0
+"""After so long (s of the clock) a robot that is not quite well is enabled too: it says itself why it refuses."""
 GOAL_S: Final = 60.0
 _TICK_S: Final = 0.1
 _USAGE_S: Final = 1.0
@@ -144,7 +150,7 @@ class Demo:
             await asyncio.wait({attempt, stopped}, return_when=asyncio.FIRST_COMPLETED)
             # An attempt that keeps running sees the stop itself.
             if not attempt.done() and self.scene.verdict is None:
-                self.scene.verdict = Verdict("stopped", "interrupted")
+                self._end(Verdict("stopped", "interrupted; all processes are being ended"))
                 attempt.cancel()
             await asyncio.wait({attempt})
             if not attempt.cancelled():
@@ -222,15 +228,22 @@ class Demo:
 
     async def _drive(self, operator: Operator, clock: SystemClock, tasks: list[asyncio.Task[None]]) -> None:
         scene = self.scene
+        operator.held_back = True
         scene.phase = "localizing"
         await self._until(lambda: scene.truth is not None, READY_S, "the simulator said what is so", tasks)
         localized = "the robot knew its place"
         await self._until(lambda: scene.pose is not None and scene.pose.localized, LOCALIZED_S, localized, tasks)
+        scene.say("robot: it knows where it is")
         # An area whose node was not heard yet is unknown, and the planner avoids it.
         scene.phase = "waiting for the nodes"
         await self._until(self._all_clear, AREAS_S, "every watched area was known to be clear", tasks)
+        scene.say(f"nodes: all {len(self._watched())} watched areas are clear")
         scene.phase = "enabling"
-        await self._until(lambda: scene.state is not None and scene.state.enabled, ENABLED_S, "it was enabled", tasks)
+        settled = clock.now() + _SETTLE_S
+        well = "the robot was well"
+        await self._until(lambda: operator.ready_s >= _HEALTHY_S or clock.now() > settled, ENABLED_S, well, tasks)
+        operator.held_back = False
+        await self._until(self._is_enabled, ENABLED_S, "it was enabled", tasks)
         scene.phase = "sending the goal"
         if not await self._send_goal(operator, tasks):
             return
@@ -247,10 +260,16 @@ class Demo:
         self._usage.restart()
         await self._watch(operator, clock, self._judge, tasks)
 
+    def _watched(self) -> set[str]:
+        return {node.area for node in self.site.site.nodes}
+
     def _all_clear(self) -> bool:
-        watched = {node.area for node in self.site.site.nodes}
         states = {area: hazard.hazard.state for area, hazard in self.scene.hazards.items()}
-        return all(states.get(area) == "clear" for area in watched)
+        return all(states.get(area) == "clear" for area in self._watched())
+
+    def _is_enabled(self) -> bool:
+        state = self.scene.state
+        return state is not None and state.enabled and state.mode not in STOP_AT_ONCE
 
     def _span(self) -> float:
         """Rough length (m) of the way: right angles from where the robot is."""

@@ -15,12 +15,14 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import msgspec
 import psutil
 import pytest
 
 from fog_contracts import channels as ch
-from fog_contracts.messages import SimTruth
+from fog_contracts.messages import MapHeartbeat, SimTruth
 from fog_runtime.clock import SystemClock
+from fog_runtime.record import read
 from fog_runtime.zenoh_edge import ZenohEdge
 
 if TYPE_CHECKING:
@@ -35,6 +37,8 @@ ENDS_S = 15.0
 PROCESSES = 10
 """Nine programs, and the guardian under its watcher."""
 NOT_TRUE = 1
+ESTIG = Path(__file__).parents[2] / "sites" / "estig"
+CORES = Path(__file__).parents[1] / "replay" / "cores.py"
 
 
 def alive(process: psutil.Process) -> bool:
@@ -143,13 +147,36 @@ def has_left_nothing(command: Command, folder: Path, children: list[psutil.Proce
     assert (report["outcome"], report["success"]) == ("stopped", False)
 
 
+def leads_fresh_cores_to_the_recorded_maps(recording: Path, out: Path) -> None:
+    """Replay a file as tests/replay does: that needs the first word of every service, and a whole end."""
+    heard = list(read(recording))
+    first = {channel.name: at_ns for at_ns, channel, _, _ in reversed(heard)}
+    # The services beat while the simulator still starts, which takes longer than this: the file begins before both.
+    assert first["sim_truth"] - first["map_heartbeat"] > 1e9
+    out.mkdir()
+    command = [sys.executable, str(CORES), str(recording), str(ESTIG), str(out)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    drawn = [
+        msgspec.json.decode(line, type=MapHeartbeat) for line in (out / "versions.jsonl").read_bytes().splitlines()
+    ]
+    hashes = {version.seq: version.hash for version in drawn}
+    # Version 1 is the site's map as it is; a replay begins with it.
+    told = {m.seq: m.hash for _, _, _, m in heard if isinstance(m, MapHeartbeat) and m.seq > 1}
+    assert told
+    assert told == {seq: hashes.get(seq) for seq in told}
+    assert (out / "again.jsonl").read_bytes().count(b"\n") >= 1
+
+
 async def test_of_two_demos_side_by_side_one_is_interrupted_and_the_other_drives_on(
-    begin: Callable[..., Command],
+    begin: Callable[..., Command], tmp_path: Path
 ) -> None:
     # At speed 1 a demo never begins anew because the machine is busy: it is the one that must go on.
-    one, other = begin("one", "--seed", "7", "--speed", "3"), begin("other", "--seed", "8")
+    recording = tmp_path / "one.mcap"
+    one = begin("one", "--seed", "7", "--speed", "3", "--record", str(recording))
+    other = begin("other", "--seed", "8")
     for command in (one, other):
-        await command.wait_for("^robot: NORMAL", DRIVES_S)
+        await command.wait_for("^planner: plan 1", DRIVES_S)
     folders = [one.folder, other.folder]
     assert folders[0] is not None
     assert folders[1] is not None
@@ -162,6 +189,7 @@ async def test_of_two_demos_side_by_side_one_is_interrupted_and_the_other_drives
     os.killpg(one.process.pid, signal.SIGINT)  # what a terminal does at Ctrl-C
     assert await one.ends(ENDS_S) == NOT_TRUE
     has_left_nothing(one, folders[0], families[0], ports[0])
+    leads_fresh_cores_to_the_recorded_maps(recording, tmp_path / "replayed")
 
     (router,) = {p.environ()["FOGNAV_ZENOH_CONNECT"] for p in families[1] if "FOGNAV_ZENOH_CONNECT" in p.environ()}
     opened = ZenohEdge.open(connect=[router], clock=SystemClock(), role="console", id="test", site="estig")
@@ -183,7 +211,7 @@ async def test_of_two_demos_side_by_side_one_is_interrupted_and_the_other_drives
 
 
 async def test_a_demo_that_is_interrupted_while_it_starts_ends_what_it_has_started(
-    begin: Callable[..., Command],
+    begin: Callable[..., Command], tmp_path: Path
 ) -> None:
     command = begin("early", "--speed", "3")
     await until(lambda: command.folder is not None, DRIVES_S, lambda: f"it began: {command.said}")

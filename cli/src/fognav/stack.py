@@ -7,7 +7,7 @@ import secrets
 import shutil
 import sys
 import tempfile
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -116,16 +116,25 @@ class Stack:
 
     async def start(self, timeout_s: float = 90.0) -> None:
         """Start everything and wait until each process says that it is ready; raises `NotReadyError`."""
-        for name in SERVERS:
-            self.supervisor.start(name)
-        await self.supervisor.wait_ready(SERVERS, timeout_s)
-        for name in (SIMULATOR, *SERVICES):
-            self.supervisor.start(name)
+        await self.start_servers(timeout_s)
+        await self.start_system(timeout_s)
+
+    async def start_servers(self, timeout_s: float = 90.0) -> None:
+        """Start what carries and keeps messages: whoever listens from here on hears all; raises `NotReadyError`."""
+        await self._start(SERVERS, SERVERS, timeout_s)
+
+    async def start_system(self, timeout_s: float = 90.0) -> None:
+        """Start all else, when the servers are ready; raises `NotReadyError`."""
+        # Before there are nodes and robots the services stand at their beginning: nothing is said that none hears.
+        await self._start(SERVICES, SERVICES, timeout_s)
         # The simulator makes the robot's serial ports, so it comes before the robot.
-        await self.supervisor.wait_ready([SIMULATOR], timeout_s)
-        for name in ROBOT:
+        await self._start([SIMULATOR], [SIMULATOR], timeout_s)
+        await self._start(ROBOT, [WATCHER], timeout_s)
+
+    async def _start(self, names: Iterable[str], until_ready: Iterable[str], timeout_s: float) -> None:
+        for name in names:
             self.supervisor.start(name)
-        await self.supervisor.wait_ready([*SERVICES, WATCHER], timeout_s)
+        await self.supervisor.wait_ready(until_ready, timeout_s)
 
     async def close(self) -> None:
         """End every process and, unless `keep_files`, remove the run's folder."""

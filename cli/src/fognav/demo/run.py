@@ -168,11 +168,11 @@ class Demo:
             if self.options.hazard and not self._hazard:
                 self.scene.say("the site's [demo] lists no areas: nothing will be blocked")
             self.scene.say(f"starting {len(stack.supervisor.names)} processes, logs in {stack.folder / 'logs'}")
-            await stack.start(READY_S)
+            await stack.start_servers(READY_S)
             async with contextlib.AsyncExitStack() as ends:
-                edge = await ends.enter_async_context(self._open(stack, clock, "demo"))
                 if self.options.record is not None:
-                    # A session of its own: what is recorded is what any listener hears.
+                    # From before the first word of any service: a file that lacks the map's first versions is no
+                    # input for a replay. A session of its own, since what is recorded is what any listener hears.
                     ears = await ends.enter_async_context(self._open(stack, clock, "record"))
                     numbers = [area.number for area in self.site.site.areas if area.number is not None]
                     await ends.enter_async_context(
@@ -180,6 +180,8 @@ class Demo:
                             self.options.record, mqtt_url=stack.mqtt_url, zenoh=ears, clock=clock, numbers=numbers
                         )
                     )
+                await stack.start_system(READY_S)
+                edge = await ends.enter_async_context(self._open(stack, clock, "demo"))
                 operator = Operator(edge, stack, self.scene, clock)
                 async with _background(operator.keep_enabled(), self._sample(stack)) as tasks:
                     await self._drive(operator, clock, tasks)

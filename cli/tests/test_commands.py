@@ -1,4 +1,6 @@
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -17,6 +19,21 @@ def test_every_command_has_help_with_an_example(command: list[str]) -> None:
     done = runner.invoke(app, [*command, "--help"])
     assert done.exit_code == 0
     assert "Example: fognav " + " ".join(command) in done.output
+
+
+@pytest.mark.parametrize("group", [[], ["site"]])
+def test_the_list_of_commands_cuts_no_sentence_off(group: list[str]) -> None:
+    done = runner.invoke(app, [*group, "--help"], env={"COLUMNS": "80"})
+    commands = done.output.partition("Commands:\n")[2].strip().splitlines()
+    assert len(commands) >= 2
+    assert [line for line in commands if not line.endswith(".") or line.endswith("...")] == []
+
+
+@pytest.mark.parametrize("arguments", [["demo", "--speed", "0"], ["--help"], ["nonsense"]])
+def test_it_calls_itself_by_the_name_that_people_type(arguments: list[str]) -> None:
+    done = subprocess.run([sys.executable, "-m", "fognav", *arguments], capture_output=True, text=True, check=False)
+    assert "Usage: fognav " in done.stdout + done.stderr
+    assert "python" not in done.stdout + done.stderr
 
 
 def test_doctor_writes_one_object_with_schema_and_version() -> None:

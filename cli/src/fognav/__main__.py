@@ -86,7 +86,10 @@ def _prepare(*, yes: bool) -> None:
     epilog="Example: fognav test --yes -k replica",
 )
 def run_tests(context: typer.Context, *, yes: Yes = False) -> None:
-    """Set up what is missing and run all tests, those with real brokers included; further arguments go to pytest."""
+    """Set up what is missing, then run every test.
+
+    Those with real brokers are among them; further arguments go to pytest.
+    """
     _prepare(yes=yes)
     command = [sys.executable, "-m", "pytest", *context.args]
     done = subprocess.run(command, check=False, cwd=checkout.root())
@@ -99,7 +102,8 @@ def demo_command(
     headless: Annotated[bool, typer.Option("--headless", help="No terminal view and no page: for machines.")] = False,
     report: Annotated[Path | None, typer.Option("--report", metavar="F", help="Write the report (JSON) here.")] = None,
     site: Annotated[
-        Path | None, typer.Option("--site", metavar="D", help="Folder of a site; sites/estig without it.")
+        Path | None,
+        typer.Option("--site", metavar="D", help="Folder of a site, or a name in sites/; estig without it."),
     ] = None,
     seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of noise, area and moment.")] = 1,
     speed: Annotated[
@@ -119,9 +123,10 @@ def demo_command(
     yes: Yes = False,
     json: Json = False,
 ) -> None:
-    """Start the whole system with simulated hardware, drive, block the way, and watch the robot go around.
+    """Run the whole system with simulated hardware, and block its way.
 
-    Exit code 0 only if the goal was reached without touching anything, by a way that avoids the blocked area.
+    Exit code 0 only if the goal was reached without touching anything, by a way that avoids the blocked area; 1 if it
+    was not, or was interrupted (the report says which); 2 if what was asked for can't be used.
     """
     from fognav.demo.command import run_demo  # noqa: PLC0415  # the other commands need not wait for its imports
     from fognav.demo.run import Options  # noqa: PLC0415  # same
@@ -160,7 +165,10 @@ def record_command(
     seconds: Annotated[float, typer.Option("--seconds", min=0.0, help="How long; 0: until Ctrl-C.")] = 0.0,
     json: Json = False,
 ) -> None:
-    """Record every channel of a running system to an MCAP file, which Foxglove opens."""
+    """Record every channel of a running system to an MCAP file.
+
+    Foxglove opens such files, and fognav replay sends them again.
+    """
     from fognav import recording  # noqa: PLC0415  # the other commands need not wait for its imports
 
     try:
@@ -183,7 +191,10 @@ def replay_command(
     speed: Annotated[float, typer.Option("--speed", min=0.1, max=50.0, help="How many times as fast.")] = 1.0,
     json: Json = False,
 ) -> None:
-    """Send a recording's messages again, at their times, to a broker and a router."""
+    """Send a recording's messages again, at their times.
+
+    They go to a broker and a router; services that listen there take them for the real thing.
+    """
     from fognav import recording  # noqa: PLC0415  # the other commands need not wait for its imports
 
     try:
@@ -206,7 +217,10 @@ def site_new(
     seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Another seed proposes other places.")] = 1,
     json: Json = False,
 ) -> None:
-    """Write a commented starting point for a site on any map_server map, ready for a demonstration."""
+    """Propose a site on any map_server map, ready for a demo.
+
+    Writes DIR/site.toml, commented, as a starting point: places, a robot and watched areas.
+    """
     from fognav.site_command import new_site  # noqa: PLC0415  # the other commands need not wait for its imports
 
     try:
@@ -242,7 +256,8 @@ def site_check(
 def main() -> None:
     """Run the command."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
-    app()
+    # Whoever started it by `python -m` or by the launcher reads the one name that all documents use.
+    app(prog_name="fognav")
 
 
 if __name__ == "__main__":

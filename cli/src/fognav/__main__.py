@@ -169,9 +169,12 @@ def record_command(
 
     Foxglove opens such files, and fognav replay sends them again.
     """
-    from fognav import recording  # noqa: PLC0415  # the other commands need not wait for its imports
+    from fog_runtime import logs  # noqa: PLC0415  # the other commands need not wait for its imports
+    from fognav import recording  # noqa: PLC0415  # same
 
+    logs.configure("record", "error", "text")
     try:
+        check_writable(file)
         made = asyncio.run(recording.record(file, mqtt_url=mqtt, zenoh_endpoint=zenoh, site=site, seconds=seconds))
     except WrongUseError as error:
         _fail(str(error), WRONG_USE)
@@ -195,8 +198,10 @@ def replay_command(
 
     They go to a broker and a router; services that listen there take them for the real thing.
     """
-    from fognav import recording  # noqa: PLC0415  # the other commands need not wait for its imports
+    from fog_runtime import logs  # noqa: PLC0415  # the other commands need not wait for its imports
+    from fognav import recording  # noqa: PLC0415  # same
 
+    logs.configure("replay", "error", "text")  # what went wrong is told by the command itself
     try:
         sent = asyncio.run(recording.play(file, mqtt_url=mqtt, zenoh_endpoint=zenoh, site=site, speed=speed))
     except WrongUseError as error:
@@ -204,7 +209,8 @@ def replay_command(
     if json:
         print_json(sent)
     else:
-        _say(f"sent {sent['sent']} messages of {file}")
+        lost = f"; its end is missing: {sent['bytes_lost']} bytes are no whole record" if sent["bytes_lost"] else ""
+        _say(f"sent {sent['sent']} messages of {file}{lost}")
 
 
 @site_app.command(
@@ -238,12 +244,17 @@ def site_new(
 
 @site_app.command("check", epilog="Example: fognav site check sites/estig")
 def site_check(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder with site.toml.")], *, json: Json = False
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder with site.toml, or a name in sites/.")],
+    *,
+    json: Json = False,
 ) -> None:
     """Check a site: map, ids, and that everything lies on free floor."""
     from fognav.site_command import check_site  # noqa: PLC0415  # same
 
-    found = check_site(folder)
+    try:
+        found = check_site(checkout.site_folder(folder))
+    except WrongUseError as error:
+        _fail(str(error), WRONG_USE)
     if json:
         print_json(found)
     elif found["ok"]:

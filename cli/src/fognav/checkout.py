@@ -23,6 +23,10 @@ def site_folder(name: Path | None) -> Path:
         return name.resolve()
     if len(name.parts) == 1 and (root() / "sites" / name / "site.toml").is_file():
         return root() / "sites" / name
+    if name.is_file():
+        raise WrongUseError(f"{name} is a file, and a site is a folder with site.toml and a map: name its folder")
+    known = ", ".join(sorted(file.parent.name for file in (root() / "sites").glob("*/site.toml")))
     raise WrongUseError(
-        f"{name} is no site: there is no {name / 'site.toml'}. Make one with: fognav site new --map MAP.yaml --out DIR"
+        f"{name} is no site: there is no {name / 'site.toml'}. Use one of sites/ ({known}), "
+        "or make one with: fognav site new --map MAP.yaml --out DIR"
     )

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import signal
+import time
 from collections.abc import AsyncIterator, Sequence
 from pathlib import Path
 from typing import Final
@@ -11,12 +12,13 @@ from fog_contracts.channels import Channel
 from fog_contracts.messages import Message
 from fog_runtime.clock import Clock, SystemClock
 from fog_runtime.mqtt_edge import MqttEdge
-from fog_runtime.record import Recorder, RecordError, read, record_all, replay
+from fog_runtime.record import Recorder, RecordError, bytes_lost, read, record_all, replay
 from fog_runtime.zenoh_edge import ZenohEdge
 from fognav.output import WrongUseError
 
 _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
 _CONNECT_S: Final = 10.0
+_POLL_S: Final = 0.05
 
 
 @contextlib.asynccontextmanager
@@ -27,12 +29,12 @@ async def recording(
 
     Raises `WrongUseError` when the file can't be written or the broker can't be reached.
     """
+    mqtt = _mqtt(mqtt_url, "fognav-record", clock)
     try:
         recorder = Recorder(path, site=zenoh.site)
     except OSError as error:
         raise WrongUseError(f"{path} can't be written: {error.strerror}. Name another file") from error
     with recorder:
-        mqtt = MqttEdge(mqtt_url, "fognav-record", clock)
         record_all(mqtt, zenoh, recorder, clock, numbers=numbers)
         task = asyncio.create_task(mqtt.run())
         try:
@@ -44,20 +46,25 @@ async def recording(
 
 
 async def record(path: Path, *, mqtt_url: str, zenoh_endpoint: str, site: str, seconds: float) -> dict[str, object]:
-    """Record for a time (0: until a signal); return what was recorded, by channel."""
-    stop = asyncio.Event()
-    for number in _SIGNALS:
-        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    """Record for a time (0: until a signal); return what was recorded, by channel.
+
+    Raises `WrongUseError` without broker or router, and then leaves a file that was there before as it is.
+    """
     clock = SystemClock()
     opened = ZenohEdge.open(connect=[zenoh_endpoint], clock=clock, role="console", id="record", site=site)
-    async with opened as zenoh, recording(path, mqtt_url=mqtt_url, zenoh=zenoh, clock=clock):
-        with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(stop.wait(), seconds or None)
+    async with opened as zenoh:
+        await _look(zenoh, zenoh_endpoint, mqtt_url, clock)
+        stop = asyncio.Event()
+        for number in _SIGNALS:
+            asyncio.get_running_loop().add_signal_handler(number, stop.set)
+        async with recording(path, mqtt_url=mqtt_url, zenoh=zenoh, clock=clock):
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(stop.wait(), seconds or None)
     return summary(path)
 
 
 def summary(path: Path) -> dict[str, object]:
-    """Return what a recording holds; raises `WrongUseError` for a file that is none."""
+    """Return what a recording holds, and what it lost at its end; raises `WrongUseError` for a file that is none."""
     counts: dict[str, int] = {}
     first = last = 0
     try:
@@ -65,18 +72,33 @@ def summary(path: Path) -> dict[str, object]:
             counts[channel.name] = counts.get(channel.name, 0) + 1
             first = first or time_ns
             last = time_ns
-    except (OSError, RecordError) as error:
-        raise WrongUseError(str(error)) from error
-    return {"file": str(path), "messages": counts, "seconds": round((last - first) / 1e9, 3)}
+        lost = bytes_lost(path)
+    except OSError as error:
+        raise WrongUseError(f"{path} can't be read: {error.strerror}. Name a file that was recorded") from error
+    except RecordError as error:
+        raise WrongUseError(f"{error}. Name a file that fognav recorded") from error
+    return {
+        "file": str(path),
+        "messages": counts,
+        "seconds": round((last - first) / 1e9, 3),
+        "bytes_lost": lost,
+    }
 
 
 async def play(path: Path, *, mqtt_url: str, zenoh_endpoint: str, site: str, speed: float) -> dict[str, object]:
-    """Send a recording's messages at their times; return how many. Raises `WrongUseError` without a broker."""
-    summary(path)  # a file that is no recording is refused before anything is sent
+    """Send a recording's messages at their times; return how many.
+
+    Raises `WrongUseError` for a file that is no recording or an empty one, before anything is sent, and without broker
+    or router.
+    """
+    held = summary(path)
+    if not held["messages"]:
+        raise WrongUseError(f"{path} holds no whole message: there is nothing to send. Record it anew")
     clock = SystemClock(speed)
-    mqtt = MqttEdge(mqtt_url, "fognav-replay", clock)
+    mqtt = _mqtt(mqtt_url, "fognav-replay", clock)
     opened = ZenohEdge.open(connect=[zenoh_endpoint], clock=clock, role="console", id="replay", site=site)
     async with opened as zenoh:
+        await _router(zenoh, zenoh_endpoint)
 
         async def send(channel: Channel, ids: dict[str, str], message: Message | str) -> None:
             if channel.transport == "mqtt":
@@ -87,14 +109,46 @@ async def play(path: Path, *, mqtt_url: str, zenoh_endpoint: str, site: str, spe
         task = asyncio.create_task(mqtt.run())
         try:
             await _connected(mqtt, mqtt_url)
-            return {"file": str(path), "sent": await replay(path, clock, send)}
+            return {"file": str(path), "sent": await replay(path, clock, send), "bytes_lost": held["bytes_lost"]}
         finally:
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)
+
+
+def _mqtt(url: str, client: str, clock: Clock) -> MqttEdge:
+    try:
+        return MqttEdge(url, client, clock)
+    except ValueError as error:
+        raise WrongUseError(f"{url!r} names no broker ({error}). Correct --mqtt") from error
+
+
+async def _look(zenoh: ZenohEdge, zenoh_endpoint: str, mqtt_url: str, clock: Clock) -> None:
+    """See whether there is a system, before a file is written over; raises `WrongUseError`."""
+    mqtt = _mqtt(mqtt_url, "fognav-look", clock)
+    looking = asyncio.create_task(mqtt.run())
+    try:
+        await _connected(mqtt, mqtt_url)
+    finally:
+        looking.cancel()
+        await asyncio.gather(looking, return_exceptions=True)
+    await _router(zenoh, zenoh_endpoint)
 
 
 async def _connected(mqtt: MqttEdge, url: str) -> None:
     try:
         await asyncio.wait_for(mqtt.wait_connected(), _CONNECT_S)
     except TimeoutError as error:
-        raise WrongUseError(f"the broker {url} can't be reached: start it, or name another") from error
+        raise WrongUseError(
+            f"the broker {url} can't be reached: start the system, or name its broker with --mqtt"
+        ) from error
+
+
+async def _router(zenoh: ZenohEdge, endpoint: str) -> None:
+    deadline = time.monotonic() + _CONNECT_S
+    while not zenoh.connected:
+        if time.monotonic() > deadline:
+            raise WrongUseError(
+                f"the zenoh router {endpoint} can't be reached: start the system, or name its router with --zenoh, "
+                "such as tcp/127.0.0.1:7447"
+            )
+        await asyncio.sleep(_POLL_S)

@@ -1,3 +1,5 @@
+import re
+
 import numpy as np
 import pytest
 
@@ -80,7 +82,6 @@ def test_site_loads_with_its_map_and_counter_clockwise_areas(folder):
         ('areas = ["a1"]', 'areas = ["a7"]', "demo.areas[0]", "one of: a1"),
         ("[demo]", '[[robots]]\nid = "r1"\nstart = { x = 1, y = 1, theta = 0 }\n[demo]', "robots.id", "twice"),
         ('name = "A small lab"', 'map = "none.yaml"', "map", "none.yaml"),
-        ('name = "A small lab"', "name = A small lab", "file", "TOML"),
         ("range_limit = 1.5 }, {", "range_limit = 9 }, {", "nodes[0].sonars[0].range_limit", "4.0"),
     ],
 )
@@ -92,6 +93,14 @@ def test_error_names_file_field_and_remedy(folder, old, new, field, words):
     text = str(refused.value)
     assert text.startswith(f"{folder / 'site.toml'}: {field}"), text
     assert words in text, text
+
+
+def test_what_is_no_toml_is_named_with_the_place(folder):
+    (folder / "site.toml").write_text(SITE.replace('name = "A small lab"', "name = A small lab"))
+    with pytest.raises(
+        SiteError, match=re.escape(f"{folder / 'site.toml'} is no valid TOML (Invalid value (at line 3")
+    ):
+        load_site(folder)
 
 
 def test_missing_folder_is_refused_with_a_remedy(tmp_path):

@@ -34,10 +34,14 @@ _SHADES: Final = {FREE: 254, LETHAL: 0, UNKNOWN: 205}
 
 
 class MapFileError(ValueError):
-    """A map file that can't be used; the message names the file, the key and the remedy."""
+    """A map file that can't be used; the message names the file, the key and the remedy.
+
+    The key `file` stands for the file as a whole.
+    """
 
     def __init__(self, file: Path, key: str, problem: str, remedy: str) -> None:
-        super().__init__(f"{file}: {key}: {problem}. {remedy}")
+        where = f"{file}" if key == "file" else f"{file}: {key}:"
+        super().__init__(f"{where} {problem}. {remedy}")
         self.file = file
         self.key = key
 
@@ -94,13 +98,22 @@ def _number(file: Path, data: dict[str, Any], key: str, low: float, high: float)
     return value
 
 
+def _no_yaml(error: yaml.YAMLError | UnicodeDecodeError) -> tuple[str, str]:
+    """Return what is wrong with a file that can't be read as YAML, in one line, and what to do."""
+    if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None:
+        where = f"line {error.problem_mark.line + 1}, column {error.problem_mark.column + 1}"
+        return f"is no valid YAML ({where}: {error.problem})", "Correct that place"
+    return "is no text", "A map is a YAML file that names an image: name that file, not the image"
+
+
 def _describe(file: Path) -> _Description:
     try:
         data = yaml.safe_load(file.read_text("utf-8"))
     except OSError as error:
-        raise MapFileError(file, "file", f"can't be read ({error.strerror})", "Check the path") from error
+        remedy = "A map is a YAML file that names an image; check the path"
+        raise MapFileError(file, "file", f"can't be read ({error.strerror})", remedy) from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise MapFileError(file, "file", f"is no valid YAML ({error})", "Correct the place it names") from error
+        raise MapFileError(file, "file", *_no_yaml(error)) from error
     if not isinstance(data, dict):
         raise MapFileError(file, "file", "is no table of keys", "Write `image: ...`, `resolution: ...` and so on")
     name = data.get("image")
@@ -108,7 +121,8 @@ def _describe(file: Path) -> _Description:
         raise MapFileError(file, "image", "missing", "Name the image file, relative to this file")
     image = file.parent / name
     if not image.is_file():
-        raise MapFileError(file, "image", f"{image} does not exist", "Put the image there or name another")
+        problem = f"{image} {'is no file' if image.exists() else 'does not exist'}"
+        raise MapFileError(file, "image", problem, "Put the image there or name another")
     given = data.get("origin")
     origin = [_as_number(value) for value in given] if isinstance(given, list) else []
     if len(origin) != 3 or not all(math.isfinite(value) for value in origin):
@@ -159,7 +173,9 @@ def _channels(file: Path, image: Path) -> tuple[NDArray[np.float64], NDArray[np.
     ) as error:  # fmt: skip
         if isinstance(error, MapFileError):
             raise
-        raise MapFileError(file, "image", f"{image} can't be decoded ({error})", "Save it as PGM or PNG") from error
+        raise MapFileError(
+            file, "image", f"{image} can't be decoded ({error})", "Save it anew, as PGM or PNG"
+        ) from error
     if pixels.ndim == 2:
         pixels = pixels[:, :, None]
     if mode == "LA":

@@ -137,6 +137,15 @@ def read(path: Path) -> Iterator[tuple[int, Channel, dict[str, str], Message | s
             yield record.log_time, channel, ids, _decoded(path, channel, record.data)
 
 
+def bytes_lost(path: Path) -> int:
+    """Return how many bytes at a recording's end belong to no whole record: a crash or a copy cut it short.
+
+    Raises `RecordError` for damage before that.
+    """
+    with path.open("rb") as file:
+        return max(0, path.stat().st_size - _whole_records(path, file))
+
+
 def _messages(path: Path, reader: NonSeekingReader) -> Iterator[tuple[Any, Any]]:
     """Yield channel and message of all that is whole; raises `RecordError` for damage."""
     try:

@@ -20,10 +20,14 @@ _BORDER: Final = 1e-6
 
 
 class SiteError(ValueError):
-    """A site that can't be used; the message names the file, the field and the remedy."""
+    """A site that can't be used; the message names the file, the field and the remedy.
+
+    The field `file` stands for the file as a whole.
+    """
 
     def __init__(self, file: Path, field: str, problem: str, remedy: str) -> None:
-        super().__init__(f"{file}: {field}: {problem}. {remedy}")
+        where = f"{file}" if field == "file" else f"{file}: {field}:"
+        super().__init__(f"{where} {problem}. {remedy}")
         self.file = file
         self.field = field
 

@@ -29,6 +29,7 @@ from fog_runtime.site import LoadedSite
 from fognav import net, system
 from fognav.demo.run import Demo, Options
 from fognav.demo.view import render
+from fognav.output import WrongUseError
 from fognav.page.app import map_png, serve
 
 FLAGS = [
@@ -116,6 +117,16 @@ async def test_the_page_serves_its_files_and_no_others(demo: Demo) -> None:
             assert (await asyncio.to_thread(net.request, "GET", port, path)).status == status, path
         outside = await asyncio.to_thread(net.request, "GET", port, "/..%2fapp.py")
         assert outside.status == 404
+
+
+async def test_a_port_that_somebody_else_has_is_refused_with_the_way_out(demo: Demo) -> None:
+    async with serve(demo) as url:
+        port = int(url.rstrip("/").rsplit(":", 1)[1])
+        with pytest.raises(
+            WrongUseError, match=rf"port {port} \(Address already in use\): choose another with --page-"
+        ):
+            async with serve(demo, port):
+                pass
 
 
 def test_the_scene_is_valid_json_before_anything_is_known() -> None:

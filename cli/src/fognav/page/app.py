@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import io
 import json
+import socket
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Final
@@ -18,6 +19,7 @@ from fog_contracts.costs import FREE, UNKNOWN
 from fog_runtime.maps import StaticMap
 from fognav import net
 from fognav.demo.run import Demo
+from fognav.output import WrongUseError
 
 _STATIC: Final = Path(__file__).parent / "static"
 _PERIOD_S: Final = 0.15
@@ -87,8 +89,22 @@ async def _stream(demo: Demo, closing: asyncio.Event) -> AsyncIterator[str]:
 
 @contextlib.asynccontextmanager
 async def serve(demo: Demo, port: int = 0) -> AsyncIterator[str]:
-    """Serve the page beside the body; yields its address. Port 0 takes a free one."""
+    """Serve the page beside the body; yields its address. Port 0 takes a free one.
+
+    Raises `WrongUseError` for a port that can't be had.
+    """
     chosen = port or net.free_port(set())
+    # Bound here: uvicorn would end the whole process when it can't.
+    listening = socket.socket()
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listening.bind((net.LOOPBACK, chosen))
+    except OSError as error:
+        listening.close()
+        raise WrongUseError(
+            f"the page can't be served on port {chosen} ({error.strerror}): choose another with --page-port, "
+            "or leave it out for any that is free"
+        ) from error
     closing = asyncio.Event()
     config = uvicorn.Config(
         make_app(demo, closing), host=net.LOOPBACK, port=chosen, log_level="warning", access_log=False, lifespan="off"
@@ -97,12 +113,12 @@ async def serve(demo: Demo, port: int = 0) -> AsyncIterator[str]:
     server = uvicorn.Server(config)
     # The command handles its signals itself.
     server.capture_signals = contextlib.nullcontext  # type: ignore[method-assign,assignment]  # a context manager too
-    task = asyncio.create_task(server.serve())
+    task = asyncio.create_task(server.serve([listening]))
     try:
         while not server.started:
             if task.done():
                 task.result()
-                raise OSError(f"the page could not be served on port {chosen}: choose another with --page-port")
+                raise OSError(f"the server of the page on port {chosen} ended before it had begun")
             await asyncio.sleep(0.02)
         yield f"http://{net.LOOPBACK}:{chosen}/"
     finally:

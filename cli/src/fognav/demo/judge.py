@@ -105,6 +105,8 @@ class Judge:
     paths: int = 0
     modes: Counter[str] = field(default_factory=Counter)
     """How often the robot entered each of its modes."""
+    stops: list[str] = field(default_factory=list)
+    """Each PROTECTIVE_STOP and FAULT that it entered, with its reasons."""
     _mode: str = ""
     _truth: SimTruth | None = None
     _begun_at_m: float | None = None
@@ -145,6 +147,8 @@ class Judge:
         if state.mode != self._mode:
             self._mode = state.mode
             self.modes[state.mode] += 1
+            if state.mode in {"PROTECTIVE_STOP", "FAULT"}:
+                self.stops.append(f"{state.mode}: {'; '.join(state.reasons) or 'no reason given'}")
         if state.goal_reached and state.goal_id in {self.goal_id, None}:
             self._claimed_at = now if self._claimed_at is None else self._claimed_at
         else:

@@ -119,6 +119,7 @@ class Demo:
         self._restarts: dict[str, int] = {}
         self._strikes = 0
         self._late_beats = 0
+        self._stops_seen = 0
         self._speeds: list[float] = []
 
     # --- attempts ---------------------------------------------------------------------------------------------------
@@ -362,9 +363,12 @@ class Demo:
             raise WrongUseError(str(error)) from error
 
     def _check_speed(self, elapsed: float, clock: SystemClock) -> None:
-        """Raise `_TooFastError` when the processes have been late for a while; at speed 1 there is nothing to lower."""
-        truth, state = self.scene.truth, self.scene.state
-        if truth is None or state is None:
+        """Raise `_TooFastError` when the processes have been late for a while, or late and the robot stopped for it.
+
+        At speed 1 there is nothing to lower.
+        """
+        truth, state, judge = self.scene.truth, self.scene.state, self._judge
+        if truth is None or state is None or judge is None:
             return
         self._speeds.append(truth.sustained_speed)
         fresh = max(0, state.loop.late - self._late_beats)
@@ -372,19 +376,37 @@ class Demo:
         slow = truth.sustained_speed < _SPEED_SHARE * clock.speed
         late = fresh / elapsed > _LATE_PER_S
         self._strikes = self._strikes + 1 if slow or late else 0
-        if clock.speed > 1.0 and self._strikes >= _SPEED_STRIKES:
+        stops = self._unexplained_stops()
+        new_stops, self._stops_seen = stops[self._stops_seen :], len(stops)
+        stopped = bool(new_stops) and (slow or fresh > 0)
+        if clock.speed > 1.0 and not judge.entered_blocked and (stopped or self._strikes >= _SPEED_STRIKES):
             why = f"{truth.sustained_speed:.2f} sustained, {fresh} of the agent's beats late in {elapsed:.0f} s"
-            raise _TooFastError(truth.sustained_speed, why)
+            raise _TooFastError(truth.sustained_speed, "; ".join([why, *(new_stops if stopped else [])]))
+
+    def _unexplained_stops(self) -> list[str]:
+        """Return the stops of this drive that nothing in its scene asks for.
+
+        The barrier stands where no robot is, and who touches something has failed anyway; but after a process died, a
+        stop is what should follow.
+        """
+        return [] if self._judge is None or self._restarts else self._judge.stops
 
     def _judge_speed(self, verdict: Verdict, clock: SystemClock) -> None:
         """Blame the haste, not the robot, for a run that failed while something was late.
 
-        A touch or a blocked area entered is never excused: what stops the robot must work at any speed.
+        And count no speed as kept at which the robot arrived, but stopped on its way although nothing in its scene asks
+        for a stop. A touch or a blocked area entered is never excused: what stops the robot must work at any
+        speed. Nor is a stop by itself an excuse for a run that failed.
         """
         entered = self._judge is not None and self._judge.entered_blocked
-        excusable = verdict.outcome not in {"reached", "contact"} and not entered
-        if clock.speed > 1.0 and excusable and self._strikes:
-            sustained = self.scene.truth.sustained_speed if self.scene.truth else 1.0
+        if clock.speed <= 1.0 or entered or verdict.outcome == "contact":
+            return
+        sustained = self.scene.truth.sustained_speed if self.scene.truth else 1.0
+        if verdict.outcome == "reached":
+            stops = self._unexplained_stops()
+            if stops and (self._blocked_at is not None or not self._hazard):
+                raise _TooFastError(sustained, f"it arrived, but stopped on its way: {'; '.join(stops)}")
+        elif self._strikes:
             raise _TooFastError(sustained, f"{verdict.outcome}: {verdict.reason}")
 
     # --- helpers ----------------------------------------------------------------------------------------------------

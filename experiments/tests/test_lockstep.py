@@ -1,15 +1,18 @@
 """The loop closes: nodes to aggregator to map to planner to robot to wheels, judged by the simulated truth."""
 
 import importlib.util
+import math
 from pathlib import Path
 
 import msgspec
 import pytest
 
 from fog_contracts.geometry import contains_point
+from fog_runtime.site import load_site
 from fognav_experiments.lockstep import draw_area, run_lockstep
 from fognav_sim.scenario import ScenarioError
 
+ESTIG = Path(__file__).parents[2] / "sites" / "estig"
 _spec = importlib.util.spec_from_file_location("little_site", Path(__file__).parent / "little_site.py")
 little = importlib.util.module_from_spec(_spec)
 _spec.loader.exec_module(little)
@@ -57,6 +60,20 @@ def test_the_hazard_reaches_the_wheels_within_three_seconds_and_every_stage_is_s
     # Five readings at 8 to 10 a second, then the next decision and wheel command.
     assert 380.0 < stages["debounce"] < 600.0
     assert stages["total"] < 1000.0
+
+
+def test_a_barrier_that_no_node_sees_turns_the_robot_back_once_and_is_not_forgotten():
+    site = load_site(ESTIG)
+    start, goal = site.site.places["a"], site.site.places["b"]
+    begin = msgspec.structs.replace(site.site.robots[0].start, x=start.x, y=start.y)
+    met = run_lockstep(site, begin, goal, 1, "z4", hazard_at_m=0.5, watched=False)
+    assert (met.outcome, met.contacts) == ("reached", 0), met.detail
+    barrier = next(area.polygon for area in site.site.areas if area.id == "z4")
+    away = [math.dist(point, barrier[0]) for point in met.track]
+    nearest = away.index(min(away))
+    assert min(away) < 8.0, "it must have come near enough to see it"
+    assert min(away[nearest + 60 :]) > 8.0, "it comes back to it"
+    assert met.distance_m < 140.0
 
 
 def test_the_same_seed_gives_the_same_run_bit_for_bit_and_another_seed_another(warned, free):

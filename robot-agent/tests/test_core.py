@@ -433,6 +433,20 @@ def test_obstacles_are_what_the_lidar_sees_and_the_map_does_not_know(world):
     assert len(world.agent.obstacles(world.now, world.stamp).points) >= 2
 
 
+def test_its_view_reaches_to_the_walls_of_the_corridor_and_to_what_stands_before_them(world):
+    def reach(x, y):
+        view = world.agent.obstacles(world.now, world.stamp).view
+        dx, dy = x - view.x, y - view.y
+        assert math.hypot(view.x - world.x, view.y - world.y) < 0.1
+        return view.reach_cm[int(math.atan2(dy, dx) % math.tau / math.tau * 180)] / 100 - math.hypot(dx, dy)
+
+    assert reach(4.0, 1.0) == pytest.approx(0.0, abs=0.15)
+    window = world.geometry.window_around(3.0, 1.3, 3.3, 1.6)
+    world.solid[window.rows, window.columns] = 1
+    world.run(0.5)
+    assert reach(3.0, 1.45) == pytest.approx(0.0, abs=0.15)
+
+
 def test_what_others_call_blocked_is_no_news(world):
     world.block(5.0, 1.5, 5.4, 2.5, solid=True)
     world.run(0.5)

@@ -8,6 +8,7 @@ threads, and the time that computing and networks take (`stages_ms` therefore ho
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import math
 import sys
@@ -290,18 +291,21 @@ def run_lockstep(
     hazard_at_m: float | None = None,
     timeout_s: float = 900.0,
     noise: Noise | None = None,
+    watched: bool = True,
 ) -> LockstepResult:
     """Drive the site's first robot from `start` to `goal`; the result is the same for the same arguments.
 
     With `hazard_area` a barrier appears in that area after `hazard_at_m` metres (drawn between 3 and 8 by the seed
-    if not given), never within 3 m of the robot. Raises `ScenarioError` for an area that the site does not have or
+    if not given), never within 3 m of the robot. Without `watched` the floor has neither areas nor nodes: the robot's
+    own lidar must find the barrier. Raises `ScenarioError` for an area that the site does not have or
     that can't be barred, `ValueError` for a start inside something.
     """
     pose = msgspec.convert(
         {"x": goal.x, "y": goal.y, "theta": goal.theta if goal.theta is not None else 0.0}, type(start)
     )
     mission = RobotGoal(goal_id="lockstep-1", pose=pose)
-    drive = _Drive(site, start, mission, seed, noise)
+    bare = msgspec.structs.replace(site.site, areas=[], nodes=[])
+    drive = _Drive(site if watched else dataclasses.replace(site, site=bare), start, mission, seed, noise)
     barrier = None
     if hazard_area is not None:
         barrier = barrier_across(_area(site, hazard_area), site.site, site.map, seed)

@@ -94,7 +94,8 @@ class AgentConfig:
     radius: float = 0.17
     height: float = 0.35
     decision_max_age: float = 0.4
-    obstacle_ttl: float = 30.0
+    obstacle_ttl: float = 600.0
+    """How long (s) what the lidar saw counts while nobody looks there again: longer than the way around it takes."""
     obstacle_limit: int = 400
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     localization: LocalizationConfig = field(default_factory=LocalizationConfig)

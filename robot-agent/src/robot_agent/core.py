@@ -18,6 +18,7 @@ from fog_contracts.commands import CommandGate
 from fog_contracts.costs import INSCRIBED, LETHAL
 from fog_contracts.geometry import contains_point, distance_to_segment
 from fog_contracts.messages import (
+    VIEW_SECTORS,
     CircleShape,
     CommandReply,
     CorridorShape,
@@ -37,6 +38,7 @@ from fog_contracts.messages import (
     RobotState,
     Shape,
     Trace,
+    View,
     Zone,
     ZoneSet,
 )
@@ -60,8 +62,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from fog_contracts.grid import GridGeometry
     from robot_agent.config import AgentConfig
     from robot_agent.drivers.rplidar import Turn
+    from robot_agent.localization import Pose2
 
 __all__ = ["AgentCore", "Decision", "Job", "SavedPose", "decide"]
 
@@ -450,7 +454,8 @@ class AgentCore:
         self._own_cells = {cell: until for cell, until in self._own_cells.items() if until >= now}
         self._own_cells.update({(int(cx), int(cy)): now + ttl + 2.0 for cx, cy in chosen})
         listed = [((cx + 0.5) * _OBSTACLE_CELL_M, (cy + 0.5) * _OBSTACLE_CELL_M) for cx, cy in chosen.tolist()]
-        return RobotObstacles(points=listed, stamp=stamp, ttl=ttl)
+        view = _view(localizer.seen_from(), points, geometry)
+        return RobotObstacles(points=listed, stamp=stamp, ttl=ttl, view=view)
 
     # --- restart ---
 
@@ -653,6 +658,18 @@ class AgentCore:
             ],
             dtype=np.bool_,
         )
+
+
+def _view(at: Pose2 | None, points: NDArray[np.float64], geometry: GridGeometry) -> View | None:
+    """Return how far the points (n, 2; m, frame `map`) let the lidar see from where it was, None off the map."""
+    if at is None or not geometry.contains_cell(*geometry.cell(at.x, at.y)):
+        return None
+    dx, dy = points[:, 0] - at.x, points[:, 1] - at.y
+    sectors = np.floor(np.arctan2(dy, dx) % math.tau * (VIEW_SECTORS / math.tau)).astype(np.int64) % VIEW_SECTORS
+    reach = np.full(VIEW_SECTORS, np.inf)
+    np.minimum.at(reach, sectors, np.hypot(dx, dy))
+    told = np.where(np.isfinite(reach), np.clip(np.floor(100.0 * reach), 0, 65_535), 0).astype(np.int64)
+    return View(x=at.x, y=at.y, reach_cm=told.tolist())
 
 
 def _zone_contains(shape: Shape, x: float, y: float) -> bool:

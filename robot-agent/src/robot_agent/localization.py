@@ -301,9 +301,14 @@ class Localizer:
 
     def points_in_map(self) -> NDArray[np.float64] | None:
         """Return the newest turn's points (n, 2) in m, frame `map`; None without pose or turn."""
+        at = self.seen_from()
+        return None if at is None or self.sweep is None else _transform(self.sweep.points, at)
+
+    def seen_from(self) -> Pose2 | None:
+        """Return where the robot was, frame `map`, when the newest turn ended; None without pose or turn."""
         if self.sweep is None or self._estimate is None:
             return None
-        return _transform(self.sweep.points, self._estimate.then(self.sweep.odom.seen_from(self._anchor)))
+        return self._estimate.then(self.sweep.odom.seen_from(self._anchor))
 
     def wall_distance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Distance (m, at most 1) of points (n, 2) in `map` to the nearest occupied cell of the map; 1 off it."""

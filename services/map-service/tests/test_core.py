@@ -1,5 +1,6 @@
 """What the master costmap is: the layers' rules, versions that replicas can follow, and never a stale cell."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,7 @@ from fog_contracts.costs import INSCRIBED, LETHAL, UNKNOWN
 from fog_contracts.geometry import GeometryError, normalized_polygon, rasterize
 from fog_contracts.grid import GridGeometry, Window
 from fog_contracts.messages import (
+    VIEW_SECTORS,
     AreaDefinition,
     AreaHazard,
     CircleShape,
@@ -21,6 +23,7 @@ from fog_contracts.messages import (
     RobotObstacles,
     RobotPose,
     Trace,
+    View,
     Zone,
 )
 from fog_contracts.replica import Applied, Replica
@@ -75,8 +78,18 @@ def pose(x: float, y: float) -> RobotPose:
     return RobotPose(x=x, y=y, theta=0.0, covariance=[0.0] * 9, v=0.0, w=0.0, radius=0.17, height=0.35, stamp=0.0)
 
 
-def seen(*points: tuple[float, float], ttl: float = 5.0) -> RobotObstacles:
-    return RobotObstacles(points=list(points), stamp=0.0, ttl=ttl)
+def seen(*points: tuple[float, float], ttl: float = 5.0, view: View | None = None) -> RobotObstacles:
+    return RobotObstacles(points=list(points), stamp=0.0, ttl=ttl, view=view)
+
+
+def looking(x: float, y: float, reach: float, towards: float = 0.0, width: float = math.tau) -> View:
+    """A view from (x, y) that reaches so far (m) in the directions around `towards` (rad), and tells nothing else."""
+    reach_cm = [0] * VIEW_SECTORS
+    for sector in range(VIEW_SECTORS):
+        middle = (sector + 0.5) * math.tau / VIEW_SECTORS
+        if abs(math.remainder(middle - towards, math.tau)) <= width / 2:
+            reach_cm[sector] = round(100 * reach)
+    return View(x=x, y=y, reach_cm=reach_cm)
 
 
 # --- Hazards --------------------------------------------------------------------------------------------------------
@@ -285,6 +298,40 @@ def test_points_on_a_robot_are_the_robot():
     assert np.array_equal(m.cost, plain)
 
 
+def test_a_thing_that_two_looks_reach_beyond_is_gone():
+    m = core()
+    plain = m.cost.copy()
+    m.on_obstacles("r1", seen((1.0, 1.0), ttl=600.0), 0.0, 0.0)
+    m.on_obstacles("r2", seen(view=looking(0.4, 1.0, 1.2)), 1.0, 1.0)
+    assert at(m, 1.0, 1.0)[0] == LETHAL, "one look may have slipped past"
+    m.on_obstacles("r1", seen(view=looking(1.0, 1.6, 1.2)), 2.0, 2.0)
+    assert np.array_equal(m.cost, plain)
+
+
+@pytest.mark.parametrize(
+    ("view", "why"),
+    [
+        (looking(0.4, 1.0, 0.7), "the look ends at it"),
+        (looking(0.4, 1.0, 0.3), "the look ends before it"),
+        (looking(0.4, 1.0, 1.2, towards=math.pi, width=4.0), "the look goes elsewhere"),
+    ],
+)
+def test_a_thing_that_no_look_reaches_beyond_stays(view, why):
+    m = core()
+    m.on_obstacles("r1", seen((1.0, 1.0), ttl=600.0), 0.0, 0.0)
+    for now in range(1, 10):
+        m.on_obstacles("r1", seen(view=view), float(now), float(now))
+    assert at(m, 1.0, 1.0)[0] == LETHAL, why
+
+
+def test_a_thing_that_is_seen_between_two_looks_beyond_it_stays():
+    m = core()
+    for now in range(10):
+        points = [(1.0, 1.0)] if now % 2 == 0 else []
+        m.on_obstacles("r1", seen(*points, ttl=600.0, view=looking(0.4, 1.0, 1.2)), float(now), float(now))
+    assert at(m, 1.0, 1.0)[0] == LETHAL
+
+
 def test_an_obstacle_that_goes_uncovers_the_zone_beneath():
     m = core()
     m.put_zone(zone(), 0.0)
@@ -359,6 +406,7 @@ events = st.one_of(
     st.tuples(st.just("define"), areas, coordinate, coordinate, st.floats(0.1, 1.5), st.booleans()),
     st.tuples(st.just("hazard"), areas, st.sampled_from(["blocked", "unknown", "clear"]), st.integers(0, 254)),
     st.tuples(st.just("see"), st.lists(point, max_size=8), st.floats(0.5, 10)),
+    st.tuples(st.just("look"), point, st.floats(0.0, 3.0)),
     st.tuples(st.just("pose"), point),
     st.tuples(st.just("watched"), st.booleans()),
     st.tuples(st.just("wait"), st.floats(0.1, 10)),
@@ -378,6 +426,8 @@ def play(m: MapCore, history: list[tuple]) -> list[MapDelta]:
             change = m.on_hazard(hazard(rest[1], seq, area=rest[0], penalty=rest[2]), now)
         elif kind == "see":
             change = m.on_obstacles("r1", seen(*rest[0], ttl=rest[1]), now, now)
+        elif kind == "look":
+            change = m.on_obstacles("r1", seen(view=looking(*rest[0], rest[1])), now, now)
         elif kind == "pose":
             m.on_pose("r2", pose(*rest[0]), now)
             change = m.tick(now, now)

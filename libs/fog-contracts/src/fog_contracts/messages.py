@@ -4,7 +4,7 @@ Stamps are seconds since the Unix epoch by the sender's clock (`fog_runtime.cloc
 people. Freshness is never judged by them but by the receiver's own monotonic clock.
 """
 
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 from msgspec import Meta, Struct
 
@@ -407,12 +407,31 @@ class RobotState(Message, frozen=True, kw_only=True):
     stamp: Stamp = 0.0
 
 
+VIEW_SECTORS: Final = 180
+"""Sectors of a robot's view, each 2 degrees wide, counted counter-clockwise from the map's x axis."""
+
+
+class View(Message, frozen=True, kw_only=True):
+    """How far a robot's lidar sees from (x, y) (m, frame `map`): per sector the nearest echo, cm; 0 = no echo at all.
+
+    Up to there the floor is free at the lidar's height, but a sector without any echo tells nothing.
+    """
+
+    x: Metres
+    y: Metres
+    reach_cm: Annotated[list[Annotated[int, Meta(ge=0, le=65_535)]], Meta(min_length=180, max_length=180)]
+
+
 class RobotObstacles(Message, frozen=True, kw_only=True):
-    """Points (m, frame `map`) that a robot's lidar sees and the map doesn't know; they hold for `ttl` seconds."""
+    """Points (m, frame `map`) that a robot's lidar sees and the map doesn't know.
+
+    They hold until a robot's view shows that they are gone, and at most for `ttl` seconds after they were last seen.
+    """
 
     points: Annotated[list[PointXY], Meta(max_length=2_000)]
     stamp: Stamp
     ttl: Annotated[float, Meta(gt=0.0, le=600.0)]
+    view: View | None = None
 
 
 CommandKind = Literal["enable", "disable", "cancel", "egress", "reset", "initial_pose"]

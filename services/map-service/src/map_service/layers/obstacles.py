@@ -1,4 +1,9 @@
-"""What robots' lidars see and the map doesn't know, until it has not been seen for a while.
+"""What robots' lidars see and the map doesn't know, until a lidar sees that it is gone.
+
+A thing that stands in a corridor is out of sight as soon as the robot turns back, so it must be remembered for longer
+than the way around takes; one that was only passing by must be forgotten as soon as somebody looks there again. Hence
+the memory is long, and a look that reaches beyond a cell twice in a row ends it, as clearing by ray tracing does in
+layered costmaps (Lu, Hershberger, Smart 2014).
 
 A point becomes a small lethal disc. Points under or beside a robot are that robot and are left out: a robot must never
 shut another one in by having looked at it.
@@ -12,7 +17,7 @@ import numpy as np
 
 from fog_contracts.costs import LETHAL
 from fog_contracts.grid import Window
-from fog_contracts.messages import Cause
+from fog_contracts.messages import VIEW_SECTORS, Cause
 from map_service.layers.protocol import Touch, paint_figure
 from map_service.shapes import Figure
 
@@ -20,7 +25,7 @@ if TYPE_CHECKING:
     from typing import Final
 
     from fog_contracts.grid import GridGeometry
-    from fog_contracts.messages import RobotObstacles, RobotPose
+    from fog_contracts.messages import RobotObstacles, RobotPose, View
     from map_service.layers.protocol import Grid
 
 DISC_RADIUS: Final = 0.05
@@ -30,6 +35,13 @@ ROBOT_MARGIN: Final = 0.22
 POSE_FRESH_S: Final = 1.0
 MAX_CELLS: Final = 20_000
 """How many cells may be held; a broken lidar must not fill the memory."""
+LOOKS_TO_CLEAR: Final = 2
+"""So many looks in a row must reach beyond a cell: one echo may have slipped past something thin."""
+BEYOND_M: Final = 0.2
+"""How far behind a cell a look must reach: the cell's size, and what localization may be off."""
+CELL_HALF_WIDTH_M: Final = 0.06
+VIEW_RANGE_M: Final = 6.0
+"""Beyond this the beams of a small lidar lie farther apart than a cell is wide."""
 _PATCH: Final = 64
 
 
@@ -39,6 +51,7 @@ class ObstaclesLayer:
     def __init__(self, geometry: GridGeometry) -> None:
         self._geometry = geometry
         self._until: dict[tuple[int, int], float] = {}
+        self._looks: dict[tuple[int, int], int] = {}  # how many looks in a row reached beyond the cell
         self._next_end = float("inf")
         self._poses: dict[str, tuple[float, RobotPose]] = {}
         reach = round(DISC_RADIUS / geometry.resolution)
@@ -55,10 +68,12 @@ class ObstaclesLayer:
         robots = [pose for at, pose in self._poses.values() if now - at <= POSE_FRESH_S]
         end = now + seen.ttl
         added: list[tuple[int, int]] = []
+        there = {self._geometry.cell(x, y) for x, y in seen.points}
         for x, y in seen.points:
             cell = self._geometry.cell(x, y)
             if not self._geometry.contains_cell(*cell):
                 continue
+            self._looks.pop(cell, None)
             if cell in self._until:
                 self._until[cell] = max(self._until[cell], end)
                 continue
@@ -71,6 +86,39 @@ class ObstaclesLayer:
             added.append(cell)
         self._next_end = min(self._next_end, end)
         self._change(added, 1, Cause(kind="obstacle", id=robot, state="seen"))
+        if seen.view is not None:
+            self._look(robot, seen.view, there)
+
+    def _look(self, robot: str, view: View, there: set[tuple[int, int]]) -> None:
+        """Forget cells that a robot's lidar has looked through, but none that the same turn saw (`there`)."""
+        doubtful = [cell for cell in self._until if cell not in there]
+        if not doubtful:
+            return
+        cells = np.array(doubtful, dtype=np.int64)
+        resolution = self._geometry.resolution
+        dx = self._geometry.origin_x + (cells[:, 0] + 0.5) * resolution - view.x
+        dy = self._geometry.origin_y + (cells[:, 1] + 0.5) * resolution - view.y
+        distance = np.hypot(dx, dy)
+        near = (distance > 2 * CELL_HALF_WIDTH_M) & (distance <= VIEW_RANGE_M)
+        cells, distance, bearing = cells[near], distance[near], np.arctan2(dy[near], dx[near])
+        half = np.arcsin(CELL_HALF_WIDTH_M / distance)
+        per_radian = VIEW_SECTORS / (2.0 * np.pi)
+        first = np.floor((bearing - half) * per_radian).astype(np.int64)
+        last = np.floor((bearing + half) * per_radian).astype(np.int64)
+        reach = np.array(view.reach_cm) / 100.0
+        gone: list[tuple[int, int]] = []
+        for (column, row), away, begin, end in zip(cells.tolist(), distance, first, last, strict=True):
+            ends = reach[np.arange(begin, end + 1) % VIEW_SECTORS]
+            ends = ends[ends > 0.0]
+            cell = (column, row)
+            if not ends.size or ends.min() <= away + BEYOND_M:
+                # Hidden, or still there as far as anybody can tell: only looks in a row count.
+                self._looks.pop(cell, None)
+                continue
+            self._looks[cell] = self._looks.get(cell, 0) + 1
+            if self._looks[cell] >= LOOKS_TO_CLEAR:
+                gone.append(cell)
+        self._drop(gone, Cause(kind="obstacle", id=robot, state="gone"))
 
     def robot_at(self, robot: str, pose: RobotPose, now: float) -> None:
         """Take where a robot is: what was seen there was the robot."""
@@ -111,6 +159,7 @@ class ObstaclesLayer:
     def _drop(self, cells: list[tuple[int, int]], cause: Cause) -> None:
         for cell in cells:
             del self._until[cell]
+            self._looks.pop(cell, None)
         self._change(cells, -1, cause)
 
     def _change(self, cells: list[tuple[int, int]], step: int, cause: Cause) -> None:

@@ -155,7 +155,9 @@ async def record(path: Path) -> tuple[MapSnapshot, str]:
         nonlocal faded_at
         faded_at = clock.now() + seen.ttl + FADED_S
 
-    async with Stack(StackConfig(site_dir=SITE, robot=demo.robot, seed=1, speed=SPEED)) as stack:
+    # So long a memory as robots have by themselves would make the recording long too.
+    memory = {"OBSTACLE_MEMORY_S": "30"}
+    async with Stack(StackConfig(site_dir=SITE, robot=demo.robot, seed=1, speed=SPEED, extra=memory)) as stack:
         keeper = stack.supervisor
         for name in SERVERS:
             keeper.start(name)

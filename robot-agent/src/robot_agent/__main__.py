@@ -31,7 +31,11 @@ async def main() -> None:
     logs.configure("robot-agent", settings.log_level, settings.log_format)
     _log.info("settings", **describe(settings))
     site, body = read_site(settings)
-    config = AgentConfig(robot=settings.robot, operator_key=read_operator_key(settings.operator_key_file))
+    config = AgentConfig(
+        robot=settings.robot,
+        operator_key=read_operator_key(settings.operator_key_file),
+        obstacle_ttl=settings.obstacle_memory_s,
+    )
     if body is not None:
         motion = replace(config.motion, inscribed_radius=body.radius)
         config = replace(config, radius=body.radius, height=body.height, motion=motion)

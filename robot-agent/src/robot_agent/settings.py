@@ -21,7 +21,9 @@ SITE_FILE: Final = "site.toml"
 
 
 class Settings(CommonSettings, frozen=True, kw_only=True):
-    """The robot's id, its wires, and the seed of its particle filter.
+    """The robot's id, its wires, the seed of its particle filter, and its memory.
+
+    `obstacle_memory_s`: how long (s) a thing that its lidar saw counts while no lidar looks there again.
 
     `site_dir` is optional here: a robot without the site's folder is told its `site` and asks for a pose or searches.
     """
@@ -31,6 +33,7 @@ class Settings(CommonSettings, frozen=True, kw_only=True):
     guardian_socket: Path
     site_dir: Path = Path()
     seed: Annotated[int, Meta(ge=0)] = 0
+    obstacle_memory_s: Annotated[float, Meta(gt=0.0, le=600.0)] = 600.0
 
 
 def read_site(settings: Settings) -> tuple[str, RobotSite | None]:

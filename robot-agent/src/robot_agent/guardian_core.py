@@ -18,7 +18,7 @@ from robot_agent.drivers import open_interface as oi
 from robot_agent.link import BaseFeedback, WheelCommand
 
 COMMAND_FRESH_S: Final = 0.2
-"""A command older than this does not move a wheel (robot.md, Guardian)."""
+"""A command older than this does not move a wheel."""
 BASE_SILENT_S: Final = 0.3
 """No valid sensor frame for this long is a fault: 20 frames of 15 ms are missing."""
 HANDSHAKE_S: Final = 1.0

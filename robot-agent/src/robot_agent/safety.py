@@ -40,7 +40,7 @@ MODE_OF: Final[dict[Level, Mode]] = {
     Level.FAULT: "FAULT",
 }
 STANDING: Final[frozenset[Mode]] = frozenset({"INIT", "HOLD", "PROTECTIVE_STOP", "FAULT"})
-"""Modes that let no wheel turn (HOLD after its ramp). EGRESS and DOCK, entered by later work, will drive slowly."""
+"""Modes that let no wheel turn (HOLD after its ramp). EGRESS and DOCK drive slowly; nothing enters them yet."""
 STOP_AT_ONCE: Final[frozenset[Mode]] = frozenset({"INIT", "PROTECTIVE_STOP", "FAULT"})
 _NEVER: Final = -math.inf
 
@@ -216,7 +216,7 @@ def step(
 ) -> tuple[SafetyState, SafetyOutputs]:
     """Judge the inputs at `now` (s, monotonic, never going back); return the new state and the verdict.
 
-    Modes and their conditions: the project's table of modes, guided by ISO 3691-4 without claiming conformity.
+    Modes and their conditions: the table of modes in docs/architecture.md, guided by ISO 3691-4 without claiming conformity.
     """
     config = config or SafetyConfig()
     findings = judge(inputs, config)

@@ -216,7 +216,8 @@ def step(
 ) -> tuple[SafetyState, SafetyOutputs]:
     """Judge the inputs at `now` (s, monotonic, never going back); return the new state and the verdict.
 
-    Modes and their conditions: the table of modes in docs/architecture.md, guided by ISO 3691-4 without claiming conformity.
+    Modes and their conditions: the table of modes in docs/architecture.md, guided by ISO 3691-4 without claiming
+    conformity.
     """
     config = config or SafetyConfig()
     findings = judge(inputs, config)

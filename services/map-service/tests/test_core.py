@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from fog_contracts.costs import INSCRIBED, LETHAL, UNKNOWN
@@ -474,6 +474,7 @@ def test_what_is_gone_leaves_the_plain_floor(history):
 
 
 @given(st.lists(point, min_size=3, max_size=9))
+@example([(0.0, -1.0), (0.0, -1.5), (1.0, -1.0)])  # wholly below the map
 @settings(max_examples=200, deadline=None)
 def test_polygons_get_the_cells_that_the_contracts_give_them(points):
     try:

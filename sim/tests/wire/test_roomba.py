@@ -2,8 +2,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
-from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -12,14 +10,6 @@ from hypothesis import strategies as st
 from fognav_sim.wire.roomba import BOOT_TEXT, FULL, OFF, PASSIVE, SAFE, Battery, RoombaEmulator
 
 DRIVE_300 = bytes((145, 1, 44, 1, 44))
-
-
-@pytest.fixture
-def data_dir() -> Path:
-    folder = Path(os.environ.get("FOGNAV_DATA") or Path(__file__).parents[4] / "shared" / "data")
-    if not (folder / "roomba").is_dir():
-        pytest.skip("no data")
-    return folder
 
 
 def awake(mode: int = SAFE) -> RoombaEmulator:

@@ -119,7 +119,7 @@ def rasterize(polygon: Polygon, geometry: GridGeometry) -> tuple[Window, NDArray
     left, bottom, right, top = bounding_box(polygon)
     window = geometry.window_around(left - margin, bottom - margin, right + margin, top + margin)
     if window.empty:
-        return window, np.zeros((0, 0), dtype=np.bool_)
+        return window, np.zeros((window.height, window.width), dtype=np.bool_)
     xs = geometry.origin_x + (np.arange(window.x, window.x + window.width) + 0.5) * geometry.resolution
     ys = geometry.origin_y + (np.arange(window.y, window.y + window.height) + 0.5) * geometry.resolution
     px, py = np.meshgrid(xs, ys)

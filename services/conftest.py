@@ -72,6 +72,8 @@ class Fog:
             "FOGNAV_REDIS_URL": self.redis.url,
             "FOGNAV_ZENOH_CONNECT": self.router.endpoint,
             "FOGNAV_TOKENS_FILE": str(tokens),
+            # The map-service need not wait long for an aggregator that a test does not start.
+            "FOGNAV_HAZARDS_WAIT_S": "0.3",
         }
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
 
@@ -164,6 +166,17 @@ def tokens_fixture() -> dict[str, dict[str, str]]:
 def fog(tmp_path: Path) -> Iterator[Fog]:
     running = Fog(tmp_path)
     try:
+        yield running
+    finally:
+        running.close()
+
+
+@pytest.fixture(scope="module")
+def calm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fog]:
+    """Give a fog with a running map-service to all tests of a module that neither kill nor restart anything."""
+    running = Fog(tmp_path_factory.mktemp("fog"))
+    try:
+        running.start("map_service")
         yield running
     finally:
         running.close()

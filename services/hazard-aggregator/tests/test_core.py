@@ -344,6 +344,25 @@ def test_a_blocked_area_stays_impassable_when_its_blocked_node_dies_and_the_othe
 # --- Restart, change of areas, the thesis's nodes -------------------------------------------------------------------
 
 
+def test_an_aggregator_that_was_held_up_hears_what_has_arrived_before_it_calls_a_node_silent():
+    rig = Rig(site("n1"))
+    rig.read(3.0, 3.0, times=5)
+    rig.now += 5.0
+    assert rig.core.tick(rig.now, rig.now) == []
+    rig.read(3.0, 3.0)
+    rig.wait(0.5)
+    assert rig.hazard.state == "clear"
+
+
+def test_an_aggregator_that_is_always_held_up_still_calls_a_silent_node_silent():
+    rig = Rig(site("n1"))
+    rig.read(3.0, 3.0, times=5)
+    for _ in range(2):
+        rig.now += 5.0
+        rig.core.tick(rig.now, rig.now)
+    assert rig.hazard.state == "unknown"
+
+
 def stored(state: str, penalty: int) -> AreaHazard:
     return AreaHazard(area="hall", state=state, severity=3, penalty=penalty, since=1.0, seq=9, epoch=0, cause="")
 

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 POSE_FRESH_S: Final = 1.0
 """How old (s, by arrival) a robot's pose may be and still explain an echo."""
+LATE_TICK_S: Final = 0.5
+"""A tick that comes so long (s) after the last one tells of a process that was held up."""
 SEVERITY: Final = {"clear": 0, "unknown": 1, "doubtful": 2, "blocked": 3}
 THESIS_NODE: Final = "thesis-area-{number}"
 """The name under which a node of the thesis, which has none, counts in its area."""
@@ -112,6 +114,8 @@ class Aggregator:
         self._poses: dict[str, tuple[float, RobotPose]] = {}
         self._seqs: dict[str, int] = {}
         self._by_node: dict[str, list[tuple[_Area, _Node]]] = {}
+        self._ticked: float | None = None
+        self._waited = False
         for definition in definitions:
             self._define(definition)
         for hazard in restored:
@@ -195,7 +199,15 @@ class Aggregator:
         return []
 
     def tick(self, now: float, stamp: float) -> list[AreaHazard]:
-        """Notice silence and flapping; call ten times a second."""
+        """Notice silence and flapping; call ten times a second.
+
+        After a gap between calls the process itself was deaf: the next call judges, so that what has arrived meanwhile
+        is heard first.
+        """
+        held_up = self._ticked is not None and now - self._ticked > LATE_TICK_S and not self._waited
+        self._ticked, self._waited = now, held_up
+        if held_up:
+            return []
         changed: list[AreaHazard] = []
         for area in self._areas.values():
             limit = area.definition.unknown.silent_after_s

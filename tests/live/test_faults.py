@@ -22,6 +22,7 @@ from driver import START, Floor
 
 from fog_contracts.geometry import contains_point
 from fog_contracts.messages import Pose, SimCommand
+from fognav import net
 from fognav.stack import AGENT, AGGREGATOR, BROKER, MAP_SERVICE, PLANNER, REDIS, ROUTER
 from fognav_sim.scenario import person_at
 
@@ -137,10 +138,20 @@ async def test_a_killed_guardian_leaves_no_wheel_turning(floor: Floor) -> None:
     assert floor.starts() == starts
 
 
+MISSED_BY = {
+    BROKER: [(AGGREGATOR, "mqtt (no broker)"), (MAP_SERVICE, "mqtt (no broker)")],
+    REDIS: [(AGGREGATOR, "store (Redis"), (MAP_SERVICE, "store (Redis"), (PLANNER, "store (Redis")],
+    ROUTER: [(PLANNER, "zenoh")],
+}
+"""Which service says on `/readyz` that it misses which part."""
+
+
 @pytest.mark.parametrize(
     ("name", "seconds"), [(BROKER, 5), (REDIS, 4), (ROUTER, 5), (AGGREGATOR, 4), (MAP_SERVICE, 5), (PLANNER, 5)]
 )
-async def test_a_part_that_vanishes_for_a_while_harms_nobody(floor: Floor, name: str, seconds: float) -> None:
+async def test_a_part_that_vanishes_for_a_while_is_missed_by_name_and_harms_nobody(
+    floor: Floor, name: str, seconds: float
+) -> None:
     east = floor.truth.x < 50
     await floor.drive_to(*(EAST if east else WEST))
     supervisor, starts = floor.stack.supervisor, floor.starts()
@@ -150,6 +161,10 @@ async def test_a_part_that_vanishes_for_a_while_harms_nobody(floor: Floor, name:
     await asyncio.sleep(seconds)  # it stays away
     away = floor.log_lines(begun)
     mode, reasons, areas = floor.state.mode, floor.state.reasons, floor.hazard("z1")
+    for service, part in MISSED_BY.get(name, ()):
+        missed = await net.readiness(floor.stack.port_file(service))
+        assert missed is not None, f"{service} says that it misses nothing"
+        assert part in missed
     supervisor.start(name)
     await supervisor.wait_ready([name], 30)
     if name in {ROUTER, MAP_SERVICE}:

@@ -52,7 +52,7 @@ async def main() -> None:
                 tasks.create_task(service.tick_loop(), name="tick")
                 tasks.create_task(service.send_loop(), name="send")
                 tasks.create_task(service.write_loop(), name="write")
-                tasks.create_task(service.read_loop(), name="read")
+                tasks.create_task(service.store_loop(), name="store")
                 tasks.create_task(serve(app, settings.http_host, settings.http_port, settings.port_file), name="http")
 
 

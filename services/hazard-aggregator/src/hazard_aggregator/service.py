@@ -152,11 +152,15 @@ class Service:
         self._store_read.set()
         self._health.set("store", ok=True)
 
-    async def read_loop(self) -> None:
-        """After a start without Redis: read it as soon as it answers, before anything is written over."""
-        while not self._store_read.is_set():
+    async def store_loop(self) -> None:
+        """Watch Redis; after a start without it, read it as soon as it answers, before anything is written over."""
+        while True:
             await asyncio.sleep(RETRY_S)
             try:
+                if self._store_read.is_set():
+                    await self._store.ping()
+                    self._health.set("store", ok=True)
+                    continue
                 stored = await self._store.load(self.core.epoch)
             except StoreError as error:
                 self._health.set("store", ok=False, detail=str(error))

@@ -77,6 +77,10 @@ class Store:
         pipe.xadd(self._audit, cast("Any", audit), maxlen=100_000, approximate=True)
         await self._ask(pipe.execute())
 
+    async def ping(self) -> None:
+        """Ask Redis for a sign of life; raises `StoreError`."""
+        await self._ask(cast("Awaitable[Any]", self._redis.ping()))
+
     async def weakness(self) -> str:
         """Return why Redis's acknowledgements can't be trusted, or an empty text (a server may refuse to tell)."""
         try:

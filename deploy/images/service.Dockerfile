@@ -8,7 +8,7 @@ RUN pip install --no-cache-dir --require-hashes -r requirements/build.txt
 COPY libs libs
 ARG MEMBER
 COPY ${MEMBER} ${MEMBER}
-RUN pip wheel --no-cache-dir --no-deps --no-build-isolation -w /wheels libs/* ./${MEMBER}
+RUN pip wheel --no-cache-dir --no-deps --no-build-isolation -w /wheels libs/*/ ./${MEMBER}
 
 FROM python:3.11-slim-bookworm
 ARG NAME
@@ -25,11 +25,12 @@ RUN set -e; pip install --no-cache-dir --no-deps /tmp/wheels/fog_contracts-*.whl
     pip install --no-cache-dir --no-deps /tmp/wheels/"$(echo "${NAME}" | tr - _)"-*.whl; \
     python -c "import importlib, sys; importlib.import_module(sys.argv[1])" "${MODULE}"; rm -rf /tmp/wheels
 COPY deploy/images/start /usr/local/bin/fognav-start
+COPY deploy/images/ready /usr/local/bin/fognav-ready
 ENV FOGNAV_MODULE=${MODULE} FOGNAV_KERNELS=${KERNELS} \
     FOGNAV_HTTP_HOST=0.0.0.0 FOGNAV_HTTP_PORT=8000 FOGNAV_DATA_DIR=/var/lib/fognav \
     NUMBA_CACHE_DIR=/var/cache/fognav/numba PYTHONUNBUFFERED=1
 USER fognav
 EXPOSE 8000
 HEALTHCHECK --interval=5s --timeout=3s --start-period=60s --retries=6 \
-    CMD ["python", "-c", "import os, urllib.request as u; u.urlopen('http://127.0.0.1:' + os.environ['FOGNAV_HTTP_PORT'] + '/readyz', timeout=2)"]
+    CMD ["fognav-ready", "8000", "/readyz"]
 ENTRYPOINT ["fognav-start"]

@@ -9,7 +9,7 @@ COPY services services
 COPY robot-agent robot-agent
 COPY sim sim
 COPY cli cli
-RUN pip wheel --no-cache-dir --no-deps --no-build-isolation -w /wheels libs/* services/* ./robot-agent ./sim ./cli
+RUN pip wheel --no-cache-dir --no-deps --no-build-isolation -w /wheels libs/*/ services/*/ ./robot-agent ./sim ./cli
 
 FROM python:3.11-slim-bookworm
 RUN useradd --system --uid 10001 --home-dir /var/lib/fognav --create-home fognav \
@@ -19,10 +19,11 @@ RUN pip install --no-cache-dir --require-hashes -r /tmp/requirements.txt
 COPY --from=wheels /wheels /tmp/wheels
 RUN pip install --no-cache-dir --no-deps /tmp/wheels/*.whl && rm -rf /tmp/wheels
 COPY deploy/images/start /usr/local/bin/fognav-start
+COPY deploy/images/ready /usr/local/bin/fognav-ready
 ENV FOGNAV_MODULE=fognav.sim_robot FOGNAV_KERNELS=all FOGNAV_HTTP_HOST=0.0.0.0 FOGNAV_DATA_DIR=/var/lib/fognav \
     FOGNAV_RUN_DIR=/tmp/fognav NUMBA_CACHE_DIR=/var/cache/fognav/numba PYTHONUNBUFFERED=1
 USER fognav
 EXPOSE 9100
 HEALTHCHECK --interval=5s --timeout=3s --start-period=120s --retries=6 \
-    CMD ["python", "-c", "import urllib.request as u; u.urlopen('http://127.0.0.1:9100/readyz', timeout=2)"]
+    CMD ["fognav-ready", "9100", "/readyz"]
 ENTRYPOINT ["fognav-start"]

@@ -1,0 +1,370 @@
+"""The fog node as people run it: `docker compose up`, on a real engine, and what it does when things are killed.
+
+The test uses a project and images of its own, publishes free ports on the loopback address only, and removes all but
+the images (the next run builds on them). Third-party images that neither the engine nor a registry has are replaced by
+those of `stand_ins.sh`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+import os
+import re
+import secrets
+import shutil
+import subprocess
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import httpx
+import pytest
+
+from fog_contracts import channels as ch
+from fog_contracts.messages import RobotPose, RobotState
+from fog_runtime.clock import SystemClock
+from fog_runtime.zenoh_edge import ZenohEdge
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+ROOT: Final = Path(__file__).parents[2]
+STAND_INS: Final = Path(__file__).with_name("stand_ins.sh")
+SERVICES: Final = ("hazard-aggregator", "map-service", "planner")
+FOG: Final = {*SERVICES, "zenoh", "mosquitto", "redis", "prometheus"}
+PORTS: Final = {
+    "hazard-aggregator": ("FOGNAV_AGGREGATOR_PORT", 8000),
+    "map-service": ("FOGNAV_MAP_PORT", 8000),
+    "planner": ("FOGNAV_PLANNER_PORT", 8000),
+    "zenoh": ("FOGNAV_ZENOH_PORT", 7447),
+    "mosquitto": ("FOGNAV_MQTT_PORT", 1883),
+    "prometheus": ("FOGNAV_PROMETHEUS_PORT", 9090),
+}
+HEALTHY_S: Final = 180.0
+"""On a busy machine of two cores; an idle one needs 20 s, most of it for compiling the kernels."""
+STOP_S: Final = 10.0
+"""After this time an engine kills what has not ended."""
+ZONE: Final = {"kind": "BLOCKED", "shape": {"type": "circle", "centre": [9.0, 42.6], "radius": 0.5}, "reason": "wet"}
+
+
+def why_not() -> str | None:
+    """Say what these tests miss here, or None."""
+    if shutil.which("docker") is None:
+        return "no `docker` on this machine"
+    for command, what in (
+        (("version", "--format", "{{.Server.Version}}"), "no docker engine answers"),
+        (("compose", "version"), "docker has no compose plugin"),
+    ):
+        try:
+            done = subprocess.run(["docker", *command], capture_output=True, text=True, timeout=20, check=False)
+        except subprocess.TimeoutExpired:
+            return f"{what} within 20 s"
+        if done.returncode != 0:
+            return f"{what}: {(done.stderr.strip() or 'it says nothing').splitlines()[-1]}"
+    return None
+
+
+MISSING: Final = why_not()
+pytestmark = [
+    pytest.mark.compose,
+    # The first run installs the packages of five images.
+    pytest.mark.timeout(1800),
+    pytest.mark.skipif(MISSING is not None, reason=MISSING or ""),
+]
+
+
+def run(command: list[str], timeout_s: float, env: dict[str, str] | None = None) -> str:
+    """Run a command and return its output; raises AssertionError with all that it said when it fails."""
+    done = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False, env=env, cwd=ROOT)
+    assert done.returncode == 0, f"{' '.join(command)} ended with {done.returncode}:\n{done.stdout}\n{done.stderr}"
+    return done.stdout
+
+
+def docker(*arguments: str, timeout_s: float = 60.0) -> str:
+    return run(["docker", *arguments], timeout_s)
+
+
+def has(kind: str, name: str) -> bool:
+    return subprocess.run(["docker", kind, "inspect", name], capture_output=True, check=False).returncode == 0
+
+
+def third_party(image: str) -> str:
+    """Return the image, got if need be, or the name of its stand-in."""
+    if has("image", image):
+        return image
+    pulled = subprocess.run(["docker", "pull", "--quiet", image], capture_output=True, timeout=600, check=False)
+    if pulled.returncode == 0:
+        return image
+    run([str(STAND_INS)], 600)
+    return f"fognav-stand-in/{image.rpartition('/')[2].partition(':')[0].removeprefix('eclipse-')}"
+
+
+class Project:
+    """One project of compose with a name, images and ports of its own."""
+
+    def __init__(self, folder: Path) -> None:
+        self.name = f"fognav-test-{secrets.token_hex(4)}"
+        self.start_log = ""
+        self._env = {k: v for k, v in os.environ.items() if not k.startswith(("FOGNAV_", "COMPOSE_"))}
+        self._env |= {"FOGNAV_BIND": "127.0.0.1"} | {variable: "0" for variable, _ in PORTS.values()}
+        self._command = ["docker", "compose", "--project-name", self.name, "--env-file", os.devnull]
+        self._command += ["--file", "docker-compose.yml"]
+        services = json.loads(self("config", "--format", "json"))["services"]
+        override: dict[str, Any] = {}
+        for service, config in services.items():
+            if (own := config["image"].removeprefix("fognav/")) != config["image"]:
+                override[service] = {"image": f"fognav-compose-test/{own}"}
+            else:
+                override[service] = {"image": third_party(config["image"])}
+            if "build" in config and not has("network", "bridge"):
+                override[service]["build"] = {"network": "host"}
+        file = folder / "override.json"
+        file.write_text(json.dumps({"services": override}), "utf-8")
+        self._command += ["--file", str(file)]
+
+    def __call__(self, *arguments: str, profile: str = "sim", timeout_s: float = 120.0) -> str:
+        """Run compose; with the profile `sim` unless told otherwise, so that its container is never forgotten."""
+        return run([*self._command, "--profile", profile, *arguments], timeout_s, self._env)
+
+    def containers(self) -> dict[str, dict[str, Any]]:
+        """Return what the engine knows of each service's container."""
+        label = f"label=com.docker.compose.project={self.name}"
+        ids = docker("ps", "--all", "--quiet", "--filter", label).split()
+        found = json.loads(docker("inspect", *ids)) if ids else []
+        return {container["Config"]["Labels"]["com.docker.compose.service"]: container for container in found}
+
+    def address(self, service: str) -> str:
+        """Return where a service's port is published now; a restart changes it."""
+        return self("port", service, str(PORTS[service][1])).strip()
+
+    def url(self, service: str, path: str) -> str:
+        return f"http://{self.address(service)}{path}"
+
+    def inside(self, service: str, script: str) -> str:
+        """Run a line of shell inside a service's container."""
+        return self("exec", "--no-TTY", service, "sh", "-c", script)
+
+    def wait_healthy(self, wanted: set[str], restarts: dict[str, int] | None = None) -> None:
+        """Wait until these services, and no others, run and are healthy, each restarted so often if asked for."""
+
+        def look() -> str | None:
+            containers = self.containers()
+            wrong = {
+                service: state.get("Health", {}).get("Status", state["Status"])
+                for service in wanted
+                if (state := containers[service]["State"]).get("Health", {}).get("Status") != "healthy"
+                or state["Status"] != "running"
+                or containers[service]["RestartCount"] != (restarts or {}).get(service, 0)
+            }
+            return f"not healthy yet: {wrong}" if wrong else None
+
+        try:
+            wait(look, HEALTHY_S)
+        except TimeoutError as error:
+            log = self("logs", "--no-color", "--tail", "30")
+            raise AssertionError(f"{error}\n{self('ps', '--all')}\n{log}") from error
+
+
+def wait(look: Callable[[], str | None], timeout_s: float) -> None:
+    """Look twice a second until nothing is missing any more; raises TimeoutError with what still is."""
+    deadline = time.monotonic() + timeout_s
+    while (missing := look()) is not None:
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"after {timeout_s:.0f} s: {missing}")
+        time.sleep(0.5)
+
+
+def leftovers(project: str) -> list[str]:
+    label = f"label=com.docker.compose.project={project}"
+    return [
+        *docker("ps", "--all", "--quiet", "--filter", label).split(),
+        *docker("volume", "ls", "--quiet", "--filter", label).split(),
+        *docker("network", "ls", "--quiet", "--filter", label).split(),
+    ]
+
+
+@pytest.fixture(scope="module")
+def fog(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Project]:
+    """The fog node, healthy, without the simulated robot."""
+    project = Project(tmp_path_factory.mktemp("compose"))
+    project("build", timeout_s=1500)
+    try:
+        project("up", "--detach", "--no-build", profile="", timeout_s=300)
+        project.wait_healthy(FOG)
+        project.start_log = project("logs", "--no-color", "--no-log-prefix", *sorted(FOG))
+        yield project
+    finally:
+        project("down", "--volumes", "--remove-orphans", "--timeout", "10")
+        assert leftovers(project.name) == []
+
+
+@pytest.fixture(scope="module")
+def sim(fog: Project) -> Project:
+    """The fog node with the simulated robot."""
+    fog("up", "--detach", "--no-build", timeout_s=300)
+    wait(lambda: None if health(fog, "sim-robot") == "healthy" else "the robot is not healthy", HEALTHY_S)
+    return fog
+
+
+def health(project: Project, service: str) -> str:
+    return str(project.containers()[service]["State"]["Health"]["Status"])
+
+
+def token(fog: Project) -> dict[str, str]:
+    return {"Authorization": f"Bearer {fog.inside('map-service', 'cat /run/fognav/admin.token').strip()}"}
+
+
+def test_one_up_brings_every_service_to_health_and_makes_the_secrets(fog: Project) -> None:
+    containers = fog.containers()
+    assert set(containers) == FOG | {"keys"}
+    assert containers["keys"]["State"]["ExitCode"] == 0
+    assert {name: fog.containers()[name]["State"]["Health"]["Status"] for name in FOG} == dict.fromkeys(FOG, "healthy")
+
+
+def test_a_first_start_logs_no_warning(fog: Project) -> None:
+    lines = fog.start_log.splitlines()
+    events = [json.loads(line) for line in lines if line.startswith("{")]
+    listening = {event["process"] for event in events if event["event"] == "listening"}
+    assert listening >= {*SERVICES, "router"}, "the log is not complete"
+    troubles = [event for event in events if event["level"] not in {"info", "debug"}]
+    # Redis says of a host that has not been told otherwise that it may refuse to fork.
+    foreign = [line for line in lines if not line.startswith("{") and "Memory overcommit" not in line]
+    troubles += [line for line in foreign if re.search(r"warn|error|denied|fail", line, re.IGNORECASE)]
+    assert troubles == []
+
+
+def test_ports_are_published_on_the_address_that_was_asked_for_and_nowhere_else(fog: Project) -> None:
+    published = {
+        name: [(port, binding["HostIp"]) for port, bindings in ports.items() for binding in bindings or []]
+        for name, container in fog.containers().items()
+        if any((ports := container["NetworkSettings"]["Ports"]).values())
+    }
+    assert published == {name: [(f"{port}/tcp", "127.0.0.1")] for name, (_, port) in PORTS.items()}
+
+
+def test_prometheus_sees_every_service_up(fog: Project) -> None:
+    def look() -> str | None:
+        answer = httpx.get(fog.url("prometheus", "/api/v1/query"), params={"query": 'up{job="fog"}'})
+        up = {sample["metric"]["process"]: sample["value"][1] for sample in answer.json()["data"]["result"]}
+        return None if up == dict.fromkeys(SERVICES, "1") else f"up: {up}"
+
+    wait(look, 30)
+
+
+def test_a_zone_drawn_with_the_made_token_outlives_a_restart_of_the_map_service(fog: Project) -> None:
+    assert httpx.post(fog.url("map-service", "/api/v1/zones"), json=ZONE).status_code == 401
+    drawn = httpx.post(fog.url("map-service", "/api/v1/zones"), json=ZONE, headers=token(fog))
+    assert drawn.status_code == 201, drawn.text
+    zone = drawn.json()
+
+    fog("restart", "map-service")
+    wait(lambda: None if health(fog, "map-service") == "healthy" else "the map-service is not healthy", HEALTHY_S)
+
+    seen = httpx.get(fog.url("map-service", "/api/v1/zones")).json()
+    assert zone in seen["zones"]
+    assert zone["id"] in seen["active"]
+    gone = httpx.delete(fog.url("map-service", f"/api/v1/zones/{zone['id']}"), headers=token(fog))
+    assert gone.status_code == 204, gone.text
+
+
+async def test_the_simulated_robot_is_enabled_and_drives(sim: Project) -> None:
+    clock = SystemClock()
+    async with ZenohEdge.open(
+        connect=[f"tcp/{sim.address('zenoh')}"], clock=clock, role="test", id="compose", site="estig"
+    ) as edge:
+        states = edge.latest(ch.ROBOT_STATE, RobotState, robot="r1")
+        poses = edge.latest(ch.ROBOT_POSE, RobotPose, robot="r1")
+        begin: RobotPose | None = None
+
+        def look() -> str | None:
+            nonlocal begin
+            state, pose = states.get(), poses.get()
+            if state is None or pose is None:
+                return "the robot says nothing"
+            begin = begin or pose
+            moved = math.hypot(pose.x - begin.x, pose.y - begin.y)
+            if state.mode == "NORMAL" and state.enabled and pose.v > 0.0 and moved > 1.0:
+                return None
+            return f"{state.mode} {state.reasons}, moved {moved:.2f} m"
+
+        await asyncio.to_thread(wait, look, 90)
+
+
+def test_no_process_is_root_has_a_capability_or_can_write_to_its_image(sim: Project) -> None:
+    for service, container in sim.containers().items():
+        if service == "keys":  # it has ended
+            continue
+        users = docker("top", container["Id"], "-eo", "uid,pid").split()[2::2]
+        assert users, service
+        assert "0" not in users, service
+        assert re.search(r"CapEff:\s*0+\n", sim.inside(service, "cat /proc/1/status")), service
+        if service == "sim-robot":  # its programs write their logs to files
+            continue
+        refused = sim.inside(service, "touch /usr/fognav 2>&1 || echo refused")
+        assert "Read-only file system" in refused, f"{service}: {refused}"
+
+
+def test_prometheus_records_the_robots_cpu_time(sim: Project) -> None:
+    def seconds() -> float | None:
+        query = {"query": 'process_cpu_seconds_total{robot="r1"}'}
+        found = httpx.get(sim.url("prometheus", "/api/v1/query"), params=query).json()["data"]["result"]
+        return float(found[0]["value"][1]) if found else None
+
+    wait(lambda: "no sample of the robot" if seconds() is None else None, 60)
+    before = seconds()
+    assert before is not None
+    wait(lambda: None if (seconds() or 0.0) > before else f"stays at {before} s", 30)
+
+
+def test_whatever_is_killed_comes_back(sim: Project) -> None:
+    everything = {*FOG, "sim-robot"}
+    before = {name: container["RestartCount"] for name, container in sim.containers().items()}
+    for name, container in sim.containers().items():
+        if name in everything:
+            # Nothing inside a container can kill its first process; the engine's init or a server's own handler is it.
+            init = container["HostConfig"].get("Init")
+            sim.inside(name, "kill -9 $(cat /proc/1/task/1/children)" if init else "kill 1")
+    sim.wait_healthy(everything, {name: before[name] + 1 for name in everything})
+
+
+def test_a_fog_node_needs_less_than_a_gigabyte(sim: Project, record_property: Callable[[str, object], None]) -> None:
+    unit = {"B": 2**-20, "KiB": 2**-10, "MiB": 1.0, "GiB": 2.0**10}
+    services = {c["Name"].lstrip("/"): name for name, c in sim.containers().items() if c["State"]["Running"]}
+    used = {}
+    for line in docker("stats", "--no-stream", "--format", "{{.Name}} {{.MemUsage}}", *services).splitlines():
+        found = re.match(r"(\S+) ([\d.]+)([A-Za-z]+) / ", line)
+        assert found is not None, line
+        used[services[found[1]]] = float(found[2]) * unit[found[3]]
+    for name, mebibytes in used.items():
+        record_property(f"{name} MiB", round(mebibytes))
+    print({name: f"{mebibytes:.0f} MiB" for name, mebibytes in sorted(used.items())})  # noqa: T201
+    assert set(used) == {*FOG, "sim-robot"}
+    assert sum(used[name] for name in FOG) < 1024
+
+
+def test_stop_ends_everything_in_good_order_and_up_brings_it_back(sim: Project) -> None:
+    begin = time.monotonic()
+    sim("stop")
+    took = time.monotonic() - begin
+    ended = {name: container["State"]["ExitCode"] for name, container in sim.containers().items()}
+    assert ended == dict.fromkeys([*FOG, "keys", "sim-robot"], 0)
+    assert took < STOP_S
+    sim("up", "--detach", "--no-build", timeout_s=300)
+    restarts = {name: container["RestartCount"] for name, container in sim.containers().items()}
+    sim.wait_healthy({*FOG, "sim-robot"}, restarts)
+
+
+def test_a_stop_while_the_kernels_are_compiled_is_obeyed(fog: Project) -> None:
+    name = f"{fog.name}-cold"
+    fog("run", "--detach", "--no-deps", "--name", name, "--env", "NUMBA_CACHE_DIR=/tmp/numba", "planner")
+    try:
+        wait(lambda: None if "fog_kernels.warm" in docker("top", name) else "it does not compile yet", 10)
+        begin = time.monotonic()
+        docker("stop", name)
+        took = time.monotonic() - begin
+        assert "kernels and helpers ready" not in docker("logs", name), "it was ready before the stop"
+    finally:
+        docker("rm", "--force", name)
+    assert took < STOP_S / 2

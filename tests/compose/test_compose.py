@@ -50,7 +50,7 @@ ZONE: Final = {"kind": "BLOCKED", "shape": {"type": "circle", "centre": [9.0, 42
 
 
 def why_not() -> str | None:
-    """Say what these tests miss here, or None. Building five images is more than a plain `fognav test` may do unasked."""
+    """Say what these tests miss here, or None; a plain `fognav test` does not build five images unasked."""
     if os.environ.get("FOGNAV_COMPOSE") != "1":
         return "builds five images: FOGNAV_COMPOSE=1 ./fognav test tests/compose"
     if shutil.which("docker") is None:

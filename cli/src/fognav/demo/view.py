@@ -28,7 +28,7 @@ _STATE_STYLES = {"blocked": "bold red", "clear": "green", "unknown": "yellow"}
 
 
 _VALUE_WIDTH: Final = 8
-"""Of the widest state and of a time in ms: narrower terminals cut names before values."""
+"""Of the widest state and of a time in ms: narrower terminals cut names, never values."""
 
 
 def _pairs() -> Table:
@@ -43,7 +43,8 @@ def _robot(scene: Scene) -> Panel:
     state, pose, truth, path = scene.state, scene.pose, scene.truth, scene.path
     mode = state.mode if state else "no word yet"
     table.add_row("mode", Text(mode, style=_MODE_STYLES.get(mode, "bold red")))
-    table.add_row("because", "; ".join(state.reasons[:3]) if state and state.reasons else "all is well")
+    if state is not None:
+        table.add_row("because", "; ".join(state.reasons[:3]) or "all is well")
     if pose is not None:
         table.add_row("pose", f"{pose.x:7.2f} m {pose.y:7.2f} m {math.degrees(pose.theta):6.0f}°   {pose.v:4.2f} m/s")
     if truth is not None:
@@ -59,9 +60,9 @@ def _robot(scene: Scene) -> Panel:
 
 
 def _hazards(scene: Scene) -> Panel:
-    table = Table.grid(padding=(0, 2))
-    table.add_column(style="dim", no_wrap=True, overflow="ellipsis")
-    table.add_column(no_wrap=True, justify="right", min_width=_VALUE_WIDTH)
+    table = Table.grid(padding=(0, 1), expand=True)
+    table.add_column(style="dim", no_wrap=True, overflow="ellipsis", ratio=1)
+    table.add_column(no_wrap=True, justify="right", width=_VALUE_WIDTH)
     for area in scene.site.site.areas:
         hazard = scene.hazards.get(area.id)
         state = hazard.hazard.state if hazard else "no word"

@@ -1,4 +1,4 @@
-# A simulated robot with its nodes: simulator, watcher, guardian and agent in one container, because ptys don't cross
+# A simulated robot with its nodes: simulator, watchdog, guardian and agent in one container, because ptys don't cross
 # containers.
 FROM python:3.11-slim-bookworm AS wheels
 WORKDIR /src

@@ -20,7 +20,7 @@ from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
 import numpy as np
-from guardian_rig import DEADLINE_S, Base, Watcher
+from guardian_rig import DEADLINE_S, Base, Watchdog
 from little_world import KEY, L_PATH, L_ROOMS, grid_of
 
 from fog_contracts import channels as ch
@@ -165,7 +165,7 @@ class Fog:
 class AgentProcess:
     """`python -m robot_agent`."""
 
-    def __init__(self, folder: Path, router: str, watcher: Watcher, body: Body, start=(2.0, 2.0, 0.0)) -> None:
+    def __init__(self, folder: Path, router: str, watchdog: Watchdog, body: Body, start=(2.0, 2.0, 0.0)) -> None:
         self.log_file = folder / "agent.log"
         self.data = folder / "data"
         self._port_file = folder / "agent.port"
@@ -181,7 +181,7 @@ class AgentProcess:
             "FOGNAV_SITE_DIR": str(site),
             "FOGNAV_DATA_DIR": str(self.data),
             "FOGNAV_LIDAR_PORT": str(body.lidar_link),
-            "FOGNAV_GUARDIAN_SOCKET": str(watcher.socket),
+            "FOGNAV_GUARDIAN_SOCKET": str(watchdog.socket),
             "FOGNAV_OPERATOR_KEY_FILE": str(key),
             "FOGNAV_ZENOH_CONNECT": router,
             "FOGNAV_PORT_FILE": str(self._port_file),
@@ -240,14 +240,14 @@ class Robot:
 
     def __init__(self, folder: Path, router: str) -> None:
         self.body = Body(folder)
-        self.watcher = Watcher(folder, self.body.link)
-        self.agent = AgentProcess(folder, router, self.watcher, self.body)
+        self.watchdog = Watchdog(folder, self.body.link)
+        self.agent = AgentProcess(folder, router, self.watchdog, self.body)
         self.fog: Fog | None = None
         self._router = router
         self._parts = ExitStack()
 
     async def __aenter__(self):
-        for part in (self.body, self.watcher, self.agent):
+        for part in (self.body, self.watchdog, self.agent):
             self._parts.enter_context(part)
         clock = SystemClock()
         self._open = ZenohEdge.open(connect=[self._router], clock=clock, role="fog", id="test", site=SITE)

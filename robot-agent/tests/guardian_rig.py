@@ -1,4 +1,4 @@
-"""An emulated base on a real pty, the watcher with its guardian as real processes, and an agent to talk to them."""
+"""An emulated base on a real pty, the watchdog with its guardian as real processes, and an agent to talk to them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from fognav_sim.wire.pty_port import PtyPort
 from fognav_sim.wire.roomba import RoombaEmulator
-from robot_agent.link import WheelCommand, decode_feedback, encode
+from robot_agent.guardian.link import WheelCommand, decode_feedback, encode
 
 if TYPE_CHECKING:
     import signal
@@ -102,11 +102,11 @@ class Base:
                 self.stopped_at = now
 
 
-class Watcher:
-    """`python -m robot_agent.watcher` and what it says."""
+class Watchdog:
+    """`python -m robot_agent.guardian.watchdog` and what it says."""
 
     def __init__(self, folder: Path, base_port: Path) -> None:
-        self.log_file = folder / "watcher.log"
+        self.log_file = folder / "watchdog.log"
         self.socket = folder / "guardian.sock"
         self.environment = {
             **os.environ,
@@ -122,7 +122,7 @@ class Watcher:
     def start(self) -> None:
         with self.log_file.open("ab") as log:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "robot_agent.watcher"], env=self.environment, stderr=log, stdout=log
+                [sys.executable, "-m", "robot_agent.guardian.watchdog"], env=self.environment, stderr=log, stdout=log
             )
 
     def __exit__(self, *_):
@@ -194,16 +194,16 @@ class Agent:
 
 
 class Rig:
-    """Base, watcher, guardian and agent, ready to drive."""
+    """Base, watchdog, guardian and agent, ready to drive."""
 
     def __init__(self, folder: Path) -> None:
         self.base = Base(folder / "roomba")
-        self.watcher = Watcher(folder, self.base.link)
-        self.agent = Agent(self.watcher.socket)
+        self.watchdog = Watchdog(folder, self.base.link)
+        self.agent = Agent(self.watchdog.socket)
         self._stack = ExitStack()
 
     def __enter__(self):
-        for part in (self.base, self.watcher, self.agent):
+        for part in (self.base, self.watchdog, self.agent):
             self._stack.enter_context(part)
         return self
 
@@ -217,6 +217,6 @@ class Rig:
 
     def end_guardian(self, number: signal.Signals) -> float:
         """Send the guardian a signal; return when that was."""
-        pid = self.watcher.guardian()
+        pid = self.watchdog.guardian()
         os.kill(pid, number)
         return time.monotonic()

@@ -18,10 +18,10 @@ from fog_contracts.messages import Pose, RobotCommand, RobotGoal, RobotPath, Rob
 from fog_contracts.replica import MasterMap
 from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.raycast import cast
+from robot_agent.agent.core import AgentCore, decide
 from robot_agent.config import AgentConfig
-from robot_agent.core import AgentCore, decide
-from robot_agent.drivers.rplidar import Turn
-from robot_agent.link import BaseFeedback
+from robot_agent.guardian.link import BaseFeedback
+from robot_agent.lidars.rplidar_a1.protocol import Turn
 
 KEY = b"k" * 32
 TICK_M = math.pi * 0.072 / 508.8

@@ -23,7 +23,7 @@ from fog_contracts.messages import (
     ZoneSet,
 )
 from fog_contracts.replica import MapError
-from robot_agent.core import decide
+from robot_agent.agent.core import decide
 
 
 @pytest.fixture

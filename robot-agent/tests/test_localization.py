@@ -12,8 +12,8 @@ from little_world import L_ROOMS, grid_of
 
 from fog_kernels.raycast import cast
 from robot_agent.config import LocalizationConfig
-from robot_agent.drivers.rplidar import Turn
-from robot_agent.localization import Localizer, Pose2, SavedPose, wrap
+from robot_agent.lidars.rplidar_a1.protocol import Turn
+from robot_agent.localization.localizer import Localizer, Pose2, SavedPose, wrap
 
 STATIC, GEOMETRY = grid_of(L_ROOMS, 15.0, 12.0)
 SOLID = (STATIC == 254).astype(np.uint8)

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from robot_agent.config import SafetyConfig
-from robot_agent.safety import (
+from robot_agent.safety.gate import (
     Level,
     SafetyInputs,
     SafetyOutputs,

@@ -23,7 +23,7 @@ from fognav import net
 from fognav.demo.operator import Operator
 from fognav.demo.scene import Scene
 from fognav.demo.usage import children
-from fognav.stack import AGENT, MAP_SERVICE, PLANNER, WATCHER, Stack, StackConfig
+from fognav.stack import AGENT, MAP_SERVICE, PLANNER, WATCHDOG, Stack, StackConfig
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -184,8 +184,8 @@ class Floor:
     @property
     def guardian(self) -> int | None:
         """Process id of the guardian."""
-        watcher = self.stack.supervisor.pid(WATCHER)
-        return next(iter(children(watcher)), None) if watcher is not None else None
+        watchdog = self.stack.supervisor.pid(WATCHDOG)
+        return next(iter(children(watchdog)), None) if watchdog is not None else None
 
     def starts(self) -> dict[str, int]:
         """How often each process was started."""

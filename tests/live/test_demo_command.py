@@ -35,7 +35,7 @@ DRIVES_S = 60.0
 ENDS_S = 15.0
 """For everything to end; the supervisor gives each rank of programs 5 s before it uses force."""
 PROCESSES = 10
-"""Nine programs, and the guardian under its watcher."""
+"""Nine programs, and the guardian under its watchdog."""
 NOT_TRUE = 1
 ESTIG = Path(__file__).parents[2] / "sites" / "estig"
 CORES = Path(__file__).parents[1] / "replay" / "cores.py"
@@ -232,7 +232,7 @@ async def test_nothing_of_a_demo_outlives_its_kill_but_files(begin: Callable[...
     ports = ports_of(children)
     command.process.kill()
     assert await command.ends(ENDS_S) == -signal.SIGKILL
-    # A guardian whose watcher is gone stops the wheels first, then ends by itself.
+    # A guardian whose watchdog is gone stops the wheels first, then ends by itself.
     await until(lambda: not any(alive(child) for child in children), 5, lambda: f"the end of {those_of(folder)}")
     assert those_of(folder) == []
     # The last thread of a killed process closes its sockets, which may be after the process counts as dead.

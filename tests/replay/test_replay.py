@@ -58,7 +58,7 @@ from fognav.demo.operator import Operator
 from fognav.demo.run import Demo, Options
 from fognav.output import WrongUseError
 from fognav.recording import recording, summary
-from fognav.stack import AGENT, MAP_SERVICE, SERVERS, SERVICES, SIMULATOR, WATCHER, Stack, StackConfig
+from fognav.stack import AGENT, MAP_SERVICE, SERVERS, SERVICES, SIMULATOR, WATCHDOG, Stack, StackConfig
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -167,7 +167,7 @@ async def record(path: Path) -> tuple[MapSnapshot, str]:
         )
         async with opened as edge, recording(path, mqtt_url=stack.mqtt_url, zenoh=edge, clock=clock):
             # Before there are nodes and robots, the services stand at their beginning.
-            for names in (SERVICES, [SIMULATOR], [WATCHER, AGENT]):
+            for names in (SERVICES, [SIMULATOR], [WATCHDOG, AGENT]):
                 for name in names:
                     keeper.start(name)
                 await keeper.wait_ready([name for name in names if name != AGENT], READY_S)
@@ -178,7 +178,7 @@ async def record(path: Path) -> tuple[MapSnapshot, str]:
             for zone in ZONES:
                 await ask_map_service(stack, "POST", "/api/v1/zones", zone)
             await drive(demo, stack, edge, clock)
-            for name in (AGENT, WATCHER):
+            for name in (AGENT, WATCHDOG):
                 await keeper.stop(name)
             await ask_map_service(stack, "DELETE", "/api/v1/zones/wet")
             await until(lambda: clock.now() > faded_at, "all obstacles had faded", READY_S)

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from fognav_sim.wire.pty_port import PtyPort
 from fognav_sim.wire.roomba import RoombaEmulator
 from fognav_sim.wire.rplidar import RplidarEmulator
-from robot_agent.drivers import open_interface as oi
-from robot_agent.drivers import rplidar
-from robot_agent.drivers.serial_port import open_port
+from robot_agent.bases.roomba600 import open_interface as oi
+from robot_agent.lidars.rplidar_a1 import protocol as rplidar
+from robot_agent.serial_port import open_port
 
 
 def box(angles, now):

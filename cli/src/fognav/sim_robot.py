@@ -1,6 +1,6 @@
 """A simulated robot for a fog node that runs elsewhere: `python -m fognav.sim_robot`, as in docker-compose.yml.
 
-Runs simulator, watcher, guardian and agent as one unit, because ptys don't cross containers, and acts as the operator:
+Runs simulator, watchdog, guardian and agent as one unit, because ptys don't cross containers, and acts as the operator:
 it enables the robot whenever that asks for it, and sends it back and forth between the demo's two places.
 """
 
@@ -128,7 +128,7 @@ def _programs(settings: Settings, robot: str) -> list[Program]:
     programs = []
     for name, module, http_port in (
         ("simulator", "fognav_sim", 0),
-        ("watcher", "robot_agent.watcher", 0),
+        ("watchdog", "robot_agent.guardian.watchdog", 0),
         ("robot-agent", "robot_agent", settings.agent_http_port),
     ):
         data = settings.data_dir / name

@@ -24,12 +24,12 @@ AGGREGATOR: Final = "hazard-aggregator"
 MAP_SERVICE: Final = "map-service"
 PLANNER: Final = "planner"
 SIMULATOR: Final = "simulator"
-WATCHER: Final = "robot-watcher"
+WATCHDOG: Final = "robot-watchdog"
 AGENT: Final = "robot-agent"
 
 SERVERS: Final = (BROKER, REDIS, ROUTER)
 SERVICES: Final = (AGGREGATOR, MAP_SERVICE, PLANNER)
-ROBOT: Final = (WATCHER, AGENT)
+ROBOT: Final = (WATCHDOG, AGENT)
 ALL: Final = (*SERVERS, SIMULATOR, *SERVICES, *ROBOT)
 
 _SOCKET_PATH_LIMIT: Final = 80
@@ -129,7 +129,7 @@ class Stack:
         await self._start(SERVICES, SERVICES, timeout_s)
         # The simulator makes the robot's serial ports, so it comes before the robot.
         await self._start([SIMULATOR], [SIMULATOR], timeout_s)
-        await self._start(ROBOT, [WATCHER], timeout_s)
+        await self._start(ROBOT, [WATCHDOG], timeout_s)
 
     async def _start(self, names: Iterable[str], until_ready: Iterable[str], timeout_s: float) -> None:
         for name in names:
@@ -177,7 +177,7 @@ class Stack:
             "LIDAR_PORT": str(self.folder / "sim" / "lidar"),
             "GUARDIAN_SOCKET": str(socket),
         }
-        self._add_python(WATCHER, "robot_agent.watcher", wires, ready=partial(_exists, socket), rank=2)
+        self._add_python(WATCHDOG, "robot_agent.guardian.watchdog", wires, ready=partial(_exists, socket), rank=2)
         self._add_python(AGENT, "robot_agent", wires, rank=2)
 
     def _add_servers(self) -> None:

@@ -33,11 +33,11 @@ from fognav_sim.node import SonarNode
 from hazard_aggregator.core import Aggregator
 from map_service.core import MapCore
 from planner.core import PlannerCore
-from robot_agent import link
+from robot_agent.agent.core import AgentCore, SavedPose, decide
+from robot_agent.agent.lidar_edge import ScanSession
 from robot_agent.config import AgentConfig
-from robot_agent.core import AgentCore, SavedPose, decide
-from robot_agent.guardian_core import GuardianCore
-from robot_agent.lidar import ScanSession
+from robot_agent.guardian import link
+from robot_agent.guardian.core import GuardianCore
 
 if TYPE_CHECKING:
     from fog_contracts.channels import Channel

@@ -181,16 +181,16 @@ async def test_edge_started_before_its_broker_connects_later(broker):
 
 async def test_will_is_published_when_the_process_vanishes(broker):
     texts = []
-    watcher = make(broker, "w")
-    watcher.on(ch.NODE_AVAILABILITY, lambda ids, text: texts.append((ids["node"], text)))
+    watchdog = make(broker, "w")
+    watchdog.on(ch.NODE_AVAILABILITY, lambda ids, text: texts.append((ids["node"], text)))
     edge = make(broker, "x", will=Will(ch.NODE_AVAILABILITY, "offline", {"node": "gone"}))
-    async with running(watcher):
+    async with running(watchdog):
         async with running(edge):
             await edge.publish(ch.NODE_AVAILABILITY, "online", wait=True, node="gone")
             # A second client of the same name makes the broker cut the first one off, as a dead link would.
             async with aiomqtt.Client("127.0.0.1", broker.port, identifier="x"):
                 await until(lambda: ("gone", "offline") in texts, "no will")
-        await watcher.clear(ch.NODE_AVAILABILITY, wait=True, node="gone")
+        await watchdog.clear(ch.NODE_AVAILABILITY, wait=True, node="gone")
 
 
 @pytest.mark.parametrize(

@@ -299,10 +299,10 @@ async def test_handler_that_fails_does_not_silence_the_channel(router):
 
 async def test_liveliness_tells_who_comes_and_goes(router):
     seen = []
-    async with edge(router.endpoint, "w") as watcher:
+    async with edge(router.endpoint, "w") as watchdog:
         async with edge(router.endpoint, "early") as early:
             early.alive("planner", "p1")
-            watcher.watch_live(lambda *event: seen.append(event))
+            watchdog.watch_live(lambda *event: seen.append(event))
             await until(lambda: ("planner", "p1", True) in seen, "the early one is not seen")
             async with edge(router.endpoint, "late") as late:
                 late.alive("robot-agent", "r1")

@@ -1,6 +1,6 @@
 """The robot's agent: `python -m robot_agent`, told by FOGNAV_* in the environment. Safe to kill and start at any time.
 
-It drives through the guardian (`python -m robot_agent.watcher` starts one), which stops the wheels without it.
+It drives through the guardian, which stops the wheels without it; `robot_agent.guardian.watchdog` starts the guardian.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from fog_runtime.clock import SystemClock
 from fog_runtime.health import Health, serve_plain
 from fog_runtime.settings import describe, load
 from fog_runtime.zenoh_edge import ZenohEdge
-from robot_agent.base_link import BaseLink
+from robot_agent.agent.core import AgentCore
+from robot_agent.agent.guardian_client import GuardianClient
+from robot_agent.agent.lidar_edge import LidarEdge
+from robot_agent.agent.service import Service
+from robot_agent.agent.settings import Settings, read_operator_key, read_site
+from robot_agent.agent.store import Store
 from robot_agent.config import AgentConfig
-from robot_agent.core import AgentCore
-from robot_agent.lidar import LidarEdge
-from robot_agent.service import Service
-from robot_agent.settings import Settings, read_operator_key, read_site
-from robot_agent.store import Store
 
 _log = logs.get("agent")
 
@@ -46,7 +46,7 @@ async def main() -> None:
         connect=settings.zenoh_endpoints, clock=clock, role="robot-agent", id=settings.robot, site=site
     ) as zenoh:
         agent = Service(core, zenoh, Store(settings.data_dir), clock, health, robot=settings.robot, site=site)
-        link = BaseLink(settings.guardian_socket, clock, agent.on_feedback, agent.on_base_lost)
+        link = GuardianClient(settings.guardian_socket, clock, agent.on_feedback, agent.on_base_lost)
         lidar = LidarEdge(settings.lidar_port, clock, core.on_lidar_nodes, agent.on_turn)
         agent.restore(body)
         agent.listen()

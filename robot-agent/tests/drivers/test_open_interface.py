@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot_agent.drivers import open_interface as oi
+from robot_agent.bases.roomba600 import open_interface as oi
 
 
 def frame_bytes(pairs: list[tuple[int, bytes]]) -> bytes:

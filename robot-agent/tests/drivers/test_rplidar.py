@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot_agent.drivers import rplidar
+from robot_agent.lidars.rplidar_a1 import protocol as rplidar
 
 SCAN = bytes.fromhex("a55a0500004081")
 EXPRESS = bytes.fromhex("a55a5400004082")

@@ -10,7 +10,7 @@ import tty
 
 import pytest
 
-from robot_agent.drivers.serial_port import Port, PortLost, open_port
+from robot_agent.serial_port import Port, PortLost, open_port
 
 pytestmark = pytest.mark.live
 
@@ -98,7 +98,7 @@ def test_a_device_that_takes_nothing_is_lost_and_does_not_hang(line):
 def test_another_process_can_use_the_inherited_descriptor(line):
     (master,), path = line
     code = (
-        "import sys; from robot_agent.drivers.serial_port import Port; "
+        "import sys; from robot_agent.serial_port import Port; "
         "port = Port.from_fd(int(sys.argv[1])); port.write(b'stop'); port.close()"
     )
     with open_port(path) as port:

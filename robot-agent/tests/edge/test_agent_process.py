@@ -12,7 +12,7 @@ from guardian_rig import STOP_S
 
 from fog_contracts.grid import Window
 from fog_runtime.servers import start_router
-from robot_agent.localization import SavedPose
+from robot_agent.localization.localizer import SavedPose
 
 pytestmark = [pytest.mark.live, pytest.mark.timeout(150)]
 
@@ -116,7 +116,7 @@ async def test_a_bumper_needs_an_authenticated_reset_that_reaches_the_guardian(r
         if reply.accepted:
             break
     assert reply.accepted, reply
-    await until(lambda: robot.watcher.count("reset") == 1, "the guardian is reset")
+    await until(lambda: robot.watchdog.count("reset") == 1, "the guardian is reset")
     assert not robot.body.moving
     await enabled(robot)
     await until(lambda: robot.body.moving, "it drives again")

@@ -10,8 +10,8 @@ from guardian_rig import DEADLINE_S
 from fog_runtime.clock import SystemClock
 from fognav_sim.wire.pty_port import PtyPort
 from fognav_sim.wire.rplidar import RplidarEmulator
-from robot_agent.drivers import rplidar
-from robot_agent.lidar import ANSWER_S, RESET_S, SILENT_S, STOP_S, LidarEdge, ScanSession
+from robot_agent.agent.lidar_edge import ANSWER_S, RESET_S, SILENT_S, STOP_S, LidarEdge, ScanSession
+from robot_agent.lidars.rplidar_a1 import protocol as rplidar
 
 STEP = 0.02
 

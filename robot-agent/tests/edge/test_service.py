@@ -14,11 +14,11 @@ from fog_contracts.grid import Window
 from fog_contracts.messages import MapSnapshot
 from fog_runtime.clock import SystemClock
 from fog_runtime.health import Health
-from robot_agent import service as service_module
+from robot_agent.agent import service as service_module
+from robot_agent.agent.core import AgentCore
+from robot_agent.agent.service import BEHIND_S, Service
+from robot_agent.agent.store import Store
 from robot_agent.config import AgentConfig
-from robot_agent.core import AgentCore
-from robot_agent.service import BEHIND_S, Service
-from robot_agent.store import Store
 
 
 class Fog:

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from fog_runtime.settings import SettingsError, load
-from robot_agent.settings import Settings, read_operator_key, read_site
+from robot_agent.agent.settings import Settings, read_operator_key, read_site
 
 SITE = """
 id = "lab"

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fognav_sim.wire.roomba import FULL, OFF, PASSIVE, SAFE, RoombaEmulator
-from robot_agent.drivers import open_interface as oi
-from robot_agent.guardian_core import BASE_SILENT_S, COMMAND_FRESH_S, SETTLE_S, GuardianCore
-from robot_agent.link import WheelCommand
+from robot_agent.bases.roomba600 import open_interface as oi
+from robot_agent.guardian.core import BASE_SILENT_S, COMMAND_FRESH_S, SETTLE_S, GuardianCore
+from robot_agent.guardian.link import WheelCommand
 
 STEP = 0.01
 

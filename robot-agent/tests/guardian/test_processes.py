@@ -32,20 +32,20 @@ def alive(pid: int) -> bool:
 def test_wheels_stop_each_time_the_guardian_is_killed_and_drive_again(rig):
     for _ in range(3):
         rig.drive()
-        dead = rig.watcher.guardian()
+        dead = rig.watchdog.guardian()
         begun = rig.end_guardian(signal.SIGKILL)
         assert rig.base.stopped_within(begun) < STOP_S
-        wait_for(lambda dead=dead: rig.watcher.guardian() not in {None, dead}, "another guardian runs")
+        wait_for(lambda dead=dead: rig.watchdog.guardian() not in {None, dead}, "another guardian runs")
 
 
 def test_wheels_stop_when_the_guardian_hangs_and_drive_again(rig):
     rig.drive()
-    hung = rig.watcher.guardian()
+    hung = rig.watchdog.guardian()
     begun = rig.end_guardian(signal.SIGSTOP)
     assert rig.base.stopped_within(begun) < STOP_S
     wait_for(lambda: not alive(hung), "the hung guardian is gone")
     rig.drive()
-    assert any("hung" in line.get("reason", "") for line in rig.watcher.events)
+    assert any("hung" in line.get("reason", "") for line in rig.watchdog.events)
 
 
 def test_wheels_stop_when_the_agent_falls_silent(rig):
@@ -58,7 +58,7 @@ def test_wheels_stop_when_the_agent_falls_silent(rig):
 
 AGENT = """
 import socket, sys, time
-from robot_agent.link import WheelCommand, encode
+from robot_agent.guardian.link import WheelCommand, encode
 with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as link:
     link.connect(sys.argv[1])
     for seq in range(10_000):
@@ -71,7 +71,7 @@ with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as link:
 def test_wheels_stop_when_the_agent_is_killed_or_hangs(rig, number):
     rig.drive()
     rig.agent.__exit__()
-    other = subprocess.Popen([sys.executable, "-c", AGENT, str(rig.watcher.socket)])
+    other = subprocess.Popen([sys.executable, "-c", AGENT, str(rig.watchdog.socket)])
     try:
         wait_for(lambda: rig.base.speeds == (0.2, 0.2), "the other agent drives")
         other.send_signal(number)
@@ -81,32 +81,32 @@ def test_wheels_stop_when_the_agent_is_killed_or_hangs(rig, number):
         other.wait()
 
 
-def test_wheels_stop_and_the_guardian_ends_when_the_watcher_is_killed(rig):
+def test_wheels_stop_and_the_guardian_ends_when_the_watchdog_is_killed(rig):
     rig.drive()
-    guardian = rig.watcher.guardian()
-    rig.watcher.process.kill()
+    guardian = rig.watchdog.guardian()
+    rig.watchdog.process.kill()
     assert rig.base.stopped_within(time.monotonic()) < STOP_S
     wait_for(lambda: not alive(guardian), "the guardian is gone")
-    rig.watcher.process.wait()
-    rig.watcher.start()
+    rig.watchdog.process.wait()
+    rig.watchdog.start()
     rig.drive()
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_ends_both_processes_cleanly_with_the_wheels_at_rest(rig, number):
     rig.drive()
-    guardian = rig.watcher.guardian()
-    rig.watcher.process.send_signal(number)
+    guardian = rig.watchdog.guardian()
+    rig.watchdog.process.send_signal(number)
     assert rig.base.stopped_within(time.monotonic()) < STOP_S
-    assert rig.watcher.process.wait(10.0) == 0
+    assert rig.watchdog.process.wait(10.0) == 0
     assert not alive(guardian)
-    assert rig.watcher.events[-1]["event"] == "ended"
+    assert rig.watchdog.events[-1]["event"] == "ended"
 
 
 def test_a_port_that_comes_back_is_opened_again(rig):
     rig.drive()
     rig.base.unplug()
-    wait_for(lambda: rig.watcher.count("port_lost"), "the loss is noticed")
+    wait_for(lambda: rig.watchdog.count("port_lost"), "the loss is noticed")
     # The cable cut the robot off while it was driving: it rolls on until somebody reaches it again.
     assert rig.base.moving
     rig.base.plug_in()
@@ -119,12 +119,12 @@ def test_garbage_on_the_line_neither_drives_nor_ends_anything(rig):
     rig.drive()
     rig.agent.wheels = (0.0, 0.0)
     wait_for(lambda: not rig.base.moving, "the base stands")
-    guardian, rng = rig.watcher.guardian(), random.Random(5)
+    guardian, rng = rig.watchdog.guardian(), random.Random(5)
     for _ in range(50):
         rig.base.send(rng.randbytes(300))
         time.sleep(0.005)
         assert not rig.base.moving
-    assert rig.watcher.guardian() == guardian
+    assert rig.watchdog.guardian() == guardian
     wait_for(lambda: rig.agent.feedback.left_ticks == rig.base.robot.encoders[0], "frames are understood again")
     rig.agent.reset = True
     rig.drive()
@@ -136,7 +136,7 @@ def test_a_bumper_latches_until_a_reset_even_over_a_new_agent(rig):
     assert rig.base.stopped_within(time.monotonic()) < STOP_S
     rig.base.robot.world.bump_left = False
     rig.agent.__exit__()
-    rig.agent = rigs.Agent(rig.watcher.socket)
+    rig.agent = rigs.Agent(rig.watchdog.socket)
     with rig.agent:
         rig.agent.wheels = (0.3, 0.3)
         wait_for(lambda: rig.agent.feedback and "bumper" in (rig.agent.feedback.fault or ""), "the fault is told")
@@ -149,27 +149,27 @@ def test_the_newest_agent_drives_and_bad_packets_are_refused(rig):
     rig.drive()
     rig.agent.__exit__()
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as old:
-        old.connect(str(rig.watcher.socket))
-        rig.agent = rigs.Agent(rig.watcher.socket)
+        old.connect(str(rig.watchdog.socket))
+        rig.agent = rigs.Agent(rig.watchdog.socket)
         with rig.agent:
             rig.drive()
             old.settimeout(5.0)
             while old.recv(4096):
                 pass
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as strange:
-        strange.connect(str(rig.watcher.socket))
+        strange.connect(str(rig.watchdog.socket))
         for packet in (b"\xff", os.urandom(4000), b"\x80", b"\x00" * 5000):
             strange.send(packet)
         assert strange.recv(4096)
-    wait_for(lambda: rig.watcher.count("bad_command"), "the refusal is logged")
-    assert rig.watcher.count("guardian_lost") == 0
+    wait_for(lambda: rig.watchdog.count("bad_command"), "the refusal is logged")
+    assert rig.watchdog.count("guardian_lost") == 0
 
 
-def test_a_second_watcher_keeps_off_a_port_in_use(rig, tmp_path):
+def test_a_second_watchdog_keeps_off_a_port_in_use(rig, tmp_path):
     rig.drive()
     folder = tmp_path / "second"
     folder.mkdir()
-    with rigs.Watcher(folder, rig.base.link) as second:
+    with rigs.Watchdog(folder, rig.base.link) as second:
         wait_for(lambda: second.count("port_lost"), "the second one is refused")
         assert "locked" in second.events[0]["reason"]
         assert rig.base.speeds == (0.3, 0.3)
@@ -185,11 +185,11 @@ def test_a_second_watcher_keeps_off_a_port_in_use(rig, tmp_path):
         ("LOG_LEVEL", "loud", "FOGNAV_LOG_LEVEL"),
     ],
 )
-def test_wrong_settings_end_the_watcher_with_words_instead_of_a_loop(tmp_path, setting, value, words):
-    with rigs.Base(tmp_path / "roomba") as base, rigs.Watcher(tmp_path, base.link) as watcher:
-        watcher.__exit__()
-        watcher.log_file.unlink()
-        watcher.environment[f"FOGNAV_{setting}"] = value
-        watcher.start()
-        assert watcher.process.wait(15.0) == 78
-        assert any(line["event"] == "bad_settings" and words in line["reason"] for line in watcher.events)
+def test_wrong_settings_end_the_watchdog_with_words_instead_of_a_loop(tmp_path, setting, value, words):
+    with rigs.Base(tmp_path / "roomba") as base, rigs.Watchdog(tmp_path, base.link) as watchdog:
+        watchdog.__exit__()
+        watchdog.log_file.unlink()
+        watchdog.environment[f"FOGNAV_{setting}"] = value
+        watchdog.start()
+        assert watchdog.process.wait(15.0) == 78
+        assert any(line["event"] == "bad_settings" and words in line["reason"] for line in watchdog.events)

@@ -21,11 +21,11 @@ from fognav.demo.operator import Operator
 from fognav.demo.scene import Scene
 from fognav.output import WrongUseError
 from fognav.recording import recording
-from fognav.stack import WATCHER, Stack, StackConfig
+from fognav.stack import WATCHDOG, Stack, StackConfig
 from fognav.supervisor import Event
 from fognav_sim.scenario import barrier_across
 from robot_agent.config import SafetyConfig
-from robot_agent.safety import STOP_AT_ONCE
+from robot_agent.safety.gate import STOP_AT_ONCE
 
 READY_S: Final = 90.0
 """Real seconds for everything to start."""
@@ -220,8 +220,8 @@ class Demo:
     async def _sample(self, stack: Stack) -> None:
         while True:
             pids = stack.pids()
-            if watcher := pids.get(WATCHER):
-                for child in usage.children(watcher)[:1]:
+            if watchdog := pids.get(WATCHDOG):
+                for child in usage.children(watchdog)[:1]:
                     pids["robot-guardian"] = child
             self._usage.sample(pids)
             self.scene.usage = self._usage.recent()

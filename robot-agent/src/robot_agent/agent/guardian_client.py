@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from fog_runtime import logs
-from robot_agent.link import PACKET_LIMIT, BaseFeedback, WheelCommand, decode_feedback, encode
+from robot_agent.guardian.link import PACKET_LIMIT, BaseFeedback, WheelCommand, decode_feedback, encode
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -27,7 +27,7 @@ RESET_VALID_S: Final = 1.0
 _log = logs.get("base")
 
 
-class BaseLink:
+class GuardianClient:
     """One connection to the guardian at a time; the callbacks run on the loop."""
 
     def __init__(
@@ -63,7 +63,7 @@ class BaseLink:
         try:
             self._socket.send(encode(msgspec.structs.replace(command, reset=reset)))
         except (BlockingIOError, ConnectionError):
-            # Full: the guardian hangs, and its watcher ends it. Broken: whoever reads notices and connects again.
+            # Full: the guardian hangs, and its watchdog ends it. Broken: whoever reads notices and connects again.
             return False
         self._reset_until = -math.inf
         return True
@@ -79,7 +79,7 @@ class BaseLink:
                     _log.info("guardian_found", socket=str(self._path))
                     reason = await self._read(link)
             except OSError as error:
-                reason = f"{self._path}: {error.strerror or error}; does the watcher run?"
+                reason = f"{self._path}: {error.strerror or error}; does the watchdog run?"
             finally:
                 self._socket = None
             self._lost(reason)

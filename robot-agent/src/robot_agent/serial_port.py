@@ -1,6 +1,6 @@
 """The edge: a serial device as a file descriptor. 115200 8N1, raw, never blocking.
 
-Plain termios, because the protocols above need nothing more and because an inherited descriptor (the watcher of the
+Plain termios, because the protocols above need nothing more and because an inherited descriptor (the watchdog of the
 guardian) has to be a port as well.
 """
 

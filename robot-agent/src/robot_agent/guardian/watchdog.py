@@ -1,4 +1,4 @@
-"""The watcher: opens the base's serial port, starts the guardian, and stops the wheels when the guardian dies or hangs.
+"""The watchdog: opens the base's serial port, starts the guardian, stops the wheels when the guardian dies or hangs.
 
 A Roomba keeps its last velocity when its host falls silent, so somebody has to outlive the guardian. This process does
 nothing else and imports next to nothing, so that next to nothing can end it. Run it as a service; it starts the
@@ -17,7 +17,7 @@ import time
 from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
-from robot_agent.drivers.serial_port import Port, PortLost, open_port
+from robot_agent.serial_port import Port, PortLost, open_port
 
 if TYPE_CHECKING:
     from types import FrameType
@@ -48,7 +48,7 @@ class _Terminated(Exception):  # noqa: N818 - an end, not an error
 
 
 def _log(event: str, **fields: object) -> None:
-    line = {"ts": time.time(), "process": "watcher", "event": event, **fields}
+    line = {"ts": time.time(), "process": "watchdog", "event": event, **fields}
     # Nobody may be left who reads the log; that must not end the one who stops the wheels.
     with suppress(OSError):
         sys.stderr.write(json.dumps(line) + "\n")
@@ -91,7 +91,7 @@ def _start_guardian(port: Port, beat_write: int, alive_read: int) -> subprocess.
         "FOGNAV_BASE_FD": str(port.fileno()),
         "FOGNAV_BASE_PORT": port.path,
         "FOGNAV_BEAT_FD": str(beat_write),
-        "FOGNAV_WATCHER_FD": str(alive_read),
+        "FOGNAV_WATCHDOG_FD": str(alive_read),
     }
     return subprocess.Popen(
         [sys.executable, "-m", "robot_agent.guardian"],

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from fog_contracts.grid import GridGeometry
-    from robot_agent.drivers.rplidar import Turn
-    from robot_agent.safety import Localization
+    from robot_agent.lidars.rplidar_a1.protocol import Turn
+    from robot_agent.safety.gate import Localization
 
 _HISTORY_S: Final = 3.0
 _EXTRAPOLATE_S: Final = 0.15

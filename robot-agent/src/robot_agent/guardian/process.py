@@ -1,7 +1,7 @@
 """The guardian process: owns the wheels, lets fresh commands of the agent through and stops for everything else.
 
-Started by the watcher, which passes the open serial port (FOGNAV_BASE_FD), the pipe for the guardian's beat
-(FOGNAV_BEAT_FD) and one whose end means that the watcher is gone (FOGNAV_WATCHER_FD). The agent connects to the Unix
+Started by the watchdog, which passes the open serial port (FOGNAV_BASE_FD), the pipe for the guardian's beat
+(FOGNAV_BEAT_FD) and one whose end means that the watchdog is gone (FOGNAV_WATCHDOG_FD). The agent connects to the Unix
 socket FOGNAV_GUARDIAN_SOCKET; the newest connection is the agent, an older one is dropped.
 """
 
@@ -11,7 +11,6 @@ import os
 import selectors
 import signal
 import socket
-import sys
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
@@ -22,10 +21,10 @@ from fog_runtime import logs
 from fog_runtime.clock import SystemClock
 from fog_runtime.logs import Level
 from fog_runtime.settings import SettingsError, load
-from robot_agent.drivers.serial_port import Port, PortLost
-from robot_agent.guardian_core import GuardianCore, Output
-from robot_agent.link import PACKET_LIMIT, WheelCommand, decode_command, encode
-from robot_agent.watcher import BAD_SETTINGS, PORT_LOST
+from robot_agent.guardian.core import GuardianCore, Output
+from robot_agent.guardian.link import PACKET_LIMIT, WheelCommand, decode_command, encode
+from robot_agent.guardian.watchdog import BAD_SETTINGS, PORT_LOST
+from robot_agent.serial_port import Port, PortLost
 
 if TYPE_CHECKING:
     from types import FrameType
@@ -37,11 +36,11 @@ PACKETS_A_ROUND: Final = 64
 
 
 class GuardianSettings(msgspec.Struct, frozen=True, kw_only=True):
-    """Environment of the guardian; the watcher fills in the descriptors."""
+    """Environment of the guardian; the watchdog fills in the descriptors."""
 
     base_fd: int
     beat_fd: int
-    watcher_fd: int
+    watchdog_fd: int
     base_port: str = ""
     guardian_socket: str
     speed: float = 1.0
@@ -51,7 +50,7 @@ class GuardianSettings(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Guardian:
-    """The loop around the core: one serial port, one agent, one watcher."""
+    """The loop around the core: one serial port, one agent, one watchdog."""
 
     def __init__(self, settings: GuardianSettings, listener: socket.socket) -> None:
         self._settings = settings
@@ -70,10 +69,10 @@ class Guardian:
         self._ended = False
 
     def run(self) -> int:
-        """Guard until the watcher or a signal ends it; returns the exit code."""
+        """Guard until the watchdog or a signal ends it; returns the exit code."""
         listener = self._listener
         self._selector.register(self._port, selectors.EVENT_READ, self._read_base)
-        self._selector.register(self._settings.watcher_fd, selectors.EVENT_READ, self._watcher_gone)
+        self._selector.register(self._settings.watchdog_fd, selectors.EVENT_READ, self._watchdog_gone)
         self._selector.register(listener, selectors.EVENT_READ, lambda: self._accept(listener))
         try:
             # What arrived while nobody read is of another time.
@@ -101,9 +100,9 @@ class Guardian:
             self._corrupted = self._core.corrupted
             self._seldom.warning("damaged_frames", "damaged_frames", now, total=self._corrupted)
 
-    def _watcher_gone(self) -> None:
+    def _watchdog_gone(self) -> None:
         if self._signal is None:
-            self._log.error("watcher_gone", remedy="the watcher ended; it must run whenever the guardian does")
+            self._log.error("watchdog_gone", remedy="the watchdog ended; it must run whenever the guardian does")
         self._ended = True
 
     def _accept(self, listener: socket.socket) -> None:
@@ -175,7 +174,7 @@ class Guardian:
         if now - self._beat_at < BEAT_S:
             return
         self._beat_at = now
-        # A full pipe means that the watcher hangs; it is no reason to drive any less safely. A broken one means that
+        # A full pipe means that the watchdog hangs; it is no reason to drive any less safely. A broken one means that
         # it is gone, which the other pipe tells too.
         with suppress(BlockingIOError, BrokenPipeError):
             os.write(self._settings.beat_fd, b".")
@@ -211,7 +210,7 @@ def _be_prompt(priority: int) -> str:
 
 
 def main() -> int:
-    """Run one guardian for the watcher that started it."""
+    """Run one guardian for the watchdog that started it."""
     try:
         settings = load(GuardianSettings, environ=os.environ)
         listener = _listen(settings.guardian_socket)
@@ -225,7 +224,3 @@ def main() -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     logs.get("guardian").info("started", port=settings.base_port, priority=_be_prompt(settings.realtime_priority))
     return guardian.run()
-
-
-if __name__ == "__main__":
-    sys.exit(main())

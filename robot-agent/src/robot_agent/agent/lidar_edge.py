@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 from fog_runtime import logs
 from fog_runtime.clock import ticker
-from robot_agent.drivers import rplidar
-from robot_agent.drivers.serial_port import Port, PortLost, open_port
+from robot_agent.lidars.rplidar_a1 import protocol as rplidar
+from robot_agent.serial_port import Port, PortLost, open_port
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from fog_runtime.clock import Clock
-    from robot_agent.drivers.rplidar import Turn
+    from robot_agent.lidars.rplidar_a1.protocol import Turn
 
 POLL_S: Final = 0.02
 """The port is read this often: some 40 nodes at a time cost a small computer far less than each alone."""

@@ -14,8 +14,8 @@ import math
 from dataclasses import dataclass, field
 from typing import Final
 
-from robot_agent.drivers import open_interface as oi
-from robot_agent.link import BaseFeedback, WheelCommand
+from robot_agent.bases.roomba600 import open_interface as oi
+from robot_agent.guardian.link import BaseFeedback, WheelCommand
 
 COMMAND_FRESH_S: Final = 0.2
 """A command older than this does not move a wheel."""

@@ -29,7 +29,7 @@ from fog_contracts.messages import (
 from fog_contracts.replica import MapError
 from fog_runtime import logs, metrics
 from fog_runtime.clock import Ticker
-from robot_agent.core import SavedPose, decide
+from robot_agent.agent.core import SavedPose, decide
 
 if TYPE_CHECKING:
     from fog_contracts.messages import RobotState
@@ -37,12 +37,12 @@ if TYPE_CHECKING:
     from fog_runtime.clock import Clock
     from fog_runtime.health import Health
     from fog_runtime.zenoh_edge import ZenohEdge
-    from robot_agent.base_link import BaseLink
-    from robot_agent.core import AgentCore
-    from robot_agent.drivers.rplidar import Turn
-    from robot_agent.lidar import LidarEdge
-    from robot_agent.link import BaseFeedback
-    from robot_agent.store import Store
+    from robot_agent.agent.core import AgentCore
+    from robot_agent.agent.guardian_client import GuardianClient
+    from robot_agent.agent.lidar_edge import LidarEdge
+    from robot_agent.agent.store import Store
+    from robot_agent.guardian.link import BaseFeedback
+    from robot_agent.lidars.rplidar_a1.protocol import Turn
 
 STREAM_S: Final = 0.05
 CONTROL_S: Final = 0.2
@@ -159,7 +159,7 @@ class Service:
         TURNS.inc()
         self._core.on_turn(turn, now)
 
-    async def stream_loop(self, link: BaseLink) -> None:
+    async def stream_loop(self, link: GuardianClient) -> None:
         """Judge safety and stream wheel commands at 20 Hz."""
         async for now in self._stream:
             link.send(self._core.stream(now, self._clock.stamp()))

@@ -43,11 +43,11 @@ from fog_contracts.messages import (
     ZoneSet,
 )
 from fog_contracts.replica import Applied, Outcome, Replica
-from robot_agent.drivers.open_interface import EncoderFault, Odometry
-from robot_agent.link import BaseFeedback, WheelCommand
-from robot_agent.localization import Localizer, SavedPose
-from robot_agent.motion import Decision, Job, PathFollower, decide, first_blocked, make_job, twist
-from robot_agent.safety import (
+from robot_agent.bases.roomba600.open_interface import EncoderFault, Odometry
+from robot_agent.guardian.link import BaseFeedback, WheelCommand
+from robot_agent.localization.localizer import Localizer, SavedPose
+from robot_agent.motion.local_planner import Decision, Job, PathFollower, decide, first_blocked, make_job, twist
+from robot_agent.safety.gate import (
     Request,
     SafetyInputs,
     SafetyOutputs,
@@ -64,8 +64,8 @@ if TYPE_CHECKING:
 
     from fog_contracts.grid import GridGeometry
     from robot_agent.config import AgentConfig
-    from robot_agent.drivers.rplidar import Turn
-    from robot_agent.localization import Pose2
+    from robot_agent.lidars.rplidar_a1.protocol import Turn
+    from robot_agent.localization.localizer import Pose2
 
 __all__ = ["AgentCore", "Decision", "Job", "SavedPose", "decide"]
 

@@ -8,8 +8,8 @@ import pytest
 from guardian_rig import DEADLINE_S
 
 from fog_runtime.clock import SystemClock
-from robot_agent.base_link import QUIET_S, RESET_VALID_S, BaseLink
-from robot_agent.link import BaseFeedback, WheelCommand, decode_command, encode
+from robot_agent.agent.guardian_client import QUIET_S, RESET_VALID_S, GuardianClient
+from robot_agent.guardian.link import BaseFeedback, WheelCommand, decode_command, encode
 
 pytestmark = pytest.mark.live
 
@@ -60,7 +60,7 @@ class Rig:
         self.clock = SkippingClock()
         self.feedback = []
         self.losses = []
-        self.link = BaseLink(
+        self.link = GuardianClient(
             path, self.clock, lambda feedback, _: self.feedback.append(feedback), lambda _, why: self.losses.append(why)
         )
 
@@ -86,7 +86,7 @@ async def rig(tmp_path):
 
 async def test_a_missing_guardian_is_told_and_found_when_it_comes(rig):
     await rig.until(lambda: rig.losses)
-    assert "does the watcher run?" in rig.losses[0]
+    assert "does the watchdog run?" in rig.losses[0]
     assert not rig.link.send(command())
     guardian = Guardian(rig.path)
     await guardian.accept()

@@ -1,0 +1,53 @@
+"""How a pure core meets the world: handlers by channel with one signature, and what they return to be published.
+
+A core offers one table (`handlers`) and one `tick`. Services subscribe to every channel of the table and publish what
+comes back, lockstep carries the messages from core to core, and a replay feeds recorded ones: none of them names a
+handler by hand, so all three run the same decisions.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+from fog_contracts.channels import Channel
+from fog_contracts.messages import Message
+
+Ids = Mapping[str, str]
+"""The variable parts of a topic or key by name, without the site: for example `{"robot": "r1"}`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """When an input is handled: `now` in seconds of the receiver's monotonic clock, `stamp` in seconds since the epoch.
+
+    Ages and timeouts are judged by `now` alone; `stamp` names moments in traces and for people.
+    """
+
+    now: float
+    stamp: float
+
+
+@dataclass(frozen=True, slots=True)
+class Publication:
+    """A message to be published on its channel, under these ids."""
+
+    channel: Channel
+    message: Message | str
+    ids: Ids = field(default_factory=dict)
+
+
+Handler = Callable[[Ids, Any, Moment], Sequence[Publication]]
+"""Takes one message of a channel; its second argument is the channel's message type (text for a text channel)."""
+
+Answerer = Callable[[Ids, Any, Moment], Message]
+"""Answers one query; its second argument is the channel's request type, or None for a query without one."""
+
+
+class Core(Protocol):
+    """What decides inside a process, without touching the world."""
+
+    def handlers(self) -> Mapping[Channel, Handler]:
+        """Return the handler of every channel that this core listens to."""
+
+    def tick(self, at: Moment) -> Sequence[Publication]:
+        """Let time pass, at least ten times a second; return what is to be published now."""

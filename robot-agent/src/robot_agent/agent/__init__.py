@@ -1,0 +1,1 @@
+"""The process that localizes, follows and judges: core, edges, settings."""

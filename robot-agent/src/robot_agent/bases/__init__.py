@@ -1,0 +1,1 @@
+"""Robot bases, one folder each."""

@@ -1,0 +1,1 @@
+"""iRobot Roomba 600 and Create 2."""

@@ -1,0 +1,1 @@
+"""Lidars, one folder each."""

@@ -144,6 +144,27 @@ def test_centre_of_a_cell_lies_in_it(column, row):
 windows = st.builds(Window, st.integers(-50, 60), st.integers(-50, 60), st.integers(0, 60), st.integers(0, 60))
 
 
+@given(st.lists(st.tuples(st.floats(-9, 9), st.floats(-9, 9)), max_size=12))
+def test_points_in_bulk_get_the_cells_that_single_points_get(points):
+    cells, inside = GRID.cells(np.array(points, dtype=np.float64))
+    assert [tuple(cell) for cell in cells.tolist()] == [GRID.cell(x, y) for x, y in points]
+    assert inside.tolist() == [GRID.contains(x, y) for x, y in points]
+    assert [tuple(centre) for centre in GRID.centres(cells).tolist()] == [GRID.centre(*cell) for cell in cells.tolist()]
+
+
+def test_sampling_a_grid_gives_the_cells_values_and_the_stated_one_outside():
+    grid = np.arange(GRID.width * GRID.height, dtype=np.uint8).reshape(GRID.shape)
+    points = np.array([(-1.95, -0.95), (-1.85, -0.85), (-2.01, 0.0), (1.99, 1.99), (2.01, 0.0), (0.0, 9.0)])
+    assert GRID.sample(grid, points, 7).tolist() == [0, grid[1, 1], 7, grid[29, 39], 7, 7]
+    assert GRID.sample(grid, np.empty((0, 2)), 7).shape == (0,)
+
+
+def test_axes_are_the_centres_of_a_windows_columns_and_rows():
+    xs, ys = GRID.axes(Window(3, 5, 2, 4))
+    assert [(x, y) for y in ys for x in xs] == [GRID.centre(c, r) for r in range(5, 9) for c in range(3, 5)]
+    assert GRID.whole == Window(0, 0, 40, 30)
+
+
 @given(a=windows, b=windows)
 def test_windows_clip_and_join(a, b):
     clipped = GRID.clip(a)
@@ -152,6 +173,11 @@ def test_windows_clip_and_join(a, b):
     for part in (a, b):
         if not part.empty:
             assert joined.union(part) == joined
+    marks = [np.zeros((200, 200), dtype=bool) for _ in range(3)]
+    for mark, window in zip(marks, (a, b, a.intersection(b)), strict=True):
+        shifted = Window(window.x + 60, window.y + 60, window.width, window.height)
+        mark[shifted.rows, shifted.columns] = True
+    assert np.array_equal(marks[0] & marks[1], marks[2])
     grid = np.zeros(GRID.shape, dtype=np.uint8)
     assert grid[clipped.rows, clipped.columns].shape == (clipped.height, clipped.width) or clipped.empty
 

@@ -1,9 +1,13 @@
 """Geometry of a grid in the frame `map`: metres on one side, cells on the other."""
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+Scalar = TypeVar("Scalar", bound=np.generic)
 
 
 class Window(NamedTuple):
@@ -39,6 +43,13 @@ class Window(NamedTuple):
         right = max(self.x + self.width, other.x + other.width)
         top = max(self.y + self.height, other.y + other.height)
         return Window(x, y, right - x, top - y)
+
+    def intersection(self, other: "Window") -> "Window":
+        """Return the cells that both windows have; it may be empty."""
+        x, y = max(self.x, other.x), max(self.y, other.y)
+        right = min(self.x + self.width, other.x + other.width)
+        top = min(self.y + self.height, other.y + other.height)
+        return Window(x, y, max(right - x, 0), max(top - y, 0))
 
     def grown(self, cells: int) -> "Window":
         """Return the window with a margin of `cells` on every side."""
@@ -88,6 +99,40 @@ class GridGeometry(msgspec.Struct, frozen=True):
         """Centre (m) of a cell."""
         return self.origin_x + (column + 0.5) * self.resolution, self.origin_y + (row + 0.5) * self.resolution
 
+    def cells(self, points: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """Return the cells that hold `points` ((n, 2), m), and which of them the grid has.
+
+        Cells are int64 (n, 2), each (column, row); the mask is (n,). A cell whose mask is False must not be used as an
+        index: it lies outside the grid.
+        """
+        scaled = (
+            np.asarray(points, dtype=np.float64).reshape(-1, 2) - (self.origin_x, self.origin_y)
+        ) / self.resolution
+        cells = np.floor(scaled).astype(np.int64)
+        inside: NDArray[np.bool_] = np.all((cells >= 0) & (cells < (self.width, self.height)), axis=1)
+        return cells, inside
+
+    def centres(self, cells: NDArray[np.integer]) -> NDArray[np.float64]:
+        """Return the centres (float64 (n, 2), m) of cells ((n, 2), each (column, row))."""
+        origin = np.array((self.origin_x, self.origin_y))
+        centres: NDArray[np.float64] = origin + (np.asarray(cells).reshape(-1, 2) + 0.5) * self.resolution
+        return centres
+
+    def sample(self, grid: NDArray[Scalar], points: NDArray[np.float64], outside: float) -> NDArray[Scalar]:
+        """Return the values ((n,)) of `grid` (height, width) at `points` ((n, 2), m); `outside` where it has none."""
+        cells, inside = self.cells(points)
+        values = np.full(len(cells), outside, dtype=grid.dtype)
+        values[inside] = grid[cells[inside, 1], cells[inside, 0]]
+        return values
+
+    def axes(self, window: Window) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the x ((width,), m) of the centres of a window's columns, and the y ((height,), m) of its rows."""
+        columns = np.arange(window.x, window.x + window.width, dtype=np.float64)
+        rows = np.arange(window.y, window.y + window.height, dtype=np.float64)
+        xs = self.origin_x + (columns + 0.5) * self.resolution
+        ys = self.origin_y + (rows + 0.5) * self.resolution
+        return xs, ys
+
     def contains_cell(self, column: int, row: int) -> bool:
         """Whether the grid has this cell."""
         return 0 <= column < self.width and 0 <= row < self.height
@@ -98,16 +143,18 @@ class GridGeometry(msgspec.Struct, frozen=True):
 
     def clip(self, window: Window) -> Window:
         """Return the part of a window that lies on the grid; it may be empty."""
-        x, y = max(window.x, 0), max(window.y, 0)
-        right = min(window.x + window.width, self.width)
-        top = min(window.y + window.height, self.height)
-        return Window(x, y, max(right - x, 0), max(top - y, 0))
+        return self.whole.intersection(window)
 
     def window_around(self, left: float, bottom: float, right: float, top: float) -> Window:
         """Return the cells that a rectangle in metres touches, clipped to the grid."""
         x, y = self.cell(left, bottom)
         last_x, last_y = self.cell(right, top)
         return self.clip(Window(x, y, last_x - x + 1, last_y - y + 1))
+
+    @property
+    def whole(self) -> Window:
+        """The window of all cells."""
+        return Window(0, 0, self.width, self.height)
 
     def part(self, window: Window) -> "GridGeometry":
         """Geometry of a window of this grid."""

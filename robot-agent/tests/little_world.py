@@ -6,7 +6,6 @@ another while the robot moves, decisions at 5 Hz, wheel commands at 20 Hz. Every
 
 from __future__ import annotations
 
-import hashlib
 import math
 from dataclasses import dataclass, field
 
@@ -21,7 +20,7 @@ from fog_kernels.raycast import cast
 from robot_agent.agent.core import AgentCore, decide
 from robot_agent.config import AgentConfig
 from robot_agent.guardian.link import BaseFeedback
-from robot_agent.lidars.rplidar_a1.protocol import Turn
+from robot_agent.hardware import LaserScan, RepeatCounter
 
 KEY = b"k" * 32
 TICK_M = math.pi * 0.072 / 508.8
@@ -81,7 +80,7 @@ class LittleWorld:
         self.travelled = 0.0
         self.commands = []
         self.nonce = 0
-        self.last_digest, self.repeats = b"", 1
+        self.repeats = RepeatCounter()
         self.frozen_turn = None
         self.turns = []
         self.decide_on = True
@@ -244,19 +243,15 @@ class LittleWorld:
             self.agent.on_lidar_nodes(self.now)
         if len(self.beams) == BEAMS:
             data = self.frozen_turn if self.frozen_turn is not None else np.array(self.beams)
-            digest = hashlib.blake2b(np.round(data, 4).tobytes(), digest_size=16).digest()
-            self.repeats = self.repeats + 1 if digest == self.last_digest else 1
-            self.last_digest = digest
-            turn = Turn(
+            scan = LaserScan(
                 angles_rad=np.array([math.remainder(a, 2 * math.pi) for a in data[:, 0]]),
                 ranges_m=data[:, 1].copy(),
                 quality=np.full(BEAMS, 40, np.uint8),
                 started_at=self.turn_started,
                 ended_at=self.now,
-                digest=digest,
-                repeats=self.repeats,
+                repeats=self.repeats.count(np.round(data, 4)),
             )
-            self.agent.on_turn(turn, self.now)
+            self.agent.on_scan(scan, self.now)
             self.beams = []
             self.turn_started = self.now
 

@@ -12,7 +12,7 @@ from little_world import L_ROOMS, grid_of
 
 from fog_kernels.raycast import cast
 from robot_agent.config import LocalizationConfig
-from robot_agent.lidars.rplidar_a1.protocol import Turn
+from robot_agent.hardware import LaserScan
 from robot_agent.localization.localizer import Localizer, Pose2, SavedPose, wrap
 
 STATIC, GEOMETRY = grid_of(L_ROOMS, 15.0, 12.0)
@@ -32,13 +32,12 @@ def look(pose_at, begin, end, *, solid=SOLID, noise=0.0, seed=0, repeats=1):
         ranges[i] = cast(solid, g.resolution, g.origin_x, g.origin_y, x, y, np.array([theta + angle]), 12.0)[0]
     ranges[~np.isfinite(ranges)] = math.nan
     ranges += noise * rng.standard_normal(360)
-    return Turn(
+    return LaserScan(
         angles_rad=np.array([wrap(a) for a in angles]),
         ranges_m=ranges,
         quality=np.full(360, 40, np.uint8),
         started_at=begin,
         ended_at=end,
-        digest=bytes([seed]),
         repeats=repeats,
     )
 
@@ -50,7 +49,7 @@ def standing(pose, *, turns=8, localizer=None, solid=SOLID, start=0.0, prepare=N
         begin = start + 0.18 * i
         for j in range(5):
             localizer.on_odometry(begin + 0.04 * j, 0.0, 0.0, 0.0)
-        localizer.on_turn(look(lambda _: pose, begin, begin + 0.16, solid=solid, noise=0.01, seed=i), begin + 0.17)
+        localizer.on_scan(look(lambda _: pose, begin, begin + 0.16, solid=solid, noise=0.01, seed=i), begin + 0.17)
         if i == 0 and prepare is not None:
             prepare(localizer)
     return localizer, start + 0.18 * turns
@@ -86,11 +85,11 @@ def test_a_turn_taken_in_motion_is_straightened(v, w):
     origin = pose_at(0.0)
     for i in range(9):
         localizer.on_odometry(0.025 * i, *(pose_at(0.025 * i).seen_from(origin)))
-    localizer.on_turn(look(pose_at, 0.0, 0.18), 0.18)
+    localizer.on_scan(look(pose_at, 0.0, 0.18), 0.18)
     still = Localizer()
     still.load_map(STATIC, GEOMETRY)
     still.on_odometry(0.0, 0.0, 0.0, 0.0)
-    still.on_turn(look(pose_at, 0.0, 0.18), 0.18)
+    still.on_scan(look(pose_at, 0.0, 0.18), 0.18)
     end = pose_at(0.18)
     fits = [one.wall_distance(_placed(one.sweep.points, end)).mean() for one in (localizer, still)]
     assert fits[0] < 0.04
@@ -135,14 +134,13 @@ def test_global_localization_says_so_when_places_look_alike():
     solid = (static == 254).astype(np.uint8)
     angles = np.arange(360) * 2 * math.pi / 360
     ranges = cast(solid, geometry.resolution, 0.0, 0.0, 2.0, 2.2, angles, 12.0)
-    turn = Turn(
-        angles_rad=angles, ranges_m=ranges, quality=np.zeros(360, np.uint8), started_at=0.0, ended_at=0.0,
-        digest=b"", repeats=1,
+    turn = LaserScan(
+        angles_rad=angles, ranges_m=ranges, quality=np.zeros(360, np.uint8), started_at=0.0, ended_at=0.0, repeats=1,
     )  # fmt: skip
-    localizer.on_turn(turn, 0.0)
+    localizer.on_scan(turn, 0.0)
     assert localizer.global_localization()
     while localizer.searching:
-        localizer.on_turn(turn, 0.1)
+        localizer.on_scan(turn, 0.1)
     assert localizer.status == "lost"
     assert "look like this one" in localizer.detail
 
@@ -194,7 +192,7 @@ def test_the_number_of_particles_stays_within_its_bounds_and_the_seed_decides_ev
             at = 0.18 * i
             localizer.on_odometry(at, 0.3 * i, 0.0, 0.0)
             turn = look(lambda _, i=i: Pose2(2.0 + 0.3 * i, 2.0, 0.0), at, at, seed=i, noise=0.01)
-            localizer.on_turn(turn, at)
+            localizer.on_scan(turn, at)
             counts.append(localizer.particles)
             found.append(tuple(localizer.pose(at)))
         assert off(localizer, at, Pose2(2.0 + 0.3 * 24, 2.0, 0.0))[0] < 0.1

@@ -131,8 +131,8 @@ class RobotRig:
         self._from_lidar = b""
         if received.nodes:
             self.agent.on_lidar_nodes(now)
-        for turn in received.turns:
-            self.agent.on_turn(turn, now)
+        for scan in received.scans:
+            self.agent.on_scan(scan, now)
         self._to_lidar += received.data + self._scan.tick(now)
 
     def tell(self) -> tuple[RobotPose | None, RobotState | None, RobotObstacles | None]:

@@ -47,7 +47,7 @@ async def main() -> None:
     ) as zenoh:
         agent = Service(core, zenoh, Store(settings.data_dir), clock, health, robot=settings.robot, site=site)
         link = GuardianClient(settings.guardian_socket, clock, agent.on_feedback, agent.on_base_lost)
-        lidar = LidarEdge(settings.lidar_port, clock, core.on_lidar_nodes, agent.on_turn)
+        lidar = LidarEdge(settings.lidar_port, clock, core.on_lidar_nodes, agent.on_scan)
         agent.restore(body)
         agent.listen()
         zenoh.alive("robot-agent", settings.robot)

@@ -27,7 +27,7 @@ class Line:
         self.device = RplidarEmulator(round_room)
         self.session = ScanSession()
         self.now = 50.0
-        self.turns = []
+        self.scans = []
         self.sent = b""
         self.cut = False
         self.write(self.session.begin(self.now))
@@ -42,16 +42,16 @@ class Line:
             self.now += STEP
             data = self.device.outgoing(self.now)
             received = self.session.receive(b"" if self.cut else data, self.now)
-            self.turns += received.turns
+            self.scans += received.scans
             self.write(received.data + self.session.tick(self.now))
 
 
-def test_stop_then_health_then_scan_and_turns_come():
+def test_stop_then_health_then_scan_and_scans_come():
     line = Line()
     line.run(2.0)
     assert line.sent == rplidar.stop() + rplidar.get_health() + rplidar.scan()
-    assert 8 <= len(line.turns) <= 10
-    assert np.nanmax(line.turns[0].ranges_m) == pytest.approx(2.5, abs=0.01)
+    assert 8 <= len(line.scans) <= 10
+    assert np.nanmax(line.scans[0].ranges_m) == pytest.approx(2.5, abs=0.01)
     assert line.session.trouble == ""
 
 
@@ -59,9 +59,9 @@ def test_a_lidar_that_scans_already_is_stopped_first_and_its_old_nodes_make_no_t
     line = Line()
     line.device.receive(rplidar.scan(), line.now)
     line.run(1.0)
-    assert line.turns
+    assert line.scans
     assert line.session.incomplete == 0
-    assert all(turn.started_at > 50.0 + STOP_S for turn in line.turns)
+    assert all(scan.started_at > 50.0 + STOP_S for scan in line.scans)
 
 
 def test_silence_leads_to_a_new_scan():
@@ -71,9 +71,9 @@ def test_silence_leads_to_a_new_scan():
     line.run(SILENT_S + 0.1)
     assert "no measurement" in line.session.trouble
     line.device.stalled = False
-    before = len(line.turns)
+    before = len(line.scans)
     line.run(1.0)
-    assert len(line.turns) > before
+    assert len(line.scans) > before
     assert line.session.trouble == ""
 
 
@@ -85,7 +85,7 @@ def test_a_lidar_that_does_not_answer_is_asked_again_and_again():
     assert "does not answer" in line.session.trouble
     line.cut = False
     line.run(3.0)
-    assert line.turns
+    assert line.scans
 
 
 def test_a_lidar_in_error_is_reset_and_tried_again():
@@ -96,14 +96,14 @@ def test_a_lidar_in_error_is_reset_and_tried_again():
     assert "error 7" in line.session.trouble
     line.device.health = 0
     line.run(RESET_S + 1.0)
-    assert line.turns
+    assert line.scans
 
 
 @pytest.mark.live
 async def test_the_edge_waits_for_its_port_and_opens_it_again(tmp_path):
     link = tmp_path / "lidar"
-    turns = []
-    edge = LidarEdge(str(link), SystemClock(), lambda _: None, lambda turn, _: turns.append(turn))
+    scans = []
+    edge = LidarEdge(str(link), SystemClock(), lambda _: None, lambda scan, _: scans.append(scan))
     task = asyncio.create_task(edge.run())
 
     async def until(condition, port=None, device=None):
@@ -118,9 +118,9 @@ async def test_the_edge_waits_for_its_port_and_opens_it_again(tmp_path):
     try:
         await until(lambda: "lidar" in edge.trouble and "No such file" in edge.trouble)
         for _ in range(2):
-            turns.clear()
+            scans.clear()
             with PtyPort(link) as port:
-                await until(lambda: len(turns) >= 2, port, RplidarEmulator(round_room))
+                await until(lambda: len(scans) >= 2, port, RplidarEmulator(round_room))
                 assert edge.trouble == ""
             await until(lambda: edge.trouble)
     finally:

@@ -64,7 +64,7 @@ if TYPE_CHECKING:
 
     from fog_contracts.grid import GridGeometry
     from robot_agent.config import AgentConfig
-    from robot_agent.lidars.rplidar_a1.protocol import Turn
+    from robot_agent.hardware import LaserScan
     from robot_agent.localization.localizer import Pose2
 
 __all__ = ["AgentCore", "Decision", "Job", "SavedPose", "decide"]
@@ -251,12 +251,12 @@ class AgentCore:
         """Take that the lidar sent anything."""
         self._node_at = now
 
-    def on_turn(self, turn: Turn, now: float) -> None:
-        """Take a complete turn of the lidar that arrived at `now`."""
+    def on_scan(self, scan: LaserScan, now: float) -> None:
+        """Take a complete scan of the lidar that arrived at `now`."""
         self._turn_at = self._node_at = now
-        self._identical_turns = turn.repeats
-        if turn.repeats < self._config.safety.identical_turns:
-            self._localizer.on_turn(turn, now)
+        self._identical_turns = scan.repeats
+        if scan.repeats < self._config.safety.identical_turns:
+            self._localizer.on_scan(scan, now)
 
     # --- operators ---
 

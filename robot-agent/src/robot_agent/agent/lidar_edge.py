@@ -1,6 +1,6 @@
 """The lidar edge: opens the port, talks the scanner into scanning, and starts over whenever it falls silent.
 
-`ScanSession` is the pure half, bytes and times in, bytes and turns out; `LidarEdge` owns the port.
+`ScanSession` is the pure half, bytes and times in, bytes and scans out; `LidarEdge` owns the port.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from fog_runtime.clock import Clock
-    from robot_agent.lidars.rplidar_a1.protocol import Turn
+    from robot_agent.hardware import LaserScan
 
 POLL_S: Final = 0.02
 """The port is read this often: some 40 nodes at a time cost a small computer far less than each alone."""
@@ -31,10 +31,10 @@ _log = logs.get("lidar")
 
 
 class Received(NamedTuple):
-    """What came of some bytes: whether there were measurements, the whole turns, and a request to send."""
+    """What came of some bytes: whether there were measurements, the whole scans, and a request to send."""
 
     nodes: bool = False
-    turns: tuple[Turn, ...] = ()
+    scans: tuple[LaserScan, ...] = ()
     data: bytes = b""
 
 
@@ -51,7 +51,7 @@ class ScanSession:
 
     @property
     def incomplete(self) -> int:
-        """Turns that were thrown away because nodes were missing."""
+        """Scans that were thrown away because nodes were missing."""
         return self._assembler.incomplete
 
     def begin(self, now: float) -> bytes:
@@ -63,7 +63,8 @@ class ScanSession:
     def receive(self, data: bytes, now: float) -> Received:
         """Take what came from the port."""
         self._parser.receive_data(data)
-        nodes, turns, answer = False, list[rplidar.Turn](), b""
+        nodes, answer = False, b""
+        scans: list[LaserScan] = []
         while (event := self._parser.next_event()) is not None:
             if isinstance(event, rplidar.Descriptor):
                 # A new answer begins: what was measured before belongs to another scan.
@@ -72,8 +73,8 @@ class ScanSession:
                 answer = self._on_health(event, now)
             elif isinstance(event, rplidar.Nodes) and self._phase == "scanning":
                 nodes, self._since, self.trouble = True, now, ""
-                turns.extend(self._assembler.feed(event, now))
-        return Received(nodes, tuple(turns), answer)
+                scans.extend(self._assembler.feed(event, now))
+        return Received(nodes, tuple(scans), answer)
 
     def tick(self, now: float) -> bytes:
         """Let time pass (20 Hz or more); return what to send."""
@@ -109,12 +110,12 @@ class LidarEdge:
         path: str,
         clock: Clock,
         on_nodes: Callable[[float], object],
-        on_turn: Callable[[Turn, float], object],
+        on_scan: Callable[[LaserScan, float], object],
     ) -> None:
         self._path = path
         self._clock = clock
         self._on_nodes = on_nodes
-        self._on_turn = on_turn
+        self._on_scan = on_scan
         self._told = ""
         self.trouble = "the lidar's port was not opened yet"
 
@@ -139,8 +140,8 @@ class LidarEdge:
             received = session.receive(port.read_available(), now)
             if received.nodes:
                 self._on_nodes(now)
-            for turn in received.turns:
-                self._on_turn(turn, now)
+            for scan in received.scans:
+                self._on_scan(scan, now)
             port.write(received.data + session.tick(now))
             self._tell(session.trouble)
 

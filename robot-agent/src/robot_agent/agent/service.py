@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from robot_agent.agent.lidar_edge import LidarEdge
     from robot_agent.agent.store import Store
     from robot_agent.guardian.link import BaseFeedback
-    from robot_agent.lidars.rplidar_a1.protocol import Turn
+    from robot_agent.hardware import LaserScan
 
 STREAM_S: Final = 0.05
 CONTROL_S: Final = 0.2
@@ -153,11 +153,11 @@ class Service:
         self._base_reason = reason
         self._core.on_base_lost(now, reason)
 
-    def on_turn(self, turn: Turn, now: float) -> None:
-        """Take a whole turn of the lidar."""
+    def on_scan(self, scan: LaserScan, now: float) -> None:
+        """Take a whole scan of the lidar."""
         self._turn_at = now
         TURNS.inc()
-        self._core.on_turn(turn, now)
+        self._core.on_scan(scan, now)
 
     async def stream_loop(self, link: GuardianClient) -> None:
         """Judge safety and stream wheel commands at 20 Hz."""

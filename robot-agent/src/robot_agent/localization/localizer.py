@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from fog_contracts.grid import GridGeometry
-    from robot_agent.lidars.rplidar_a1.protocol import Turn
+    from robot_agent.hardware import LaserScan
     from robot_agent.safety.gate import Localization
 
 _HISTORY_S: Final = 3.0
@@ -194,9 +194,9 @@ class Localizer:
         while self._history[0][0] < at - _HISTORY_S:
             self._history.popleft()
 
-    def on_turn(self, turn: Turn, now: float) -> None:
-        """Take a whole turn of the lidar: correct the pose when the robot moved, judge how well it fits."""
-        self.sweep = self._deskewed(turn)
+    def on_scan(self, scan: LaserScan, now: float) -> None:
+        """Take a whole scan of the lidar: correct the pose when the robot moved, judge how well it fits."""
+        self.sweep = self._deskewed(scan)
         if self.sweep is None or self._geometry is None:
             return
         if self._search is not None:
@@ -385,26 +385,26 @@ class Localizer:
             x, y, theta = x + v * late * np.cos(heading), y + v * late * np.sin(heading), theta + w * late
         return x, y, theta
 
-    def _deskewed(self, turn: Turn) -> Sweep | None:
+    def _deskewed(self, scan: LaserScan) -> Sweep | None:
         """Move each beam by the robot's motion between its own time and the turn's end."""
-        if not self._history or self._history[0][0] > turn.ended_at:
+        if not self._history or self._history[0][0] > scan.ended_at:
             return None
         c = self._config
-        ranges = np.asarray(turn.ranges_m, dtype=np.float64)
+        ranges = np.asarray(scan.ranges_m, dtype=np.float64)
         valid = np.isfinite(ranges) & (ranges >= c.range_min) & (ranges <= c.range_max)
         count = len(ranges)
-        times = turn.started_at + (turn.ended_at - turn.started_at) * np.arange(count) / max(count - 1, 1)
-        directions = np.asarray(turn.angles_rad)[valid] + c.lidar_yaw
+        times = scan.started_at + (scan.ended_at - scan.started_at) * np.arange(count) / max(count - 1, 1)
+        directions = np.asarray(scan.angles_rad)[valid] + c.lidar_yaw
         base_x = c.lidar_x + ranges[valid] * np.cos(directions)
         base_y = c.lidar_y + ranges[valid] * np.sin(directions)
         x, y, theta = self._odom_at(times[valid])
-        end = self.odom_at(turn.ended_at)
+        end = self.odom_at(scan.ended_at)
         assert end is not None
         odom_x = x + np.cos(theta) * base_x - np.sin(theta) * base_y - end.x
         odom_y = y + np.sin(theta) * base_x + np.cos(theta) * base_y - end.y
         cos, sin = math.cos(end.theta), math.sin(end.theta)
         points = np.column_stack((cos * odom_x + sin * odom_y, -sin * odom_x + cos * odom_y))
-        return Sweep(points, end, turn.ended_at)
+        return Sweep(points, end, scan.ended_at)
 
     def _beams(self, points: NDArray[np.float64], count: int | None = None) -> NDArray[np.float64]:
         wanted = count or self._config.beams

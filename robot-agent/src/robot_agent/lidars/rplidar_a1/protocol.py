@@ -1,4 +1,4 @@
-"""RPLidar A1: commands as bytes, the answer stream as typed events, nodes as whole turns.
+"""RPLidar A1: commands as bytes, the answer stream as typed events, nodes as whole scans.
 
 Nothing here touches a port or a clock: bytes and arrival times go in, values come out. Nodes are decoded in bulk by
 numpy, so that thousands of them a second cost a small computer little.
@@ -7,7 +7,6 @@ Source: Slamtec, RPLIDAR interface protocol and application notes, A1 (protocol 
 
 from __future__ import annotations
 
-import hashlib
 import re
 from collections import deque
 from dataclasses import dataclass
@@ -15,6 +14,8 @@ from enum import IntEnum
 from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 import numpy as np
+
+from robot_agent.hardware import LaserScan, RepeatCounter
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -447,28 +448,7 @@ def decode_capsule(capsule: bytes, next_start: int) -> Nodes:
     return Nodes(start, quality, angle.astype(np.uint16), distance)
 
 
-# --- turns ------------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Turn:
-    """One whole turn of the head, n nodes in order of arrival.
-
-    angles_rad: float64[n], counter-clockwise in the laser frame, 0 straight ahead, in (-pi, pi].
-    ranges_m: float64[n], metres, nan where nothing came back; not clipped to the rated 0.15..12 m, because a
-    too-near obstacle is an obstacle. quality: uint8[n].
-    started_at, ended_at: arrival of the first and last node, seconds on the caller's clock, interpolated in a batch.
-    digest: of all decoded fields. repeats: how many turns in a row had this digest, this one included; a live head
-    never gives two equal ones, a stuck link does.
-    """
-
-    angles_rad: NDArray[np.float64]
-    ranges_m: NDArray[np.float64]
-    quality: NDArray[np.uint8]
-    started_at: float
-    ended_at: float
-    digest: bytes
-    repeats: int
+# --- scans ------------------------------------------------------------------------------------------------------------
 
 
 _SECTORS: Final = 36
@@ -480,9 +460,9 @@ _ARRIVAL_GAP_S: Final = 0.5
 
 
 class ScanAssembler:
-    """Nodes -> whole turns. A turn runs from one start flag to the next and must have looked in nearly all directions.
+    """Nodes -> whole scans. A scan runs from one start flag to the next and must have looked in nearly all directions.
 
-    `incomplete` counts turns that were thrown away because nodes were missing; the piece before the first start flag
+    `incomplete` counts scans that were thrown away because nodes were missing; the piece before the first start flag
     does not count.
     """
 
@@ -492,27 +472,26 @@ class ScanAssembler:
         self._count = 0
         self._started = False
         self._arrived: float | None = None
-        self._digest = b""
-        self._repeats = 0
+        self._repeats = RepeatCounter()
         self.incomplete = 0
 
-    def feed(self, nodes: Nodes, now: float) -> list[Turn]:
-        """Take a batch that arrived at `now` (seconds, monotonic); the turns that it completes."""
+    def feed(self, nodes: Nodes, now: float) -> list[LaserScan]:
+        """Take a batch that arrived at `now` (seconds, monotonic); the scans that it completes."""
         times = self._arrival_times(len(nodes.start), now)
         angle = nodes.angle_q6
         near_zero = (angle < _START_WINDOW_Q6) | (angle >= _FULL_TURN_Q6 - _START_WINDOW_Q6)
-        turns: list[Turn] = []
+        scans: list[LaserScan] = []
         begin = 0
         for boundary in np.flatnonzero(nodes.start & near_zero):
             self._append(nodes, times, begin, int(boundary))
-            turns.extend(self._finish())
+            scans.extend(self._finish())
             begin = int(boundary)
             self._started = True
         self._append(nodes, times, begin, len(nodes.start))
-        return turns
+        return scans
 
     def reset(self) -> None:
-        """Forget the turn at hand, after the scan was started anew."""
+        """Forget the scan at hand, after the scan was started anew."""
         self._clear()
         self._started = False
         self._arrived = None
@@ -541,7 +520,7 @@ class ScanAssembler:
     def _clear(self) -> None:
         self._pieces, self._times, self._count = [], [], 0
 
-    def _finish(self) -> list[Turn]:
+    def _finish(self) -> list[LaserScan]:
         if not self._count:
             return []
         quality = np.concatenate([piece.quality for piece in self._pieces])
@@ -553,22 +532,16 @@ class ScanAssembler:
         if np.count_nonzero(sectors) < _SECTORS_NEEDED:
             self.incomplete += 1
             return []
-        digest = hashlib.blake2b(digest_size=16)
-        for field in (quality, angle_q6, distance_q2):
-            digest.update(field.tobytes())
-        self._repeats = self._repeats + 1 if digest.digest() == self._digest else 1
-        self._digest = digest.digest()
         clockwise = angle_q6 * (np.pi / (180.0 * 64.0))
         ranges = distance_q2 * 0.00025
         ranges[distance_q2 == 0] = np.nan
         return [
-            Turn(
+            LaserScan(
                 angles_rad=np.where(clockwise < np.pi, 0.0, 2.0 * np.pi) - clockwise,
                 ranges_m=ranges,
                 quality=quality,
                 started_at=float(times[0]),
                 ended_at=float(times[-1]),
-                digest=self._digest,
-                repeats=self._repeats,
+                repeats=self._repeats.count(quality, angle_q6, distance_q2),
             )
         ]

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from fog_contracts.costs import DEFAULT_INFLATION
 from fog_contracts.geometry import rasterize
 from fog_contracts.grid import GridGeometry
 from fog_contracts.messages import SimObstacle
@@ -41,7 +42,7 @@ def test_a_proposal_can_be_driven_and_each_area_can_be_driven_around(seed: int) 
     assert site.demo is not None
     assert site.demo.areas
     planner = Planner(geometry.width, geometry.height)
-    table = inflation_table(RESOLUTION, 0.17, 0.55, 5.0)
+    table = inflation_table(RESOLUTION, DEFAULT_INFLATION)
     start, goal = site.robots[0].start, site.places["b"]
     ends = geometry.cell(start.x, start.y), geometry.cell(goal.x, goal.y)
     free = planner.plan(inflate(cells, table), *ends)

@@ -25,6 +25,7 @@ from little_world import KEY, L_PATH, L_ROOMS, grid_of
 
 from fog_contracts import channels as ch
 from fog_contracts.commands import sign
+from fog_contracts.costs import Inflation
 from fog_contracts.messages import (
     CommandReply,
     Pose,
@@ -103,7 +104,7 @@ class Fog:
     def __init__(self, edge: ZenohEdge, clock: SystemClock, body: Body) -> None:
         self.edge = edge
         self.clock = clock
-        table = inflation_table(body.geometry.resolution, 0.17, 0.55, 6.0)
+        table = inflation_table(body.geometry.resolution, Inflation(cost_scaling=6.0))
         cost = inflate(body.static.copy(), table)
         self.master = MasterMap(SITE, body.geometry, body.static, cost, epoch=7)
         self.goal: RobotGoal | None = None

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fog_contracts.commands import sign
+from fog_contracts.costs import Inflation
 from fog_contracts.grid import GridGeometry, Window
 from fog_contracts.messages import Pose, RobotCommand, RobotGoal, RobotPath, RobotState, Trace
 from fog_contracts.replica import MasterMap
@@ -58,7 +59,7 @@ class LittleWorld:
     def __post_init__(self):
         self.static, self.geometry = grid_of(self.rooms, *self.size)
         self.solid = (self.static == 254).astype(np.uint8)
-        self.table = inflation_table(self.geometry.resolution, 0.17, 0.55, 6.0)
+        self.table = inflation_table(self.geometry.resolution, Inflation(cost_scaling=6.0))
         self.raw = self.static.copy()
         self.master = MasterMap("lab", self.geometry, self.static, inflate(self.raw, self.table), epoch=7)
         self.rng = np.random.default_rng(self.seed)

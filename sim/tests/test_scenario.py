@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fog_contracts.costs import Inflation
 from fog_contracts.geometry import contains_point, rasterize
 from fog_contracts.grid import GridGeometry
 from fog_contracts.messages import Pose
@@ -43,7 +44,8 @@ def can_pass(static, obstacle):
     cells = static.cells.copy()
     window, mask = rasterize([(x, y) for x, y in obstacle.polygon], static.geometry)
     cells[window.rows, window.columns][mask] = 254
-    table = inflation_table(RES, 0.16, 0.2, 3.0)  # a little less than the robot: a wider gap must not pass unseen
+    # A little less than the robot: a wider gap must not pass unseen.
+    table = inflation_table(RES, Inflation(inscribed_radius=0.16, inflation_radius=0.2))
     cost = inflate((cells == 254).astype(np.uint8) * 254, table)
     y = static.geometry.cell(1.0, 2.0)[1]
     return Planner(static.geometry.width, static.geometry.height).plan(cost, (20, y), (220, y)).found

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from fog_contracts.costs import DEFAULT_INFLATION
 from fog_contracts.geometry import contains_point, distance_to_polygon, rasterize
 from fog_contracts.site import AreaSite, Site
 from fog_kernels.astar import Planner
@@ -61,7 +62,7 @@ class Floor:
         self.areas = {area.id: area for area in self.site.areas}
         raw = np.where(self.image == 254, 0, np.where(self.image == 0, 254, 255)).astype(np.uint8)
         self.raw = raw
-        self.table = inflation_table(self.geometry.resolution, 0.17, 0.55, 3.0)
+        self.table = inflation_table(self.geometry.resolution, DEFAULT_INFLATION)
         self.planner = Planner(self.geometry.width, self.geometry.height)
         self._known: dict[tuple[object, ...], Way | None] = {}
 

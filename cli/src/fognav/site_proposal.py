@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fog_contracts.costs import FREE, LETHAL
+from fog_contracts.costs import DEFAULT_INFLATION, FREE, LETHAL
 from fog_contracts.geometry import Point, rasterize
 from fog_contracts.grid import GridGeometry
 from fog_contracts.messages import Pose
@@ -25,9 +25,7 @@ from fog_kernels.raycast import cast
 from fog_runtime.maps import StaticMap
 from fognav_sim.scenario import ScenarioError, barrier_across
 
-ROBOT_RADIUS: Final = 0.17
-INFLATION_RADIUS: Final = 0.55
-COST_SCALING: Final = 5.0
+ROBOT_RADIUS: Final = DEFAULT_INFLATION.inscribed_radius
 PLACE_CLEARANCE_M: Final = 0.45
 DRIVE_M: Final = (15.0, 60.0)
 """Length of a good demonstration: long enough to see a danger coming, short enough to watch."""
@@ -66,7 +64,7 @@ class _Floor:
     clearance: NDArray[np.float64]
 
     def inflated(self, raw: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        table = inflation_table(self.geometry.resolution, ROBOT_RADIUS, INFLATION_RADIUS, COST_SCALING)
+        table = inflation_table(self.geometry.resolution, DEFAULT_INFLATION)
         return inflate(raw, table)
 
     def ranges(self, at: Point, angles: NDArray[np.float64], reach: float) -> NDArray[np.float64]:

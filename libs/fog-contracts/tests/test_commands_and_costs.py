@@ -9,7 +9,17 @@ from fog_contracts import messages as m
 from fog_contracts.channels import ROBOT_COMMAND
 from fog_contracts.codec import decode, encode
 from fog_contracts.commands import VALID_S, CommandGate, sign
-from fog_contracts.costs import LETHAL, UNKNOWN, combine_costs, combine_speed_limits, is_traversable
+from fog_contracts.costs import (
+    COST_PER_FACTOR,
+    COST_WEIGHT,
+    LETHAL,
+    NEUTRAL_WEIGHT,
+    UNKNOWN,
+    Inflation,
+    combine_costs,
+    combine_speed_limits,
+    is_traversable,
+)
 
 KEY = b"k" * 32
 
@@ -98,3 +108,15 @@ def test_lower_speed_limit_wins_and_none_is_no_limit(a, b):
     for one, other, got in zip(a.flat, b.flat, out.flat, strict=True):
         limits = [v for v in (one, other) if v]
         assert got == (min(limits) if limits else 0)
+
+
+@pytest.mark.parametrize("factor", [1.0, 2.0, 5.0])
+def test_cost_of_a_factor_weighs_that_many_free_cells(factor):
+    assert NEUTRAL_WEIGHT + COST_WEIGHT * COST_PER_FACTOR * (factor - 1.0) == pytest.approx(factor * NEUTRAL_WEIGHT)
+
+
+@pytest.mark.parametrize("name", ["inscribed_radius", "inflation_radius", "cost_scaling"])
+@pytest.mark.parametrize("value", [-0.1, float("nan"), float("inf")])
+def test_inflation_that_cannot_be_is_refused_by_name(name, value):
+    with pytest.raises(ValueError, match=name):
+        Inflation(**{name: value})

@@ -15,13 +15,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fog_contracts.costs import DEFAULT_INFLATION
 from fog_kernels.astar import (
     DIAGONAL,
     STRAIGHT,
     Planner,
     line_cost,
     nearest_traversable,
-    path_cost,
     shortcut,
 )
 from fog_kernels.inflation import inflate, inflation_table
@@ -83,9 +83,16 @@ def cell_of(data: st.DataObject, costmap: NDArray[np.uint8]) -> Cell:
 
 
 def assert_valid(costmap: NDArray[np.uint8], cells: NDArray[np.int32], start: Cell, goal: Cell, cost: float) -> None:
+    """A path from start to goal, every step of it one that the planner may take, of this cost."""
     assert tuple(cells[0]) == start
     assert tuple(cells[-1]) == goal
-    assert path_cost(costmap, cells) == pytest.approx(cost, abs=1e-6)
+    total = 0
+    for (x0, y0), (x1, y1) in itertools.pairwise(cells.tolist()):
+        assert max(abs(x1 - x0), abs(y1 - y0)) == 1
+        assert max(costmap[y0, x0], costmap[y1, x0], costmap[y0, x1], costmap[y1, x1]) < 253
+        weights = round(50 + 0.8 * int(costmap[y0, x0])) + round(50 + 0.8 * int(costmap[y1, x1]))
+        total += (DIAGONAL if x0 != x1 and y0 != y1 else STRAIGHT) * weights
+    assert total / (2 * STRAIGHT) == cost
 
 
 @settings(max_examples=250, deadline=None)
@@ -127,7 +134,6 @@ def test_replanning_with_the_goal_field_equals_a_full_search(static: NDArray[np.
         x, y = cell_of(data, static)
         patch = costmap[y : y + data.draw(st.integers(1, height)), x : x + data.draw(st.integers(1, width))]
         np.maximum(patch, data.draw(st.sampled_from([0, 30, 200, 253, 254, 255])), out=patch)
-        assert planner.raises_only(costmap)
         expected = dijkstra(costmap, start).get(goal)
         result = planner.plan(costmap, start, goal)
         assert result.cost == (math.inf if expected is None else expected / (2 * STRAIGHT))
@@ -136,19 +142,6 @@ def test_replanning_with_the_goal_field_equals_a_full_search(static: NDArray[np.
     other = cell_of(data, static)
     expected = dijkstra(static, start).get(other)
     assert planner.plan(static, start, other).cost == (math.inf if expected is None else expected / (2 * STRAIGHT))
-
-
-def test_a_lowered_cell_is_noticed() -> None:
-    static = np.full((4, 4), 7, np.uint8)
-    planner = Planner(4, 4)
-    planner.set_goal_field(static, (0, 0))
-    lowered = static.copy()
-    lowered[3, 2] = 6
-    assert planner.raises_only(static)
-    assert not planner.raises_only(lowered)
-    planner.clear_goal_field()
-    with pytest.raises(RuntimeError, match="set_goal_field"):
-        planner.raises_only(static)
 
 
 def test_costs_beyond_32_bits_are_exact() -> None:
@@ -305,7 +298,7 @@ def test_a_line_between_two_diagonal_walls_is_blocked() -> None:
 def test_the_path_keeps_to_the_middle_of_a_corridor() -> None:
     raw = np.zeros((40, 200), np.uint8)
     raw[:3] = raw[-3:] = 254
-    costmap = inflate(raw, inflation_table(0.05, 0.17, 0.55, 3.0))
+    costmap = inflate(raw, inflation_table(0.05, DEFAULT_INFLATION))
     result = Planner(200, 40).plan(costmap, (10, 8), (190, 31))
     middle = result.cells[(result.cells[:, 0] > 40) & (result.cells[:, 0] < 160)]
     distance_to_wall = np.minimum(middle[:, 1] - 2, 37 - middle[:, 1])

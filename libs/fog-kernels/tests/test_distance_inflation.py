@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fog_contracts.costs import DEFAULT_INFLATION, Inflation
 from fog_kernels.distance import squared_distance_capped
 from fog_kernels.inflation import InflationTable, inflate, inflate_window, inflation_table
 
@@ -56,14 +57,14 @@ def reference_inflation(raw: NDArray[np.uint8], table: InflationTable) -> NDArra
 @settings(max_examples=60, deadline=None)
 @given(raw_maps(), st.floats(0.05, 0.8))
 def test_inflation_equals_its_definition(raw: NDArray[np.uint8], radius: float) -> None:
-    table = inflation_table(0.05, 0.17, radius, 3.0)
+    table = inflation_table(0.05, Inflation(inflation_radius=radius))
     assert np.array_equal(inflate(raw, table), reference_inflation(raw, table))
 
 
 @settings(max_examples=150, deadline=None)
 @given(raw_maps(), st.data())
 def test_a_window_brings_the_whole_map_up_to_date(raw: NDArray[np.uint8], data: st.DataObject) -> None:
-    table = inflation_table(0.05, 0.17, data.draw(st.sampled_from([0.0, 0.2, 0.55])), 3.0)
+    table = inflation_table(0.05, Inflation(inflation_radius=data.draw(st.sampled_from([0.0, 0.2, 0.55]))))
     out = inflate(raw, table)
     height, width = raw.shape
     changed = raw.copy()
@@ -82,7 +83,7 @@ def test_a_window_brings_the_whole_map_up_to_date(raw: NDArray[np.uint8], data: 
 
 
 def test_costs_follow_the_exponential_decay() -> None:
-    table = inflation_table(0.05, 0.17, 0.55, 3.0)
+    table = inflation_table(0.05, DEFAULT_INFLATION)
     assert table.reach == 11
     assert table.cost[0] == 254
     assert table.cost[9] == 253  # 0.15 m
@@ -93,11 +94,12 @@ def test_costs_follow_the_exponential_decay() -> None:
 
 def test_read_only_maps_are_accepted() -> None:
     raw = np.frombuffer(bytes([0, 254, 0, 0]), np.uint8).reshape(2, 2)
-    assert inflate(raw, inflation_table(0.05, 0.0, 0.0, 1.0)).tolist() == [[0, 254], [0, 0]]
+    table = inflation_table(0.05, Inflation(inscribed_radius=0.0, inflation_radius=0.0))
+    assert inflate(raw, table).tolist() == [[0, 254], [0, 0]]
 
 
 def test_wrong_arrays_are_refused_by_name() -> None:
-    table = inflation_table(0.05, 0.17, 0.55, 3.0)
+    table = inflation_table(0.05, DEFAULT_INFLATION)
     with pytest.raises(TypeError, match="raw must be uint8"):
         inflate(np.zeros((4, 4), np.int32), table)  # type: ignore[arg-type]  # the refusal is what is tested
     with pytest.raises(ValueError, match="raw must be C-ordered"):
@@ -108,6 +110,6 @@ def test_wrong_arrays_are_refused_by_name() -> None:
     with pytest.raises(ValueError, match="out must not be raw"):
         inflate(raw, table, raw)
     with pytest.raises(ValueError, match="180"):
-        inflation_table(0.01, 0.1, 2.0, 1.0)
+        inflation_table(0.01, Inflation(inflation_radius=2.0))
     with pytest.raises(ValueError, match="cap_cells"):
         squared_distance_capped(raw, 0)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from fog_contracts.costs import DEFAULT_INFLATION
 from fog_kernels.dwa import DwaLimits, DwaResult, DwaSettings, dwa
 from fog_kernels.inflation import inflate, inflation_table
 
@@ -25,7 +26,7 @@ def world(*rooms: tuple[float, float, float, float]) -> NDArray[np.uint8]:
     raw = np.full((160, 160), 254, np.uint8)
     for x0, y0, x1, y1 in rooms:
         raw[round(y0 / RESOLUTION) : round(y1 / RESOLUTION), round(x0 / RESOLUTION) : round(x1 / RESOLUTION)] = 0
-    return inflate(raw, inflation_table(RESOLUTION, 0.17, 0.55, 3.0))
+    return inflate(raw, inflation_table(RESOLUTION, DEFAULT_INFLATION))
 
 
 L_CORRIDOR = world((0.5, 0.5, 6.0, 2.0), (4.5, 0.5, 6.0, 7.0))

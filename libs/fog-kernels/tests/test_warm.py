@@ -11,6 +11,7 @@ from fog_kernels import warm
 
 RUN_ALL = """
 import numpy as np
+from fog_contracts.costs import DEFAULT_INFLATION
 from fog_kernels import warm
 warm.warm()
 from fog_kernels import amcl, astar, distance, dwa, inflation, likelihood, raycast
@@ -18,7 +19,7 @@ raw = np.zeros((60, 60), np.uint8)
 raw[0] = 254
 shut = raw.copy()
 shut.setflags(write=False)
-table = inflation.inflation_table(0.05, 0.17, 0.55, 3.0)
+table = inflation.inflation_table(0.05, DEFAULT_INFLATION)
 for source in (raw, shut):
     cost = inflation.inflate(source, table)
     inflation.inflate_window(source, table, 3, 3, 4, 4, cost)
@@ -28,7 +29,7 @@ for source in (raw, shut):
     planner.set_goal_field(cost, (50, 50))
     cells = planner.plan(cost, (20, 20), (50, 50)).cells
     planner.plan(cost, (np.int64(20), np.int32(20)), (40, 50), max_expansions=10)
-    planner.shortcut(cost, cells), planner.path_cost(cost, cells), planner.raises_only(cost)
+    planner.shortcut(cost, cells)
     planner.nearest_reachable(cost, (20, 20), (0, 0)), astar.nearest_traversable(cost, (0, 0), 20)
     astar.line_cost(cost, 20, 20, 30, 30)
     dwa.dwa(0, 0, 1, 1, np.float32(0), cost, 0.05, 0, 0, [(1, 1), (2, 1)], 2, 1)
@@ -37,7 +38,6 @@ for source in (raw, shut):
     x, y, theta = (np.ones(5, np.float32) for _ in range(3))
     weights = np.full(5, 0.2)
     amcl.motion_update(x, y, theta, 0, 1, 0, (1, 1, 1, 1), state)
-    amcl.measurement_update(x, y, theta, weights, field, 0.05, 0, 0, [0, 1], [1, 1])
     amcl.score_poses(x, y, theta, field, 0.05, 0, 0, [0, 1], [1, 1])
     amcl.estimate(*amcl.resample(x, y, theta, weights, 2, 5, 0.05, state))
 print(warm.cache_misses())

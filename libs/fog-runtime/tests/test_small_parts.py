@@ -17,7 +17,7 @@ from fog_contracts.messages import Trace
 from fog_runtime import logs, metrics
 from fog_runtime.files import atomic_write
 from fog_runtime.health import Health, serve_plain
-from fog_runtime.settings import CommonSettings, Secret, SettingsError, describe, load
+from fog_runtime.settings import CommonSettings, InflationSettings, Secret, SettingsError, describe, load
 from fog_runtime.slots import Slot
 
 
@@ -219,3 +219,10 @@ def test_failed_atomic_write_leaves_the_old_file(tmp_path):
         atomic_write(path, "no bytes")  # type: ignore[arg-type]
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_inflation_that_cannot_be_is_refused_while_the_settings_are_read():
+    environ = {"FOGNAV_SITE_DIR": "/s", "FOGNAV_DATA_DIR": "/d", "FOGNAV_COST_SCALING": "5"}
+    assert load(InflationSettings, environ=environ).inflation.cost_scaling == 5.0
+    with pytest.raises(SettingsError, match="inflation_radius"):
+        load(InflationSettings, environ={**environ, "FOGNAV_INFLATION_RADIUS": "-1"})

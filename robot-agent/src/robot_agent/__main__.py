@@ -37,7 +37,8 @@ async def main() -> None:
         obstacle_ttl=settings.obstacle_memory_s,
     )
     if body is not None:
-        motion = replace(config.motion, inscribed_radius=body.radius)
+        inflation = replace(config.motion.inflation, inscribed_radius=body.radius)
+        motion = replace(config.motion, inflation=inflation)
         config = replace(config, radius=body.radius, height=body.height, motion=motion)
     clock = SystemClock(settings.speed)
     core = AgentCore(config, settings.seed)

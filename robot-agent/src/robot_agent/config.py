@@ -4,6 +4,15 @@ Lengths in m, angles in rad, times in s.
 """
 
 from dataclasses import dataclass, field
+from typing import Final
+
+from fog_contracts.costs import DEFAULT_INFLATION, Inflation
+
+LOCAL_INFLATION: Final = Inflation(
+    inscribed_radius=DEFAULT_INFLATION.inscribed_radius, inflation_radius=0.45, cost_scaling=8.0
+)
+"""That of what the lidar sees, in the local window: narrower and steeper than the map's, because the robot sees such a
+thing where it is and passes it closely at need, whereas the map's costs keep whole paths in the middle of corridors."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,9 +88,7 @@ class MotionConfig:
     tolerance_xy: float = 0.10
     tolerance_theta: float = 0.17
     window: float = 2.0
-    inscribed_radius: float = 0.17
-    inflation_radius: float = 0.45
-    cost_scaling: float = 8.0
+    inflation: Inflation = LOCAL_INFLATION
     stuck_after: float = 10.0
 
 

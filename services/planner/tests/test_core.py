@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from fog_contracts.costs import DEFAULT_INFLATION
 from fog_contracts.grid import GridGeometry, Window
 from fog_contracts.messages import (
     AreaHazard,
@@ -51,7 +52,7 @@ class Map:
         self.static[:, [0, -1]] = 254
         for wall in walls:
             self.paint(self.static, wall, 254)
-        self.table = inflation_table(RES, 0.17, 0.55, 3.0)
+        self.table = inflation_table(RES, DEFAULT_INFLATION)
         self.areas: dict[str, Box] = {}
         self.penalties: dict[str, int] = {}
         self.master = MasterMap("test", self.geometry, self.static, inflate(self.static, self.table), epoch)

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from fog_contracts import channels as ch
+from fog_contracts.costs import DEFAULT_INFLATION
 from fog_contracts.grid import GridGeometry, Window
 from fog_contracts.messages import (
     AreaHazard,
@@ -95,7 +96,7 @@ class World:
         self.folder, self.router, self.redis, self.edge, self.clock = folder, router, redis, edge, clock
         self.geometry = GridGeometry(200, 120, 0.1, 0.0, 0.0)
         self.static = static_map()
-        self.table = inflation_table(0.1, 0.17, 0.55, 3.0)
+        self.table = inflation_table(0.1, DEFAULT_INFLATION)
         self.master = MasterMap("test", self.geometry, self.static, inflate(self.static, self.table), 5)
         self.paths: list[RobotPath] = []
         self.goals: list[RobotGoal] = []

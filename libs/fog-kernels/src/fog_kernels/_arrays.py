@@ -14,7 +14,6 @@ if TYPE_CHECKING:
 U8_GRID = types.Array(types.uint8, 2, "C", readonly=True)
 U8_FLAT = types.Array(types.uint8, 1, "C", readonly=True)
 I32_FLAT = types.Array(types.int32, 1, "C", readonly=True)
-I64_FLAT = types.Array(types.int64, 1, "C", readonly=True)
 I32_PAIRS = types.Array(types.int32, 2, "C", readonly=True)
 F32_FLAT = types.Array(types.float32, 1, "C", readonly=True)
 F64_FLAT = types.Array(types.float64, 1, "C", readonly=True)
@@ -28,7 +27,6 @@ I64_OUT = types.Array(types.int64, 1, "C")
 U64_OUT = types.Array(types.uint64, 1, "C")
 F32_OUT = types.Array(types.float32, 1, "C")
 F64_OUT = types.Array(types.float64, 1, "C")
-F64_GRID_OUT = types.Array(types.float64, 2, "C")
 
 
 def grid(array: NDArray[Any], name: str) -> NDArray[np.uint8]:

@@ -1,4 +1,4 @@
-"""Kernels of a particle filter for localization: move, weigh, resample, estimate, score.
+"""Kernels of a particle filter for localization: move, score, resample, estimate.
 
 Particles are a structure of arrays: x, y (m) and theta (rad) in `map`, float32; weights float64, adding up to 1.
 Randomness comes from an explicit generator state (xoshiro256++, Blackman and Vigna 2019), made by `rng_state` and
@@ -134,50 +134,6 @@ def _move(x: Any, y: Any, theta: Any, rot1: float, trans: float, rot2: float, al
 
 
 _BEAM_ARGUMENTS = (_arrays.F32_GRID, float32, float32, float32, _arrays.F32_FLAT, _arrays.F32_FLAT)
-
-
-@njit(
-    float64(_arrays.F32_FLAT, _arrays.F32_FLAT, _arrays.F32_FLAT, _arrays.F64_OUT, *_BEAM_ARGUMENTS),
-    cache=True,
-    nogil=True,
-)
-def _weigh(
-    x: Any,
-    y: Any,
-    theta: Any,
-    weights: Any,
-    field: Any,
-    inverse: Any,
-    origin_x: Any,
-    origin_y: Any,
-    end_x: Any,
-    end_y: Any,
-) -> Any:
-    height, width = field.shape
-    beams = end_x.size
-    average = 0.0
-    total = 0.0
-    for i in range(x.size):
-        cos = math.cos(theta[i])
-        sin = math.sin(theta[i])
-        base_x = (x[i] - origin_x) * inverse
-        base_y = (y[i] - origin_y) * inverse
-        match = np.float32(0.0)
-        for k in range(beams):
-            column = base_x + cos * end_x[k] - sin * end_y[k]
-            row = base_y + sin * end_x[k] + cos * end_y[k]
-            if column >= 0 and row >= 0 and column < width and row < height:
-                match += field[np.uint32(row), np.uint32(column)]
-        average += weights[i] * match
-        weights[i] *= 1.0 + match
-        total += weights[i]
-    if total > 0.0 and math.isfinite(total):
-        for i in range(x.size):
-            weights[i] /= total
-    else:
-        for i in range(x.size):
-            weights[i] = 1.0 / x.size
-    return average / beams
 
 
 @njit(
@@ -521,12 +477,7 @@ def motion_update(
 
 
 def _beam_ends(
-    beam_angles: ArrayLike,
-    beam_ranges: ArrayLike,
-    laser_x: float,
-    laser_y: float,
-    laser_theta: float,
-    resolution: float,
+    beam_angles: ArrayLike, beam_ranges: ArrayLike, resolution: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return where the valid beams end, in cells from the robot's centre in its frame."""
     angles = _arrays.vector(beam_angles, "beam_angles")
@@ -534,48 +485,9 @@ def _beam_ends(
     if angles.size != ranges.size:
         raise ValueError(f"beam_angles and beam_ranges must have one length, not {angles.size} and {ranges.size}")
     valid = np.isfinite(ranges) & (ranges > 0.0) & np.isfinite(angles)
-    directions = angles[valid] + laser_theta
-    ends_x = (laser_x + ranges[valid] * np.cos(directions)) / resolution
-    ends_y = (laser_y + ranges[valid] * np.sin(directions)) / resolution
+    ends_x = ranges[valid] * np.cos(angles[valid]) / resolution
+    ends_y = ranges[valid] * np.sin(angles[valid]) / resolution
     return ends_x.astype(np.float32), ends_y.astype(np.float32)
-
-
-def measurement_update(
-    x: NDArray[np.float32],
-    y: NDArray[np.float32],
-    theta: NDArray[np.float32],
-    weights: NDArray[np.float64],
-    field: NDArray[np.float32],
-    resolution: float,
-    origin_x: float,
-    origin_y: float,
-    beam_angles: ArrayLike,
-    beam_ranges: ArrayLike,
-    laser_x: float = 0.0,
-    laser_y: float = 0.0,
-    laser_theta: float = 0.0,
-) -> float:
-    """Multiply the weights by how well a scan fits, normalize them, and return the average likelihood per beam.
-
-    `field`: `likelihood_field` of the map whose lower-left corner is (origin_x, origin_y). Beams are radians and metres
-    in the laser's frame, which sits at (laser_x, laser_y, laser_theta) on the robot; ranges that aren't finite or
-    above 0 are left out (pass nan for what hit nothing). A particle's weight is multiplied by 1 + the sum of the
-    field's values at the beams' ends (AMCL's form); ends off the map add nothing.
-
-    The return value is the mean field value under the old weights, the figure for augmented MCL's slow and fast
-    averages; 0.0 when no beam was valid, and the weights are then left alone.
-    Raises TypeError or ValueError for wrong types or shapes.
-    """
-    _check_particles(x, y, theta)
-    _check_weights(weights, x.size)
-    _arrays.exact(field, np.float32, 2, "field")
-    resolution = _arrays.positive(resolution, "resolution")
-    ends_x, ends_y = _beam_ends(beam_angles, beam_ranges, laser_x, laser_y, laser_theta, resolution)
-    if ends_x.size == 0:
-        return 0.0
-    return float(
-        _weigh(x, y, theta, weights, field, 1.0 / resolution, float(origin_x), float(origin_y), ends_x, ends_y)
-    )
 
 
 def score_poses(
@@ -588,21 +500,20 @@ def score_poses(
     origin_y: float,
     beam_angles: ArrayLike,
     beam_ranges: ArrayLike,
-    laser_x: float = 0.0,
-    laser_y: float = 0.0,
-    laser_theta: float = 0.0,
 ) -> NDArray[np.float64]:
-    """Return the mean field value at the beams' ends for each candidate pose, float64 (n,), for global localization.
+    """Return the mean field value at the beams' ends for each candidate pose, float64 (n,).
 
-    Arguments as for `measurement_update`; zeros when no beam is valid. Raises TypeError or ValueError for wrong types
-    or shapes.
+    `field`: `likelihood_field` of the map whose lower-left corner is (origin_x, origin_y) in `map`, its cells
+    `resolution` wide (m). Beams are radians and metres from the robot's centre, in its frame; ranges that aren't finite
+    or above 0 are left out (pass nan for what hit nothing), ends off the map add nothing. Zeros when no beam is valid.
+    Raises TypeError or ValueError for wrong types or shapes.
     """
     poses = [_arrays.vector(values, name) for values, name in ((xs, "xs"), (ys, "ys"), (thetas, "thetas"))]
     if not poses[0].size == poses[1].size == poses[2].size:
         raise ValueError("xs, ys and thetas must have one length")
     _arrays.exact(field, np.float32, 2, "field")
     resolution = _arrays.positive(resolution, "resolution")
-    ends_x, ends_y = _beam_ends(beam_angles, beam_ranges, laser_x, laser_y, laser_theta, resolution)
+    ends_x, ends_y = _beam_ends(beam_angles, beam_ranges, resolution)
     out = np.zeros(poses[0].size)
     if ends_x.size:
         _score(

@@ -19,18 +19,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numba import float64, int64, njit, types
 
+from fog_contracts.costs import COST_WEIGHT, INSCRIBED, NEUTRAL_WEIGHT, PENALTY_MAX
 from fog_kernels import _arrays
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-INSCRIBED = 253
 STRAIGHT = 408
 DIAGONAL = 577
 BUCKETS = 1024  # heads fit the first-level cache; a power of two
-
-DEFAULT_NEUTRAL = 50
-DEFAULT_FACTOR = 0.8
 
 _FOUND = 0
 _NOT_FOUND = 1
@@ -397,14 +394,6 @@ def _fill_field(
     return _FOUND if unset != 0 else _NOT_FOUND
 
 
-@njit(types.boolean(_arrays.U8_FLAT, _arrays.U8_FLAT), cache=True, nogil=True)
-def _none_lower(costmap: Any, reference: Any) -> bool:
-    lower = 0
-    for i in range(costmap.size):
-        lower |= costmap[i] < reference[i]
-    return lower == 0
-
-
 @njit(int64(_arrays.U8_FLAT, int64, int64, int64, int64, _arrays.U8_GRID_OUT, type_scratch), cache=True, nogil=True)
 def _nearest_reachable(costmap: Any, width: int, start: int, goal_x: int, goal_y: int, seen: Any, stack: Any) -> Any:
     # A diagonal needs both orthogonal cells, so 4-connectivity decides what can be reached.
@@ -608,17 +597,17 @@ def _weights(neutral: int, factor: float) -> NDArray[np.int32]:
     weight = np.zeros(256, np.int32)
     graded = neutral + factor * np.arange(INSCRIBED)
     if graded[-1] > 100_000:
-        raise ValueError("neutral + factor * 252 must not exceed 100000")
+        raise ValueError(f"neutral + factor * {PENALTY_MAX} must not exceed 100000")
     weight[:INSCRIBED] = np.rint(graded)
     weight.setflags(write=False)
     return weight
 
 
-_DEFAULT_WEIGHTS = _weights(DEFAULT_NEUTRAL, DEFAULT_FACTOR)
+_DEFAULT_WEIGHTS = _weights(NEUTRAL_WEIGHT, COST_WEIGHT)
 
 
 def _weights_of(neutral: int, factor: float) -> NDArray[np.int32]:
-    if neutral == DEFAULT_NEUTRAL and factor == DEFAULT_FACTOR:
+    if neutral == NEUTRAL_WEIGHT and factor == COST_WEIGHT:
         return _DEFAULT_WEIGHTS
     return _weights(neutral, factor)
 
@@ -647,10 +636,9 @@ class PlanResult:
 
 
 class _Guide(NamedTuple):
-    """A goal, the static costmap and the exact cost from every cell to the goal."""
+    """A goal and the exact cost from every cell to it."""
 
     goal: tuple[int, int]
-    static: NDArray[np.uint8]
     field: NDArray[np.int32 | np.int64]
 
 
@@ -669,7 +657,7 @@ class Planner:
     a robot pay for the corridor's middle with a detour of at most about five times the length in the dearest cells.
     """
 
-    def __init__(self, width: int, height: int, neutral: int = DEFAULT_NEUTRAL, factor: float = DEFAULT_FACTOR) -> None:
+    def __init__(self, width: int, height: int, neutral: int = NEUTRAL_WEIGHT, factor: float = COST_WEIGHT) -> None:
         if width < 1 or height < 1 or width * height > 2**31 - 2:
             raise ValueError(f"width and height must be positive and below 2^31 cells in all, not {width} x {height}")
         self.width = width
@@ -780,13 +768,14 @@ class Planner:
         self._allocate()
         guide = self._guide
         if guide is not None:
-            self._guide = _Guide(guide.goal, guide.static, _as_wide(guide.field))
+            self._guide = _Guide(guide.goal, _as_wide(guide.field))
 
     def set_goal_field(self, static_costmap: NDArray[np.uint8], goal: tuple[int, int]) -> None:
         """Compute the exact cost to the goal from every cell, to guide `plan` for this goal from now on.
 
-        Guided plans are exact as long as costs are only raised above the static costmap (see `raises_only`). Takes
-        about a full Dijkstra search; safe to run in a thread beside `plan`. Raises ValueError as `plan` does.
+        Guided plans are exact as long as costs are only raised above the static costmap. Takes about a full Dijkstra
+        search; safe to run in a thread beside `plan`, and the static costmap may change meanwhile: it is copied first.
+        Raises ValueError as `plan` does.
         """
         static = self._grid(static_costmap).copy()
         target = self._index(goal, "goal")
@@ -811,21 +800,7 @@ class Planner:
                 capacity *= 2
             else:
                 break
-        self._guide = _Guide((int(goal[0]), int(goal[1])), static, field)
-
-    def clear_goal_field(self) -> None:
-        """Forget the goal field: plans use the octile heuristic again."""
-        self._guide = None
-
-    def raises_only(self, costmap: NDArray[np.uint8]) -> bool:
-        """Tell whether no cell is lower than in the static costmap of the goal field, so that guided plans are exact.
-
-        Raises RuntimeError when no goal field is set.
-        """
-        guide = self._guide
-        if guide is None:
-            raise RuntimeError("no goal field is set: call set_goal_field first")
-        return bool(_none_lower(self._grid(costmap).ravel(), guide.static.ravel()))
+        self._guide = _Guide((int(goal[0]), int(goal[1])), field)
 
     def nearest_reachable(
         self, costmap: NDArray[np.uint8], start: tuple[int, int], goal: tuple[int, int]
@@ -843,10 +818,6 @@ class Planner:
             _nearest_reachable(costmap.ravel(), self.width, first, int(goal[0]), int(goal[1]), seen, self._touched)
         )
         return nearest % self.width, nearest // self.width
-
-    def path_cost(self, costmap: NDArray[np.uint8], cells: NDArray[np.int32]) -> float:
-        """Return `path_cost` with this planner's weights."""
-        return path_cost(costmap, cells, self.neutral, self.factor)
 
     def shortcut(self, costmap: NDArray[np.uint8], cells: NDArray[np.int32]) -> NDArray[np.float64]:
         """Return `shortcut` with this planner's weights."""
@@ -872,8 +843,8 @@ def line_cost(
     y0: float,
     x1: float,
     y1: float,
-    neutral: int = DEFAULT_NEUTRAL,
-    factor: float = DEFAULT_FACTOR,
+    neutral: int = NEUTRAL_WEIGHT,
+    factor: float = COST_WEIGHT,
 ) -> float:
     """Return the integral of the weight along a straight line, in cells times weight.
 
@@ -886,26 +857,11 @@ def line_cost(
     return float(_line_cost(costmap, weight, float(x0), float(y0), float(x1), float(y1), math.inf))
 
 
-def path_cost(
-    costmap: NDArray[np.uint8],
-    cells: NDArray[np.int32],
-    neutral: int = DEFAULT_NEUTRAL,
-    factor: float = DEFAULT_FACTOR,
-) -> float:
-    """Return what `Planner.plan` would call the cost of these cells, int32 (n, 2) as (column, row).
-
-    Infinite when a step isn't one that the planner may take. Raises TypeError or ValueError for wrong types or shapes.
-    """
-    costmap = _arrays.grid(costmap, "costmap")
-    cells = _cells_array(cells)
-    return float(_cells_cost(costmap, _weights_of(neutral, factor), cells, np.empty(len(cells))))
-
-
 def shortcut(
     costmap: NDArray[np.uint8],
     cells: NDArray[np.int32],
-    neutral: int = DEFAULT_NEUTRAL,
-    factor: float = DEFAULT_FACTOR,
+    neutral: int = NEUTRAL_WEIGHT,
+    factor: float = COST_WEIGHT,
     slack: float = 0.01,
 ) -> NDArray[np.float64]:
     """Straighten a path along lines of sight that cost at most `1 + slack` times the part that they replace.

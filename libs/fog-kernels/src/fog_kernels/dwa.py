@@ -15,12 +15,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numba import float64, int64, njit
 
+from fog_contracts.costs import INSCRIBED, PENALTY_MAX
 from fog_kernels import _arrays
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
-
-INSCRIBED = 253
 
 _MAX_STEPS = 200
 _SEGMENTS = 64
@@ -389,7 +388,7 @@ def _choose(
                     w_path * 0.5 * (math.sqrt(off_end) + math.sqrt(off_half))
                     + w_goal * (remaining - at)
                     + w_heading * turn
-                    + w_cost * dearest / 252.0
+                    + w_cost * dearest / PENALTY_MAX
                     + w_turn * abs(w - w_now)
                 )
             admissible += 1

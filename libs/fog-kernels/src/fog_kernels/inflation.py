@@ -13,13 +13,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numba import int64, njit, void
 
+from fog_contracts.costs import INSCRIBED, LETHAL, PENALTY_MAX
 from fog_kernels import _arrays
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-INSCRIBED = 253
-LETHAL = 254
+    from fog_contracts.costs import Inflation
+
 MAX_REACH = 180  # the sum of two squares of up to reach + 1 must fit uint16
 
 
@@ -31,18 +32,13 @@ class InflationTable:
     reach: int
 
 
-def inflation_table(
-    resolution: float, inscribed_radius: float, inflation_radius: float, cost_scaling: float
-) -> InflationTable:
-    """Tabulate the inflated cost by squared distance in cells.
+def inflation_table(resolution: float, inflation: Inflation) -> InflationTable:
+    """Tabulate the inflated cost by squared distance in cells on a grid of this resolution (m per cell).
 
-    Radii and resolution are in metres, `cost_scaling` in 1/m (Nav2's cost_scaling_factor).
-    Raises ValueError if a value is negative, the resolution is 0, or the radius spans more than 180 cells.
+    Raises ValueError if the resolution is not above 0, or the inflation radius spans more than 180 cells.
     """
     resolution = _arrays.positive(resolution, "resolution")
-    if min(inscribed_radius, inflation_radius, cost_scaling) < 0.0:
-        raise ValueError("inscribed_radius, inflation_radius and cost_scaling must not be negative")
-    reach = math.floor(inflation_radius / resolution + 1e-9)
+    reach = math.floor(inflation.inflation_radius / resolution + 1e-9)
     if reach > MAX_REACH:
         raise ValueError(f"inflation_radius spans {reach} cells, at most {MAX_REACH} are supported")
     cost = np.zeros(reach * reach + 1, np.uint8)
@@ -50,10 +46,12 @@ def inflation_table(
         distance = math.sqrt(square) * resolution
         if square == 0:
             cost[square] = LETHAL
-        elif distance <= inscribed_radius + 1e-9:
+        elif distance <= inflation.inscribed_radius + 1e-9:
             cost[square] = INSCRIBED
         else:
-            cost[square] = int(252.0 * math.exp(-cost_scaling * (distance - inscribed_radius)))
+            cost[square] = int(
+                PENALTY_MAX * math.exp(-inflation.cost_scaling * (distance - inflation.inscribed_radius))
+            )
     cost.setflags(write=False)
     return InflationTable(cost=cost, reach=reach)
 

@@ -8,6 +8,7 @@ from typing import Any, Final, Literal, TypeVar
 
 import msgspec
 
+from fog_contracts.costs import DEFAULT_INFLATION, Inflation
 from fog_runtime.logs import Level
 
 S = TypeVar("S", bound=msgspec.Struct)
@@ -70,6 +71,26 @@ class CommonSettings(msgspec.Struct, frozen=True, kw_only=True):
     def zenoh_endpoints(self) -> list[str]:
         """The endpoints in `zenoh_connect`."""
         return [part.strip() for part in self.zenoh_connect.split(",") if part.strip()]
+
+
+class InflationSettings(CommonSettings, frozen=True, kw_only=True):
+    """What a process understands that inflates costmaps: radii in m, `cost_scaling` in 1/m."""
+
+    inscribed_radius: float = DEFAULT_INFLATION.inscribed_radius
+    inflation_radius: float = DEFAULT_INFLATION.inflation_radius
+    cost_scaling: float = DEFAULT_INFLATION.cost_scaling
+
+    def __post_init__(self) -> None:
+        _ = self.inflation  # refuses what can't be while the settings are read, not when the map arrives
+
+    @property
+    def inflation(self) -> Inflation:
+        """The three as one value."""
+        return Inflation(
+            inscribed_radius=self.inscribed_radius,
+            inflation_radius=self.inflation_radius,
+            cost_scaling=self.cost_scaling,
+        )
 
 
 def _hook(kind: type, value: Any) -> Any:

@@ -109,7 +109,7 @@ def decide(job: Job) -> Decision:
     """Choose the speeds for the next period; pure, some milliseconds of work, releases the GIL inside its kernels."""
     c = job.config
     resolution = job.window.resolution
-    table = inflation_table(resolution, c.inscribed_radius, c.inflation_radius, c.cost_scaling)
+    table = inflation_table(resolution, c.inflation)
     costs = local_costs(job.cost, job.window, job.seen, table)
     limits = DwaLimits(
         v_max=max(0.0, min(job.cap, c.speed)),
@@ -320,7 +320,7 @@ def make_job(
     path, ends_here = follower.rest(_AHEAD_M)
     limit = _speed_limit(speed_limits, geometry, pose, config)
     part = geometry.part(window)
-    near = np.abs(seen - (pose.x, pose.y)).max(axis=1, initial=0.0) <= half + config.inflation_radius
+    near = np.abs(seen - (pose.x, pose.y)).max(axis=1, initial=0.0) <= half + config.inflation.inflation_radius
     return Job(
         plan_id=plan_id,
         planner_epoch=planner_epoch,
@@ -341,7 +341,7 @@ def make_job(
 
 def _speed_limit(speed_limits: NDArray[np.uint8], geometry: GridGeometry, pose: Pose2, config: MotionConfig) -> float:
     """Return the lowest limit (m/s) of the speed layer's cells under the robot; infinite without one."""
-    r = config.inscribed_radius
+    r = config.inflation.inscribed_radius
     under = geometry.window_around(pose.x - r, pose.y - r, pose.x + r, pose.y + r)
     cells = speed_limits[under.rows, under.columns]
     cells = cells[cells != NO_SPEED_LIMIT]

@@ -36,9 +36,7 @@ async def main() -> None:
             site,
             loaded.map,
             await store.begin_epoch(),
-            settings.inscribed_radius,
-            settings.inflation_radius,
-            settings.cost_scaling,
+            settings.inflation,
             definitions=loaded.site.definitions(),
         )
         mqtt = MqttEdge(settings.mqtt_url, "map-service", clock)

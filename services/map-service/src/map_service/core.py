@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from msgspec import structs
 
+from fog_contracts.costs import DEFAULT_INFLATION
 from fog_contracts.messages import HazardArea, MapDelta, MapHeartbeat, MapSnapshot, Trace, Zone, ZoneSet
 from fog_contracts.replica import MasterMap
 from map_service import layers
@@ -16,6 +17,7 @@ from map_service.layers.protocol import overlap
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from fog_contracts.costs import Inflation
     from fog_contracts.grid import GridGeometry, Window
     from fog_contracts.messages import AreaDefinition, AreaHazard, Cause, Layer, RobotObstacles, RobotPose
     from fog_contracts.replica import Version
@@ -46,7 +48,7 @@ class MapChange:
 class MapCore:
     """Holds the layers and the versioned map; every input returns what changed.
 
-    Radii in m, `cost_scaling` in 1/m. `definitions` are areas known from the site: until the aggregator speaks of
+    `definitions` are areas known from the site: until the aggregator speaks of
     them they count as unknown.
     """
 
@@ -55,9 +57,7 @@ class MapCore:
         site: str,
         static: StaticMap,
         epoch: int,
-        inscribed_radius: float = 0.17,
-        inflation_radius: float = 0.55,
-        cost_scaling: float = 3.0,
+        inflation: Inflation = DEFAULT_INFLATION,
         *,
         definitions: Iterable[AreaDefinition] = (),
     ) -> None:
@@ -67,9 +67,7 @@ class MapCore:
             self._layers.hazards.define(definition)
         self._touches()
         self._raw, speed = self._painted()
-        self._inflation = layers.InflationLayer(
-            self._raw, static.geometry.resolution, inscribed_radius, inflation_radius, cost_scaling
-        )
+        self._inflation = layers.InflationLayer(self._raw, static.geometry.resolution, inflation)
         self._master = MasterMap(site, static.geometry, static.cells, self._inflation.cost, epoch)
         self._master.write([("speed", self._whole, speed)], [], [])
 

@@ -1,12 +1,9 @@
 """What the map-service can be told (environment FOGNAV_*), beside what all processes can."""
 
-from fog_runtime.settings import CommonSettings
+from fog_runtime.settings import InflationSettings
 
 
-class Settings(CommonSettings, frozen=True, kw_only=True):
-    """Radii in m, `cost_scaling` in 1/m; `hazards_wait_s`: how long a start waits for the aggregator's word."""
+class Settings(InflationSettings, frozen=True, kw_only=True):
+    """`hazards_wait_s`: how long a start waits for the aggregator's word."""
 
-    inscribed_radius: float = 0.17
-    inflation_radius: float = 0.55
-    cost_scaling: float = 3.0
     hazards_wait_s: float = 3.0

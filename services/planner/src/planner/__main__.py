@@ -31,9 +31,7 @@ async def main() -> None:
     clock = SystemClock(settings.speed)
     health = Health("store", "goals", "map", "zenoh")
     config = PlannerConfig(
-        inscribed_radius=settings.inscribed_radius,
-        inflation_radius=settings.inflation_radius,
-        cost_scaling=settings.cost_scaling,
+        inflation=settings.inflation,
         release=settings.release_m,
     )
     async with (

@@ -15,7 +15,7 @@ import numpy as np
 from msgspec import structs
 from numpy.typing import NDArray
 
-from fog_contracts.costs import INSCRIBED, LETHAL, UNKNOWN
+from fog_contracts.costs import DEFAULT_INFLATION, INSCRIBED, LETHAL, UNKNOWN, Inflation
 from fog_contracts.grid import GridGeometry, Window
 from fog_contracts.messages import (
     PLAN_CODES,
@@ -53,11 +53,9 @@ _KEPT_DELTAS: Final = 256
 
 @dataclass(frozen=True)
 class PlannerConfig:
-    """Lengths in m, times in s. Radii and scaling are the map-service's; they only make the search faster."""
+    """Lengths in m, times in s. The inflation is the map-service's; it only makes the search faster."""
 
-    inscribed_radius: float = 0.17
-    inflation_radius: float = 0.55
-    cost_scaling: float = 3.0
+    inflation: Inflation = DEFAULT_INFLATION
     corridor: float = 0.72
     """Half the width that counts as touched: the robot's radius and the inflation band."""
     saving: float = 0.10
@@ -202,10 +200,7 @@ class PlannerCore:
 
     def _set_floor(self, snapshot: MapSnapshot) -> None:
         """Take what costs can never fall below: the inflated static map (or less, should the master be lower)."""
-        config = self.config
-        table = inflation_table(
-            snapshot.geometry.resolution, config.inscribed_radius, config.inflation_radius, config.cost_scaling
-        )
+        table = inflation_table(snapshot.geometry.resolution, self.config.inflation)
         floor = np.minimum(inflate(np.ascontiguousarray(self._replica.static), table), self._replica.cost)
         if not np.array_equal(floor, self._floor):
             self._lower_floor(floor)
@@ -392,7 +387,7 @@ class PlannerCore:
         geometry = self._replica.geometry
         assert geometry is not None
         if self._regions is None:
-            reach = self.config.inflation_radius + 2 * geometry.resolution
+            reach = self.config.inflation.inflation_radius + 2 * geometry.resolution
             hazards = (hazard_region(told, geometry, reach) for _, told in sorted(self._hazards.items()))
             zones = (zone_region(zone, geometry, reach) for zone in (self._zones.zones if self._zones else []))
             self._regions = [region for region in (*hazards, *zones) if region is not None]

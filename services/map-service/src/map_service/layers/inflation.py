@@ -10,16 +10,15 @@ from fog_kernels.inflation import inflate, inflate_window, inflation_table
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from fog_contracts.costs import Inflation
     from map_service.layers.protocol import Grid
 
 
 class InflationLayer:
-    """Keeps the inflated map; radii in m, `cost_scaling` in 1/m (Nav2's `cost_scaling_factor`)."""
+    """Keeps the inflated map of a grid of this resolution (m per cell)."""
 
-    def __init__(
-        self, raw: Grid, resolution: float, inscribed_radius: float, inflation_radius: float, cost_scaling: float
-    ) -> None:
-        self._table = inflation_table(resolution, inscribed_radius, inflation_radius, cost_scaling)
+    def __init__(self, raw: Grid, resolution: float, inflation: Inflation) -> None:
+        self._table = inflation_table(resolution, inflation)
         self.cost = inflate(raw, self._table)
 
     def update(self, raw: Grid, windows: Iterable[Window]) -> list[Window]:

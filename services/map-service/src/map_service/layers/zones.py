@@ -1,8 +1,7 @@
 """Operators' zones: no-go, penalty and speed limit, each while it is enabled and its time has come.
 
-A PENALTY of factor f makes a free cell as expensive as f cells of free floor: the planner weighs a cell with
-50 + 0.8 * cost (NavFn's constants), so that cost = 62.5 * (f - 1), at most 252. Where something costs more already, the
-higher cost stays.
+A PENALTY of factor f makes a free cell as expensive as f cells of free floor, as far as costs go (252 makes it five).
+Where something costs more already, the higher cost stays.
 """
 
 from __future__ import annotations
@@ -10,20 +9,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from fog_contracts.costs import LETHAL, PENALTY_MAX
+from fog_contracts.costs import COST_PER_FACTOR, LETHAL, PENALTY_MAX
 from fog_contracts.messages import Cause
 from map_service.layers.protocol import Touch, paint_figure
 from map_service.shapes import rasterize_shape
 
 if TYPE_CHECKING:
-    from typing import Final
-
     from fog_contracts.grid import GridGeometry, Window
     from fog_contracts.messages import Zone
     from map_service.layers.protocol import Grid
     from map_service.shapes import Figure
-
-COST_PER_FACTOR: Final = 62.5
 
 
 def penalty_cost(factor: float) -> int:

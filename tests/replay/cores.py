@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from fog_contracts import channels as ch
+from fog_contracts.handlers import Moment
 from fog_contracts.messages import (
     AreaDefinition,
     AreaHazard,
@@ -21,7 +22,6 @@ from fog_contracts.messages import (
     MapHeartbeat,
     MapSnapshot,
     Message,
-    NodeReading,
     PlanRequest,
     Pose,
     RobotGoal,
@@ -35,7 +35,6 @@ from fog_contracts.replica import Applied, Replica
 from fog_runtime.record import read
 from fog_runtime.site import LoadedSite, load_site
 from hazard_aggregator.core import Aggregator
-from hazard_aggregator.outbox import Outbox
 from map_service.core import MapChange, MapCore
 from planner.core import PlannerCore
 
@@ -81,23 +80,20 @@ def aggregate(heard: list[Heard], site: LoadedSite) -> list[AreaHazard]:
     """Return the hazards that an aggregator announces, with a store that answers at once."""
     begin, hazard = first(heard, ch.AREA_HAZARD)
     assert isinstance(hazard, AreaHazard)
-    core, outbox = Aggregator(site.site.definitions(), site.site.nodes, hazard.epoch), Outbox()
+    core = Aggregator(site.site.definitions(), site.site.nodes, hazard.epoch)
+    handlers = core.handlers()
     announced: list[AreaHazard] = []
     for at, event in beating(heard, begin):
+        moment = Moment(at, at)
         if event is None:
-            changed = core.tick(at, at)
+            publications = core.tick(moment)
         else:
             _, channel, ids, message = event
-            if isinstance(message, NodeReading):
-                changed = core.on_reading(ids["node"], message, at, at)
-            elif channel is ch.NODE_AVAILABILITY:
-                changed = core.on_availability(ids["node"], message == "online", at, at)
-            elif isinstance(message, RobotPose):
-                changed = core.on_pose(ids["robot"], message, at)
-            else:
+            if channel not in handlers:
                 continue
-        announced += outbox.offer(changed)
-        announced += outbox.stored(outbox.unstored())
+            publications = [*handlers[channel](ids, message, moment)]
+        published = (*publications, *core.stored(core.to_store()))
+        announced += [p.message for p in published if isinstance(p.message, AreaHazard)]
     return announced
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final, TypeVar
 from fog_contracts import channels as ch
 from fog_contracts.codec import decode, encode
 from fog_contracts.commands import sign
+from fog_contracts.handlers import Moment
 from fog_contracts.messages import (
     AreaDefinition,
     AreaHazard,
@@ -19,7 +20,6 @@ from fog_contracts.messages import (
     MapDelta,
     MapHeartbeat,
     Message,
-    NodeReading,
     RobotCommand,
     RobotGoal,
     RobotObstacles,
@@ -40,7 +40,10 @@ from robot_agent.guardian import link
 from robot_agent.guardian.core import GuardianCore
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from fog_contracts.channels import Channel
+    from fog_contracts.handlers import Publication
     from fog_contracts.messages import CommandKind, MapSnapshot
     from fog_contracts.site import RobotSite
     from fog_runtime.site import LoadedSite
@@ -199,11 +202,9 @@ class FogRig:
         stamp = STAMP + now
         for node in self.nodes:
             for reading in node.poll(self.world, now):
-                told = carry(ch.NODE_READING, reading)
-                assert isinstance(told, NodeReading)
-                self._hazards(self.aggregator.on_reading(node.node.id, told, now, stamp), now)
+                self._aggregate(ch.NODE_READING, {"node": node.node.id}, reading, now)
         if self._steps % _BEAT_STEPS == 0:
-            self._hazards(self.aggregator.tick(now, stamp), now)
+            self._hazards(self.aggregator.tick(Moment(now, stamp)), now)
             self._change(self.map.tick(now, stamp))
             self._heartbeats.append(carry(ch.MAP_HEARTBEAT, self.map.heartbeat(stamp)))
 
@@ -230,7 +231,7 @@ class FogRig:
         """Take what a robot publishes."""
         pose, state, obstacles = told
         if pose is not None:
-            self._hazards(self.aggregator.on_pose(robot, pose, now), now)
+            self._aggregate(ch.ROBOT_POSE, {"robot": robot}, pose, now)
             self.map.on_pose(robot, pose, now)
             self.planner.on_pose(robot, pose, now)
         if state is not None:
@@ -265,11 +266,15 @@ class FogRig:
                 published.append(goal)
         return published
 
-    def _hazards(self, changed: list[AreaHazard], now: float) -> None:
-        for hazard in changed:
-            taken = carry(ch.AREA_HAZARD, hazard)
-            assert isinstance(taken, AreaHazard)
-            self._change(self.map.on_hazard(taken, STAMP + now))
+    def _aggregate(self, channel: Channel, ids: dict[str, str], message: Message, now: float) -> None:
+        handler = self.aggregator.handlers()[channel]
+        self._hazards(handler(ids, carry(channel, message), Moment(now, STAMP + now)), now)
+
+    def _hazards(self, publications: Iterable[Publication], now: float) -> None:
+        """Take what the aggregator publishes, with a store that answers at once."""
+        for publication in (*publications, *self.aggregator.stored(self.aggregator.to_store())):
+            if isinstance(hazard := publication.message, AreaHazard):
+                self._change(self.map.on_hazard(carry(ch.AREA_HAZARD, hazard), STAMP + now))
 
     def _change(self, change: MapChange) -> None:
         self._deltas += [carry(ch.MAP_DELTA, delta) for delta in change.deltas]

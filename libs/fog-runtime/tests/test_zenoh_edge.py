@@ -12,6 +12,7 @@ from prometheus_client import REGISTRY
 from fog_contracts import channels as ch
 from fog_contracts import messages as m
 from fog_contracts.codec import ContractError
+from fog_contracts.handlers import RefusedMessageError
 from fog_runtime.clock import SystemClock
 from fog_runtime.servers import free_port, start_router
 from fog_runtime.zenoh_edge import ZenohEdge, session_config
@@ -281,6 +282,25 @@ async def test_broken_and_oversized_requests_are_refused_in_words(router):
 
         assert "start" in (await asyncio.to_thread(ask, b"\x80"))[0]
         assert "over the limit" in (await asyncio.to_thread(ask, b"x" * 2000))[0]
+
+
+async def test_a_message_that_its_handler_refuses_is_counted_as_refused(router):
+    def handler(ids, message):
+        raise RefusedMessageError("it can't be used")
+
+    before = counted("fognav_refused_messages_total", ch.ROBOT_POSE)
+    failed = counted("fognav_handler_errors_total", ch.ROBOT_POSE)
+    async with edge(router.endpoint, "a") as a, edge(router.endpoint, "b") as b:
+        b.subscribe(ch.ROBOT_POSE, m.RobotPose, handler)
+        await publish_until(
+            a,
+            ch.ROBOT_POSE,
+            lambda _: pose(1.0),
+            lambda: counted("fognav_refused_messages_total", ch.ROBOT_POSE) > before,
+            "not counted",
+            robot="r1",
+        )
+    assert counted("fognav_handler_errors_total", ch.ROBOT_POSE) == failed
 
 
 async def test_handler_that_fails_does_not_silence_the_channel(router):

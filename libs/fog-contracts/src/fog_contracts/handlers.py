@@ -36,6 +36,13 @@ class Publication:
     ids: Ids = field(default_factory=dict)
 
 
+class RefusedMessageError(ValueError):
+    """A handler can't use a message although its type is right; the text says why.
+
+    The edge that delivered the message counts and reports it as it does with messages that break their contract.
+    """
+
+
 Handler = Callable[[Ids, Any, Moment], Sequence[Publication]]
 """Takes one message of a channel; its second argument is the channel's message type (text for a text channel)."""
 

@@ -18,6 +18,7 @@ from paho.mqtt.subscribeoptions import SubscribeOptions
 
 from fog_contracts.channels import Channel
 from fog_contracts.codec import ContractError, decode, decode_text, encode
+from fog_contracts.handlers import RefusedMessageError
 from fog_contracts.messages import Message
 from fog_runtime import logs, metrics
 from fog_runtime.clock import Clock
@@ -190,6 +191,17 @@ class MqttEdge:
         """
         return await self._send(channel, channel.key(**ids), _encoded(channel, message), wait=wait)
 
+    def publish_nowait(self, channel: Channel, message: Message | str, **ids: str) -> None:
+        """Publish in the order of the calls, without waiting; a message that has no connection is dropped and counted.
+
+        Raises `ContractError` when the message breaks the channel's contract.
+        """
+        topic, data, client = channel.key(**ids), _encoded(channel, message), self._client
+        if client is None:
+            metrics.DROPPED.labels(channel.name).inc()
+        else:
+            self._spawn(self._give(client, channel, topic, data), topic)
+
     async def clear(self, channel: Channel, *, wait: bool = False, **ids: str) -> bool:
         """Take a retained message away (MQTT: an empty retained payload)."""
         return await self._send(channel, channel.key(**ids), b"", wait=wait)
@@ -315,6 +327,8 @@ class MqttEdge:
             metrics.RECEIVED.labels(channel.name).inc()
             try:
                 registration.handler(ids, content)
+            except RefusedMessageError as error:
+                self._refuse(channel, topic, str(error))
             except Exception as error:  # noqa: BLE001  # one message must not end the process; the event tells of the bug
                 metrics.HANDLER_ERRORS.labels(channel.name).inc()
                 _log.error("handler_failed", error=error, channel=channel.name, topic=topic)

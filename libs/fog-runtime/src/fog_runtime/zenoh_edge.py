@@ -22,6 +22,7 @@ from zenoh import ext
 
 from fog_contracts.channels import LIVE, Channel
 from fog_contracts.codec import ContractError, decode, encode
+from fog_contracts.handlers import RefusedMessageError
 from fog_contracts.messages import Message
 from fog_runtime import logs, metrics
 from fog_runtime.clock import Clock
@@ -187,6 +188,8 @@ class _Inbox(Generic[M]):
         metrics.RECEIVED.labels(self._channel.name).inc()
         try:
             self._handler(ids, message)
+        except RefusedMessageError as error:
+            self._edge.refuse(self._channel, key, str(error))
         except Exception as error:  # noqa: BLE001  # one message must not end the process; the event tells of the bug
             metrics.HANDLER_ERRORS.labels(self._channel.name).inc()
             _log.error("handler_failed", error=error, channel=self._channel.name, key=key)

@@ -24,7 +24,7 @@ _log = logs.get("aggregator")
 
 
 async def main() -> None:
-    """Connect, recall what was stored, then judge readings until cancelled."""
+    """Connect, recall what was stored, then turn readings into hazards until cancelled."""
     settings = load(Settings, environ=os.environ)
     logs.configure("hazard-aggregator", settings.log_level, settings.log_format)
     _log.info("settings", **describe(settings))
@@ -37,20 +37,19 @@ async def main() -> None:
         definitions = {d.id: d for d in [*loaded.site.definitions(), *stored.definitions]}
         rule = debounce.find(settings.debounce)
         core = Aggregator(definitions.values(), loaded.site.nodes, stored.epoch, stored.hazards, rule=rule)
-        service = Service(core, loaded.site, store, clock, health)
-        if was_read:
-            service.store_was_read()
         mqtt = MqttEdge(settings.mqtt_url, "hazard-aggregator", clock)
         async with ZenohEdge.open(
             connect=settings.zenoh_endpoints, clock=clock, role="hazard-aggregator", id=site, site=site
         ) as zenoh:
-            service.listen(mqtt, zenoh)
+            service = Service(core, store, mqtt, zenoh, clock, health)
+            if was_read:
+                service.store_was_read()
+            service.subscribe()
             zenoh.alive("hazard-aggregator", site)
             app = make_api(service, loaded.map.geometry, clock, health, load_tokens(settings.tokens_file))
             async with asyncio.TaskGroup() as tasks:
                 tasks.create_task(mqtt.run(), name="mqtt")
                 tasks.create_task(service.tick_loop(), name="tick")
-                tasks.create_task(service.send_loop(), name="send")
                 tasks.create_task(service.write_loop(), name="write")
                 tasks.create_task(service.store_loop(), name="store")
                 tasks.create_task(serve(app, settings.http_host, settings.http_port, settings.port_file), name="http")

@@ -64,8 +64,7 @@ def make_api(service: Service, geometry: GridGeometry, clock: Clock, health: Hea
     app = make_app("Fognav hazard-aggregator", "1", health, tokens)
 
     def views() -> dict[str, AreaView]:
-        announced = {hazard.area: hazard for hazard in service.outbox.announced()}
-        withheld = service.outbox.withheld()
+        announced, withheld = service.core.announced(), service.core.withheld()
         return {
             d.id: AreaView(definition=d, hazard=announced.get(d.id), withheld=d.id in withheld)
             for d in service.core.definitions()
@@ -150,7 +149,7 @@ def _checked(area_id: str, body: AreaBody, version: int, service: Service, geome
             reach = f"the map reaches from ({left:.2f}, {bottom:.2f}) to ({right:.2f}, {top:.2f}) m"
             raise ProblemError(422, f"({x:.2f}, {y:.2f}) is off the map: {reach}", field=f"body.polygon.{index}")
     for index, node in enumerate(body.nodes):
-        if node not in service.nodes:
+        if node not in service.core.nodes:
             detail = f"the site has no node {node}: add it to site.toml first, with its place and its limits"
             raise ProblemError(422, detail, field=f"body.nodes.{index}")
     try:

@@ -1,6 +1,6 @@
 """What one reading of a node says about its area: the sonars against their calibration, the robots that explain them.
 
-Pure: the poses of robots come as arguments, already judged fresh by the caller.
+Pure: the poses of robots come as arguments, already found fresh by the caller.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ LIMIT_TOLERANCE: Final = 0.01
 """A range this near (m) to the limit may be called either way: node and fog round differently."""
 
 
-class Verdict(NamedTuple):
+class Classification(NamedTuple):
     """What a reading says, in words too; `explained_by` names the robot that is all the reading sees."""
 
     state: AreaState
@@ -36,10 +36,10 @@ class Verdict(NamedTuple):
     explained_by: str | None = None
 
 
-def judge_sonar(sonar: Sonar, status: str, measured: float | None, shift: float = 0.0) -> tuple[AreaState, str]:
+def classify_sonar(sonar: Sonar, status: str, measured: float | None, shift: float = 0.0) -> tuple[AreaState, str]:
     """Return what one sonar says: an echo nearer than its limit is `blocked`; what can't be right is `unknown`.
 
-    `shift` (m) moves the limit, to judge readings that are as near to it as rounding.
+    `shift` (m) moves the limit, to classify readings that are as near to it as rounding.
     """
     if status == "stuck":
         return "unknown", "the echo line is stuck"
@@ -96,7 +96,7 @@ def explaining_robot(
     return None
 
 
-def judge_reading(site: NodeSite, reading: NodeReading, poses: Iterable[tuple[str, RobotPose]]) -> Verdict:
+def classify_reading(site: NodeSite, reading: NodeReading, poses: Iterable[tuple[str, RobotPose]]) -> Classification:
     """Return what a reading says about the area.
 
     The sonars are fused as the node does it: blocked if one says so, clear if all do, unknown otherwise. A node whose
@@ -104,41 +104,41 @@ def judge_reading(site: NodeSite, reading: NodeReading, poses: Iterable[tuple[st
     neither way, as long as no other echo blocks.
     """
     if len(reading.range_m) != len(site.sonars):
-        return Verdict("unknown", f"it reports {len(reading.range_m)} sonars, the site has {len(site.sonars)}")
-    judged, fused = _fuse(site, reading, 0.0)
+        return Classification("unknown", f"it reports {len(reading.range_m)} sonars, the site has {len(site.sonars)}")
+    classified, fused = _fuse(site, reading, 0.0)
     if fused != reading.state:
         for shift in (LIMIT_TOLERANCE, -LIMIT_TOLERANCE):
             other, other_fused = _fuse(site, reading, shift)
             if other_fused == reading.state:
-                judged, fused = other, other_fused
+                classified, fused = other, other_fused
                 break
         else:
-            return _contradiction(reading, judged, fused)
+            return _contradiction(reading, classified, fused)
     if fused == "blocked":
-        blocking = [i for i, (state, _) in enumerate(judged) if state == "blocked"]
+        blocking = [i for i, (state, _) in enumerate(classified) if state == "blocked"]
         fresh = list(poses)
         robots = [explaining_robot(site, site.sonars[i], reading.range_m[i] or 0.0, fresh) for i in blocking]
         for index, robot in zip(blocking, robots, strict=True):
             if robot is None:
-                return Verdict("blocked", f"sonar {index}: {judged[index][1]}")
-        return Verdict("blocked", f"sonar {blocking[0]} sees the robot {robots[0]}", explained_by=robots[0])
-    index = next(i for i, (state, _) in enumerate(judged) if state == fused)
-    return Verdict(fused, f"sonar {index}: {judged[index][1]}")
+                return Classification("blocked", f"sonar {index}: {classified[index][1]}")
+        return Classification("blocked", f"sonar {blocking[0]} sees the robot {robots[0]}", explained_by=robots[0])
+    index = next(i for i, (state, _) in enumerate(classified) if state == fused)
+    return Classification(fused, f"sonar {index}: {classified[index][1]}")
 
 
 def _fuse(site: NodeSite, reading: NodeReading, shift: float) -> tuple[list[tuple[AreaState, str]], AreaState]:
-    """Judge every sonar with its limit shifted (m), and fuse them."""
-    judged = [
-        judge_sonar(sonar, status, measured, shift)
+    """Classify every sonar with its limit shifted (m), and fuse them."""
+    classified = [
+        classify_sonar(sonar, status, measured, shift)
         for sonar, status, measured in zip(site.sonars, reading.status, reading.range_m, strict=True)
     ]
-    states = {state for state, _ in judged}
-    return judged, "blocked" if "blocked" in states else "unknown" if "unknown" in states else "clear"
+    states = {state for state, _ in classified}
+    return classified, "blocked" if "blocked" in states else "unknown" if "unknown" in states else "clear"
 
 
-def _contradiction(reading: NodeReading, judged: list[tuple[AreaState, str]], fused: AreaState) -> Verdict:
+def _contradiction(reading: NodeReading, classified: list[tuple[AreaState, str]], fused: AreaState) -> Classification:
     """Say why the node's own word is not believed."""
-    index = next(i for i, (state, _) in enumerate(judged) if state == fused)
+    index = next(i for i, (state, _) in enumerate(classified) if state == fused)
     if reading.state == "unknown":
-        return Verdict("unknown", "the node calls its own reading unknown")
-    return Verdict("unknown", f"the node says {reading.state}, but of sonar {index}: {judged[index][1]}")
+        return Classification("unknown", "the node calls its own reading unknown")
+    return Classification("unknown", f"the node says {reading.state}, but of sonar {index}: {classified[index][1]}")

@@ -1,0 +1,74 @@
+"""A table of handlers wired to transports that only take notes."""
+
+import pytest
+
+from fog_contracts import channels as ch
+from fog_contracts import messages as m
+from fog_contracts.handlers import Moment, Publication
+from fog_runtime.clock import ManualClock
+from fog_runtime.edges import Edges
+
+POSE = m.RobotPose(x=1.0, y=2.0, theta=0.0, covariance=[0.0] * 9, v=0.0, w=0.0, radius=0.2, height=0.3, stamp=1.0)
+GOAL = m.RobotGoal(goal_id="g", pose=None)
+
+
+class Mqtt:
+    def __init__(self) -> None:
+        self.handlers, self.numbers, self.sent = {}, {}, []
+
+    def on(self, channel, handler, kind=None, *, numbers=()):
+        assert kind is channel.message
+        self.handlers[channel], self.numbers[channel] = handler, list(numbers)
+
+    def publish_nowait(self, channel, message, **ids):
+        self.sent.append((channel, message, ids))
+
+
+class Zenoh:
+    def __init__(self) -> None:
+        self.handlers, self.sent = {}, []
+
+    def subscribe(self, channel, kind, handler):
+        assert kind is channel.message
+        self.handlers[channel] = handler
+
+    def publish(self, channel, message, **ids):
+        self.sent.append((channel, message, ids))
+
+
+def test_each_channel_of_a_table_is_wired_by_its_transport_and_answers_are_published():
+    clock, mqtt, zenoh = ManualClock(5.0), Mqtt(), Zenoh()
+    edges = Edges(clock, mqtt=mqtt, zenoh=zenoh)
+    received, published = [], []
+
+    def handler(ids, message, at):
+        received.append((dict(ids), message, at))
+        return [Publication(ch.ROBOT_GOAL, GOAL, {"robot": "r1"}), Publication(ch.THESIS_WSN, "7,1,2")]
+
+    def publish(publications):
+        published.extend(publications)
+        for publication in publications:
+            edges.publish(publication)
+
+    edges.subscribe({ch.ROBOT_POSE: handler, ch.THESIS_AREA: handler}, publish, numbers=[7])
+    zenoh.handlers[ch.ROBOT_POSE]({"robot": "r1"}, POSE)
+    clock.advance(1.0)
+    mqtt.handlers[ch.THESIS_AREA]({"number": "7"}, "blocked")
+    assert received == [
+        ({"robot": "r1"}, POSE, Moment(5.0, 5.0)),
+        ({"number": "7"}, "blocked", Moment(6.0, 6.0)),
+    ]
+    assert len(published) == 4
+    assert zenoh.sent == [(ch.ROBOT_GOAL, GOAL, {"robot": "r1"})] * 2
+    assert mqtt.sent == [(ch.THESIS_WSN, "7,1,2", {})] * 2
+    assert mqtt.numbers[ch.THESIS_AREA] == [7]
+
+
+def test_a_channel_whose_transport_is_missing_is_an_error_at_once():
+    edges = Edges(ManualClock(), zenoh=Zenoh())
+    with pytest.raises(ValueError, match="node_reading"):
+        edges.subscribe({ch.NODE_READING: lambda _ids, _message, _at: []}, list)
+    with pytest.raises(ValueError, match="thesis_wsn"):
+        edges.publish(Publication(ch.THESIS_WSN, "7,1,2"))
+    with pytest.raises(ValueError, match="robot_goal"):
+        Edges(ManualClock(), mqtt=Mqtt()).publish(Publication(ch.ROBOT_GOAL, GOAL, {"robot": "r1"}))

@@ -26,7 +26,8 @@ from fog_contracts.messages import (
 from fog_contracts.site import AreaSite, DemoPlan, NodeSite, Place, RobotSite, Site, Sonar
 from fog_runtime.maps import StaticMap
 from fog_runtime.site import LoadedSite
-from fognav import net, system
+from fog_supervisor import net
+from fognav import system
 from fognav.demo.run import Demo, Options
 from fognav.demo.view import render
 from fognav.output import WrongUseError

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 import psutil
 import pytest
 
-from fognav import net
+from fog_supervisor import net
 from fognav.stack import BROKER, REDIS, ROUTER, SERVERS, Stack, StackConfig
 
 if TYPE_CHECKING:
-    from fognav.supervisor import Event
+    from fog_supervisor.supervisor import Event
 
 pytestmark = pytest.mark.live
 TIMEOUT_S = 20.0

@@ -5,22 +5,20 @@ WORKDIR /src
 COPY requirements/build.txt requirements/
 RUN pip install --no-cache-dir --require-hashes -r requirements/build.txt
 COPY libs libs
-COPY services services
 COPY robot-agent robot-agent
 COPY sim sim
-COPY cli cli
-RUN pip wheel --no-cache-dir --no-deps --no-build-isolation -w /wheels libs/*/ services/*/ ./robot-agent ./sim ./cli
+RUN pip wheel --no-cache-dir --no-deps --no-build-isolation -w /wheels libs/*/ ./robot-agent ./sim
 
 FROM python:3.11-slim-bookworm
 RUN useradd --system --uid 10001 --home-dir /var/lib/fognav --create-home fognav \
     && mkdir -p /var/cache/fognav /run/fognav && chown fognav: /var/cache/fognav /run/fognav
-COPY requirements/fognav-cli.txt /tmp/requirements.txt
+COPY requirements/fognav-sim.txt /tmp/requirements.txt
 RUN pip install --no-cache-dir --require-hashes -r /tmp/requirements.txt
 COPY --from=wheels /wheels /tmp/wheels
 RUN pip install --no-cache-dir --no-deps /tmp/wheels/*.whl && rm -rf /tmp/wheels
 COPY deploy/images/start /usr/local/bin/fognav-start
 COPY deploy/images/ready /usr/local/bin/fognav-ready
-ENV FOGNAV_MODULE=fognav.sim_robot FOGNAV_KERNELS=all FOGNAV_HTTP_HOST=0.0.0.0 FOGNAV_DATA_DIR=/var/lib/fognav \
+ENV FOGNAV_MODULE=fognav_sim.robot_unit FOGNAV_KERNELS=all FOGNAV_HTTP_HOST=0.0.0.0 FOGNAV_DATA_DIR=/var/lib/fognav \
     FOGNAV_RUN_DIR=/tmp/fognav NUMBA_CACHE_DIR=/var/cache/fognav/numba PYTHONUNBUFFERED=1
 USER fognav
 EXPOSE 9100

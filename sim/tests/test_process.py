@@ -19,8 +19,8 @@ from fog_contracts.messages import CommandReply, NodeReading, Pose, SimCommand, 
 from fog_runtime.clock import SystemClock
 from fog_runtime.maps import StaticMap, save_map
 from fog_runtime.mqtt_edge import MqttEdge
-from fog_runtime.servers import start_mosquitto, start_router
 from fog_runtime.zenoh_edge import ZenohEdge
+from fog_supervisor.servers import start_mosquitto, start_router
 
 pytestmark = pytest.mark.live
 

@@ -19,7 +19,7 @@ from fog_runtime.clock import SystemClock
 from fog_runtime.mqtt_edge import MqttEdge
 from fog_runtime.site import load_site
 from fog_runtime.zenoh_edge import ZenohEdge
-from fognav import net
+from fog_supervisor import net
 from fognav.demo.operator import Operator
 from fognav.demo.scene import Scene
 from fognav.demo.usage import children
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from fog_contracts.messages import RobotState, SimTruth
-    from fognav.supervisor import Event
+    from fog_supervisor.supervisor import Event
 
 ESTIG = Path(__file__).parents[2] / "sites" / "estig"
 ROBOT = "r1"

@@ -22,7 +22,7 @@ from driver import START, Floor
 
 from fog_contracts.geometry import contains_point
 from fog_contracts.messages import Pose, SimCommand
-from fognav import net
+from fog_supervisor import net
 from fognav.stack import AGENT, AGGREGATOR, BROKER, MAP_SERVICE, PLANNER, REDIS, ROUTER
 from fognav_sim.scenario import person_at
 

@@ -53,7 +53,7 @@ from fog_runtime.clock import SystemClock
 from fog_runtime.record import RecordError, read
 from fog_runtime.site import load_site
 from fog_runtime.zenoh_edge import ZenohEdge
-from fognav import net
+from fog_supervisor import net
 from fognav.demo.operator import Operator
 from fognav.demo.run import Demo, Options
 from fognav.output import WrongUseError

@@ -14,8 +14,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
 
-from fognav import net, system
-from fognav.supervisor import Event, Program, Supervisor
+from fog_supervisor import net, servers
+from fog_supervisor.supervisor import Event, Program, Supervisor
 
 BROKER: Final = "mosquitto"
 REDIS: Final = "redis"
@@ -181,47 +181,16 @@ class Stack:
         self._add_python(AGENT, "robot_agent", wires, rank=2)
 
     def _add_servers(self) -> None:
-        paths = {tool: system.find(tool) for tool in (system.MOSQUITTO, system.REDIS)}
-        if missing := [tool for tool, path in paths.items() if path is None]:
-            raise system.MissingToolsError(
-                f"missing: {' and '.join(t.name for t in missing)}. Install with: {system.how_to_get(missing)}"
-            )
         data = self.folder / "data"
-        lines = [
-            f"listener {self.mqtt_port} {net.LOOPBACK}",
-            "allow_anonymous true",
-            "persistence false",
-            # A payload beyond every channel's limit must not even reach a subscriber's memory.
-            "message_size_limit 1048576",
-        ]
-        if os.geteuid() == 0:
-            lines.append("user root")  # else it becomes another user, who may not read this private folder
-        configuration = self.folder / "mosquitto.conf"
-        configuration.write_text("\n".join(lines) + "\n", "utf-8")
-        (data / REDIS).mkdir()
-        redis_options = {
-            "port": str(self.redis_port),
-            "bind": net.LOOPBACK,
-            "dir": str(data / REDIS),
-            "appendonly": "yes",
-            "appendfsync": "always",
-            "save": "",
-            "daemonize": "no",
-        }
-        redis_arguments = [part for key, value in redis_options.items() for part in (f"--{key}", value)]
-        mqtt, redis, zenoh = self.mqtt_port, self.redis_port, self.zenoh_port
-        self._add(
-            BROKER,
-            (str(paths[system.MOSQUITTO]), "-c", str(configuration)),
-            ready=partial(net.listens, mqtt),
-        )
-        self._add(
-            REDIS,
-            (str(paths[system.REDIS]), *redis_arguments),
-            ready=partial(net.listens, redis, b"PING\r\n", b"+PONG"),
-        )
-        router = (sys.executable, "-m", "fog_runtime.router", "--listen", self.zenoh_endpoint)
-        self._add(ROUTER, router, ready=partial(net.listens, zenoh))
+        for name in (BROKER, REDIS):
+            (data / name).mkdir(mode=0o700)
+        for program in (
+            servers.mosquitto_program(data / BROKER, self.mqtt_port),
+            servers.redis_program(data / REDIS, self.redis_port),
+            servers.router_program(self.zenoh_port),
+        ):
+            ready = partial(net.listens, program.port, program.hello, program.answer)
+            self._add(program.name, program.command, ready=ready)
 
     def _add_python(
         self,

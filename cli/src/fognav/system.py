@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Protocol
 
-_EXTRA_FOLDERS: Final = ("/usr/sbin", "/usr/local/sbin", "/opt/homebrew/sbin", "/opt/homebrew/bin")
-"""Debian puts the broker into /usr/sbin, which is not on the PATH of everybody."""
+from fog_supervisor.servers import find_program
+
 _INSTALL_TIMEOUT_S: Final = 600.0
 
 
@@ -111,11 +111,7 @@ PROVIDERS: Final[list[Provider]] = [AptProvider()]
 
 def find(tool: Tool) -> Path | None:
     """Return where the program is, on the PATH or where systems keep their servers."""
-    folders = os.pathsep.join([os.environ.get("PATH", ""), *_EXTRA_FOLDERS])
-    for name in tool.executables:
-        if found := shutil.which(name, path=folders):
-            return Path(found)
-    return None
+    return find_program(*tool.executables)
 
 
 def how_to_get(tools: Sequence[Tool]) -> str:

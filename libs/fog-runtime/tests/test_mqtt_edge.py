@@ -15,14 +15,14 @@ from fog_contracts import messages as m
 from fog_contracts.codec import ContractError
 from fog_runtime.clock import SystemClock
 from fog_runtime.mqtt_edge import MqttEdge, Will
-from fog_runtime.servers import start_mosquitto
+from fog_supervisor.servers import start_mosquitto
 
 pytestmark = pytest.mark.live
 
 
 @pytest.fixture(scope="module")
 def shared_broker(tmp_path_factory):
-    with start_mosquitto(tmp_path_factory.mktemp("mosquitto"), extra="max_queued_messages 5000") as broker:
+    with start_mosquitto(tmp_path_factory.mktemp("mosquitto")) as broker:
         yield broker
 
 

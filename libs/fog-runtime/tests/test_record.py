@@ -10,8 +10,8 @@ from fog_contracts import messages as m
 from fog_runtime.clock import ManualClock, SystemClock
 from fog_runtime.mqtt_edge import MqttEdge
 from fog_runtime.record import Recorder, RecordError, read, record_all, replay
-from fog_runtime.servers import start_mosquitto, start_router
 from fog_runtime.zenoh_edge import ZenohEdge
+from fog_supervisor.servers import start_mosquitto, start_router
 
 
 def reading(seq):

@@ -14,8 +14,9 @@ from fog_contracts import messages as m
 from fog_contracts.codec import ContractError
 from fog_contracts.handlers import RefusedMessageError
 from fog_runtime.clock import SystemClock
-from fog_runtime.servers import free_port, start_router
 from fog_runtime.zenoh_edge import ZenohEdge, session_config
+from fog_supervisor.net import free_port
+from fog_supervisor.servers import start_router
 
 pytestmark = pytest.mark.live
 

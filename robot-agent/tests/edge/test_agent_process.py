@@ -11,7 +11,7 @@ from agent_rig import Robot, until
 from guardian_rig import STOP_S
 
 from fog_contracts.grid import Window
-from fog_runtime.servers import start_router
+from fog_supervisor.servers import start_router
 from robot_agent.localization.localizer import SavedPose
 
 pytestmark = [pytest.mark.live, pytest.mark.timeout(150)]

@@ -7,7 +7,7 @@ import pytest
 from redis.asyncio import Redis
 
 from fog_contracts.messages import AreaDefinition, AreaHazard
-from fog_runtime.servers import Server, start_redis
+from fog_supervisor.servers import Server, start_redis
 from hazard_aggregator.store import Store, StoreError
 
 pytestmark = pytest.mark.live

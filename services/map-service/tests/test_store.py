@@ -7,7 +7,7 @@ import pytest
 from redis.asyncio import Redis
 
 from fog_contracts.messages import CircleShape, Zone
-from fog_runtime.servers import Server, start_redis
+from fog_supervisor.servers import Server, start_redis
 from map_service.store import Audit, Store, StoreError
 
 pytestmark = pytest.mark.live

@@ -35,8 +35,8 @@ from fog_contracts.replica import MasterMap
 from fog_kernels.inflation import inflate, inflation_table
 from fog_runtime.clock import SystemClock, ticker
 from fog_runtime.http import token_hash
-from fog_runtime.servers import Server, start_redis, start_router
 from fog_runtime.zenoh_edge import ZenohEdge
+from fog_supervisor.servers import Server, start_redis, start_router
 
 pytestmark = pytest.mark.live
 

@@ -8,12 +8,12 @@ from pathlib import Path
 
 from fog_runtime import logs
 from fog_runtime.site import SiteError, load_site
+from fog_supervisor.supervisor import NotReadyError
 from fognav.demo.judge import Verdict
 from fognav.demo.run import Demo, Options
 from fognav.demo.view import show
 from fognav.output import WrongUseError, console
 from fognav.page.app import serve
-from fognav.supervisor import NotReadyError
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 

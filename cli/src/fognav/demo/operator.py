@@ -27,7 +27,7 @@ from fog_contracts.messages import (
 )
 from fog_runtime.clock import Clock
 from fog_runtime.zenoh_edge import ZenohEdge
-from fognav import net
+from fog_supervisor import net
 from fognav.demo.danger import path_length
 from fognav.demo.scene import Scene
 from fognav.stack import PLANNER, Stack

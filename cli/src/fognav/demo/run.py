@@ -14,6 +14,7 @@ from fog_contracts.site import AreaSite
 from fog_runtime.clock import SystemClock
 from fog_runtime.site import LoadedSite
 from fog_runtime.zenoh_edge import ZenohEdge
+from fog_supervisor.supervisor import Event
 from fognav.demo import usage
 from fognav.demo.danger import Danger, NoDangerError, along, choose, may_appear
 from fognav.demo.judge import Judge, Verdict, hazard_to_path_ms, stages_ms
@@ -22,7 +23,6 @@ from fognav.demo.scene import Scene
 from fognav.output import WrongUseError
 from fognav.recording import recording
 from fognav.stack import WATCHDOG, Stack, StackConfig
-from fognav.supervisor import Event
 from fognav_sim.scenario import barrier_across
 from robot_agent.config import SafetyConfig
 from robot_agent.safety.gate import STOP_AT_ONCE

@@ -17,7 +17,7 @@ from PIL import Image
 
 from fog_contracts.costs import FREE, UNKNOWN
 from fog_runtime.maps import StaticMap
-from fognav import net
+from fog_supervisor import net
 from fognav.demo.run import Demo
 from fognav.output import WrongUseError
 
@@ -93,7 +93,7 @@ async def serve(demo: Demo, port: int = 0) -> AsyncIterator[str]:
 
     Raises `WrongUseError` for a port that can't be had.
     """
-    chosen = port or net.free_port(set())
+    chosen = port or net.free_port()
     # Bound here: uvicorn would end the whole process when it can't.
     listening = socket.socket()
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

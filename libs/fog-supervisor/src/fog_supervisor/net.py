@@ -19,8 +19,9 @@ _TRIES: Final = 200
 HTTP_TIMEOUT_S: Final = 5.0
 
 
-def free_port(taken: set[int]) -> int:
+def free_port(taken: set[int] | None = None) -> int:
     """Return a port that nobody listens on and that is not in `taken`, and add it there."""
+    taken = set() if taken is None else taken
     generator = random.SystemRandom()
     for _ in range(_TRIES):
         port = generator.randint(_FIRST, _LAST)

@@ -1,4 +1,4 @@
-"""A simulated robot for a fog node that runs elsewhere: `python -m fognav.sim_robot`, as in docker-compose.yml.
+"""A simulated robot for a fog node that runs elsewhere: `python -m fognav_sim.robot_unit`, as in docker-compose.yml.
 
 Runs simulator, watchdog, guardian and agent as one unit, because ptys don't cross containers, and acts as the operator:
 it enables the robot whenever that asks for it, and sends it back and forth between the demo's two places.
@@ -26,7 +26,7 @@ from fog_runtime.clock import SystemClock, ticker
 from fog_runtime.settings import CommonSettings, SettingsError, describe, load
 from fog_runtime.site import load_site
 from fog_runtime.zenoh_edge import ZenohEdge
-from fognav.supervisor import Event, Program, Supervisor
+from fog_supervisor.supervisor import Event, Program, Supervisor
 
 _LOOK_S: Final = 1.0
 _TIMEOUT_S: Final = 5.0

@@ -9,7 +9,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from fognav.supervisor import Event, NotReadyError, Program, Supervisor, log_tail
+from fog_supervisor.supervisor import Event, NotReadyError, Program, Supervisor, log_tail
 
 DEADLINE_S = 10.0
 
@@ -114,7 +114,7 @@ async def test_stopping_while_it_waits_for_its_restart_cancels_that(bench: Bench
 async def test_a_program_that_ignores_the_request_to_end_is_ended_by_force(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fognav.supervisor.END_TIMEOUT_S", 0.2)
+    monkeypatch.setattr("fog_supervisor.supervisor.END_TIMEOUT_S", 0.2)
     bench.add("stubborn", STUBBORN, ready="deaf")
     bench.supervisor.start("stubborn")
     await bench.supervisor.wait_ready(["stubborn"], DEADLINE_S)
@@ -163,7 +163,7 @@ async def test_higher_ranks_end_first(bench: Bench) -> None:
 def test_programs_die_with_the_command_even_when_it_is_killed(tmp_path: Path) -> None:
     code = (
         "import asyncio, os, pathlib, sys\n"
-        "from fognav.supervisor import Program, Supervisor\n"
+        "from fog_supervisor.supervisor import Program, Supervisor\n"
         "async def main():\n"
         "    supervisor = Supervisor(lambda event: None)\n"
         "    folder = pathlib.Path(sys.argv[1])\n"

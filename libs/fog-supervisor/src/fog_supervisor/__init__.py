@@ -1,0 +1,1 @@
+"""Process supervision on one machine: programs with restarts, private servers and their configurations."""

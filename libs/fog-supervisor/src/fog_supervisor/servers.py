@@ -1,0 +1,235 @@
+"""Private Mosquitto, Redis and zenoh router processes on loopback ports: for the demonstration and for tests.
+
+A `ServerProgram` says how to run one and how to see that it is ready; the demonstration gives it to its `Supervisor`.
+`start_mosquitto`, `start_redis` and `start_router` run one at once, each with its own configuration, data and log in a
+folder; it is ready when the function returns, which blocks for some 30 ms (the router for some 0.5 s).
+"""
+
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Final, Self
+
+from fog_supervisor import configurations
+from fog_supervisor.net import LOOPBACK, free_port
+
+_READY_S: Final = 15.0
+_STOP_S: Final = 5.0
+_ATTEMPTS: Final = 5
+"""Free ports to try: another process may take one between its choice and its use."""
+_SERVER_FOLDERS: Final = ("/usr/sbin", "/usr/local/sbin", "/opt/homebrew/sbin", "/opt/homebrew/bin")
+"""Debian keeps servers in /usr/sbin, which is not on every user's path."""
+
+
+class ServerError(RuntimeError):
+    """A server that is not installed or does not start; the message says what to do, or holds the end of its log."""
+
+
+def find_program(*names: str) -> Path | None:
+    """Return where the first of these programs is, on the PATH or where systems keep their servers."""
+    folders = os.pathsep.join([os.environ.get("PATH", ""), *_SERVER_FOLDERS])
+    return next((Path(found) for name in names if (found := shutil.which(name, path=folders))), None)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ServerProgram:
+    """How to run a server on a loopback port; it is ready when it takes connections and answers `hello` so."""
+
+    name: str
+    port: int
+    url: str
+    command: tuple[str, ...]
+    hello: bytes = b""
+    answer: bytes = b""
+
+    def ready(self) -> bool:
+        """Whether it takes connections and answers as it should."""
+        try:
+            with socket.create_connection((LOOPBACK, self.port), timeout=0.5) as connection:
+                if not self.hello:
+                    return True
+                connection.sendall(self.hello)
+                return connection.recv(64).startswith(self.answer)
+        except OSError:
+            return False
+
+
+def _installed(name: str, package: str) -> str:
+    found = find_program(name)
+    if found is None:
+        raise ServerError(f"{name} is not installed: apt-get install -y --no-install-recommends {package}")
+    return str(found)
+
+
+def mosquitto_program(folder: Path, port: int, *, extra: str = "") -> ServerProgram:
+    """Return an MQTT broker for anonymous clients, configured in `folder`; `extra` lines end its configuration.
+
+    Raises `ServerError` when it is not installed.
+    """
+    program = _installed("mosquitto", "mosquitto")
+    # Root would become another user, who may not enter a private folder.
+    lines = [*(["user root"] if os.geteuid() == 0 else []), *extra.splitlines()]
+    file = folder / "mosquitto.conf"
+    file.write_text(configurations.mosquitto(f"{port} {LOOPBACK}", str(folder), further=lines), "utf-8")
+    return ServerProgram(
+        name="mosquitto", port=port, url=f"mqtt://{LOOPBACK}:{port}", command=(program, "-c", str(file))
+    )
+
+
+def redis_program(folder: Path, port: int) -> ServerProgram:
+    """Return a Redis that keeps what it acknowledged, configured in `folder`; raises `ServerError` without one."""
+    program = _installed("redis-server", "redis-server")
+    file = folder / "redis.conf"
+    file.write_text(configurations.redis(LOOPBACK, str(folder), port=port), "utf-8")
+    return ServerProgram(
+        name="redis",
+        port=port,
+        url=f"redis://{LOOPBACK}:{port}/0",
+        command=(program, str(file)),
+        hello=b"PING\r\n",
+        answer=b"+PONG",
+    )
+
+
+def router_program(port: int) -> ServerProgram:
+    """Return a zenoh router."""
+    endpoint = f"tcp/{LOOPBACK}:{port}"
+    command = (sys.executable, "-m", "fog_runtime.router", *configurations.router_arguments(endpoint))
+    return ServerProgram(name="zenoh-router", port=port, url=endpoint, command=command)
+
+
+class Server:
+    """A running server process; a context manager that stops it. Belongs to the thread that made it."""
+
+    def __init__(self, program: ServerProgram, folder: Path) -> None:
+        """Start it at once, in `folder`, and wait until it is ready; raises `ServerError`."""
+        self.program = program
+        self.folder = folder
+        self._process: subprocess.Popen[bytes] | None = None
+        self.start()
+
+    @property
+    def name(self) -> str:
+        """What it is called in messages."""
+        return self.program.name
+
+    @property
+    def port(self) -> int:
+        """Where it listens on the loopback interface."""
+        return self.program.port
+
+    @property
+    def url(self) -> str:
+        """How clients name it."""
+        return self.program.url
+
+    @property
+    def endpoint(self) -> str:
+        """The same as `url`: what zenoh calls it."""
+        return self.program.url
+
+    @property
+    def pid(self) -> int:
+        """Process id; raises `ServerError` when it is not running."""
+        if self._process is None:
+            raise ServerError(f"{self.name} is not running: start it first")
+        return self._process.pid
+
+    @property
+    def log(self) -> Path:
+        """File with everything that it printed."""
+        return self.folder / f"{self.name}.log"
+
+    def running(self) -> bool:
+        """Whether the process lives."""
+        return self._process is not None and self._process.poll() is None
+
+    def start(self) -> None:
+        """Start it (again, on the same port, with the same data) and wait until it is ready."""
+        if self.running():
+            return
+        with self.log.open("ab") as log:
+            self._process = self._spawn(log)
+        deadline = time.monotonic() + _READY_S
+        while not self.program.ready():
+            if self._process.poll() is not None or time.monotonic() > deadline:
+                self.kill()
+                tail = "\n".join(self.log.read_text("utf-8", "replace").splitlines()[-8:])
+                raise ServerError(f"{self.name} did not start on port {self.port}; the end of {self.log}:\n{tail}")
+            time.sleep(0.01)
+
+    def _spawn(self, log: IO[bytes]) -> subprocess.Popen[bytes]:
+        # Its own session: Ctrl-C in a terminal is for whoever started it, who stops it in the right order.
+        return subprocess.Popen(  # noqa: S603  # a fixed command, no shell
+            self.program.command,
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            cwd=self.folder,
+            start_new_session=True,
+        )
+
+    def stop(self) -> None:
+        """End it in good order (SIGTERM), or by force when it does not end within 5 s."""
+        if self._process is None:
+            return
+        self._process.terminate()
+        try:
+            self._process.wait(_STOP_S)
+        except subprocess.TimeoutExpired:
+            self.kill()
+        self._process = None
+
+    def kill(self) -> None:
+        """End it as a crash would (SIGKILL)."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+            self._process = None
+
+    def restart(self) -> None:
+        """Stop it in good order, if it still runs, and start it again on the same port with the same data."""
+        self.stop()
+        self.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+
+def _start(folder: Path, port: int, program: Callable[[Path, int], ServerProgram]) -> Server:
+    folder = folder.resolve()
+    folder.mkdir(parents=True, exist_ok=True)
+    if port:
+        return Server(program(folder, port), folder)
+    taken: set[int] = set()
+    for _ in range(_ATTEMPTS - 1):
+        try:
+            return Server(program(folder, free_port(taken)), folder)
+        except ServerError:
+            # Somebody took the port first; whatever else is wrong, the last attempt says.
+            continue
+    return Server(program(folder, free_port(taken)), folder)
+
+
+def start_mosquitto(folder: Path, port: int = 0, *, extra: str = "") -> Server:
+    """Start an MQTT broker for anonymous clients; `extra` lines end its configuration. Port 0 takes a free one."""
+    return _start(folder, port, lambda place, chosen: mosquitto_program(place, chosen, extra=extra))
+
+
+def start_redis(folder: Path, port: int = 0) -> Server:
+    """Start a Redis whose acknowledged writes survive a crash. Port 0 takes a free one."""
+    return _start(folder, port, redis_program)
+
+
+def start_router(folder: Path, port: int = 0) -> Server:
+    """Start a zenoh router (`python -m fog_runtime.router`). Port 0 takes a free one."""
+    return _start(folder, port, lambda _, chosen: router_program(chosen))

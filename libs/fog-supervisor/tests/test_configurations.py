@@ -1,0 +1,68 @@
+"""One source for the servers' configurations: what is deployed is what demonstration and tests run."""
+
+import shlex
+import subprocess
+from pathlib import Path
+
+import pytest
+import yaml
+
+from fog_contracts.channels import CHANNELS
+from fog_runtime import router
+from fog_supervisor import configurations
+from fog_supervisor.servers import mosquitto_program, redis_program, router_program, start_mosquitto, start_redis
+
+ROOT = Path(__file__).parents[3]
+OWN_OF_A_PLACE = ("listener ", "persistence_location ", "user ", "bind ", "port ", "dir ")
+
+
+def shared_lines(text: str) -> list[str]:
+    """The lines that may not differ between the ways to run a server."""
+    return [line for line in text.splitlines() if line and not line.startswith(OWN_OF_A_PLACE)]
+
+
+def test_the_deployed_files_are_what_the_source_makes() -> None:
+    assert configurations.stale(ROOT / "deploy") == []
+
+
+def test_a_stale_file_is_named_with_the_remedy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert configurations.main(["--write", str(tmp_path)]) == 0
+    assert configurations.main(["--check", str(tmp_path)]) == 0
+    (tmp_path / "redis" / "redis.conf").write_text("appendfsync everysec\n")
+    assert configurations.main(["--check", str(tmp_path)]) == 1
+    assert "redis.conf is stale: run python -m fog_supervisor.configurations --write" in capsys.readouterr().out
+
+
+def test_private_servers_have_the_limits_and_the_durability_of_the_deployed_ones(tmp_path: Path) -> None:
+    deployed = configurations.deployed()
+    mosquitto_program(tmp_path, 1)
+    redis_program(tmp_path, 1)
+    for name in ("mosquitto", "redis"):
+        private = (tmp_path / f"{name}.conf").read_text()
+        assert shared_lines(private) == shared_lines(deployed[f"{name}/{name}.conf"])
+        assert "127.0.0.1" in private
+        assert "0.0.0.0" not in private
+
+
+def test_the_composed_router_is_given_the_arguments_of_the_private_one() -> None:
+    service = yaml.safe_load((ROOT / "docker-compose.yml").read_text())["services"]["zenoh"]
+    endpoint = service["command"][1]
+    assert service["command"] == configurations.router_arguments(endpoint)
+    assert service["build"]["args"]["MODULE"] == router.__name__
+    private = router_program(7447)
+    assert list(private.command[1:]) == ["-m", router.__name__, *configurations.router_arguments(private.url)]
+
+
+def test_every_message_fits_into_the_brokers_packets() -> None:
+    largest = max(channel.limit for channel in CHANNELS.values() if channel.transport == "mqtt")
+    assert largest + 1024 < configurations.MQTT_PACKET_LIMIT  # topic and properties
+
+
+@pytest.mark.live
+def test_a_folder_with_a_space_in_its_name_serves_as_well(tmp_path: Path) -> None:
+    with start_redis(tmp_path / "my data") as redis, start_mosquitto(tmp_path / "my broker"):
+        done = subprocess.run(
+            shlex.split(f"redis-cli -p {redis.port} config get appendfsync"), capture_output=True, text=True, check=True
+        )
+        assert done.stdout.split() == ["appendfsync", "always"]
+        assert (redis.folder / "appendonlydir").exists()

@@ -1,10 +1,7 @@
 """Prometheus metrics that all processes share; CPU and memory come from prometheus-client's process collector."""
 
-import os
-import resource
 from collections.abc import Collection
-from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 from prometheus_client import (
     CONTENT_TYPE_LATEST,
@@ -70,21 +67,3 @@ def observe_trace(trace: Trace, stages: Collection[str] = tuple(STAGES)) -> None
 def exposition(registry: CollectorRegistry = REGISTRY) -> tuple[bytes, str]:
     """Return the metrics in Prometheus's text format, and their content type."""
     return generate_latest(registry), CONTENT_TYPE_LATEST
-
-
-class ProcessUsage(NamedTuple):
-    """What this process has used so far: CPU seconds (user and system), resident bytes now."""
-
-    cpu_s: float
-    rss_bytes: int
-
-
-def process_usage() -> ProcessUsage:
-    """Return CPU time and resident memory of this process; other systems than Linux give the memory's peak."""
-    usage = resource.getrusage(resource.RUSAGE_SELF)
-    cpu = usage.ru_utime + usage.ru_stime
-    try:
-        pages = int(Path("/proc/self/statm").read_text("ascii").split()[1])
-    except FileNotFoundError:  # no Linux
-        return ProcessUsage(cpu, usage.ru_maxrss)
-    return ProcessUsage(cpu, pages * os.sysconf("SC_PAGE_SIZE"))

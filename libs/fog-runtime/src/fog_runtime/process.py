@@ -1,34 +1,13 @@
 """The life of a process: start, run until told to stop, end cleanly."""
 
 import asyncio
-import ctypes
 import os
 import signal
-import sys
 from collections.abc import Awaitable, Callable
-from typing import Final
 
 from fog_runtime import logs
 
-_PR_SET_PDEATHSIG: Final = 1
-
 _log = logs.get("process")
-
-
-def die_with_parent() -> None:
-    """Ask the kernel to send SIGTERM to this process when its parent dies; does nothing but on Linux.
-
-    A launcher that is killed can't stop its children any more; without this they would keep ports and robots.
-    """
-    if sys.platform != "linux":
-        return
-    parent = os.getppid()
-    libc = ctypes.CDLL(None, use_errno=True)
-    if libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0) != 0:
-        raise OSError(ctypes.get_errno(), "prctl(PR_SET_PDEATHSIG) failed")
-    if os.getppid() != parent:
-        # The parent died between the two calls: nobody will send the signal.
-        os.kill(os.getpid(), signal.SIGTERM)
 
 
 async def _supervise(main: Callable[[], Awaitable[None]]) -> None:

@@ -1,0 +1,84 @@
+from __future__ import annotations
+
+import msgspec
+import pytest
+
+from fog_runtime import parts
+from fog_runtime.settings import SettingsError, load_options
+
+GROUP = "fognav.test_parts"
+
+
+@pytest.fixture
+def install(tmp_path, monkeypatch):
+    """Make entry points as an installed distribution has them."""
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def write(distribution: str, *lines: str) -> None:
+        folder = tmp_path / f"{distribution}-1.0.dist-info"
+        folder.mkdir()
+        (folder / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {distribution}\nVersion: 1.0\n")
+        (folder / "entry_points.txt").write_text("\n".join([f"[{GROUP}]", *lines]) + "\n")
+
+    return write
+
+
+def test_a_part_is_found_by_its_name(install):
+    install("one", "pi = math:pi")
+    install("two", "tau = math:tau")
+    assert parts.names(GROUP) == ["pi", "tau"]
+    assert parts.load(GROUP, "pi", float) == pytest.approx(3.14159, abs=1e-5)
+
+
+def test_an_unknown_name_is_refused_with_the_known_ones(install):
+    install("one", "pi = math:pi", "tau = math:tau")
+    with pytest.raises(parts.PartError, match=r"no 'phi' \(known: pi, tau\)"):
+        parts.load(GROUP, "phi", float)
+
+
+def test_a_group_without_parts_says_so():
+    with pytest.raises(parts.PartError, match="known: none"):
+        parts.load(GROUP, "pi", float)
+
+
+def test_a_name_that_two_packages_claim_is_refused(install):
+    install("one", "pi = math:pi")
+    install("two", "pi = math:e")
+    with pytest.raises(parts.PartError, match="math:e of two, math:pi of one"):
+        parts.load(GROUP, "pi", float)
+
+
+@pytest.mark.parametrize(("value", "words"), [("nowhere_at_all:x", "imported"), ("math:no_such", "imported")])
+def test_a_part_that_cannot_be_imported_is_named(install, value, words):
+    install("one", f"pi = {value}")
+    with pytest.raises(parts.PartError, match=words):
+        parts.load(GROUP, "pi", float)
+
+
+def test_a_part_of_another_kind_is_refused(install):
+    install("one", "pi = math:pi")
+    with pytest.raises(parts.PartError, match="is no str"):
+        parts.load(GROUP, "pi", str)
+
+
+class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    axle_m: float = 0.2
+    counts: int = 100
+
+
+def test_options_come_from_json_over_their_defaults():
+    assert load_options(Options, "", variable="X") == Options()
+    assert load_options(Options, '{"counts": 7}', variable="X") == Options(counts=7)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('{"axle_m": "wide"}', r"FOGNAV_X: Expected `float`, got `str` - at `\$.axle_m`. Give .*: axle_m, counts"),
+        ('{"axel_m": 0.3}', "FOGNAV_X: .*axel_m"),
+        ("axle_m=0.3", "FOGNAV_X: JSON is malformed"),
+    ],
+)
+def test_wrong_options_are_refused_by_variable_and_field(text, words):
+    with pytest.raises(SettingsError, match=words):
+        load_options(Options, text, variable="FOGNAV_X")

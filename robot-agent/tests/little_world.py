@@ -11,9 +11,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from fog_contracts import channels as ch
 from fog_contracts.commands import sign
 from fog_contracts.costs import Inflation
 from fog_contracts.grid import GridGeometry, Window
+from fog_contracts.handlers import Moment
 from fog_contracts.messages import Pose, RobotCommand, RobotGoal, RobotPath, RobotState, Trace
 from fog_contracts.replica import MasterMap
 from fog_kernels.inflation import inflate, inflation_table
@@ -24,6 +26,7 @@ from robot_agent.guardian.link import BaseFeedback
 from robot_agent.hardware import LaserScan, RepeatCounter
 
 KEY = b"k" * 32
+AGENT = AgentConfig(robot="r1", operator_key=KEY)
 TICK_M = math.pi * 0.072 / 508.8
 AXLE = 0.235
 DT = 0.01
@@ -55,6 +58,7 @@ class LittleWorld:
     pose: tuple = (2.0, 2.0, 0.0)
     seed: int = 1
     lidar_noise: float = 0.01
+    start_agent: type = AgentCore
 
     def __post_init__(self):
         self.static, self.geometry = grid_of(self.rooms, *self.size)
@@ -63,7 +67,7 @@ class LittleWorld:
         self.raw = self.static.copy()
         self.master = MasterMap("lab", self.geometry, self.static, inflate(self.raw, self.table), epoch=7)
         self.rng = np.random.default_rng(self.seed)
-        self.agent = AgentCore(AgentConfig(robot="r1", operator_key=KEY), seed=self.seed)
+        self.agent = self.start_agent(AGENT, self.seed)
         self.now = START
         self.steps = 0
         self.x, self.y, self.theta = self.pose
@@ -86,18 +90,41 @@ class LittleWorld:
         self.turns = []
         self.decide_on = True
         self.resets = 0
+        self.published = []
         self.worst_error = (0.0, 0.0)
 
     @property
     def stamp(self):
         return STAMP + self.now - START
 
+    @property
+    def moment(self):
+        return Moment(self.now, self.stamp)
+
+    def send(self, channel, message):
+        """Hand the agent a message of the fog."""
+        assert self.agent.handlers()[channel]({"robot": "r1"}, message, self.moment) == ()
+
+    def ask(self, command):
+        """Hand the agent an operator's command as it is; return its reply."""
+        return self.agent.answerers()[ch.ROBOT_COMMAND]({"robot": "r1"}, command, self.moment)
+
+    def obstacles(self):
+        """Let time pass until the agent next reports obstacles; return the report."""
+        self.published.clear()
+        assert self.run(1.1, lambda w: w.said(ch.ROBOT_OBSTACLES)), "no report of obstacles within a second"
+        return self.said(ch.ROBOT_OBSTACLES)[0]
+
+    def said(self, channel):
+        """Return what the agent has published on a channel."""
+        return [publication.message for publication in self.published if publication.channel is channel]
+
     def command(self, kind, **more):
         self.nonce += 1
         unsigned = RobotCommand(
             kind=kind, robot="r1", operator="ann", nonce=f"nonce-{self.nonce:016d}", issued_at=self.stamp, **more
         )
-        return self.agent.on_command(sign(unsigned, KEY), self.now, self.stamp)
+        return self.ask(sign(unsigned, KEY))
 
     def ready(self):
         """Bring a new agent to NORMAL, as an operator would."""
@@ -126,8 +153,8 @@ class LittleWorld:
             goal_theta=theta,
             traces=list(traces),
         )
-        self.agent.on_goal(self.goal, self.now)
-        self.agent.on_path(self.path, self.now, self.stamp)
+        self.send(ch.ROBOT_GOAL, self.goal)
+        self.send(ch.ROBOT_PATH, self.path)
 
     def block(self, left, bottom, right, top, *, solid=False, tell=True):
         """Make a rectangle lethal in the master costmap and, if solid, stand something there."""
@@ -140,23 +167,23 @@ class LittleWorld:
         deltas = self.master.write([("cost", whole, inflate(self.raw, self.table))], [], [])
         if tell:
             for delta in deltas:
-                self.agent.on_delta(delta, self.now)
+                self.send(ch.MAP_DELTA, delta)
         return deltas
 
     def restart(self):
         """Kill the agent and start another one with what it had saved."""
-        saved = self.agent.save(self.now)
+        saved = self.agent.pose_to_store(self.now)
         self.wheels = (0.0, 0.0)
-        self.agent = AgentCore(AgentConfig(robot="r1", operator_key=KEY), seed=self.seed + 1)
+        self.agent = self.start_agent(AGENT, self.seed + 1)
         if saved is not None:
             self.agent.restore(saved)
         return saved
 
     def state(self) -> RobotState:
-        return self.agent.state(self.stamp, self.now)
+        return self.agent.state(self.moment)
 
     def error(self):
-        pose = self.agent.pose(self.stamp, self.now)
+        pose = self.agent.pose(self.moment)
         return math.hypot(pose.x - self.x, pose.y - self.y), abs(math.remainder(pose.theta - self.theta, 2 * math.pi))
 
     def run(self, seconds, until=None):
@@ -190,12 +217,12 @@ class LittleWorld:
             )
         self._scan()
         if self.heartbeats_on and self.steps % 10 == 0:
-            self.agent.on_heartbeat(self.master.heartbeat(self.stamp), self.now)
+            self.send(ch.MAP_HEARTBEAT, self.master.heartbeat(self.stamp))
         if self.path is not None and self.path_on and self.steps % 50 == 0:
-            self.agent.on_goal(self.goal, self.now)
-            self.agent.on_path(self.path, self.now, self.stamp)
+            self.send(ch.ROBOT_GOAL, self.goal)
+            self.send(ch.ROBOT_PATH, self.path)
         if self.decide_on and self.steps % 20 == 0 and (job := self.agent.control_job(self.now)) is not None:
-            self.agent.accept(decide(job), self.now)
+            self.agent.accept(decide(job))
         if self.steps % 5 == 0:
             command = self.agent.stream(self.now, self.stamp)
             self.resets += command.reset
@@ -205,6 +232,8 @@ class LittleWorld:
             self.commands.append((self.now, command.left, command.right))
             if self.agent.localizer.status == "good":
                 self.worst_error = tuple(max(pair) for pair in zip(self.worst_error, self.error(), strict=True))
+        if self.steps % 10 == 0:
+            self.published.extend(self.agent.tick(self.moment))
 
     def _move(self):
         left, right = self.wheels

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from little_world import KEY, L_PATH, START, LittleWorld, trace
 
+from fog_contracts import channels as ch
 from fog_contracts.commands import sign
 from fog_contracts.messages import (
     AreaHazard,
@@ -18,7 +19,10 @@ from fog_contracts.messages import (
     Pose,
     Refusal,
     RobotCommand,
+    RobotObstacles,
     RobotPath,
+    RobotPose,
+    RobotState,
     Zone,
     ZoneSet,
 )
@@ -150,7 +154,7 @@ def test_a_refusal_holds_with_the_planners_sentence(driving):
         driving.path, plan_id=2, points=[], refusal=Refusal(code=208, reason=sentence, causes=[])
     )
     driving.path = refused
-    driving.agent.on_path(refused, driving.now, driving.stamp)
+    driving.send(ch.ROBOT_PATH, refused)
     assert seconds_to_rest(driving) <= 0.6
     assert driving.state().mode == "HOLD"
     assert sentence in " ".join(driving.state().reasons)
@@ -190,10 +194,10 @@ def test_old_changes_that_trickle_in_do_not_make_the_map_fresh_while_newer_ones_
     late = [delta for box in boxes for delta in driving.block(*box, tell=False)]
     for delta in late[:-1]:
         driving.run(0.5)
-        driving.agent.on_delta(delta, driving.now)
+        driving.send(ch.MAP_DELTA, delta)
     assert driving.state().mode == "HOLD"
     assert any("have been missing" in reason for reason in driving.state().reasons)
-    driving.agent.on_delta(late[-1], driving.now)
+    driving.send(ch.MAP_DELTA, late[-1])
     assert driving.run(4.0, lambda w: w.state().mode == "NORMAL")
 
 
@@ -320,7 +324,7 @@ def hazard(state, polygon):
 
 def test_a_hazard_over_the_robot_stops_it_until_an_operator_enables(driving):
     x = driving.x
-    driving.agent.on_hazard(hazard("blocked", [(x - 1, 1), (x + 1, 1), (x + 1, 3), (x - 1, 3)]), driving.now)
+    driving.send(ch.HAZARD, hazard("blocked", [(x - 1, 1), (x + 1, 1), (x + 1, 3), (x - 1, 3)]))
     driving.block(x - 1, 1.0, x + 1, 3.0)
     driving.run(0.1)
     assert driving.wheels == (0.0, 0.0)
@@ -336,14 +340,14 @@ def test_a_no_go_zone_over_the_robot_is_named_with_its_reason(driving):
     x = driving.x
     shape = PolygonShape(points=[(x - 1, 1), (x + 1, 1), (x + 1, 3), (x - 1, 3)])
     zone = Zone(id="wet-floor", kind="BLOCKED", shape=shape, reason="being mopped")
-    driving.agent.on_zones(ZoneSet(epoch=7, seq=1, zones=[zone]), driving.now)
+    driving.send(ch.ZONES, ZoneSet(epoch=7, seq=1, zones=[zone]))
     driving.block(x - 1, 1.0, x + 1, 3.0)
     driving.run(0.1)
     assert any("wet-floor (being mopped)" in reason for reason in driving.state().reasons)
 
 
 def test_in_an_area_that_nobody_can_tell_it_drives_slowly(driving):
-    driving.agent.on_hazard(hazard("unknown", [(1, 1), (9, 1), (9, 3), (1, 3)]), driving.now)
+    driving.send(ch.HAZARD, hazard("unknown", [(1, 1), (9, 1), (9, 3), (1, 3)]))
     driving.run(0.5)
     assert driving.state().mode == "DEGRADED"
     assert sum(driving.wheels) / 2 <= 0.15 + 1e-9
@@ -354,22 +358,22 @@ def test_the_speed_layer_limits_the_robot(driving):
     everywhere = g.window_around(*g.bounds)
     cells = np.full((everywhere.height, everywhere.width), 12, np.uint8)
     for delta in driving.master.write([("speed", everywhere, cells)], [Cause(kind="zone", id="s", state="on")], []):
-        driving.agent.on_delta(delta, driving.now)
+        driving.send(ch.MAP_DELTA, delta)
     driving.run(1.0)
     assert sum(driving.wheels) / 2 == pytest.approx(0.12, abs=0.005)
 
 
 def test_a_path_of_another_goal_or_an_older_plan_is_not_followed(world):
     world.drive_to(L_PATH, plan_id=5)
-    followed = world.agent.state(world.stamp, world.now).plan_id
+    followed = world.state().plan_id
     older = msgspec.structs.replace(world.path, plan_id=4)
     foreign = msgspec.structs.replace(world.path, plan_id=9, goal_id="g0")
     for path in (older, foreign, msgspec.structs.replace(world.path, planner_epoch=2, plan_id=99)):
-        world.agent.on_path(path, world.now, world.stamp)
-    assert world.agent.state(world.stamp, world.now).plan_id == followed == 5
+        world.send(ch.ROBOT_PATH, path)
+    assert world.state().plan_id == followed == 5
     restarted = msgspec.structs.replace(world.path, planner_epoch=4, plan_id=1)
-    world.agent.on_path(restarted, world.now, world.stamp)
-    assert world.agent.state(world.stamp, world.now).plan_id == 1
+    world.send(ch.ROBOT_PATH, restarted)
+    assert world.state().plan_id == 1
 
 
 def test_a_planner_that_falls_silent_lets_it_drive_slowly_to_the_end_of_the_released_part(world):
@@ -391,10 +395,10 @@ def test_a_decision_for_a_path_that_was_replaced_is_dropped(driving):
         released_length=9.0,
     )  # fmt: skip
     driving.path = back
-    driving.agent.on_path(back, driving.now, driving.stamp)
-    driving.agent.accept(late, driving.now)
-    assert driving.agent._decision.plan_id == 1  # the old one runs out, the late one did not renew it
-    assert driving.agent._decision is not late
+    driving.send(ch.ROBOT_PATH, back)
+    driving.agent.accept(late)
+    assert driving.agent._wheels.decision.plan_id == 1  # the old one runs out, the late one did not renew it
+    assert driving.agent._wheels.decision is not late
     assert seconds_to_rest(driving) <= 1.2
 
 
@@ -419,23 +423,23 @@ def test_the_first_command_on_a_new_path_closes_its_trace_once(driving):
 
 
 def test_obstacles_are_what_the_lidar_sees_and_the_map_does_not_know(world):
-    assert world.agent.obstacles(world.now, world.stamp).points == []
+    assert world.obstacles().points == []
     g = world.geometry
     window = g.window_around(5.0, 1.8, 5.3, 2.2)
     world.solid[window.rows, window.columns] = 1
     world.run(0.5)
-    seen = np.array(world.agent.obstacles(world.now, world.stamp).points)
+    seen = np.array(world.obstacles().points)
     assert len(seen) >= 3
     assert np.abs(seen - (5.0, 2.0)).max() < 0.35
     # once the map shows it because this robot said so, it is still reported: else it would expire while in sight
     world.block(5.0, 1.8, 5.3, 2.2)
     world.run(0.5)
-    assert len(world.agent.obstacles(world.now, world.stamp).points) >= 2
+    assert len(world.obstacles().points) >= 2
 
 
 def test_its_view_reaches_to_the_walls_of_the_corridor_and_to_what_stands_before_them(world):
     def reach(x, y):
-        view = world.agent.obstacles(world.now, world.stamp).view
+        view = world.obstacles().view
         dx, dy = x - view.x, y - view.y
         assert math.hypot(view.x - world.x, view.y - world.y) < 0.1
         return view.reach_cm[int(math.atan2(dy, dx) % math.tau / math.tau * 180)] / 100 - math.hypot(dx, dy)
@@ -450,7 +454,7 @@ def test_its_view_reaches_to_the_walls_of_the_corridor_and_to_what_stands_before
 def test_what_others_call_blocked_is_no_news(world):
     world.block(5.0, 1.5, 5.4, 2.5, solid=True)
     world.run(0.5)
-    assert world.agent.obstacles(world.now, world.stamp).points == []
+    assert world.obstacles().points == []
 
 
 @pytest.mark.parametrize(
@@ -463,7 +467,7 @@ def test_what_others_call_blocked_is_no_news(world):
 def test_a_command_that_is_not_an_operators_changes_nothing(world, change, word):
     command = RobotCommand(kind="disable", robot="r1", operator="ann", nonce="n" * 16, issued_at=world.stamp)
     bad = msgspec.structs.replace(sign(command, KEY), **change)
-    reply = world.agent.on_command(bad, world.now, world.stamp)
+    reply = world.ask(bad)
     assert not reply.accepted
     assert word in reply.reason
     assert world.state().mode == "NORMAL"
@@ -471,7 +475,7 @@ def test_a_command_that_is_not_an_operators_changes_nothing(world, change, word)
 
 def test_a_command_that_is_too_old_changes_nothing(world):
     command = RobotCommand(kind="disable", robot="r1", operator="ann", nonce="n" * 16, issued_at=world.stamp - 6.0)
-    reply = world.agent.on_command(sign(command, KEY), world.now, world.stamp)
+    reply = world.ask(sign(command, KEY))
     assert not reply.accepted
     assert "6.0 s old" in reply.reason
     assert world.state().mode == "NORMAL"
@@ -479,8 +483,8 @@ def test_a_command_that_is_too_old_changes_nothing(world):
 
 def test_a_command_counts_once(world):
     command = sign(RobotCommand(kind="disable", robot="r1", operator="ann", nonce="n" * 16, issued_at=world.stamp), KEY)
-    assert world.agent.on_command(command, world.now, world.stamp).accepted
-    assert "already" in world.agent.on_command(command, world.now, world.stamp).reason
+    assert world.ask(command).accepted
+    assert "already" in world.ask(command).reason
 
 
 def test_egress_is_refused_with_a_plain_reason(world):
@@ -510,7 +514,7 @@ def test_without_a_snapshot_there_is_no_enable_and_a_damaged_snapshot_is_refused
     damaged = msgspec.structs.replace(world.master.snapshot(), hash=1)
     with pytest.raises(MapError):
         world.agent.load(damaged, world.now)
-    assert world.agent.needs_snapshot
+    assert world.agent.wants_snapshot(world.now)
 
 
 def test_what_others_hear_can_be_sent_and_read_again(driving):
@@ -518,8 +522,9 @@ def test_what_others_hear_can_be_sent_and_read_again(driving):
     window = g.window_around(driving.x + 1.5, 2.3, driving.x + 1.8, 2.6)
     driving.solid[window.rows, window.columns] = 1
     driving.run(1.0)
-    agent, now, stamp = driving.agent, driving.now, driving.stamp
-    said = [agent.pose(stamp, now), agent.state(stamp, now), agent.obstacles(now, stamp), agent.stream(now, stamp)]
-    for message in [*said, agent.save(now)]:
+    seen = driving.obstacles()
+    said = [publication.message for publication in driving.published]
+    assert {type(message) for message in said} == {RobotPose, RobotState, RobotObstacles}
+    for message in [*said, driving.agent.stream(driving.now, driving.stamp), driving.agent.pose_to_store(driving.now)]:
         assert msgspec.msgpack.decode(msgspec.msgpack.encode(message), type=type(message)) == message
-    assert said[2].points
+    assert seen.points

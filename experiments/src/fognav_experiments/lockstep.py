@@ -142,7 +142,7 @@ class _Drive:
     def step(self) -> None:
         """Let 10 ms pass everywhere."""
         robot, fog = self.robot, self.fog
-        robot.step(fog.snapshot if robot.agent.needs_snapshot else None)
+        robot.step(fog.snapshot if robot.agent.wants_snapshot(robot.now) else None)
         for happened in self.scenario.step(self.world, self.now):
             self.barrier_since = self.now
             self.say(happened.name)

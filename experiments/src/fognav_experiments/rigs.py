@@ -35,7 +35,7 @@ from map_service.core import MapCore
 from planner.core import PlannerCore
 from robot_agent.agent.core import AgentCore, SavedPose, decide
 from robot_agent.agent.lidar_edge import ScanSession
-from robot_agent.config import AgentConfig
+from robot_agent.config import agent_config
 from robot_agent.guardian import link
 from robot_agent.guardian.core import GuardianCore
 
@@ -60,7 +60,6 @@ _LIDAR_STEPS: Final = 2
 _STREAM_STEPS: Final = 5
 _BEAT_STEPS: Final = 10
 _CONTROL_STEPS: Final = 20
-_SECOND_STEPS: Final = 100
 
 
 def carry(channel: Channel, message: M) -> M:
@@ -76,9 +75,7 @@ class RobotRig:
         self.world = world
         self.hardware = Hardware(world, start, left_encoder=65_000, right_encoder=100)
         self.guardian = GuardianCore()
-        self.agent = AgentCore(
-            AgentConfig(robot=robot.id, operator_key=_KEY, radius=robot.radius, height=robot.height), seed
-        )
+        self.agent = AgentCore(agent_config(robot.id, _KEY, robot), seed)
         begin = robot.start
         self.agent.restore(
             SavedPose(site=site.site.id, x=begin.x, y=begin.y, theta=begin.theta, sigma_xy=0.25, sigma_theta=0.15)
@@ -89,7 +86,6 @@ class RobotRig:
         self._from_lidar = b""
         self._steps = 0
         self._nonce = 0
-        self._obstacles_due = False
         self.state: RobotState | None = None
         self.pose: RobotPose | None = None
 
@@ -98,6 +94,11 @@ class RobotRig:
         """The emulated time, s."""
         return self.hardware.now
 
+    @property
+    def moment(self) -> Moment:
+        """The emulated time by both clocks."""
+        return Moment(self.now, STAMP + self.now)
+
     def step(self, load: MapSnapshot | None) -> None:
         """Let 10 ms pass; `load` is the snapshot to be had, for when the agent needs one."""
         self._steps += 1
@@ -105,12 +106,12 @@ class RobotRig:
         self._to_base = self._to_lidar = b""
         base, lidar = self.hardware.step(STEP_S)
         now = self.now
-        if load is not None and self.agent.needs_snapshot:
+        if load is not None and self.agent.wants_snapshot(now):
             self.agent.load(load, now)
         self._guard(base, now)
         self._look(lidar, now)
         if self._steps % _CONTROL_STEPS == 0 and (job := self.agent.control_job(now)) is not None:
-            self.agent.accept(decide(job), now)
+            self.agent.accept(decide(job))
         if self._steps % _STREAM_STEPS == 0:
             command = link.decode_command(link.encode(self.agent.stream(now, STAMP + now)))
             self._to_base += self.guardian.on_command(command, now).data
@@ -138,17 +139,26 @@ class RobotRig:
             self.agent.on_scan(scan, now)
         self._to_lidar += received.data + self._scan.tick(now)
 
+    def hear(self, channel: Channel, message: Message) -> None:
+        """Hand a message of the fog to the agent."""
+        self.agent.handlers()[channel]({"robot": self.id}, message, self.moment)
+
     def tell(self) -> tuple[RobotPose | None, RobotState | None, RobotObstacles | None]:
-        """Return what the agent publishes in this step: pose at 10 Hz, state at 10 Hz at most, obstacles at 1 Hz."""
+        """Return what the agent publishes in this step, of which there is one every 0.1 s: pose, state, obstacles."""
         if self._steps % _BEAT_STEPS:
             return None, None, None
-        now = self.now
-        pose = self.agent.pose(STAMP + now, now)
-        state = carry(ch.ROBOT_STATE, self.agent.state(STAMP + now, now))
-        self.pose = None if pose is None else carry(ch.ROBOT_POSE, pose)
-        self.state = state
-        obstacles = self.agent.obstacles(now, STAMP + now) if self._steps % _SECOND_STEPS == 0 else None
-        return self.pose, state, None if obstacles is None else carry(ch.ROBOT_OBSTACLES, obstacles)
+        pose = state = obstacles = None
+        for publication in self.agent.tick(self.moment):
+            match publication.message:
+                case RobotPose() as message:
+                    pose = carry(publication.channel, message)
+                case RobotState() as message:
+                    state = carry(publication.channel, message)
+                case RobotObstacles() as message:
+                    obstacles = carry(publication.channel, message)
+        self.pose = pose
+        self.state = state or self.state
+        return pose, state, obstacles
 
     def command(self, kind: CommandKind) -> CommandReply:
         """Give an operator's signed command."""
@@ -161,7 +171,9 @@ class RobotRig:
             issued_at=STAMP + self.now,
         )
         command = carry(ch.ROBOT_COMMAND, sign(unsigned, _KEY))
-        return self.agent.on_command(command, self.now, STAMP + self.now)
+        reply = self.agent.answerers()[ch.ROBOT_COMMAND]({"robot": self.id}, command, self.moment)
+        assert isinstance(reply, CommandReply)
+        return reply
 
 
 class FogRig:
@@ -241,29 +253,29 @@ class FogRig:
 
     def deliver(self, robot: RobotRig) -> list[RobotPath | RobotGoal]:
         """Bring the robot what the fog published since the last time; return its paths and goals."""
-        now, stamp, agent = robot.now, STAMP + robot.now, robot.agent
+        now, stamp = robot.now, STAMP + robot.now
         self.inform_planner(now)
         for told in self._told:
-            agent.on_hazard(told, now)
+            robot.hear(ch.HAZARD, told)
         for zones in self._zones:
-            agent.on_zones(zones, now)
+            robot.hear(ch.ZONES, zones)
         for delta in self._deltas:
-            agent.on_delta(delta, now)
+            robot.hear(ch.MAP_DELTA, delta)
         for heartbeat in self._heartbeats:
-            agent.on_heartbeat(heartbeat, now)
+            robot.hear(ch.MAP_HEARTBEAT, heartbeat)
         self._told, self._zones, self._deltas, self._heartbeats = [], [], [], []
         published: list[RobotPath | RobotGoal] = []
         for name, message in self.planner.tick(now, stamp):
             if name != robot.id:
                 continue
+            taken: RobotPath | RobotGoal
             if isinstance(message, RobotPath):
-                path = carry(ch.ROBOT_PATH, message)
-                agent.on_path(path, now, stamp)
-                published.append(path)
+                taken = carry(ch.ROBOT_PATH, message)
+                robot.hear(ch.ROBOT_PATH, taken)
             else:
-                goal = carry(ch.ROBOT_GOAL, message)
-                agent.on_goal(goal, now)
-                published.append(goal)
+                taken = carry(ch.ROBOT_GOAL, message)
+                robot.hear(ch.ROBOT_GOAL, taken)
+            published.append(taken)
         return published
 
     def _aggregate(self, channel: Channel, ids: dict[str, str], message: Message, now: float) -> None:

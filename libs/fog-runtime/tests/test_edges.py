@@ -26,11 +26,14 @@ class Mqtt:
 
 class Zenoh:
     def __init__(self) -> None:
-        self.handlers, self.sent = {}, []
+        self.handlers, self.only, self.served, self.sent = {}, {}, {}, []
 
-    def subscribe(self, channel, kind, handler):
+    def subscribe(self, channel, kind, handler, **ids):
         assert kind is channel.message
-        self.handlers[channel] = handler
+        self.handlers[channel], self.only[channel] = handler, ids
+
+    def serve(self, channel, handler, **ids):
+        self.served[channel] = (handler, ids)
 
     def publish(self, channel, message, **ids):
         self.sent.append((channel, message, ids))
@@ -72,3 +75,24 @@ def test_a_channel_whose_transport_is_missing_is_an_error_at_once():
         edges.publish(Publication(ch.THESIS_WSN, "7,1,2"))
     with pytest.raises(ValueError, match="robot_goal"):
         Edges(ManualClock(), mqtt=Mqtt()).publish(Publication(ch.ROBOT_GOAL, GOAL, {"robot": "r1"}))
+
+
+def test_a_robot_hears_and_answers_on_its_own_channels_only():
+    clock, zenoh = ManualClock(5.0), Zenoh()
+    edges = Edges(clock, zenoh=zenoh)
+
+    def nothing(_ids, _message, _at):
+        return []
+
+    def answer(ids, command, at):
+        return m.CommandReply(accepted=True, reason=f"{ids['robot']} {command.kind} {at.now}")
+
+    edges.subscribe({ch.ROBOT_GOAL: nothing, ch.MAP_HEARTBEAT: nothing}, list, only={"robot": "r1"})
+    assert zenoh.only == {ch.ROBOT_GOAL: {"robot": "r1"}, ch.MAP_HEARTBEAT: {}}
+    edges.serve({ch.ROBOT_COMMAND: answer}, robot="r1")
+    handler, ids = zenoh.served[ch.ROBOT_COMMAND]
+    assert ids == {"robot": "r1"}
+    command = m.RobotCommand(kind="cancel", robot="r1", operator="ann", nonce="n" * 16, issued_at=1.0)
+    assert handler({"robot": "r1"}, command).reason == "r1 cancel 5.0"
+    with pytest.raises(ValueError, match="robot_command"):
+        Edges(clock, mqtt=Mqtt()).serve({ch.ROBOT_COMMAND: answer}, robot="r1")

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import os
-from dataclasses import replace
 
 from fog_runtime import logs, process
 from fog_runtime.clock import SystemClock
@@ -20,7 +19,7 @@ from robot_agent.agent.lidar_edge import LidarEdge
 from robot_agent.agent.service import Service
 from robot_agent.agent.settings import Settings, read_operator_key, read_site
 from robot_agent.agent.store import Store
-from robot_agent.config import AgentConfig
+from robot_agent.config import agent_config
 
 _log = logs.get("agent")
 
@@ -31,15 +30,9 @@ async def main() -> None:
     logs.configure("robot-agent", settings.log_level, settings.log_format)
     _log.info("settings", **describe(settings))
     site, body = read_site(settings)
-    config = AgentConfig(
-        robot=settings.robot,
-        operator_key=read_operator_key(settings.operator_key_file),
-        obstacle_ttl=settings.obstacle_memory_s,
+    config = agent_config(
+        settings.robot, read_operator_key(settings.operator_key_file), body, obstacle_ttl=settings.obstacle_memory_s
     )
-    if body is not None:
-        inflation = replace(config.motion.inflation, inscribed_radius=body.radius)
-        motion = replace(config.motion, inflation=inflation)
-        config = replace(config, radius=body.radius, height=body.height, motion=motion)
     clock = SystemClock(settings.speed)
     core = AgentCore(config, settings.seed)
     health = Health("map", "pose", "lidar", "base")
@@ -50,7 +43,7 @@ async def main() -> None:
         link = GuardianClient(settings.guardian_socket, clock, agent.on_feedback, agent.on_base_lost)
         lidar = LidarEdge(settings.lidar_port, clock, core.on_lidar_nodes, agent.on_scan)
         agent.restore(body)
-        agent.listen()
+        agent.subscribe()
         zenoh.alive("robot-agent", settings.robot)
         with serve_plain(health, settings.http_host, settings.http_port, settings.port_file):
             async with asyncio.TaskGroup() as tasks:
@@ -59,8 +52,8 @@ async def main() -> None:
                 tasks.create_task(agent.stream_loop(link), name="stream")
                 tasks.create_task(agent.control_loop(), name="control")
                 tasks.create_task(agent.map_loop(), name="map")
-                tasks.create_task(agent.tell_loop(), name="tell")
-                tasks.create_task(agent.keep_loop(lidar), name="keep")
+                tasks.create_task(agent.publish_loop(), name="publish")
+                tasks.create_task(agent.housekeeping_loop(lidar), name="housekeeping")
 
 
 if __name__ == "__main__":

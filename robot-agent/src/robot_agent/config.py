@@ -3,10 +3,11 @@
 Lengths in m, angles in rad, times in s.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 from fog_contracts.costs import DEFAULT_INFLATION, Inflation
+from fog_contracts.site import RobotSite
 
 LOCAL_INFLATION: Final = Inflation(
     inscribed_radius=DEFAULT_INFLATION.inscribed_radius, inflation_radius=0.45, cost_scaling=8.0
@@ -107,3 +108,19 @@ class AgentConfig:
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     localization: LocalizationConfig = field(default_factory=LocalizationConfig)
     motion: MotionConfig = field(default_factory=MotionConfig)
+
+
+def agent_config(
+    robot: str, operator_key: bytes, body: RobotSite | None = None, *, obstacle_ttl: float | None = None
+) -> AgentConfig:
+    """Return the configuration of a robot with this id, in the body that its site describes, if it does.
+
+    obstacle_ttl: how long (s) what its lidar saw counts while nobody looks there again; None for the default.
+    """
+    defaults = AgentConfig(robot=robot, operator_key=operator_key)
+    ttl = defaults.obstacle_ttl if obstacle_ttl is None else obstacle_ttl
+    if body is None:
+        return replace(defaults, obstacle_ttl=ttl)
+    inflation = replace(defaults.motion.inflation, inscribed_radius=body.radius)
+    motion = replace(defaults.motion, inflation=inflation)
+    return replace(defaults, obstacle_ttl=ttl, radius=body.radius, height=body.height, motion=motion)

@@ -10,13 +10,15 @@ import pytest
 from guardian_rig import DEADLINE_S
 from little_world import KEY, LittleWorld
 
+from fog_contracts import channels as ch
 from fog_contracts.grid import Window
 from fog_contracts.messages import MapSnapshot
 from fog_runtime.clock import SystemClock
 from fog_runtime.health import Health
 from robot_agent.agent import service as service_module
 from robot_agent.agent.core import AgentCore
-from robot_agent.agent.service import BEHIND_S, Service
+from robot_agent.agent.map_copy import BEHIND_S
+from robot_agent.agent.service import Service
 from robot_agent.agent.store import Store
 from robot_agent.config import AgentConfig
 
@@ -27,6 +29,13 @@ class Fog:
     def __init__(self):
         self.answers = asyncio.Queue()
         self.asked = 0
+        self.handlers = {}
+
+    def subscribe(self, channel, _kind, handler, **_ids):
+        self.handlers[channel] = handler
+
+    def serve(self, _channel, _handler, **_ids):
+        pass
 
     async def ask(self, _channel, _request, kind, _timeout):
         assert kind is MapSnapshot
@@ -51,6 +60,7 @@ class Rig:
         self.service = Service(
             self.core, self.fog, Store(tmp_path), SystemClock(), Health(), robot="r1", site=self.master.site
         )
+        self.service.subscribe()
         self.changes = 0
 
     def change(self):
@@ -59,10 +69,10 @@ class Rig:
 
     def deliver(self, deltas):
         for delta in deltas:
-            self.service._on_delta({}, delta)
+            self.fog.handlers[ch.MAP_DELTA]({}, delta)
 
     def beat(self):
-        self.service._on_heartbeat({}, self.master.heartbeat(1.0))
+        self.fog.handlers[ch.MAP_HEARTBEAT]({}, self.master.heartbeat(1.0))
 
     async def until(self, condition):
         end = time.monotonic() + DEADLINE_S
@@ -92,7 +102,7 @@ async def test_changes_during_the_fetch_of_a_snapshot_are_applied_after_it(mappi
     mapping.fog.answers.put_nowait(old)
     await mapping.until(lambda: mapping.core.replica.version == mapping.master.version)
     assert mapping.fog.asked == 1
-    assert not mapping.core.needs_snapshot
+    assert not mapping.core.replica.needs_snapshot
 
 
 async def test_changes_of_a_map_service_that_is_gone_do_not_spoil_the_new_map(mapping):
@@ -102,7 +112,7 @@ async def test_changes_of_a_map_service_that_is_gone_do_not_spoil_the_new_map(ma
     fresh.master._version = type(fresh.master.version)(8, 0, fresh.master.version.hash)
     mapping.fog.answers.put_nowait(fresh.master.snapshot())
     await mapping.until(lambda: mapping.core.replica.version == fresh.master.version)
-    assert not mapping.core.needs_snapshot
+    assert not mapping.core.replica.needs_snapshot
 
 
 async def test_a_last_change_that_got_lost_is_noticed_by_the_heartbeat_after_a_grace(mapping):

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from fog_contracts.channels import Channel
-    from fog_contracts.handlers import Handler, Publication
+    from fog_contracts.handlers import Answerer, Handler, Ids, Publication
     from fog_runtime.clock import Clock
     from fog_runtime.mqtt_edge import MqttEdge
     from fog_runtime.zenoh_edge import ZenohEdge
@@ -35,14 +35,23 @@ class Edges:
         publish: Callable[[Sequence[Publication]], object],
         *,
         numbers: Sequence[str | int] = (),
+        only: Ids | None = None,
     ) -> None:
         """Have each channel's messages go to its handler, and what the handler returns to `publish`.
 
         Call it before the MQTT connection runs. `numbers` names the areas of the thesis's topics, for which MQTT has
-        no wildcard. Raises `ValueError` for a channel whose transport this process does not have.
+        no wildcard; `only` narrows zenoh's channels to those of these ids, as a robot hears its own. Raises
+        `ValueError` for a channel whose transport this process does not have.
         """
         for channel, handler in handlers.items():
-            self._subscribe(channel, self._delivery(handler, publish), numbers)
+            self._subscribe(channel, self._delivery(handler, publish), numbers, only or {})
+
+    def serve(self, answerers: Mapping[Channel, Answerer], **ids: str) -> None:
+        """Have each queryable's requests go to its answerer; `ids` are the variable parts of the keys served."""
+        for channel, answerer in answerers.items():
+            if self._zenoh is None:
+                raise ValueError(f"channel {channel.name} is carried by zenoh, to which this process is not connected")
+            self._zenoh.serve(channel, self._reply(answerer), **_fitting(channel, ids))
 
     def publish(self, publication: Publication) -> None:
         """Publish without waiting; raises `ContractError` when the message breaks the channel's contract."""
@@ -64,8 +73,18 @@ class Edges:
 
         return deliver
 
+    def _reply(self, answerer: Answerer) -> Callable[[dict[str, str], Any], Message]:
+        def reply(ids: dict[str, str], request: Any) -> Message:
+            return answerer(ids, request, self.now())
+
+        return reply
+
     def _subscribe(
-        self, channel: Channel, deliver: Callable[[dict[str, str], Any], None], numbers: Sequence[str | int]
+        self,
+        channel: Channel,
+        deliver: Callable[[dict[str, str], Any], None],
+        numbers: Sequence[str | int],
+        only: Ids,
     ) -> None:
         if channel.transport == "mqtt" and self._mqtt is not None:
             if channel.message is None:
@@ -73,6 +92,11 @@ class Edges:
             else:
                 self._mqtt.on(channel, deliver, channel.message)
         elif channel.transport == "zenoh" and self._zenoh is not None and channel.message is not None:
-            self._zenoh.subscribe(channel, channel.message, deliver)
+            self._zenoh.subscribe(channel, channel.message, deliver, **_fitting(channel, only))
         else:
             raise ValueError(f"channel {channel.name} is carried by {channel.transport}: this process can't hear it")
+
+
+def _fitting(channel: Channel, ids: Ids) -> dict[str, str]:
+    """Return the ids that the channel has a place for."""
+    return {name: value for name, value in ids.items() if name in channel.fields}

@@ -110,7 +110,6 @@ class SafetyState:
 class SafetyOutputs:
     """The verdict: mode, why, the cap on speed (m/s), and how a moving robot comes to rest.
 
-    `released_only`: stop at the end of the released part of the path. `operator`: only a person can end this mode.
     `refusal`: why the request was not followed (None when it was, or when there was none).
     """
 
@@ -118,8 +117,6 @@ class SafetyOutputs:
     reasons: tuple[str, ...]
     cap: float
     stop: Literal["none", "ramp", "now"]
-    released_only: bool
-    operator: bool
     changed: bool
     refusal: str | None
 
@@ -366,8 +363,6 @@ def _verdict(state: SafetyState, before: Mode, refusal: str | None, config: Safe
         reasons=state.reasons,
         cap=caps.get(state.mode, 0.0),
         stop=stop,
-        released_only=state.mode != "NORMAL",
-        operator=state.mode in {"INIT", "FAULT"} or bool(state.latched),
         changed=state.mode != before,
         refusal=refusal,
     )

@@ -1,0 +1,85 @@
+"""The reasons behind blocked cells: watched areas and operators' no-go zones, and whether the robot stands in one."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fog_contracts import channels as ch
+from fog_contracts.costs import LETHAL
+from fog_contracts.geometry import contains_point, distance_to_segment
+from fog_contracts.messages import CircleShape, PolygonShape, RectangleShape
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from fog_contracts.handlers import Handler, Ids, Moment, Publication
+    from fog_contracts.messages import HazardArea, Shape, Zone, ZoneSet
+    from fog_contracts.replica import Replica
+    from robot_agent.agent.obstacle_reporter import ObstacleReporter
+    from robot_agent.localization.localizer import Pose2
+
+
+class BlockedPlaces:
+    """The newest state of every watched area, and all no-go zones."""
+
+    def __init__(self) -> None:
+        self._hazards: dict[str, HazardArea] = {}
+        self._zones: list[Zone] = []
+
+    def handlers(self) -> Mapping[ch.Channel, Handler]:
+        """Return the handlers of the channels that tell the reasons behind cells."""
+        return {ch.HAZARD: self._on_hazard, ch.ZONES: self._on_zones}
+
+    def _on_hazard(self, _ids: Ids, hazard: HazardArea, _at: Moment) -> Sequence[Publication]:
+        self._hazards[hazard.hazard.area] = hazard
+        return ()
+
+    def _on_zones(self, _ids: Ids, zones: ZoneSet, _at: Moment) -> Sequence[Publication]:
+        self._zones = [zone for zone in zones.zones if zone.enabled and zone.kind == "BLOCKED"]
+        return ()
+
+    def around(self, pose: Pose2, replica: Replica, reporter: ObstacleReporter, now: float) -> str | None:
+        """Return which blocked place the robot's centre (m, frame `map`) stands in, in words; None for no such place.
+
+        The map decides whether it is blocked, the areas and zones only name the reason. What the robot's own lidar
+        reported does not count: it would be the robot's own side, or a thing that it stands beside.
+        """
+        geometry = replica.geometry
+        if geometry is None:
+            return None
+        column, row = geometry.cell(pose.x, pose.y)
+        if not geometry.contains_cell(column, row) or replica.cost[row, column] != LETHAL:
+            return None
+        if replica.static[row, column] == LETHAL:
+            return None  # a pose that is some centimetres off, beside a wall
+        for hazard in self._hazards.values():
+            if hazard.hazard.state != "clear" and contains_point(hazard.polygon, pose.x, pose.y):
+                return f"the {hazard.hazard.state} area {hazard.label or hazard.hazard.area}"
+        for zone in self._zones:
+            if _contains(zone.shape, pose.x, pose.y):
+                return f"the no-go zone {zone.id}" + (f" ({zone.reason})" if zone.reason else "")
+        if reporter.is_self_reported(np.array([[pose.x, pose.y]]), now)[0]:
+            return None
+        return "a blocked part of the map"
+
+    def caution(self, pose: Pose2) -> str | None:
+        """Return why the robot must be slow where it is (m, frame `map`), in words; None when it need not be."""
+        for hazard in self._hazards.values():
+            if hazard.hazard.state == "unknown" and contains_point(hazard.polygon, pose.x, pose.y):
+                return f"nobody can tell whether the area {hazard.label or hazard.hazard.area} is clear"
+        return None
+
+
+def _contains(shape: Shape, x: float, y: float) -> bool:
+    if isinstance(shape, PolygonShape):
+        return contains_point(shape.points, x, y)
+    if isinstance(shape, RectangleShape):
+        (x0, y0), (x1, y1) = shape.corner, shape.opposite
+        return min(x0, x1) <= x <= max(x0, x1) and min(y0, y1) <= y <= max(y0, y1)
+    if isinstance(shape, CircleShape):
+        return math.hypot(x - shape.centre[0], y - shape.centre[1]) <= shape.radius
+    sides = zip(shape.line, shape.line[1:], strict=False)
+    return any(distance_to_segment(a, b, x, y) <= shape.width / 2 for a, b in sides)

@@ -1,0 +1,110 @@
+"""What the robot tells of the things around it: lidar points that the map does not explain, and how far it sees."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from fog_contracts.costs import FREE, INSCRIBED, UNKNOWN
+from fog_contracts.messages import VIEW_SECTORS, RobotObstacles, View
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from fog_contracts.grid import GridGeometry
+    from fog_contracts.handlers import Moment
+    from fog_contracts.replica import Replica
+    from robot_agent.localization.localizer import Localizer, Pose2
+
+_EXPLAINED_M: Final = 0.25
+"""A lidar point this near to a wall of the map is that wall."""
+_CELL_M: Final = 0.1
+_RANGE_M: Final = 6.0
+_TURN_RATE: Final = 0.5
+"""Above this turning rate (rad/s) no obstacle is reported: what is left of the skew smears it."""
+_SCAN_AGE_S: Final = 0.5
+_REMEMBERED_S: Final = 2.0
+"""A cell counts as reported by this robot for so much longer than its report holds: map and message take their time."""
+_POINTS_LEAST: Final = 2
+"""One beam alone may be a mixed echo off an edge."""
+
+Cell = tuple[int, int]
+
+
+class ObstacleReporter:
+    """Turns scans into reports, and remembers which cells it reported itself.
+
+    ttl: how long (s) a report holds. limit: points in a report, the nearest ones.
+    """
+
+    def __init__(self, ttl: float, limit: int) -> None:
+        self._ttl = ttl
+        self._limit = limit
+        self._reported: dict[Cell, float] = {}
+        """Until when each cell counts as reported by this robot."""
+
+    def report(self, localizer: Localizer, replica: Replica, scan_age: float, at: Moment) -> RobotObstacles | None:
+        """Return points that the lidar sees and the map does not explain; None when that can't be told now.
+
+        What others put on the map is no news, what this robot did is reported for as long as it is in sight.
+        """
+        points, scan, pose = localizer.points_in_map(), localizer.sweep, localizer.pose(at.now)
+        if localizer.status != "good" or replica.geometry is None or points is None or scan is None or pose is None:
+            return None
+        if scan_age > _SCAN_AGE_S or abs(localizer.twist()[1]) > _TURN_RATE:
+            return None
+        near = np.hypot(*scan.points.T) <= _RANGE_M
+        unexplained = points[near & (localizer.wall_distance(points) > _EXPLAINED_M)]
+        unexplained = unexplained[self._is_news(unexplained, replica, replica.geometry, at.now)]
+        cells = self._choose(unexplained, pose)
+        self._remember(cells, at.now)
+        return RobotObstacles(
+            points=[((cx + 0.5) * _CELL_M, (cy + 0.5) * _CELL_M) for cx, cy in cells],
+            stamp=at.stamp,
+            ttl=self._ttl,
+            view=view(localizer.seen_from(), points, replica.geometry),
+        )
+
+    def is_self_reported(self, points: NDArray[np.float64], now: float) -> NDArray[np.bool_]:
+        """Tell which points (n, 2; m, frame `map`) lie at a cell that this robot reported, or beside one."""
+        known = {cell for cell, until in self._reported.items() if until >= now}
+        around = [(dx, dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1)]
+        cells = np.floor(points / _CELL_M).astype(np.int64).tolist()
+        return np.array([any((cx + dx, cy + dy) in known for dx, dy in around) for cx, cy in cells], dtype=np.bool_)
+
+    def _choose(self, points: NDArray[np.float64], pose: Pose2) -> list[Cell]:
+        """Return the cells that hold enough of the points (n, 2), the nearest ones to the robot if they are many."""
+        cells, counts = np.unique(np.floor(points / _CELL_M).astype(np.int64), axis=0, return_counts=True)
+        chosen = cells[counts >= _POINTS_LEAST]
+        if len(chosen) > self._limit:
+            offset = (chosen + 0.5) * _CELL_M - (pose.x, pose.y)
+            chosen = chosen[np.argsort(np.hypot(*offset.T), kind="stable")[: self._limit]]
+        return [(cx, cy) for cx, cy in chosen.tolist()]
+
+    def _remember(self, cells: list[Cell], now: float) -> None:
+        self._reported = {cell: until for cell, until in self._reported.items() if until >= now}
+        self._reported.update(dict.fromkeys(cells, now + self._ttl + _REMEMBERED_S))
+
+    def _is_news(
+        self, points: NDArray[np.float64], replica: Replica, geometry: GridGeometry, now: float
+    ) -> NDArray[np.bool_]:
+        """Tell which points (n, 2) lie where nobody but this robot itself called something lethal or close to it."""
+        _, inside = geometry.cells(points)
+        known_floor = geometry.sample(replica.static, points, UNKNOWN) == FREE
+        free = known_floor & (geometry.sample(replica.cost, points, UNKNOWN) < INSCRIBED)
+        news: NDArray[np.bool_] = free | (self.is_self_reported(points, now) & inside)
+        return news
+
+
+def view(at: Pose2 | None, points: NDArray[np.float64], geometry: GridGeometry) -> View | None:
+    """Return how far the points (n, 2; m, frame `map`) let the lidar see from where it was, None off the map."""
+    if at is None or not geometry.contains_cell(*geometry.cell(at.x, at.y)):
+        return None
+    dx, dy = points[:, 0] - at.x, points[:, 1] - at.y
+    sectors = np.floor(np.arctan2(dy, dx) % math.tau * (VIEW_SECTORS / math.tau)).astype(np.int64) % VIEW_SECTORS
+    reach = np.full(VIEW_SECTORS, np.inf)
+    np.minimum.at(reach, sectors, np.hypot(dx, dy))
+    reach_cm = np.where(np.isfinite(reach), np.clip(np.floor(100.0 * reach), 0, 65_535), 0).astype(np.int64)
+    return View(x=at.x, y=at.y, reach_cm=reach_cm.tolist())

@@ -1,0 +1,88 @@
+"""Operators' commands: each is carried out once, if it is signed, fresh and fits the robot's state; else refused."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, Protocol
+
+from fog_contracts.commands import CommandGate
+from fog_contracts.costs import LETHAL
+from fog_contracts.messages import CommandReply
+
+if TYPE_CHECKING:
+    from fog_contracts.handlers import Moment
+    from fog_contracts.messages import Pose, RobotCommand
+    from fog_contracts.replica import Replica
+    from robot_agent.safety.gate import Request, SafetyOutputs
+
+_REASON_LIMIT: Final = 500
+
+
+class Commanded(Protocol):
+    """What an operator may have done to the robot."""
+
+    def request(self, request: Request, now: float) -> SafetyOutputs:
+        """Hand a request to the safety gate; its refusal stands in the outputs."""
+
+    def cancel_goal(self) -> str | None:
+        """Give the goal up; return which it was, None when there is none."""
+
+    def take_initial_pose(self, pose: Pose | None) -> str | None:
+        """Start localization at a pose in `map`; return why not, None when it is taken."""
+
+
+class OperatorCommands:
+    """Checks commands and carries them out on one robot."""
+
+    def __init__(self, robot: str, key: bytes, commanded: Commanded) -> None:
+        self._gate = CommandGate(robot, key)
+        self._robot = commanded
+
+    def answer(self, command: RobotCommand, at: Moment) -> CommandReply:
+        """Carry a command out, or say why not."""
+        refusal = self._gate.refusal(command, at.stamp)
+        if refusal is not None:
+            return _refused(refusal)
+        match command.kind:
+            case "enable" | "disable" | "reset":
+                return self._request(command.kind, at.now)
+            case "cancel":
+                goal = self._robot.cancel_goal()
+                if goal is None:
+                    return _refused("there is no goal to cancel")
+                return CommandReply(accepted=True, reason=f"the goal {goal} is cancelled on the robot")
+            case "initial_pose":
+                refusal = self._robot.take_initial_pose(command.pose)
+                if refusal is not None:
+                    return _refused(refusal)
+                return CommandReply(accepted=True, reason="taken; the next turns of the lidar check it")
+            case "egress":
+                return _refused("this robot can't leave a blocked area by itself yet: end the block or move it by hand")
+
+    def _request(self, request: Request, now: float) -> CommandReply:
+        outputs = self._robot.request(request, now)
+        if outputs.refusal is not None:
+            return _refused(outputs.refusal)
+        if request == "reset":
+            return CommandReply(accepted=True, reason="the fault is reset; enable the robot to let it drive")
+        return CommandReply(accepted=True, reason=f"{request}d; the mode is {outputs.mode}")
+
+
+def initial_pose_refusal(pose: Pose | None, replica: Replica, *, at_rest: bool) -> str | None:
+    """Return why a robot can't be at an initial pose that an operator gives; None when it can."""
+    geometry = replica.geometry
+    if pose is None:
+        return "the command carries no pose: give x, y and theta"
+    if geometry is None:
+        return "the robot has no map yet: wait until it has loaded one"
+    if not at_rest:
+        return "the robot is driving: disable it first"
+    column, row = geometry.cell(pose.x, pose.y)
+    if not geometry.contains_cell(column, row):
+        return f"({pose.x:.2f}, {pose.y:.2f}) lies off the map"
+    if replica.static[row, column] == LETHAL:
+        return f"({pose.x:.2f}, {pose.y:.2f}) lies in a wall of the map"
+    return None
+
+
+def _refused(reason: str) -> CommandReply:
+    return CommandReply(accepted=False, reason=reason[:_REASON_LIMIT])

@@ -1,0 +1,107 @@
+"""Whether the path may still be driven: the fog's plan may be older than the robot's copy of the map.
+
+A path that is blocked near the robot, or for longer than the planner needs to replan, is a problem; so is one that
+was planned on another map.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from fog_contracts.costs import INSCRIBED
+from robot_agent.motion.local_planner import first_blocked
+
+if TYPE_CHECKING:
+    from fog_contracts.messages import RobotPath
+    from fog_contracts.replica import Replica, Version
+    from robot_agent.agent.mission import Mission, PathName
+    from robot_agent.motion.local_planner import PathFollower
+
+BLOCK_NEAR_M: Final = 3.0
+"""A blocked path this near stops the robot at once; farther away the planner gets `PLANNER_GRACE_S` to replan."""
+PLANNER_GRACE_S: Final = 1.0
+"""How long the planner may take for a path on the newest map."""
+
+
+class _Block(NamedTuple):
+    """Where along the path (m from its start) it is blocked, and what to say of it."""
+
+    at: float
+    reason: str
+
+
+class PathMonitor:
+    """Compares the path that is followed with the robot's copy of the map."""
+
+    def __init__(self) -> None:
+        self._checked: tuple[Version, PathName] | None = None
+        self._block: _Block | None = None
+        self._blocked_since: float | None = None
+        self._other_map_since: float | None = None
+
+    def begin(self) -> None:
+        """Begin to watch another path. One that replaces a blocked path inherits no grace."""
+        self._block = self._checked = None
+
+    def reset(self) -> None:
+        """Forget the path: there is none to watch."""
+        self._block = self._blocked_since = self._other_map_since = None
+
+    def check(self, mission: Mission, replica: Replica, now: float) -> None:
+        """Look along the path, whenever path or map may have changed; costs nothing when neither did."""
+        name, follower, path = mission.path_name, mission.follower, mission.path
+        if name is None or path is None or follower is None or replica.version is None:
+            self._clear()
+            return
+        if self._checked == (replica.version, name):
+            return
+        self._checked = (replica.version, name)
+        self._block = _find_block(path, follower, replica, replica.version)
+        if self._block is None:
+            self._clear()
+        elif self._blocked_since is None:
+            self._blocked_since = now
+
+    def problem(self, mission: Mission, version: Version | None, now: float) -> str | None:
+        """Return why the path must not be driven, in words; None when it may. Call it steadily: it keeps time."""
+        path = mission.path
+        if path is None or not mission.active:
+            return None
+        if path.refusal is not None:
+            return f"the planner finds no way: {path.refusal.reason}"
+        if self._is_of_other_map(path, version, now):
+            return "the path was planned on another map than the robot's"
+        if self._block is None or self._blocked_since is None:
+            return None
+        progress = mission.follower.progress if mission.follower else 0.0
+        near = self._block.at - progress <= BLOCK_NEAR_M
+        return self._block.reason if near or now - self._blocked_since > PLANNER_GRACE_S else None
+
+    def _clear(self) -> None:
+        self._block = self._blocked_since = None
+
+    def _is_of_other_map(self, path: RobotPath, version: Version | None, now: float) -> bool:
+        if version is None or path.map_epoch == version.epoch:
+            self._other_map_since = None
+            return False
+        if self._other_map_since is None:
+            self._other_map_since = now
+        return now - self._other_map_since > PLANNER_GRACE_S
+
+
+def _find_block(path: RobotPath, follower: PathFollower, replica: Replica, version: Version) -> _Block | None:
+    """Return what first blocks the rest of the path on the robot's map; None when nothing does."""
+    assert replica.geometry is not None
+    same_map = path.map_epoch == version.epoch
+    if same_map and path.map_seq > version.seq:
+        # Checked as soon as the robot's map has caught up; how long it may lag is the safety gate's matter.
+        return None
+    # A planner that knew all of this map may lead the robot out over what its lidar took for an obstacle.
+    known = same_map and path.map_seq == version.seq
+    ahead = first_blocked(replica.cost, replica.geometry, follower, led_out=known)
+    if ahead is None:
+        return None
+    column, row = replica.geometry.cell(*follower.points[-1])
+    goal_blocked = replica.geometry.contains_cell(column, row) and replica.cost[row, column] >= INSCRIBED
+    what = "the goal is blocked" if goal_blocked else f"the path is blocked {ahead:.1f} m ahead"
+    return _Block(follower.progress + ahead, f"{what} on the newest map; waiting for a new plan")

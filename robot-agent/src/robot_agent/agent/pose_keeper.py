@@ -1,0 +1,75 @@
+"""How the robot comes to a pose after a start, and which poses it keeps for the next one."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from fog_contracts.messages import Mode
+    from fog_contracts.replica import Replica
+    from robot_agent.localization.localizer import Localizer, SavedPose
+
+SEARCH_AGAIN_S: Final = 15.0
+"""A global search is not begun again before this time has passed."""
+_MOVED_M: Final = 0.02
+_TURNED_RAD: Final = 0.03
+_SIGMA_CHANGED: Final = 0.05
+
+
+class PoseKeeper:
+    """Starts the localizer from a stored pose or by a global search, and picks the poses that are worth storing."""
+
+    def __init__(self, localizer: Localizer) -> None:
+        self._localizer = localizer
+        self._waiting: SavedPose | None = None
+        """A stored pose to start at as soon as the map of its site is there."""
+        self._searched_at = -math.inf
+        self._stored: SavedPose | None = None
+
+    def restore(self, saved: SavedPose, site: str) -> None:
+        """Start at a stored pose, at once if the map of its site is loaded already; the lidar verifies it."""
+        if site == saved.site:
+            self._localizer.restore(saved)
+        else:
+            self._waiting = saved
+
+    def load_map(self, replica: Replica) -> None:
+        """Take the static map of a snapshot that was loaded."""
+        assert replica.geometry is not None
+        self._localizer.load_map(replica.static, replica.geometry)
+        waiting, self._waiting = self._waiting, None
+        if waiting is not None and waiting.site == replica.site:
+            self._localizer.restore(waiting)
+
+    def search(self, mode: Mode, now: float, *, at_rest: bool) -> bool:
+        """Begin to search the whole map when nobody gave a pose: at rest and in INIT only; return whether one began."""
+        localizer = self._localizer
+        if localizer.status != "none" or localizer.searching or localizer.pose(now) is not None:
+            return False
+        if mode != "INIT" or not at_rest or now - self._searched_at <= SEARCH_AGAIN_S:
+            return False
+        if not localizer.global_localization():
+            return False
+        self._searched_at = now
+        return True
+
+    def to_store(self, site: str, now: float) -> SavedPose | None:
+        """Return the pose if it is trusted and differs from the one returned last, which counts as stored.
+
+        Storage of a small computer wears out, so only what moved is worth a write.
+        """
+        pose = self._localizer.save(site, now) if site else None
+        if pose is None or (self._stored is not None and not _differs(pose, self._stored)):
+            return None
+        self._stored = pose
+        return pose
+
+
+def _differs(new: SavedPose, old: SavedPose) -> bool:
+    return (
+        math.hypot(new.x - old.x, new.y - old.y) > _MOVED_M
+        or abs(math.remainder(new.theta - old.theta, math.tau)) > _TURNED_RAD
+        or abs(new.sigma_xy - old.sigma_xy) > _SIGMA_CHANGED
+        or abs(new.sigma_theta - old.sigma_theta) > _SIGMA_CHANGED
+    )

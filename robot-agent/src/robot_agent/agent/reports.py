@@ -1,0 +1,88 @@
+"""What the robot tells of itself, as messages."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from fog_contracts.messages import LoopHealth, RobotPose, RobotState
+
+if TYPE_CHECKING:
+    from fog_contracts.handlers import Moment
+    from fog_contracts.messages import Trace
+    from fog_contracts.replica import Version
+    from robot_agent.agent.mission import Mission
+    from robot_agent.config import AgentConfig
+    from robot_agent.guardian.link import BaseFeedback
+    from robot_agent.localization.localizer import Localizer
+    from robot_agent.motion.local_planner import Decision
+    from robot_agent.safety.gate import SafetyState
+
+_VARIANCE_LEAST: Final = (1e-4, 1e-4, 1e-4)
+_SPEED_LIMIT: Final = 10.0
+_REASON_LIMIT: Final = 500
+
+
+def robot_pose(localizer: Localizer, config: AgentConfig, at: Moment) -> RobotPose | None:
+    """Return the pose at a moment with its covariance and the measured twist; None while none is known."""
+    pose = localizer.pose(at.now)
+    if pose is None:
+        return None
+    v, w = localizer.twist()
+    covariance = localizer.covariance() + np.diag(_VARIANCE_LEAST)
+    return RobotPose(
+        x=pose.x,
+        y=pose.y,
+        theta=pose.theta,
+        covariance=[float(value) for value in covariance.ravel()],
+        v=min(max(v, -_SPEED_LIMIT), _SPEED_LIMIT),
+        w=min(max(w, -_SPEED_LIMIT), _SPEED_LIMIT),
+        radius=config.radius,
+        height=config.height,
+        stamp=at.stamp,
+        localized=localizer.status in {"good", "weak"},
+    )
+
+
+def robot_state(
+    safety: SafetyState,
+    mission: Mission,
+    version: Version | None,
+    feedback: BaseFeedback | None,
+    *,
+    hindrances: list[str],
+    traces: list[Trace],
+    loop: LoopHealth,
+    stamp: float,
+) -> RobotState:
+    """Return what the robot is doing and why; `hindrances` are reasons that are not the safety gate's."""
+    path = mission.path
+    return RobotState(
+        mode=safety.mode,
+        reasons=[reason[:_REASON_LIMIT] for reason in (*safety.reasons, *hindrances)],
+        enabled=safety.enabled,
+        battery=feedback.battery if feedback else None,
+        goal_id=mission.goal_id,
+        map_epoch=version.epoch if version else 0,
+        map_seq=version.seq if version else 0,
+        plan_id=path.plan_id if path else None,
+        planner_epoch=path.planner_epoch if path else None,
+        goal_reached=mission.reached,
+        goal_distance=mission.follower.left if mission.follower else None,
+        loop=loop,
+        traces=list(traces),
+        stamp=stamp,
+    )
+
+
+def hindrances(mission: Mission, decision: Decision | None, stuck_after: float, now: float) -> list[str]:
+    """Return, in words, what keeps a robot that may drive from its goal."""
+    found: list[str] = []
+    if decision is not None and decision.blocked:
+        found.append(decision.blocked)
+    if mission.follower is None:
+        found.append("waiting for a path")
+    elif (stuck := mission.follower.stuck_for(now)) > stuck_after:
+        found.append(f"no progress along the path for {stuck:.0f} s")
+    return found

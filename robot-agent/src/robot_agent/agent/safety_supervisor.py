@@ -1,0 +1,69 @@
+"""Gathers what the safety gate judges, and keeps the gate's state and its last outputs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from robot_agent.safety.gate import SafetyInputs, SafetyState, step
+
+if TYPE_CHECKING:
+    from robot_agent.agent.map_copy import MapCopy
+    from robot_agent.agent.mission import Mission
+    from robot_agent.agent.sensors import BaseSource, LidarSource
+    from robot_agent.config import SafetyConfig
+    from robot_agent.localization.localizer import Localizer
+    from robot_agent.safety.gate import Request, SafetyOutputs
+
+
+class SafetySupervisor:
+    """The safety gate with its memory."""
+
+    def __init__(self, config: SafetyConfig) -> None:
+        self._config = config
+        self.state = SafetyState()
+        self.outputs = step(self.state, SafetyInputs(), 0.0, config)[1]
+
+    def evaluate(self, inputs: SafetyInputs, now: float, request: Request | None = None) -> SafetyOutputs:
+        """Step the gate at `now` (s, monotonic), with an operator's request if there is one."""
+        self.state, self.outputs = step(self.state, replace(inputs, request=request), now, self._config)
+        return self.outputs
+
+
+def safety_inputs(
+    base: BaseSource,
+    lidar: LidarSource,
+    map_copy: MapCopy,
+    localizer: Localizer,
+    mission: Mission,
+    *,
+    path_problem: str | None,
+    inside_blocked: str | None,
+    caution: str | None,
+    now: float,
+) -> SafetyInputs:
+    """Gather age, value and complaint of every source at `now` (s, monotonic)."""
+    feedback, follower = base.feedback, mission.follower
+    return SafetyInputs(
+        map_loaded=map_copy.replica.version is not None,
+        map_age=map_copy.age(now),
+        map_gap=map_copy.gap(now),
+        localization=localizer.status,
+        localization_detail=localizer.detail,
+        lidar_node_age=lidar.node_age(now),
+        turn_age=lidar.scan_age(now),
+        identical_turns=lidar.identical_scans,
+        base_age=base.age(now),
+        base_silent=base.lost,
+        base_fault=feedback.fault if feedback else None,
+        base_stopped=feedback.stopped if feedback else None,
+        bumper=feedback is not None and feedback.bumper,
+        cliff=feedback is not None and feedback.cliff,
+        wheel_drop=feedback is not None and feedback.wheel_drop,
+        mission=mission.active,
+        plan_age=mission.planner_age(now),
+        released_left=follower.released_left if follower else 0.0,
+        path_problem=path_problem,
+        inside_blocked=inside_blocked,
+        caution=caution,
+    )

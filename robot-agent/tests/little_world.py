@@ -23,12 +23,13 @@ from fog_kernels.raycast import cast
 from robot_agent.agent.core import AgentCore, decide
 from robot_agent.config import AgentConfig
 from robot_agent.guardian.link import BaseFeedback
-from robot_agent.hardware import LaserScan, RepeatCounter
+from robot_agent.hardware import BaseStatus, DriveTrain, LaserScan, RepeatCounter, WheelOdometry
 
 KEY = b"k" * 32
-AGENT = AgentConfig(robot="r1", operator_key=KEY)
 TICK_M = math.pi * 0.072 / 508.8
 AXLE = 0.235
+DRIVE_TRAIN = DriveTrain(axle_m=AXLE, travel_wrap_m=65_536 * TICK_M)
+AGENT = AgentConfig(robot="r1", operator_key=KEY, drive_train=DRIVE_TRAIN)
 DT = 0.01
 BEAMS = 360
 TURN_S = 0.18
@@ -198,18 +199,12 @@ class LittleWorld:
         self.now = START + self.steps * DT
         self._move()
         if self.base_on and self.steps % 4 == 0:
-            left, right = (int(t) & 0xFFFF for t in self.ticks)
+            left, right = ((int(t) & 0xFFFF) * TICK_M for t in self.ticks)
             self.agent.on_base(
                 BaseFeedback(
                     seq=self.steps,
-                    left_ticks=left,
-                    right_ticks=right,
-                    oi_mode=2,
-                    bumper=self.bumper,
-                    cliff=False,
-                    wheel_drop=False,
-                    battery=0.8,
-                    charging=False,
+                    status=BaseStatus(bumper_left=self.bumper, battery=0.8),
+                    odometry=WheelOdometry(left_m=left, right_m=right),
                     fault=self.fault,
                     stopped=None,
                 ),

@@ -15,7 +15,9 @@ from fognav_sim.wire.pty_port import PtyPort
 from fognav_sim.wire.roomba import RoombaEmulator
 from fognav_sim.wire.rplidar import RplidarEmulator
 from robot_agent.bases.roomba600 import open_interface as oi
+from robot_agent.bases.roomba600.driver import Roomba600Driver, Roomba600Options
 from robot_agent.lidars.rplidar_a1 import protocol as rplidar
+from robot_agent.odometry import EncoderFault, Motion, Odometry
 from robot_agent.serial_port import open_port
 
 
@@ -103,7 +105,8 @@ def test_each_danger_arrives_as_itself_and_all_but_the_bumper_end_safe_mode(fiel
 )
 def test_odometry_follows_any_drive_through_any_encoder_wrap(legs, left, right):
     roomba = RoombaEmulator(left_encoder=left, right_encoder=right)
-    parser, odometry = oi.StreamParser(oi.GUARDIAN_STREAM), oi.Odometry()
+    driver = Roomba600Driver(Roomba600Options())
+    odometry = Odometry(driver.drive_train)
     roomba.receive(oi.start() + oi.safe() + oi.stream(oi.GUARDIAN_STREAM), 0.0)
     now, pose = 0.0, (0.0, 0.0, 0.0)
     for leg in legs:
@@ -121,9 +124,9 @@ def test_odometry_follows_any_drive_through_any_encoder_wrap(legs, left, right):
                     y += (v_left + v_right) / 2 * 0.015 / 4 * math.sin(theta)
                     pose = (x, y, theta + (v_right - v_left) * 0.015 / 4 / 0.235 / 2)
             roomba.tick(now, 0.015)
-            parser.receive_data(roomba.outgoing(now))
-            for frame in events(parser):
-                assert isinstance(odometry.update(*frame.encoders, now), oi.Motion)
+            driver.receive_data(roomba.outgoing(now), now)
+            for reading in events(driver):
+                assert isinstance(odometry.update(reading.odometry, now), Motion)
     # A tick is 0.44 mm of a wheel, 1.9 mrad of heading.
     assert odometry.pose[2] == pytest.approx(pose[2], abs=0.006)
     assert math.dist(odometry.pose[:2], pose[:2]) < 0.002 + 0.006 * len(legs)
@@ -131,20 +134,19 @@ def test_odometry_follows_any_drive_through_any_encoder_wrap(legs, left, right):
 
 def test_a_reset_robot_is_noticed_by_text_mode_and_encoders():
     roomba = RoombaEmulator(left_encoder=30000, right_encoder=30000)
-    parser, odometry = oi.StreamParser(oi.GUARDIAN_STREAM), oi.Odometry()
-    setup = oi.start() + oi.safe() + oi.stream(oi.GUARDIAN_STREAM)
-    roomba.receive(setup, 0.0)
-    parser.receive_data(roomba.outgoing(0.016))
-    (frame,) = events(parser)
-    odometry.update(*frame.encoders, 0.016)
+    driver = Roomba600Driver(Roomba600Options())
+    odometry = Odometry(driver.drive_train)
+    roomba.receive(driver.wake(), 0.0)
+    driver.receive_data(roomba.outgoing(0.016), 0.016)
+    (reading,) = events(driver)
+    odometry.update(reading.odometry, 0.016)
     roomba.receive(oi.reset(), 0.02)
-    parser.receive_data(roomba.outgoing(1.0))
-    assert list(events(parser)) == []
-    assert parser.skipped_bytes > 0
-    roomba.receive(setup, 1.0)
-    parser.receive_data(roomba.outgoing(1.016))
-    (frame,) = events(parser)
-    assert isinstance(odometry.update(*frame.encoders, 1.016), oi.EncoderFault)
+    driver.receive_data(roomba.outgoing(1.0), 1.0)
+    assert list(events(driver)) == []
+    roomba.receive(driver.wake(), 1.0)
+    driver.receive_data(roomba.outgoing(1.016), 1.016)
+    (reading,) = events(driver)
+    assert isinstance(odometry.update(reading.odometry, 1.016), EncoderFault)
 
 
 # --- RPLidar ---
@@ -236,7 +238,8 @@ def test_a_robot_is_driven_over_a_pty_and_survives_a_host_that_crashes(tmp_path)
     link = tmp_path / "roomba"
     begin = time.monotonic()
     last = begin
-    parser, odometry = oi.StreamParser(oi.GUARDIAN_STREAM), oi.Odometry()
+    driver = Roomba600Driver(Roomba600Options())
+    odometry = Odometry(driver.drive_train)
 
     def simulate() -> None:
         nonlocal last
@@ -250,19 +253,19 @@ def test_a_robot_is_driven_over_a_pty_and_survives_a_host_that_crashes(tmp_path)
         last = now
 
     with PtyPort(link) as line:
-        with open_port(str(link)) as port:
+        with open_port(str(link), 115200) as port:
             port.write(oi.start() + oi.safe() + oi.stream(oi.GUARDIAN_STREAM) + oi.drive_wheels(0.2, 0.2))
             while odometry.pose[0] < 0.05:
                 assert time.monotonic() - begin < 20.0
                 simulate()
-                parser.receive_data(port.read_available())
-                for frame in events(parser):
-                    odometry.update(*frame.encoders, time.monotonic())
-        assert (parser.corrupted, odometry.faults) == (0, 0)
+                driver.receive_data(port.read_available(), time.monotonic())
+                for reading in events(driver):
+                    odometry.update(reading.odometry, time.monotonic())
+        assert (driver.corrupted, odometry.faults) == (0, 0)
         # The host is gone without a word: the wheels keep turning. The next one stops them.
         simulate()
         assert roomba.wheel_speeds_m_s == (0.2, 0.2)
-        with open_port(str(link)) as port:
+        with open_port(str(link), 115200) as port:
             port.write(oi.drive_direct(0, 0))
             while roomba.wheel_speeds_m_s != (0.0, 0.0):
                 assert time.monotonic() - begin < 20.0
@@ -276,7 +279,7 @@ def test_whole_turns_arrive_over_a_pty():
     parser, assembler = rplidar.Parser(), rplidar.ScanAssembler()
     turns = []
     deadline = time.monotonic() + 20.0
-    with PtyPort() as line, open_port(str(line.path)) as port:
+    with PtyPort() as line, open_port(str(line.path), 115200) as port:
         port.set_dtr(on=False)
         port.write(rplidar.stop() + rplidar.get_health() + rplidar.scan())
         while len(turns) < 3:

@@ -34,10 +34,10 @@ from hazard_aggregator.core import Aggregator
 from map_service.core import MapCore
 from planner.core import PlannerCore
 from robot_agent.agent.core import AgentCore, SavedPose, decide
-from robot_agent.agent.lidar_edge import ScanSession
 from robot_agent.config import agent_config
 from robot_agent.guardian import link
 from robot_agent.guardian.core import GuardianCore
+from robot_agent.registry import make_base, make_lidar
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -74,13 +74,14 @@ class RobotRig:
         self.id = robot.id
         self.world = world
         self.hardware = Hardware(world, start, left_encoder=65_000, right_encoder=100)
-        self.guardian = GuardianCore()
-        self.agent = AgentCore(agent_config(robot.id, _KEY, robot), seed)
+        base, self._scan = make_base("roomba600"), make_lidar("rplidar-a1")
+        self.guardian = GuardianCore(base)
+        config = agent_config(robot.id, _KEY, robot).with_hardware(base.drive_train, self._scan.traits)
+        self.agent = AgentCore(config, seed)
         begin = robot.start
         self.agent.restore(
             SavedPose(site=site.site.id, x=begin.x, y=begin.y, theta=begin.theta, sigma_xy=0.25, sigma_theta=0.15)
         )
-        self._scan = ScanSession()
         self._to_base = b""
         self._to_lidar = self._scan.begin(start)
         self._from_lidar = b""
@@ -133,7 +134,7 @@ class RobotRig:
             return
         received = self._scan.receive(self._from_lidar, now)
         self._from_lidar = b""
-        if received.nodes:
+        if received.samples:
             self.agent.on_lidar_nodes(now)
         for scan in received.scans:
             self.agent.on_scan(scan, now)

@@ -20,6 +20,7 @@ from robot_agent.agent.service import Service
 from robot_agent.agent.settings import Settings, read_operator_key, read_site
 from robot_agent.agent.store import Store
 from robot_agent.config import agent_config
+from robot_agent.registry import make_base, make_lidar
 
 _log = logs.get("agent")
 
@@ -33,6 +34,9 @@ async def main() -> None:
     config = agent_config(
         settings.robot, read_operator_key(settings.operator_key_file), body, obstacle_ttl=settings.obstacle_memory_s
     )
+    base = make_base(settings.base, settings.base_options)
+    scanner = make_lidar(settings.lidar, settings.lidar_options)
+    config = config.with_hardware(base.drive_train, scanner.traits)
     clock = SystemClock(settings.speed)
     core = AgentCore(config, settings.seed)
     health = Health("map", "pose", "lidar", "base")
@@ -41,7 +45,7 @@ async def main() -> None:
     ) as zenoh:
         agent = Service(core, zenoh, Store(settings.data_dir), clock, health, robot=settings.robot, site=site)
         link = GuardianClient(settings.guardian_socket, clock, agent.on_feedback, agent.on_base_lost)
-        lidar = LidarEdge(settings.lidar_port, clock, core.on_lidar_nodes, agent.on_scan)
+        lidar = LidarEdge(settings.lidar_port, scanner, clock, core.on_lidar_nodes, agent.on_scan)
         agent.restore(body)
         agent.subscribe()
         zenoh.alive("robot-agent", settings.robot)

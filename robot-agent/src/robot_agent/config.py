@@ -3,17 +3,27 @@
 Lengths in m, angles in rad, times in s.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field, replace
-from typing import Final
+from typing import TYPE_CHECKING, Final, Self
 
 from fog_contracts.costs import DEFAULT_INFLATION, Inflation
-from fog_contracts.site import RobotSite
+from robot_agent.hardware import DriveTrain
+
+if TYPE_CHECKING:
+    from fog_contracts.site import RobotSite
+    from robot_agent.hardware import LidarTraits
 
 LOCAL_INFLATION: Final = Inflation(
     inscribed_radius=DEFAULT_INFLATION.inscribed_radius, inflation_radius=0.45, cost_scaling=8.0
 )
 """That of what the lidar sees, in the local window: narrower and steeper than the map's, because the robot sees such a
 thing where it is and passes it closely at need, whereas the map's costs keep whole paths in the middle of corridors."""
+
+
+_SCANS_LOST: Final = 2.4
+"""No whole scan for so many revolutions counts as a lost one."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -105,9 +115,21 @@ class AgentConfig:
     obstacle_ttl: float = 600.0
     """How long (s) what the lidar saw counts while nobody looks there again: longer than the way around it takes."""
     obstacle_limit: int = 400
+    drive_train: DriveTrain = field(default_factory=DriveTrain)
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     localization: LocalizationConfig = field(default_factory=LocalizationConfig)
     motion: MotionConfig = field(default_factory=MotionConfig)
+
+    def with_hardware(self, drive_train: DriveTrain, lidar: LidarTraits) -> Self:
+        """Return the same, fitted to a base and a lidar: geometry, top speed, ranges, and how long a scan may take."""
+        speed = min(self.motion.wheel_speed, drive_train.wheel_speed_max_m_s)
+        return replace(
+            self,
+            drive_train=drive_train,
+            motion=replace(self.motion, axle=drive_train.axle_m, wheel_speed=speed),
+            localization=replace(self.localization, range_min=lidar.range_min_m, range_max=lidar.range_max_m),
+            safety=replace(self.safety, turn_lost=max(self.safety.turn_lost, _SCANS_LOST * lidar.scan_period_s)),
+        )
 
 
 def agent_config(

@@ -1,4 +1,4 @@
-"""The edge: a serial device as a file descriptor. 115200 8N1, raw, never blocking.
+"""The edge: a serial device as a file descriptor. 8N1, raw, never blocking.
 
 Plain termios, because the protocols above need nothing more and because an inherited descriptor (the watchdog of the
 guardian) has to be a port as well.
@@ -94,7 +94,7 @@ class Port:
                 raise PortLost(self.path, _reason(error)) from error
 
     def set_dtr(self, *, on: bool) -> bool:
-        """Set or clear the DTR line (cleared lets an RPLidar A1's motor run). False where there is none, as on a pty.
+        """Set or clear the DTR line. False where there is none, as on a pty.
 
         Raises:
             PortLost: when the device is gone.
@@ -129,11 +129,11 @@ class Port:
         self.close()
 
 
-def open_port(path: str) -> Port:
-    """Open a serial device (or pty) for this process alone: 115200 8N1, raw, non-blocking.
+def open_port(path: str, baud: int) -> Port:
+    """Open a serial device (or pty) for this process alone: 8N1 at `baud`, raw, non-blocking.
 
     Raises:
-        PortLost: if it is missing, forbidden, in use by another Port, or no terminal.
+        PortLost: if it is missing, forbidden, in use by another Port, no terminal, or can't be so fast.
 
     """
     try:
@@ -141,14 +141,17 @@ def open_port(path: str) -> Port:
     except OSError as error:
         raise PortLost(path, _reason(error)) from error
     try:
-        _set_up(fd, path)
+        _set_up(fd, path, baud)
     except BaseException:
         os.close(fd)
         raise
     return Port(fd, path, owned=True)
 
 
-def _set_up(fd: int, path: str) -> None:
+def _set_up(fd: int, path: str, baud: int) -> None:
+    speed = getattr(termios, f"B{baud}", None)
+    if speed is None:
+        raise PortLost(path, f"this system has no rate of {baud} baud")
     try:
         # Advisory, and shared by those who inherit the descriptor.
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -159,7 +162,6 @@ def _set_up(fd: int, path: str) -> None:
         control[termios.VMIN] = 1
         control[termios.VTIME] = 0
         mode = termios.CS8 | termios.CREAD | termios.CLOCAL
-        speed = termios.B115200
         termios.tcsetattr(fd, termios.TCSAFLUSH, [0, 0, mode, 0, speed, speed, control])
     except termios.error as error:
         raise PortLost(path, f"not a serial device ({error.args[-1]})") from error

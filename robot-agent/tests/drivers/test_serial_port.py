@@ -35,7 +35,7 @@ def read_some(port: Port) -> bytes:
 def test_every_byte_value_passes_both_ways(line):
     (master,), path = line
     every = bytes(range(256))
-    with open_port(path) as port:
+    with open_port(path, 115200) as port:
         assert port.read_available() == b""
         os.write(master, every)
         got = b""
@@ -48,7 +48,7 @@ def test_every_byte_value_passes_both_ways(line):
 
 def test_the_line_is_115200_8n1_and_raw(line):
     _, path = line
-    with open_port(path) as port:
+    with open_port(path, 115200) as port:
         iflag, oflag, cflag, lflag, ispeed, ospeed, _ = termios.tcgetattr(port.fileno())
     assert (iflag, oflag, lflag) == (0, 0, 0)
     assert cflag & termios.CSIZE == termios.CS8
@@ -58,13 +58,13 @@ def test_the_line_is_115200_8n1_and_raw(line):
 
 def test_a_pty_has_no_dtr_and_that_is_no_error(line):
     _, path = line
-    with open_port(path) as port:
+    with open_port(path, 115200) as port:
         assert port.set_dtr(on=False) is False
 
 
 def test_losing_the_device_is_one_error_that_says_what_to_check(line):
     ends, path = line
-    with open_port(path) as port:
+    with open_port(path, 115200) as port:
         os.close(ends.pop())
         with pytest.raises(PortLost, match="plugged in") as lost:
             port.read_available()
@@ -75,23 +75,23 @@ def test_losing_the_device_is_one_error_that_says_what_to_check(line):
 
 def test_a_missing_device_and_a_file_that_is_none_are_refused(tmp_path):
     with pytest.raises(PortLost, match="No such file"):
-        open_port(str(tmp_path / "none"))
+        open_port(str(tmp_path / "none"), 115200)
     plain = tmp_path / "plain"
     plain.write_bytes(b"")
     with pytest.raises(PortLost, match="not a serial device"):
-        open_port(str(plain))
+        open_port(str(plain), 115200)
 
 
 def test_a_port_in_use_is_refused_and_free_after_close(line):
     _, path = line
-    with open_port(path), pytest.raises(PortLost, match="locked"):
-        open_port(path)
-    open_port(path).close()
+    with open_port(path, 115200), pytest.raises(PortLost, match="locked"):
+        open_port(path, 115200)
+    open_port(path, 115200).close()
 
 
 def test_a_device_that_takes_nothing_is_lost_and_does_not_hang(line):
     _, path = line
-    with open_port(path) as port, pytest.raises(PortLost, match="no byte"):
+    with open_port(path, 115200) as port, pytest.raises(PortLost, match="no byte"):
         port.write(bytes(1_000_000))
 
 
@@ -101,7 +101,7 @@ def test_another_process_can_use_the_inherited_descriptor(line):
         "import sys; from robot_agent.serial_port import Port; "
         "port = Port.from_fd(int(sys.argv[1])); port.write(b'stop'); port.close()"
     )
-    with open_port(path) as port:
+    with open_port(path, 115200) as port:
         subprocess.run(
             [sys.executable, "-c", code, str(port.fileno())], pass_fds=(port.fileno(),), check=True, timeout=30
         )
@@ -117,7 +117,7 @@ def test_a_descriptor_that_is_not_open_is_refused():
 
 def test_closing_twice_is_harmless(line):
     _, path = line
-    port = open_port(path)
+    port = open_port(path, 115200)
     port.close()
     port.close()
     assert port.fileno() == -1

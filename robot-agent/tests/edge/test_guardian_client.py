@@ -10,13 +10,13 @@ from guardian_rig import DEADLINE_S
 from fog_runtime.clock import SystemClock
 from robot_agent.agent.guardian_client import QUIET_S, RESET_VALID_S, GuardianClient
 from robot_agent.guardian.link import BaseFeedback, WheelCommand, decode_command, encode
+from robot_agent.hardware import BaseStatus, WheelOdometry
 
 pytestmark = pytest.mark.live
 
 FEEDBACK = BaseFeedback(
-    seq=1, left_ticks=5, right_ticks=6, oi_mode=2, bumper=False, cliff=False, wheel_drop=False,
-    battery=0.5, charging=False, fault=None, stopped=None,
-)  # fmt: skip
+    seq=1, status=BaseStatus(battery=0.5), odometry=WheelOdometry(left_m=5.0, right_m=6.0), fault=None, stopped=None
+)
 
 
 class SkippingClock(SystemClock):

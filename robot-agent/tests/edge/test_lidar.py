@@ -10,8 +10,9 @@ from guardian_rig import DEADLINE_S
 from fog_runtime.clock import SystemClock
 from fognav_sim.wire.pty_port import PtyPort
 from fognav_sim.wire.rplidar import RplidarEmulator
-from robot_agent.agent.lidar_edge import ANSWER_S, RESET_S, SILENT_S, STOP_S, LidarEdge, ScanSession
+from robot_agent.agent.lidar_edge import LidarEdge
 from robot_agent.lidars.rplidar_a1 import protocol as rplidar
+from robot_agent.lidars.rplidar_a1.driver import ANSWER_S, RESET_S, SILENT_S, STOP_S, RplidarA1Driver
 
 STEP = 0.02
 
@@ -25,7 +26,7 @@ class Line:
 
     def __init__(self):
         self.device = RplidarEmulator(round_room)
-        self.session = ScanSession()
+        self.session = RplidarA1Driver()
         self.now = 50.0
         self.scans = []
         self.sent = b""
@@ -103,7 +104,7 @@ def test_a_lidar_in_error_is_reset_and_tried_again():
 async def test_the_edge_waits_for_its_port_and_opens_it_again(tmp_path):
     link = tmp_path / "lidar"
     scans = []
-    edge = LidarEdge(str(link), SystemClock(), lambda _: None, lambda scan, _: scans.append(scan))
+    edge = LidarEdge(str(link), RplidarA1Driver(), SystemClock(), lambda _: None, lambda scan, _: scans.append(scan))
     task = asyncio.create_task(edge.run())
 
     async def until(condition, port=None, device=None):

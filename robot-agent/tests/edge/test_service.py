@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 from guardian_rig import DEADLINE_S
-from little_world import KEY, LittleWorld
+from little_world import AGENT, LittleWorld
 
 from fog_contracts import channels as ch
 from fog_contracts.grid import Window
@@ -20,7 +20,6 @@ from robot_agent.agent.core import AgentCore
 from robot_agent.agent.map_copy import BEHIND_S
 from robot_agent.agent.service import Service
 from robot_agent.agent.store import Store
-from robot_agent.config import AgentConfig
 
 
 class Fog:
@@ -56,7 +55,7 @@ class Rig:
         self.world = LittleWorld()
         self.master = self.world.master
         self.fog = Fog()
-        self.core = AgentCore(AgentConfig(robot="r1", operator_key=KEY), seed=1)
+        self.core = AgentCore(AGENT, seed=1)
         self.service = Service(
             self.core, self.fog, Store(tmp_path), SystemClock(), Health(), robot="r1", site=self.master.site
         )

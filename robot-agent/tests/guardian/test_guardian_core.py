@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 import struct
 from dataclasses import dataclass, field
 
@@ -8,11 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fognav_sim.wire.roomba import FULL, OFF, PASSIVE, SAFE, RoombaEmulator
-from robot_agent.bases.roomba600 import open_interface as oi
-from robot_agent.guardian.core import BASE_SILENT_S, COMMAND_FRESH_S, SETTLE_S, GuardianCore
+from robot_agent.bases.roomba600.driver import Roomba600Driver, Roomba600Options
+from robot_agent.guardian.core import COMMAND_FRESH_S, GuardianCore
 from robot_agent.guardian.link import WheelCommand
 
 STEP = 0.01
+BASE_SILENT_S = Roomba600Driver.timing.silence
+SETTLE_S = Roomba600Driver.timing.settle
 
 
 def commands(data: bytes) -> list[tuple[int, bytes]]:
@@ -31,7 +34,7 @@ class Rig:
     """A guardian and an emulated base on one line, in emulated time; every rule is checked after every step."""
 
     base: RoombaEmulator = field(default_factory=RoombaEmulator)
-    core: GuardianCore = field(default_factory=GuardianCore)
+    core: GuardianCore = field(default_factory=lambda: GuardianCore(Roomba600Driver(Roomba600Options())))
     now: float = 100.0
     seq: int = 0
     command_at: float = -1e9
@@ -245,7 +248,7 @@ def test_a_base_that_leaves_safe_mode_stays_so_until_a_reset(mode):
     change_mode(rig.base, mode)
     rig.drive(5.0)
     assert rig.base.mode == mode
-    assert "left Safe mode" in rig.core.latched
+    assert "left its driving mode" in rig.core.latched
     assert rig.wheels == (0.0, 0.0)
     rig.command(0.0, 0.0, reset=True)
     rig.run(0.3)
@@ -265,7 +268,7 @@ def test_frames_from_before_a_handshake_do_not_count_as_its_answer():
     rig.command(0.3, 0.3, reset=True)
     rig.now += 0.5 * SETTLE_S
     rig.take(rig.core.on_bytes(old, rig.now))
-    assert rig.feedback[-1].stopped == "the base is not in Safe mode yet"
+    assert rig.feedback[-1].stopped == "the base is not ready to drive yet"
     rig.command(0.3, 0.3)
     assert rig.wheels == (0.0, 0.0)
 
@@ -313,7 +316,7 @@ def test_a_base_on_its_charger_is_left_alone_until_it_is_taken_off():
     later = b"".join(rig.core.tick(rig.now + 0.02 * n).data for n in range(12))
     assert {opcode for opcode, _ in commands(later)} <= {145}
     assert rig.feedback[-1].stopped == "the base stands on its charger"
-    assert rig.feedback[-1].charging
+    assert rig.feedback[-1].status.charging
     rig.base.world.charger = False
     rig.run(1.5)
     assert rig.base.mode == SAFE
@@ -336,15 +339,16 @@ def test_feedback_carries_encoders_battery_and_news_at_once():
     rig.base.add_wheel_travel(0.1, 0.2)
     rig.run(0.1)
     told = rig.feedback[-1]
-    assert (told.left_ticks, told.right_ticks) == rig.base.encoders
-    assert told.battery == pytest.approx(2400 / 2600, abs=0.01)
-    assert told.oi_mode == oi.Mode.SAFE
+    travel = (told.odometry.left_m, told.odometry.right_m)
+    assert travel == pytest.approx([ticks * math.pi * 0.072 / 508.8 for ticks in rig.base.encoders], abs=1e-9)
+    assert told.status.battery == pytest.approx(2400 / 2600, abs=0.01)
+    assert told.status.mode_problem is None
     assert told.stopped == "no fresh command of the agent"
     assert [feedback.seq for feedback in rig.feedback] == list(range(1, len(rig.feedback) + 1))
 
 
-def test_the_farewell_stops_the_wheels():
+def test_the_stop_command_stops_the_wheels():
     rig = ready_rig()
     rig.drive(0.3)
-    rig.base.receive(rig.core.farewell(), rig.now)
+    rig.base.receive(rig.core.stop_command(), rig.now)
     assert rig.base.wheel_speeds_m_s == (0.0, 0.0)

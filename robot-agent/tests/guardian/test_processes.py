@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 import os
 import random
 import signal
@@ -125,7 +126,8 @@ def test_garbage_on_the_line_neither_drives_nor_ends_anything(rig):
         time.sleep(0.005)
         assert not rig.base.moving
     assert rig.watchdog.guardian() == guardian
-    wait_for(lambda: rig.agent.feedback.left_ticks == rig.base.robot.encoders[0], "frames are understood again")
+    travel = rig.base.robot.encoders[0] * math.pi * 0.072 / 508.8
+    wait_for(lambda: abs(rig.agent.feedback.odometry.left_m - travel) < 1e-9, "frames are understood again")
     rig.agent.reset = True
     rig.drive()
 
@@ -180,6 +182,8 @@ def test_a_second_watchdog_keeps_off_a_port_in_use(rig, tmp_path):
     [
         ("BASE_PORT", "", "FOGNAV_BASE_PORT is not set"),
         ("SPEED", "fast", "positive number"),
+        ("BASE", "tank", "no 'tank' (known: "),
+        ("BASE_OPTIONS", '{"axle_m": 3.0}', "$.axle_m"),
         ("GUARDIAN_SOCKET", "", "FOGNAV_GUARDIAN_SOCKET"),
         ("GUARDIAN_SOCKET", "/tmp/nowhere/guardian.sock", "No such file or directory. Name a path"),
         ("LOG_LEVEL", "loud", "FOGNAV_LOG_LEVEL"),

@@ -31,9 +31,9 @@ from robot_agent.agent.reports import hindrances, robot_pose, robot_state
 from robot_agent.agent.safety_supervisor import SafetySupervisor, safety_inputs
 from robot_agent.agent.sensors import BaseSource, LidarSource
 from robot_agent.agent.wheel_control import WheelControl
-from robot_agent.bases.roomba600.open_interface import EncoderFault, Odometry
 from robot_agent.localization.localizer import Localizer, SavedPose
 from robot_agent.motion.local_planner import Decision, Job, decide, make_job, twist
+from robot_agent.odometry import EncoderFault, Odometry
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -68,7 +68,7 @@ class AgentCore:
     def __init__(self, config: AgentConfig, seed: int = 0) -> None:
         self._config = config
         self._base = BaseSource()
-        self._odometry = Odometry()
+        self._odometry = Odometry(config.drive_train)
         self._lidar = LidarSource()
         self._localizer = Localizer(config.localization, seed)
         self._pose_keeper = PoseKeeper(self._localizer)
@@ -145,7 +145,7 @@ class AgentCore:
     def on_base(self, feedback: BaseFeedback, now: float) -> None:
         """Take what the guardian read from the base."""
         self._base.on_feedback(feedback, now)
-        motion = self._odometry.update(feedback.left_ticks, feedback.right_ticks, now)
+        motion = self._odometry.update(feedback.odometry, now)
         if not isinstance(motion, EncoderFault):
             self._localizer.on_odometry(now, motion.x, motion.y, motion.theta)
 

@@ -62,7 +62,7 @@ def robot_state(
         mode=safety.mode,
         reasons=[reason[:_REASON_LIMIT] for reason in (*safety.reasons, *hindrances)],
         enabled=safety.enabled,
-        battery=feedback.battery if feedback else None,
+        battery=feedback.status.battery if feedback else None,
         goal_id=mission.goal_id,
         map_epoch=version.epoch if version else 0,
         map_seq=version.seq if version else 0,

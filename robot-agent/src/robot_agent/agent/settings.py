@@ -13,6 +13,7 @@ from fog_contracts.commands import KEY_BYTES
 from fog_contracts.messages import Id
 from fog_contracts.site import Site
 from fog_runtime.settings import CommonSettings, SettingsError
+from robot_agent.guardian.watchdog import DEFAULT_BASE
 
 if TYPE_CHECKING:
     from fog_contracts.site import RobotSite
@@ -21,7 +22,10 @@ SITE_FILE: Final = "site.toml"
 
 
 class Settings(CommonSettings, frozen=True, kw_only=True):
-    """The robot's id, its wires, the seed of its particle filter, and its memory.
+    """The robot's id, its base and lidar with their wires, the seed of its particle filter, and its memory.
+
+    `base`, `lidar`: names in the entry points `fognav.bases` and `fognav.lidars`; the base must be the guardian's.
+    `base_options`, `lidar_options`: a JSON object with the part's own options; empty for its defaults.
 
     `obstacle_memory_s`: how long (s) a thing that its lidar saw counts while no lidar looks there again.
 
@@ -29,6 +33,10 @@ class Settings(CommonSettings, frozen=True, kw_only=True):
     """
 
     robot: Id
+    base: str = DEFAULT_BASE
+    base_options: str = ""
+    lidar: str = "rplidar-a1"
+    lidar_options: str = ""
     lidar_port: str
     guardian_socket: Path
     site_dir: Path = Path()

@@ -1,8 +1,8 @@
 """What the guardian decides: which bytes go to the base, and when the wheels must stand. Pure; time is an argument.
 
 The guardian trusts nobody. A command of the agent moves the wheels only while it is fresh; bumper, cliff, wheel drop,
-an unexpected OI mode or a silent base stop them within one sensor frame, latched until the agent passes on an
-operator's reset. A Roomba keeps its last velocity when the host is silent, so "stop" is always a command, repeated.
+a base that leaves its driving mode or falls silent stop them within one sensor frame, latched until the agent passes on
+an operator's reset. A base may keep its last velocity when the host is silent, so "stop" is always a command, repeated.
 
 The agent keeps a fault of its own as soon as it hears of the latch, so either of the two may die without the fault
 being forgotten. When both die, the robot starts in INIT, and an operator must enable it as after any boot.
@@ -10,21 +10,18 @@ being forgotten. When both die, the robot starts in INIT, and an operator must e
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-from robot_agent.bases.roomba600 import open_interface as oi
-from robot_agent.guardian.link import BaseFeedback, WheelCommand
+import msgspec
+
+from robot_agent.guardian.link import WHEEL_SPEED_MAX_M_S, BaseFeedback, WheelCommand
+
+if TYPE_CHECKING:
+    from robot_agent.hardware import BaseDriver, BaseReading, BaseStatus
 
 COMMAND_FRESH_S: Final = 0.2
 """A command older than this does not move a wheel."""
-BASE_SILENT_S: Final = 0.3
-"""No valid sensor frame for this long is a fault: 20 frames of 15 ms are missing."""
-HANDSHAKE_S: Final = 1.0
-"""How long the base may take to report Safe mode before the handshake is sent again."""
-SETTLE_S: Final = 0.1
-"""Frames that come sooner after a handshake may stem from before it: they don't tell the mode that it led to."""
 OVERCURRENT_S: Final = 0.3
 """A wheel motor that starts on a carpet draws much for a moment; one that is blocked keeps drawing."""
 REPEAT_S: Final = 0.05
@@ -39,7 +36,7 @@ STEP_S: Final = 0.06
 class Limits:
     """What the guardian lets through: wheel speed and mean speed in m/s, gain of a wheel's speed in m/s2."""
 
-    wheel: float = 0.5
+    wheel: float = WHEEL_SPEED_MAX_M_S
     linear: float = 0.31
     acceleration: float = 3.0
 
@@ -56,10 +53,10 @@ class Output:
 class _Base:
     """What is known of the base."""
 
-    frame: oi.Frame | None = None
-    frame_at: float = -1.0e9
-    safe: bool = False
-    handshake_at: float | None = None
+    reading: BaseReading | None = None
+    reading_at: float = -1.0e9
+    awake: bool = False
+    woken_at: float | None = None
     overcurrent_since: float | None = None
 
 
@@ -67,10 +64,11 @@ class _Base:
 class GuardianCore:
     """One base, one agent. Feed it bytes, commands and time; write what it returns."""
 
+    driver: BaseDriver
     limits: Limits = field(default_factory=Limits)
 
     def __post_init__(self) -> None:
-        self._parser = oi.StreamParser(oi.GUARDIAN_STREAM)
+        self._wheel_limit = min(self.limits.wheel, self.driver.drive_train.wheel_speed_max_m_s)
         self._base = _Base()
         self._command: WheelCommand | None = None
         self._command_at = -1.0e9
@@ -91,17 +89,17 @@ class GuardianCore:
     @property
     def corrupted(self) -> int:
         """Sensor frames that came damaged."""
-        return self._parser.corrupted
+        return self.driver.corrupted
 
     def on_bytes(self, data: bytes, now: float) -> Output:
         """Take what the base sent; a frame that calls for a stop yields the stop at once."""
-        self._parser.receive_data(data)
+        self.driver.receive_data(data, now)
         news: list[BaseFeedback] = []
         urgent = b""
-        while (frame := self._parser.next_event()) is not None:
-            self._base.frame, self._base.frame_at = frame, now
-            urgent += self._judge(frame, now)
-            feedback = self._feedback(frame, now)
+        while (reading := self.driver.next_event()) is not None:
+            self._base.reading, self._base.reading_at = reading, now
+            urgent += self._check(reading.status, now)
+            feedback = self._feedback(reading, now)
             if feedback is not None:
                 news.append(feedback)
         return Output(urgent, tuple(news))
@@ -111,8 +109,8 @@ class GuardianCore:
         self._command, self._command_at = command, now
         if command.reset and self._latched is not None:
             self._latched = None
-            self._base.safe = False
-            return Output(self._handshake(now))
+            self._base.awake = False
+            return Output(self._wake(now))
         return self._drive(now)
 
     def on_agent_lost(self, now: float) -> Output:
@@ -122,63 +120,61 @@ class GuardianCore:
 
     def tick(self, now: float) -> Output:
         """Let time pass (50 Hz or more): stale commands, a silent base, repeated stops."""
-        base = self._base
-        if not base.safe:
-            due = base.handshake_at is None or now - base.handshake_at > HANDSHAKE_S
-            # On its charger the base falls out of Safe mode at once, and asking again would only disturb the charging.
+        base, timing = self._base, self.driver.timing
+        if not base.awake:
+            due = base.woken_at is None or now - base.woken_at > timing.wake
+            # A base that does not drive on its charger is left alone there: waking it would only disturb the charging.
             if due and not self._charging(now):
-                return Output(self._handshake(now), self._reminder(now))
-            # The handshake may have got lost, and the base may still roll as somebody else left it.
+                return Output(self._wake(now), self._reminder(now))
+            # What should wake it may have got lost, and the base may still roll as somebody else left it.
             again = now - self._sent_at >= REPEAT_S
             return Output(self._send((0.0, 0.0), now) if again else b"", self._reminder(now))
-        silent = now - base.frame_at
-        if silent > BASE_SILENT_S:
+        silent = now - base.reading_at
+        if silent > timing.silence:
             data = self._latch(f"the base has sent no valid frame for {silent:.1f} s: check cable and power", now)
             return Output(data, self._reminder(now))
         return self._drive(now)
 
-    def farewell(self) -> bytes:
-        """Return the bytes that stop the wheels when the guardian ends in good order; the base stays in Safe mode."""
-        return oi.drive_direct(0, 0)
+    def stop_command(self) -> bytes:
+        """Return the bytes that stop the wheels when the guardian ends in good order; the base stays awake."""
+        return self.driver.drive(0.0, 0.0)
 
     def _charging(self, now: float) -> bool:
         base = self._base
-        return base.frame is not None and now - base.frame_at <= BASE_SILENT_S and base.frame.on_charger
+        fresh = now - base.reading_at <= self.driver.timing.silence
+        return base.reading is not None and fresh and base.reading.status.charging
 
-    def _handshake(self, now: float) -> bytes:
-        # Start puts the OI into Passive mode, which stops the wheels by itself; the zero after Safe is for a base
-        # whose receiver was in the middle of a command and swallowed the Start.
-        self._base.handshake_at = now
+    def _wake(self, now: float) -> bytes:
+        self._base.woken_at = now
         self._wheels, self._sent, self._sent_at = (0.0, 0.0), (0.0, 0.0), now
-        return oi.start() + oi.safe() + oi.drive_direct(0, 0) + oi.stream(oi.GUARDIAN_STREAM)
+        return self.driver.wake()
 
-    def _judge(self, frame: oi.Frame, now: float) -> bytes:
+    def _check(self, status: BaseStatus, now: float) -> bytes:
         base = self._base
-        if not base.safe:
-            settled = base.handshake_at is not None and now - base.handshake_at >= SETTLE_S
-            if not settled or frame.mode != oi.Mode.SAFE:
+        if not base.awake:
+            settled = base.woken_at is not None and now - base.woken_at >= self.driver.timing.settle
+            if not settled or status.mode_problem is not None:
                 return b""
-            base.safe, base.overcurrent_since, self._stepped_at = True, None, now
+            base.awake, base.overcurrent_since, self._stepped_at = True, None, now
         if self._latched is not None:
             return b""
-        if not frame.wheel_overcurrent:
+        if not status.overcurrent:
             base.overcurrent_since = None
         elif base.overcurrent_since is None:
             base.overcurrent_since = now
-        # Safe mode itself falls back to Passive on cliff, wheel drop or charger: those say more than the mode does.
-        if frame.cliff:
+        # A base may leave its driving mode by itself on cliff or wheel drop: those say more than the mode does.
+        if status.cliff:
             return self._latch("a cliff sensor sees no floor", now)
-        if frame.wheel_dropped:
+        if status.wheel_drop:
             return self._latch("a wheel has dropped: the robot was lifted or hangs over an edge", now)
-        if frame.bumped:
-            side = "both sides" if frame.bump_left and frame.bump_right else "left" if frame.bump_left else "right"
+        if status.bumper:
+            both = status.bumper_left and status.bumper_right
+            side = "both sides" if both else "left" if status.bumper_left else "right"
             return self._latch(f"the bumper is pressed ({side})", now)
         if base.overcurrent_since is not None and now - base.overcurrent_since >= OVERCURRENT_S:
             return self._latch("a wheel motor draws too much current: it is blocked", now)
-        if frame.mode != oi.Mode.SAFE:
-            name = frame.mode.name if isinstance(frame.mode, oi.Mode) else str(frame.mode)
-            why = "it has contact to a charger" if frame.on_charger else "by itself"
-            return self._latch(f"the base left Safe mode (now {name}): {why}", now)
+        if status.mode_problem is not None:
+            return self._latch(f"the base left its driving mode: {status.mode_problem}", now)
         return b""
 
     def _latch(self, reason: str, now: float) -> bytes:
@@ -191,8 +187,7 @@ class GuardianCore:
         return self._send(self._wheels, now)
 
     def _drive(self, now: float) -> Output:
-        base = self._base
-        if not base.safe:
+        if not self._base.awake:
             return Output()
         elapsed = 0.0 if self._stepped_at is None else max(0.0, min(now - self._stepped_at, STEP_S))
         self._stepped_at = now
@@ -216,49 +211,37 @@ class GuardianCore:
         scale = min(
             1.0,
             self.limits.linear / mean if mean > self.limits.linear else 1.0,
-            self.limits.wheel / fastest if fastest > self.limits.wheel else 1.0,
+            self._wheel_limit / fastest if fastest > self._wheel_limit else 1.0,
         )
         return left * scale, right * scale
 
     def _send(self, wheels: tuple[float, float], now: float) -> bytes:
         self._sent, self._sent_at = wheels, now
-        return oi.drive_direct(right_mm_s=round(wheels[1] * 1000), left_mm_s=round(wheels[0] * 1000))
+        return self.driver.drive(*wheels)
 
-    def _feedback(self, frame: oi.Frame, now: float) -> BaseFeedback | None:
-        key = (frame.mode, frame.bumped, frame.cliff, frame.wheel_dropped, self._latched, self._base.safe)
+    def _feedback(self, reading: BaseReading, now: float) -> BaseFeedback | None:
+        # All that is news but the battery, which changes all the time.
+        key = (msgspec.structs.replace(reading.status, battery=None), self._latched, self._base.awake)
         if key == self._feedback_key and now - self._feedback_at < FEEDBACK_S:
             return None
         self._feedback_key = key
-        return self._report(frame, now)
+        return self._report(reading, now)
 
     def _reminder(self, now: float) -> tuple[BaseFeedback, ...]:
         """Repeat the last frame while the base says nothing new, so that the agent knows what it waits for."""
-        frame = self._base.frame
-        return () if frame is None or now - self._feedback_at < FEEDBACK_S else (self._report(frame, now),)
+        reading = self._base.reading
+        return () if reading is None or now - self._feedback_at < FEEDBACK_S else (self._report(reading, now),)
 
-    def _report(self, frame: oi.Frame, now: float) -> BaseFeedback:
+    def _report(self, reading: BaseReading, now: float) -> BaseFeedback:
         self._seq += 1
         self._feedback_at = now
         stopped = None
-        if not self._base.safe:
-            on_charger = "the base stands on its charger"
-            stopped = on_charger if self._charging(now) else "the base is not in Safe mode yet"
+        if not self._base.awake:
+            stopped = "the base stands on its charger" if self._charging(now) else "the base is not ready to drive yet"
         elif self._command is None or now - self._command_at > COMMAND_FRESH_S:
             stopped = "no fresh command of the agent"
-        left, right = frame.encoders
-        charge = frame.charge_fraction
         return BaseFeedback(
-            seq=self._seq,
-            left_ticks=left,
-            right_ticks=right,
-            oi_mode=int(frame.mode),
-            bumper=frame.bumped,
-            cliff=frame.cliff,
-            wheel_drop=frame.wheel_dropped,
-            battery=min(1.0, max(0.0, charge)) if math.isfinite(charge) else None,
-            charging=frame.on_charger,
-            fault=self._latched,
-            stopped=stopped,
+            seq=self._seq, status=reading.status, odometry=reading.odometry, fault=self._latched, stopped=stopped
         )
 
 

@@ -1,17 +1,20 @@
 """What agent and guardian tell each other over their Unix socket (SOCK_SEQPACKET, msgpack, one message a packet)."""
 
-from typing import Annotated
+from typing import Annotated, Final
 
 import msgspec
 from msgspec import Meta, Struct
 
 from fog_contracts.messages import Count, Sentence
+from robot_agent.hardware import BaseStatus, WheelOdometry
 
 PACKET_LIMIT = 4096
 """Bytes of the largest packet that either side accepts."""
 
-WheelSpeed = Annotated[float, Meta(ge=-0.5, le=0.5)]
-Ticks = Annotated[int, Meta(ge=0, le=65_535)]
+WHEEL_SPEED_MAX_M_S: Final = 0.5
+"""No base of this system is asked to turn a wheel faster, whatever it could do."""
+
+WheelSpeed = Annotated[float, Meta(ge=-WHEEL_SPEED_MAX_M_S, le=WHEEL_SPEED_MAX_M_S)]
 
 
 class WheelCommand(Struct, frozen=True, kw_only=True):
@@ -29,20 +32,13 @@ class WheelCommand(Struct, frozen=True, kw_only=True):
 class BaseFeedback(Struct, frozen=True, kw_only=True):
     """What the guardian last read from the base.
 
-    Encoders are raw counters of 16 bits that wrap. `fault` names what the serial link or the Open Interface does wrong
-    (None: nothing), `stopped` why the guardian holds the wheels at zero whatever the agent asks (None: it doesn't).
-    `battery` is the charged fraction, None when unknown.
+    `fault` is what the guardian has latched (None: nothing), `stopped` why it holds the wheels at zero whatever the
+    agent asks (None: it doesn't).
     """
 
     seq: Count
-    left_ticks: Ticks
-    right_ticks: Ticks
-    oi_mode: Annotated[int, Meta(ge=0, le=255)]
-    bumper: bool
-    cliff: bool
-    wheel_drop: bool
-    battery: Annotated[float, Meta(ge=0.0, le=1.0)] | None
-    charging: bool
+    status: BaseStatus
+    odometry: WheelOdometry
     fault: Sentence | None
     stopped: Sentence | None
 

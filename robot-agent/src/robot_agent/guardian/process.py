@@ -23,11 +23,14 @@ from fog_runtime.logs import Level
 from fog_runtime.settings import SettingsError, load
 from robot_agent.guardian.core import GuardianCore, Output
 from robot_agent.guardian.link import PACKET_LIMIT, WheelCommand, decode_command, encode
-from robot_agent.guardian.watchdog import BAD_SETTINGS, PORT_LOST
+from robot_agent.guardian.watchdog import BAD_SETTINGS, DEFAULT_BASE, PORT_LOST
+from robot_agent.registry import make_base
 from robot_agent.serial_port import Port, PortLost
 
 if TYPE_CHECKING:
     from types import FrameType
+
+    from robot_agent.hardware import BaseDriver
 
 TICK_S: Final = 0.02
 BEAT_S: Final = 0.05
@@ -41,6 +44,8 @@ class GuardianSettings(msgspec.Struct, frozen=True, kw_only=True):
     base_fd: int
     beat_fd: int
     watchdog_fd: int
+    base: str = DEFAULT_BASE
+    base_options: str = ""
     base_port: str = ""
     guardian_socket: str
     speed: float = 1.0
@@ -52,11 +57,11 @@ class GuardianSettings(msgspec.Struct, frozen=True, kw_only=True):
 class Guardian:
     """The loop around the core: one serial port, one agent, one watchdog."""
 
-    def __init__(self, settings: GuardianSettings, listener: socket.socket) -> None:
+    def __init__(self, settings: GuardianSettings, driver: BaseDriver, listener: socket.socket) -> None:
         self._settings = settings
         self._listener = listener
         self._clock = SystemClock(settings.speed)
-        self._core = GuardianCore()
+        self._core = GuardianCore(driver)
         self._port = Port.from_fd(settings.base_fd, settings.base_port or None)
         self._selector = selectors.DefaultSelector()
         self._agent: socket.socket | None = None
@@ -82,7 +87,7 @@ class Guardian:
                     key.data()
                 self._do(self._core.tick(self._clock.now()))
                 self._beat()
-            self._port.write(self._core.farewell())
+            self._port.write(self._core.stop_command())
         except PortLost as error:
             self._log.error("port_lost", reason=str(error))
             return PORT_LOST
@@ -213,14 +218,16 @@ def main() -> int:
     """Run one guardian for the watchdog that started it."""
     try:
         settings = load(GuardianSettings, environ=os.environ)
+        driver = make_base(settings.base, settings.base_options)
         listener = _listen(settings.guardian_socket)
     except SettingsError as error:
         logs.configure("guardian", "info", "json")
         logs.get("guardian").error("bad_settings", reason=str(error))
         return BAD_SETTINGS
     logs.configure("guardian", settings.log_level, settings.log_format)
-    guardian = Guardian(settings, listener)
+    guardian = Guardian(settings, driver, listener)
     signal.signal(signal.SIGTERM, guardian.end)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    logs.get("guardian").info("started", port=settings.base_port, priority=_be_prompt(settings.realtime_priority))
+    priority = _be_prompt(settings.realtime_priority)
+    logs.get("guardian").info("started", base=settings.base, port=settings.base_port, priority=priority)
     return guardian.run()

@@ -1,8 +1,9 @@
 """The watchdog: opens the base's serial port, starts the guardian, stops the wheels when the guardian dies or hangs.
 
-A Roomba keeps its last velocity when its host falls silent, so somebody has to outlive the guardian. This process does
-nothing else and imports next to nothing, so that next to nothing can end it. Run it as a service; it starts the
-guardian again after each end. Settings (environment): FOGNAV_BASE_PORT, FOGNAV_SPEED, and those of the guardian.
+A base may keep its last velocity when its host falls silent, so somebody has to outlive the guardian. This process
+does nothing else and imports next to nothing, so that next to nothing can end it. Run it as a service; it starts the
+guardian again after each end. Settings (environment): FOGNAV_BASE, FOGNAV_BASE_PORT, FOGNAV_SPEED, and those of the
+guardian.
 """
 
 from __future__ import annotations
@@ -17,7 +18,9 @@ import time
 from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
+from fog_runtime import parts
 from robot_agent.serial_port import Port, PortLost, open_port
+from robot_agent.stop_command import StopCommand
 
 if TYPE_CHECKING:
     from types import FrameType
@@ -37,10 +40,9 @@ RESTART_S: Final = 0.3
 REOPEN_S: Final = 1.0
 TERMINATE_S: Final = 1.0
 
-# Start, Safe, Drive Direct 0 0. Sent twice: the guardian may have died in the middle of a command, whose missing
-# bytes the base would take from the first copy.
-ZERO_SPEED: Final = bytes((145, 0, 0, 0, 0))
-STOP_WHEELS: Final = (bytes((128, 131)) + ZERO_SPEED) * 2
+STOPS: Final = "fognav.base_stops"
+"""Entry points with the stop command of each base, apart from its driver: plain bytes in a module of its own."""
+DEFAULT_BASE: Final = "roomba600"
 
 
 class _Terminated(Exception):  # noqa: N818 - an end, not an error
@@ -62,7 +64,7 @@ def _terminate(signum: int, _frame: FrameType | None) -> None:
     raise _Terminated(signal.Signals(signum).name)
 
 
-def stop_wheels(port: Port, command: bytes = STOP_WHEELS) -> bool:
+def stop_wheels(port: Port, command: bytes) -> bool:
     """Write the stop; False (and logged) when the port takes nothing."""
     try:
         port.write(command)
@@ -72,7 +74,7 @@ def stop_wheels(port: Port, command: bytes = STOP_WHEELS) -> bool:
     return True
 
 
-def hold(port: Port, seconds: float) -> None:
+def hold(port: Port, command: bytes, seconds: float) -> None:
     """Wait with the wheels held at zero: a stop may get lost on the line, and nobody else repeats it now.
 
     Raises:
@@ -81,7 +83,7 @@ def hold(port: Port, seconds: float) -> None:
     """
     until = time.monotonic() + seconds
     while (left := until - time.monotonic()) > 0:
-        port.write(ZERO_SPEED)
+        port.write(command)
         time.sleep(min(left, REPEAT_S))
 
 
@@ -100,14 +102,14 @@ def _start_guardian(port: Port, beat_write: int, alive_read: int) -> subprocess.
     )
 
 
-def _watch(guardian: subprocess.Popen[bytes], beat_read: int, port: Port, silence_s: float) -> str:
+def _watch(guardian: subprocess.Popen[bytes], beat_read: int, port: Port, hold_command: bytes, silence_s: float) -> str:
     """Return why the guardian can't be trusted any more. Until its first beat the wheels are held at zero from here."""
     starts_until: float | None = time.monotonic() + STARTUP_S
     while True:
         if starts_until is None:
             timeout = silence_s
         else:
-            port.write(ZERO_SPEED)
+            port.write(hold_command)
             timeout = REPEAT_S
         if select.select((beat_read,), (), (), timeout)[0]:
             if not os.read(beat_read, 4096):
@@ -118,7 +120,7 @@ def _watch(guardian: subprocess.Popen[bytes], beat_read: int, port: Port, silenc
             return f"hung: no beat for {silence_s if starts_until is None else STARTUP_S:.3f} s, killed"
 
 
-def guard_once(port: Port, silence_s: float) -> int:
+def guard_once(port: Port, base: StopCommand, silence_s: float) -> int:
     """Run the guardian until it ends or hangs; the wheels are stopped when this returns. Returns its exit code.
 
     Raises:
@@ -132,8 +134,8 @@ def guard_once(port: Port, silence_s: float) -> int:
     os.close(beat_write)
     os.close(alive_read)
     try:
-        reason = _watch(guardian, beat_read, port, silence_s)
-        stopped = stop_wheels(port)
+        reason = _watch(guardian, beat_read, port, base.hold, silence_s)
+        stopped = stop_wheels(port, base.stop)
         code = _end(guardian)
         _log("guardian_lost", reason=reason, exit_code=code, wheels_stopped=stopped)
         return code
@@ -144,7 +146,7 @@ def guard_once(port: Port, silence_s: float) -> int:
         os.close(alive_write)
         os.close(beat_read)
         _end(guardian)
-        stop_wheels(port)
+        stop_wheels(port, base.stop)
 
 
 def _end(guardian: subprocess.Popen[bytes]) -> int:
@@ -180,6 +182,11 @@ def main() -> int:
     if not 0 < speed < 1000:
         _log("bad_settings", reason="FOGNAV_SPEED must be a positive number such as 1 (simulated over wall time)")
         return BAD_SETTINGS
+    try:
+        base = parts.load(STOPS, os.environ.get("FOGNAV_BASE") or DEFAULT_BASE, StopCommand)
+    except parts.PartError as error:
+        _log("bad_settings", reason=f"FOGNAV_BASE: {error}")
+        return BAD_SETTINGS
     signal.signal(signal.SIGTERM, _terminate)
     signal.signal(signal.SIGINT, _terminate)
     silence_s = max(SILENCE_S / speed, SILENCE_LEAST_S)
@@ -187,18 +194,18 @@ def main() -> int:
     try:
         while True:
             try:
-                with open_port(path) as port:
+                with open_port(path, base.baud) as port:
                     # First of all: a log that nobody reads must not keep the wheels turning.
-                    stop_wheels(port)
+                    stop_wheels(port, base.stop)
                     if (refusal := refuse_speed(speed, os.ttyname(port.fileno()))) is not None:
                         _log("bad_settings", reason=refusal)
                         return BAD_SETTINGS
                     _log("port_open", path=path)
                     told = ""
-                    while (code := guard_once(port, silence_s)) != PORT_LOST:
+                    while (code := guard_once(port, base, silence_s)) != PORT_LOST:
                         if code == BAD_SETTINGS:
                             return code
-                        hold(port, RESTART_S / speed)
+                        hold(port, base.hold, RESTART_S / speed)
             except PortLost as error:
                 if str(error) != told:
                     told = str(error)

@@ -1,4 +1,4 @@
-"""Roomba 600 Open Interface: commands as bytes, the sensor stream as typed frames, encoders as motion.
+"""Roomba 600 Open Interface: commands as bytes, the sensor stream as typed frames.
 
 Nothing here touches a port or a clock: bytes and arrival times go in, values come out.
 Source: iRobot Create 2 Open Interface specification based on the Roomba 600 (2018).
@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import struct
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import IntEnum
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
 _Enum = TypeVar("_Enum", bound=IntEnum)
 
-BAUD: Final = 115200
 STREAM_PERIOD_S: Final = 0.015
 STREAM_HEADER: Final = 19
 # 15 ms at 115200 baud, ten bits to a byte; a longer stream frame comes out corrupted (specification, opcode 148).
@@ -523,145 +522,3 @@ class StreamParser:
             packets.update(decode_packets((packet_id,), bytes(self._buffer[cursor + 1 : following])))
             cursor = following
         return packets
-
-
-# --- encoders -> motion -----------------------------------------------------------------------------------------------
-
-
-def wheel_delta(new: int, old: int) -> int:
-    """Ticks from one 16-bit encoder reading to the next, -32768..32767, whichever way the counter wrapped."""
-    return ((new - old + 0x8000) & 0xFFFF) - 0x8000
-
-
-@dataclass(frozen=True, slots=True)
-class Geometry:
-    """What turns ticks into metres. Defaults: Roomba 600 (specification, packets 43 and 44)."""
-
-    ticks_per_turn: float = 508.8
-    wheel_diameter_m: float = 0.072
-    axle_m: float = 0.235
-    wheel_speed_max_m_s: float = WHEEL_SPEED_MAX_MM_S / 1000.0
-
-    @property
-    def metres_per_tick(self) -> float:
-        """Way of the wheel's rim per tick, metres."""
-        return math.pi * self.wheel_diameter_m / self.ticks_per_turn
-
-
-@dataclass(frozen=True, slots=True)
-class Reading:
-    """One pair of encoder values (ticks, 16 bit) and its arrival, seconds on the caller's monotonic clock."""
-
-    left: int
-    right: int
-    at: float
-
-
-@dataclass(frozen=True, slots=True)
-class Motion:
-    """A plausible step: ways of the wheels in metres, and the pose (x, y in metres, theta in radians) after it."""
-
-    left_m: float
-    right_m: float
-    x: float
-    y: float
-    theta: float
-
-
-@dataclass(frozen=True, slots=True)
-class EncoderFault:
-    """A step that no wheel can make. It moved nothing; the pose is the one before it."""
-
-    left_m: float
-    right_m: float
-    possible_m: float
-    elapsed_s: float
-
-    def __str__(self) -> str:
-        return (
-            f"encoders jumped by left {self.left_m:+.3f} m and right {self.right_m:+.3f} m in {self.elapsed_s:.3f} s, "
-            f"{self.possible_m:.3f} m is possible: a damaged frame, a robot that restarted, or a gap in the stream"
-        )
-
-
-@dataclass(frozen=True, slots=True)
-class OdometryState:
-    """Pose in the odometry frame (metres, radians, theta not wrapped) and the readings that it rests on."""
-
-    x: float = 0.0
-    y: float = 0.0
-    theta: float = 0.0
-    trusted: Reading | None = None
-    suspect: Reading | None = None
-
-
-def integrate(
-    x: float, y: float, theta: float, left_m: float, right_m: float, axle_m: float
-) -> tuple[float, float, float]:
-    """Pose after both wheels rolled along one arc of a circle, exact for constant speeds.
-
-    The chord of an arc of length s and angle a is s sin(a/2)/(a/2), at the mean heading (Siegwart and Nourbakhsh,
-    Introduction to Autonomous Mobile Robots, section 5.2.4, with the chord in place of the arc). Metres and radians.
-    """
-    turn = (right_m - left_m) / axle_m
-    half = 0.5 * turn
-    chord = 0.5 * (left_m + right_m) * (math.sin(half) / half if half else 1.0)
-    return x + chord * math.cos(theta + half), y + chord * math.sin(theta + half), theta + turn
-
-
-# Frames that the host reads late arrive together, 15 ms of motion with no time between them.
-_ARRIVAL_SLACK_S: Final = 0.1
-_SPEED_MARGIN: Final = 1.2
-
-
-def advance(state: OdometryState, reading: Reading, geometry: Geometry) -> tuple[OdometryState, Motion | EncoderFault]:
-    """Take one reading: the new state, and the motion or why it is none.
-
-    The first reading only sets the zero. A step beyond what the wheels can do (top speed and a fifth, over the time
-    since the last trusted reading and 0.1 s) is an EncoderFault. One wild reading costs nothing, the next good one
-    connects to the trusted one; if the readings after it agree with it instead (the robot restarted), they become
-    trusted, and the jump itself never counts as motion.
-    """
-    if state.trusted is None:
-        return replace(state, trusted=reading), Motion(0.0, 0.0, state.x, state.y, state.theta)
-    left_m, right_m, possible_m = _step(state.trusted, reading, geometry)
-    if max(abs(left_m), abs(right_m)) > possible_m:
-        fault = EncoderFault(left_m, right_m, possible_m, reading.at - state.trusted.at)
-        if state.suspect is None:
-            return replace(state, suspect=reading), fault
-        left_m, right_m, possible_m = _step(state.suspect, reading, geometry)
-        if max(abs(left_m), abs(right_m)) > possible_m:
-            return replace(state, suspect=reading), fault
-    x, y, theta = integrate(state.x, state.y, state.theta, left_m, right_m, geometry.axle_m)
-    return OdometryState(x, y, theta, trusted=reading), Motion(left_m, right_m, x, y, theta)
-
-
-def _step(old: Reading, new: Reading, geometry: Geometry) -> tuple[float, float, float]:
-    scale = geometry.metres_per_tick
-    span = max(0.0, new.at - old.at) + _ARRIVAL_SLACK_S
-    possible = _SPEED_MARGIN * geometry.wheel_speed_max_m_s * span
-    if possible > 0x4000 * scale:
-        # The counter may have gone around unseen: no step over such a gap can be told from another.
-        possible = -1.0
-    return wheel_delta(new.left, old.left) * scale, wheel_delta(new.right, old.right) * scale, possible
-
-
-class Odometry:
-    """The odometry of one base: `advance` with its state kept."""
-
-    def __init__(self, geometry: Geometry | None = None) -> None:
-        self._geometry = geometry or Geometry()
-        self._state = OdometryState()
-        self.faults = 0
-
-    @property
-    def pose(self) -> tuple[float, float, float]:
-        """(x, y, theta) in the odometry frame: metres, radians, theta not wrapped."""
-        return self._state.x, self._state.y, self._state.theta
-
-    def update(self, left: int, right: int, now: float) -> Motion | EncoderFault:
-        """Take the encoders of a frame that arrived at `now` (seconds, monotonic)."""
-        self._state, outcome = advance(self._state, Reading(left, right, now), self._geometry)
-        if isinstance(outcome, EncoderFault):
-            self.faults += 1
-        return outcome

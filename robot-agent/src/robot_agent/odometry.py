@@ -1,0 +1,136 @@
+"""From how far the wheels rolled to where the robot is: pure functions, and one class that keeps their state."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final
+
+from robot_agent.hardware import DriveTrain
+
+if TYPE_CHECKING:
+    from robot_agent.hardware import WheelOdometry
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """Travel of both wheels as their counters say it (m), and its arrival, seconds on the caller's monotonic clock."""
+
+    left_m: float
+    right_m: float
+    at: float
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """A plausible step: ways of the wheels in metres, and the pose (x, y in metres, theta in radians) after it."""
+
+    left_m: float
+    right_m: float
+    x: float
+    y: float
+    theta: float
+
+
+@dataclass(frozen=True, slots=True)
+class EncoderFault:
+    """A step that no wheel can make. It moved nothing; the pose is the one before it."""
+
+    left_m: float
+    right_m: float
+    possible_m: float
+    elapsed_s: float
+
+    def __str__(self) -> str:
+        return (
+            f"encoders jumped by left {self.left_m:+.3f} m and right {self.right_m:+.3f} m in {self.elapsed_s:.3f} s, "
+            f"{self.possible_m:.3f} m is possible: a damaged frame, a base that restarted, or a gap in its frames"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryState:
+    """Pose in the odometry frame (metres, radians, theta not wrapped) and the readings that it rests on."""
+
+    x: float = 0.0
+    y: float = 0.0
+    theta: float = 0.0
+    trusted: Reading | None = None
+    suspect: Reading | None = None
+
+
+def wheel_travel(new_m: float, old_m: float, wrap_m: float) -> float:
+    """Travel from one reading of a counter to the next (m), whichever way it wrapped: at most half of `wrap_m`."""
+    return math.remainder(new_m - old_m, wrap_m)
+
+
+def integrate(
+    x: float, y: float, theta: float, left_m: float, right_m: float, axle_m: float
+) -> tuple[float, float, float]:
+    """Pose after both wheels rolled along one arc of a circle, exact for constant speeds.
+
+    The chord of an arc of length s and angle a is s sin(a/2)/(a/2), at the mean heading (Siegwart and Nourbakhsh,
+    Introduction to Autonomous Mobile Robots, section 5.2.4, with the chord in place of the arc). Metres and radians.
+    """
+    turn = (right_m - left_m) / axle_m
+    half = 0.5 * turn
+    chord = 0.5 * (left_m + right_m) * (math.sin(half) / half if half else 1.0)
+    return x + chord * math.cos(theta + half), y + chord * math.sin(theta + half), theta + turn
+
+
+# Frames that the host reads late arrive together, some milliseconds of motion with no time between them.
+_ARRIVAL_SLACK_S: Final = 0.1
+_SPEED_MARGIN: Final = 1.2
+
+
+def advance(state: OdometryState, reading: Reading, drive: DriveTrain) -> tuple[OdometryState, Motion | EncoderFault]:
+    """Take one reading: the new state, and the motion or why it is none.
+
+    The first reading only sets the zero. A step beyond what the wheels can do (top speed and a fifth, over the time
+    since the last trusted reading and 0.1 s) is an EncoderFault. One wild reading costs nothing, the next good one
+    connects to the trusted one; if the readings after it agree with it instead (the base restarted), they become
+    trusted, and the jump itself never counts as motion.
+    """
+    if state.trusted is None:
+        return replace(state, trusted=reading), Motion(0.0, 0.0, state.x, state.y, state.theta)
+    left_m, right_m, possible_m = _step(state.trusted, reading, drive)
+    if max(abs(left_m), abs(right_m)) > possible_m:
+        fault = EncoderFault(left_m, right_m, possible_m, reading.at - state.trusted.at)
+        if state.suspect is None:
+            return replace(state, suspect=reading), fault
+        left_m, right_m, possible_m = _step(state.suspect, reading, drive)
+        if max(abs(left_m), abs(right_m)) > possible_m:
+            return replace(state, suspect=reading), fault
+    x, y, theta = integrate(state.x, state.y, state.theta, left_m, right_m, drive.axle_m)
+    return OdometryState(x, y, theta, trusted=reading), Motion(left_m, right_m, x, y, theta)
+
+
+def _step(old: Reading, new: Reading, drive: DriveTrain) -> tuple[float, float, float]:
+    span = max(0.0, new.at - old.at) + _ARRIVAL_SLACK_S
+    possible = _SPEED_MARGIN * drive.wheel_speed_max_m_s * span
+    if possible > drive.travel_wrap_m / 4:
+        # The counter may have gone around unseen: no step over such a gap can be told from another.
+        possible = -1.0
+    wrap = drive.travel_wrap_m
+    return wheel_travel(new.left_m, old.left_m, wrap), wheel_travel(new.right_m, old.right_m, wrap), possible
+
+
+class Odometry:
+    """The odometry of one base: `advance` with its state kept."""
+
+    def __init__(self, drive: DriveTrain | None = None) -> None:
+        self._drive = drive or DriveTrain()
+        self._state = OdometryState()
+        self.faults = 0
+
+    @property
+    def pose(self) -> tuple[float, float, float]:
+        """(x, y, theta) in the odometry frame: metres, radians, theta not wrapped."""
+        return self._state.x, self._state.y, self._state.theta
+
+    def update(self, wheels: WheelOdometry, now: float) -> Motion | EncoderFault:
+        """Take the travel of a frame that arrived at `now` (seconds, monotonic)."""
+        self._state, outcome = advance(self._state, Reading(wheels.left_m, wheels.right_m, now), self._drive)
+        if isinstance(outcome, EncoderFault):
+            self.faults += 1
+        return outcome

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from fog_contracts import channels as ch
+from fog_contracts.follower import MapFollower
 from fog_contracts.handlers import Moment
 from fog_contracts.messages import (
     AreaDefinition,
@@ -31,7 +32,6 @@ from fog_contracts.messages import (
     RobotState,
     ZoneSet,
 )
-from fog_contracts.replica import Applied, Replica
 from fog_runtime.record import read
 from fog_runtime.site import LoadedSite, load_site
 from hazard_aggregator.core import Aggregator
@@ -135,16 +135,16 @@ def draw(heard: list[Heard], site: LoadedSite) -> tuple[list[MapDelta], MapSnaps
 
 
 def copy(heard: list[Heard], site: LoadedSite) -> list[MapHeartbeat]:
-    """Return every version that a replica reaches by the recorded deltas; raises `ReplayError` if one does not fit."""
-    replica, versions = Replica(), []
-    replica.load(empty_map(heard, site).snapshot())
+    """Return every version that a copy reaches by the recorded deltas; raises `ReplayError` if one does not fit."""
+    follower, versions = MapFollower(), []
+    follower.on_snapshot(empty_map(heard, site).snapshot(), heard[0][0])
     for at, _, _, message in heard:
         if isinstance(message, MapDelta):
-            outcome = replica.apply(message)
-            if outcome == "gap":
-                raise ReplayError(f"recorded delta {message.seq} part {message.part} does not fit {replica.version}")
-            if isinstance(outcome, Applied):
-                version = outcome.version
+            applied = follower.on_delta(message, at)
+            if follower.wants_snapshot(at):
+                raise ReplayError(f"recorded delta {message.seq} part {message.part} does not fit {follower.version}")
+            if applied is not None:
+                version = applied.version
                 versions.append(MapHeartbeat(epoch=version.epoch, seq=version.seq, hash=version.hash, stamp=at))
     return versions
 
@@ -184,7 +184,7 @@ def new_planner(heard: list[Heard], site: LoadedSite) -> PlannerCore:
     _, path = first(heard, ch.ROBOT_PATH)
     assert isinstance(path, RobotPath)
     core = PlannerCore(path.planner_epoch)
-    core.load(empty_map(heard, site).snapshot())
+    core.load(empty_map(heard, site).snapshot(), heard[0][0])
     return core
 
 

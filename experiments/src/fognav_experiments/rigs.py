@@ -202,7 +202,7 @@ class FogRig:
             taken = carry(ch.AREA_DEFINITION, definition)
             assert isinstance(taken, AreaDefinition)
             self._change(self.map.on_definition(taken, STAMP + start))
-        self.planner.load(self.map.snapshot())
+        self.planner.load(self.map.snapshot(), start)
 
     @property
     def snapshot(self) -> MapSnapshot:
@@ -232,8 +232,8 @@ class FogRig:
             planner.on_delta(delta, now)
         for heartbeat in self._heartbeats:
             planner.on_heartbeat(heartbeat, now)
-        if planner.needs_snapshot:
-            planner.load(self.map.snapshot())
+        if planner.wants_snapshot(now):
+            planner.load(self.map.snapshot(), now)
         for job in planner.field_jobs():
             job.run()
             planner.take_field(job)

@@ -11,13 +11,13 @@ from guardian_rig import DEADLINE_S
 from little_world import AGENT, LittleWorld
 
 from fog_contracts import channels as ch
+from fog_contracts.follower import GRACE_S
 from fog_contracts.grid import Window
 from fog_contracts.messages import MapSnapshot
 from fog_runtime.clock import SystemClock
 from fog_runtime.health import Health
 from robot_agent.agent import service as service_module
 from robot_agent.agent.core import AgentCore
-from robot_agent.agent.map_copy import BEHIND_S
 from robot_agent.agent.service import Service
 from robot_agent.agent.store import Store
 
@@ -101,7 +101,7 @@ async def test_changes_during_the_fetch_of_a_snapshot_are_applied_after_it(mappi
     mapping.fog.answers.put_nowait(old)
     await mapping.until(lambda: mapping.core.replica.version == mapping.master.version)
     assert mapping.fog.asked == 1
-    assert not mapping.core.replica.needs_snapshot
+    assert not mapping.core.wants_snapshot(time.monotonic())
 
 
 async def test_changes_of_a_map_service_that_is_gone_do_not_spoil_the_new_map(mapping):
@@ -111,7 +111,7 @@ async def test_changes_of_a_map_service_that_is_gone_do_not_spoil_the_new_map(ma
     fresh.master._version = type(fresh.master.version)(8, 0, fresh.master.version.hash)
     mapping.fog.answers.put_nowait(fresh.master.snapshot())
     await mapping.until(lambda: mapping.core.replica.version == fresh.master.version)
-    assert not mapping.core.replica.needs_snapshot
+    assert not mapping.core.wants_snapshot(time.monotonic())
 
 
 async def test_a_last_change_that_got_lost_is_noticed_by_the_heartbeat_after_a_grace(mapping):
@@ -126,7 +126,7 @@ async def test_a_last_change_that_got_lost_is_noticed_by_the_heartbeat_after_a_g
         return mapping.core.replica.version == mapping.master.version
 
     await mapping.until(caught_up)
-    assert time.monotonic() - begun >= BEHIND_S
+    assert time.monotonic() - begun >= GRACE_S
     assert mapping.fog.asked == 2
 
 

@@ -133,7 +133,7 @@ async def test_a_drawn_zone_reaches_the_robot_and_survives_a_kill(fog, until, to
         fog.start("map_service")
         await fog.ready("map_service")
         await until(lambda: robot.beats[-1].epoch > epoch, "a new epoch")
-        assert not robot.replica.check(robot.beats[-1])
+        assert robot.replica.version.epoch == epoch
         await robot.load()
         assert robot.cost(6.0, 3.0) == LETHAL
 

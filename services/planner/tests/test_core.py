@@ -127,7 +127,7 @@ class Drive:
     def __init__(self, the_map: Map | None = None, start: tuple[float, float] = (1.0, 6.0)) -> None:
         self.map = the_map or Map()
         self.core = PlannerCore(epoch=7)
-        self.core.load(self.map.master.snapshot())
+        self.core.load(self.map.master.snapshot(), 100.0)
         self.now = 100.0
         self.at = start
         self.paths: list[RobotPath] = []
@@ -278,9 +278,9 @@ def test_lost_deltas_need_a_snapshot_and_the_ones_that_came_meanwhile_are_not_lo
     drive.map.put("lost", (5.0, 0.0, 6.0, 1.0))
     snapshot = drive.map.master.snapshot()
     drive.send(drive.map.put("z1", UPPER))
-    assert drive.core.needs_snapshot
-    drive.core.load(snapshot)
-    assert not drive.core.needs_snapshot
+    assert drive.core.wants_snapshot(drive.now)
+    drive.core.load(snapshot, drive.now)
+    assert not drive.core.wants_snapshot(drive.now)
     drive.step()
     assert via(drive.paths[-1]) == "lower"
     assert drive.paths[-1].map_seq == 2
@@ -290,9 +290,9 @@ def test_a_heartbeat_that_stays_ahead_makes_a_snapshot_necessary() -> None:
     drive = Drive(start=LEFT)
     drive.map.put("z1", UPPER)
     drive.step(0.4)
-    assert not drive.core.needs_snapshot
+    assert not drive.core.wants_snapshot(drive.now)
     drive.step(0.4)
-    assert drive.core.needs_snapshot
+    assert drive.core.wants_snapshot(drive.now)
 
 
 def test_a_new_epoch_of_the_map_is_planned_on_afresh() -> None:
@@ -301,8 +301,8 @@ def test_a_new_epoch_of_the_map_is_planned_on_afresh() -> None:
     drive.map = Map(epoch=2)
     drive.map.put("z1", UPPER)
     drive.step()
-    assert drive.core.needs_snapshot
-    drive.core.load(drive.map.master.snapshot())
+    assert drive.core.wants_snapshot(drive.now)
+    drive.core.load(drive.map.master.snapshot(), drive.now)
     drive.step()
     assert (drive.paths[-1].map_epoch, via(drive.paths[-1])) == (2, "lower")
     assert drive.core.plans["epoch"] == 1

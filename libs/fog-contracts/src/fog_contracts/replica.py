@@ -234,7 +234,8 @@ Outcome = Applied | Literal["waiting", "old", "gap"]
 class Replica:
     """The reader's side: a copy of the map that is either exactly one version of the writer's or known to be broken.
 
-    A gap, an unknown epoch or a wrong hash makes it broken (`needs_snapshot`); a snapshot mends it.
+    A gap, an unknown epoch or a wrong hash makes it broken (`needs_snapshot`); a snapshot mends it. `MapFollower`
+    decides which version is the newest and when to ask for a snapshot.
     """
 
     def __init__(self) -> None:
@@ -258,15 +259,9 @@ class Replica:
         return self.layers["speed"]
 
     def load(self, snapshot: MapSnapshot) -> Applied:
-        """Take a snapshot, whatever was there before; raises `MapError` and changes nothing when it is no map.
-
-        A snapshot older than the copy (same epoch, lower seq) is refused too: answers may overtake one another.
-        """
+        """Take a snapshot, whatever was there before; raises `MapError` and changes nothing when it is no map."""
         g = snapshot.geometry
         geometry = GridGeometry(g.width, g.height, g.resolution, g.origin_x, g.origin_y)
-        known = self.version
-        if known and not self.needs_snapshot and known.epoch == snapshot.epoch and snapshot.seq < known.seq:
-            raise MapError(f"the snapshot is of version {snapshot.seq}, older than the copy's {known.seq}")
         layers: dict[Layer, Grid] = {
             "cost": _unpack("zlib", snapshot.cost, geometry.shape, "the cost layer").copy(),
             "speed": _unpack("zlib", snapshot.speed, geometry.shape, "the speed layer").copy(),
@@ -302,21 +297,10 @@ class Replica:
             return "waiting"
         return self._complete(delta)
 
-    def check(self, heartbeat: MapHeartbeat) -> bool:
-        """Compare with the writer's version: False when deltas are missing or the copy is of another history.
-
-        A heartbeat that runs ahead is no break by itself (its delta may be under way): the caller decides how long
-        that may last. Another epoch, or another hash for the same seq, is a break at once.
-        """
-        if self.version is None or self.needs_snapshot:
-            return False
-        if heartbeat.epoch != self.version.epoch:
-            self._broken()
-            return False
-        if heartbeat.seq == self.version.seq and heartbeat.hash != self.version.hash:
-            self._broken()
-            return False
-        return heartbeat.seq <= self.version.seq
+    def invalidate(self) -> None:
+        """Take that the copy is of another history than the writer's: only a snapshot helps from now on."""
+        self.needs_snapshot = True
+        self._parts = {}
 
     def _complete(self, delta: MapDelta) -> Outcome:
         assert self.version is not None
@@ -355,6 +339,5 @@ class Replica:
         return old
 
     def _broken(self) -> Literal["gap"]:
-        self.needs_snapshot = True
-        self._parts = {}
+        self.invalidate()
         return "gap"

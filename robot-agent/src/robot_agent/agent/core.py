@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fog_contracts import channels as ch
+from fog_contracts.follower import MapFollower
 from fog_contracts.messages import LoopHealth
 from robot_agent.agent.blocked_places import BlockedPlaces
-from robot_agent.agent.map_copy import MapCopy
 from robot_agent.agent.mission import Mission
 from robot_agent.agent.obstacle_reporter import ObstacleReporter
 from robot_agent.agent.operator_commands import OperatorCommands, initial_pose_refusal
@@ -72,7 +72,7 @@ class AgentCore:
         self._lidar = LidarSource()
         self._localizer = Localizer(config.localization, seed)
         self._pose_keeper = PoseKeeper(self._localizer)
-        self._map = MapCopy()
+        self._map = MapFollower()
         self._places = BlockedPlaces()
         self._mission = Mission()
         self._path_monitor = PathMonitor()
@@ -101,7 +101,7 @@ class AgentCore:
         return {ch.ROBOT_COMMAND: self._on_command}
 
     def _on_delta(self, _ids: Ids, delta: MapDelta, at: Moment) -> Sequence[Publication]:
-        if self._map.on_delta(delta, at.now):
+        if self._map.on_delta(delta, at.now) is not None:
             self._path_monitor.check(self._mission, self.replica, at.now)
         return ()
 
@@ -136,7 +136,7 @@ class AgentCore:
 
     def load(self, snapshot: MapSnapshot, now: float) -> None:
         """Take a snapshot, from the map-service or from disk; raises `MapError` when it is none."""
-        self._map.load(snapshot, now)
+        self._map.on_snapshot(snapshot, now)
         self._pose_keeper.load_map(self.replica)
         self._path_monitor.check(self._mission, self.replica, now)
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from robot_agent.safety.gate import SafetyInputs, SafetyState, step
 
 if TYPE_CHECKING:
-    from robot_agent.agent.map_copy import MapCopy
+    from fog_contracts.follower import MapFollower
     from robot_agent.agent.mission import Mission
     from robot_agent.agent.sensors import BaseSource, LidarSource
     from robot_agent.config import SafetyConfig
@@ -33,7 +33,7 @@ class SafetySupervisor:
 def safety_inputs(
     base: BaseSource,
     lidar: LidarSource,
-    map_copy: MapCopy,
+    the_map: MapFollower,
     localizer: Localizer,
     mission: Mission,
     *,
@@ -45,9 +45,9 @@ def safety_inputs(
     """Gather age, value and complaint of every source at `now` (s, monotonic)."""
     feedback, follower = base.feedback, mission.follower
     return SafetyInputs(
-        map_loaded=map_copy.replica.version is not None,
-        map_age=map_copy.age(now),
-        map_gap=map_copy.gap(now),
+        map_loaded=the_map.version is not None,
+        map_age=the_map.age(now),
+        map_gap=the_map.gap(now),
         localization=localizer.status,
         localization_detail=localizer.detail,
         lidar_node_age=lidar.node_age(now),

@@ -6,7 +6,7 @@ seconds, `stamp` seconds as in messages.
 
 import heapq
 import math
-from collections import OrderedDict, deque
+from collections import OrderedDict
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Final, Literal
@@ -16,6 +16,7 @@ from msgspec import structs
 from numpy.typing import NDArray
 
 from fog_contracts.costs import DEFAULT_INFLATION, INSCRIBED, LETHAL, UNKNOWN, Inflation
+from fog_contracts.follower import MapFollower
 from fog_contracts.grid import GridGeometry, Window
 from fog_contracts.messages import (
     PLAN_CODES,
@@ -38,7 +39,7 @@ from fog_contracts.messages import (
     Trace,
     ZoneSet,
 )
-from fog_contracts.replica import Applied, Replica
+from fog_contracts.replica import Applied
 from fog_kernels.astar import Planner, line_cost, nearest_traversable
 from fog_kernels.inflation import inflate, inflation_table
 from planner.reasons import Region, cutting, hazard_region, lifted, zone_region
@@ -47,8 +48,6 @@ from planner.route import Floats, Route
 Grid = NDArray[np.uint8]
 Why = Literal["goal", "map", "epoch", "strayed", "clearing", "refused"]
 """Why a robot's way is planned again; `map` is a change within the swept corridor of its remaining path."""
-
-_KEPT_DELTAS: Final = 256
 
 
 @dataclass(frozen=True)
@@ -137,7 +136,7 @@ class PlannerCore:
     def __init__(self, epoch: int, config: PlannerConfig | None = None) -> None:
         self.epoch = epoch
         self.config = config or PlannerConfig()
-        self._replica = Replica()
+        self._map = MapFollower(grace_s=self.config.gap_s)
         self._robots: dict[str, _Robot] = {}
         self._hazards: dict[str, HazardArea] = {}
         self._zones: ZoneSet | None = None
@@ -148,9 +147,6 @@ class PlannerCore:
         self._planner: Planner | None = None
         self._guided: OrderedDict[tuple[int, int], Planner] = OrderedDict()
         self._wanted: dict[tuple[int, int], FieldJob | None] = {}
-        self._missed: deque[MapDelta] = deque(maxlen=_KEPT_DELTAS)
-        self._map_seen: float | None = None
-        self._ahead_since: float | None = None
         self._next_id = 1
         self.plans: dict[Why, int] = {}
         """How many times a way was computed, by reason."""
@@ -159,49 +155,36 @@ class PlannerCore:
 
     # --- The map ----------------------------------------------------------------------------------------------------
 
-    @property
-    def needs_snapshot(self) -> bool:
+    def wants_snapshot(self, now: float) -> bool:
         """Whether deltas were lost, or there is no map yet."""
-        return self._replica.needs_snapshot
+        return self._map.wants_snapshot(now)
 
     @property
     def geometry(self) -> GridGeometry | None:
         """The map's geometry; None before the first snapshot."""
-        return self._replica.geometry
+        return self._map.geometry
 
-    def load(self, snapshot: MapSnapshot) -> None:
-        """Take a snapshot, and the deltas that came while it was under way; raises `MapError` when it is damaged."""
-        known = self._replica.version
-        same_history = known is not None and known.epoch == snapshot.epoch and self._replica.geometry is not None
-        shape = self._replica.geometry
-        self._replica.load(snapshot)
-        geometry = self._replica.geometry
+    def load(self, snapshot: MapSnapshot, now: float) -> None:
+        """Take a snapshot; raises `MapError` and changes nothing when it is damaged or outdated."""
+        known, shape = self._map.version, self._map.geometry
+        applied = self._map.on_snapshot(snapshot, now)
+        geometry = self._map.geometry
         assert geometry is not None
-        self._map_seen = None
-        self._ahead_since = None
-        self._set_floor(snapshot)
+        self._set_floor(geometry)
         if shape != geometry:
             self._planner = Planner(geometry.width, geometry.height)
             self._regions = None
-        missed, self._missed = list(self._missed), deque(maxlen=_KEPT_DELTAS)
-        traces: list[Trace] = []
-        for delta in missed:
-            outcome = self._replica.apply(delta)
-            if isinstance(outcome, Applied):
-                traces += outcome.traces
-            elif outcome == "gap":
-                # Deltas of another history wait here too; the heartbeat will tell whether anything is missing.
-                self._replica.needs_snapshot = False
-        self._before = self._replica.cost.copy()
+        self._before = self._map.cost.copy()
+        same_history = known is not None and known.epoch == snapshot.epoch
         for robot in self._robots.values():
             if robot.goal and robot.goal.pose:
                 robot.dirty = robot.dirty or ("map" if same_history else "epoch")
-                robot.traces += traces
+                robot.traces += applied.traces
 
-    def _set_floor(self, snapshot: MapSnapshot) -> None:
+    def _set_floor(self, geometry: GridGeometry) -> None:
         """Take what costs can never fall below: the inflated static map (or less, should the master be lower)."""
-        table = inflation_table(snapshot.geometry.resolution, self.config.inflation)
-        floor = np.minimum(inflate(np.ascontiguousarray(self._replica.static), table), self._replica.cost)
+        table = inflation_table(geometry.resolution, self.config.inflation)
+        floor = np.minimum(inflate(np.ascontiguousarray(self._map.static), table), self._map.cost)
         if not np.array_equal(floor, self._floor):
             self._lower_floor(floor)
 
@@ -214,28 +197,18 @@ class PlannerCore:
 
     def on_delta(self, delta: MapDelta, now: float) -> None:
         """Take a delta; robots whose way it touches, or whom it may serve with a better one, are planned again."""
-        outcome = self._replica.apply(delta)
-        if outcome == "gap":
-            self._missed.append(delta)
-        elif isinstance(outcome, Applied):
-            self._map_seen = now
-            self._ahead_since = None
-            self._changed(outcome)
+        applied = self._map.on_delta(delta, now)
+        if applied is not None:
+            self._changed(applied)
 
     def on_heartbeat(self, heartbeat: MapHeartbeat, now: float) -> None:
         """Compare with the map-service's version; deltas that stay away make a snapshot necessary."""
-        if self._replica.check(heartbeat):
-            self._map_seen = now
-            self._ahead_since = None
-        elif not self._replica.needs_snapshot:
-            self._ahead_since = now if self._ahead_since is None else self._ahead_since
-            if now - self._ahead_since > self.config.gap_s:
-                self._replica.needs_snapshot = True
+        self._map.on_heartbeat(heartbeat, now)
 
     def _changed(self, applied: Applied) -> None:
-        geometry = self._replica.geometry
+        geometry = self._map.geometry
         assert geometry is not None
-        cost = self._replica.cost
+        cost = self._map.cost
         for layer, window in applied.windows:
             if layer != "cost":
                 continue
@@ -255,7 +228,7 @@ class PlannerCore:
         self, robot: _Robot, changed: NDArray[np.bool_], fell: NDArray[np.bool_], window: Window, traces: list[Trace]
     ) -> None:
         """Mark a robot whose way must be planned again after a change in the window."""
-        geometry, plan = self._replica.geometry, robot.plan
+        geometry, plan = self._map.geometry, robot.plan
         assert geometry is not None
         if plan is None or robot.goal is None or robot.goal.pose is None:
             return
@@ -274,7 +247,7 @@ class PlannerCore:
 
     def _may_save(self, robot: _Robot, plan: _Plan, route: Route, window: Window) -> bool:
         """Whether a way through the window could save the set share, if everything on it were free."""
-        geometry, planner = self._replica.geometry, self._planner
+        geometry, planner = self._map.geometry, self._planner
         assert geometry is not None
         assert planner is not None
         x, y = self._place(robot, route, plan)
@@ -288,7 +261,7 @@ class PlannerCore:
             return math.hypot(dx, dy)
 
         least = (away(column, row) + away(end_column, end_row)) * planner.neutral
-        remaining = route.cost(self._replica.cost, geometry, plan.at)
+        remaining = route.cost(self._map.cost, geometry, plan.at)
         return least < (1.0 - self.config.saving) * remaining
 
     @staticmethod
@@ -305,7 +278,7 @@ class PlannerCore:
 
         Hazards and zones come and go: a goal inside one is taken, and refused by its path as long as that lasts.
         """
-        geometry = self._replica.geometry
+        geometry = self._map.geometry
         if geometry is None:
             return None
         column, row = geometry.cell(x, y)
@@ -316,7 +289,7 @@ class PlannerCore:
         near = nearest_traversable(self._floor, (column, row), round(5.0 / geometry.resolution))
         nearest = geometry.centre(*near) if near else None
         what = {LETHAL: "in a wall", UNKNOWN: "where the map is unknown"}.get(
-            int(self._replica.static[row, column]), "too near a wall for the robot"
+            int(self._map.static[row, column]), "too near a wall for the robot"
         )
         return self._refusal(206, f"the goal ({x:.2f}, {y:.2f}) lies {what}{_nearest(nearest)}", nearest=nearest)
 
@@ -384,19 +357,19 @@ class PlannerCore:
 
     def _blocking_regions(self) -> list[Region]:
         """Hazards and zones that have lethal cells right now."""
-        geometry = self._replica.geometry
+        geometry = self._map.geometry
         assert geometry is not None
         if self._regions is None:
             reach = self.config.inflation.inflation_radius + 2 * geometry.resolution
             hazards = (hazard_region(told, geometry, reach) for _, told in sorted(self._hazards.items()))
             zones = (zone_region(zone, geometry, reach) for zone in (self._zones.zones if self._zones else []))
             self._regions = [region for region in (*hazards, *zones) if region is not None]
-        return [region for region in self._regions if region.blocks(self._replica.cost)]
+        return [region for region in self._regions if region.blocks(self._map.cost)]
 
     # --- Distance fields: computed elsewhere, used when they are there -----------------------------------------------
 
     def _goal_cells(self) -> Iterable[tuple[int, int]]:
-        geometry = self._replica.geometry
+        geometry = self._map.geometry
         if geometry is None:
             return
         for robot in self._robots.values():
@@ -406,7 +379,7 @@ class PlannerCore:
                     yield cell
 
     def _want_field(self, pose: Pose) -> None:
-        geometry = self._replica.geometry
+        geometry = self._map.geometry
         if geometry is None:
             return
         cell = geometry.cell(pose.x, pose.y)
@@ -465,14 +438,10 @@ class PlannerCore:
         return out
 
     def _map_fresh(self, now: float) -> bool:
-        if self._replica.version is None or self._replica.needs_snapshot:
-            return False
-        if self._map_seen is None:
-            self._map_seen = now
-        return now - self._map_seen <= self.config.map_age_s
+        return not self._map.wants_snapshot(now) and self._map.age(now) <= self.config.map_age_s
 
     def _path(self, robot: _Robot, plan: _Plan, stamp: float) -> RobotPath:
-        version = self._replica.version
+        version = self._map.version
         assert version is not None
         assert robot.goal is not None
         route, goal = plan.route, robot.goal.pose
@@ -493,12 +462,12 @@ class PlannerCore:
         )
 
     def _replan(self, robot: _Robot, goal: Pose, pose: RobotPose, stamp: float) -> None:
-        geometry = self._replica.geometry
+        geometry = self._map.geometry
         assert geometry is not None
         why: Why = robot.dirty or "goal"
         traces = [structs.replace(trace, plan_published=stamp) for trace in robot.traces]
         robot.dirty, robot.traces = None, []
-        found = self._find(self._replica.cost, (pose.x, pose.y), (goal.x, goal.y))
+        found = self._find(self._map.cost, (pose.x, pose.y), (goal.x, goal.y))
         self._count(why, found)
         old = robot.plan
         if old is not None and self._is_kept(old, found, why, geometry):
@@ -517,7 +486,7 @@ class PlannerCore:
             return old.refusal == found.refusal
         if old.route is None or why in ("goal", "strayed"):
             return False
-        remaining = old.route.cost(self._replica.cost, geometry, old.at)
+        remaining = old.route.cost(self._map.cost, geometry, old.at)
         share = self.config.saving if why == "clearing" else self.config.hysteresis
         return not math.isinf(remaining) and found.cost >= (1.0 - share) * remaining
 
@@ -525,15 +494,15 @@ class PlannerCore:
 
     def plan(self, request: PlanRequest) -> PlanReply:
         """Answer a question for a way, without side effects."""
-        version = self._replica.version
+        version = self._map.version
         if version is None:
             return PlanReply(refusal=self._refusal(207, "the planner has no map yet; ask again when it is ready"))
         start, goal = request.start, request.goal
-        found = self._find(self._replica.cost, (start.x, start.y), (goal.x, goal.y))
+        found = self._find(self._map.cost, (start.x, start.y), (goal.x, goal.y))
         return self._reply(found)
 
     def _reply(self, found: _Found) -> PlanReply:
-        version = self._replica.version
+        version = self._map.version
         assert version is not None
         route = found.route
         return PlanReply(
@@ -546,7 +515,7 @@ class PlannerCore:
         )
 
     def _find(self, cost: Grid, start: PointXY, goal: PointXY) -> _Found:
-        geometry, planner = self._replica.geometry, self._planner
+        geometry, planner = self._map.geometry, self._planner
         assert geometry is not None
         assert planner is not None
         begin, end = geometry.cell(*start), geometry.cell(*goal)
@@ -581,7 +550,7 @@ class PlannerCore:
         Where the line between the exact point and the next corner would touch an impassable cell, the middle of the
         point's cell stays: at most 4 cm away.
         """
-        geometry = self._replica.geometry
+        geometry = self._map.geometry
         assert geometry is not None
         origin = np.array((geometry.origin_x, geometry.origin_y))
         cells = corners.astype(np.float64)
@@ -602,7 +571,7 @@ class PlannerCore:
 
         The way there may lead over the inscribed band and what lidars saw, never through a wall or a blocked region.
         """
-        geometry = self._replica.geometry
+        geometry = self._map.geometry
         assert geometry is not None
         column, row = begin
         if cost[row, column] < INSCRIBED:
@@ -617,7 +586,7 @@ class PlannerCore:
         for step in range(1, steps + 1):
             x = round(column + (free[0] - column) * step / steps)
             y = round(row + (free[1] - row) * step / steps)
-            if self._replica.static[y, x] != 0 or any(region.covers(x, y) for region in blocking):
+            if self._map.static[y, x] != 0 or any(region.covers(x, y) for region in blocking):
                 return None
         return free
 
@@ -668,7 +637,7 @@ class PlannerCore:
         return self._refusal(208, reason, [cause], nearest)
 
     def _nearest(self, cost: Grid, free: tuple[int, int], end: tuple[int, int]) -> PointXY | None:
-        geometry, planner = self._replica.geometry, self._planner
+        geometry, planner = self._map.geometry, self._planner
         assert geometry is not None
         assert planner is not None
         x, y = geometry.centre(*planner.nearest_reachable(cost, free, end))
@@ -681,10 +650,10 @@ class PlannerCore:
 
         Inside the areas that reach over the robot the static map's costs count; everything else stays in force.
         """
-        geometry = self._replica.geometry
+        geometry = self._map.geometry
         if geometry is None:
             return PlanReply(refusal=self._refusal(207, "the planner has no map yet; ask again when it is ready"))
-        cost = self._replica.cost
+        cost = self._map.cost
         start = (request.pose.x, request.pose.y)
         begin = geometry.cell(*start)
         if not geometry.contains_cell(*begin):

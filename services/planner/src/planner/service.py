@@ -212,13 +212,13 @@ class Service:
         """Fetch the whole map whenever the core needs it."""
         while True:
             await self._wants_map.wait()
-            if not self._core.needs_snapshot:
+            if not self._core.wants_snapshot(self._clock.now()):
                 self._wants_map.clear()
                 continue
             try:
                 snapshot = await self._zenoh.ask(ch.MAP_SNAPSHOT, None, MapSnapshot, SNAPSHOT_TIMEOUT_S)
                 if snapshot is not None:
-                    await self._in_core(partial(self._core.load, snapshot))
+                    await self._in_core(partial(self._core.load, snapshot, self._clock.now()))
                     self._wants_map.clear()
                     self._wake.set()
                     SNAPSHOTS.labels("taken").inc()
@@ -248,7 +248,7 @@ class Service:
                 told = await self._in_core(partial(self._turn, jobs))
             for robot, message in told:
                 self._publish(robot, message)
-            if self._core.needs_snapshot:
+            if self._core.wants_snapshot(self._clock.now()):
                 self._wants_map.set()
             self._health.set("zenoh", ok=self._zenoh.connected, detail="" if self._zenoh.connected else "no router")
             self._measure()

@@ -1,0 +1,210 @@
+"""Following the master costmap: a replica kept up to date from deltas, heartbeats and snapshots, whatever gets lost.
+
+Pure: messages and times go in; applied changes, the wish for a snapshot, and the copy's age and gap come out. Times are
+seconds of the reader's monotonic clock.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Final
+
+from fog_contracts.grid import GridGeometry
+from fog_contracts.messages import MapDelta, MapHeartbeat, MapSnapshot
+from fog_contracts.replica import Applied, Grid, MapError, Replica, Version
+
+GRACE_S: Final = 0.5
+"""How long a delta that a heartbeat announced may be under way before it is taken for lost (5 heartbeats)."""
+MAX_HELD: Final = 256
+
+
+class MapFollower:
+    """Keeps a replica at the newest version of the map that its writer is known to have.
+
+    The newest version is the highest one that a heartbeat, a delta or a snapshot named: later epoch first, then higher
+    seq. Heartbeats that keep naming an older one for longer than `grace_s` mean that the writer started again with
+    lower numbers (its clock or its store was reset); the version that they name is then the newest.
+
+    Deltas that can't be applied yet are held, the latest `max_held` of them, and applied as soon as the missing ones
+    or a snapshot arrive.
+    """
+
+    def __init__(self, *, grace_s: float = GRACE_S, max_held: int = MAX_HELD) -> None:
+        self._grace_s = grace_s
+        self._max_held = max_held
+        self._replica = Replica()
+        self._held: dict[tuple[int, int, int], MapDelta] = {}
+        """Deltas by epoch, seq and part, oldest arrival first."""
+        self._newest: Version | None = None
+        self._contradicted_since: float | None = None
+        """Since when heartbeats have named only versions older than `_newest`."""
+        self._behind_since: float | None = None
+        self._confirmed_at = -math.inf
+
+    # --- Messages in ------------------------------------------------------------------------------------------------
+
+    def on_delta(self, delta: MapDelta, now: float) -> Applied | None:
+        """Take a delta; return what changed, with all held deltas that it completes, or None if nothing did."""
+        announced = Version(delta.epoch, delta.seq, delta.hash)
+        if self._newest is None or _order(announced) > _order(self._newest):
+            self._newest, self._contradicted_since = announced, None
+        self._hold(delta, self._newest)
+        applied = _joined(self._apply_held())
+        self._assess(now, confirmed=applied is not None)
+        return applied
+
+    def on_heartbeat(self, heartbeat: MapHeartbeat, now: float) -> None:
+        """Take the writer's word on which version it has."""
+        named = Version(heartbeat.epoch, heartbeat.seq, heartbeat.hash)
+        if self._newest is None or _order(named) >= _order(self._newest):
+            self._newest, self._contradicted_since = named, None
+        elif self._contradicted_since is None:
+            self._contradicted_since = now  # perhaps only late
+        elif now - self._contradicted_since > self._grace_s:
+            self._newest, self._contradicted_since = named, None
+            self._held.clear()
+            if named != self._replica.version:
+                self._replica.invalidate()
+        self._assess(now, confirmed=named == self._newest)
+
+    def on_snapshot(self, snapshot: MapSnapshot, now: float) -> Applied:
+        """Take a snapshot and the deltas held since it was asked for; return all that changed.
+
+        It does not make the copy fresh, for it may come from a disk: the next heartbeat does. Raises `MapError` and
+        changes nothing when it is damaged, or older than the copy, or of a writer that another has replaced.
+        """
+        self._refuse_outdated(snapshot)
+        loaded = self._replica.load(snapshot)
+        if self._newest is None or _order(loaded.version) > _order(self._newest):
+            self._newest = loaded.version
+        self._held = {key: delta for key, delta in self._held.items() if delta.epoch == snapshot.epoch}
+        applied = _joined([loaded, *self._apply_held()])
+        assert applied is not None
+        self._assess(now, confirmed=False)
+        return applied
+
+    # --- State out --------------------------------------------------------------------------------------------------
+
+    @property
+    def up_to_date(self) -> bool:
+        """Whether there is a whole copy, and no newer version is known than the copy's."""
+        intact = self._replica.version is not None and not self._replica.needs_snapshot
+        return intact and self._newest in (None, self._replica.version)
+
+    def wants_snapshot(self, now: float) -> bool:
+        """Whether only a snapshot helps: no copy yet, a broken one, one of another history, or a delta that is lost."""
+        version, newest = self._replica.version, self._newest
+        if version is None or self._replica.needs_snapshot:
+            return True
+        if newest is None or newest == version:
+            return False
+        if newest.epoch != version.epoch or newest.seq <= version.seq:
+            return True
+        if any(epoch == version.epoch and seq > version.seq + 1 for epoch, seq, _ in self._held):
+            return True  # deltas are delivered in order: the one before was lost
+        return self.gap(now) > self._grace_s
+
+    def age(self, now: float) -> float:
+        """Return the seconds since a message last showed the copy to be the newest version; inf before the first."""
+        return max(0.0, now - self._confirmed_at)
+
+    def gap(self, now: float) -> float:
+        """Return for how long (s) the copy has lacked a version that is known to exist; 0 when it lacks none."""
+        return 0.0 if self._behind_since is None else max(0.0, now - self._behind_since)
+
+    @property
+    def replica(self) -> Replica:
+        """The copy itself, for reading."""
+        return self._replica
+
+    @property
+    def site(self) -> str:
+        """The site's id; empty before the first snapshot."""
+        return self._replica.site
+
+    @property
+    def version(self) -> Version | None:
+        """The copy's version; None before the first snapshot."""
+        return self._replica.version
+
+    @property
+    def geometry(self) -> GridGeometry | None:
+        """The map's geometry; None before the first snapshot."""
+        return self._replica.geometry
+
+    @property
+    def cost(self) -> Grid:
+        """The master costmap (height, width); of one version, even while the copy is behind or broken."""
+        return self._replica.cost
+
+    @property
+    def speed(self) -> Grid:
+        """The speed layer (height, width), cm/s, 0 = no limit."""
+        return self._replica.speed
+
+    @property
+    def static(self) -> Grid:
+        """The static map (height, width); no cells before the first snapshot."""
+        return self._replica.static
+
+    # --- Inside -----------------------------------------------------------------------------------------------------
+
+    def _hold(self, delta: MapDelta, newest: Version) -> None:
+        version = self._replica.version
+        if version is not None and delta.epoch == version.epoch and not self._replica.needs_snapshot:
+            if delta.seq <= version.seq:
+                return
+        elif delta.epoch != newest.epoch:
+            return  # a late message of a writer that was replaced
+        self._held[delta.epoch, delta.seq, delta.part] = delta
+        if len(self._held) > self._max_held:
+            del self._held[next(iter(self._held))]
+
+    def _apply_held(self) -> list[Applied]:
+        """Apply the held deltas that follow the copy's version without a gap."""
+        changes: list[Applied] = []
+        while (version := self._replica.version) is not None and not self._replica.needs_snapshot:
+            next_parts = [key for key in self._held if key[:2] == (version.epoch, version.seq + 1)]
+            if not next_parts:
+                break
+            outcomes = [self._replica.apply(self._held.pop(key)) for key in next_parts]
+            changes += [outcome for outcome in outcomes if isinstance(outcome, Applied)]
+        if version is not None and not self._replica.needs_snapshot:
+            at = _order(version)
+            self._held = {key: delta for key, delta in self._held.items() if key[:2] > at}
+        return changes
+
+    def _refuse_outdated(self, snapshot: MapSnapshot) -> None:
+        version, newest = self._replica.version, self._newest
+        if newest is None:
+            return
+        if snapshot.epoch < newest.epoch:
+            raise MapError(f"the snapshot is of epoch {snapshot.epoch}, but the map-service is at epoch {newest.epoch}")
+        started_again = version is not None and _order(newest) < _order(version)
+        if version is None or started_again or snapshot.epoch != version.epoch:
+            return
+        if snapshot.seq < version.seq:
+            raise MapError(f"the snapshot is of version {snapshot.seq}, older than the copy's {version.seq}")
+
+    def _assess(self, now: float, *, confirmed: bool) -> None:
+        if self.up_to_date:
+            self._behind_since = None
+            if confirmed:
+                self._confirmed_at = max(self._confirmed_at, now)
+        elif self._behind_since is None:
+            self._behind_since = now
+
+
+def _order(version: Version) -> tuple[int, int]:
+    return version.epoch, version.seq
+
+
+def _joined(changes: Sequence[Applied]) -> Applied | None:
+    """Return changes that followed one another as one, None when there are none."""
+    if len(changes) < 2:
+        return changes[0] if changes else None
+    return Applied(
+        changes[-1].version,
+        [window for change in changes for window in change.windows],
+        [cause for change in changes for cause in change.causes],
+        [trace for change in changes for trace in change.traces],
+    )

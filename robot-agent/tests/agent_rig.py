@@ -41,8 +41,8 @@ from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.raycast import cast
 from fog_runtime.clock import SystemClock
 from fog_runtime.zenoh_edge import ZenohEdge
-from fognav_sim.wire.pty_port import PtyPort
-from fognav_sim.wire.rplidar import RplidarEmulator
+from fognav_sim.pty_port import PtyPort
+from robot_agent.lidars.rplidar_a1.emulator import RplidarEmulator
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -13,8 +13,8 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fognav_sim.wire.pty_port import PtyPort
-from fognav_sim.wire.roomba import RoombaEmulator
+from fognav_sim.pty_port import PtyPort
+from robot_agent.bases.roomba600.emulator import RoombaEmulator
 from robot_agent.guardian.link import WheelCommand, decode_feedback, encode
 
 if TYPE_CHECKING:

@@ -8,9 +8,12 @@ from hypothesis import strategies as st
 from fog_contracts.grid import GridGeometry
 from fog_contracts.messages import Pose
 from fog_contracts.site import RobotSite
-from fognav_sim.hardware import LINE_BYTES_S, Hardware, Line
+from fognav_sim import devices
+from fognav_sim.hardware import Hardware, Line
 from fognav_sim.world import World
 
+BAUD = 115_200
+TICK_M = np.pi * 0.072 / 508.8
 DRIVE_200 = bytes([128, 131, 145, 0, 200, 0, 200])
 STREAM = bytes([148, 3, 7, 43, 44])
 SCAN = bytes([0xA5, 0x20])
@@ -23,15 +26,19 @@ def hall():
     return World(geometry, cells, RobotSite(id="r1", start=Pose(x=1.0, y=2.0, theta=0.0)), seed=1)
 
 
+def hardware_in(world, start=0.0, **more):
+    return Hardware(world, devices.make_base("roomba600"), devices.make_lidar("rplidar-a1", world.lidar), start, **more)
+
+
 @given(chunks=st.lists(st.integers(0, 400), min_size=1, max_size=60))
 def test_a_line_keeps_order_loses_nothing_below_its_rate_and_is_never_faster(chunks):
-    line, sent, given_, at = Line(), b"", b"", 0.0
+    line, sent, given_, at = Line(BAUD), b"", b"", 0.0
     for size in chunks:
         data = bytes(len(given_) + n & 0xFF for n in range(size))
         given_ += data
         sent += line.send(data, 0.01)
         at += 0.01
-        assert len(sent) <= LINE_BYTES_S * at + 1e-6
+        assert len(sent) <= BAUD / 10 * at + 1e-6
         assert sent == given_[: len(sent)] or line.lost
     if not line.lost:
         for _ in range(1000):
@@ -40,7 +47,7 @@ def test_a_line_keeps_order_loses_nothing_below_its_rate_and_is_never_faster(chu
 
 
 def test_a_line_that_is_too_slow_drops_the_oldest_bytes_and_counts_them():
-    line = Line()
+    line = Line(BAUD)
     data = bytes(6000)
     line.send(data, 0.0)
     assert line.lost == 6000 - 4096
@@ -48,7 +55,7 @@ def test_a_line_that_is_too_slow_drops_the_oldest_bytes_and_counts_them():
 
 def test_drive_direct_moves_the_robot_and_its_encoders():
     world = hall()
-    hardware = Hardware(world, 5.0, left_encoder=65_500)
+    hardware = hardware_in(world, 5.0, rolled=(65_500 * TICK_M, 0.0))
     hardware.receive(DRIVE_200, b"")
     for _ in range(200):
         hardware.step()
@@ -60,7 +67,7 @@ def test_drive_direct_moves_the_robot_and_its_encoders():
 
 def test_a_wall_stops_the_robot_counts_once_and_presses_the_bumper_in_the_stream():
     world = hall()
-    hardware = Hardware(world, 0.0)
+    hardware = hardware_in(world)
     hardware.receive(DRIVE_200 + STREAM, b"")
     received = b""
     for _ in range(3000):
@@ -78,7 +85,7 @@ def test_a_wall_stops_the_robot_counts_once_and_presses_the_bumper_in_the_stream
 
 
 def test_a_scan_and_the_stream_fit_on_their_lines():
-    hardware = Hardware(hall(), 0.0)
+    hardware = hardware_in(hall())
     hardware.receive(DRIVE_200 + STREAM, SCAN)
     base, lidar = 0, 0
     for _ in range(1000):

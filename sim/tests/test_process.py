@@ -120,7 +120,7 @@ async def test_commands_drive_the_robot_and_the_truth_tells_it(tmp_path):
         port = rig.port_file.read_text("utf-8").split()[0]
         answer = await asyncio.to_thread(urllib.request.urlopen, f"http://127.0.0.1:{port}/readyz")
         assert json.loads(answer.read())["ready"]
-        base = os.open(rig.run / "roomba", os.O_RDWR | os.O_NOCTTY)
+        base = os.open(rig.run / "base", os.O_RDWR | os.O_NOCTTY)
         try:
             os.write(base, bytes([128, 131, 145, 0, 200, 0, 200, 148, 2, 43, 44]))
             await until(lambda: rig.truths[-1].distance > 0.3, "the robot drove")
@@ -133,7 +133,7 @@ async def test_commands_drive_the_robot_and_the_truth_tells_it(tmp_path):
         assert rig.truths[-1].sustained_speed == pytest.approx(1.0, abs=0.2)
         process.send_signal(signal.SIGTERM)
         assert await process.wait() == 0
-        assert not (rig.run / "roomba").exists()
+        assert not (rig.run / "base").exists()
     log = rig.log()
     assert any(line["left"] == 0.2 for line in log)
     assert log[-1]["x"] == pytest.approx(rig.truths[-1].x, abs=1e-6)

@@ -173,7 +173,7 @@ class Stack:
         socket = self.folder / "guardian.sock"
         wires = {
             "ROBOT": self.config.robot,
-            "BASE_PORT": str(self.folder / "sim" / "roomba"),
+            "BASE_PORT": str(self.folder / "sim" / "base"),
             "LIDAR_PORT": str(self.folder / "sim" / "lidar"),
             "GUARDIAN_SOCKET": str(socket),
         }

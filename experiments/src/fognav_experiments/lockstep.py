@@ -22,6 +22,7 @@ from fog_contracts.geometry import contains_point, distance_to_polygon
 from fog_contracts.messages import PlanRequest, RobotGoal, RobotPath, SimObstacle
 from fog_runtime.site import LoadedSite, load_site
 from fognav_experiments.rigs import FogRig, RobotRig
+from fognav_sim.devices import DEFAULT_BASE, DEFAULT_LIDAR
 from fognav_sim.hardware import STEP_S
 from fognav_sim.scenario import Event, Scenario, ScenarioError, barrier_across
 from fognav_sim.world import Noise, World
@@ -97,11 +98,21 @@ class LockstepResult(msgspec.Struct, frozen=True, kw_only=True):
 class _Drive:
     """One run: rigs, scenario and what is written down about it."""
 
-    def __init__(self, site: LoadedSite, start: Pose, goal: RobotGoal, seed: int, noise: Noise | None) -> None:
+    def __init__(
+        self,
+        site: LoadedSite,
+        start: Pose,
+        goal: RobotGoal,
+        seed: int,
+        noise: Noise | None,
+        *,
+        base: str = DEFAULT_BASE,
+        lidar: str = DEFAULT_LIDAR,
+    ) -> None:
         robot = msgspec.structs.replace(site.site.robots[0], start=start)
         self.site, self.goal, self.seed = site, goal, seed
         self.world = World(site.map.geometry, site.map.cells, robot, seed, noise=noise)
-        self.robot = RobotRig(site, robot, self.world, seed, 0.0)
+        self.robot = RobotRig(site, robot, self.world, seed, 0.0, base=base, lidar=lidar)
         self.fog = FogRig(site, self.world, seed, 0.0)
         self.scenario = Scenario((), start=0.0)
         self.events: list[Happening] = []
@@ -292,20 +303,24 @@ def run_lockstep(
     timeout_s: float = 900.0,
     noise: Noise | None = None,
     watched: bool = True,
+    base: str = DEFAULT_BASE,
+    lidar: str = DEFAULT_LIDAR,
 ) -> LockstepResult:
     """Drive the site's first robot from `start` to `goal`; the result is the same for the same arguments.
 
     With `hazard_area` a barrier appears in that area after `hazard_at_m` metres (drawn between 3 and 8 by the seed
     if not given), never within 3 m of the robot. Without `watched` the floor has neither areas nor nodes: the robot's
-    own lidar must find the barrier. Raises `ScenarioError` for an area that the site does not have or
-    that can't be barred, `ValueError` for a start inside something.
+    own lidar must find the barrier. `base` and `lidar` name the robot's hardware. Raises `ScenarioError` for an area
+    that the site does not have or that can't be barred, `ValueError` for a start inside something.
     """
     pose = msgspec.convert(
         {"x": goal.x, "y": goal.y, "theta": goal.theta if goal.theta is not None else 0.0}, type(start)
     )
     mission = RobotGoal(goal_id="lockstep-1", pose=pose)
     bare = msgspec.structs.replace(site.site, areas=[], nodes=[])
-    drive = _Drive(site if watched else dataclasses.replace(site, site=bare), start, mission, seed, noise)
+    drive = _Drive(
+        site if watched else dataclasses.replace(site, site=bare), start, mission, seed, noise, base=base, lidar=lidar
+    )
     barrier = None
     if hazard_area is not None:
         barrier = barrier_across(_area(site, hazard_area), site.site, site.map, seed)

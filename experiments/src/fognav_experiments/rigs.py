@@ -28,6 +28,7 @@ from fog_contracts.messages import (
     RobotState,
     ZoneSet,
 )
+from fognav_sim import devices
 from fognav_sim.hardware import STEP_S, Hardware
 from fognav_sim.node import SonarNode
 from hazard_aggregator.core import Aggregator
@@ -55,6 +56,8 @@ M = TypeVar("M", bound=Message)
 STAMP: Final = 1_700_000_000.0
 """Where the emulated wall clock stands at time zero: runs must not depend on when they are made."""
 _KEY: Final = b"lockstep operator key, no secret"
+_ROLLED_M: Final = (28.9, 0.04)
+"""The wheels have rolled before: a counter of 16 bits wraps on the way."""
 _GUARDIAN_STEPS: Final = 2
 _LIDAR_STEPS: Final = 2
 _STREAM_STEPS: Final = 5
@@ -70,13 +73,25 @@ def carry(channel: Channel, message: M) -> M:
 class RobotRig:
     """Simulated hardware, guardian and agent of one robot, as its three processes connect them."""
 
-    def __init__(self, site: LoadedSite, robot: RobotSite, world: World, seed: int, start: float) -> None:
+    def __init__(
+        self,
+        site: LoadedSite,
+        robot: RobotSite,
+        world: World,
+        seed: int,
+        start: float,
+        *,
+        base: str = devices.DEFAULT_BASE,
+        lidar: str = devices.DEFAULT_LIDAR,
+    ) -> None:
+        """Put the robot together; `base` and `lidar` name its drivers and their emulators."""
         self.id = robot.id
         self.world = world
-        self.hardware = Hardware(world, start, left_encoder=65_000, right_encoder=100)
-        base, self._scan = make_base("roomba600"), make_lidar("rplidar-a1")
-        self.guardian = GuardianCore(base)
-        config = agent_config(robot.id, _KEY, robot).with_hardware(base.drive_train, self._scan.traits)
+        driver, self._scan = make_base(base), make_lidar(lidar)
+        emulators = devices.make_base(base), devices.make_lidar(lidar, world.lidar)
+        self.hardware = Hardware(world, *emulators, start, rolled=_ROLLED_M)
+        self.guardian = GuardianCore(driver)
+        config = agent_config(robot.id, _KEY, robot).with_hardware(driver.drive_train, self._scan.traits)
         self.agent = AgentCore(config, seed)
         begin = robot.start
         self.agent.restore(

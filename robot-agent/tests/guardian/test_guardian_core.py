@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fognav_sim.wire.roomba import FULL, OFF, PASSIVE, SAFE, RoombaEmulator
 from robot_agent.bases.roomba600.driver import Roomba600Driver, Roomba600Options
+from robot_agent.bases.roomba600.emulator import FULL, OFF, PASSIVE, SAFE, RoombaEmulator
 from robot_agent.guardian.core import COMMAND_FRESH_S, GuardianCore
 from robot_agent.guardian.link import WheelCommand
 

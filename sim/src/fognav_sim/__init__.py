@@ -1,1 +1,1 @@
-"""Simulated world with wire-level Roomba, RPLidar and sensor nodes."""
+"""Simulated world with wire-level robot hardware and sensor nodes."""

@@ -1,6 +1,6 @@
 """The simulator: `python -m fognav_sim`, told by FOGNAV_* in the environment.
 
-Offers the devices RUN_DIR/roomba and RUN_DIR/lidar, publishes as every sensor node of the site, and tells the truth.
+Offers the devices RUN_DIR/base and RUN_DIR/lidar, publishes as every sensor node of the site, and tells the truth.
 """
 
 import asyncio
@@ -13,12 +13,16 @@ from fog_runtime.health import Health, serve_plain
 from fog_runtime.settings import SettingsError, describe, load
 from fog_runtime.site import LoadedSite, load_site
 from fog_runtime.zenoh_edge import ZenohEdge
+from fognav_sim import devices
+from fognav_sim.hardware import Hardware
 from fognav_sim.live import Floor, Node, run_nodes
 from fognav_sim.node import SonarNode
 from fognav_sim.settings import Settings
 from fognav_sim.world import World
 
 _log = logs.get("sim")
+_ROLLED_M = (28.4, 0.5)
+"""The wheels have rolled before this day: soon after it drives on, a counter of 16 bits wraps."""
 
 
 def _robot(loaded: LoadedSite, wanted: str) -> RobotSite:
@@ -39,10 +43,12 @@ async def main() -> None:
     robot = _robot(loaded, settings.robot)
     clock = SystemClock(settings.speed)
     world = World(loaded.map.geometry, loaded.map.cells, robot, settings.seed)
+    base, lidar = devices.make_base(settings.base), devices.make_lidar(settings.lidar, world.lidar)
+    hardware = Hardware(world, base, lidar, clock.now(), rolled=_ROLLED_M)
     boot = int(clock.stamp())
     health = Health("devices", "zenoh")
     site = settings.site or loaded.site.id
-    with Floor(world, clock, settings.run_dir, settings.truth_log) as floor:
+    with Floor(hardware, clock, settings.run_dir, settings.truth_log) as floor:
         health.set("devices", ok=True)
         async with ZenohEdge.open(
             connect=settings.zenoh_endpoints, clock=clock, role="sim", id=robot.id, site=site

@@ -4,23 +4,21 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from fognav_sim.wire.roomba import RoombaEmulator
-from fognav_sim.wire.rplidar import RplidarEmulator
-
 if TYPE_CHECKING:
+    from fognav_sim.devices import BaseEmulator, LidarEmulator
     from fognav_sim.world import World
 
 STEP_S: Final = 0.01
-LINE_BYTES_S: Final = 11_520.0
-"""What 115200 baud carry with 8 data bits, start and stop bit."""
+_BITS_PER_BYTE: Final = 10
+"""8 data bits, start and stop bit."""
 _BUFFER_BYTES: Final = 4096
 
 
 class Line:
     """A serial line's pace: bytes go in at once and come out at the line's rate. Old ones are lost when it is full."""
 
-    def __init__(self, rate: float = LINE_BYTES_S) -> None:
-        self._rate = rate
+    def __init__(self, baud: int) -> None:
+        self._rate = baud / _BITS_PER_BYTE
         self._waiting = bytearray()
         self._credit = 0.0
         self.lost = 0
@@ -44,12 +42,23 @@ class Line:
 class Hardware:
     """Base and lidar of the world's robot; `now` (s) moves with each step."""
 
-    def __init__(self, world: World, start: float, *, left_encoder: int = 0, right_encoder: int = 0) -> None:
+    def __init__(
+        self,
+        world: World,
+        base: BaseEmulator,
+        lidar: LidarEmulator,
+        start: float,
+        *,
+        rolled: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
+        """Put the devices on the robot. `rolled` is how far (m) its wheels have rolled before: counters may wrap."""
         self.world = world
         self.now = start
-        self.base = RoombaEmulator(left_encoder=left_encoder, right_encoder=right_encoder)
-        self.lidar = RplidarEmulator(world.lidar)
-        self._base_line, self._lidar_line = Line(), Line()
+        self.base = base
+        self.lidar = lidar
+        base.add_wheel_travel(*rolled)
+        world.axle = base.axle_m
+        self._base_line, self._lidar_line = Line(base.baud), Line(lidar.baud)
 
     @property
     def lost_bytes(self) -> int:
@@ -69,7 +78,8 @@ class Hardware:
         world.set_wheels(*base.wheel_speeds_m_s)
         base.add_wheel_travel(*world.step(dt))
         self.now += dt
-        base.world.bump_left, base.world.bump_right = world.bumpers
+        bump_left, bump_right = world.bumpers
+        base.feel(bump_left=bump_left, bump_right=bump_right, cliff=False)
         base.tick(self.now, dt)
         return (
             self._base_line.send(base.outgoing(self.now), dt),

@@ -17,8 +17,8 @@ from fog_contracts.messages import CommandReply, NodeConfig, SimCommand
 from fog_runtime import logs
 from fog_runtime.clock import Ticker
 from fog_runtime.mqtt_edge import MqttEdge, Will
-from fognav_sim.hardware import STEP_S, Hardware
-from fognav_sim.wire.pty_port import PtyPort
+from fognav_sim.hardware import STEP_S
+from fognav_sim.pty_port import PtyPort
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
     from fog_runtime.clock import Clock
     from fog_runtime.zenoh_edge import ZenohEdge
+    from fognav_sim.hardware import Hardware
     from fognav_sim.node import SonarNode
-    from fognav_sim.world import World
 
 TRUTH_S: Final = 0.1
 LOG_S: Final = 0.01
@@ -92,12 +92,12 @@ class TruthLog:
 class Floor:
     """The world at its pace, with its two serial devices; the nodes look at it, and commands change it."""
 
-    def __init__(self, world: World, clock: Clock, run_dir: Path, truth_log: Path | None) -> None:
-        self.world = world
+    def __init__(self, hardware: Hardware, clock: Clock, run_dir: Path, truth_log: Path | None) -> None:
+        self.world = hardware.world
         self._clock = clock
-        self._hardware = Hardware(world, clock.now(), left_encoder=64_000, right_encoder=1_000)
+        self._hardware = hardware
         self._stack = ExitStack()
-        self._base = self._stack.enter_context(PtyPort(run_dir / "roomba"))
+        self._base = self._stack.enter_context(PtyPort(run_dir / "base"))
         self._lidar = self._stack.enter_context(PtyPort(run_dir / "lidar"))
         self._truth_log = TruthLog(truth_log)
         self._stack.callback(self._truth_log.close)

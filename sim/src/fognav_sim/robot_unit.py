@@ -120,7 +120,7 @@ def _programs(settings: Settings, robot: str) -> list[Program]:
     logs_folder = run / "logs"
     own = {
         "RUN_DIR": run / "wires",
-        "BASE_PORT": run / "wires" / "roomba",
+        "BASE_PORT": run / "wires" / "base",
         "LIDAR_PORT": run / "wires" / "lidar",
         "GUARDIAN_SOCKET": run / "guardian.sock",
         "ROBOT": robot,

@@ -3,13 +3,18 @@
 from pathlib import Path
 
 from fog_runtime.settings import CommonSettings
+from fognav_sim.devices import DEFAULT_BASE, DEFAULT_LIDAR
 
 
 class Settings(CommonSettings, frozen=True, kw_only=True):
-    """FOGNAV_RUN_DIR: folder of the devices `roomba` and `lidar`; FOGNAV_TRUTH_LOG: file for what is really so."""
+    """FOGNAV_RUN_DIR: folder of the devices `base` and `lidar`; FOGNAV_TRUTH_LOG: file for what is really so."""
 
     run_dir: Path
     robot: str = ""
     """Id of the robot in `site.toml`; empty: its first."""
+    base: str = DEFAULT_BASE
+    """What the robot drives on: a name in the entry points `fognav.base_emulators`."""
+    lidar: str = DEFAULT_LIDAR
+    """What it sees with: a name in the entry points `fognav.lidar_emulators`."""
     seed: int = 1
     truth_log: Path | None = None

@@ -97,7 +97,8 @@ class World:
         self.geometry = geometry
         self.robot = robot
         self.noise = noise or Noise()
-        self._axle = axle
+        self.axle = axle
+        """Distance (m) between the wheels of the base that drives."""
         self._wheel_lag = wheel_lag
         self._occupied = np.ascontiguousarray(cells == LETHAL, dtype=np.uint8)
         squared = squared_distance_capped(self._occupied, math.ceil(_FAR_M / geometry.resolution))
@@ -197,7 +198,7 @@ class World:
 
     def _move(self, left: float, right: float) -> None:
         body = self._body
-        ahead, turn = (left + right) / 2, (right - left) / self._axle
+        ahead, turn = (left + right) / 2, (right - left) / self.axle
         middle = body.theta + turn / 2
         x, y = body.x + ahead * math.cos(middle), body.y + ahead * math.sin(middle)
         clearance, towards = self._nearest(x, y)

@@ -17,6 +17,7 @@ from typing import Final
 
 OFF, PASSIVE, SAFE, FULL = range(4)
 
+BAUD: Final = 115200
 TICKS_PER_TURN: Final = 508.8
 WHEEL_DIAMETER_M: Final = 0.072
 AXLE_MM: Final = 235.0
@@ -111,7 +112,7 @@ _TRICKLE_MA: Final = 60.0
 
 
 class RoombaEmulator:
-    """The robot's end of the serial line.
+    """The robot's end of the serial line, as `fognav_sim.devices.BaseEmulator` asks for it.
 
     The world calls `tick(now, dt)`, reads `wheel_speeds_m_s`, moves its robot, tells how far the wheels really rolled
     by `add_wheel_travel`, and sets `world`. The port calls `receive` and `outgoing`. `now` is any monotonic clock,
@@ -134,6 +135,22 @@ class RoombaEmulator:
         self._next_frame = 0.0
         self._distance_mm = 0.0
         self._angle_deg = 0.0
+
+    @property
+    def baud(self) -> int:
+        """Speed of the serial line."""
+        return BAUD
+
+    @property
+    def axle_m(self) -> float:
+        """Distance between the wheels, m."""
+        return AXLE_MM / 1000.0
+
+    def feel(self, *, bump_left: bool, bump_right: bool, cliff: bool) -> None:
+        """Set bumper and cliff sensors at once; everything else is in `world`."""
+        self.world.bump_left, self.world.bump_right = bump_left, bump_right
+        self.world.cliff_left = self.world.cliff_right = cliff
+        self.world.cliff_front_left = self.world.cliff_front_right = cliff
 
     @property
     def wheel_speeds_m_s(self) -> tuple[float, float]:

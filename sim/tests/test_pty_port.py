@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from fognav_sim.wire.pty_port import PtyPort
+from fognav_sim.pty_port import PtyPort
 
 pytestmark = pytest.mark.live
 

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 Measure = Callable[["NDArray[np.float64]", float], "NDArray[np.float64]"]
 """(angles in radians, counter-clockwise in the laser frame; time in seconds) -> ranges in metres, nan for no return."""
 
+BAUD: Final = 115200
 NODES_PER_S: Final = 2000.0
 TURNS_PER_S: Final = 5.5
 RANGE_MIN_M: Final = 0.15
@@ -34,7 +35,7 @@ _CATCH_UP_S: Final = 0.5
 
 
 class RplidarEmulator:
-    """The lidar's end of the serial line.
+    """The lidar's end of the serial line, as `fognav_sim.devices.LidarEmulator` asks for it.
 
     The port calls `receive` and `outgoing`; `now` is any monotonic clock, seconds. `health` and `error_code` are what
     a health request gets. Two faults can be set at any time: `stalled` sends nothing more, `frozen` sends the bytes of
@@ -76,6 +77,11 @@ class RplidarEmulator:
         self._turn = bytearray()
         self._last_turn = b""
         self._replayed = 0
+
+    @property
+    def baud(self) -> int:
+        """Speed of the serial line."""
+        return BAUD
 
     @property
     def scanning(self) -> bool:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fognav_sim.wire.roomba import BOOT_TEXT, FULL, OFF, PASSIVE, SAFE, Battery, RoombaEmulator
+from robot_agent.bases.roomba600.emulator import BOOT_TEXT, FULL, OFF, PASSIVE, SAFE, Battery, RoombaEmulator
 
 DRIVE_300 = bytes((145, 1, 44, 1, 44))
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fognav_sim.wire.rplidar import BOOT_TEXT, RplidarEmulator
+from robot_agent.lidars.rplidar_a1.emulator import BOOT_TEXT, RplidarEmulator
 
 SCAN = bytes.fromhex("a55a0500004081")
 

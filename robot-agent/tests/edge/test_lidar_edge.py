@@ -8,11 +8,11 @@ import pytest
 from guardian_rig import DEADLINE_S
 
 from fog_runtime.clock import SystemClock
-from fognav_sim.wire.pty_port import PtyPort
-from fognav_sim.wire.rplidar import RplidarEmulator
+from fognav_sim.pty_port import PtyPort
 from robot_agent.agent.lidar_edge import LidarEdge
 from robot_agent.lidars.rplidar_a1 import protocol as rplidar
 from robot_agent.lidars.rplidar_a1.driver import ANSWER_S, RESET_S, SILENT_S, STOP_S, RplidarA1Driver
+from robot_agent.lidars.rplidar_a1.emulator import RplidarEmulator
 
 STEP = 0.02
 

@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fognav_sim.wire.pty_port import PtyPort
-from fognav_sim.wire.roomba import RoombaEmulator
-from fognav_sim.wire.rplidar import RplidarEmulator
+from fognav_sim.pty_port import PtyPort
 from robot_agent.bases.roomba600 import open_interface as oi
 from robot_agent.bases.roomba600.driver import Roomba600Driver, Roomba600Options
+from robot_agent.bases.roomba600.emulator import RoombaEmulator
 from robot_agent.lidars.rplidar_a1 import protocol as rplidar
+from robot_agent.lidars.rplidar_a1.emulator import RplidarEmulator
 from robot_agent.odometry import EncoderFault, Motion, Odometry
 from robot_agent.serial_port import open_port
 

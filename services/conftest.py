@@ -119,7 +119,7 @@ class Fog:
     async def edges(self) -> AsyncIterator[tuple[MqttEdge, ZenohEdge, Callable[[], None]]]:
         """Give a connection to each side; register on the broker's before calling the third, which connects it."""
         clock = SystemClock()
-        mqtt = MqttEdge(self.mosquitto.url, "test", clock)
+        mqtt = MqttEdge(self.mosquitto.url, "test", clock, site="test")
         tasks: list[asyncio.Task[None]] = []
         async with AsyncExitStack() as stack:
             zenoh = await stack.enter_async_context(

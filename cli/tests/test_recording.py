@@ -41,7 +41,7 @@ async def test_what_crosses_both_transports_is_recorded_and_sent_again(tmp_path:
             stack.supervisor.start(name)
         await stack.supervisor.wait_ready([BROKER, ROUTER], TIMEOUT_S)
         heard: asyncio.Queue[object] = asyncio.Queue()
-        mqtt = MqttEdge(stack.mqtt_url, "test", clock)
+        mqtt = MqttEdge(stack.mqtt_url, "test", clock, site="here")
         mqtt.on(ch.AREA_HAZARD, lambda _, hazard: heard.put_nowait(hazard), AreaHazard)
         opened = ZenohEdge.open(connect=[stack.zenoh_endpoint], clock=clock, role="console", id="test", site="here")
         async with opened as zenoh:

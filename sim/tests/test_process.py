@@ -96,7 +96,7 @@ async def simulator(folder: Path, speed=1):
         url = broker.endpoint if "://" in broker.endpoint else f"mqtt://{broker.endpoint}"
         rig = Rig(folder, url, router.endpoint)
         clock = SystemClock()
-        mqtt = MqttEdge(url, "test", clock)
+        mqtt = MqttEdge(url, "test", clock, site="lab")
         mqtt.on(ch.NODE_READING, lambda _, reading: rig.readings.append(reading), NodeReading)
         mqtt.on(ch.NODE_AVAILABILITY, lambda _, text: rig.availability.append(text))
         listening = asyncio.create_task(mqtt.run())

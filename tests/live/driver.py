@@ -100,7 +100,7 @@ class Floor:
                 )
             )
             self.operator = Operator(edge, self.stack, self.scene, self.clock)
-            mqtt = MqttEdge(self.stack.mqtt_url, "live-test", self.clock)
+            mqtt = MqttEdge(self.stack.mqtt_url, "live-test", self.clock, site=self._site.site.id)
             mqtt.on(ch.NODE_READING, self._on_reading, NodeReading)
             listening = asyncio.create_task(mqtt.run())
             self._ends.push_async_callback(_end, listening)

@@ -187,7 +187,7 @@ async def test_rubbish_from_sensors_and_on_the_line_ends_nothing(floor: Floor) -
     await floor.drive_to(*(EAST if floor.truth.x < 50 else WEST))
     starts = floor.starts()
     generator = random.Random(1)
-    topic = "fog/v1/nodes/n1/reading"
+    topic = "fog/v1/estig/nodes/n1/reading"
     rubbish: list[bytes] = [
         b"", b"{", b"null", b"[1,2]", b"\xff\xfe\x00", json.dumps({"seq": "one"}).encode(), generator.randbytes(900),
         b"[" * 1000, b"x" * 500_000,

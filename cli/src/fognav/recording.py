@@ -29,7 +29,7 @@ async def recording(
 
     Raises `WrongUseError` when the file can't be written or the broker can't be reached.
     """
-    mqtt = _mqtt(mqtt_url, "fognav-record", clock)
+    mqtt = _mqtt(mqtt_url, "fognav-record", clock, zenoh.site)
     try:
         recorder = Recorder(path, site=zenoh.site)
     except OSError as error:
@@ -95,7 +95,7 @@ async def play(path: Path, *, mqtt_url: str, zenoh_endpoint: str, site: str, spe
     if not held["messages"]:
         raise WrongUseError(f"{path} holds no whole message: there is nothing to send. Record it anew")
     clock = SystemClock(speed)
-    mqtt = _mqtt(mqtt_url, "fognav-replay", clock)
+    mqtt = _mqtt(mqtt_url, "fognav-replay", clock, site)
     opened = ZenohEdge.open(connect=[zenoh_endpoint], clock=clock, role="console", id="replay", site=site)
     async with opened as zenoh:
         await _router(zenoh, zenoh_endpoint)
@@ -115,16 +115,16 @@ async def play(path: Path, *, mqtt_url: str, zenoh_endpoint: str, site: str, spe
             await asyncio.gather(task, return_exceptions=True)
 
 
-def _mqtt(url: str, client: str, clock: Clock) -> MqttEdge:
+def _mqtt(url: str, client: str, clock: Clock, site: str) -> MqttEdge:
     try:
-        return MqttEdge(url, client, clock)
+        return MqttEdge(url, client, clock, site=site)
     except ValueError as error:
         raise WrongUseError(f"{url!r} names no broker ({error}). Correct --mqtt") from error
 
 
 async def _look(zenoh: ZenohEdge, zenoh_endpoint: str, mqtt_url: str, clock: Clock) -> None:
     """See whether there is a system, before a file is written over; raises `WrongUseError`."""
-    mqtt = _mqtt(mqtt_url, "fognav-look", clock)
+    mqtt = _mqtt(mqtt_url, "fognav-look", clock, zenoh.site)
     looking = asyncio.create_task(mqtt.run())
     try:
         await _connected(mqtt, mqtt_url)

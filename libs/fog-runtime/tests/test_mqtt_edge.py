@@ -49,7 +49,7 @@ async def running(*edges):
 
 
 def make(broker, name, **keys):
-    return MqttEdge(broker.url, name, SystemClock(), **keys)
+    return MqttEdge(broker.url, name, SystemClock(), **{"site": "lab", **keys})
 
 
 def reading(seq):
@@ -196,13 +196,13 @@ async def test_will_is_published_when_the_process_vanishes(broker):
 @pytest.mark.parametrize(
     ("topic", "payload"),
     [
-        ("fog/v1/nodes/n1/reading", b"no json"),
-        ("fog/v1/nodes/n1/reading", b"\xff\xfe"),
-        ("fog/v1/nodes/n1/reading", b""),
-        ("fog/v1/nodes/n1/reading", b"{}"),
-        ("fog/v1/nodes/n1/reading", b"x" * 2000),
-        ("fog/v1/nodes/N 1/reading", b"{}"),
-        ("fog/v1/nodes/n1/reading", json.dumps({"seq": 1, "boot": 1, "uptime_ms": 1, "range_m": [0.0],
+        ("fog/v1/lab/nodes/n1/reading", b"no json"),
+        ("fog/v1/lab/nodes/n1/reading", b"\xff\xfe"),
+        ("fog/v1/lab/nodes/n1/reading", b""),
+        ("fog/v1/lab/nodes/n1/reading", b"{}"),
+        ("fog/v1/lab/nodes/n1/reading", b"x" * 2000),
+        ("fog/v1/lab/nodes/N 1/reading", b"{}"),
+        ("fog/v1/lab/nodes/n1/reading", json.dumps({"seq": 1, "boot": 1, "uptime_ms": 1, "range_m": [0.0],
                                                 "status": ["ok"], "state": "clear"}).encode()),
     ],
 )  # fmt: skip
@@ -222,7 +222,7 @@ async def test_retained_reading_is_never_taken_for_a_fresh_one(broker):
     seen = []
     before = counted("fognav_refused_messages_total", ch.NODE_READING)
     async with raw(broker) as client:
-        await client.publish("fog/v1/nodes/old/reading", json.dumps({
+        await client.publish("fog/v1/lab/nodes/old/reading", json.dumps({
             "seq": 1, "boot": 1, "uptime_ms": 1, "range_m": [1.0], "status": ["ok"], "state": "clear",
         }), retain=True, qos=1)  # fmt: skip
         edge = make(broker, "e")
@@ -231,7 +231,7 @@ async def test_retained_reading_is_never_taken_for_a_fresh_one(broker):
             await until(lambda: counted("fognav_refused_messages_total", ch.NODE_READING) == before + 1, "not refused")
             await edge.publish(ch.NODE_READING, reading(1), node="new")
             await until(lambda: seen, "nothing came")
-        await client.publish("fog/v1/nodes/old/reading", b"", retain=True, qos=1)
+        await client.publish("fog/v1/lab/nodes/old/reading", b"", retain=True, qos=1)
     assert seen == ["new"]
 
 
@@ -264,8 +264,8 @@ def passwords(tmp_path):
 async def test_password_in_the_address_is_used_and_a_wrong_one_is_tried_again(tmp_path, passwords):
     extra = f"allow_anonymous false\npassword_file {passwords}"
     with start_mosquitto(tmp_path / "broker", extra=extra) as broker:
-        good = MqttEdge(f"mqtt://fog:p%40ss@127.0.0.1:{broker.port}", "good", SystemClock())
-        bad = MqttEdge(f"mqtt://fog:wrong@127.0.0.1:{broker.port}", "bad", SystemClock())
+        good = MqttEdge(f"mqtt://fog:p%40ss@127.0.0.1:{broker.port}", "good", SystemClock(), site="lab")
+        bad = MqttEdge(f"mqtt://fog:wrong@127.0.0.1:{broker.port}", "bad", SystemClock(), site="lab")
         async with running(good):
             task = asyncio.create_task(bad.run())
             done, _ = await asyncio.wait([task], timeout=0.5)
@@ -278,8 +278,8 @@ async def test_password_in_the_address_is_used_and_a_wrong_one_is_tried_again(tm
 
 async def test_wrong_use_is_an_error_at_once():
     with pytest.raises(ValueError, match="mqtt://"):
-        MqttEdge("http://broker", "e", SystemClock())
-    edge = MqttEdge("mqtt://127.0.0.1", "e", SystemClock())
+        MqttEdge("http://broker", "e", SystemClock(), site="lab")
+    edge = MqttEdge("mqtt://127.0.0.1", "e", SystemClock(), site="lab")
     with pytest.raises(ValueError, match="NodeReading"):
         edge.on(ch.NODE_READING, print)
     with pytest.raises(ValueError, match="zenoh"):
@@ -288,3 +288,22 @@ async def test_wrong_use_is_an_error_at_once():
         await edge.publish(ch.NODE_AVAILABILITY, "x" * 100, node="n1")
     with pytest.raises(ContractError, match="not text"):
         await edge.publish(ch.NODE_READING, "text", node="n1")
+
+
+@pytest.mark.live
+async def test_sites_that_share_a_broker_hear_only_their_own(broker):
+    here, there = [], []
+    ours, theirs = make(broker, "ours"), make(broker, "theirs", site="other")
+    for edge, heard in ((ours, here), (theirs, there)):
+        edge.on(ch.NODE_READING, lambda ids, message, to=heard: to.append((ids, message.seq)), m.NodeReading)
+        edge.on(ch.AREA_HAZARD, lambda ids, message, to=heard: to.append((ids, message.seq)), m.AreaHazard)
+    async with running(ours, theirs):
+        assert await theirs.publish(ch.AREA_HAZARD, hazard(2), wait=True, area="shared")
+        assert await ours.publish(ch.AREA_HAZARD, hazard(1), wait=True, area="shared")
+        await until(lambda: ({"area": "shared"}, 1) in here and there, "nothing came")
+        assert await theirs.clear(ch.AREA_HAZARD, wait=True, area="shared")
+        assert await ours.clear(ch.AREA_HAZARD, wait=True, area="shared")
+        with pytest.raises(ValueError, match="fills the site in"):
+            await ours.publish(ch.NODE_READING, reading(1), site="other", node="n1")
+    assert [seq for ids, seq in here if ids == {"area": "shared"}] == [1]
+    assert there == [({"area": "shared"}, 2)]

@@ -59,7 +59,8 @@ def test_other_readers_find_topics_schemas_and_json(tmp_path):
     with (tmp_path / "r.mcap").open("rb") as file:
         found = list(make_reader(file).iter_messages())
     assert {info.topic for _, info, _ in found} == {
-        "fog/v1/nodes/n1/reading", "fog/v1/nodes/n1/availability", "fog/lab/map/delta", "fog/v1/nodes/n2/reading",
+        "fog/v1/lab/nodes/n1/reading", "fog/v1/lab/nodes/n1/availability", "fog/lab/map/delta",
+        "fog/v1/lab/nodes/n2/reading",
     }  # fmt: skip
     for schema, info, record_ in found:
         assert (schema.encoding, info.message_encoding) == ("jsonschema", "json")
@@ -139,7 +140,7 @@ async def test_replay_keeps_the_intervals_of_its_clock(tmp_path):
 async def test_record_all_takes_both_transports_at_any_speed(tmp_path, speed):
     clock, begun = SystemClock(speed), time.time()
     with start_mosquitto(tmp_path / "m") as broker, start_router(tmp_path / "z") as router:
-        mqtt = MqttEdge(broker.url, "rec", clock)
+        mqtt = MqttEdge(broker.url, "rec", clock, site="lab")
         async with ZenohEdge.open(connect=[router.endpoint], clock=clock, role="test", id="t", site="lab") as zenoh:
             with Recorder(tmp_path / "r.mcap") as recorder:
                 record_all(mqtt, zenoh, recorder, clock, numbers=[1])

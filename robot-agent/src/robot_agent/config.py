@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final, Self
 
+from fog_contracts.channels import MAP_HEARTBEAT, ROBOT_PATH
 from fog_contracts.costs import DEFAULT_INFLATION, Inflation
 from robot_agent.hardware import DriveTrain
 
@@ -34,10 +35,10 @@ class SafetyConfig:
     speed_degraded: float = 0.15
     speed_egress: float = 0.10
     relax_after: float = 2.0
-    map_late: float = 1.0
+    map_late: float = MAP_HEARTBEAT.max_age_s
     map_lost: float = 3.0
     gap_lost: float = 1.0
-    plan_late: float = 1.5
+    plan_late: float = ROBOT_PATH.max_age_s
     released_end: float = 0.15
     """With less released path ahead (m) the robot stands at its end, within the goal tolerance."""
     lidar_node_lost: float = 0.3

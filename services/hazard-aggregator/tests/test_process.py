@@ -184,10 +184,10 @@ async def test_garbage_is_refused_and_nothing_stops(fog, until):
     url = await fog.ready("hazard_aggregator")
     async with watching(fog) as (watch, _), httpx.AsyncClient() as client:
         raw = watch.mqtt._client
-        topic = ch.NODE_READING.key(node="n1")
-        for payload in (b"x" * 10_000_000, b"{", b'{"seq":-1}', b"\xff\xfe"):
+        topic = ch.NODE_READING.key(site="test", node="n1")
+        for payload in (b"x" * 200_000, b"{", b'{"seq":-1}', b"\xff\xfe"):
             await raw.publish(topic, payload, qos=0, timeout=30)
-        await raw.publish(ch.NODE_AVAILABILITY.key(node="n1"), b"maybe", qos=1)
+        await raw.publish(ch.NODE_AVAILABILITY.key(site="test", node="n1"), b"maybe", qos=1)
         await watch.read(0.8, 5)
         await until(lambda: watch.state == "blocked", "still works", lambda: fog.log("hazard_aggregator"))
         metrics = (await client.get(f"{url}/metrics")).text

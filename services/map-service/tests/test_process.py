@@ -236,8 +236,9 @@ async def test_without_redis_zones_stay_writes_wait_and_a_restart_serves_nothing
 async def test_hazards_are_back_after_the_broker_was_killed_and_garbage_stops_nothing(fog, until):
     async with running(fog, "hazard_aggregator", "map_service") as (client, robot, mqtt):
         await fog.ready("hazard_aggregator")
-        await mqtt._client.publish(ch.AREA_HAZARD.key(area="hall"), b"x" * 10_000_000, qos=1, timeout=30)
-        await mqtt._client.publish(ch.AREA_DEFINITION.key(area="hall"), json.dumps({"id": "hall"}).encode(), qos=1)
+        hall = {"site": "test", "area": "hall"}
+        await mqtt._client.publish(ch.AREA_HAZARD.key(**hall), b"x" * 200_000, qos=1, timeout=30)
+        await mqtt._client.publish(ch.AREA_DEFINITION.key(**hall), json.dumps({"id": "hall"}).encode(), qos=1)
         refused = ('{channel="area_hazard"} 1.0', '{channel="area_definition"} 1.0')
         ask = partial(client.get, "/metrics")
         await first(ask, lambda answer: all(f"fognav_refused_messages_total{line}" in answer.text for line in refused))

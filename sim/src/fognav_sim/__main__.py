@@ -59,7 +59,7 @@ async def main() -> None:
                     tasks.create_task(floor.run(), name="world")
                     tasks.create_task(floor.tell(edge, robot.id), name="truth")
                     sonars = [SonarNode(node, boot, clock.now()) for node in loaded.site.nodes]
-                    nodes = [Node(each, floor, settings.mqtt_url, clock) for each in sonars]
+                    nodes = [Node(each, floor, settings.mqtt_url, clock, site) for each in sonars]
                     tasks.create_task(run_nodes(nodes, clock), name="nodes")
                     while True:
                         there = edge.connected

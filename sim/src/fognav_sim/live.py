@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from fognav_sim.hardware import Hardware
     from fognav_sim.node import SonarNode
 
-TRUTH_S: Final = 0.1
 LOG_S: Final = 0.01
 CATCH_UP_S: Final = 0.25
 """A simulation that is further behind than this lets the time pass unsimulated, and says so in its sustained speed."""
@@ -167,7 +166,7 @@ class Floor:
 
     async def tell(self, edge: ZenohEdge, robot: str) -> None:
         """Publish the truth ten times a second, until cancelled."""
-        async for _ in Ticker(self._clock, TRUTH_S):
+        async for _ in Ticker(self._clock, ch.SIM_TRUTH.period_s):
             truth = self.world.truth(self._clock.stamp(), self.sustained_speed)
             edge.publish(ch.SIM_TRUTH, truth, robot=robot)
 
@@ -175,13 +174,13 @@ class Floor:
 class Node:
     """A virtual sensor node with an MQTT connection of its own, as a real one has."""
 
-    def __init__(self, sonars: SonarNode, floor: Floor, url: str, clock: Clock) -> None:
+    def __init__(self, sonars: SonarNode, floor: Floor, url: str, clock: Clock, site: str) -> None:
         self._sonars = sonars
         self._floor = floor
         self._clock = clock
         self._id = sonars.node.id
         will = Will(ch.NODE_AVAILABILITY, "offline", {"node": self._id})
-        self._mqtt = MqttEdge(url, f"node-{self._id}", clock, will=will)
+        self._mqtt = MqttEdge(url, f"node-{self._id}", clock, site=site, will=will)
         self._mqtt.on(ch.NODE_CONFIG, self._on_config, NodeConfig)
         self._mqtt.on_connect(self._announce)
 

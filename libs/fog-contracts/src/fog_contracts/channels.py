@@ -1,12 +1,14 @@
-"""The one table of channels: key, transport, message, encoding, rate, maximum age, size limit, who sends, who listens.
+"""The one table of channels: key, message, size limit, who publishes, who subscribes, durability, rate, maximum age.
 
-Freshness checks, access control lists, the docs and the firmware's header derive from it; nothing else spells a topic.
+Both edges, the freshness limits of every receiver, `docs/channels.md`, the brokers' access control lists and the
+firmware's header derive from it; nothing else spells a topic or key.
 """
 
+import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import KW_ONLY, dataclass, field
+from functools import cached_property, partial
 from typing import Final, Literal
 
 from fog_contracts import messages as m
@@ -14,40 +16,83 @@ from fog_contracts import messages as m
 Transport = Literal["mqtt", "zenoh"]
 Kind = Literal["pub", "query", "liveliness"]
 Encoding = Literal["json", "msgpack", "text"]
+Durability = Literal["volatile", "latest", "recovered"]
+Role = Literal[
+    "node", "thesis-node", "thesis-robot", "home-assistant", "hazard-aggregator", "map-service", "planner",
+    "robot-agent", "console", "sim", "recorder",
+]  # fmt: skip
+
+ROLES: Final[Mapping[Role, str]] = {
+    "node": "a sensor node on the wall",
+    "thesis-node": "a sensor node that speaks the topics of the thesis",
+    "thesis-robot": "a robot that listens to the topic of the thesis",
+    "home-assistant": "Home Assistant, which discovers nodes",
+    "hazard-aggregator": "turns readings into the state of each area",
+    "map-service": "keeps the costmap",
+    "planner": "plans paths and keeps missions",
+    "robot-agent": "a robot's agent",
+    "console": "operators' tools: the `fognav` command, the demo and its page",
+    "sim": "the simulated world",
+    "recorder": "`fognav record`: subscribes to everything and publishes nothing",
+}
+"""Who may stand at the ends of a channel."""
+
+DURABILITIES: Final[Mapping[Durability, str]] = {
+    "volatile": "a late subscriber waits for the next message; a lost one stays lost",
+    "latest": "a late subscriber is given the latest message of each key at once; older ones may be lost",
+    "recovered": "a late subscriber is given the recent messages, lost ones are sent again, all arrive in order",
+}
+"""What becomes of messages that a subscriber missed. MQTT: `latest` is retained, `recovered` does not exist."""
 
 _ID = r"[a-z0-9][a-z0-9-]{0,31}"
 _FIELDS: Final[Mapping[str, str]] = {"number": r"[0-9]{1,4}"}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Channel:
-    """One row of the table.
+    """One row of the table. Channels are compared and hashed by identity: they are keys of tables of handlers.
 
-    `template` names the variable parts in braces; `message` is what is published or, for a queryable, asked, and
-    `reply` what it answers; `max_age_s` is when a receiver calls the latest value stale (None: it keeps).
+    `template` names the variable parts in braces. `message` is what is published or, for a query, asked (None: text,
+    or a query without a request), and `reply` what is answered; publishers of a query answer it, subscribers ask.
+    A published zenoh channel of durability `latest` may be asked as well: for its latest message, without a request.
+    `limit` and `reply_limit` are in bytes. `rate_hz` is the rate in normal operation (None: on change). A value that
+    arrived more than `max_age_s` ago is stale (infinite: it holds until the next, or the message says how long).
     """
 
     name: str
-    transport: Transport
-    kind: Kind
     template: str
     message: type[m.Message] | None
+    _: KW_ONLY
+    transport: Transport
+    kind: Kind
     encoding: Encoding
-    limit: int
-    publishers: tuple[str, ...]
-    subscribers: tuple[str, ...]
+    limit: int = 0
+    publishers: tuple[Role, ...]
+    subscribers: tuple[Role, ...]
+    durability: Durability
     reply: type[m.Message] | None = None
     reply_limit: int = 0
     rate_hz: float | None = None
-    max_age_s: float | None = None
+    max_age_s: float = math.inf
     qos: Literal[0, 1] = 0
-    retained: bool = False
-    recovered: bool = False
+    words: tuple[str, ...] = ()
+    """The texts that a text channel carries, where they are few."""
     about: str = ""
+    """What it carries, where no message type says it."""
     fields: tuple[str, ...] = field(init=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "fields", tuple(re.findall(r"\{(\w+)\}", self.template)))
+
+    @property
+    def retained(self) -> bool:
+        """Whether the MQTT broker keeps the latest message."""
+        return self.transport == "mqtt" and self.durability == "latest"
+
+    @property
+    def period_s(self) -> float:
+        """Seconds between two messages in normal operation; infinite for what is published on change only."""
+        return math.inf if self.rate_hz is None else 1.0 / self.rate_hz
 
     def key(self, **ids: str) -> str:
         """Spell the topic or key with these ids; raises `ValueError` for a missing, unknown or malformed id."""
@@ -84,346 +129,92 @@ KIB: Final = 1024
 MIB: Final = 1024 * 1024
 DELTA_LIMIT: Final = 64 * KIB
 
-NODE_AVAILABILITY = Channel(
-    "node_availability",
-    "mqtt",
-    "pub",
-    "fog/v1/nodes/{node}/availability",
-    None,
-    "text",
-    16,
-    ("node",),
-    ("hazard-aggregator",),
-    qos=1,
-    retained=True,
-    about="`online`, or `offline` as the node's last will",
-)
-NODE_READING = Channel(
-    "node_reading",
-    "mqtt",
-    "pub",
-    "fog/v1/nodes/{node}/reading",
-    m.NodeReading,
-    "json",
-    KIB,
-    ("node",),
-    ("hazard-aggregator",),
-    rate_hz=10.0,
-    max_age_s=3.0,
-    about="one measurement of all sonars of a node",
-)
-NODE_VALUE = Channel(
-    "node_value",
-    "mqtt",
-    "pub",
-    "fog/v1/nodes/{node}/value",
-    m.NodeValue,
-    "json",
-    KIB,
-    ("node",),
-    ("hazard-aggregator",),
-    max_age_s=30.0,
-    about="a danger that a number can tell",
-)
-NODE_CONFIG = Channel(
-    "node_config",
-    "mqtt",
-    "pub",
-    "fog/v1/nodes/{node}/config",
-    m.NodeConfig,
-    "json",
-    KIB,
-    ("hazard-aggregator",),
-    ("node",),
-    qos=1,
-    retained=True,
-    about="range limit per sonar, pause between measurements",
-)
-AREA_HAZARD = Channel(
-    "area_hazard",
-    "mqtt",
-    "pub",
-    "fog/v1/areas/{area}/hazard",
-    m.AreaHazard,
-    "json",
-    4 * KIB,
-    ("hazard-aggregator",),
-    ("map-service",),
-    qos=1,
-    retained=True,
-    about="the state of one area",
-)
-AREA_DEFINITION = Channel(
-    "area_definition",
-    "mqtt",
-    "pub",
-    "fog/v1/areas/{area}/definition",
-    m.AreaDefinition,
-    "json",
-    32 * KIB,
-    ("hazard-aggregator",),
-    ("map-service",),
-    qos=1,
-    retained=True,
-    about="where an area lies, who watches it, how it is judged",
-)
-THESIS_AREA = Channel(
-    "thesis_area",
-    "mqtt",
-    "pub",
-    "area {number}",
-    None,
-    "text",
-    16,
-    ("node",),
-    ("hazard-aggregator",),
-    about="`blocked` or `clear` from the thesis's nodes",
-)
-THESIS_WSN = Channel(
-    "thesis_wsn",
-    "mqtt",
-    "pub",
-    "WSN",
-    None,
-    "text",
-    64,
-    ("hazard-aggregator",),
-    ("thesis-robot",),
-    qos=1,
-    about="`n,x,y`, or `n,-999,-999` when clear, for the thesis's robots",
-)
-HOME_ASSISTANT = Channel(
-    "home_assistant",
-    "mqtt",
-    "pub",
-    "homeassistant/device/{node}/config",
-    None,
-    "json",
-    8 * KIB,
-    ("hazard-aggregator", "node"),
-    ("home-assistant",),
-    qos=1,
-    retained=True,
-    about="Home Assistant's device discovery",
-)
+# --- The table ------------------------------------------------------------------------------------------------------
 
-MAP_DELTA = Channel(
-    "map_delta",
-    "zenoh",
-    "pub",
-    "fog/{site}/map/delta",
-    m.MapDelta,
-    "msgpack",
-    DELTA_LIMIT,
-    ("map-service",),
-    ("planner", "robot-agent", "console"),
-    recovered=True,
-    about="one window of a new map version",
-)
-MAP_HEARTBEAT = Channel(
-    "map_heartbeat",
-    "zenoh",
-    "pub",
-    "fog/{site}/map/heartbeat",
-    m.MapHeartbeat,
-    "msgpack",
-    256,
-    ("map-service",),
-    ("planner", "robot-agent", "console"),
-    rate_hz=10.0,
-    max_age_s=1.0,
-    about="the map version that holds now",
-)
-MAP_SNAPSHOT = Channel(
-    "map_snapshot",
-    "zenoh",
-    "query",
-    "fog/{site}/map/snapshot",
-    None,
-    "msgpack",
-    0,
-    ("map-service",),
-    ("planner", "robot-agent", "console"),
-    reply=m.MapSnapshot,
-    reply_limit=64 * MIB,
-    about="the whole map at one version",
-)
-HAZARD = Channel(
-    "hazard",
-    "zenoh",
-    "pub",
-    "fog/{site}/hazards/{area}",
-    m.HazardArea,
-    "msgpack",
-    64 * KIB,
-    ("map-service",),
-    ("planner", "robot-agent", "console"),
-    about="the reason behind cells: a hazard and its place; also queryable",
-)
-ZONES = Channel(
-    "zones",
-    "zenoh",
-    "pub",
-    "fog/{site}/zones",
-    m.ZoneSet,
-    "msgpack",
-    4 * MIB,
-    ("map-service",),
-    ("planner", "robot-agent", "console"),
-    about="the reason behind cells: all zones; also queryable",
-)
-PLANNER_PLAN = Channel(
-    "planner_plan",
-    "zenoh",
-    "query",
-    "fog/{site}/planner/plan",
-    m.PlanRequest,
-    "msgpack",
-    KIB,
-    ("planner",),
-    ("robot-agent", "console"),
-    reply=m.PlanReply,
-    reply_limit=4 * MIB,
-    about="goal to path or typed refusal, without side effects",
-)
-PLANNER_EGRESS = Channel(
-    "planner_egress",
-    "zenoh",
-    "query",
-    "fog/{site}/planner/egress",
-    m.EgressRequest,
-    "msgpack",
-    KIB,
-    ("planner",),
-    ("robot-agent",),
-    reply=m.PlanReply,
-    reply_limit=4 * MIB,
-    about="a way out for a robot inside a blocked area",
-)
-ROBOT_GOAL = Channel(
-    "robot_goal",
-    "zenoh",
-    "pub",
-    "fog/{site}/robots/{robot}/goal",
-    m.RobotGoal,
-    "msgpack",
-    KIB,
-    ("planner",),
-    ("robot-agent", "console"),
-    rate_hz=1.0,
-    about="the mission",
-)
-ROBOT_PATH = Channel(
-    "robot_path",
-    "zenoh",
-    "pub",
-    "fog/{site}/robots/{robot}/path",
-    m.RobotPath,
-    "msgpack",
-    MIB,
-    ("planner",),
-    ("robot-agent", "console"),
-    rate_hz=2.0,
-    max_age_s=1.5,
-    about="the way with its released part, or the refusal",
-)
-ROBOT_POSE = Channel(
-    "robot_pose",
-    "zenoh",
-    "pub",
-    "fog/{site}/robots/{robot}/pose",
-    m.RobotPose,
-    "msgpack",
-    KIB,
-    ("robot-agent",),
-    ("planner", "hazard-aggregator", "map-service", "console"),
-    rate_hz=10.0,
-    max_age_s=1.0,
-    about="pose, covariance and twist",
-)
-ROBOT_STATE = Channel(
-    "robot_state",
-    "zenoh",
-    "pub",
-    "fog/{site}/robots/{robot}/state",
-    m.RobotState,
-    "msgpack",
-    16 * KIB,
-    ("robot-agent",),
-    ("planner", "map-service", "console"),
-    rate_hz=1.0,
-    max_age_s=3.0,
-    about="mode and reasons, on change and once a second",
-)
-ROBOT_OBSTACLES = Channel(
-    "robot_obstacles",
-    "zenoh",
-    "pub",
-    "fog/{site}/robots/{robot}/obstacles",
-    m.RobotObstacles,
-    "msgpack",
-    64 * KIB,
-    ("robot-agent",),
-    ("map-service", "console"),
-    rate_hz=1.0,
-    max_age_s=3.0,
-    about="what the lidar sees and the map doesn't know",
-)
-ROBOT_COMMAND = Channel(
-    "robot_command",
-    "zenoh",
-    "query",
-    "fog/{site}/robots/{robot}/command",
-    m.RobotCommand,
-    "msgpack",
-    KIB,
-    ("robot-agent",),
-    ("console",),
-    reply=m.CommandReply,
-    reply_limit=2 * KIB,
-    about="an operator's signed, single-use command",
-)
-LIVE = Channel(
-    "live",
-    "zenoh",
-    "liveliness",
-    "fog/{site}/live/{role}/{id}",
-    None,
-    "msgpack",
-    0,
-    ("hazard-aggregator", "map-service", "planner", "robot-agent"),
-    ("console",),
-    about="presence; no safety signal",
-)
+V1: Final = "fog/v1/{site}/"
+FOG: Final = "fog/{site}/"
 
-SIM_TRUTH = Channel(
-    "sim_truth",
-    "zenoh",
-    "pub",
-    "fog/{site}/sim/{robot}/truth",
-    m.SimTruth,
-    "msgpack",
-    256 * KIB,
-    ("sim",),
-    ("console",),
-    rate_hz=10.0,
-    max_age_s=1.0,
-    about="what is really so in the simulated world",
-)
-SIM_COMMAND = Channel(
-    "sim_command",
-    "zenoh",
-    "query",
-    "fog/{site}/sim/{robot}/command",
-    m.SimCommand,
-    "msgpack",
-    256 * KIB,
-    ("sim",),
-    ("console",),
-    reply=m.CommandReply,
-    reply_limit=2 * KIB,
-    about="change the simulated world",
-)
+NODE: Final = "node"
+AGGREGATOR: Final = "hazard-aggregator"
+MAP: Final = "map-service"
+PLANNER: Final = "planner"
+ROBOT: Final = "robot-agent"
+CONSOLE: Final = "console"
+SIM: Final = "sim"
+
+VOLATILE: Final = "volatile"
+LATEST: Final = "latest"
+RECOVERED: Final = "recovered"
+
+_mqtt = partial(Channel, transport="mqtt", kind="pub", encoding="json")
+_text = partial(Channel, transport="mqtt", kind="pub", encoding="text", message=None)
+_pub = partial(Channel, transport="zenoh", kind="pub", encoding="msgpack")
+_query = partial(Channel, transport="zenoh", kind="query", encoding="msgpack", durability=VOLATILE)
+_live = partial(Channel, transport="zenoh", kind="liveliness", encoding="msgpack", message=None, durability=LATEST)
+
+# fmt: off
+# Sensor nodes and areas: MQTT, JSON or text
+NODE_AVAILABILITY = _text( "node_availability", V1 + "nodes/{node}/availability",                       limit=16,
+    publishers=(NODE,),          subscribers=(AGGREGATOR,),       durability=LATEST,   qos=1,
+    words=("online", "offline"), about="whether a node is connected; `offline` is its last will")
+NODE_READING      = _mqtt( "node_reading",      V1 + "nodes/{node}/reading",          m.NodeReading,    limit=KIB,
+    publishers=(NODE,),          subscribers=(AGGREGATOR,),       durability=VOLATILE, qos=0, rate_hz=10, max_age_s=3)
+NODE_VALUE        = _mqtt( "node_value",        V1 + "nodes/{node}/value",            m.NodeValue,      limit=KIB,
+    publishers=(NODE,),          subscribers=(AGGREGATOR,),       durability=VOLATILE, qos=0)
+NODE_CONFIG       = _mqtt( "node_config",       V1 + "nodes/{node}/config",           m.NodeConfig,     limit=KIB,
+    publishers=(AGGREGATOR,),    subscribers=(NODE,),             durability=LATEST,   qos=1)
+AREA_HAZARD       = _mqtt( "area_hazard",       V1 + "areas/{area}/hazard",           m.AreaHazard,     limit=4 * KIB,
+    publishers=(AGGREGATOR,),    subscribers=(AGGREGATOR, MAP),   durability=LATEST,   qos=1)
+AREA_DEFINITION   = _mqtt( "area_definition",   V1 + "areas/{area}/definition",       m.AreaDefinition, limit=32 * KIB,
+    publishers=(AGGREGATOR,),    subscribers=(MAP,),              durability=LATEST,   qos=1)
+THESIS_AREA       = _text( "thesis_area",       "area {number}",                                        limit=16,
+    publishers=("thesis-node",), subscribers=(AGGREGATOR,),       durability=VOLATILE, qos=0,
+    words=("blocked", "clear"), about="what a node of the thesis says of its area")
+THESIS_WSN        = _text( "thesis_wsn",        "WSN",                                                  limit=64,
+    publishers=(AGGREGATOR,),    subscribers=("thesis-robot",),   durability=VOLATILE, qos=1,
+    about="`n,x,y` for a blocked area, `n,-999,-999` for a clear one")
+HOME_ASSISTANT    = _text( "home_assistant",    "homeassistant/device/{node}/config",                   limit=8 * KIB,
+    publishers=(NODE, AGGREGATOR), subscribers=("home-assistant",), durability=LATEST, qos=1,
+    about="Home Assistant's device discovery (JSON)")
+
+# The map and what stands behind its cells: zenoh, msgpack
+MAP_DELTA         = _pub(  "map_delta",         FOG + "map/delta",      m.MapDelta,     limit=DELTA_LIMIT,
+    publishers=(MAP,), subscribers=(PLANNER, ROBOT, CONSOLE), durability=RECOVERED)
+MAP_HEARTBEAT     = _pub(  "map_heartbeat",     FOG + "map/heartbeat",  m.MapHeartbeat, limit=256,
+    publishers=(MAP,), subscribers=(PLANNER, ROBOT, CONSOLE), durability=VOLATILE, rate_hz=10, max_age_s=1)
+MAP_SNAPSHOT      = _query("map_snapshot",      FOG + "map/snapshot",   None,           limit=0,
+    publishers=(MAP,), subscribers=(PLANNER, ROBOT, CONSOLE), reply=m.MapSnapshot, reply_limit=64 * MIB)
+HAZARD            = _pub(  "hazard",            FOG + "hazards/{area}", m.HazardArea,   limit=64 * KIB,
+    publishers=(MAP,), subscribers=(PLANNER, ROBOT, CONSOLE), durability=LATEST)
+ZONES             = _pub(  "zones",             FOG + "zones",          m.ZoneSet,      limit=4 * MIB,
+    publishers=(MAP,), subscribers=(PLANNER, ROBOT, CONSOLE), durability=LATEST)
+
+# Planner and robots: zenoh, msgpack
+PLANNER_PLAN      = _query("planner_plan",      FOG + "planner/plan",             m.PlanRequest,    limit=KIB,
+    publishers=(PLANNER,), subscribers=(ROBOT, CONSOLE),   reply=m.PlanReply, reply_limit=4 * MIB)
+PLANNER_EGRESS    = _query("planner_egress",    FOG + "planner/egress",           m.EgressRequest,  limit=KIB,
+    publishers=(PLANNER,), subscribers=(ROBOT,),           reply=m.PlanReply, reply_limit=4 * MIB)
+ROBOT_GOAL        = _pub(  "robot_goal",        FOG + "robots/{robot}/goal",      m.RobotGoal,      limit=KIB,
+    publishers=(PLANNER,), subscribers=(ROBOT, CONSOLE),   durability=VOLATILE, rate_hz=1)
+ROBOT_PATH        = _pub(  "robot_path",        FOG + "robots/{robot}/path",      m.RobotPath,      limit=MIB,
+    publishers=(PLANNER,), subscribers=(ROBOT, CONSOLE),   durability=VOLATILE, rate_hz=2, max_age_s=1.5)
+ROBOT_POSE        = _pub(  "robot_pose",        FOG + "robots/{robot}/pose",      m.RobotPose,      limit=KIB,
+    publishers=(ROBOT,), subscribers=(AGGREGATOR, MAP, PLANNER, CONSOLE), durability=VOLATILE, rate_hz=10, max_age_s=1)
+ROBOT_STATE       = _pub(  "robot_state",       FOG + "robots/{robot}/state",     m.RobotState,     limit=16 * KIB,
+    publishers=(ROBOT,),   subscribers=(PLANNER, CONSOLE), durability=VOLATILE, rate_hz=1, max_age_s=3)
+ROBOT_OBSTACLES   = _pub(  "robot_obstacles",   FOG + "robots/{robot}/obstacles", m.RobotObstacles, limit=64 * KIB,
+    publishers=(ROBOT,),   subscribers=(MAP, CONSOLE),     durability=VOLATILE, rate_hz=1)
+ROBOT_COMMAND     = _query("robot_command",     FOG + "robots/{robot}/command",   m.RobotCommand,   limit=KIB,
+    publishers=(ROBOT,),   subscribers=(CONSOLE,),         reply=m.CommandReply, reply_limit=2 * KIB)
+LIVE              = _live( "live",              FOG + "live/{role}/{id}", about="who is there; no safety signal",
+    publishers=(AGGREGATOR, MAP, PLANNER, ROBOT), subscribers=(CONSOLE,))
+
+# The simulated world: zenoh, msgpack
+SIM_TRUTH         = _pub(  "sim_truth",         FOG + "sim/{robot}/truth",   m.SimTruth,   limit=256 * KIB,
+    publishers=(SIM,), subscribers=(CONSOLE,), durability=VOLATILE, rate_hz=10)
+SIM_COMMAND       = _query("sim_command",       FOG + "sim/{robot}/command", m.SimCommand, limit=256 * KIB,
+    publishers=(SIM,), subscribers=(CONSOLE,), reply=m.CommandReply, reply_limit=2 * KIB)
+# fmt: on
 
 CHANNELS: Final[Mapping[str, Channel]] = {
     channel.name: channel

@@ -88,11 +88,6 @@ def _encoded(channel: Channel, message: Message | str) -> bytes:
     return data
 
 
-def _mqtt_will(will: Will) -> aiomqtt.Will:
-    channel = will.channel
-    return aiomqtt.Will(channel.key(**will.ids), _encoded(channel, will.message), channel.qos, channel.retained)
-
-
 def _tell_refused(topics: Sequence[str], codes: Sequence[object]) -> None:
     for topic, code in zip(topics, codes, strict=True):
         if isinstance(code, ReasonCode) and code.is_failure:
@@ -102,11 +97,15 @@ def _tell_refused(topics: Sequence[str], codes: Sequence[object]) -> None:
 class MqttEdge:
     """One process's connection to the broker. All handlers run on the event loop's thread."""
 
-    def __init__(self, url: str, client_id: str, clock: Clock, *, will: Will | None = None) -> None:
-        """Prepare a connection; nothing happens before `run`. Raises `ValueError` for an address that is none."""
+    def __init__(self, url: str, client_id: str, clock: Clock, *, site: str, will: Will | None = None) -> None:
+        """Prepare a connection; nothing happens before `run`. `site` is filled into every topic that has one.
+
+        Raises `ValueError` for an address that is none.
+        """
         self._address = _address(url)
         self._client_id = client_id
         self._clock = clock
+        self._site = site
         self._will = will
         self._registrations: list[_Registration] = []
         self._on_connect: list[Callable[[], Awaitable[None]]] = []
@@ -157,7 +156,7 @@ class MqttEdge:
         if "number" in channel.fields:
             topics = [channel.key(number=str(number)) for number in numbers]
         else:
-            topics = [channel.pattern()]
+            topics = [channel.pattern(**self._with_site(channel, {}))]
         self._registrations.append(_Registration(channel, handler, kind, topics))
 
     async def add_number(self, channel: Channel, number: str | int) -> None:
@@ -189,14 +188,14 @@ class MqttEdge:
         Without a connection nothing is kept: the answer is False, and whoever must not lose it publishes again in
         `on_connect`. Raises `ContractError` when the message breaks the channel's contract.
         """
-        return await self._send(channel, channel.key(**ids), _encoded(channel, message), wait=wait)
+        return await self._send(channel, self._topic(channel, ids), _encoded(channel, message), wait=wait)
 
     def publish_nowait(self, channel: Channel, message: Message | str, **ids: str) -> None:
         """Publish in the order of the calls, without waiting; a message that has no connection is dropped and counted.
 
         Raises `ContractError` when the message breaks the channel's contract.
         """
-        topic, data, client = channel.key(**ids), _encoded(channel, message), self._client
+        topic, data, client = self._topic(channel, ids), _encoded(channel, message), self._client
         if client is None:
             metrics.DROPPED.labels(channel.name).inc()
         else:
@@ -204,7 +203,7 @@ class MqttEdge:
 
     async def clear(self, channel: Channel, *, wait: bool = False, **ids: str) -> bool:
         """Take a retained message away (MQTT: an empty retained payload)."""
-        return await self._send(channel, channel.key(**ids), b"", wait=wait)
+        return await self._send(channel, self._topic(channel, ids), b"", wait=wait)
 
     async def run(self) -> None:
         """Keep the connection until cancelled; a broker that is away, lost or unwilling is tried again."""
@@ -224,6 +223,20 @@ class MqttEdge:
             failures += 1
             await asyncio.sleep(delay)
 
+    def _with_site(self, channel: Channel, ids: Ids) -> Ids:
+        if "site" in ids:
+            raise ValueError("the edge fills the site in: leave it out")
+        return {**ids, "site": self._site} if "site" in channel.fields else ids
+
+    def _topic(self, channel: Channel, ids: Ids) -> str:
+        return channel.key(**self._with_site(channel, ids))
+
+    def _mqtt_will(self, will: Will) -> aiomqtt.Will:
+        channel = will.channel
+        return aiomqtt.Will(
+            self._topic(channel, will.ids), _encoded(channel, will.message), channel.qos, channel.retained
+        )
+
     def _make(self) -> aiomqtt.Client:
         client = aiomqtt.Client(
             self._address.host,
@@ -233,7 +246,7 @@ class MqttEdge:
             identifier=self._client_id,
             protocol=aiomqtt.ProtocolVersion.V5,
             clean_start=True,
-            will=_mqtt_will(self._will) if self._will else None,
+            will=self._mqtt_will(self._will) if self._will else None,
             timeout=_TIMEOUT_S,
             keepalive=KEEPALIVE_S,
             max_queued_incoming_messages=_QUEUE,
@@ -308,6 +321,7 @@ class MqttEdge:
                 if any(message.topic.matches(pattern) for pattern in registration.topics):
                     self._refuse(channel, topic, "the ids in the topic are malformed")
                 continue
+            ids.pop("site", None)  # its own: it subscribes to no other
             data = message.payload
             if message.retain and not channel.retained:
                 # It may be years old; a stale reading must never pass for a fresh one.

@@ -11,7 +11,7 @@ import json
 import random
 import threading
 from collections import deque
-from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from functools import partial
@@ -20,7 +20,7 @@ from typing import Any, Final, Generic, Literal, TypeVar
 import zenoh
 from zenoh import ext
 
-from fog_contracts.channels import LIVE, Channel
+from fog_contracts.channels import LIVE, Channel, Durability
 from fog_contracts.codec import ContractError, decode, encode
 from fog_contracts.handlers import RefusedMessageError
 from fog_contracts.messages import Message
@@ -35,6 +35,8 @@ RECOVERED_SAMPLES: Final = 256
 """Messages of a recovered channel that its publisher keeps for those who lost them: 16 MiB of full deltas."""
 HEARTBEAT_S: Final = 0.5
 """Real seconds between the announcements by which a subscriber notices that the last message was lost."""
+_KEPT: Final[Mapping[Durability, int]] = {"volatile": 0, "latest": 1, "recovered": RECOVERED_SAMPLES}
+"""How many messages of a key its publisher keeps for those who missed them."""
 _QUEUE: Final = 4096
 """Messages of a recovered channel that may wait for the loop; more are dropped, which the versions reveal."""
 _PENDING_QUERIES: Final = 64
@@ -63,11 +65,6 @@ def session_config(
     return config
 
 
-def _is_kept(channel: Channel) -> bool:
-    """Whether the latest value holds until another comes, so that late joiners must be given it."""
-    return channel.kind == "pub" and channel.rate_hz is None and channel.max_age_s is None and not channel.recovered
-
-
 def _finish(query: Any) -> None:
     """Let the asker know that no answer of ours will come any more (`drop` has no types in zenoh's stubs)."""
     query.drop()
@@ -79,9 +76,8 @@ class _Publisher:
     def __init__(self, channel: Channel, key: str) -> None:
         self._channel = channel
         self._key = key
-        depth = RECOVERED_SAMPLES if channel.recovered else 1 if _is_kept(channel) else 0
-        self._depth = depth
-        self._waiting: deque[bytes] = deque(maxlen=depth)
+        self._depth = _KEPT[channel.durability]
+        self._waiting: deque[bytes] = deque(maxlen=self._depth)
         self._put: Callable[[bytes], object] | None = None
 
     def declare(self, session: zenoh.Session) -> None:
@@ -129,10 +125,9 @@ class _Inbox(Generic[M]):
         self._woken = False
 
     def declare(self, session: zenoh.Session) -> object:
-        channel = self._channel
-        if not (channel.recovered or _is_kept(channel)):
+        depth = _KEPT[self._channel.durability]
+        if not depth:
             return session.declare_subscriber(self._pattern, self._arrived)
-        depth = RECOVERED_SAMPLES if channel.recovered else 1
         return ext.declare_advanced_subscriber(
             session,
             self._pattern,
@@ -152,7 +147,7 @@ class _Inbox(Generic[M]):
             return
         data = sample.payload.to_bytes()
         with self._lock:
-            if self._channel.recovered:
+            if self._channel.durability == "recovered":
                 if len(self._queue) >= _QUEUE:
                     self._queue.popleft()
                     metrics.DROPPED.labels(self._channel.name).inc()
@@ -324,8 +319,8 @@ class ZenohEdge:
     def publish(self, channel: Channel, message: Message, **ids: str) -> None:
         """Publish without waiting; raises `ContractError` when the message breaks the channel's contract.
 
-        Without a connection the message is lost, but for recovered channels, and the latest of those whose value
-        holds until the next (hazards, zones): these reach their subscribers as soon as there is one.
+        Without a connection the message is lost, but for channels of durability `recovered`, and the latest of those
+        of durability `latest`: these reach their subscribers as soon as there is one.
         """
         key = self._key(channel, ids)
         data = encode(channel, message)

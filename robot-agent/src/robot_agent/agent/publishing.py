@@ -14,9 +14,9 @@ if TYPE_CHECKING:
 
     from fog_contracts.messages import Message, RobotObstacles, RobotPose, RobotState
 
-POSE_S: Final = 0.1
-STATE_S: Final = 1.0
-OBSTACLES_S: Final = 1.0
+POSE_S: Final = ch.ROBOT_POSE.period_s
+STATE_S: Final = ch.ROBOT_STATE.period_s
+OBSTACLES_S: Final = ch.ROBOT_OBSTACLES.period_s
 _SLACK_S: Final = 0.05
 """A tick that comes early by so much is due already: ticks are 0.1 s apart, and not exactly."""
 _NUMBER: Final = re.compile(r"[\d.]+")

@@ -37,7 +37,7 @@ async def main() -> None:
         definitions = {d.id: d for d in [*loaded.site.definitions(), *stored.definitions]}
         rule = debounce.find(settings.debounce)
         core = Aggregator(definitions.values(), loaded.site.nodes, stored.epoch, stored.hazards, rule=rule)
-        mqtt = MqttEdge(settings.mqtt_url, "hazard-aggregator", clock)
+        mqtt = MqttEdge(settings.mqtt_url, "hazard-aggregator", clock, site=site)
         async with ZenohEdge.open(
             connect=settings.zenoh_endpoints, clock=clock, role="hazard-aggregator", id=site, site=site
         ) as zenoh:

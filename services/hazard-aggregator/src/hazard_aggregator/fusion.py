@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from fog_contracts.channels import ROBOT_POSE
 from fog_contracts.costs import LETHAL
 from fog_contracts.messages import AreaDefinition, AreaHazard, Trace
 from hazard_aggregator import debounce
@@ -20,8 +21,6 @@ if TYPE_CHECKING:
     from fog_contracts.messages import AreaState, NodeReading, RobotPose
     from fog_contracts.site import NodeSite
 
-POSE_FRESH_S: Final = 1.0
-"""How old (s, by arrival) a robot's pose may be and still explain an echo."""
 LATE_TICK_S: Final = 0.5
 """A tick that comes so long (s) after the last one tells of a process that was held up."""
 SEVERITY: Final = {"clear": 0, "unknown": 1, "doubtful": 2, "blocked": 3}
@@ -226,7 +225,7 @@ class AreaFusion:
                 elif now - node.settled > limit and node.state != "unknown":
                     node.lose_trust("its readings contradict one another")
             changed += self._evaluate(area, stamp)
-        self._poses = {robot: seen for robot, seen in self._poses.items() if now - seen[0] <= POSE_FRESH_S}
+        self._poses = {robot: seen for robot, seen in self._poses.items() if now - seen[0] <= ROBOT_POSE.max_age_s}
         return changed
 
     def put_area(self, definition: AreaDefinition, stamp: float) -> list[AreaHazard]:
@@ -285,7 +284,7 @@ class AreaFusion:
 
     def _fresh_poses(self, now: float) -> Iterator[tuple[str, RobotPose]]:
         for robot, (seen, pose) in self._poses.items():
-            if now - seen <= POSE_FRESH_S and pose.localized:
+            if now - seen <= ROBOT_POSE.max_age_s and pose.localized:
                 yield robot, pose
 
     @staticmethod

@@ -39,7 +39,7 @@ async def main() -> None:
             settings.inflation,
             definitions=loaded.site.definitions(),
         )
-        mqtt = MqttEdge(settings.mqtt_url, "map-service", clock)
+        mqtt = MqttEdge(settings.mqtt_url, "map-service", clock, site=site)
         async with ZenohEdge.open(
             connect=settings.zenoh_endpoints, clock=clock, role="map-service", id=site, site=site
         ) as zenoh:

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from map_service.core import MapChange, MapCore
     from map_service.store import AuditEntry, Outcome, Store
 
-BEAT_S = 0.1
+BEAT_S = ch.MAP_HEARTBEAT.period_s
 RETRY_S = 0.5
 AGGREGATOR = "hazard-aggregator"
 ABSENT_S = 3.0

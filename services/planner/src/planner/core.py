@@ -15,6 +15,7 @@ import numpy as np
 from msgspec import structs
 from numpy.typing import NDArray
 
+from fog_contracts.channels import MAP_HEARTBEAT, ROBOT_GOAL, ROBOT_PATH, ROBOT_STATE
 from fog_contracts.costs import DEFAULT_INFLATION, INSCRIBED, LETHAL, UNKNOWN, Inflation
 from fog_contracts.follower import MapFollower
 from fog_contracts.grid import GridGeometry, Window
@@ -67,10 +68,11 @@ class PlannerConfig:
     spacing: float = 0.10
     release: float = 15.0
     """How much of the path ahead of the robot it may drive without hearing from the planner again."""
-    republish_s: float = 0.5
-    goal_republish_s: float = 1.0
-    pose_age_s: float = 3.0
-    map_age_s: float = 1.0
+    republish_s: float = ROBOT_PATH.period_s
+    goal_republish_s: float = ROBOT_GOAL.period_s
+    robot_silent_s: float = ROBOT_STATE.max_age_s
+    """Nothing is planned for a robot whose last pose is older: it is away, and hears nothing either."""
+    map_age_s: float = MAP_HEARTBEAT.max_age_s
     gap_s: float = 0.5
     """How long a heartbeat may run ahead of the deltas before the map is fetched whole."""
     max_expansions: int = 50_000_000
@@ -425,7 +427,7 @@ class PlannerCore:
                 out.append((name, structs.replace(robot.goal, stamp=stamp)))
                 robot.goal_due = now + self.config.goal_republish_s
             pose = robot.pose
-            if pose is None or now - robot.pose_at > self.config.pose_age_s or not fresh_map:
+            if pose is None or now - robot.pose_at > self.config.robot_silent_s or not fresh_map:
                 continue
             if robot.goal.pose is None:
                 continue

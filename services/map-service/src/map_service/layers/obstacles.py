@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fog_contracts.channels import ROBOT_POSE
 from fog_contracts.costs import LETHAL
 from fog_contracts.grid import Window
 from fog_contracts.messages import VIEW_SECTORS, Cause
@@ -32,7 +33,6 @@ DISC_RADIUS: Final = 0.05
 """Radius (m) of the disc that a point becomes."""
 ROBOT_MARGIN: Final = 0.22
 """How far (m) around a robot's rim points count as the robot: its inscribed radius and what localization may be off."""
-POSE_FRESH_S: Final = 1.0
 MAX_CELLS: Final = 20_000
 """How many cells may be held; a broken lidar must not fill the memory."""
 LOOKS_TO_CLEAR: Final = 2
@@ -65,7 +65,7 @@ class ObstaclesLayer:
 
     def see(self, robot: str, seen: RobotObstacles, now: float) -> None:
         """Take what a robot sees."""
-        robots = [pose for at, pose in self._poses.values() if now - at <= POSE_FRESH_S]
+        robots = [pose for at, pose in self._poses.values() if now - at <= ROBOT_POSE.max_age_s]
         end = now + seen.ttl
         added: list[tuple[int, int]] = []
         there = {self._geometry.cell(x, y) for x, y in seen.points}

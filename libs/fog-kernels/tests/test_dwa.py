@@ -204,6 +204,13 @@ def test_an_inscribed_cell_is_left_slowly_and_only_away_from_the_wall() -> None:
     assert decide(costmap, (*band, math.pi), (0.0, 0.0), path, path[-1], settings=strict).n_admissible == 0
 
 
+def test_an_escape_does_not_lead_back_onto_inscribed_cells() -> None:
+    costmap = np.zeros((160, 160), np.uint8)
+    costmap[:, 58:62] = costmap[:, 64:] = 253  # columns 58 to 61, 10 cm of free floor, and inscribed ever after
+    chosen = decide(costmap, (3.07, 3.0, 0.0), (0.0, 0.0), [(3.0, 3.0), (7.0, 3.0)], (7.0, 3.0))
+    assert 3.10 < 3.07 + 3.0 * chosen.v < 3.20
+
+
 def test_what_cannot_be_judged_is_refused() -> None:
     with pytest.raises(ValueError, match="finite"):
         decide(OPEN, (3.0, 3.0, math.inf), (0.0, 0.0), [], (4.0, 3.0))

@@ -2,8 +2,10 @@
 
 Every pair of speeds that the motors can reach within a control period is rolled out as an arc over the local costmap;
 among the arcs that stay clear of obstacles the cheapest wins. Costs count metres off the path, metres still to go,
-the heading relative to the path ahead, and the dearest cell touched. Large heading errors are turned away in place,
+the heading relative to the path ahead, and the highest cost touched. Large heading errors are turned away in place,
 so that a path that starts behind the robot isn't reached by a wide arc.
+
+The tests hold a plain reimplementation of this definition, which a property test compares with the kernel.
 """
 
 from __future__ import annotations
@@ -13,18 +15,24 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numba import float64, int64, njit
+from numba import float64, int64, njit, types
 
-from fog_contracts.costs import INSCRIBED, PENALTY_MAX
+from fog_contracts.costs import INSCRIBED, LETHAL, PENALTY_MAX
 from fog_kernels import _arrays
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
 _MAX_STEPS = 200
-_SEGMENTS = 64
-_MERGED = 0.25
-_MERGE_OFF = 0.01
+_MAX_SEGMENTS = 64
+_MERGED_LENGTH = 0.25
+"""Points of the path are merged into segments of at most this length (m), ..."""
+_MERGED_OFFSET = 0.01
+"""... as long as they lie this close (m) to a straight line."""
+_TURN_STANDING = 10.0
+"""Weight per m/s while turning in place: high enough that it only ever costs braking."""
+_ESCAPE_LENGTH = 0.3
+"""A robot on inscribed cells must have left them after driving this far (m)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,11 +58,11 @@ class DwaLimits:
 
 @dataclass(frozen=True, slots=True)
 class DwaSettings:
-    """How arcs are sampled, rolled out and judged; lengths in metres, times in seconds.
+    """How arcs are sampled, rolled out and scored; lengths in metres, times in seconds.
 
     `period` is the time until the next decision. Weights: `w_path` per metre off the path, `w_goal` per metre still to
-    go, `w_heading` per radian between the heading at the end and the path ahead of there, `w_cost` for the dearest
-    cell touched (0..1), `w_turn` per rad/s of change in turning rate. `lookahead` is how far ahead on the path the
+    go, `w_heading` per radian between the heading at the end and the path ahead of there, `w_cost` for the highest
+    cost touched (0..1), `w_turn` per rad/s of change in turning rate. `lookahead` is how far ahead on the path the
     heading aims; heading errors above `turn_in_place` are turned away standing. Towards the goal the speed follows
     sqrt(2 * approach * distance). A robot whose centre already stands on an inscribed cell (253), where a map change or
     the rounding to cells may put it, may turn, and drive at up to `escape_v` on arcs that leave these cells within
@@ -103,14 +111,298 @@ DEFAULT_LIMITS = DwaLimits()
 DEFAULT_SETTINGS = DwaSettings()
 
 
-@njit(float64(float64), cache=True, nogil=True)
+class DwaParameters(NamedTuple):
+    """`DwaLimits` and `DwaSettings` as the kernel reads them: named tuples are what numba takes by name.
+
+    m/s: v_max, wheel_max, escape_v. rad/s: w_max. m/s^2: acc_v, approach. rad/s^2: acc_w. m: axle, lookahead,
+    goal_tolerance. rad: turn_in_place, heading_tolerance. s: sim_time, dt, period. Weights: w_path and w_goal per m,
+    w_heading per rad, w_cost for the highest cost (0..1), w_turn per rad/s. Numbers of samples: n_v, n_w.
+    """
+
+    v_max: float
+    w_max: float
+    acc_v: float
+    acc_w: float
+    wheel_max: float
+    axle: float
+    sim_time: float
+    dt: float
+    period: float
+    w_path: float
+    w_goal: float
+    w_heading: float
+    w_cost: float
+    w_turn: float
+    lookahead: float
+    turn_in_place: float
+    approach: float
+    goal_tolerance: float
+    heading_tolerance: float
+    escape_v: float
+    n_v: int
+    n_w: int
+
+
+class _Route(NamedTuple):
+    """The path from its point nearest to the robot on, as straight segments.
+
+    Segment i < size begins at (x[i], y[i]) in m, points along the unit vector (ux[i], uy[i]), is length[i] m long and
+    begins start[i] m along the route; all float64 (64,). `remaining`: m from the route's begin to the goal.
+    """
+
+    x: NDArray[np.float64]
+    y: NDArray[np.float64]
+    ux: NDArray[np.float64]
+    uy: NDArray[np.float64]
+    length: NDArray[np.float64]
+    start: NDArray[np.float64]
+    size: int
+    remaining: float
+
+
+class _Window(NamedTuple):
+    """The speeds (m/s, rad/s) that the motors can reach within a period."""
+
+    v_low: float
+    v_high: float
+    w_low: float
+    w_high: float
+
+
+_PARAMETERS: Any = types.NamedTuple((*(float64,) * 20, int64, int64), DwaParameters)  # type: ignore[no-untyped-call]  # numba's
+_RESULT: Any = types.NamedTuple((float64, float64, float64, int64), DwaResult)  # type: ignore[no-untyped-call]  # numba's
+
+# Inlined before compilation: an array that is passed to a compiled function has its references counted at each call,
+# which makes the loop over the arcs twice as slow and more.
+_helper = njit(inline="always", cache=True)
+
+
+@_helper
 def _wrapped(angle: float) -> float:
     """Return the angle in -pi..pi."""
     return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
 
 
+@_helper
+def _path_point(path: Any, index: int, goal_x: float, goal_y: float) -> tuple[float, float]:
+    """Return a point of the path (m); the goal follows its last one."""
+    x, y = goal_x, goal_y
+    if index < path.shape[0]:
+        x, y = path[index, 0], path[index, 1]
+    return x, y
+
+
+@_helper
+def _nearest_piece(path: Any, goal_x: float, goal_y: float, x: float, y: float) -> tuple[int, float]:
+    """Return the index of the path's piece nearest to (x, y), and the share (0..1) of it before the nearest point."""
+    nearest = 0
+    nearest_share = 0.0
+    least = math.inf
+    for i in range(path.shape[0]):
+        ax, ay = path[i, 0], path[i, 1]
+        bx, by = _path_point(path, i + 1, goal_x, goal_y)
+        ux, uy = bx - ax, by - ay
+        square = ux * ux + uy * uy
+        share = ((x - ax) * ux + (y - ay) * uy) / square if square > 0.0 else 0.0
+        share = min(max(share, 0.0), 1.0)
+        away = (ax + share * ux - x) ** 2 + (ay + share * uy - y) ** 2
+        if away < least - 1e-12:
+            least = away
+            nearest = i
+            nearest_share = share
+    return nearest, nearest_share
+
+
+@_helper
+def _route_ahead(path: Any, goal_x: float, goal_y: float, x: float, y: float, p: DwaParameters) -> _Route:
+    """Return the route from the path's point nearest to the robot on, with the segments that a decision can reach.
+
+    Without a path, or beside its end, the route leads straight to the goal.
+    """
+    seg_x = np.empty(_MAX_SEGMENTS)
+    seg_y = np.empty(_MAX_SEGMENTS)
+    seg_ux = np.empty(_MAX_SEGMENTS)
+    seg_uy = np.empty(_MAX_SEGMENTS)
+    seg_length = np.empty(_MAX_SEGMENTS)
+    seg_start = np.empty(_MAX_SEGMENTS)
+    count = 0
+    remaining = 0.0
+    reach = p.v_max * p.sim_time + 2.0 * p.lookahead
+    points = path.shape[0]
+    if points > 0:
+        nearest, share = _nearest_piece(path, goal_x, goal_y, x, y)
+        to_x, to_y = _path_point(path, nearest + 1, goal_x, goal_y)
+        from_x = path[nearest, 0] + share * (to_x - path[nearest, 0])
+        from_y = path[nearest, 1] + share * (to_y - path[nearest, 1])
+        for i in range(nearest + 2, points + 2):
+            # The segment from..to grows over points that lie nearly on it: few segments to measure to.
+            ux, uy = to_x - from_x, to_y - from_y
+            length = math.sqrt(ux * ux + uy * uy)
+            next_x, next_y = _path_point(path, i, goal_x, goal_y)
+            wx, wy = next_x - from_x, next_y - from_y
+            grown = math.sqrt(wx * wx + wy * wy)
+            straight = abs(ux * wy - uy * wx) <= _MERGED_OFFSET * grown and ux * wx + uy * wy > 0.0
+            if i <= points and (length < 1e-9 or (length < grown <= _MERGED_LENGTH and straight)):
+                to_x, to_y = next_x, next_y
+                continue
+            if length > 1e-9:
+                if remaining < reach and count < _MAX_SEGMENTS:
+                    seg_x[count] = from_x
+                    seg_y[count] = from_y
+                    seg_ux[count] = ux / length
+                    seg_uy[count] = uy / length
+                    seg_length[count] = length
+                    seg_start[count] = remaining
+                    count += 1
+                remaining += length
+            from_x, from_y = to_x, to_y
+            to_x, to_y = next_x, next_y
+    to_goal = math.sqrt((goal_x - x) ** 2 + (goal_y - y) ** 2)
+    if remaining < p.goal_tolerance < to_goal:
+        seg_x[0] = x
+        seg_y[0] = y
+        seg_ux[0] = (goal_x - x) / to_goal
+        seg_uy[0] = (goal_y - y) / to_goal
+        seg_length[0] = to_goal
+        seg_start[0] = 0.0
+        count = 1
+        remaining = to_goal
+    return _Route(seg_x, seg_y, seg_ux, seg_uy, seg_length, seg_start, count, remaining)
+
+
+@_helper
+def _point_along(route: _Route, along: float) -> tuple[float, float]:
+    """Return the point (m) of the route at a length along it, or the end of its last segment."""
+    k = 0
+    while k + 1 < route.size and route.start[k + 1] <= along:
+        k += 1
+    on = min(along - route.start[k], route.length[k])
+    return route.x[k] + on * route.ux[k], route.y[k] + on * route.uy[k]
+
+
+@_helper
+def _offset(dx: float, dy: float, ux: float, uy: float, length: float) -> tuple[float, float]:
+    """Return the squared distance (m^2) from a point to a segment, and how far along it (m) the nearest point lies.
+
+    (dx, dy): the point seen from the segment's begin; (ux, uy): the segment's direction.
+    """
+    along = min(max(dx * ux + dy * uy, 0.0), length)
+    dx -= along * ux
+    dy -= along * uy
+    return dx * dx + dy * dy, along
+
+
+@_helper
+def _reachable_speeds(v_now: float, w_now: float, v_top: float, p: DwaParameters) -> _Window:
+    """Return the speeds that can be reached within a period; `v_top` (m/s) limits the forward speed beside the base.
+
+    A speed that is above its limit already is braked as hard as possible.
+    """
+    v_low = min(max(v_now - p.acc_v * p.period, 0.0), p.v_max)
+    v_high = max(min(v_now + p.acc_v * p.period, p.v_max, v_top), v_low)
+    w_low = max(w_now - p.acc_w * p.period, -p.w_max)
+    w_high = min(w_now + p.acc_w * p.period, p.w_max)
+    if w_high < w_low:
+        w_low = w_high = w_now - math.copysign(p.acc_w * p.period, w_now)
+    return _Window(v_low, v_high, w_low, w_high)
+
+
+@_helper
+def _turning_rate(error: float, w_now: float, p: DwaParameters) -> float:
+    """Return the turning rate (rad/s) for turning a heading error (rad) away in place.
+
+    So fast that the error can be braked away, at a third of the braking power to stay smooth.
+    """
+    rate = math.copysign(min(p.w_max, 2.0 * abs(error), math.sqrt(0.67 * p.acc_w * abs(error))), error)
+    if abs(error) > 2.8 and rate * w_now < -0.01:
+        rate = -rate  # about face: keep the sense of turning, noise must not reverse it
+    return rate
+
+
+@_helper
+def _roll_out(w: float, theta: float, dt: float, cells_per_m: float, unit_x: Any, unit_y: Any) -> None:
+    """Fill unit_x, unit_y with the exact arc of turning rate w per unit of speed (cells per m/s), at each step."""
+    half = 0.5 * w * dt
+    chord = dt * cells_per_m * (math.sin(half) / half if abs(half) > 1e-9 else 1.0)
+    cos_now = math.cos(theta + half)
+    sin_now = math.sin(theta + half)
+    cos_step = math.cos(2.0 * half)
+    sin_step = math.sin(2.0 * half)
+    unit_x[0] = 0.0
+    unit_y[0] = 0.0
+    for t in range(1, unit_x.size):
+        unit_x[t] = unit_x[t - 1] + chord * cos_now
+        unit_y[t] = unit_y[t - 1] + chord * sin_now
+        turned = cos_now * cos_step - sin_now * sin_step
+        sin_now = sin_now * cos_step + cos_now * sin_step
+        cos_now = turned
+
+
+@_helper
+def _highest_cost(
+    costmap: Any,
+    column: float,
+    row: float,
+    v: float,
+    unit_x: Any,
+    unit_y: Any,
+    steps: int,
+    escaping: bool,  # noqa: FBT001  # numba knows no keyword-only arguments
+) -> int:
+    """Return the highest cost (0..252) on an arc from (column, row), LETHAL when the arc is blocked.
+
+    An arc that is `escaping` may begin on inscribed cells, but not come back to them; INSCRIBED: it never leaves them.
+    Leave the returns where they are: with one at the end, numba's code is half as fast.
+    """
+    height, width = costmap.shape
+    highest = 0
+    inscribed = escaping
+    for t in range(1, steps + 1):
+        c = math.floor(column + v * unit_x[t])
+        r = math.floor(row + v * unit_y[t])
+        if c < 0 or c >= width or r < 0 or r >= height:
+            return LETHAL
+        cost = int(costmap[r, c])
+        if cost >= INSCRIBED:
+            if inscribed and cost == INSCRIBED:
+                continue
+            return LETHAL
+        inscribed = False
+        highest = max(highest, cost)
+    return INSCRIBED if inscribed else highest
+
+
+@_helper
+def _route_cost(
+    route: _Route, mid_x: float, mid_y: float, end_x: float, end_y: float, end_theta: float, p: DwaParameters
+) -> float:
+    """Weigh how an arc with this middle (m) and end (m, rad) follows the route."""
+    off_end = math.inf
+    off_mid = math.inf
+    along = 0.0
+    for k in range(route.size):
+        x, y, ux, uy, length = route.x[k], route.y[k], route.ux[k], route.uy[k], route.length[k]
+        square, on = _offset(end_x - x, end_y - y, ux, uy, length)
+        if square < off_end:
+            off_end = square
+            along = route.start[k] + on
+        square, on = _offset(mid_x - x, mid_y - y, ux, uy, length)
+        off_mid = min(off_mid, square)
+    aim_x, aim_y = _point_along(route, min(along + p.lookahead, route.remaining))
+    ahead_x = aim_x - end_x
+    ahead_y = aim_y - end_y
+    # Near its end the path gives no direction any more.
+    trust = min(math.sqrt(ahead_x * ahead_x + ahead_y * ahead_y) / p.lookahead, 1.0)
+    turn = abs(_wrapped(math.atan2(ahead_y, ahead_x) - end_theta)) * trust
+    return (
+        p.w_path * 0.5 * (math.sqrt(off_end) + math.sqrt(off_mid))
+        + p.w_goal * (route.remaining - along)
+        + p.w_heading * turn
+    )
+
+
 @njit(
-    int64(
+    _RESULT(
         float64,
         float64,
         float64,
@@ -124,10 +416,7 @@ def _wrapped(angle: float) -> float:
         float64,
         float64,
         float64,
-        _arrays.F64_FLAT,
-        int64,
-        int64,
-        _arrays.F64_OUT,
+        _PARAMETERS,
     ),
     cache=True,
     nogil=True,
@@ -146,260 +435,122 @@ def _choose(
     goal_x: float,
     goal_y: float,
     goal_theta: float,
-    numbers: Any,
-    n_v: int,
-    n_w: int,
-    chosen: Any,
-) -> int:
-    """Fill chosen = (v, w, score); return the number of admissible arcs. goal_theta may be nan."""
-    v_max, w_max, acc_v, acc_w, wheel_max, axle = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], numbers[5]
-    sim_time, dt, period = numbers[6], numbers[7], numbers[8]
-    w_path, w_goal, w_heading, w_cost, w_turn = numbers[9], numbers[10], numbers[11], numbers[12], numbers[13]
-    lookahead, turn_in_place, approach = numbers[14], numbers[15], numbers[16]
-    goal_tolerance, heading_tolerance, escape_v = numbers[17], numbers[18], numbers[19]
+    p: DwaParameters,
+) -> DwaResult:
+    """Return the best arc; arguments as for `dwa`, goal_theta may be nan."""
     height, width = costmap.shape
-    inverse = 1.0 / resolution
-    chosen[0] = 0.0
-    chosen[1] = 0.0
-    chosen[2] = -math.inf
+    cells_per_m = 1.0 / resolution
+    column = (x - origin_x) * cells_per_m
+    row = (y - origin_y) * cells_per_m
+    if not (0.0 <= column < width and 0.0 <= row < height):
+        return DwaResult(0.0, 0.0, -math.inf, 0)
+    cost_here = costmap[math.floor(row), math.floor(column)]
+    escaping = cost_here == INSCRIBED and p.escape_v > 0.0
+    if cost_here >= INSCRIBED and not escaping:
+        return DwaResult(0.0, 0.0, -math.inf, 0)
 
-    column = math.floor((x - origin_x) * inverse)
-    row = math.floor((y - origin_y) * inverse)
-    if column < 0 or column >= width or row < 0 or row >= height:
-        return 0
-    here = costmap[row, column]
-    escaping = here == INSCRIBED and escape_v > 0.0
-    if here >= INSCRIBED and not escaping:
-        return 0
-
-    # The piece of the path that this decision can reach, from the point nearest to the robot on; then the goal.
-    points = path.shape[0]
-    nearest = 0
-    along = 0.0
-    least = math.inf
-    for i in range(points):
-        ax, ay = path[i, 0], path[i, 1]
-        bx, by = (path[i + 1, 0], path[i + 1, 1]) if i + 1 < points else (goal_x, goal_y)
-        ux, uy = bx - ax, by - ay
-        square = ux * ux + uy * uy
-        part = ((x - ax) * ux + (y - ay) * uy) / square if square > 0.0 else 0.0
-        part = min(max(part, 0.0), 1.0)
-        away = (ax + part * ux - x) ** 2 + (ay + part * uy - y) ** 2
-        if away < least - 1e-12:
-            least = away
-            nearest = i
-            along = part
-    seg_x = np.empty(_SEGMENTS)
-    seg_y = np.empty(_SEGMENTS)
-    seg_ux = np.empty(_SEGMENTS)
-    seg_uy = np.empty(_SEGMENTS)
-    seg_length = np.empty(_SEGMENTS)
-    seg_from = np.empty(_SEGMENTS)
-    segments = 0
-    reach = v_max * sim_time + 2.0 * lookahead
-    remaining = 0.0
-    if points > 0:
-        bx, by = (path[nearest + 1, 0], path[nearest + 1, 1]) if nearest + 1 < points else (goal_x, goal_y)
-        from_x = path[nearest, 0] + along * (bx - path[nearest, 0])
-        from_y = path[nearest, 1] + along * (by - path[nearest, 1])
-        to_x, to_y = bx, by
-        for i in range(nearest + 2, points + 2):
-            # The segment from..to grows over points that lie within a centimetre of it: few segments to measure to.
-            ux, uy = to_x - from_x, to_y - from_y
-            length = math.sqrt(ux * ux + uy * uy)
-            if i <= points:
-                bx, by = (path[i, 0], path[i, 1]) if i < points else (goal_x, goal_y)
-                wx, wy = bx - from_x, by - from_y
-                grown = math.sqrt(wx * wx + wy * wy)
-                if length < 1e-9 or (
-                    length < grown <= _MERGED
-                    and abs(ux * wy - uy * wx) <= _MERGE_OFF * grown
-                    and ux * wx + uy * wy > 0.0
-                ):
-                    to_x, to_y = bx, by
-                    continue
-            if length > 1e-9:
-                if remaining < reach and segments < _SEGMENTS:
-                    seg_x[segments] = from_x
-                    seg_y[segments] = from_y
-                    seg_ux[segments] = ux / length
-                    seg_uy[segments] = uy / length
-                    seg_length[segments] = length
-                    seg_from[segments] = remaining
-                    segments += 1
-                remaining += length
-            from_x, from_y = to_x, to_y
-            to_x, to_y = bx, by
+    route = _route_ahead(path, goal_x, goal_y, x, y, p)
     to_goal = math.sqrt((goal_x - x) ** 2 + (goal_y - y) ** 2)
-    at_goal = to_goal <= goal_tolerance and remaining <= 3.0 * goal_tolerance
-    if not at_goal and (segments == 0 or remaining < goal_tolerance):
-        # No path, or beside its end: straight to the goal.
-        seg_x[0] = x
-        seg_y[0] = y
-        seg_ux[0] = (goal_x - x) / to_goal
-        seg_uy[0] = (goal_y - y) / to_goal
-        seg_length[0] = to_goal
-        seg_from[0] = 0.0
-        segments = 1
-        remaining = to_goal
-
-    # Where the path ahead lies, seen from here: decides between turning in place and driving.
-    error = 0.0
-    turning = False
+    at_goal = to_goal <= p.goal_tolerance and route.remaining <= 3.0 * p.goal_tolerance
+    v_top = math.inf
     if at_goal:
-        if not math.isnan(goal_theta):
-            error = _wrapped(goal_theta - theta)
-            turning = abs(error) > heading_tolerance
+        error = 0.0 if math.isnan(goal_theta) else _wrapped(goal_theta - theta)
+        turning = abs(error) > p.heading_tolerance
         if not turning:
-            chosen[2] = 0.0
-            return 1
+            return DwaResult(0.0, 0.0, 0.0, 1)
     else:
-        aim = min(lookahead, remaining)
-        k = 0
-        while k + 1 < segments and seg_from[k + 1] <= aim:
-            k += 1
-        on = min(aim - seg_from[k], seg_length[k])
-        aim_x = seg_x[k] + on * seg_ux[k]
-        aim_y = seg_y[k] + on * seg_uy[k]
+        aim_x, aim_y = _point_along(route, min(p.lookahead, route.remaining))
         error = _wrapped(math.atan2(aim_y - y, aim_x - x) - theta)
-        turning = abs(error) > turn_in_place
-
-    v_low = max(v_now - acc_v * period, 0.0)
-    v_high = min(v_now + acc_v * period, v_max)
-    if not at_goal:
-        v_high = min(v_high, math.sqrt(2.0 * approach * max(to_goal, remaining, 0.25 * goal_tolerance)))
+        turning = abs(error) > p.turn_in_place
+        v_top = math.sqrt(2.0 * p.approach * max(to_goal, route.remaining, 0.25 * p.goal_tolerance))
     if escaping:
-        v_high = min(v_high, escape_v)
+        v_top = min(v_top, p.escape_v)
     if turning:
-        v_high = 0.0
-    v_low = min(v_low, v_max)
-    v_high = max(v_high, v_low)
-    w_low = max(w_now - acc_w * period, -w_max)
-    w_high = min(w_now + acc_w * period, w_max)
-    if w_high < w_low:
-        # Faster than allowed already: brake as hard as possible.
-        w_low = w_high = w_now - math.copysign(acc_w * period, w_now)
-    w_step = (w_high - w_low) / (n_w - 1)
-    v_step = (v_high - v_low) / (n_v - 1)
-    wanted = 0.0
-    if turning:
-        # Turn so fast that the error can be braked away, at a third of the braking power to stay smooth.
-        wanted = math.copysign(min(w_max, 2.0 * abs(error), math.sqrt(0.67 * acc_w * abs(error))), error)
-        if abs(error) > 2.8 and wanted * w_now < -0.01:
-            wanted = -wanted  # about face: keep the sense of turning, noise must not reverse it
+        v_top = 0.0
+    window = _reachable_speeds(v_now, w_now, v_top, p)
+    rate = _turning_rate(error, w_now, p) if turning else 0.0
 
     # Long enough to prove that the fastest arc can be braked before anything that it would hit.
-    horizon = max(sim_time, period + v_high / acc_v)
+    horizon = max(p.sim_time, p.period + window.v_high / p.acc_v)
     if escaping:
-        horizon = max(horizon, 0.3 / escape_v)
-    steps = min(math.ceil(horizon / dt - 1e-9), _MAX_STEPS)
-    judged = min(max(round(sim_time / dt), 1), steps)
-    halfway = max(judged // 2, 1)
+        horizon = max(horizon, _ESCAPE_LENGTH / p.escape_v)
+    steps = min(math.ceil(horizon / p.dt - 1e-9), _MAX_STEPS)
+    end = min(max(round(p.sim_time / p.dt), 1), steps)
+    middle = max(end // 2, 1)
     unit_x = np.empty(steps + 1)
     unit_y = np.empty(steps + 1)
-    base_x = (x - origin_x) * inverse
-    base_y = (y - origin_y) * inverse
-    zero_w = -1
-    if w_low <= 0.0 <= w_high and w_step > 0.0:
-        zero_w = round(-w_low / w_step)
+    v_step = (window.v_high - window.v_low) / (p.n_v - 1)
+    w_step = (window.w_high - window.w_low) / (p.n_w - 1)
+    straight = -1
+    if window.w_low <= 0.0 <= window.w_high and w_step > 0.0:
+        straight = round(-window.w_low / w_step)
     admissible = 0
-    best = math.inf
-    for j in range(n_w):
-        w = 0.0 if j == zero_w else w_low + j * w_step
-        # Exact arc per unit of speed, in cells: positions are linear in v.
-        unit_x[0] = 0.0
-        unit_y[0] = 0.0
-        half = 0.5 * w * dt
-        chord = dt * inverse * (math.sin(half) / half if abs(half) > 1e-9 else 1.0)
-        cos_now = math.cos(theta + half)
-        sin_now = math.sin(theta + half)
-        cos_step = math.cos(2.0 * half)
-        sin_step = math.sin(2.0 * half)
-        for t in range(1, steps + 1):
-            unit_x[t] = unit_x[t - 1] + chord * cos_now
-            unit_y[t] = unit_y[t - 1] + chord * sin_now
-            turned = cos_now * cos_step - sin_now * sin_step
-            sin_now = sin_now * cos_step + cos_now * sin_step
-            cos_now = turned
-        end_theta = theta + w * sim_time
-        for i in range(n_v):
-            v = v_low + i * v_step
-            if v + 0.5 * axle * abs(w) > wheel_max + 1e-9:
+    least = math.inf
+    best_v = 0.0
+    best_w = 0.0
+    for j in range(p.n_w):
+        w = 0.0 if j == straight else window.w_low + j * w_step
+        _roll_out(w, theta, p.dt, cells_per_m, unit_x, unit_y)
+        for i in range(p.n_v if v_step > 0.0 else 1):
+            v = window.v_low + i * v_step
+            if v + 0.5 * p.axle * abs(w) > p.wheel_max + 1e-9:
                 break  # so would every faster one
-            dearest = 0
-            leaving = escaping
-            blocked = False
-            for t in range(1, steps + 1):
-                c = math.floor(base_x + v * unit_x[t])
-                r = math.floor(base_y + v * unit_y[t])
-                if c < 0 or c >= width or r < 0 or r >= height:
-                    blocked = True
-                    break
-                cost = int(costmap[r, c])
-                if cost >= INSCRIBED:
-                    if leaving and cost == INSCRIBED:
-                        continue
-                    blocked = True
-                    break
-                leaving = False
-                dearest = max(dearest, cost)
-            if blocked:
+            highest = _highest_cost(costmap, column, row, v, unit_x, unit_y, steps, escaping)
+            if highest == LETHAL:
                 continue
             if turning:
-                total = abs(w - wanted) + 10.0 * v
+                total = abs(w - rate) + _TURN_STANDING * v
+            elif highest == INSCRIBED and v > 0.0:
+                continue  # this way leads along the wall, not off it
             else:
-                if leaving and v > 0.0:
-                    continue  # still inscribed at the end: this way leads along the wall, not off it
-                off_end = math.inf
-                off_half = math.inf
-                at = 0.0
-                end_x = x + v * unit_x[judged] * resolution
-                end_y = y + v * unit_y[judged] * resolution
-                mid_x = x + v * unit_x[halfway] * resolution
-                mid_y = y + v * unit_y[halfway] * resolution
-                for k in range(segments):
-                    px = end_x - seg_x[k]
-                    py = end_y - seg_y[k]
-                    on = min(max(px * seg_ux[k] + py * seg_uy[k], 0.0), seg_length[k])
-                    px -= on * seg_ux[k]
-                    py -= on * seg_uy[k]
-                    square = px * px + py * py
-                    if square < off_end:
-                        off_end = square
-                        at = seg_from[k] + on
-                    px = mid_x - seg_x[k]
-                    py = mid_y - seg_y[k]
-                    on = min(max(px * seg_ux[k] + py * seg_uy[k], 0.0), seg_length[k])
-                    px -= on * seg_ux[k]
-                    py -= on * seg_uy[k]
-                    off_half = min(off_half, px * px + py * py)
-                aim = min(at + lookahead, remaining)
-                k = 0
-                while k + 1 < segments and seg_from[k + 1] <= aim:
-                    k += 1
-                on = min(aim - seg_from[k], seg_length[k])
-                ahead_x = seg_x[k] + on * seg_ux[k] - end_x
-                ahead_y = seg_y[k] + on * seg_uy[k] - end_y
-                ahead = ahead_x * ahead_x + ahead_y * ahead_y
-                # Near its end the path gives no direction any more.
-                trust = min(math.sqrt(ahead) / lookahead, 1.0)
-                turn = abs(_wrapped(math.atan2(ahead_y, ahead_x) - end_theta)) * trust
+                touched = 0 if highest == INSCRIBED else highest
                 total = (
-                    w_path * 0.5 * (math.sqrt(off_end) + math.sqrt(off_half))
-                    + w_goal * (remaining - at)
-                    + w_heading * turn
-                    + w_cost * dearest / PENALTY_MAX
-                    + w_turn * abs(w - w_now)
+                    _route_cost(
+                        route,
+                        x + v * unit_x[middle] * resolution,
+                        y + v * unit_y[middle] * resolution,
+                        x + v * unit_x[end] * resolution,
+                        y + v * unit_y[end] * resolution,
+                        theta + w * p.sim_time,
+                        p,
+                    )
+                    + p.w_cost * touched / PENALTY_MAX
+                    + p.w_turn * abs(w - w_now)
                 )
             admissible += 1
-            if total < best:
-                best = total
-                chosen[0] = v
-                chosen[1] = w
-                chosen[2] = -total
-            if v_step <= 0.0:
-                break
-    return admissible
+            if total < least:
+                least = total
+                best_v = v
+                best_w = w
+    return DwaResult(best_v, best_w, -least, admissible)
+
+
+def _parameters(limits: DwaLimits, settings: DwaSettings) -> DwaParameters:
+    """Return both as the kernel reads them."""
+    return DwaParameters(
+        v_max=float(limits.v_max),
+        w_max=float(limits.w_max),
+        acc_v=float(limits.acc_v),
+        acc_w=float(limits.acc_w),
+        wheel_max=float(limits.wheel_max),
+        axle=float(limits.axle),
+        sim_time=float(settings.sim_time),
+        dt=float(settings.dt),
+        period=float(settings.period),
+        w_path=float(settings.w_path),
+        w_goal=float(settings.w_goal),
+        w_heading=float(settings.w_heading),
+        w_cost=float(settings.w_cost),
+        w_turn=float(settings.w_turn),
+        lookahead=float(settings.lookahead),
+        turn_in_place=float(settings.turn_in_place),
+        approach=float(settings.approach),
+        goal_tolerance=float(settings.goal_tolerance),
+        heading_tolerance=float(settings.heading_tolerance),
+        escape_v=float(settings.escape_v),
+        n_v=settings.n_v,
+        n_w=settings.n_w,
+    )
 
 
 def dwa(
@@ -436,49 +587,14 @@ def dwa(
     aims = (float(goal_x), float(goal_y), 0.0 if goal_theta is None else float(goal_theta))
     if not all(map(math.isfinite, state + aims)) or not np.isfinite(points).all():
         raise ValueError("speeds, pose, origin, path and goal must be finite: don't decide on a lost pose")
-    numbers = np.array(
-        (
-            limits.v_max,
-            limits.w_max,
-            limits.acc_v,
-            limits.acc_w,
-            limits.wheel_max,
-            limits.axle,
-            settings.sim_time,
-            settings.dt,
-            settings.period,
-            settings.w_path,
-            settings.w_goal,
-            settings.w_heading,
-            settings.w_cost,
-            settings.w_turn,
-            settings.lookahead,
-            settings.turn_in_place,
-            settings.approach,
-            settings.goal_tolerance,
-            settings.heading_tolerance,
-            settings.escape_v,
-        ),
-        np.float64,
-    )
-    chosen = np.empty(3)
-    admissible = _choose(
-        state[0],
-        state[1],
-        state[2],
-        state[3],
-        state[4],
+    chosen: DwaResult = _choose(
+        *state[:5],
         costmap,
         _arrays.positive(resolution, "resolution"),
-        state[5],
-        state[6],
+        *state[5:],
         points,
-        aims[0],
-        aims[1],
+        *aims[:2],
         math.nan if goal_theta is None else aims[2],
-        numbers,
-        settings.n_v,
-        settings.n_w,
-        chosen,
+        _parameters(limits, settings),
     )
-    return DwaResult(float(chosen[0]), float(chosen[1]), float(chosen[2]), int(admissible))
+    return chosen

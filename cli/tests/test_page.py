@@ -28,7 +28,8 @@ from fog_runtime.maps import StaticMap
 from fog_runtime.site import LoadedSite
 from fog_supervisor import net
 from fognav import system
-from fognav.demo.run import Demo, Options
+from fognav.demo.options import Options
+from fognav.demo.run import Demo
 from fognav.demo.view import render
 from fognav.output import WrongUseError
 from fognav.page.app import map_png, serve

@@ -15,10 +15,10 @@ from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.raycast import cast
 from fog_runtime.maps import StaticMap, save_map
 from fog_runtime.site import load_site
-from fognav.demo.danger import choose
 from fognav.output import WrongUseError
 from fognav.site_command import check_site, identifier, new_site
 from fognav.site_proposal import NoSiteError, propose
+from fognav_sim.drive.hazard import draw_hazard
 from fognav_sim.scenario import barrier_across
 
 RESOLUTION = 0.05
@@ -56,7 +56,7 @@ def test_a_proposal_can_be_driven_and_each_area_can_be_driven_around(seed: int) 
     def barrier_in(area: AreaSite) -> SimObstacle:
         return barrier_across(area, site, StaticMap(geometry, cells), seed)
 
-    assert choose(site, path, seed, barrier_in).area.id in site.demo.areas
+    assert draw_hazard(site, path, seed, barrier_in).area.id in site.demo.areas
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -9,7 +9,7 @@ import pytest
 
 from fog_contracts.geometry import contains_point
 from fog_runtime.site import load_site
-from fognav_experiments.lockstep import draw_area, run_lockstep
+from fognav_experiments.lockstep import run_lockstep
 from fognav_sim.scenario import ScenarioError
 
 ESTIG = Path(__file__).parents[2] / "sites" / "estig"
@@ -81,11 +81,6 @@ def test_the_same_seed_gives_the_same_run_bit_for_bit_and_another_seed_another(w
     assert drive(4).track != free.track
 
 
-def test_an_area_is_drawn_only_where_the_way_enters_it_late_enough():
-    site = little.little_site()
-    near, far = [(5.0, 1.5), (7.0, 1.5)], [(x / 2 - 8.0, 1.5) for x in range(32)]
-    assert draw_area(site, far, ["z1"], seed=1) == "z1"
-    with pytest.raises(ScenarioError, match="late enough"):
-        draw_area(site, near, ["z1"], seed=1)
-    with pytest.raises(ScenarioError, match="no area 'z9'"):
-        draw_area(site, far, ["z9"], seed=1)
+def test_an_area_that_the_site_does_not_have_is_named():
+    with pytest.raises(ScenarioError, match="no area 'z9'; it has: z1"):
+        drive(1, "z9")

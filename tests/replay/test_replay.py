@@ -54,8 +54,12 @@ from fog_runtime.record import RecordError, read
 from fog_runtime.site import load_site
 from fog_runtime.zenoh_edge import ZenohEdge
 from fog_supervisor import net
+from fognav.demo.attempt import Attempt
+from fognav.demo.background import Background
 from fognav.demo.operator import Operator
-from fognav.demo.run import Demo, Options
+from fognav.demo.options import DrivePlan, Options
+from fognav.demo.scene import Scene
+from fognav.demo.speed import SpeedWatch
 from fognav.output import WrongUseError
 from fognav.recording import recording, summary
 from fognav.stack import AGENT, MAP_SERVICE, SERVERS, SERVICES, SIMULATOR, WATCHDOG, Stack, StackConfig
@@ -83,13 +87,13 @@ ZONES: tuple[dict[str, Any], ...] = (
 )  # fmt: skip
 
 
-class UnhurriedDemo(Demo):
-    """A demo that takes a machine too slow for the speed: nobody judges how well the robot drives here."""
+class UnhurriedWatch(SpeedWatch):
+    """Takes a machine too slow for the speed: nobody evaluates how well the robot drives here."""
 
-    def _check_speed(self, elapsed, clock):
+    def check(self, *_, **__):
         pass
 
-    def _judge_speed(self, verdict, clock):
+    def check_outcome(self, *_, **__):
         pass
 
 
@@ -120,35 +124,39 @@ async def ask_map_service(stack: Stack, method: str, path: str, body: dict[str, 
     assert answer.status < 300, answer.reason
 
 
-async def drive(demo: Demo, stack: Stack, edge: ZenohEdge, clock: SystemClock) -> None:
+async def drive(attempt: Attempt, stack: Stack, edge: ZenohEdge, clock: SystemClock) -> None:
     """Drive until the robot follows a path around the barrier."""
-    operator = Operator(edge, stack, demo.scene, clock)
-    helping = asyncio.create_task(operator.keep_enabled())
-    driving = asyncio.create_task(demo._drive(operator, clock, [helping]))
+    scene = attempt.scene
+    operator = Operator(edge, stack, scene, clock)
 
-    def beyond(distance: float) -> bool:
-        assert not driving.done(), (demo.scene.verdict, list(demo.scene.events))
-        return demo._judge is not None and demo._judge.distance_m >= distance
+    async with Background(operator.keep_enabled()) as background:
+        driving = asyncio.create_task(attempt.drive(operator, clock, background))
 
-    def avoids() -> bool:
-        return beyond(0.0) and demo._blocked_at is not None and demo._judge is not None and demo._judge.paths >= 2
+        def beyond(distance: float) -> bool:
+            assert not driving.done(), (scene.outcome, list(scene.events))
+            return attempt.evaluation is not None and attempt.evaluation.distance_m >= distance
 
-    try:
-        await until(avoids, f"the way was blocked and planned anew: {list(demo.scene.events)}", DRIVE_S)
-        assert demo._judge is not None
-        there = demo._judge.distance_m + AFTER_M
-        await until(lambda: beyond(there), "the robot followed its new path", DRIVE_S)
-    finally:
-        for task in (driving, helping):
-            task.cancel()
-        await asyncio.gather(driving, helping, return_exceptions=True)
+        def avoids() -> bool:
+            evaluation = attempt.evaluation
+            return beyond(0.0) and attempt.hazard.placed_at is not None and evaluation and evaluation.plans >= 2
+
+        try:
+            await until(avoids, f"the way was blocked and planned anew: {list(scene.events)}", DRIVE_S)
+            assert attempt.evaluation is not None
+            there = attempt.evaluation.distance_m + AFTER_M
+            await until(lambda: beyond(there), "the robot followed its new path", DRIVE_S)
+        finally:
+            driving.cancel()
+            await asyncio.gather(driving, return_exceptions=True)
 
 
 async def record(path: Path) -> tuple[MapSnapshot, str]:
     """Record a demo; return the last map and the area that was blocked."""
     site = load_site(SITE)
     clock = SystemClock(SPEED)
-    demo = UnhurriedDemo(site, Options(seed=1, speed=SPEED))
+    plan = DrivePlan.of(site, Options(seed=1, speed=SPEED))
+    attempt = Attempt(plan, Scene(site, plan.robot, 1, SPEED))
+    attempt.speed_watch = UnhurriedWatch(SPEED)
     faded_at = 0.0
 
     def on_obstacles(_: dict[str, str], seen: RobotObstacles) -> None:
@@ -157,7 +165,7 @@ async def record(path: Path) -> tuple[MapSnapshot, str]:
 
     # So long a memory as robots have by themselves would make the recording long too.
     memory = {"OBSTACLE_MEMORY_S": "30"}
-    async with Stack(StackConfig(site_dir=SITE, robot=demo.robot, seed=1, speed=SPEED, extra=memory)) as stack:
+    async with Stack(StackConfig(site_dir=SITE, robot=plan.robot, seed=1, speed=SPEED, extra=memory)) as stack:
         keeper = stack.supervisor
         for name in SERVERS:
             keeper.start(name)
@@ -172,20 +180,20 @@ async def record(path: Path) -> tuple[MapSnapshot, str]:
                     keeper.start(name)
                 await keeper.wait_ready([name for name in names if name != AGENT], READY_S)
             edge.subscribe(ch.ROBOT_OBSTACLES, RobotObstacles, on_obstacles)
-            stood = await edge.ask(ch.SIM_COMMAND, SimCommand(place=[BOX]), CommandReply, 10.0, robot=demo.robot)
+            stood = await edge.ask(ch.SIM_COMMAND, SimCommand(place=[BOX]), CommandReply, 10.0, robot=plan.robot)
             assert stood is not None
             assert stood.accepted, stood.reason
             for zone in ZONES:
                 await ask_map_service(stack, "POST", "/api/v1/zones", zone)
-            await drive(demo, stack, edge, clock)
+            await drive(attempt, stack, edge, clock)
             for name in (AGENT, WATCHDOG):
                 await keeper.stop(name)
             await ask_map_service(stack, "DELETE", "/api/v1/zones/wet")
             await until(lambda: clock.now() > faded_at, "all obstacles had faded", READY_S)
             last = await edge.ask(ch.MAP_SNAPSHOT, None, MapSnapshot, 10.0)
             assert last is not None
-    assert demo._danger is not None
-    return last, demo._danger.area.id
+    assert attempt.hazard.area is not None
+    return last, attempt.hazard.area
 
 
 @pytest.fixture(scope="module")

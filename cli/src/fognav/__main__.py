@@ -129,7 +129,7 @@ def demo_command(
     was not, or was interrupted (the report says which); 2 if what was asked for can't be used.
     """
     from fognav.demo.command import run_demo  # noqa: PLC0415  # the other commands need not wait for its imports
-    from fognav.demo.run import Options  # noqa: PLC0415  # same
+    from fognav.demo.options import Options  # noqa: PLC0415  # same
 
     try:
         folder = checkout.site_folder(site)

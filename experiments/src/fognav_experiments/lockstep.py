@@ -13,50 +13,35 @@ import json
 import math
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Final
 
 import msgspec
-import numpy as np
 
-from fog_contracts.geometry import contains_point, distance_to_polygon
+from fog_contracts.geometry import distance_to_polygon
 from fog_contracts.messages import PlanRequest, RobotGoal, RobotPath, SimObstacle
+from fog_contracts.stages import SPANS, durations_ms
 from fog_runtime.site import LoadedSite, load_site
-from fognav_experiments.rigs import FogRig, RobotRig
+from fognav_experiments.rigs import STAMP, FogRig, RobotRig
 from fognav_sim.devices import DEFAULT_BASE, DEFAULT_LIDAR
+from fognav_sim.drive.evaluation import DriveEvaluation, DriveOutcome, OutcomeKind
+from fognav_sim.drive.hazard import draw_hazard, draw_trigger
+from fognav_sim.drive.operator import OperatorPolicy
 from fognav_sim.hardware import STEP_S
 from fognav_sim.scenario import Event, Scenario, ScenarioError, barrier_across
 from fognav_sim.world import Noise, World
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from fog_contracts.messages import Pose, Trace
     from fog_contracts.site import AreaSite, Place
 
-Outcome = Literal["reached", "refused", "contact", "timeout", "stopped"]
-
 WARM_UP_S: Final = 12.0
 """Time in which areas must be judged, the pose found and the robot enabled."""
-TRIGGER_M: Final = (3.0, 8.0)
-"""Between these the travelled distance is drawn after which an area is blocked."""
-ROOM_M: Final = 4.0
-"""An area is drawn only if the way enters it at least this far after the latest trigger."""
 TRACK_M: Final = 0.25
 """Spacing of the recorded track."""
-OFF_GOAL_M: Final = 0.30
-"""A robot that believes to be at its goal must really be this near."""
-REFUSED_S: Final = 10.0
-STOPPED_S: Final = 3.0
-HELD_S: Final = 62.0
-
-STAGES: Final = {
-    "debounce": ("first_reading", "confirmed"),
-    "costmap": ("confirmed", "costmap_published"),
-    "plan": ("costmap_published", "plan_published"),
-    "deliver": ("plan_published", "path_received"),
-    "command": ("path_received", "first_command"),
-    "total": ("first_reading", "first_command"),
-}
+OPERATE_STEPS: Final = 50
+"""Steps of 10 ms between two looks of the operator."""
+TRUTH_STEPS: Final = 10
+"""Steps of 10 ms between two looks of the evaluation, as the simulator publishes the truth."""
 
 
 class Happening(msgspec.Struct, frozen=True, kw_only=True):
@@ -75,7 +60,7 @@ class LockstepResult(msgspec.Struct, frozen=True, kw_only=True):
     barrier, `stages_ms` the blocked hazard's way, `track` the true way every 0.25 m.
     """
 
-    outcome: Outcome
+    outcome: OutcomeKind
     detail: str
     seed: int
     distance_m: float
@@ -116,12 +101,9 @@ class _Drive:
         self.fog = FogRig(site, self.world, seed, 0.0)
         self.scenario = Scenario((), start=0.0)
         self.events: list[Happening] = []
-        self.crossed: list[str] = []
         self.track: list[tuple[float, float]] = []
-        self.plans = 0
         self.planned_m = 0.0
         self.path: RobotPath | None = None
-        self.refused_since: float | None = None
         self.barrier: SimObstacle | None = None
         self.barrier_since: float | None = None
         self.hazard_clearance = math.inf
@@ -130,9 +112,11 @@ class _Drive:
         self.commands = 0
         self.begun_at = 0.0
         self.began_m = 0.0
+        self.operator = OperatorPolicy(self.now)
+        self.evaluation: DriveEvaluation | None = None
+        self._steps = 0
         self._mode = ""
-        self._mode_since = 0.0
-        self._any_heading = False
+        self._crossed = 0
 
     @property
     def now(self) -> float:
@@ -152,6 +136,7 @@ class _Drive:
 
     def step(self) -> None:
         """Let 10 ms pass everywhere."""
+        self._steps += 1
         robot, fog = self.robot, self.fog
         robot.step(fog.snapshot if robot.agent.wants_snapshot(robot.now) else None)
         for happened in self.scenario.step(self.world, self.now):
@@ -171,29 +156,21 @@ class _Drive:
 
     def _on_path(self, path: RobotPath) -> None:
         known, self.path = self.path, path
-        if path.refusal is None:
-            self.refused_since = None
-        elif self.refused_since is None:
-            self.refused_since = self.now
+        if self.evaluation is not None:
+            self.evaluation.on_path(path, self.now)
         if known is not None and known.plan_id == path.plan_id:
             return
-        self.plans += 1
         if path.refusal is not None:
             self.say(f"no way: {path.refusal.reason}")
             return
         length = sum(math.dist(a, b) for a, b in zip(path.points, path.points[1:], strict=False))
-        if self.plans == 1:
-            self.planned_m = length
+        self.planned_m = self.planned_m or length
         self.say(f"plan {path.plan_id}: {length:.1f} m")
 
     def _watch(self) -> None:
         x, y, _ = self.world.pose
         if not self.track or math.dist(self.track[-1], (x, y)) >= TRACK_M:
             self.track.append((round(float(x), 3), round(float(y), 3)))
-            for area in self.site.site.areas:
-                if area.id not in self.crossed and contains_point(area.polygon, x, y):
-                    self.crossed.append(area.id)
-                    self.say(f"enters {area.id}")
             pose = self.robot.pose
             if pose is not None and pose.localized:
                 self.pose_error = max(self.pose_error, math.hypot(pose.x - x, pose.y - y))
@@ -201,35 +178,48 @@ class _Drive:
             gap = distance_to_polygon(self.barrier.polygon, x, y) - self.world.robot.radius
             self.hazard_clearance = min(self.hazard_clearance, gap)
         state = self.robot.state
-        if state is not None and state.mode != self._mode:
-            self._mode, self._mode_since = state.mode, self.now
-            self.say(f"robot: {state.mode} ({'; '.join(state.reasons[:2])})")
+        if state is not None:
+            self.operator.on_state(state, self.now)
+            if state.mode != self._mode:
+                self._mode = state.mode
+                self.say(f"robot: {state.mode} ({'; '.join(state.reasons[:2])})")
+        if self._steps % OPERATE_STEPS == 0:
+            self._operate()
+        if self.evaluation is not None and self._steps % TRUTH_STEPS == 0:
+            self._evaluate(self.evaluation)
 
-    def operate(self) -> None:
-        """Do what a person would: enable the robot, at the start and where it waits for a person's look."""
-        state = self.robot.state
-        if state is None:
-            return
-        stood = self.now - self._mode_since
-        waits = not state.enabled or state.mode == "INIT"
-        waits = waits or (state.mode == "PROTECTIVE_STOP" and stood >= STOPPED_S)
-        waits = waits or (state.mode == "HOLD" and stood >= HELD_S)
-        if not waits:
-            return
-        reply = self.robot.command("enable")
-        if reply.accepted:
+    def _operate(self) -> None:
+        command = self.operator.command_due(self.now)
+        if command is not None and self.robot.command(command).accepted:
             self.commands += 1
-            self.say("operator: enable")
+            self.say(f"operator: {command}")
+
+    def _evaluate(self, evaluation: DriveEvaluation) -> None:
+        evaluation.on_truth(self.world.truth(STAMP + self.now))
+        if self.robot.state is not None:
+            evaluation.on_state(self.robot.state, self.now)
+        for area in evaluation.route_areas[self._crossed :]:
+            self.say(f"enters {area}")
+        self._crossed = len(evaluation.route_areas)
+
+    def begin(self, timeout_s: float) -> None:
+        """Let the drive to the goal begin now."""
+        assert self.goal.pose is not None
+        self.begun_at, self.began_m = self.now, self.world.distance
+        self.evaluation = DriveEvaluation(
+            goal=(self.goal.pose.x, self.goal.pose.y),
+            goal_id=self.goal.goal_id,
+            areas=self.site.site.areas,
+            begun=self.now,
+            timeout_s=timeout_s,
+        )
+        self._evaluate(self.evaluation)
 
     def warm_up(self) -> str | None:
         """Run until the robot may drive; returns why it never could, or None."""
         until = self.now + WARM_UP_S
-        steps = 0
         while self.now < until:
             self.step()
-            steps += 1
-            if steps % 50 == 0:
-                self.operate()
             state = self.robot.state
             judged = all(told.hazard.state != "unknown" for told in self.fog.hazards.values())
             if state is not None and state.mode == "NORMAL" and judged:
@@ -238,58 +228,30 @@ class _Drive:
         reasons = self.robot.state.reasons if self.robot.state else []
         return f"not ready after {WARM_UP_S:.0f} s: {'; '.join(reasons)}; unknown areas: {unknown}"
 
-    def verdict(self, timeout_s: float) -> tuple[Outcome, str] | None:
-        """Return how the drive ended, None while it goes on."""
-        state = self.robot.state
-        if self.world.contacts:
-            x, y, _ = self.world.pose
-            return "contact", f"the robot touched something at ({x:.2f}, {y:.2f})"
-        if state is not None and state.goal_reached:
-            assert self.goal.pose is not None
-            x, y, _ = self.world.pose
-            off = math.hypot(x - self.goal.pose.x, y - self.goal.pose.y)
-            if off > OFF_GOAL_M:
-                return "stopped", f"the robot believes to be at its goal and is {off:.2f} m off"
-            return "reached", f"{off:.2f} m off the goal"
-        if state is not None and state.mode == "FAULT":
-            return "stopped", "; ".join(state.reasons)
-        if self.refused_since is not None and self.now - self.refused_since > REFUSED_S:
-            assert self.path is not None
-            return "refused", self.path.refusal.reason if self.path.refusal else ""
-        if self.now - self.begun_at > timeout_s:
-            return "timeout", "; ".join(state.reasons) if state is not None else ""
-        return None
-
-    def result(self, outcome: Outcome, detail: str, area: str | None) -> LockstepResult:
+    def result(self, outcome: DriveOutcome, area: str | None) -> LockstepResult:
         """Put together what is known."""
+        evaluation = self.evaluation
         happened = next((event for event in self.events if event.what.startswith("barrier appears")), None)
         return LockstepResult(
-            outcome=outcome,
-            detail=detail,
+            outcome=outcome.kind,
+            detail=outcome.reason,
             seed=self.seed,
             distance_m=round(self.driven, 3),
             time_s=round(self.now - self.begun_at, 2),
             min_clearance_m=round(self.world.truth(0.0).min_clearance, 3),
             contacts=self.world.contacts,
             planned_m=round(self.planned_m, 2),
-            replans=max(0, self.plans - 1),
+            replans=max(0, evaluation.plans - 1) if evaluation is not None else 0,
             hazard_area=area,
             hazard_at_m=happened.distance_m if happened else None,
             hazard_clearance_m=round(self.hazard_clearance, 3) if happened else None,
-            crossed=self.crossed,
-            stages_ms=self._stages(area),
+            crossed=list(dict.fromkeys(evaluation.route_areas)) if evaluation is not None else [],
+            stages_ms=durations_ms(next((t for t in self.traces if t.area == area), None), SPANS),
             pose_error_m=round(self.pose_error, 3),
             operator_commands=self.commands,
             events=self.events,
             track=self.track,
         )
-
-    def _stages(self, area: str | None) -> dict[str, float]:
-        trace = next((trace for trace in self.traces if trace.area == area), None)
-        if trace is None:
-            return {}
-        pairs = {stage: (getattr(trace, a), getattr(trace, b)) for stage, (a, b) in STAGES.items()}
-        return {stage: round(1000.0 * (b - a), 1) for stage, (a, b) in pairs.items() if a and b}
 
 
 def run_lockstep(
@@ -325,22 +287,20 @@ def run_lockstep(
     if hazard_area is not None:
         barrier = barrier_across(_area(site, hazard_area), site.site, site.map, seed)
     why = drive.warm_up()
-    drive.begun_at, drive.began_m = drive.now, drive.world.distance
+    drive.begin(timeout_s)
     if why is not None:
-        return drive.result("stopped", why, hazard_area)
+        return drive.result(DriveOutcome("stopped", why), hazard_area)
     if barrier is not None:
         drive.barrier = barrier
-        at = hazard_at_m if hazard_at_m is not None else float(np.random.default_rng((seed, 1)).uniform(*TRIGGER_M))
+        at = hazard_at_m if hazard_at_m is not None else draw_trigger(seed)
         event = Event(name=f"barrier appears in {hazard_area}", place=(barrier,), at_distance=at)
         drive.scenario = Scenario([event], start=drive.now, distance=drive.world.distance)
     drive.fog.planner.set_goal(drive.robot.id, mission, any_heading=goal.theta is None)
-    steps = 0
-    while (verdict := drive.verdict(timeout_s)) is None:
+    evaluation = drive.evaluation
+    assert evaluation is not None
+    while (outcome := evaluation.outcome(drive.now)) is None:
         drive.step()
-        steps += 1
-        if steps % 50 == 0:
-            drive.operate()
-    return drive.result(*verdict, hazard_area)
+    return drive.result(outcome, hazard_area)
 
 
 def _area(site: LoadedSite, area_id: str) -> AreaSite:
@@ -348,28 +308,6 @@ def _area(site: LoadedSite, area_id: str) -> AreaSite:
         if area.id == area_id:
             return area
     raise ScenarioError(f"the site has no area {area_id!r}; it has: {', '.join(a.id for a in site.site.areas)}")
-
-
-def entry(path: Sequence[tuple[float, float]], area: AreaSite) -> float | None:
-    """Return how far along a track (m) it first enters an area; None when it never does."""
-    travelled = 0.0
-    for index, point in enumerate(path):
-        travelled += math.dist(path[index - 1], point) if index else 0.0
-        if contains_point(area.polygon, *point):
-            return travelled
-    return None
-
-
-def draw_area(site: LoadedSite, track: Sequence[tuple[float, float]], areas: Sequence[str], seed: int) -> str:
-    """Draw one of `areas` that a track enters late enough to be blocked before; raises `ScenarioError` if none is."""
-    fitting = []
-    for area_id in areas:
-        at = entry(track, _area(site, area_id))
-        if at is not None and at > TRIGGER_M[1] + ROOM_M:
-            fitting.append(area_id)
-    if not fitting:
-        raise ScenarioError(f"the way enters none of the areas {', '.join(areas) or '(none)'} late enough")
-    return fitting[int(np.random.default_rng((seed, 2)).integers(len(fitting)))]
 
 
 def _free_way(site: LoadedSite, start: Pose, goal: Place, seed: int) -> list[tuple[float, float]]:
@@ -414,14 +352,21 @@ def main() -> None:
     start = msgspec.structs.replace(
         robot, x=begin.x, y=begin.y, theta=begin.theta if begin.theta is not None else robot.theta
     )
-    area = None
+    area, trigger_m = arguments.area, None
     try:
-        if not arguments.no_hazard:
-            areas = demo.areas if demo else [a.id for a in site.site.areas]
-            area = arguments.area or draw_area(
-                site, _free_way(site, start, goal, arguments.seed), areas, arguments.seed
+        if arguments.no_hazard:
+            area = None
+        elif area is None:
+            hazard = draw_hazard(
+                site.site,
+                _free_way(site, start, goal, arguments.seed),
+                arguments.seed,
+                lambda closed: barrier_across(closed, site.site, site.map, arguments.seed),
             )
-        result = run_lockstep(site, start, goal, arguments.seed, area, timeout_s=arguments.timeout)
+            area, trigger_m = hazard.area.id, hazard.trigger_m
+        result = run_lockstep(
+            site, start, goal, arguments.seed, area, hazard_at_m=trigger_m, timeout_s=arguments.timeout
+        )
     except ScenarioError as error:
         parser.error(str(error))
     shown = msgspec.to_builtins(result)

@@ -14,6 +14,7 @@ import pytest
 from prometheus_client import REGISTRY
 
 from fog_contracts.messages import Trace
+from fog_contracts.stages import SPANS
 from fog_runtime import logs, metrics
 from fog_runtime.files import atomic_write
 from fog_runtime.health import Health, serve_plain
@@ -183,10 +184,10 @@ def stage_sum(stage):
 
 
 def test_trace_fills_the_finished_stages_only():
-    before = {stage: stage_sum(stage) for stage in metrics.STAGES}
+    before = {stage: stage_sum(stage) for stage in SPANS}
     trace = Trace(area="a1", epoch=1, seq=1, first_reading=10.0, confirmed=10.5, costmap_published=10.75)
     metrics.observe_trace(trace)
-    gained = {stage: stage_sum(stage) - before[stage] for stage in metrics.STAGES}
+    gained = {stage: stage_sum(stage) - before[stage] for stage in SPANS}
     assert gained == pytest.approx(
         {"debounce": 0.5, "costmap": 0.25, "plan": 0, "deliver": 0, "command": 0, "total": 0}
     )

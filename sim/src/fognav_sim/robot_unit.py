@@ -27,6 +27,7 @@ from fog_runtime.settings import CommonSettings, SettingsError, describe, load
 from fog_runtime.site import load_site
 from fog_runtime.zenoh_edge import ZenohEdge
 from fog_supervisor.supervisor import Event, Program, Supervisor
+from fognav_sim.drive.operator import OperatorCommand, OperatorPolicy, Shuttle
 
 _LOOK_S: Final = 1.0
 _TIMEOUT_S: Final = 5.0
@@ -44,43 +45,38 @@ class Settings(CommonSettings, frozen=True, kw_only=True):
     agent_http_port: int = 9100
 
 
-class _Drive:
+class _Operator:
     """The operator's part: what the robot last said, and where it is to go next."""
 
     def __init__(self, settings: Settings, robot: str, places: tuple[str, str], edge: ZenohEdge) -> None:
         self._settings = settings
         self._robot = robot
-        self._places = places
         self._edge = edge
         self._clock = SystemClock(settings.speed)
         assert settings.operator_key_file is not None
         self._key = bytes.fromhex(settings.operator_key_file.read_text("ascii"))
         self._token = settings.token_file.read_text("ascii").strip()
         self._state = edge.latest(ch.ROBOT_STATE, RobotState, robot=robot)
-        self._legs = 0
-        self._sent = False
+        self._policy = OperatorPolicy(self._clock.now())
+        self._shuttle = Shuttle(*places)
 
     async def run(self) -> None:
         """Enable and send, once a second as needed, until cancelled."""
-        async for _ in ticker(self._clock, _LOOK_S):
+        async for now in ticker(self._clock, _LOOK_S):
             state = self._state.get()
             if state is None:
                 continue
-            if not state.enabled or state.mode == "INIT":
-                await self._enable()
-            elif self._sent and state.goal_reached:
-                self._sent = False
-                self._legs += 1
-                _log.info("arrived", place=self._next_place(-1), legs=self._legs)
-            if state.enabled and not self._sent:
-                await self._send()
+            self._policy.on_state(state, now)
+            if (command := self._policy.command_due(now)) is not None:
+                await self._command(command)
+            if (place := self._shuttle.on_state(state)) is not None:
+                _log.info("arrived", place=place, legs=self._shuttle.legs)
+            if (place := self._shuttle.goal_due(state)) is not None:
+                await self._send(place)
 
-    def _next_place(self, ahead: int = 0) -> str:
-        return self._places[(self._legs + ahead + 1) % 2]
-
-    async def _enable(self) -> None:
+    async def _command(self, kind: OperatorCommand) -> None:
         unsigned = RobotCommand(
-            kind="enable",
+            kind=kind,
             robot=self._robot,
             operator="sim-robot",
             nonce=secrets.token_hex(16),
@@ -90,18 +86,22 @@ class _Drive:
             command = sign(unsigned, self._key)
             reply = await self._edge.ask(ch.ROBOT_COMMAND, command, CommandReply, _TIMEOUT_S, robot=self._robot)
         except ContractError as error:
-            _log.warning("enable_failed", reason=str(error))
+            _log.warning("command_failed", kind=kind, reason=str(error))
             return
-        _log.info("enable", accepted=reply is not None and reply.accepted, reason=reply.reason if reply else "silent")
+        _log.info(
+            "command",
+            kind=kind,
+            accepted=reply is not None and reply.accepted,
+            reason=reply.reason if reply else "silent",
+        )
 
-    async def _send(self) -> None:
-        place = self._next_place()
+    async def _send(self, place: str) -> None:
         try:
             await asyncio.to_thread(self._put_goal, place)
         except (OSError, urllib.error.URLError) as error:
             _log.warning("goal_failed", place=place, reason=str(error), url=self._settings.planner_url)
             return
-        self._sent = True
+        self._shuttle.under_way = True
         _log.info("goal", place=place)
 
     def _put_goal(self, place: str) -> None:
@@ -169,7 +169,7 @@ async def main() -> None:
         for program in _programs(settings, robot):
             supervisor.add(program)
             supervisor.start(program.name)
-        await _Drive(settings, robot, (site.demo.start, site.demo.goal), edge).run()
+        await _Operator(settings, robot, (site.demo.start, site.demo.goal), edge).run()
 
 
 if __name__ == "__main__":

@@ -1,1 +1,1 @@
-"""The demonstration: an operator who starts everything, sends the robot on its way, blocks that way, and judges."""
+"""The demonstration: it starts everything, sends the robot on its way, blocks that way, and evaluates the drive."""

@@ -9,11 +9,12 @@ from pathlib import Path
 from fog_runtime import logs
 from fog_runtime.site import SiteError, load_site
 from fog_supervisor.supervisor import NotReadyError
-from fognav.demo.judge import Verdict
-from fognav.demo.run import Demo, Options
+from fognav.demo.options import Options
+from fognav.demo.run import Demo
 from fognav.demo.view import show
 from fognav.output import WrongUseError, console
 from fognav.page.app import serve
+from fognav_sim.drive.evaluation import DriveOutcome
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -21,7 +22,7 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 async def run_demo(
     folder: Path, options: Options, *, headless: bool, page_port: int, say: Callable[[str], None]
 ) -> dict[str, object]:
-    """Run a demonstration on a site's folder until its verdict or a signal; return the report.
+    """Run a demonstration on a site's folder until its outcome or a signal; return the report.
 
     Raises `WrongUseError` for a site that can't be used.
     """
@@ -47,7 +48,7 @@ async def run_demo(
             return await demo.run(stop)
     except (NotReadyError, TimeoutError) as error:
         say(str(error))
-        demo.scene.verdict = Verdict("stopped", str(error))
+        demo.scene.outcome = DriveOutcome("stopped", str(error))
         return demo.report()
 
 

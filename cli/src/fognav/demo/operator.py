@@ -28,21 +28,16 @@ from fog_contracts.messages import (
 from fog_runtime.clock import Clock
 from fog_runtime.zenoh_edge import ZenohEdge
 from fog_supervisor import net
-from fognav.demo.danger import path_length
 from fognav.demo.scene import Scene
 from fognav.stack import PLANNER, Stack
+from fognav_sim.drive.hazard import path_length
+from fognav_sim.drive.operator import OperatorPolicy
 
 if TYPE_CHECKING:
-    from fognav.demo.judge import Judge
+    from fognav_sim.drive.evaluation import DriveEvaluation
 
 _ASK_TIMEOUT_S: Final = 2.0
 _ENABLE_EVERY_S: Final = 1.0
-_STOPPED_S: Final = 5.0
-"""A robot that stands in a protective stop for this long is looked at, and enabled again; one that just started is
-given as long to come by what it says that it lacks."""
-_HELD_S: Final = 61.0
-"""After 60 s in HOLD a robot waits for an operator."""
-_FAULT_S: Final = 2.0
 
 
 class Operator:
@@ -54,12 +49,11 @@ class Operator:
         self._scene = scene
         self._clock = clock
         self._robot = scene.robot
-        self.judge: Judge | None = None
+        self.evaluation: DriveEvaluation | None = None
         self.held_back = False
         """While this is so, nobody wants the robot to drive yet: it is not enabled."""
+        self._policy = OperatorPolicy(clock.now())
         self._mode = ""
-        self._mode_since = clock.now()
-        self._lacked_at = clock.now()
         self._spoke_of: set[str] = set()
         self._last_refusal = ""
         self._enabled_once = False
@@ -85,29 +79,28 @@ class Operator:
 
     def _on_truth(self, _ids: Mapping[str, str], truth: SimTruth) -> None:
         self._scene.take_truth(truth)
-        if self.judge is not None:
-            self.judge.on_truth(truth)
+        if self.evaluation is not None:
+            self.evaluation.on_truth(truth)
 
     def _on_state(self, _ids: Mapping[str, str], state: RobotState) -> None:
         now = self._clock.now()
         if state.mode != self._mode:
             self._scene.say(_mode_news(state, first=not self._mode))
-            self._mode, self._mode_since = state.mode, now
-        if not _lacks_only_us(state):
-            self._lacked_at = now
+            self._mode = state.mode
+        self._policy.on_state(state, now)
         self._scene.state = state
-        self._scene.traces.take(state.traces)
-        if self.judge is not None:
-            self.judge.on_state(state, now)
+        self._scene.traces.update(state.traces)
+        if self.evaluation is not None:
+            self.evaluation.on_state(state, now)
 
     def _on_path(self, _ids: Mapping[str, str], path: RobotPath) -> None:
         known = self._scene.path
         if known is None or (known.planner_epoch, known.plan_id) != (path.planner_epoch, path.plan_id):
             self._scene.say(_path_news(path))
         self._scene.path = path
-        self._scene.traces.take(path.traces)
-        if self.judge is not None:
-            self.judge.on_path(path, self._clock.now())
+        self._scene.traces.update(path.traces)
+        if self.evaluation is not None:
+            self.evaluation.on_path(path, self._clock.now())
 
     def _on_hazard(self, ids: Mapping[str, str], hazard: HazardArea) -> None:
         area, state = ids["area"], hazard.hazard.state
@@ -120,13 +113,12 @@ class Operator:
                 self._spoke_of.add(area)
             self._scene.hazards[area] = hazard
         if hazard.hazard.trace is not None:
-            self._scene.traces.take([hazard.hazard.trace])
+            self._scene.traces.update([hazard.hazard.trace])
 
     @property
     def ready_s(self) -> float:
         """For how long (s of the clock) the robot has lacked nothing but an operator who enables it."""
-        state = self._scene.state
-        return self._clock.now() - self._lacked_at if state is not None and _lacks_only_us(state) else 0.0
+        return self._policy.ready_s(self._clock.now())
 
     # --- acting -----------------------------------------------------------------------------------------------------
 
@@ -180,17 +172,8 @@ class Operator:
             await asyncio.sleep(self._clock.real(_ENABLE_EVERY_S))
 
     def _due(self) -> CommandKind | None:
-        state = self._scene.state
-        if state is None or self.held_back or (self.judge is None and self._scene.verdict is not None):
-            return None
-        stood = self._clock.now() - self._mode_since
-        if state.mode == "FAULT":
-            return "reset" if stood >= _FAULT_S else None
-        # One that lacks more is asked as well in the end: its refusal says what keeps it.
-        waits = state.mode == "INIT" and (_lacks_only_us(state) or stood >= _STOPPED_S)
-        waits = waits or (state.mode == "PROTECTIVE_STOP" and stood >= _STOPPED_S)
-        waits = waits or (state.mode == "HOLD" and stood >= _HELD_S)
-        return "enable" if waits else None
+        drive_over = self.evaluation is None and self._scene.outcome is not None
+        return None if self.held_back or drive_over else self._policy.command_due(self._clock.now())
 
     async def _act(self, kind: CommandKind) -> None:
         reply = await self.command(kind)
@@ -210,11 +193,6 @@ class Operator:
         if words != self._last_refusal:
             self._last_refusal = words
             self._scene.say(f"operator: {text}")
-
-
-def _lacks_only_us(state: RobotState) -> bool:
-    """Whether a robot that is not enabled names one reason alone: then that is the missing operator."""
-    return state.mode == "INIT" and len(state.reasons) <= 1
 
 
 def _mode_news(state: RobotState, *, first: bool) -> str:

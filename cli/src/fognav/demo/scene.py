@@ -19,9 +19,10 @@ from fog_contracts.messages import (
     SimTruth,
     Trace,
 )
+from fog_contracts.stages import Traces, durations_ms, hazard_to_path_ms
 from fog_runtime.maps import StaticMap
 from fog_runtime.site import LoadedSite
-from fognav.demo.judge import Traces, Verdict, hazard_to_path_ms, stages_ms
+from fognav_sim.drive.evaluation import DriveOutcome
 
 _EVENTS: Final = 200
 _TRAIL: Final = 20_000
@@ -48,7 +49,7 @@ class Scene:
     traces: Traces = field(default_factory=Traces)
     trace: Trace | None = None
     usage: dict[str, tuple[float, float]] = field(default_factory=dict)
-    verdict: Verdict | None = None
+    outcome: DriveOutcome | None = None
     events: deque[tuple[float, str]] = field(default_factory=lambda: deque(maxlen=_EVENTS))
     trail: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=_TRAIL))
     told: int = 0
@@ -69,6 +70,16 @@ class Scene:
         last = self.trail[-1] if self.trail else None
         if last is None or abs(last[0] - truth.x) + abs(last[1] - truth.y) >= _TRAIL_STEP_M:
             self.trail.append((round(truth.x, 2), round(truth.y, 2)))
+
+    def situation(self) -> str:
+        """Return what the robot and the fog said last, for the message of a failure."""
+        heard = (
+            f"the robot says {self.state.mode}: {'; '.join(self.state.reasons)}"
+            if self.state
+            else "no word of the robot"
+        )
+        areas = ", ".join(f"{area} {hazard.hazard.state}" for area, hazard in self.hazards.items())
+        return f"{heard}; areas: {areas or 'none heard of'}"
 
     def still(self) -> dict[str, Any]:
         """Return what does not change during a run, as plain values for the page."""
@@ -117,10 +128,10 @@ class Scene:
             "refusal": path.refusal.reason if path and path.refusal else "",
             "hazards": {area: hazard.hazard.state for area, hazard in self.hazards.items()},
             "seen": [[round(x, 2), round(y, 2)] for x, y in self.obstacles.points] if self.obstacles else [],
-            "stages": stages_ms(self.trace),
+            "stages": durations_ms(self.trace),
             "hazard_to_path": hazard_to_path_ms(self.trace),
             "processes": {name: [round(cpu, 1), round(rss, 1)] for name, (cpu, rss) in self.usage.items()},
-            "outcome": self.verdict and [self.verdict.outcome, self.verdict.reason],
+            "outcome": self.outcome and [self.outcome.kind, self.outcome.reason],
             "told": self.told,
             "events": [[round(at, 1), text] for at, text in list(self.events)[-30:]],
         }

@@ -10,10 +10,10 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from fognav.demo.danger import path_length
-from fognav.demo.judge import STAGES, hazard_to_path_ms, stages_ms
+from fog_contracts.stages import STAGES, durations_ms, hazard_to_path_ms
 from fognav.demo.run import Demo
 from fognav.demo.scene import Scene
+from fognav_sim.drive.hazard import path_length
 
 _PERIOD_S = 0.2
 _MODE_STYLES = {
@@ -68,10 +68,10 @@ def _hazards(scene: Scene) -> Panel:
         state = hazard.hazard.state if hazard else "no word"
         table.add_row(area.label or area.id, Text(state, style=_STATE_STYLES.get(state, "dim")))
     trace = scene.trace
-    took = stages_ms(trace)
+    took = durations_ms(trace)
     if took:
         table.add_row("", "")
-        for stage, _, _ in STAGES:
+        for stage in STAGES:
             table.add_row(stage, f"{took[stage]:.0f} ms" if stage in took else "...")
         total = hazard_to_path_ms(trace)
         if total is not None:

@@ -14,16 +14,7 @@ from prometheus_client import (
 )
 
 from fog_contracts.messages import Trace
-
-STAGES: Final = {
-    "debounce": ("first_reading", "confirmed"),
-    "costmap": ("confirmed", "costmap_published"),
-    "plan": ("costmap_published", "plan_published"),
-    "deliver": ("plan_published", "path_received"),
-    "command": ("path_received", "first_command"),
-    "total": ("first_reading", "first_command"),
-}
-"""Stages of a hazard's way, each between two stamps of its trace; `total` is the thesis's "around 3 seconds"."""
+from fog_contracts.stages import SPANS, durations_s
 
 STAGE_SECONDS: Final = Histogram(
     "fognav_stage_seconds",
@@ -49,19 +40,16 @@ CONNECTED: Final = Gauge("fognav_connected", "Whether the connection is up (1) o
 CONNECTS: Final = Counter("fognav_connects_total", "Connections made, the first one included", ["transport"])
 
 
-def observe_trace(trace: Trace, stages: Collection[str] = tuple(STAGES)) -> None:
+def observe_trace(trace: Trace, stages: Collection[str] = tuple(SPANS)) -> None:
     """Take a trace's finished `stages` into the histogram; stages with a stamp missing are left out.
 
     Each process observes the stages that it completes, so that none counts twice.
     """
-    for stage in stages:
-        begin, end = (getattr(trace, name) for name in STAGES[stage])
-        if begin == 0.0 or end == 0.0:
-            continue
-        if end < begin:
+    for stage, seconds in durations_s(trace, {stage: SPANS[stage] for stage in stages}).items():
+        if seconds < 0.0:
             TRACE_SKEW.labels(stage).inc()
-            continue
-        STAGE_SECONDS.labels(stage).observe(end - begin)
+        else:
+            STAGE_SECONDS.labels(stage).observe(seconds)
 
 
 def exposition(registry: CollectorRegistry = REGISTRY) -> tuple[bytes, str]:

@@ -1,4 +1,4 @@
-"""Which area becomes blocked, when, and by what: pure, drawn by a seed."""
+"""Which area of a drive becomes blocked, when, and by what: drawn by a seed. Pure."""
 
 import itertools
 import math
@@ -10,12 +10,10 @@ from typing import Final
 from fog_contracts.geometry import Point, contains_point, distance_to_polygon
 from fog_contracts.messages import SimObstacle
 from fog_contracts.site import AreaSite, Site
-from fognav_sim.scenario import ScenarioError
+from fognav_sim.scenario import KEEP_AWAY_M, ScenarioError
 
 TRIGGER_M: Final = (3.0, 8.0)
 """Between these the travelled distance is drawn after which the way is blocked."""
-KEEP_AWAY_M: Final = 3.0
-"""Nothing appears nearer to the robot than this."""
 BRAKING_ROOM_M: Final = 1.0
 _STEP: Final = 0.05
 
@@ -23,12 +21,8 @@ BarrierIn = Callable[[AreaSite], SimObstacle]
 """Makes a barrier that closes an area; raises `ScenarioError` where none fits."""
 
 
-class NoDangerError(ValueError):
-    """No area of the site fits the way; the message says why."""
-
-
 @dataclass(frozen=True)
-class Danger:
+class PlannedHazard:
     """What will happen: the area, the barrier in it, and the travelled distance (m) at which it appears."""
 
     area: AreaSite
@@ -55,16 +49,22 @@ def path_length(path: Sequence[Point]) -> float:
     return sum(math.dist(a, b) for a, b in itertools.pairwise(path))
 
 
-def choose(site: Site, path: Sequence[Point], seed: int, barrier_in: BarrierIn) -> Danger:
+def draw_trigger(seed: int) -> float:
+    """Draw the travelled distance (m) after which the way is blocked."""
+    return random.Random(seed).uniform(*TRIGGER_M)
+
+
+def draw_hazard(site: Site, path: Sequence[Point], seed: int, barrier_in: BarrierIn) -> PlannedHazard:
     """Draw the area that becomes blocked, among the demo's areas that the path crosses, and the moment.
 
-    The moment is early enough to keep the robot away from the area when the barrier appears. Raises `NoDangerError`.
+    The moment is early enough to keep the robot away from the area when the barrier appears. Raises `ScenarioError`
+    when no area fits; the message says why.
     """
     wanted = site.demo.areas if site.demo else []
     known = {area.id: area for area in site.areas}
     generator = random.Random(seed)
-    trigger = generator.uniform(*TRIGGER_M)
-    fitting: list[Danger] = []
+    trigger = generator.uniform(*TRIGGER_M)  # as draw_trigger; the area is drawn next
+    fitting: list[PlannedHazard] = []
     reasons: list[str] = []
     for identifier in wanted:
         area = known[identifier]
@@ -77,15 +77,45 @@ def choose(site: Site, path: Sequence[Point], seed: int, barrier_in: BarrierIn) 
             reasons.append(f"{identifier} lies only {entry:.1f} m along the way")
             continue
         try:
-            fitting.append(Danger(area, barrier_in(area), min(trigger, latest)))
+            fitting.append(PlannedHazard(area, barrier_in(area), min(trigger, latest)))
         except ScenarioError as error:
             reasons.append(str(error))
     if not fitting:
         why = "; ".join(reasons) or "[demo] of site.toml lists no areas"
-        raise NoDangerError(f"no area can be blocked on this way: {why}. Choose other areas, or use --no-hazard")
+        raise ScenarioError(f"no area can be blocked on this way: {why}. Choose other areas, or use --no-hazard")
     return generator.choice(fitting)
 
 
-def may_appear(danger: Danger, robot: Point) -> bool:
+def may_appear(hazard: PlannedHazard, robot: Point) -> bool:
     """Whether the robot is far enough away for the barrier to appear."""
-    return min(distance_to_polygon(p, *robot) for p in (danger.area.polygon, danger.barrier.polygon)) >= KEEP_AWAY_M
+    return min(distance_to_polygon(p, *robot) for p in (hazard.area.polygon, hazard.barrier.polygon)) >= KEEP_AWAY_M
+
+
+class HazardSchedule:
+    """Draws the hazard of one drive when its first path is known, and says when to place the barrier."""
+
+    def __init__(self, site: Site, seed: int, barrier_in: BarrierIn) -> None:
+        self._site = site
+        self._seed = seed
+        self._barrier_in = barrier_in
+        self.planned: PlannedHazard | None = None
+
+    def draw(self, path: Sequence[Point]) -> PlannedHazard:
+        """Draw the hazard for a path, in place of any before; raises `ScenarioError`."""
+        self.planned = draw_hazard(self._site, path, self._seed, self._barrier_in)
+        return self.planned
+
+    def due(self, path: Sequence[Point], travelled_m: float, robot: Point) -> PlannedHazard | None:
+        """Return the hazard whose barrier is to be placed now, or None while it is too early; raises `ScenarioError`.
+
+        `path` is the robot's way from here on, `travelled_m` what it has driven, `robot` where it really is (m).
+        """
+        planned = self.planned or self.draw(path)
+        if travelled_m < planned.trigger_m:
+            return None
+        if along(path, planned.area.polygon) is None or not may_appear(planned, robot):
+            # The way has changed meanwhile (an obstacle, a service that was away): another area, from here on.
+            planned = self.draw(path)
+            if travelled_m < planned.trigger_m or not may_appear(planned, robot):
+                return None
+        return planned

@@ -1,4 +1,4 @@
-"""Did it go well? Judged by the truth of the simulated world, not by what the robot believes. Pure."""
+"""How a drive went, by the truth of the simulated world and not by what the robot believes. Pure."""
 
 import math
 from collections import Counter
@@ -6,13 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
-import msgspec
-
 from fog_contracts.geometry import Point, contains_point, distance_to_polygon
-from fog_contracts.messages import RobotPath, RobotState, SimTruth, Trace
+from fog_contracts.messages import RobotPath, RobotState, SimTruth
 from fog_contracts.site import AreaSite
 
-Outcome = Literal["reached", "refused", "contact", "timeout", "stopped"]
+OutcomeKind = Literal["reached", "refused", "contact", "timeout", "stopped"]
 
 TOLERANCE_M: Final = 0.30
 """How far from the goal the robot may really be: its own tolerance (0.10 m) plus what it may err about its place."""
@@ -20,77 +18,19 @@ CLAIM_S: Final = 3.0
 """How long a robot that says it has arrived, but has not, may go on correcting itself."""
 REFUSAL_S: Final = 20.0
 """How long a refusal stands before it is the end: a hazard may pass."""
-STAGES: Final = (
-    ("debounce", "first_reading", "confirmed"),
-    ("costmap", "confirmed", "costmap_published"),
-    ("plan", "costmap_published", "plan_published"),
-    ("deliver", "plan_published", "path_received"),
-    ("command", "path_received", "first_command"),
-)
-"""Stage, and the stamps of a trace between which it lies."""
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """How the run ended, and why in words."""
+class DriveOutcome:
+    """How the drive ended, and why in words."""
 
-    outcome: Outcome
+    kind: OutcomeKind
     reason: str
 
 
-class Traces:
-    """Collects what messages tell of each hazard's way through the stages."""
-
-    def __init__(self) -> None:
-        self._known: dict[tuple[str, int, int], Trace] = {}
-
-    def take(self, traces: Sequence[Trace]) -> None:
-        """Merge traces: a stage that was reached once stays reached."""
-        for trace in traces:
-            key = (trace.area, trace.epoch, trace.seq)
-            known = self._known.get(key)
-            if known is None:
-                self._known[key] = trace
-                continue
-            stamps = {
-                name: getattr(known, name) or getattr(trace, name)
-                for name in trace.__struct_fields__
-                if name not in {"area", "epoch", "seq"}
-            }
-            self._known[key] = msgspec.structs.replace(known, **stamps)
-
-    def of(self, area: str, since: float) -> Trace | None:
-        """Return the first trace of an area whose first reading is not older than `since` (stamp)."""
-        found = [t for t in self._known.values() if t.area == area and t.first_reading >= since]
-        return min(found, key=lambda t: t.first_reading, default=None)
-
-    def latest(self) -> Trace | None:
-        """Return the trace with the youngest first reading."""
-        return max(self._known.values(), key=lambda t: t.first_reading, default=None)
-
-
-def stages_ms(trace: Trace | None) -> dict[str, float]:
-    """Milliseconds that each stage took, as far as the trace got."""
-    if trace is None:
-        return {}
-    found = {}
-    for stage, begin, end in STAGES:
-        begun, ended = getattr(trace, begin), getattr(trace, end)
-        if begun and ended:
-            found[stage] = round((ended - begun) * 1000, 1)
-    return found
-
-
-def hazard_to_path_ms(trace: Trace | None) -> float | None:
-    """Milliseconds from the first reading that saw the danger to the robot's new path."""
-    if trace is None or not trace.first_reading or not trace.path_received:
-        return None
-    return round((trace.path_received - trace.first_reading) * 1000, 1)
-
-
 @dataclass(kw_only=True)
-class Judge:
-    """Watches a drive to `goal` (m); `now` is in seconds of the clock, and the drive begins at `begun`."""
+class DriveEvaluation:
+    """Follows a drive to `goal` (m); `now` is in seconds of the clock, and the drive begins at `begun`."""
 
     goal: Point
     goal_id: str
@@ -102,7 +42,7 @@ class Judge:
     blocked_clearance_m: float = math.inf
     min_clearance_m: float = math.inf
     route_areas: list[str] = field(default_factory=list)
-    paths: int = 0
+    plans: int = 0
     modes: Counter[str] = field(default_factory=Counter)
     """How often the robot entered each of its modes."""
     stops: list[str] = field(default_factory=list)
@@ -114,7 +54,7 @@ class Judge:
     _claimed_at: float | None = None
     _refused_at: float | None = None
     _refusal: str = ""
-    _plans: set[tuple[int, int]] = field(default_factory=set)
+    _known_plans: set[tuple[int, int]] = field(default_factory=set)
 
     @property
     def distance_m(self) -> float:
@@ -128,7 +68,7 @@ class Judge:
         self.blocked = area
 
     def on_truth(self, truth: SimTruth) -> None:
-        """Take what is really so."""
+        """Take the simulator's ground truth."""
         if self._begun_at_m is None:
             self._begun_at_m, self._contacts_before = truth.distance, truth.contacts
         self._truth = truth
@@ -160,29 +100,31 @@ class Judge:
             return
         if path.refusal is None:
             self._refused_at = None
-            self._plans.add((path.planner_epoch, path.plan_id))
-            self.paths = len(self._plans)
+            self._known_plans.add((path.planner_epoch, path.plan_id))
+            self.plans = len(self._known_plans)
         elif self._refused_at is None:
             self._refused_at = now
             self._refusal = f"{path.refusal.name}: {path.refusal.reason}"
 
-    def verdict(self, now: float) -> Verdict | None:
-        """Return how the run ended, or None while it goes on."""
+    def outcome(self, now: float) -> DriveOutcome | None:
+        """Return how the drive ended, or None while it goes on."""
         truth = self._truth
         if truth is not None and truth.contacts > (self._contacts_before or 0):
-            return Verdict("contact", f"the robot touched something at ({truth.x:.2f}, {truth.y:.2f})")
+            return DriveOutcome("contact", f"the robot touched something at ({truth.x:.2f}, {truth.y:.2f})")
         if truth is not None and self._claimed_at is not None:
             off = math.hypot(truth.x - self.goal[0], truth.y - self.goal[1])
             if off <= TOLERANCE_M:
-                return Verdict("reached", f"the robot stands {off:.2f} m from its goal")
+                return DriveOutcome("reached", f"the robot stands {off:.2f} m from its goal")
             if now - self._claimed_at > CLAIM_S:
-                return Verdict("stopped", f"the robot says that it has arrived, but it is {off:.2f} m from its goal")
+                return DriveOutcome(
+                    "stopped", f"the robot says that it has arrived, but it is {off:.2f} m from its goal"
+                )
         if self._refused_at is not None and now - self._refused_at > REFUSAL_S:
-            return Verdict("refused", self._refusal)
+            return DriveOutcome("refused", self._refusal)
         if now - self.begun > self.timeout_s:
-            return Verdict("timeout", f"the goal was not reached within {self.timeout_s:.0f} s")
+            return DriveOutcome("timeout", f"the goal was not reached within {self.timeout_s:.0f} s")
         return None
 
-    def success(self, outcome: Outcome) -> bool:
-        """Whether all that was asked for came true: arrived, nothing touched, the danger avoided."""
-        return outcome == "reached" and not self.entered_blocked
+    def success(self, kind: OutcomeKind) -> bool:
+        """Whether all that was asked for came true: arrived, nothing touched, the blocked area avoided."""
+        return kind == "reached" and not self.entered_blocked

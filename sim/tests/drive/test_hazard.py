@@ -6,8 +6,8 @@ from hypothesis import strategies as st
 
 from fog_contracts.messages import SimObstacle
 from fog_contracts.site import AreaSite, DemoPlan, NodeSite, Site, Sonar
-from fognav.demo.danger import KEEP_AWAY_M, NoDangerError, along, choose, may_appear
-from fognav_sim.scenario import ScenarioError
+from fognav_sim.drive.hazard import HazardSchedule, along, draw_hazard, draw_trigger, may_appear
+from fognav_sim.scenario import KEEP_AWAY_M, ScenarioError
 
 PATH = [(0.0, 0.0), (10.0, 0.0), (30.0, 0.0)]
 
@@ -46,32 +46,51 @@ def test_an_area_that_can_t_be_closed_is_left_out_and_said_so() -> None:
     def nowhere(area: AreaSite) -> SimObstacle:
         raise ScenarioError(f"area {area.id}: no barrier fits")
 
-    with pytest.raises(NoDangerError, match="z1: no barrier fits"):
-        choose(site(("z1", 12.0)), PATH, 1, nowhere)
+    with pytest.raises(ScenarioError, match="z1: no barrier fits"):
+        draw_hazard(site(("z1", 12.0)), PATH, 1, nowhere)
 
 
 @given(seed=st.integers(0, 10_000))
 def test_the_draw_is_the_same_for_the_same_seed_and_early_enough(seed: int) -> None:
     plan = site(("z1", 9.0), ("z2", 20.0), ("z3", 40.0))
-    drawn = choose(plan, PATH, seed, anywhere)
-    assert drawn == choose(plan, PATH, seed, anywhere)
+    drawn = draw_hazard(plan, PATH, seed, anywhere)
+    assert drawn == draw_hazard(plan, PATH, seed, anywhere)
     assert drawn.area.id in {"z1", "z2"}
     entry = along(PATH, drawn.area.polygon)
     assert entry is not None
+    assert drawn.trigger_m <= draw_trigger(seed)
     assert 0.0 <= drawn.trigger_m <= min(8.0, entry - KEEP_AWAY_M)
     assert may_appear(drawn, (drawn.trigger_m, 0.0))
 
 
 def test_every_area_on_the_way_is_drawn_by_some_seed() -> None:
     plan = site(("z1", 9.0), ("z2", 20.0))
-    assert {choose(plan, PATH, seed, anywhere).area.id for seed in range(30)} == {"z1", "z2"}
+    assert {draw_hazard(plan, PATH, seed, anywhere).area.id for seed in range(30)} == {"z1", "z2"}
 
 
 def test_a_way_that_meets_no_area_says_why() -> None:
-    with pytest.raises(NoDangerError, match="does not cross far"):
-        choose(site(("far", 60.0)), PATH, 1, anywhere)
+    with pytest.raises(ScenarioError, match="does not cross far"):
+        draw_hazard(site(("far", 60.0)), PATH, 1, anywhere)
 
 
 def test_nothing_appears_near_the_robot() -> None:
-    drawn = choose(site(("z1", 12.0)), PATH, 1, anywhere)
+    drawn = draw_hazard(site(("z1", 12.0)), PATH, 1, anywhere)
     assert not may_appear(drawn, (9.5, 0.0))
+
+
+def test_a_barrier_is_due_after_its_distance_and_never_near_the_robot() -> None:
+    schedule = HazardSchedule(site(("z1", 12.0)), 1, anywhere)
+    planned = schedule.draw(PATH)
+    assert schedule.due(PATH, planned.trigger_m - 0.1, (planned.trigger_m - 0.1, 0.0)) is None
+    assert schedule.due(PATH, planned.trigger_m, (9.5, 0.0)) is None
+    assert schedule.due(PATH, planned.trigger_m, (planned.trigger_m, 0.0)) == planned
+
+
+def test_a_robot_that_goes_another_way_meanwhile_gets_an_area_of_that_way() -> None:
+    schedule = HazardSchedule(site(("z1", 12.0), ("z2", -30.0)), 1, anywhere)
+    assert schedule.draw(PATH).area.id == "z1"
+    back = [(-x, y) for x, y in PATH]
+    due = schedule.due(back, 9.0, (0.0, 0.0))
+    assert due is not None
+    assert due.area.id == "z2"
+    assert schedule.planned == due

@@ -1,0 +1,204 @@
+"""One attempt of a demonstration, at one speed: the whole system started, one drive, everything ended."""
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator
+from typing import Final
+
+from fog_runtime.clock import SystemClock
+from fog_runtime.zenoh_edge import ZenohEdge
+from fog_supervisor.supervisor import Event
+from fognav.demo.background import Background
+from fognav.demo.operator import Operator
+from fognav.demo.options import DrivePlan
+from fognav.demo.placement import HazardPlacement
+from fognav.demo.preparation import Preparation
+from fognav.demo.scene import Scene
+from fognav.demo.speed import SpeedWatch, TooFastError
+from fognav.demo.usage import Usage, children
+from fognav.output import WrongUseError
+from fognav.recording import recording
+from fognav.stack import WATCHDOG, Stack, StackConfig
+from fognav_sim.drive.evaluation import DriveEvaluation, DriveOutcome
+
+READY_S: Final = 90.0
+"""Real seconds for everything to start."""
+_TICK_S: Final = 0.1
+_USAGE_S: Final = 1.0
+_SPEED_CHECK_S: Final = 2.0
+_SLOWEST_MPS: Final = 0.08
+"""Mean speed (way, standing and detours together) below which a drive is given up."""
+_DETOUR: Final = 3.0
+_TIMEOUT_BASE_S: Final = 180.0
+
+
+class Attempt:
+    """One attempt; what it found out is there for the report while it runs and afterwards."""
+
+    def __init__(self, plan: DrivePlan, scene: Scene) -> None:
+        self.plan = plan
+        self.scene = scene
+        self.evaluation: DriveEvaluation | None = None
+        self.hazard = HazardPlacement(plan.site, plan.options.seed, scene)
+        self.speed_watch = SpeedWatch(scene.speed)
+        self.usage = Usage()
+        self.restarts: dict[str, int] = {}
+        """How often each process died and was started again."""
+        self.ended_at: float | None = None
+
+    # --- the system ---
+
+    async def run(self, stop: asyncio.Event) -> None:
+        """Start everything, drive, and end everything; with `keep_running` only when `stop` is set.
+
+        Raises `NotReadyError` or `TimeoutError` when something does not come about, `TooFastError`, and `WrongUseError`
+        when the site can't be used so.
+        """
+        options = self.plan.options
+        clock = SystemClock(self.scene.speed)
+        site_dir = self.plan.site.directory
+        config = StackConfig(site_dir=site_dir, robot=self.plan.robot, seed=options.seed, speed=self.scene.speed)
+        async with Stack(config, self._on_process) as stack, self._keeping_logs(stack):
+            if options.hazard and not self.plan.hazard:
+                self.scene.say("the site's [demo] lists no areas: nothing will be blocked")
+            self.scene.say(f"starting {len(stack.supervisor.names)} processes, logs in {stack.folder / 'logs'}")
+            await stack.start_servers(READY_S)
+            async with contextlib.AsyncExitStack() as ends:
+                # From before the first word of any service: a file that lacks the map's first versions is no input for
+                # a replay.
+                await ends.enter_async_context(self._recording(stack, clock))
+                await stack.start_system(READY_S)
+                edge = await ends.enter_async_context(self._open(stack, clock, "demo"))
+                operator = Operator(edge, stack, self.scene, clock)
+                async with Background(operator.keep_enabled(), self._sample_usage(stack)) as background:
+                    await self.drive(operator, clock, background)
+                    if options.keep_running:
+                        self.scene.say("still running: Ctrl-C ends everything")
+                        await stop.wait()
+
+    @contextlib.asynccontextmanager
+    async def _recording(self, stack: Stack, clock: SystemClock) -> AsyncIterator[None]:
+        """Record every channel if that was asked for; by a session of its own, for any listener hears the same."""
+        path = self.plan.options.record
+        if path is None:
+            yield
+            return
+        numbers = [area.number for area in self.plan.site.site.areas if area.number is not None]
+        async with (
+            self._open(stack, clock, "record") as edge,
+            recording(path, mqtt_url=stack.mqtt_url, zenoh=edge, clock=clock, numbers=numbers),
+        ):
+            yield
+
+    @contextlib.asynccontextmanager
+    async def _keeping_logs(self, stack: Stack) -> AsyncIterator[None]:
+        """Keep the logs of an attempt that went wrong by itself."""
+        try:
+            yield
+        except (asyncio.CancelledError, TooFastError, WrongUseError):
+            raise
+        except Exception:
+            stack.keep_files = True
+            raise
+        else:
+            stack.keep_files = not self.success()
+        finally:
+            if stack.keep_files:
+                self.scene.say(f"its logs are kept in {stack.folder / 'logs'}")
+
+    def _open(self, stack: Stack, clock: SystemClock, name: str) -> contextlib.AbstractAsyncContextManager[ZenohEdge]:
+        site = self.plan.site.site.id
+        return ZenohEdge.open(connect=[stack.zenoh_endpoint], clock=clock, role="console", id=name, site=site)
+
+    def _on_process(self, event: Event) -> None:
+        if event.what == "died":
+            self.restarts[event.program] = self.restarts.get(event.program, 0) + 1
+            self.scene.say(f"{event.program} died ({event.detail})")
+        elif event.what == "started" and event.program in self.restarts:
+            self.scene.say(f"{event.program} was started again")
+
+    async def _sample_usage(self, stack: Stack) -> None:
+        while True:
+            pids = stack.pids()
+            if watchdog := pids.get(WATCHDOG):
+                for child in children(watchdog)[:1]:
+                    pids["robot-guardian"] = child
+            self.usage.sample(pids)
+            self.scene.usage = self.usage.recent()
+            await asyncio.sleep(_USAGE_S)
+
+    # --- the drive ---
+
+    async def drive(self, operator: Operator, clock: SystemClock, background: Background) -> None:
+        """Prepare the robot, send it to its goal, and watch it until the drive has an outcome."""
+        preparation = Preparation(self.plan, self.scene, operator, clock, background)
+        await preparation.make_ready()
+        if (failed := await preparation.send_goal()) is not None:
+            self.end(failed)
+            return
+        goal, truth = self.scene.goal, self.scene.truth
+        assert goal is not None
+        assert truth is not None
+        place = self.plan.goal
+        # Rough length (m) of the way: right angles from where the robot is.
+        span = abs(truth.x - place.x) + abs(truth.y - place.y)
+        self.evaluation = operator.evaluation = DriveEvaluation(
+            goal=(place.x, place.y),
+            goal_id=goal.goal_id,
+            areas=self.plan.site.site.areas,
+            begun=clock.now(),
+            timeout_s=_TIMEOUT_BASE_S + _DETOUR * span / _SLOWEST_MPS,
+        )
+        self.scene.phase = "driving"
+        self.usage.restart()
+        await self._watch(operator, clock, self.evaluation, background)
+
+    async def _watch(
+        self, operator: Operator, clock: SystemClock, evaluation: DriveEvaluation, background: Background
+    ) -> None:
+        checked = clock.now()
+        while (outcome := evaluation.outcome(clock.now())) is None:
+            background.check()
+            if self.plan.hazard:
+                await self.hazard.place_if_due(operator, evaluation, clock)
+            if clock.now() - checked >= _SPEED_CHECK_S * clock.speed:
+                self._check_speed(clock.now() - checked, evaluation)
+                checked = clock.now()
+            await asyncio.sleep(max(0.02, clock.real(_TICK_S)))
+            self.scene.trace = self.hazard.trace()
+        self.speed_watch.check_outcome(
+            outcome,
+            self.scene.truth,
+            self.unexplained_stops(),
+            entered_blocked=evaluation.entered_blocked,
+            hazard_done=self.hazard.placed_at is not None or not self.plan.hazard,
+        )
+        self.end(outcome)
+        self.ended_at = clock.now()
+
+    def _check_speed(self, elapsed_s: float, evaluation: DriveEvaluation) -> None:
+        truth, state = self.scene.truth, self.scene.state
+        if truth is not None and state is not None:
+            stops = self.unexplained_stops()
+            self.speed_watch.check(elapsed_s, truth, state, stops, entered_blocked=evaluation.entered_blocked)
+
+    def unexplained_stops(self) -> list[str]:
+        """Return the stops of this drive that nothing in its scene asks for.
+
+        The barrier stands where no robot is, and who touches something has failed anyway; but after a process died, a
+        stop is what should follow.
+        """
+        return [] if self.evaluation is None or self.restarts else self.evaluation.stops
+
+    def end(self, outcome: DriveOutcome) -> None:
+        """Show the outcome."""
+        self.scene.outcome = outcome
+        self.scene.phase = outcome.kind
+        self.scene.say(f"{outcome.kind}: {outcome.reason}")
+
+    def success(self) -> bool:
+        """Whether all that was asked for came true."""
+        evaluation, outcome = self.evaluation, self.scene.outcome
+        if evaluation is None or outcome is None or not evaluation.success(outcome.kind):
+            return False
+        return not self.plan.hazard or self.hazard.placed_at is not None

@@ -1,0 +1,54 @@
+"""What a demonstration was asked for, and what that means on a site."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from fog_contracts.site import Place
+from fog_runtime.site import LoadedSite
+from fognav.output import WrongUseError
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """What `fognav demo` was asked for."""
+
+    seed: int = 1
+    speed: float = 1.0
+    hazard: bool = True
+    keep_running: bool = False
+    record: Path | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class DrivePlan:
+    """A drive of a site's first robot to the goal of its `[demo]`; with `hazard` its way gets blocked."""
+
+    site: LoadedSite
+    options: Options
+    robot: str
+    place: str
+    """Id of the place that is the goal."""
+    goal: Place
+    hazard: bool
+
+    @classmethod
+    def of(cls, site: LoadedSite, options: Options) -> "DrivePlan":
+        """Return the plan; raises `WrongUseError` for a site without `[demo]` or without a robot."""
+        demo = site.site.demo
+        if demo is None:
+            raise WrongUseError(f"{site.directory}/site.toml has no [demo]: name a start, a goal and areas there")
+        if not site.site.robots:
+            raise WrongUseError(f"{site.directory}/site.toml has no [[robots]]: say where the robot starts")
+        return cls(
+            site=site,
+            options=options,
+            robot=site.site.robots[0].id,
+            place=demo.goal,
+            goal=site.site.places[demo.goal],
+            hazard=options.hazard and bool(demo.areas),
+        )
+
+    @property
+    def watched_areas(self) -> set[str]:
+        """Ids of the areas that have nodes."""
+        return {node.area for node in self.site.site.nodes}

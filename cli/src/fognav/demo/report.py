@@ -1,0 +1,61 @@
+"""The report of a demonstration (`fognav demo --report`)."""
+
+import math
+from collections.abc import Sequence
+
+from fog_contracts.stages import durations_ms, hazard_to_path_ms
+from fognav.demo.attempt import Attempt
+
+
+def modes(attempt: Attempt) -> dict[str, int]:
+    """Return how often the robot entered each mode on its drive."""
+    return dict(attempt.evaluation.modes) if attempt.evaluation is not None else {}
+
+
+def report(attempt: Attempt, given_up: Sequence[dict[str, object]]) -> dict[str, object]:
+    """Sum up the last attempt; `given_up` are those before it whose speed was not kept."""
+    return {
+        **_outcome(attempt),
+        **_drive(attempt),
+        "processes": attempt.usage.report(),
+        "restarts": attempt.restarts,
+        "modes": modes(attempt),
+        "given_up": list(given_up),
+        "speed": attempt.scene.speed,
+        "asked_speed": attempt.plan.options.speed,
+        "sustained_speed": attempt.speed_watch.sustained,
+        "events": [f"{at:.1f} {text}" for at, text in attempt.scene.events],
+    }
+
+
+def _outcome(attempt: Attempt) -> dict[str, object]:
+    outcome = attempt.scene.outcome
+    return {
+        "outcome": outcome.kind if outcome else "stopped",
+        "success": attempt.success(),
+        "reason": outcome.reason if outcome else "it ended before there was an outcome",
+        "site": attempt.plan.site.site.id,
+        "seed": attempt.plan.options.seed,
+    }
+
+
+def _drive(attempt: Attempt) -> dict[str, object]:
+    evaluation, trace = attempt.evaluation, attempt.hazard.trace()
+    begun, ended = (evaluation.begun if evaluation else 0.0), attempt.ended_at
+    return {
+        "distance_m": round(evaluation.distance_m, 2) if evaluation else 0.0,
+        "time_s": round(ended - begun, 2) if evaluation and ended else None,
+        "min_clearance_m": _finite(evaluation.min_clearance_m) if evaluation else None,
+        "hazard": attempt.plan.hazard,
+        "area": attempt.hazard.area,
+        "area_entered": evaluation.entered_blocked if evaluation else False,
+        "area_clearance_m": _finite(evaluation.blocked_clearance_m) if evaluation else None,
+        "route_areas": evaluation.route_areas if evaluation else [],
+        "plans": evaluation.plans if evaluation else 0,
+        "stages_ms": durations_ms(trace),
+        "hazard_to_path_ms": hazard_to_path_ms(trace),
+    }
+
+
+def _finite(value: float) -> float | None:
+    return round(value, 3) if math.isfinite(value) else None

@@ -16,7 +16,6 @@ from fog_contracts import channels as ch
 from fog_contracts.follower import MapFollower
 from fog_contracts.handlers import Moment
 from fog_contracts.messages import (
-    AreaDefinition,
     AreaHazard,
     HazardArea,
     MapDelta,
@@ -26,7 +25,6 @@ from fog_contracts.messages import (
     PlanRequest,
     Pose,
     RobotGoal,
-    RobotObstacles,
     RobotPath,
     RobotPose,
     RobotState,
@@ -35,11 +33,13 @@ from fog_contracts.messages import (
 from fog_runtime.record import read
 from fog_runtime.site import LoadedSite, load_site
 from hazard_aggregator.core import Aggregator
-from map_service.core import MapChange, MapCore
+from map_service.core import MapCore
 from planner.core import PlannerCore
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
+
+    from fog_contracts.handlers import Publication
 
 Heard = tuple[float, ch.Channel, dict[str, str], Message | str]
 
@@ -107,37 +107,33 @@ def empty_map(heard: list[Heard], site: LoadedSite) -> MapCore:
 def draw(heard: list[Heard], site: LoadedSite) -> tuple[list[MapDelta], MapSnapshot]:
     """Return the deltas that a map-service publishes, and its last map."""
     core, deltas = empty_map(heard, site), []
+    handlers = core.handlers()
 
-    def take(change: MapChange) -> None:
-        deltas.extend(change.deltas)
+    def take(publications: Sequence[Publication]) -> None:
+        deltas.extend(p.message for p in publications if isinstance(p.message, MapDelta))
 
-    for at, event in beating(heard, heard[0][0]):
+    begin = Moment(heard[0][0], heard[0][0])
+    # What crosses no channel: the aggregator lives, and the broker is connected.
+    take(core.load_zones([], begin))
+    take(core.on_broker(begin, connected=True))
+    take(core.on_aggregator("recorded", begin, alive=True))
+    for at, event in beating(heard, begin.now):
+        moment = Moment(at, at)
         if event is None:
-            take(core.tick(at, at))
+            take(core.tick(moment))
             continue
-        _, _, ids, message = event
-        if isinstance(message, AreaDefinition):
-            take(core.on_definition(message, at))
-        elif isinstance(message, AreaHazard):
-            take(core.on_hazard(message, at))
-        elif isinstance(message, RobotObstacles):
-            take(core.on_obstacles(ids["robot"], message, at, at))
-        elif isinstance(message, RobotPose):
-            core.on_pose(ids["robot"], message, at)
-        elif isinstance(message, ZoneSet):
-            kept = {zone.id for zone in message.zones}
-            for zone in core.zones():
-                if zone.id not in kept:
-                    take(core.remove_zone(zone.id, at))
-            for zone in message.zones:
-                take(core.put_zone(zone, at))
-    return deltas, core.snapshot()
+        _, channel, ids, message = event
+        if isinstance(message, ZoneSet):
+            take(core.load_zones(message.zones, moment))
+        elif channel in handlers:
+            take(handlers[channel](ids, message, moment))
+    return deltas, core.costmap.snapshot()
 
 
 def copy(heard: list[Heard], site: LoadedSite) -> list[MapHeartbeat]:
     """Return every version that a copy reaches by the recorded deltas; raises `ReplayError` if one does not fit."""
     follower, versions = MapFollower(), []
-    follower.on_snapshot(empty_map(heard, site).snapshot(), heard[0][0])
+    follower.on_snapshot(empty_map(heard, site).costmap.snapshot(), heard[0][0])
     for at, _, _, message in heard:
         if isinstance(message, MapDelta):
             applied = follower.on_delta(message, at)
@@ -184,7 +180,7 @@ def new_planner(heard: list[Heard], site: LoadedSite) -> PlannerCore:
     _, path = first(heard, ch.ROBOT_PATH)
     assert isinstance(path, RobotPath)
     core = PlannerCore(path.planner_epoch)
-    core.load(empty_map(heard, site).snapshot(), heard[0][0])
+    core.load(empty_map(heard, site).costmap.snapshot(), heard[0][0])
     return core
 
 

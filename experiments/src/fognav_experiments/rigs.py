@@ -13,8 +13,6 @@ from fog_contracts.codec import decode, encode
 from fog_contracts.commands import sign
 from fog_contracts.handlers import Moment
 from fog_contracts.messages import (
-    AreaDefinition,
-    AreaHazard,
     CommandReply,
     HazardArea,
     MapDelta,
@@ -49,7 +47,6 @@ if TYPE_CHECKING:
     from fog_contracts.site import RobotSite
     from fog_runtime.site import LoadedSite
     from fognav_sim.world import World
-    from map_service.core import MapChange
 
 M = TypeVar("M", bound=Message)
 
@@ -212,17 +209,18 @@ class FogRig:
         self._heartbeats: list[MapHeartbeat] = []
         self._zones: list[ZoneSet] = []
         self._steps = 0
-        self._change(self.map.on_aggregator(present=True, stamp=STAMP + start))
+        at = Moment(start, STAMP + start)
+        self._publish_map(self.map.load_zones([], at))
+        self._publish_map(self.map.on_broker(at, connected=True))
+        self._publish_map(self.map.on_aggregator("lockstep", at, alive=True))
         for definition in definitions:
-            taken = carry(ch.AREA_DEFINITION, definition)
-            assert isinstance(taken, AreaDefinition)
-            self._change(self.map.on_definition(taken, STAMP + start))
-        self.planner.load(self.map.snapshot(), start)
+            self._map(ch.AREA_DEFINITION, {"area": definition.id}, definition, start)
+        self.planner.load(self.snapshot, start)
 
     @property
     def snapshot(self) -> MapSnapshot:
         """The map-service's snapshot."""
-        return self.map.snapshot()
+        return self.map.costmap.snapshot()
 
     def step(self, now: float) -> None:
         """Let time pass up to `now`: nodes measure, and every 0.1 s aggregator, map-service and planner beat."""
@@ -233,8 +231,7 @@ class FogRig:
                 self._aggregate(ch.NODE_READING, {"node": node.node.id}, reading, now)
         if self._steps % _BEAT_STEPS == 0:
             self._hazards(self.aggregator.tick(Moment(now, stamp)), now)
-            self._change(self.map.tick(now, stamp))
-            self._heartbeats.append(carry(ch.MAP_HEARTBEAT, self.map.heartbeat(stamp)))
+            self._publish_map(self.map.tick(Moment(now, stamp)))
 
     def inform_planner(self, now: float) -> None:
         """Give the planner the map's news; the robot gets the same right after."""
@@ -248,7 +245,7 @@ class FogRig:
         for heartbeat in self._heartbeats:
             planner.on_heartbeat(heartbeat, now)
         if planner.wants_snapshot(now):
-            planner.load(self.map.snapshot(), now)
+            planner.load(self.snapshot, now)
         for job in planner.field_jobs():
             job.run()
             planner.take_field(job)
@@ -260,12 +257,12 @@ class FogRig:
         pose, state, obstacles = told
         if pose is not None:
             self._aggregate(ch.ROBOT_POSE, {"robot": robot}, pose, now)
-            self.map.on_pose(robot, pose, now)
+            self._map(ch.ROBOT_POSE, {"robot": robot}, pose, now)
             self.planner.on_pose(robot, pose, now)
         if state is not None:
             self.planner.on_state(robot, state, now)
         if obstacles is not None:
-            self._change(self.map.on_obstacles(robot, obstacles, now, STAMP + now))
+            self._map(ch.ROBOT_OBSTACLES, {"robot": robot}, obstacles, now)
 
     def deliver(self, robot: RobotRig) -> list[RobotPath | RobotGoal]:
         """Bring the robot what the fog published since the last time; return its paths and goals."""
@@ -301,14 +298,22 @@ class FogRig:
     def _hazards(self, publications: Iterable[Publication], now: float) -> None:
         """Take what the aggregator publishes, with a store that answers at once."""
         for publication in (*publications, *self.aggregator.stored(self.aggregator.to_store())):
-            if isinstance(hazard := publication.message, AreaHazard):
-                self._change(self.map.on_hazard(carry(ch.AREA_HAZARD, hazard), STAMP + now))
+            if publication.channel in self.map.handlers():
+                self._map(publication.channel, dict(publication.ids), publication.message, now)
 
-    def _change(self, change: MapChange) -> None:
-        self._deltas += [carry(ch.MAP_DELTA, delta) for delta in change.deltas]
-        for told in change.hazards:
-            taken = carry(ch.HAZARD, told)
-            self._told.append(taken)
-            self.hazards[taken.hazard.area] = taken
-        if change.zones is not None:
-            self._zones.append(carry(ch.ZONES, change.zones))
+    def _map(self, channel: Channel, ids: dict[str, str], message: Message | str, now: float) -> None:
+        assert isinstance(message, Message)
+        self._publish_map(self.map.handlers()[channel](ids, carry(channel, message), Moment(now, STAMP + now)))
+
+    def _publish_map(self, publications: Iterable[Publication]) -> None:
+        for message in (publication.message for publication in publications):
+            if isinstance(message, MapDelta):
+                self._deltas.append(carry(ch.MAP_DELTA, message))
+            elif isinstance(message, MapHeartbeat):
+                self._heartbeats.append(carry(ch.MAP_HEARTBEAT, message))
+            elif isinstance(message, HazardArea):
+                hazard = carry(ch.HAZARD, message)
+                self._told.append(hazard)
+                self.hazards[hazard.hazard.area] = hazard
+            elif isinstance(message, ZoneSet):
+                self._zones.append(carry(ch.ZONES, message))

@@ -1,6 +1,7 @@
 """What the master costmap is: the layers' rules, versions that replicas can follow, and never a stale cell."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,16 +9,21 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from fog_contracts import channels as ch
 from fog_contracts.costs import INSCRIBED, LETHAL, UNKNOWN
 from fog_contracts.geometry import GeometryError, normalized_polygon, rasterize
 from fog_contracts.grid import GridGeometry, Window
+from fog_contracts.handlers import Moment, Publication, RefusedMessageError
 from fog_contracts.messages import (
     VIEW_SECTORS,
     AreaDefinition,
     AreaHazard,
     CircleShape,
     CorridorShape,
+    HazardArea,
     MapDelta,
+    MapHeartbeat,
+    Message,
     PolygonShape,
     RectangleShape,
     RobotObstacles,
@@ -25,9 +31,11 @@ from fog_contracts.messages import (
     Trace,
     View,
     Zone,
+    ZoneSet,
 )
 from fog_contracts.replica import Applied, Replica
-from map_service.core import MapCore, merged
+from map_service.core import MapCore
+from map_service.costmap import merged
 from map_service.layers.zones import penalty_cost
 from map_service.shapes import ZoneError, checked_zone, rasterize_shape
 
@@ -47,8 +55,78 @@ def floor(width: int = 80, height: int = 60, *, origin: tuple[float, float] = (-
     return Plan(GridGeometry(width, height, 0.05, *origin), cells)
 
 
-def core(plan: Plan | None = None) -> MapCore:
-    return MapCore("test", plan or floor(), 3)
+@dataclass
+class Change:
+    """What was published after an input, by channel."""
+
+    deltas: list[MapDelta]
+    hazards: list[HazardArea]
+    zones: ZoneSet | None
+
+
+class Rig:
+    """A core that serves its map, fed through its table of handlers."""
+
+    def __init__(self, plan: Plan) -> None:
+        self.core = MapCore("test", plan, 3)
+        at = Moment(0.0, 0.0)
+        self.core.load_zones([], at)
+        self.core.on_broker(at, connected=True)
+        self.core.on_aggregator("a1", at, alive=True)
+        self.core.tick(at)
+        self.map = self.core.costmap
+        self.geometry = self.map.geometry
+
+    @property
+    def cost(self) -> np.ndarray:
+        return self.map.cost
+
+    @property
+    def speed(self) -> np.ndarray:
+        return self.map.speed
+
+    def on_definition(self, definition: AreaDefinition, stamp: float) -> Change:
+        return self._feed(ch.AREA_DEFINITION, definition, stamp, stamp, area=definition.id)
+
+    def on_hazard(self, hazard: AreaHazard, stamp: float) -> Change:
+        return self._feed(ch.AREA_HAZARD, hazard, stamp, stamp, area=hazard.area)
+
+    def on_obstacles(self, robot: str, obstacles: RobotObstacles, now: float, stamp: float) -> Change:
+        return self._feed(ch.ROBOT_OBSTACLES, obstacles, now, stamp, robot=robot)
+
+    def on_pose(self, robot: str, at: RobotPose, now: float) -> Change:
+        return self._feed(ch.ROBOT_POSE, at, now, now, robot=robot)
+
+    def on_aggregator(self, *, present: bool, stamp: float) -> Change:
+        changed = self.core.on_aggregator("a1", Moment(stamp, stamp), alive=present)
+        # The broker tells nothing new, but by then the aggregator has been away for too long.
+        return self._change([*changed, *self.core.on_broker(Moment(stamp + 3.1, stamp), connected=True)])
+
+    def put_zone(self, zone: Zone, stamp: float) -> Change:
+        return self._change(self.core.put_zone(zone, Moment(stamp, stamp)))
+
+    def remove_zone(self, zone_id: str, stamp: float) -> Change:
+        return self._change(self.core.remove_zone(zone_id, Moment(stamp, stamp)))
+
+    def tick(self, now: float, stamp: float) -> Change:
+        return self._change(self.core.tick(Moment(now, stamp)))
+
+    def _feed(self, channel: ch.Channel, message: Message, now: float, stamp: float, **ids: str) -> Change:
+        return self._change(self.core.handlers()[channel](ids, message, Moment(now, stamp)))
+
+    @staticmethod
+    def _change(publications: Sequence[Publication]) -> Change:
+        messages = [publication.message for publication in publications]
+        zones = [message for message in messages if isinstance(message, ZoneSet)]
+        return Change(
+            [message for message in messages if isinstance(message, MapDelta)],
+            [message for message in messages if isinstance(message, HazardArea)],
+            zones[-1] if zones else None,
+        )
+
+
+def core(plan: Plan | None = None) -> Rig:
+    return Rig(plan or floor())
 
 
 def definition(name: str = "hall", x: float = 0.5, y: float = 0.5, size: float = 0.5, **fields) -> AreaDefinition:
@@ -64,7 +142,7 @@ def hazard(state: str, seq: int = 1, *, area: str = "hall", epoch: int = 1, pena
     )
 
 
-def at(map_core: MapCore, x: float, y: float) -> tuple[int, int]:
+def at(map_core: Rig, x: float, y: float) -> tuple[int, int]:
     column, row = map_core.geometry.cell(x, y)
     return int(map_core.cost[row, column]), int(map_core.speed[row, column])
 
@@ -183,6 +261,124 @@ def test_without_its_aggregator_no_area_counts_as_clear():
     assert at(m, 0.75, 0.75) == (0, 0)
 
 
+def test_an_area_whose_polygon_crosses_itself_is_refused_and_leaves_the_known_one():
+    m = core()
+    m.on_definition(definition(), 0.0)
+    bowtie = AreaDefinition(id="hall", polygon=[(0.0, 0.0), (1.0, 1.0), (1.0, 0.0), (0.0, 1.0)], version=2)
+    with pytest.raises(RefusedMessageError, match=r"area hall: .*crosses itself"):
+        m.on_definition(bowtie, 0.0)
+    assert at(m, 0.75, 0.75) == (200, 15)
+
+
+# --- Serving --------------------------------------------------------------------------------------------------------
+
+
+def started(**arguments) -> MapCore:
+    return MapCore("test", floor(), 3, definitions=[definition(), definition("gate", x=1.5)], **arguments)
+
+
+def moment(now: float) -> Moment:
+    return Moment(now, now)
+
+
+def sent(publications: Sequence[Publication]) -> list[str]:
+    return [publication.channel.name for publication in publications]
+
+
+def test_nothing_is_published_before_the_zones_are_read():
+    m = started()
+    assert m.tick(moment(0.0)) == []
+    assert m.handlers()[ch.AREA_HAZARD]({"area": "hall"}, hazard("blocked"), moment(0.1)) == []
+    assert m.put_zone(zone(), moment(0.1)) == []
+    assert m.tick(moment(100.0)) == []
+    assert (m.serving, m.missing()) == (False, "the zones are not read yet")
+    m.load_zones([zone("stored")], moment(100.1))
+    first = m.tick(moment(100.2))
+    assert m.serving
+    assert (sent(first), m.missing()) == (["hazard", "hazard", "zones", "map_heartbeat"], "")
+    assert [z.id for z in first[2].message.zones] == ["stored"]
+    assert first[-1].message == MapHeartbeat(
+        epoch=3, seq=m.costmap.version.seq, hash=m.costmap.version.hash, stamp=100.2
+    )
+    assert sent(m.tick(moment(100.3))) == ["map_heartbeat"]
+
+
+def test_a_start_waits_for_the_hazards_of_all_areas_but_not_forever():
+    patient, hasty = started(hazards_wait_s=3.0), started(hazards_wait_s=3.0)
+    for m in (patient, hasty):
+        m.load_zones([], moment(0.0))
+        m.tick(moment(0.0))
+        m.handlers()[ch.AREA_HAZARD]({"area": "hall"}, hazard("blocked"), moment(0.1))
+        assert m.tick(moment(0.2)) == []
+        assert m.missing() == "waiting for the hazards of gate"
+    assert patient.tick(moment(2.9)) == []
+    assert sent(patient.tick(moment(3.0)))[-1] == "map_heartbeat"
+    hasty.handlers()[ch.AREA_HAZARD]({"area": "gate"}, hazard("clear", area="gate"), moment(0.3))
+    assert sent(hasty.tick(moment(0.4)))[-1] == "map_heartbeat"
+
+
+def test_queries_get_the_map_its_zones_and_one_areas_hazard():
+    m = started()
+    m.load_zones([zone()], moment(0.0))
+    m.tick(moment(0.0))
+    answers = m.answerers()
+    assert answers[ch.MAP_SNAPSHOT]({}, None, moment(1.0)) is m.costmap.snapshot()
+    assert [z.id for z in answers[ch.ZONES]({}, None, moment(1.0)).zones] == ["z1"]
+    assert answers[ch.HAZARD]({"area": "gate"}, None, moment(1.0)).hazard.area == "gate"
+
+
+@pytest.mark.parametrize("gone", ["aggregator", "broker", "both from the start"])
+def test_areas_stop_counting_as_clear_three_seconds_after_the_aggregator_or_its_broker_is_gone(gone):
+    m = started()
+    m.load_zones([], moment(0.0))
+    if gone != "both from the start":
+        m.on_broker(moment(0.0), connected=True)
+        m.on_aggregator("a1", moment(0.0), alive=True)
+    m.tick(moment(0.0))
+    m.handlers()[ch.AREA_HAZARD]({"area": "hall"}, hazard("clear"), moment(0.0))
+
+    def state(now: float) -> str:
+        m.tick(moment(now))
+        return m.hazards()[0].hazard.state
+
+    begin = 0.0
+    if gone != "both from the start":
+        begin = 10.0
+        assert state(begin) == "clear"
+    if gone == "aggregator":
+        m.on_aggregator("a1", moment(begin), alive=False)
+    elif gone == "broker":
+        m.on_broker(moment(begin), connected=False)
+    assert state(begin + 2.9) == "clear"
+    assert state(begin + 3.1) == "unknown"
+    back = [*m.on_broker(moment(begin + 4.0), connected=True), *m.on_aggregator("a1", moment(begin + 4.0), alive=True)]
+    assert sent(back) == ["map_delta", "map_delta", "hazard"]
+    assert state(begin + 4.1) == "clear"
+
+
+def test_one_of_two_aggregators_is_enough():
+    m = started()
+    m.load_zones([], moment(0.0))
+    m.on_broker(moment(0.0), connected=True)
+    for name in ("a1", "a2"):
+        m.on_aggregator(name, moment(0.0), alive=True)
+    m.handlers()[ch.AREA_HAZARD]({"area": "hall"}, hazard("clear"), moment(0.0))
+    m.on_aggregator("a1", moment(1.0), alive=False)
+    m.tick(moment(9.0))
+    assert m.hazards()[0].hazard.state == "clear"
+
+
+def test_stored_zones_replace_those_on_the_map_or_nothing_changes():
+    m = started()
+    m.load_zones([zone("old"), zone("kept")], moment(0.0))
+    bad = zone("bad", shape=RectangleShape(corner=(0.0, 0.0), opposite=(0.0, 1.0)))
+    with pytest.raises(ZoneError, match=r"bad\.shape\.opposite"):
+        m.load_zones([zone("new"), bad], moment(1.0))
+    assert [z.id for z in m.zones()] == ["kept", "old"]
+    m.load_zones([zone("new"), zone("kept")], moment(1.0))
+    assert [z.id for z in m.zones()] == ["kept", "new"]
+
+
 # --- Zones ----------------------------------------------------------------------------------------------------------
 
 
@@ -213,7 +409,7 @@ def test_kinds_write_cost_or_speed():
     change = m.put_zone(zone("c", "BLOCKED"), 0.0)
     assert at(m, 1.0, 1.0) == (254, 20)
     assert [z.id for z in change.zones.zones] == ["a", "b", "c"]
-    assert change.zones.seq == m.version.seq
+    assert change.zones.seq == m.map.version.seq
     m.remove_zone("c", 0.0)
     assert at(m, 1.0, 1.0) == (penalty_cost(2.0), 20)
 
@@ -413,7 +609,7 @@ events = st.one_of(
 )
 
 
-def play(m: MapCore, history: list[tuple]) -> list[MapDelta]:
+def play(m: Rig, history: list[tuple]) -> list[MapDelta]:
     now, deltas = 0.0, []
     for seq, (kind, *rest) in enumerate(history, start=1):
         if kind == "zone":
@@ -432,7 +628,7 @@ def play(m: MapCore, history: list[tuple]) -> list[MapDelta]:
             m.on_pose("r2", pose(*rest[0]), now)
             change = m.tick(now, now)
         elif kind == "watched":
-            change = m.on_aggregator(rest[0], now)
+            change = m.on_aggregator(present=rest[0], stamp=now)
         else:
             now += rest[0]
             change = m.tick(now, now)
@@ -445,15 +641,15 @@ def play(m: MapCore, history: list[tuple]) -> list[MapDelta]:
 def test_after_any_history_the_map_equals_a_full_recompute_and_its_replica(history):
     m = core()
     replica = Replica()
-    replica.load(m.snapshot())
+    replica.load(m.map.snapshot())
     for delta in play(m, history):
         outcome = replica.apply(delta)
         assert outcome == "waiting" or isinstance(outcome, Applied)
-    cost, speed = m.recomputed()
+    cost, speed = m.map.recomputed()
     assert np.array_equal(m.cost, cost)
     assert np.array_equal(m.speed, speed)
     assert not replica.needs_snapshot
-    assert replica.version == m.version
+    assert replica.version == m.map.version
     assert np.array_equal(replica.cost, cost)
     assert np.array_equal(replica.speed, speed)
 

@@ -38,19 +38,20 @@ async def main() -> None:
             await store.begin_epoch(),
             settings.inflation,
             definitions=loaded.site.definitions(),
+            hazards_wait_s=settings.hazards_wait_s,
         )
         mqtt = MqttEdge(settings.mqtt_url, "map-service", clock, site=site)
         async with ZenohEdge.open(
             connect=settings.zenoh_endpoints, clock=clock, role="map-service", id=site, site=site
         ) as zenoh:
             service = Service(core, store, mqtt, zenoh, clock, health)
-            service.listen()
+            service.subscribe()
             zenoh.alive("map-service", site)
             app = make_api(service, loaded.site, clock, health, load_tokens(settings.tokens_file))
             async with asyncio.TaskGroup() as tasks:
                 tasks.create_task(mqtt.run(), name="mqtt")
                 tasks.create_task(service.store_loop(), name="store")
-                tasks.create_task(service.beat_loop(settings.hazards_wait_s), name="beat")
+                tasks.create_task(service.tick_loop(), name="tick")
                 tasks.create_task(serve(app, settings.http_host, settings.http_port, settings.port_file), name="http")
 
 

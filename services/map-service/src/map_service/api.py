@@ -39,7 +39,7 @@ from fog_runtime.http import (
     read_body,
     require,
 )
-from map_service.layers.protocol import Grid
+from map_service.layers.base import Grid
 from map_service.service import ConflictError, Service
 from map_service.shapes import ZoneError
 from map_service.store import AuditEntry, StoreError
@@ -97,7 +97,7 @@ def _add_zones(app: FastAPI, service: Service, clock: Clock) -> None:
     async def list_zones() -> Response:
         """List all zones with the map version that shows them."""
         _check_read(service)
-        version = service.core.version
+        version = service.core.costmap.version
         zones = service.core.zones()
         answer = ZoneList(zones=zones, active=service.core.active_zones(), epoch=version.epoch, seq=version.seq)
         return _json(answer)
@@ -145,15 +145,15 @@ def _add_zones(app: FastAPI, service: Service, clock: Clock) -> None:
 
 
 def _add_views(app: FastAPI, service: Service, site: Site) -> None:
-    core = service.core
+    core, costmap = service.core, service.core.costmap
     pictures: dict[str, tuple[object, bytes]] = {}
 
     async def picture(name: str, cells: Grid, palette: bytes) -> Response:
         """Encode off the loop, once per version; the pixels' values are the cells'."""
         known = pictures.get(name)
-        if known is None or known[0] != core.version:
+        if known is None or known[0] != costmap.version:
             # The copy is taken before the loop can change the map.
-            pictures[name] = known = (core.version, await asyncio.to_thread(_png, cells.copy(), palette))
+            pictures[name] = known = (costmap.version, await asyncio.to_thread(_png, cells.copy(), palette))
         return Response(known[1], media_type="image/png", headers={"Cache-Control": "no-cache"})
 
     @app.get("/api/v1/hazards", tags=["map"], responses=answer_schema(app, list[HazardArea]))
@@ -169,22 +169,22 @@ def _add_views(app: FastAPI, service: Service, site: Site) -> None:
     @app.get("/api/v1/map", tags=["map"], responses=answer_schema(app, MapInfo))
     async def map_info() -> Response:
         """Return the map's geometry and version."""
-        g = core.geometry
+        g = costmap.geometry
         geometry = MapGeometry(
             width=g.width, height=g.height, resolution=g.resolution, origin_x=g.origin_x, origin_y=g.origin_y
         )
-        return _json(MapInfo(site=site.id, geometry=geometry, epoch=core.version.epoch, seq=core.version.seq))
+        return _json(MapInfo(site=site.id, geometry=geometry, epoch=costmap.version.epoch, seq=costmap.version.seq))
 
     @app.get("/api/v1/map.png", tags=["map"], response_class=Response, responses=_IMAGE)
     async def map_png() -> Response:
         """Return the floor plan: white is free, black occupied, grey unknown."""
-        return await picture("map", core.static, _PLAN)
+        return await picture("map", costmap.static, _PLAN)
 
     @app.get("/api/v1/costmap.png", tags=["map"], response_class=Response, responses=_IMAGE)
     async def costmap_png() -> Response:
         """Return the master costmap; a pixel's palette index is the cell's cost."""
         _check_read(service)
-        return await picture("cost", core.cost, _COSTS)
+        return await picture("cost", costmap.cost, _COSTS)
 
 
 @contextmanager
@@ -204,7 +204,7 @@ def _problems(name: str) -> Iterator[None]:
 
 
 def _check_read(service: Service) -> None:
-    if not service.zones_are_read:
+    if not service.core.zones_are_read:
         raise ProblemError(
             503, "the stored zones are not read yet: try again once /readyz says so", headers=RETRY_AFTER
         )

@@ -1,55 +1,44 @@
-"""The master costmap: hazards, zones and obstacles in, versions of the map out. Pure: time comes as an argument."""
+"""What the map-service decides: which inputs change the map, whether areas count as clear, when the map is served.
+
+Pure: every input comes with its `Moment`, and everything that is to be published is returned. The layers listen for
+themselves (`map_service.layers`), the costmap turns what they changed into versions (`map_service.costmap`).
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, TypeVar
 
-import numpy as np
-from msgspec import structs
-
+from fog_contracts import channels as ch
 from fog_contracts.costs import DEFAULT_INFLATION
-from fog_contracts.messages import HazardArea, MapDelta, MapHeartbeat, MapSnapshot, Trace, Zone, ZoneSet
-from fog_contracts.replica import MasterMap
-from map_service import layers
-from map_service.layers.protocol import overlap
+from fog_contracts.handlers import Publication
+from fog_contracts.messages import HazardArea, ZoneSet
+from map_service import layers as standard_layers
+from map_service.costmap import LayeredCostmap
+from map_service.layers import HazardsLayer, ZonesLayer
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping, Sequence
+    from typing import Any, Final
 
+    from fog_contracts.channels import Channel
     from fog_contracts.costs import Inflation
-    from fog_contracts.grid import GridGeometry, Window
-    from fog_contracts.messages import AreaDefinition, AreaHazard, Cause, Layer, RobotObstacles, RobotPose
-    from fog_contracts.replica import Version
-    from map_service.layers.protocol import Grid, Touch
+    from fog_contracts.handlers import Answerer, Handler, Ids, Moment
+    from fog_contracts.messages import AreaDefinition, MapSnapshot, Zone
+    from map_service.costmap import StaticMap
+    from map_service.layers.base import CostLayer
 
+L = TypeVar("L", bound="CostLayer")
 
-class StaticMap(Protocol):
-    """A floor plan: geometry, and cells uint8 (height, width): 0 free, 254 occupied, 255 unknown."""
-
-    @property
-    def geometry(self) -> GridGeometry:
-        """Size, resolution and origin."""
-
-    @property
-    def cells(self) -> Grid:
-        """The plan itself."""
-
-
-@dataclass(frozen=True)
-class MapChange:
-    """What to publish after an input: the deltas of a new version (none when no cell differs), and the reasons."""
-
-    deltas: list[MapDelta] = field(default_factory=list)
-    hazards: list[HazardArea] = field(default_factory=list)
-    zones: ZoneSet | None = None
+AGGREGATOR_LOST_S: Final = 3.0
+"""How long (s) the aggregator, or the broker, may be gone until no area counts as clear any more."""
 
 
 class MapCore:
-    """Holds the layers and the versioned map; every input returns what changed.
+    """The map-service's core; nothing is published before the map is whole (`serving`).
 
-    `definitions` are areas known from the site: until the aggregator speaks of
-    them they count as unknown.
+    `layers` are bottom first, with a `HazardsLayer` and a `ZonesLayer` among them; by default the standard ones.
+    `definitions` are areas known from the site: until the aggregator speaks of them they count as unknown.
+    `hazards_wait_s` is how long the first tick's map waits for the hazards of all areas.
     """
 
     def __init__(
@@ -59,168 +48,165 @@ class MapCore:
         epoch: int,
         inflation: Inflation = DEFAULT_INFLATION,
         *,
+        layers: Sequence[CostLayer] | None = None,
         definitions: Iterable[AreaDefinition] = (),
+        hazards_wait_s: float = 0.0,
     ) -> None:
-        self.geometry = static.geometry
-        self._layers = layers.stack(static.geometry, static.cells)
+        if layers is None:
+            layers = standard_layers.standard(static.geometry, static.cells)
+        self._layers = layers
+        self._hazards = _only(layers, HazardsLayer)
+        self._zones = _only(layers, ZonesLayer)
         for definition in definitions:
-            self._layers.hazards.define(definition)
-        self._touches()
-        self._raw, speed = self._painted()
-        self._inflation = layers.InflationLayer(self._raw, static.geometry.resolution, inflation)
-        self._master = MasterMap(site, static.geometry, static.cells, self._inflation.cost, epoch)
-        self._master.write([("speed", self._whole, speed)], [], [])
+            self._hazards.define(definition)
+        self.costmap = LayeredCostmap(site, static, layers, inflation, epoch)
+        self._zones_read = False
+        self._hazards_wait_s = hazards_wait_s
+        self._serving = False
+        self._first_tick: float | None = None
+        self._aggregators: set[str] = set()
+        self._broker_connected = False
+        self._aggregator_lost_since: float | None = None
 
     # --- What it holds ----------------------------------------------------------------------------------------------
 
     @property
-    def version(self) -> Version:
-        """The version that holds now."""
-        return self._master.version
+    def serving(self) -> bool:
+        """Whether the map is whole and may be published and asked for."""
+        return self._serving
 
     @property
-    def cost(self) -> Grid:
-        """The master costmap, uint8 (height, width)."""
-        return self._master.layers["cost"]
+    def zones_are_read(self) -> bool:
+        """Whether the stored zones are on the map."""
+        return self._zones_read
 
-    @property
-    def speed(self) -> Grid:
-        """The speed layer, uint8 (height, width), cm/s, 0 = no limit."""
-        return self._master.layers["speed"]
-
-    @property
-    def static(self) -> Grid:
-        """The floor plan, uint8 (height, width)."""
-        return self._master.static
-
-    def heartbeat(self, stamp: float) -> MapHeartbeat:
-        """Return the message that carries the version."""
-        return self._master.heartbeat(stamp)
-
-    def snapshot(self) -> MapSnapshot:
-        """Return the whole map."""
-        return self._master.snapshot()
+    def missing(self) -> str:
+        """Say what the map waits for before it is served; empty when it waits for nothing."""
+        if not self._zones_read:
+            return "the zones are not read yet"
+        if not self._serving:
+            return f"waiting for the hazards of {', '.join(self._hazards.unheard()) or 'no area'}"
+        return ""
 
     def zones(self) -> list[Zone]:
         """Return all zones by id."""
-        return self._layers.zones.zones()
+        return self._zones.zones()
 
     def active_zones(self) -> list[str]:
         """Return the ids of the zones that hold now."""
-        return self._layers.zones.active()
+        return self._zones.active()
 
     def zone_set(self) -> ZoneSet:
         """Return all zones with the map version that shows them."""
-        return ZoneSet(epoch=self.version.epoch, seq=self.version.seq, zones=self.zones())
+        version = self.costmap.version
+        return ZoneSet(epoch=version.epoch, seq=version.seq, zones=self.zones())
 
     def hazards(self) -> list[HazardArea]:
         """Return every area with its hazard."""
-        return self._layers.hazards.described()
+        return [p.message for p in self._hazards.publications() if isinstance(p.message, HazardArea)]
 
-    def unheard_areas(self) -> list[str]:
-        """Return the areas of which the aggregator has not spoken yet."""
-        return self._layers.hazards.unheard()
+    # --- Channels ---------------------------------------------------------------------------------------------------
 
-    def recomputed(self) -> tuple[Grid, Grid]:
-        """Return cost and speed layer computed from scratch: what the master must equal, cell by cell."""
-        raw, speed = self._painted()
-        return self._inflation.whole(raw), speed
+    def handlers(self) -> Mapping[Channel, Handler]:
+        """Return the handler of every channel that a layer listens to."""
+        listening: dict[Channel, list[Handler]] = {}
+        for layer in self._layers:
+            for channel, handler in layer.handlers().items():
+                listening.setdefault(channel, []).append(handler)
+        return {channel: self._input(handlers) for channel, handlers in listening.items()}
 
-    # --- Inputs -----------------------------------------------------------------------------------------------------
+    def answerers(self) -> Mapping[Channel, Answerer]:
+        """Return who answers queries, once the map is served."""
+        return {ch.MAP_SNAPSHOT: self._snapshot, ch.ZONES: self._zone_set, ch.HAZARD: self._hazard}
 
-    def on_definition(self, definition: AreaDefinition, stamp: float) -> MapChange:
-        """Take an area's definition; raises `GeometryError` for a polygon that can't be used."""
-        return self._commit(stamp, self._layers.hazards.define(definition))
+    def tick(self, at: Moment) -> list[Publication]:
+        """Let zones begin and end, obstacles expire, clear areas become unknown; call ten times a second."""
+        if self._first_tick is None:
+            self._first_tick = at.now
+        publications = self._check_aggregator_liveness(at)
+        for layer in self._layers:
+            publications += layer.tick(at)
+        publications = self._commit(publications, at)
+        if not self._serving:
+            if not self._is_whole(at.now):
+                return []
+            self._serving = True
+            publications = [*self._hazards.publications(), Publication(ch.ZONES, self.zone_set())]
+        return [*publications, Publication(ch.MAP_HEARTBEAT, self.costmap.heartbeat(at.stamp))]
 
-    def on_hazard(self, hazard: AreaHazard, stamp: float) -> MapChange:
-        """Take an area's state; what was overtaken is ignored."""
-        return self._commit(stamp, self._layers.hazards.take(hazard))
+    # --- What no channel carries ------------------------------------------------------------------------------------
 
-    def on_aggregator(self, present: bool, stamp: float) -> MapChange:  # noqa: FBT001  # the news itself
-        """Take whether the aggregator is there: without it, clear areas become unknown."""
-        return self._commit(stamp, self._layers.hazards.set_watched(present))
+    def on_aggregator(self, name: str, at: Moment, *, alive: bool) -> list[Publication]:
+        """Take that an aggregator came or went, by its liveliness token."""
+        (self._aggregators.add if alive else self._aggregators.discard)(name)
+        return self._commit(self._check_aggregator_liveness(at), at)
 
-    def put_zone(self, zone: Zone, stamp: float) -> MapChange:
-        """Add or replace a zone; raises `ZoneError` for a shape that can't be used."""
-        self._layers.zones.put(zone, stamp)
-        return self._commit(stamp, zones=True)
+    def on_broker(self, at: Moment, *, connected: bool) -> list[Publication]:
+        """Take whether the broker, which carries the aggregator's messages, is connected."""
+        self._broker_connected = connected
+        return self._commit(self._check_aggregator_liveness(at), at)
 
-    def remove_zone(self, zone_id: str, stamp: float) -> MapChange:
-        """Forget a zone."""
-        return self._commit(stamp, zones=self._layers.zones.remove(zone_id))
+    def load_zones(self, zones: Iterable[Zone], at: Moment) -> list[Publication]:
+        """Make the map's zones those that are stored; raises `ZoneError`, and changes nothing, for an unusable one."""
+        self._zones.replace_all(zones, at.stamp)
+        self._zones_read = True
+        return self._commit([], at)
 
-    def on_obstacles(self, robot: str, seen: RobotObstacles, now: float, stamp: float) -> MapChange:
-        """Take what a robot's lidar sees."""
-        self._layers.obstacles.see(robot, seen, now)
-        return self._commit(stamp)
+    def put_zone(self, zone: Zone, at: Moment) -> list[Publication]:
+        """Add or replace a zone that is stored; raises `ZoneError` for a shape that can't be used."""
+        self._zones.put(zone, at.stamp)
+        return self._commit([], at)
 
-    def on_pose(self, robot: str, pose: RobotPose, now: float) -> None:
-        """Take where a robot is; obstacles that are this robot vanish with the next tick."""
-        self._layers.obstacles.robot_at(robot, pose, now)
-
-    def tick(self, now: float, stamp: float) -> MapChange:
-        """Let zones begin and end and obstacles expire; call ten times a second."""
-        before = self.active_zones()
-        for layer in self._layers.order:
-            layer.tick(now, stamp)
-        return self._commit(stamp, zones=self.active_zones() != before)
+    def remove_zone(self, zone_id: str, at: Moment) -> list[Publication]:
+        """Forget a zone that is not stored any more."""
+        self._zones.remove(zone_id)
+        return self._commit([], at)
 
     # --- Inside -----------------------------------------------------------------------------------------------------
 
-    @property
-    def _whole(self) -> Window:
-        return self.geometry.clip(self.geometry.window_around(*self.geometry.bounds))
+    def _input(self, handlers: Sequence[Handler]) -> Handler:
+        def handle(ids: Ids, message: Any, at: Moment) -> list[Publication]:
+            return self._commit([p for handler in handlers for p in handler(ids, message, at)], at)
 
-    def _touches(self) -> list[Touch]:
-        return [touch for layer in self._layers.order for touch in layer.touched()]
+        return handle
 
-    def _paint(self, window: Window) -> tuple[Grid, Grid]:
-        """Return cost (not inflated) and speed of a window, painted by all layers."""
-        cost = np.zeros((window.height, window.width), dtype=np.uint8)
-        speed = np.zeros((window.height, window.width), dtype=np.uint8)
-        for layer in self._layers.order:
-            layer.paint(window, cost, speed)
-        return cost, speed
+    def _commit(self, publications: list[Publication], at: Moment) -> list[Publication]:
+        """Turn what the layers changed into a version; return its deltas with the reasons, once the map is served."""
+        deltas = [Publication(ch.MAP_DELTA, delta) for delta in self.costmap.update(at.stamp)]
+        zones = [Publication(ch.ZONES, self.zone_set())] if self._zones.take_changed() else []
+        return [*deltas, *publications, *zones] if self._serving else []
 
-    def _painted(self) -> tuple[Grid, Grid]:
-        return self._paint(self._whole)
+    def _check_aggregator_liveness(self, at: Moment) -> list[Publication]:
+        """Let areas count as clear only while an aggregator is alive, and the broker between is connected.
 
-    def _commit(self, stamp: float, hazards: list[HazardArea] | None = None, *, zones: bool = False) -> MapChange:
-        """Recompute what the layers touched and turn it into a version."""
-        touches = self._touches()
-        windows = merged([touch.window for touch in touches])
-        changes: list[tuple[Layer, Window, Grid]] = []
-        for window in windows:
-            cost, speed = self._paint(window)
-            self._raw[window.rows, window.columns] = cost
-            changes.append(("speed", window, speed))
-        changes.extend(
-            ("cost", window, self._inflation.cost[window.rows, window.columns])
-            for window in self._inflation.update(self._raw, windows)
-        )
-        causes: list[Cause] = list(dict.fromkeys(touch.cause for touch in touches))
-        traces = {
-            (trace.area, trace.epoch, trace.seq): structs.replace(trace, costmap_published=stamp)
-            for trace in (touch.trace for touch in touches)
-            if trace is not None
-        }
-        deltas = self._master.write(changes, causes, list[Trace](traces.values()))
-        return MapChange(deltas, hazards or [], self.zone_set() if zones else None)
+        An aggregator that has not appeared since the start counts as lost as one that left.
+        """
+        if self._aggregators and self._broker_connected:
+            self._aggregator_lost_since = None
+            return self._hazards.set_aggregator_lost(False)
+        if self._aggregator_lost_since is None:
+            self._aggregator_lost_since = at.now
+        if at.now - self._aggregator_lost_since > AGGREGATOR_LOST_S:
+            return self._hazards.set_aggregator_lost(True)
+        return []
+
+    def _is_whole(self, now: float) -> bool:
+        """Whether the zones are read and every area was heard of; after the wait, the others count as unknown."""
+        waited = self._first_tick is not None and now - self._first_tick >= self._hazards_wait_s
+        return self._zones_read and (waited or not self._hazards.unheard())
+
+    def _snapshot(self, _ids: Ids, _request: None, _at: Moment) -> MapSnapshot:
+        return self.costmap.snapshot()
+
+    def _zone_set(self, _ids: Ids, _request: None, _at: Moment) -> ZoneSet:
+        return self.zone_set()
+
+    def _hazard(self, ids: Ids, _request: None, _at: Moment) -> HazardArea:
+        return next(described for described in self.hazards() if described.hazard.area == ids["area"])
 
 
-def merged(windows: list[Window]) -> list[Window]:
-    """Unite windows that overlap, so that no cell is painted twice; windows apart stay apart and small."""
-    result: list[Window] = []
-    for window in windows:
-        if window.empty:
-            continue
-        grown = window
-        apart = []
-        for other in result:
-            if overlap(grown, other).empty:
-                apart.append(other)
-            else:
-                grown = grown.union(other)
-        # Having grown, it may overlap one that it did not before.
-        result = [*apart, grown] if grown == window else merged([*apart, grown])
-    return result
+def _only(layers: Iterable[CostLayer], kind: type[L]) -> L:
+    for layer in layers:
+        if isinstance(layer, kind):
+            return layer
+    raise ValueError(f"the map-service can't do without its {kind.__name__}: name it among the layers")

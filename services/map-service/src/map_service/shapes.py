@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     Axis = NDArray[np.float64]
 
 
-class Figure(NamedTuple):
+class ShapeMask(NamedTuple):
     """The cells of a shape: a window of the grid and a mask (window height, window width) inside it."""
 
     window: Window
@@ -51,7 +51,7 @@ def _outline(shape: PolygonShape | RectangleShape) -> list[Point]:
     return [(left, bottom), (right, bottom), (right, top), (left, top)]
 
 
-def _near_line(line: list[Point], reach: float, geometry: GridGeometry) -> Figure:
+def _near_line(line: list[Point], reach: float, geometry: GridGeometry) -> ShapeMask:
     """Return the cells whose centres lie within `reach` (m) of a polyline; one point makes a disc."""
     left, bottom, right, top = bounding_box(line)
     window = geometry.window_around(left - reach, bottom - reach, right + reach, top + reach)
@@ -70,10 +70,10 @@ def _near_line(line: list[Point], reach: float, geometry: GridGeometry) -> Figur
         mask[
             part.y - window.y : part.y - window.y + part.height, part.x - window.x : part.x - window.x + part.width
         ] |= near
-    return Figure(window, mask)
+    return ShapeMask(window, mask)
 
 
-def _rasterized(ring: list[Point], geometry: GridGeometry) -> Figure:
+def _rasterized(ring: list[Point], geometry: GridGeometry) -> ShapeMask:
     """Return what `fog_contracts.geometry.rasterize` does, in time that does not grow with sides times cells.
 
     Even-odd rule by scan lines: every side flips, in each row that it crosses, all cells to its left.
@@ -81,7 +81,7 @@ def _rasterized(ring: list[Point], geometry: GridGeometry) -> Figure:
     margin = geometry.resolution * math.sqrt(0.5)
     window, near = _near_line([*ring, ring[0]], margin, geometry)
     if window.empty:
-        return Figure(window, near)
+        return ShapeMask(window, near)
     xs, ys = _axes(window, geometry)
     flips = np.zeros((window.height, window.width + 1), dtype=np.bool_)
     for (x0, y0), (x1, y1) in itertools.pairwise([*ring, ring[0]]):
@@ -90,7 +90,7 @@ def _rasterized(ring: list[Point], geometry: GridGeometry) -> Figure:
             at = (x1 - x0) * (ys[crossed] - y0) / (y1 - y0) + x0
             flips[crossed, np.searchsorted(xs, at, side="left")] ^= True
     inside = np.logical_xor.accumulate(flips[:, :0:-1], axis=1)[:, ::-1]
-    return Figure(window, near | inside)
+    return ShapeMask(window, near | inside)
 
 
 def _axes(window: Window, geometry: GridGeometry) -> tuple[Axis, Axis]:
@@ -105,7 +105,7 @@ def _centres(window: Window, geometry: GridGeometry) -> tuple[Axis, Axis]:
     return px, py
 
 
-def rasterize_shape(shape: Shape, geometry: GridGeometry) -> Figure:
+def rasterize_shape(shape: Shape, geometry: GridGeometry) -> ShapeMask:
     """Return the cells of a shape: those within half a cell's diagonal of it, so that none is drawn too small.
 
     Raises `ZoneError` for an outline that can't be used. The window is empty for a shape off the map.

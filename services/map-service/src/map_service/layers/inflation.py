@@ -1,4 +1,4 @@
-"""Inflation of what all layers painted: the last step, recomputed only around what changed."""
+"""Inflation of what all layers wrote: the last step, recomputed only around what changed."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from fog_contracts.costs import Inflation
-    from map_service.layers.protocol import Grid
+    from map_service.layers.base import Grid
 
 
 class InflationLayer:
@@ -22,7 +22,7 @@ class InflationLayer:
         self.cost = inflate(raw, self._table)
 
     def update(self, raw: Grid, windows: Iterable[Window]) -> list[Window]:
-        """Take in that `raw` changed inside these windows; return the windows of `cost` that were rewritten."""
+        """Inflate anew around these windows, in which `raw` changed; return the windows of `cost` that it rewrote."""
         rewritten = (Window(*inflate_window(raw, self._table, *window, self.cost)) for window in windows)
         return [window for window in rewritten if not window.empty]
 

@@ -15,19 +15,22 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fog_contracts.channels import ROBOT_POSE
+from fog_contracts import channels as ch
 from fog_contracts.costs import LETHAL
 from fog_contracts.grid import Window
 from fog_contracts.messages import VIEW_SECTORS, Cause
-from map_service.layers.protocol import Touch, paint_figure
-from map_service.shapes import Figure
+from map_service.layers.base import CostLayer, write_cost
+from map_service.shapes import ShapeMask
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from typing import Final
 
+    from fog_contracts.channels import Channel
     from fog_contracts.grid import GridGeometry
+    from fog_contracts.handlers import Handler, Ids, Moment, Publication
     from fog_contracts.messages import RobotObstacles, RobotPose, View
-    from map_service.layers.protocol import Grid
+    from map_service.layers.base import Grid
 
 DISC_RADIUS: Final = 0.05
 """Radius (m) of the disc that a point becomes."""
@@ -45,10 +48,11 @@ VIEW_RANGE_M: Final = 6.0
 _PATCH: Final = 64
 
 
-class ObstaclesLayer:
+class ObstaclesLayer(CostLayer):
     """Holds cells that were seen, each with the time until which it counts."""
 
     def __init__(self, geometry: GridGeometry) -> None:
+        super().__init__()
         self._geometry = geometry
         self._until: dict[tuple[int, int], float] = {}
         self._looks: dict[tuple[int, int], int] = {}  # how many looks in a row reached beyond the cell
@@ -60,12 +64,15 @@ class ObstaclesLayer:
         self._reach = reach
         # How many discs cover a cell: with overlapping discs, a cell is free again only when the last one is gone.
         self._cover = np.zeros(geometry.shape, dtype=np.int16)
-        self._touched: list[Touch] = []
         self.refused = 0
 
-    def see(self, robot: str, seen: RobotObstacles, now: float) -> None:
-        """Take what a robot sees."""
-        robots = [pose for at, pose in self._poses.values() if now - at <= ROBOT_POSE.max_age_s]
+    def handlers(self) -> Mapping[Channel, Handler]:
+        """Return the handlers of robots' obstacles and poses."""
+        return {ch.ROBOT_OBSTACLES: self._on_obstacles, ch.ROBOT_POSE: self._on_pose}
+
+    def _on_obstacles(self, ids: Ids, seen: RobotObstacles, at: Moment) -> list[Publication]:
+        robot, now = ids["robot"], at.now
+        robots = [pose for at, pose in self._poses.values() if now - at <= ch.ROBOT_POSE.max_age_s]
         end = now + seen.ttl
         added: list[tuple[int, int]] = []
         there = {self._geometry.cell(x, y) for x, y in seen.points}
@@ -87,17 +94,16 @@ class ObstaclesLayer:
         self._next_end = min(self._next_end, end)
         self._change(added, 1, Cause(kind="obstacle", id=robot, state="seen"))
         if seen.view is not None:
-            self._look(robot, seen.view, there)
+            self._clear_seen_through(robot, seen.view, there)
+        return []
 
-    def _look(self, robot: str, view: View, there: set[tuple[int, int]]) -> None:
+    def _clear_seen_through(self, robot: str, view: View, there: set[tuple[int, int]]) -> None:
         """Forget cells that a robot's lidar has looked through, but none that the same turn saw (`there`)."""
         doubtful = [cell for cell in self._until if cell not in there]
         if not doubtful:
             return
         cells = np.array(doubtful, dtype=np.int64)
-        resolution = self._geometry.resolution
-        dx = self._geometry.origin_x + (cells[:, 0] + 0.5) * resolution - view.x
-        dy = self._geometry.origin_y + (cells[:, 1] + 0.5) * resolution - view.y
+        dx, dy = (self._geometry.centres(cells) - (view.x, view.y)).T
         distance = np.hypot(dx, dy)
         near = (distance > 2 * CELL_HALF_WIDTH_M) & (distance <= VIEW_RANGE_M)
         cells, distance, bearing = cells[near], distance[near], np.arctan2(dy[near], dx[near])
@@ -120,15 +126,16 @@ class ObstaclesLayer:
                 gone.append(cell)
         self._drop(gone, Cause(kind="obstacle", id=robot, state="gone"))
 
-    def robot_at(self, robot: str, pose: RobotPose, now: float) -> None:
-        """Take where a robot is: what was seen there was the robot."""
-        self._poses[robot] = (now, pose)
+    def _on_pose(self, ids: Ids, pose: RobotPose, at: Moment) -> list[Publication]:
+        """Forget what was seen where a robot is: it was the robot."""
+        robot = ids["robot"]
+        self._poses[robot] = (at.now, pose)
         if not self._until:
-            return
+            return []
         reach = pose.radius + ROBOT_MARGIN
         window = self._geometry.window_around(pose.x - reach, pose.y - reach, pose.x + reach, pose.y + reach)
         if window.empty or not self._cover[window.rows, window.columns].any():
-            return
+            return []
         cells = [
             (column, row)
             for row in range(window.y, window.y + window.height)
@@ -136,25 +143,22 @@ class ObstaclesLayer:
             if (column, row) in self._until and _beside(pose, *self._geometry.centre(column, row))
         ]
         self._drop(cells, Cause(kind="obstacle", id=robot, state="robot"))
+        return []
 
-    def tick(self, now: float, stamp: float) -> None:  # noqa: ARG002  # the protocol's
+    def tick(self, at: Moment) -> list[Publication]:
         """Forget what has not been seen for its time."""
-        if now < self._next_end:
-            return
-        over = [cell for cell, end in self._until.items() if end <= now]
+        if at.now < self._next_end:
+            return []
+        over = [cell for cell, end in self._until.items() if end <= at.now]
         self._drop(over, Cause(kind="obstacle", id="lidar", state="gone"))
         self._next_end = min(self._until.values(), default=float("inf"))
+        return []
 
-    def touched(self) -> list[Touch]:
-        """Return the windows around cells that came or went."""
-        touched, self._touched = self._touched, []
-        return touched
-
-    def paint(self, window: Window, cost: Grid, speed: Grid) -> None:  # noqa: ARG002  # the protocol's
+    def update_costs(self, window: Window, cost: Grid, speed: Grid) -> None:  # noqa: ARG002  # they limit no speed
         """Write the discs; they set no speed limit."""
         mask = self._cover[window.rows, window.columns] > 0
         if mask.any():
-            paint_figure(Figure(window, mask), window, cost, LETHAL)
+            write_cost(ShapeMask(window, mask), window, cost, LETHAL)
 
     def _drop(self, cells: list[tuple[int, int]], cause: Cause) -> None:
         for cell in cells:
@@ -171,7 +175,8 @@ class ObstaclesLayer:
             window = Window(column, row, 1, 1).grown(self._reach)
             key = (column // _PATCH, row // _PATCH)
             patches[key] = patches[key].union(window) if key in patches else window
-        self._touched += [Touch(self._geometry.clip(window), cause) for window in patches.values()]
+        for window in patches.values():
+            self.mark_updated(self._geometry.clip(window), cause)
 
 
 def _beside(pose: RobotPose, x: float, y: float) -> bool:

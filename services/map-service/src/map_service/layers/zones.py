@@ -11,14 +11,17 @@ from typing import TYPE_CHECKING
 
 from fog_contracts.costs import COST_PER_FACTOR, LETHAL, PENALTY_MAX
 from fog_contracts.messages import Cause
-from map_service.layers.protocol import Touch, paint_figure
-from map_service.shapes import rasterize_shape
+from map_service.layers.base import CostLayer, write_cost, write_speed_limit
+from map_service.shapes import ZoneError, rasterize_shape
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from fog_contracts.grid import GridGeometry, Window
+    from fog_contracts.handlers import Moment, Publication
     from fog_contracts.messages import Zone
-    from map_service.layers.protocol import Grid
-    from map_service.shapes import Figure
+    from map_service.layers.base import Grid
+    from map_service.shapes import ShapeMask
 
 
 def penalty_cost(factor: float) -> int:
@@ -41,71 +44,91 @@ def is_active(zone: Zone, stamp: float) -> bool:
 @dataclass
 class _Held:
     zone: Zone
-    figure: Figure
+    mask: ShapeMask
     active: bool
 
 
-class ZonesLayer:
-    """Holds all zones; only active ones are painted."""
+class ZonesLayer(CostLayer):
+    """Holds all zones; only active ones count."""
 
     def __init__(self, geometry: GridGeometry) -> None:
+        super().__init__()
         self._geometry = geometry
         self._held: dict[str, _Held] = {}
-        self._touched: list[Touch] = []
+        self._changed = False
 
     def put(self, zone: Zone, stamp: float) -> None:
-        """Add or replace a zone."""
-        old = self._held.get(zone.id)
-        if old is not None and old.zone == zone:
-            return
-        active = is_active(zone, stamp)
-        held = _Held(zone, rasterize_shape(zone.shape, self._geometry), active)
-        self._held[zone.id] = held
-        if old is not None and old.active:
-            self._touch(old, "active" if active else "inactive")
-        if active:
-            self._touch(held, "active")
+        """Add or replace a zone; raises `ZoneError` for a shape that can't be used."""
+        self._put(zone, rasterize_shape(zone.shape, self._geometry), stamp)
 
-    def remove(self, zone_id: str) -> bool:
-        """Forget a zone; return whether there was one."""
+    def remove(self, zone_id: str) -> None:
+        """Forget a zone, if there is one."""
         old = self._held.pop(zone_id, None)
-        if old is not None and old.active:
-            self._touch(old, "removed")
-        return old is not None
+        if old is not None:
+            self._changed = True
+            if old.active:
+                self._mark(old, "removed")
+
+    def replace_all(self, zones: Iterable[Zone], stamp: float) -> None:
+        """Hold exactly these zones; raises `ZoneError`, which names it, and changes nothing for an unusable one."""
+        masks: dict[str, tuple[Zone, ShapeMask]] = {}
+        for zone in zones:
+            try:
+                masks[zone.id] = zone, rasterize_shape(zone.shape, self._geometry)
+            except ZoneError as error:
+                raise ZoneError(f"{zone.id}.{error.field}", error.message) from error
+        for name in [name for name in self._held if name not in masks]:
+            self.remove(name)
+        for zone, mask in masks.values():
+            self._put(zone, mask, stamp)
 
     def zones(self) -> list[Zone]:
         """Return all zones, active or not, by id."""
         return [self._held[name].zone for name in sorted(self._held)]
 
     def active(self) -> list[str]:
-        """Return the ids of the zones that are painted."""
+        """Return the ids of the zones that count."""
         return sorted(name for name, held in self._held.items() if held.active)
 
-    def tick(self, now: float, stamp: float) -> None:  # noqa: ARG002  # the protocol's
+    def take_changed(self) -> bool:
+        """Return whether a zone came, went, began or ended since this was last called."""
+        changed, self._changed = self._changed, False
+        return changed
+
+    def tick(self, at: Moment) -> list[Publication]:
         """Let zones begin and end."""
         for held in self._held.values():
-            active = is_active(held.zone, stamp)
+            active = is_active(held.zone, at.stamp)
             if active != held.active:
                 held.active = active
-                self._touch(held, "active" if active else "inactive")
+                self._changed = True
+                self._mark(held, "active" if active else "inactive")
+        return []
 
-    def touched(self) -> list[Touch]:
-        """Return the windows of zones that changed."""
-        touched, self._touched = self._touched, []
-        return touched
-
-    def paint(self, window: Window, cost: Grid, speed: Grid) -> None:
+    def update_costs(self, window: Window, cost: Grid, speed: Grid) -> None:
         """Write the active zones."""
         for held in self._held.values():
             zone = held.zone
             if not held.active:
                 continue
             if zone.kind == "BLOCKED":
-                paint_figure(held.figure, window, cost, LETHAL)
+                write_cost(held.mask, window, cost, LETHAL)
             elif zone.kind == "PENALTY" and zone.factor is not None:
-                paint_figure(held.figure, window, cost, penalty_cost(zone.factor))
+                write_cost(held.mask, window, cost, penalty_cost(zone.factor))
             elif zone.kind == "SPEED_LIMIT" and zone.speed is not None:
-                paint_figure(held.figure, window, speed, speed_value(zone.speed), speed=True)
+                write_speed_limit(held.mask, window, speed, speed_value(zone.speed))
 
-    def _touch(self, held: _Held, state: str) -> None:
-        self._touched.append(Touch(held.figure.window, Cause(kind="zone", id=held.zone.id, state=state)))
+    def _put(self, zone: Zone, mask: ShapeMask, stamp: float) -> None:
+        old = self._held.get(zone.id)
+        if old is not None and old.zone == zone:
+            return
+        held = _Held(zone, mask, is_active(zone, stamp))
+        self._held[zone.id] = held
+        self._changed = True
+        if old is not None and old.active:
+            self._mark(old, "active" if held.active else "inactive")
+        if held.active:
+            self._mark(held, "active")
+
+    def _mark(self, held: _Held, state: str) -> None:
+        self.mark_updated(held.mask.window, Cause(kind="zone", id=held.zone.id, state=state))

@@ -1,0 +1,134 @@
+"""The master costmap: layers combined, inflated and turned into versions. Pure."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from msgspec import structs
+
+from fog_contracts.messages import Trace
+from fog_contracts.replica import MasterMap
+from map_service.layers import InflationLayer
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from fog_contracts.costs import Inflation
+    from fog_contracts.grid import GridGeometry, Window
+    from fog_contracts.messages import Cause, Layer, MapDelta, MapHeartbeat, MapSnapshot
+    from fog_contracts.replica import Version
+    from map_service.layers.base import CostLayer, Grid
+
+
+class StaticMap(Protocol):
+    """A floor plan: geometry, and cells uint8 (height, width): 0 free, 254 occupied, 255 unknown."""
+
+    @property
+    def geometry(self) -> GridGeometry:
+        """Size, resolution and origin."""
+
+    @property
+    def cells(self) -> Grid:
+        """The plan itself."""
+
+
+class LayeredCostmap:
+    """Holds the versioned map that its layers (bottom first) and inflation make."""
+
+    def __init__(
+        self, site: str, static: StaticMap, layers: Sequence[CostLayer], inflation: Inflation, epoch: int
+    ) -> None:
+        self.geometry = static.geometry
+        self._layers = layers
+        for layer in layers:
+            layer.take_updated()  # all of it is computed here
+        self._raw, speed = self._computed(self.geometry.whole)
+        self._inflation = InflationLayer(self._raw, static.geometry.resolution, inflation)
+        self._master = MasterMap(site, static.geometry, static.cells, self._inflation.cost, epoch)
+        self._master.write([("speed", self.geometry.whole, speed)], [], [])
+
+    @property
+    def version(self) -> Version:
+        """The version that holds now."""
+        return self._master.version
+
+    @property
+    def cost(self) -> Grid:
+        """The master costmap, uint8 (height, width)."""
+        return self._master.layers["cost"]
+
+    @property
+    def speed(self) -> Grid:
+        """The speed layer, uint8 (height, width), cm/s, 0 = no limit."""
+        return self._master.layers["speed"]
+
+    @property
+    def static(self) -> Grid:
+        """The floor plan, uint8 (height, width)."""
+        return self._master.static
+
+    def heartbeat(self, stamp: float) -> MapHeartbeat:
+        """Return the message that carries the version."""
+        return self._master.heartbeat(stamp)
+
+    def snapshot(self) -> MapSnapshot:
+        """Return the whole map."""
+        return self._master.snapshot()
+
+    def recomputed(self) -> tuple[Grid, Grid]:
+        """Return cost and speed layer computed from scratch: what the master must equal, cell by cell."""
+        raw, speed = self._computed(self.geometry.whole)
+        return self._inflation.whole(raw), speed
+
+    def update(self, stamp: float) -> list[MapDelta]:
+        """Compute anew what layers marked as updated; return the deltas of the new version, none when no cell differs.
+
+        `stamp` (s since the epoch) enters the traces of hazards that caused it.
+        """
+        updated = [bounds for layer in self._layers for bounds in layer.take_updated()]
+        if not updated:
+            return []
+        windows = merged([bounds.window for bounds in updated])
+        changes: list[tuple[Layer, Window, Grid]] = []
+        for window in windows:
+            cost, speed = self._computed(window)
+            self._raw[window.rows, window.columns] = cost
+            changes.append(("speed", window, speed))
+        changes.extend(
+            ("cost", window, self._inflation.cost[window.rows, window.columns])
+            for window in self._inflation.update(self._raw, windows)
+        )
+        causes: list[Cause] = list(dict.fromkeys(bounds.cause for bounds in updated))
+        traces = {
+            (trace.area, trace.epoch, trace.seq): structs.replace(trace, costmap_published=stamp)
+            for trace in (bounds.trace for bounds in updated)
+            if trace is not None
+        }
+        return self._master.write(changes, causes, list[Trace](traces.values()))
+
+    def _computed(self, window: Window) -> tuple[Grid, Grid]:
+        """Return cost (not inflated) and speed limit of a window, combined from all layers."""
+        cost = np.zeros((window.height, window.width), dtype=np.uint8)
+        speed = np.zeros((window.height, window.width), dtype=np.uint8)
+        for layer in self._layers:
+            layer.update_costs(window, cost, speed)
+        return cost, speed
+
+
+def merged(windows: list[Window]) -> list[Window]:
+    """Unite windows that overlap, so that no cell is computed twice; windows apart stay apart and small."""
+    result: list[Window] = []
+    for window in windows:
+        if window.empty:
+            continue
+        grown = window
+        apart = []
+        for other in result:
+            if grown.intersection(other).empty:
+                apart.append(other)
+            else:
+                grown = grown.union(other)
+        # Having grown, it may overlap one that it did not before.
+        result = [*apart, grown] if grown == window else merged([*apart, grown])
+    return result

@@ -1,0 +1,91 @@
+"""What every cost layer does (after Nav2's `Layer`: bounds first, then costs inside a window)."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fog_contracts.costs import combine_costs, combine_speed_limits
+from fog_contracts.grid import Window
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from fog_contracts.channels import Channel
+    from fog_contracts.handlers import Handler, Moment, Publication
+    from fog_contracts.messages import Cause, Trace
+    from map_service.shapes import ShapeMask
+
+Grid = NDArray[np.uint8]
+
+
+class UpdatedBounds(NamedTuple):
+    """A window in which a layer's costs differ from before, and why."""
+
+    window: Window
+    cause: Cause
+    trace: Trace | None = None
+
+
+class CostLayer(ABC):
+    """One layer of the costmap; it overrides what it needs, `update_costs` always.
+
+    A layer that changed calls `mark_updated`; after every input and tick the map's windows that layers marked are
+    computed anew from all layers.
+    """
+
+    def __init__(self) -> None:
+        self._updated: list[UpdatedBounds] = []
+
+    def handlers(self) -> Mapping[Channel, Handler]:
+        """Return the handler of every channel that the layer listens to; what they return is published."""
+        return {}
+
+    def tick(self, at: Moment) -> Sequence[Publication]:  # noqa: ARG002  # a layer without a sense of time ignores it
+        """Let time pass, ten times a second; return what is to be published now."""
+        return []
+
+    @abstractmethod
+    def update_costs(self, window: Window, cost: Grid, speed: Grid) -> None:
+        """Combine the layer's opinion into `cost` and `speed`, both uint8 (window.height, window.width).
+
+        They hold what the layers below wrote inside the window. No layer lowers a cost or raises a speed limit:
+        `write_cost` and `write_speed_limit` see to it.
+        """
+
+    def mark_updated(self, window: Window, cause: Cause, trace: Trace | None = None) -> None:
+        """Note that the layer's costs inside a window differ from now on."""
+        self._updated.append(UpdatedBounds(window, cause, trace))
+
+    def take_updated(self) -> list[UpdatedBounds]:
+        """Return what was marked since this was last called."""
+        updated, self._updated = self._updated, []
+        return updated
+
+
+def write_cost(shape: ShapeMask, window: Window, cost: Grid, value: int) -> None:
+    """Combine one cost into `cost` (the map inside `window`) wherever the shape has cells."""
+    if (cut := _cut(shape, window, cost)) is not None:
+        mask, below = cut
+        below[...] = combine_costs(below, np.full(below.shape, value, dtype=np.uint8), mask)
+
+
+def write_speed_limit(shape: ShapeMask, window: Window, speed: Grid, value: int) -> None:
+    """Combine one speed limit (cm/s) into `speed` (the map inside `window`) wherever the shape has cells."""
+    if (cut := _cut(shape, window, speed)) is not None:
+        mask, below = cut
+        below[...] = combine_speed_limits(below, np.where(mask, value, 0).astype(np.uint8))
+
+
+def _cut(shape: ShapeMask, window: Window, grid: Grid) -> tuple[NDArray[np.bool_], Grid] | None:
+    """Return the shape's mask and the grid's cells where shape and window overlap, or None where they don't."""
+    common = shape.window.intersection(window)
+    if common.empty:
+        return None
+    in_shape, in_grid = (
+        Window(common.x - frame.x, common.y - frame.y, common.width, common.height) for frame in (shape.window, window)
+    )
+    return shape.mask[in_shape.rows, in_shape.columns], grid[in_grid.rows, in_grid.columns]

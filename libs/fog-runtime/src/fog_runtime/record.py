@@ -1,6 +1,7 @@
 """Record what crosses the channels into MCAP files, which Foxglove opens as they are, and read or replay them.
 
-Messages are stored as JSON with their JSON schema, under their real topic or key.
+Messages are stored as JSON with their JSON schema, under their real topic or key. A process may also record entries of
+its own, which cross no channel (`Recorder.write_entry`, `read_entries`); `read` passes over them.
 """
 
 from __future__ import annotations
@@ -33,6 +34,8 @@ _CHUNK: Final = 64 * 1024
 
 _FRAME: Final = 9
 _NO_OPCODE: Final = 0
+_ENTRY: Final = "entry"
+"""Metadata by which an entry that crosses no channel is known."""
 
 _log = logs.get("record")
 
@@ -47,7 +50,7 @@ class _Text(Message, frozen=True, kw_only=True):
     text: str
 
 
-def _schema(kind: type[Message]) -> bytes:
+def _schema(kind: type[msgspec.Struct]) -> bytes:
     (described,), components = msgspec.json.schema_components([kind], ref_template="#/$defs/{name}")
     # Foxglove wants an object at the top, not a reference to one.
     root = components.pop(described["$ref"].rsplit("/", 1)[1]) if "$ref" in described else described
@@ -69,7 +72,7 @@ class Recorder:
         self._file = path.open("wb")
         self._writer = Writer(self._file, chunk_size=_CHUNK)
         self._writer.start(profile="fognav", library="fog-runtime")
-        self._schemas: dict[type[Message], int] = {}
+        self._schemas: dict[type[msgspec.Struct], int] = {}
         self._channels: dict[str, int] = {}
         self._counts: dict[str, int] = {}
 
@@ -79,33 +82,42 @@ class Recorder:
             ids = {**ids, "site": self._site}
         key = channel.key(**ids)
         content = _Text(text=message) if isinstance(message, str) else message
-        number = self._channels.get(key)
+        self._add(key, content, {"channel": channel.name}, log_time_ns)
+
+    def write_entry(self, topic: str, entry: msgspec.Struct, log_time_ns: int) -> None:
+        """Write an entry that crosses no channel, under a topic that is no channel's and holds one type of entry."""
+        self._add(topic, entry, {_ENTRY: topic}, log_time_ns)
+
+    def _add(self, topic: str, content: msgspec.Struct, metadata: dict[str, str], log_time_ns: int) -> None:
+        number = self._channels.get(topic)
         if number is None:
-            number = self._channels[key] = self._register(channel, key, type(content))
-        self._counts[key] = self._counts.get(key, 0) + 1
+            number = self._channels[topic] = self._register(topic, type(content), metadata)
+        self._counts[topic] = self._counts.get(topic, 0) + 1
         self._writer.add_message(
             channel_id=number,
             log_time=log_time_ns,
             publish_time=log_time_ns,
-            sequence=self._counts[key],
+            sequence=self._counts[topic],
             data=msgspec.json.encode(content),
         )
 
-    def _register(self, channel: Channel, key: str, kind: type[Message]) -> int:
+    def _register(self, topic: str, kind: type[msgspec.Struct], metadata: dict[str, str]) -> int:
         if kind not in self._schemas:
             self._schemas[kind] = self._writer.register_schema(
                 name=f"fognav.{kind.__name__.lstrip('_')}", encoding="jsonschema", data=_schema(kind)
             )
         return int(
             self._writer.register_channel(
-                topic=key, message_encoding="json", schema_id=self._schemas[kind], metadata={"channel": channel.name}
+                topic=topic, message_encoding="json", schema_id=self._schemas[kind], metadata=metadata
             )
         )
 
     def close(self) -> None:
-        """Write the index and close the file."""
-        _finish(self._writer)
-        self._file.close()
+        """Write the index and close the file; it is closed too when there is no room for the index (`OSError`)."""
+        try:
+            _finish(self._writer)
+        finally:
+            self._file.close()
 
     def __enter__(self) -> Self:
         return self
@@ -120,6 +132,26 @@ def read(path: Path) -> Iterator[tuple[int, Channel, dict[str, str], Message | s
     A file that a crash cut short gives all that is whole. Raises `RecordError` for what is no recording, or
     when it comes to bytes that are damaged.
     """
+    for info, record in _records(path):
+        if _ENTRY in info.metadata:
+            continue
+        channel = CHANNELS.get(info.metadata.get("channel", ""))
+        ids = channel.match(info.topic) if channel else None
+        if channel is None or ids is None:
+            raise RecordError(f"{path}: {info.topic!r} belongs to no channel of this version of the contracts")
+        ids.pop("site", None)
+        yield record.log_time, channel, ids, _decoded(path, channel, record.data)
+
+
+def read_entries(path: Path) -> Iterator[tuple[int, str, bytes]]:
+    """Yield (time in ns, topic, JSON) of the entries that cross no channel, as `read` does with messages."""
+    for info, record in _records(path):
+        if _ENTRY in info.metadata:
+            yield record.log_time, info.topic, record.data
+
+
+def _records(path: Path) -> Iterator[tuple[Any, Any]]:
+    """Yield channel and message of all that is whole; raises `RecordError` as `read` does."""
     size = path.stat().st_size
     if size < MAGIC_SIZE:
         raise RecordError(f"{path}: is no MCAP file ({size} bytes)")
@@ -128,13 +160,7 @@ def read(path: Path) -> Iterator[tuple[int, Channel, dict[str, str], Message | s
         if whole < size:
             _log.warning("recording_cut_short", path=str(path), bytes_lost=size - whole)
         reader = NonSeekingReader(cast("BinaryIO", _Head(file, whole)), validate_crcs=True)
-        for info, record in _messages(path, reader):
-            channel = CHANNELS.get(info.metadata.get("channel", ""))
-            ids = channel.match(info.topic) if channel else None
-            if channel is None or ids is None:
-                raise RecordError(f"{path}: {info.topic!r} belongs to no channel of this version of the contracts")
-            ids.pop("site", None)
-            yield record.log_time, channel, ids, _decoded(path, channel, record.data)
+        yield from _messages(path, reader)
 
 
 def bytes_lost(path: Path) -> int:

@@ -1,0 +1,338 @@
+"""Everything that reaches the agent's core, in order and with its exact times, and what the core answers.
+
+`LoggedAgent` is an `AgentCore` that hands an entry to `write` before every input and after every output. A fresh core
+that is fed the inputs again gives the same outputs to the last bit (`robot_agent.agent.replay`). An agent that logs
+nothing is a plain `AgentCore` and pays nothing.
+
+No secret enters the log: its configuration holds `LOG_KEY` in place of the operators' key, and commands that were
+signed with theirs are signed anew with it.
+"""
+
+from __future__ import annotations
+
+import hmac
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
+import numpy as np
+
+from fog_contracts import channels as ch
+from fog_contracts.commands import sign
+from fog_contracts.messages import LoopHealth, MapSnapshot, Mode, RobotCommand
+from robot_agent.agent.core import AgentCore
+from robot_agent.config import AgentConfig
+from robot_agent.guardian.link import BaseFeedback, WheelCommand
+from robot_agent.hardware import LaserScan
+from robot_agent.localization.localizer import SavedPose
+from robot_agent.motion.local_planner import Decision
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from fog_contracts.channels import Channel
+    from fog_contracts.handlers import Answerer, Handler, Ids, Moment, Publication
+    from fog_contracts.messages import Message
+    from robot_agent.motion.local_planner import Job
+
+LOG_KEY: Final = b"known to all: signs commands in logs only"
+"""Stands in a log for the operators' key."""
+
+
+class Entry(msgspec.Struct, frozen=True, kw_only=True):
+    """One entry of the log. `now` is s of the robot's monotonic clock, `stamp` s since the epoch."""
+
+
+class Input(Entry, frozen=True, kw_only=True):
+    """Something that reached the core, written before the core took it."""
+
+
+class Output(Entry, frozen=True, kw_only=True):
+    """Something that the core answered to the input before it."""
+
+
+class Started(Input, frozen=True, kw_only=True):
+    """A new core; the first entry of every log."""
+
+    config: AgentConfig
+    seed: int
+
+
+class PoseRestored(Input, frozen=True, kw_only=True):
+    """A pose of an earlier run, or the site's start pose."""
+
+    pose: SavedPose
+
+
+class SnapshotLoaded(Input, frozen=True, kw_only=True):
+    """A snapshot of the map, from the map-service or from disk."""
+
+    snapshot: MapSnapshot
+    now: float
+
+
+class MessageReceived(Input, frozen=True, kw_only=True):
+    """A message of a channel, by the channel's name."""
+
+    channel: str
+    ids: dict[str, str]
+    message: Any
+    now: float
+    stamp: float
+
+
+class QueryReceived(Input, frozen=True, kw_only=True):
+    """A query, by its channel's name."""
+
+    channel: str
+    ids: dict[str, str]
+    request: Any
+    now: float
+    stamp: float
+
+
+class BaseReceived(Input, frozen=True, kw_only=True):
+    """What the guardian read from the base."""
+
+    feedback: BaseFeedback
+    now: float
+
+
+class BaseLost(Input, frozen=True, kw_only=True):
+    """The link to the guardian broke."""
+
+    reason: str
+    now: float
+
+
+class LidarNodesReceived(Input, frozen=True, kw_only=True):
+    """The lidar sent anything."""
+
+    now: float
+
+
+class ScanReceived(Input, frozen=True, kw_only=True):
+    """A whole scan: its arrays as bytes, float64, float64 and uint8, little-endian, so that they come back exactly."""
+
+    angles_rad: bytes
+    ranges_m: bytes
+    quality: bytes
+    started_at: float
+    ended_at: float
+    repeats: int
+    now: float
+
+    @classmethod
+    def of(cls, scan: LaserScan, now: float) -> ScanReceived:
+        """Return the entry of a scan that arrived at `now`."""
+        return cls(
+            angles_rad=np.asarray(scan.angles_rad, "<f8").tobytes(),
+            ranges_m=np.asarray(scan.ranges_m, "<f8").tobytes(),
+            quality=np.asarray(scan.quality, np.uint8).tobytes(),
+            started_at=float(scan.started_at),
+            ended_at=float(scan.ended_at),
+            repeats=int(scan.repeats),
+            now=now,
+        )
+
+    def scan(self) -> LaserScan:
+        """Return the scan."""
+        return LaserScan(
+            angles_rad=np.frombuffer(self.angles_rad, "<f8"),
+            ranges_m=np.frombuffer(self.ranges_m, "<f8"),
+            quality=np.frombuffer(self.quality, np.uint8),
+            started_at=self.started_at,
+            ended_at=self.ended_at,
+            repeats=self.repeats,
+        )
+
+
+class LoopHealthReceived(Input, frozen=True, kw_only=True):
+    """How punctual the process's loops are."""
+
+    health: LoopHealth
+
+
+class ControlCycle(Input, frozen=True, kw_only=True):
+    """The control loop asked for a job."""
+
+    now: float
+
+
+class DecisionMade(Input, frozen=True, kw_only=True):
+    """What came of the last job. A function of that alone, so a replay computes it again."""
+
+    decision: Decision
+
+
+class StreamCycle(Input, frozen=True, kw_only=True):
+    """The stream loop asked for a wheel command."""
+
+    now: float
+    stamp: float
+
+
+class Tick(Input, frozen=True, kw_only=True):
+    """The publish loop let time pass."""
+
+    now: float
+    stamp: float
+
+
+class StorageCheck(Input, frozen=True, kw_only=True):
+    """The housekeeping loop asked for a pose to store."""
+
+    now: float
+
+
+class WheelsCommanded(Output, frozen=True, kw_only=True):
+    """The wheel command, and the mode that allowed it."""
+
+    command: WheelCommand
+    mode: Mode
+
+
+class Published(Output, frozen=True, kw_only=True):
+    """A publication, by its channel's name."""
+
+    channel: str
+    ids: dict[str, str]
+    message: Any
+
+
+class Answered(Output, frozen=True, kw_only=True):
+    """The answer to a query."""
+
+    reply: Any
+
+
+class PoseStored(Output, frozen=True, kw_only=True):
+    """A pose that is worth storing."""
+
+    pose: SavedPose
+
+
+class EntriesLost(Entry, frozen=True, kw_only=True):
+    """So many entries are missing here: the disk was too slow. Nothing after them can be replayed."""
+
+    count: int
+
+
+_KINDS: Final[tuple[type[Entry], ...]] = (
+    Started, PoseRestored, SnapshotLoaded, MessageReceived, QueryReceived, BaseReceived, BaseLost, LidarNodesReceived,
+    ScanReceived, LoopHealthReceived, ControlCycle, DecisionMade, StreamCycle, Tick, StorageCheck,
+    WheelsCommanded, Published, Answered, PoseStored, EntriesLost,
+)  # fmt: skip
+ENTRY_OF_TOPIC: Final[Mapping[str, type[Entry]]] = {f"agent/{kind.__name__}": kind for kind in _KINDS}
+TOPIC_OF_ENTRY: Final[Mapping[type[Entry], str]] = {kind: topic for topic, kind in ENTRY_OF_TOPIC.items()}
+"""Under which topic of a recording each type of entry is written."""
+
+
+class LoggedAgent(AgentCore):
+    """An `AgentCore` all of whose inputs and outputs are handed to `write`, which must not block."""
+
+    def __init__(self, config: AgentConfig, seed: int, write: Callable[[Entry], object]) -> None:
+        self._write = write
+        self._key = config.operator_key
+        write(Started(config=replace(config, operator_key=LOG_KEY), seed=seed))
+        super().__init__(config, seed)
+
+    def handlers(self) -> Mapping[Channel, Handler]:
+        """Return the core's handlers, each of which logs what it takes and returns."""
+        return {channel: partial(self._handle, channel, handler) for channel, handler in super().handlers().items()}
+
+    def answerers(self) -> Mapping[Channel, Answerer]:
+        """Return the core's answerers, each of which logs what it is asked and answers."""
+        return {channel: partial(self._answer, channel, answerer) for channel, answerer in super().answerers().items()}
+
+    def _handle(
+        self, channel: Channel, handler: Handler, ids: Ids, message: Message, at: Moment
+    ) -> Sequence[Publication]:
+        self._write(MessageReceived(channel=channel.name, ids=dict(ids), message=message, now=at.now, stamp=at.stamp))
+        return self._log_publications(handler(ids, message, at))
+
+    def _answer(self, channel: Channel, answerer: Answerer, ids: Ids, request: Any, at: Moment) -> Message:
+        logged = self._without_secret(request) if channel is ch.ROBOT_COMMAND else request
+        self._write(QueryReceived(channel=channel.name, ids=dict(ids), request=logged, now=at.now, stamp=at.stamp))
+        reply = answerer(ids, request, at)
+        self._write(Answered(reply=reply))
+        return reply
+
+    def _without_secret(self, command: RobotCommand) -> RobotCommand:
+        """Return the command as valid or invalid under `LOG_KEY` as it is under the operators' key."""
+        if hmac.compare_digest(sign(command, self._key).signature, command.signature):
+            return sign(command, LOG_KEY)
+        return msgspec.structs.replace(command, signature=b"")
+
+    def load(self, snapshot: MapSnapshot, now: float) -> None:
+        """Log the snapshot and load it."""
+        self._write(SnapshotLoaded(snapshot=snapshot, now=now))
+        super().load(snapshot, now)
+
+    def restore(self, saved: SavedPose) -> None:
+        """Log the pose and start at it."""
+        self._write(PoseRestored(pose=saved))
+        super().restore(saved)
+
+    def on_base(self, feedback: BaseFeedback, now: float) -> None:
+        """Log the feedback and take it."""
+        self._write(BaseReceived(feedback=feedback, now=now))
+        super().on_base(feedback, now)
+
+    def on_base_lost(self, now: float, reason: str) -> None:
+        """Log that the link broke, and take it."""
+        self._write(BaseLost(reason=reason, now=now))
+        super().on_base_lost(now, reason)
+
+    def on_lidar_nodes(self, now: float) -> None:
+        """Log that the lidar sent anything, and take it."""
+        self._write(LidarNodesReceived(now=now))
+        super().on_lidar_nodes(now)
+
+    def on_scan(self, scan: LaserScan, now: float) -> None:
+        """Log the scan and take it."""
+        self._write(ScanReceived.of(scan, now))
+        super().on_scan(scan, now)
+
+    def on_loop_health(self, health: LoopHealth) -> None:
+        """Log the loops' health and take it."""
+        self._write(LoopHealthReceived(health=health))
+        super().on_loop_health(health)
+
+    def control_job(self, now: float) -> Job | None:
+        """Log the control cycle and return its job."""
+        self._write(ControlCycle(now=now))
+        return super().control_job(now)
+
+    def accept(self, decision: Decision) -> None:
+        """Log the decision and take it."""
+        self._write(DecisionMade(decision=decision))
+        super().accept(decision)
+
+    def stream(self, now: float, stamp: float) -> WheelCommand:
+        """Log the stream cycle and its command."""
+        self._write(StreamCycle(now=now, stamp=stamp))
+        command = super().stream(now, stamp)
+        self._write(WheelsCommanded(command=command, mode=self.safety.mode))
+        return command
+
+    def tick(self, at: Moment) -> Sequence[Publication]:
+        """Log that time passes, and what is published."""
+        self._write(Tick(now=at.now, stamp=at.stamp))
+        return self._log_publications(super().tick(at))
+
+    def pose_to_store(self, now: float) -> SavedPose | None:
+        """Log the question, and the pose if there is one to store."""
+        self._write(StorageCheck(now=now))
+        pose = super().pose_to_store(now)
+        if pose is not None:
+            self._write(PoseStored(pose=pose))
+        return pose
+
+    def _log_publications(self, publications: Sequence[Publication]) -> Sequence[Publication]:
+        for publication in publications:
+            self._write(
+                Published(channel=publication.channel.name, ids=dict(publication.ids), message=publication.message)
+            )
+        return publications

@@ -1,0 +1,217 @@
+"""Replay what an agent logged: a fresh core is fed the same inputs and must answer the same to the last bit.
+
+`python -m robot_agent.agent.replay FILE` prints what came of it as JSON and ends with 1 if anything differs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import sys
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import msgspec
+
+from fog_contracts.channels import CHANNELS
+from fog_contracts.handlers import Moment
+from fog_contracts.replica import MapError
+from fog_runtime.record import RecordError, read_entries
+from robot_agent.agent import input_log as log
+from robot_agent.agent.core import decide
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from robot_agent.motion.local_planner import Job
+
+_SHOWN: Final = 20
+"""Differences that are kept; further ones are counted."""
+_TEXT_LIMIT: Final = 500
+
+
+class ReplayError(ValueError):
+    """A log that can't be replayed; the message names it and says why."""
+
+
+class Difference(msgspec.Struct, frozen=True, kw_only=True):
+    """An output that is not the recorded one: after which input (counted from 1), and both as JSON."""
+
+    after_input: int
+    recorded: str
+    replayed: str
+
+
+@dataclass(kw_only=True)
+class Replayed:
+    """What came of a replay: counts by type of entry, modes in order, a digest of all outputs, and differences."""
+
+    inputs: Counter[str] = field(default_factory=Counter)
+    outputs: Counter[str] = field(default_factory=Counter)
+    modes: list[str] = field(default_factory=list)
+    digest: str = ""
+    differences: list[Difference] = field(default_factory=list)
+    different: int = 0
+
+
+def replay(path: Path) -> Replayed:
+    """Feed a log to a fresh core; raises `ReplayError` or `RecordError` for one that can't be replayed.
+
+    A log that a crash cut short is replayed as far as it goes.
+    """
+    entries = _entries(path)
+    first = next(entries, None)
+    if first is None or not isinstance(first[0], log.Started):
+        raise ReplayError(f"{path}: begins with no start of an agent: it is no input log, or its begin is lost")
+    run = _Run(first[0])
+    recorded: list[bytes] = []
+    for entry, data in entries:
+        if isinstance(entry, log.EntriesLost):
+            raise ReplayError(
+                f"{path}: {entry.count} entries are missing after input {run.count}: its disk was too slow"
+            )
+        if isinstance(entry, log.Output):
+            recorded.append(data)
+            continue
+        run.compare(recorded)
+        recorded = []
+        run.feed(entry)
+    # The last input may have been cut off from its outputs.
+    run.compare(recorded, whole=False)
+    return run.finish()
+
+
+def _entries(path: Path) -> Iterator[tuple[log.Entry, bytes]]:
+    for _, topic, data in read_entries(path):
+        kind = log.ENTRY_OF_TOPIC.get(topic)
+        if kind is None:
+            continue
+        try:
+            yield msgspec.json.decode(data, type=kind), data
+        except msgspec.DecodeError as error:
+            raise ReplayError(f"{path}: an entry of {topic} is of another version of the agent: {error}") from error
+
+
+class _Run:
+    """A core under replay, and what it has produced since the last input."""
+
+    def __init__(self, started: log.Started) -> None:
+        self.count = 0
+        self._result = Replayed()
+        self._digest = hashlib.blake2b(digest_size=16)
+        self._produced: list[bytes] = []
+        self._job: Job | None = None
+        self._agent = log.LoggedAgent(started.config, started.seed, self._take)
+
+    def _take(self, entry: log.Entry) -> None:
+        if not isinstance(entry, log.Output):
+            return
+        data = msgspec.json.encode(entry)
+        self._produced.append(data)
+        self._digest.update(data)
+        self._result.outputs[type(entry).__name__] += 1
+        if isinstance(entry, log.WheelsCommanded) and self._result.modes[-1:] != [entry.mode]:
+            self._result.modes.append(entry.mode)
+
+    def compare(self, recorded: Sequence[bytes], *, whole: bool = True) -> None:
+        """Compare what was produced since the last input with what was recorded."""
+        produced, self._produced = self._produced, []
+        if not whole:
+            produced = produced[: len(recorded)]
+        for index in range(max(len(recorded), len(produced))):
+            self._expect(
+                recorded[index] if index < len(recorded) else b"nothing",
+                produced[index] if index < len(produced) else b"nothing",
+            )
+
+    def _expect(self, recorded: bytes, replayed: bytes) -> None:
+        if recorded == replayed:
+            return
+        self._result.different += 1
+        if len(self._result.differences) < _SHOWN:
+            before, after = (data[:_TEXT_LIMIT].decode(errors="replace") for data in (recorded, replayed))
+            self._result.differences.append(Difference(after_input=self.count, recorded=before, replayed=after))
+
+    def feed(self, entry: log.Entry) -> None:
+        """Hand an input to the core."""
+        self.count += 1
+        self._result.inputs[type(entry).__name__] += 1
+        agent = self._agent
+        match entry:
+            case log.MessageReceived():
+                self._message(entry)
+            case log.QueryReceived():
+                self._query(entry)
+            case log.SnapshotLoaded():
+                self._load(entry)
+            case log.PoseRestored():
+                agent.restore(entry.pose)
+            case log.BaseReceived():
+                agent.on_base(entry.feedback, entry.now)
+            case log.BaseLost():
+                agent.on_base_lost(entry.now, entry.reason)
+            case log.LidarNodesReceived():
+                agent.on_lidar_nodes(entry.now)
+            case log.ScanReceived():
+                agent.on_scan(entry.scan(), entry.now)
+            case log.LoopHealthReceived():
+                agent.on_loop_health(entry.health)
+            case log.ControlCycle():
+                self._job = agent.control_job(entry.now)
+            case log.DecisionMade():
+                self._decide(entry)
+            case log.StreamCycle():
+                agent.stream(entry.now, entry.stamp)
+            case log.Tick():
+                agent.tick(Moment(entry.now, entry.stamp))
+            case log.StorageCheck():
+                agent.pose_to_store(entry.now)
+            case _:
+                raise ReplayError(f"input {self.count}: a log can't go on with {type(entry).__name__}")
+
+    def _message(self, entry: log.MessageReceived) -> None:
+        channel = CHANNELS[entry.channel]
+        message = msgspec.convert(entry.message, channel.message)
+        self._agent.handlers()[channel](entry.ids, message, Moment(entry.now, entry.stamp))
+
+    def _query(self, entry: log.QueryReceived) -> None:
+        channel = CHANNELS[entry.channel]
+        request = None if channel.message is None else msgspec.convert(entry.request, channel.message)
+        self._agent.answerers()[channel](entry.ids, request, Moment(entry.now, entry.stamp))
+
+    def _load(self, entry: log.SnapshotLoaded) -> None:
+        try:
+            self._agent.load(entry.snapshot, entry.now)
+        except MapError:
+            return  # as it was refused then: what follows would differ otherwise
+
+    def _decide(self, entry: log.DecisionMade) -> None:
+        recorded = msgspec.json.encode(entry.decision)
+        self._expect(recorded, b"no job" if self._job is None else msgspec.json.encode(decide(self._job)))
+        self._job = None
+        self._agent.accept(entry.decision)
+
+    def finish(self) -> Replayed:
+        """Return what came of the run."""
+        self._result.digest = self._digest.hexdigest()
+        return self._result
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Replay the log named on the command line."""
+    parser = argparse.ArgumentParser(prog="python -m robot_agent.agent.replay", description=__doc__)
+    parser.add_argument("file", type=Path, help="what an agent wrote with FOGNAV_INPUT_LOG")
+    path: Path = parser.parse_args(arguments).file
+    try:
+        result = replay(path)
+    except (ReplayError, RecordError, OSError) as error:
+        sys.stderr.write(f"{error}\n")
+        return 2
+    sys.stdout.write(msgspec.json.format(msgspec.json.encode(result)).decode() + "\n")
+    return 1 if result.different else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

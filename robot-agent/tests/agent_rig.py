@@ -169,6 +169,7 @@ class AgentProcess:
     def __init__(self, folder: Path, router: str, watchdog: Watchdog, body: Body, start=(2.0, 2.0, 0.0)) -> None:
         self.log_file = folder / "agent.log"
         self.data = folder / "data"
+        self.input_log = folder / "inputs.mcap"
         self._port_file = folder / "agent.port"
         site, key = folder / "site", folder / "operator.key"
         site.mkdir(exist_ok=True)
@@ -187,6 +188,7 @@ class AgentProcess:
             "FOGNAV_ZENOH_CONNECT": router,
             "FOGNAV_PORT_FILE": str(self._port_file),
             "FOGNAV_SEED": "1",
+            "FOGNAV_INPUT_LOG": str(self.input_log),
         }
         self.process: subprocess.Popen[bytes] | None = None
 

@@ -14,7 +14,8 @@ is compared which this can't touch:
 - each plan, computed again on the map version that it names and from the point where it begins, point for point;
 - which way the replayed planner goes, by where it leads.
 
-The robot-agent is not replayed: bytes of base and lidar cross no channel.
+The robot-agent is replayed from a log of its own, for what its base and lidar send crosses no channel
+(robot-agent/tests/test_replay.py).
 """
 
 from __future__ import annotations

@@ -2,6 +2,7 @@ import asyncio
 import json
 import time
 
+import msgspec
 import pytest
 from mcap.reader import make_reader
 
@@ -9,7 +10,7 @@ from fog_contracts import channels as ch
 from fog_contracts import messages as m
 from fog_runtime.clock import ManualClock, SystemClock
 from fog_runtime.mqtt_edge import MqttEdge
-from fog_runtime.record import Recorder, RecordError, read, record_all, replay
+from fog_runtime.record import Recorder, RecordError, read, read_entries, record_all, replay
 from fog_runtime.zenoh_edge import ZenohEdge
 from fog_supervisor.servers import start_mosquitto, start_router
 
@@ -164,3 +165,23 @@ async def test_record_all_takes_both_transports_at_any_speed(tmp_path, speed):
         "node_reading": ({"node": "n1"}, reading(1)),
         "thesis_area": ({"number": "1"}, "blocked"),
     }
+
+
+class Entry(msgspec.Struct, frozen=True, kw_only=True):
+    number: int
+    data: bytes
+
+
+def test_entries_that_cross_no_channel_lie_beside_messages_and_are_read_apart(tmp_path):
+    path = tmp_path / "both.mcap"
+    heartbeat = m.MapHeartbeat(epoch=1, seq=2, hash=3, stamp=4.0)
+    with Recorder(path, site="lab") as recorder:
+        recorder.write_entry("own/entry", Entry(number=1, data=b"\x00\xff"), 10)
+        recorder.write(ch.MAP_HEARTBEAT, {}, heartbeat, 11)
+        recorder.write_entry("own/entry", Entry(number=2, data=b""), 12)
+    assert list(read(path)) == [(11, ch.MAP_HEARTBEAT, {}, heartbeat)]
+    entries = [(at, topic, msgspec.json.decode(data, type=Entry)) for at, topic, data in read_entries(path)]
+    assert entries == [
+        (10, "own/entry", Entry(number=1, data=b"\x00\xff")),
+        (12, "own/entry", Entry(number=2, data=b"")),
+    ]

@@ -13,8 +13,8 @@ from fog_runtime.clock import SystemClock
 from fog_runtime.health import Health, serve_plain
 from fog_runtime.settings import describe, load
 from fog_runtime.zenoh_edge import ZenohEdge
-from robot_agent.agent.core import AgentCore
 from robot_agent.agent.guardian_client import GuardianClient
+from robot_agent.agent.input_writer import open_core
 from robot_agent.agent.lidar_edge import LidarEdge
 from robot_agent.agent.service import Service
 from robot_agent.agent.settings import Settings, read_operator_key, read_site
@@ -38,18 +38,20 @@ async def main() -> None:
     scanner = make_lidar(settings.lidar, settings.lidar_options)
     config = config.with_hardware(base.drive_train, scanner.traits)
     clock = SystemClock(settings.speed)
-    core = AgentCore(config, settings.seed)
     health = Health("map", "pose", "lidar", "base")
     async with ZenohEdge.open(
         connect=settings.zenoh_endpoints, clock=clock, role="robot-agent", id=settings.robot, site=site
     ) as zenoh:
-        agent = Service(core, zenoh, Store(settings.data_dir), clock, health, robot=settings.robot, site=site)
-        link = GuardianClient(settings.guardian_socket, clock, agent.on_feedback, agent.on_base_lost)
-        lidar = LidarEdge(settings.lidar_port, scanner, clock, core.on_lidar_nodes, agent.on_scan)
-        agent.restore(body)
-        agent.subscribe()
-        zenoh.alive("robot-agent", settings.robot)
-        with serve_plain(health, settings.http_host, settings.http_port, settings.port_file):
+        with (
+            open_core(config, settings.seed, settings.input_log) as core,
+            serve_plain(health, settings.http_host, settings.http_port, settings.port_file),
+        ):
+            agent = Service(core, zenoh, Store(settings.data_dir), clock, health, robot=settings.robot, site=site)
+            link = GuardianClient(settings.guardian_socket, clock, agent.on_feedback, agent.on_base_lost)
+            lidar = LidarEdge(settings.lidar_port, scanner, clock, core.on_lidar_nodes, agent.on_scan)
+            agent.restore(body)
+            agent.subscribe()
+            zenoh.alive("robot-agent", settings.robot)
             async with asyncio.TaskGroup() as tasks:
                 tasks.create_task(link.run(), name="base")
                 tasks.create_task(lidar.run(), name="lidar")

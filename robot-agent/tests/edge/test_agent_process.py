@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import signal
@@ -12,6 +13,7 @@ from guardian_rig import STOP_S
 
 from fog_contracts.grid import Window
 from fog_supervisor.servers import start_router
+from robot_agent.agent.replay import replay
 from robot_agent.localization.localizer import SavedPose
 
 pytestmark = [pytest.mark.live, pytest.mark.timeout(150)]
@@ -151,3 +153,22 @@ async def test_a_robot_without_a_fog_starts_from_its_files_and_waits(robot):
     robot.fog.send_robot_to_the_corner()
     await until(lambda: robot.fog.state.mode == "HOLD", "an old map holds the robot")
     assert not robot.body.moving
+
+
+async def test_what_a_live_agent_logged_is_replayed_to_the_same_commands_and_publications(robot):
+    await enabled(robot)
+    robot.fog.send_robot_to_the_corner()
+    await until(lambda: robot.body.pose[0] > 2.6, "it follows the path")
+    reply = await robot.fog.command("disable")
+    assert reply.accepted, reply
+    await until(lambda: robot.fog.state.mode == "INIT", "the robot is disabled")
+    robot.agent.process.send_signal(signal.SIGTERM)
+    assert robot.agent.process.wait(10.0) == 0
+    result = await asyncio.to_thread(replay, robot.agent.input_log)
+    assert result.differences == []
+    assert {"SnapshotLoaded", "PoseRestored", "LoopHealthReceived"} <= set(result.inputs)
+    assert result.outputs["Answered"] == 2
+    assert result.outputs["WheelsCommanded"] > 20
+    assert result.inputs["DecisionMade"] > 5
+    assert "NORMAL" in result.modes
+    assert result.modes[-1] == "INIT"

@@ -27,6 +27,9 @@ class Settings(CommonSettings, frozen=True, kw_only=True):
     `base`, `lidar`: names in the entry points `fognav.bases` and `fognav.lidars`; the base must be the guardian's.
     `base_options`, `lidar_options`: a JSON object with the part's own options; empty for its defaults.
 
+    `input_log`: where to log all that reaches the agent's core, for `python -m robot_agent.agent.replay`; some 1.5 MB
+    a minute. The log of the run before is kept beside it.
+
     `obstacle_memory_s`: how long (s) a thing that its lidar saw counts while no lidar looks there again.
 
     `site_dir` is optional here: a robot without the site's folder is told its `site` and asks for a pose or searches.
@@ -41,6 +44,7 @@ class Settings(CommonSettings, frozen=True, kw_only=True):
     guardian_socket: Path
     site_dir: Path = Path()
     seed: Annotated[int, Meta(ge=0)] = 0
+    input_log: Path | None = None
     obstacle_memory_s: Annotated[float, Meta(gt=0.0, le=600.0)] = 600.0
 
 

@@ -1,0 +1,91 @@
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+from guardian_rig import DEADLINE_S
+from little_world import AGENT, LittleWorld
+
+from fog_runtime.record import Recorder, read_entries
+from robot_agent.agent import input_writer
+from robot_agent.agent.core import AgentCore
+from robot_agent.agent.input_log import TOPIC_OF_ENTRY, BaseLost, EntriesLost, LoggedAgent
+from robot_agent.agent.input_writer import LOST, InputWriter, open_core
+from robot_agent.agent.replay import replay
+
+
+def lost():
+    return LOST._value.get()
+
+
+def topics(path):
+    return [topic for _, topic, _ in read_entries(path)]
+
+
+def test_what_an_agent_logs_is_on_disk_when_it_ends_and_can_be_replayed(tmp_path):
+    path = tmp_path / "logs" / "inputs.mcap"
+    with open_core(AGENT, 4, path) as core:
+        assert isinstance(core, LoggedAgent)
+        world = LittleWorld(seed=4, start_agent=lambda _config, _seed: core)
+        world.agent.load(world.master.snapshot(), world.now)
+        world.run(1.0)
+    result = replay(path)
+    assert result.differences == []
+    assert result.outputs["WheelsCommanded"] == len(world.commands) == 20
+
+
+def test_an_agent_without_a_log_is_a_plain_core():
+    with open_core(AGENT, 4, None) as core:
+        assert type(core) is AgentCore
+
+
+def test_the_log_of_the_run_before_is_kept(tmp_path):
+    path = tmp_path / "inputs.mcap"
+    for reason in ("first", "second", "third"):
+        with InputWriter(path) as writer:
+            writer.write(BaseLost(reason=reason, now=1.0))
+    assert [b"third" in data for _, _, data in read_entries(path)] == [True]
+    assert [b"second" in data for _, _, data in read_entries(tmp_path / "inputs.previous.mcap")] == [True]
+
+
+def test_a_full_disk_is_counted_and_stops_nobody(caplog):
+    before = lost()
+    with open_core(AGENT, 4, Path("/dev/full")) as core:
+        world = LittleWorld(seed=4, start_agent=lambda _config, _seed: core)
+        world.agent.load(world.master.snapshot(), world.now)
+        world.run(2.0)
+        assert len(world.commands) == 40
+    assert lost() > before
+    assert caplog.messages.count("input_log_ended") == 1
+
+
+def test_a_log_that_can_not_be_begun_leaves_the_agent_without_one(tmp_path, caplog):
+    (tmp_path / "file").write_text("no folder")
+    with open_core(AGENT, 4, tmp_path / "file" / "inputs.mcap") as core:
+        assert type(core) is AgentCore
+    assert "input_log_not_begun" in caplog.messages
+
+
+def test_a_disk_that_is_too_slow_leaves_a_mark_where_entries_are_missing(tmp_path, monkeypatch):
+    begun, release, written = threading.Event(), threading.Event(), threading.Semaphore(0)
+
+    class SlowRecorder(Recorder):
+        def write_entry(self, topic, entry, log_time_ns):
+            begun.set()
+            release.wait()
+            super().write_entry(topic, entry, log_time_ns)
+            written.release()
+
+    monkeypatch.setattr(input_writer, "Recorder", SlowRecorder)
+    path, entry, before = tmp_path / "inputs.mcap", BaseLost(reason="x", now=1.0), lost()
+    with InputWriter(path, waiting_most=2) as writer:
+        writer.write(entry)
+        assert begun.wait(DEADLINE_S)
+        for _ in range(5):
+            writer.write(entry)  # two may wait
+        assert lost() - before == 3
+        release.set()
+        assert all(written.acquire(timeout=DEADLINE_S) for _ in range(3))
+        writer.write(entry)
+    kinds = [TOPIC_OF_ENTRY[kind] for kind in (BaseLost, BaseLost, BaseLost, EntriesLost, BaseLost)]
+    assert topics(path) == kinds

@@ -4,6 +4,7 @@ import asyncio
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Annotated, NoReturn
 
@@ -94,6 +95,35 @@ def run_tests(context: typer.Context, *, yes: Yes = False) -> None:
     command = [sys.executable, "-m", "pytest", *context.args]
     done = subprocess.run(command, check=False, cwd=checkout.root())
     raise typer.Exit(done.returncode)
+
+
+@app.command("check", epilog="Example: fognav check --json")
+def check_command(*, json: Json = False) -> None:
+    """Check format, lint, types, import contracts, dead code and generated files.
+
+    All checks run; exit code 1 if one of them fails.
+    """
+    from fognav import checks  # noqa: PLC0415  # the other commands need not wait for its imports
+
+    def show(result: checks.CheckResult) -> None:
+        mark = "[green]ok[/]    " if result.ok else "[red]failed[/]"
+        console.print(f"{mark} {result.seconds:5.1f} s  {result.check.name}")
+        if not result.ok:
+            _say(result.output)
+
+    begun = time.monotonic()
+    try:
+        results = asyncio.run(checks.run_checks(checks.CHECKS, checkout.root(), show))
+    except WrongUseError as error:
+        _fail(str(error), WRONG_USE)
+    seconds, failed = time.monotonic() - begun, [result for result in results if not result.ok]
+    if json:
+        shown = [{"check": r.check.name, "ok": r.ok, "seconds": round(r.seconds, 1)} for r in results]
+        print_json({"ok": not failed, "seconds": round(seconds, 1), "checks": shown})
+    if failed:
+        todo = "\n".join(f"  {result.check.name}: {result.check.remedy}" for result in failed)
+        _fail(f"{len(failed)} of {len(results)} checks failed in {seconds:.0f} s:\n{todo}")
+    _say(f"all {len(results)} checks hold ({seconds:.0f} s)")
 
 
 @app.command("demo", epilog="Example: fognav demo --headless --report report.json --seed 7")

@@ -25,7 +25,6 @@ from fog_kernels.raycast import cast
 from fog_runtime.maps import StaticMap
 from fognav_sim.scenario import ScenarioError, barrier_across
 
-ROBOT_RADIUS: Final = DEFAULT_INFLATION.inscribed_radius
 PLACE_CLEARANCE_M: Final = 0.45
 DRIVE_M: Final = (15.0, 60.0)
 """Length of a good demonstration: long enough to see a danger coming, short enough to watch."""

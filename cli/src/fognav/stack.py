@@ -30,7 +30,6 @@ AGENT: Final = "robot-agent"
 SERVERS: Final = (BROKER, REDIS, ROUTER)
 SERVICES: Final = (AGGREGATOR, MAP_SERVICE, PLANNER)
 ROBOT: Final = (WATCHDOG, AGENT)
-ALL: Final = (*SERVERS, SIMULATOR, *SERVICES, *ROBOT)
 
 _SOCKET_PATH_LIMIT: Final = 80
 """Unix socket paths end at 108 bytes; folders this long leave room for the file's name."""
@@ -74,7 +73,7 @@ def _nothing() -> None:
 
 
 class Stack:
-    """Every process of one demonstration, by name (`ALL`); leaving the context ends them and removes their files.
+    """Every process of one demonstration, by name; leaving the context ends them and removes their files.
 
     Ports, keys, tokens and files are this run's own, so that several stacks run side by side.
     """

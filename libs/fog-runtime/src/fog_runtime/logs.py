@@ -6,12 +6,10 @@ import sys
 import threading
 from collections.abc import Mapping
 from datetime import UTC, datetime
-from types import TracebackType
 from typing import Final, Literal
 
 Format = Literal["json", "text"]
 Level = Literal["debug", "info", "warning", "error"]
-ExcInfo = BaseException | tuple[type[BaseException], BaseException, TracebackType | None] | None
 
 _FIELDS: Final = "fognav_fields"
 

@@ -1,0 +1,90 @@
+"""What vulture may take for dead although it is not, with the reason; whatever else nothing uses has to go.
+
+vulture looks at the members' sources without their tests: code that only a test keeps alive is dead too, unless it is
+named here. Run it by `./fognav check`.
+"""
+
+# --- Fields of messages, reports and API answers: other programs and people read them. ---
+_.age_s  # api: age of an area's last reading
+_.author  # messages: of a zone
+_.control_p99_s  # messages: how regular the agent's loops are
+_.stream_p99_s
+_.severity
+_.uptime_ms  # messages: of a sensor node
+_.rssi
+_.fw
+_.hazard_clearance_m  # lockstep: fields of its result
+_.operator_commands
+_.pose_error_m
+_.replans
+_.stages_ms
+_.time_s
+_.costmap_published  # messages: stamps of a trace, read by their names in fog_contracts.stages
+_.plan_published
+_.path_received
+_.first_command
+_.publishers  # channels: what documents and access lists are made from
+_.subscribers
+_.ROLES
+_.DURABILITIES
+
+# --- Names that a library calls or reads. ---
+_.capture_signals  # uvicorn
+_.should_exit
+_.timeout_graceful_shutdown
+_.daemon_threads  # http.server
+_.do_GET
+_.log_message
+_.pending_calls_threshold  # aiomqtt
+type_cells  # numba: a name that compiled signatures close over
+_.FACTORY  # bases and lidars are found by their entry points
+_.RoombaEmulator
+_.RplidarEmulator
+
+# --- Protocols that are written down whole, as their data sheets do. ---
+_.NOT_CHARGING  # Roomba Open Interface
+_.RECONDITIONING
+_.FULL_CHARGING
+_.TRICKLE
+_.WAITING
+_.bumped
+_.charging_state
+_.current_a
+_.voltage_v
+_.requested_wheels_m_s
+_.pause_stream
+_.resume_stream
+_.power
+_.query_list
+_.seek_dock
+_.sensors
+_.GOOD  # RPLidar
+_.express_scan
+_.express_us
+_.standard_us
+_.firmware
+_.model
+_.get_info
+_.get_sample_rate
+
+# --- For tests, of this repository and of those who build on it. ---
+_.ManualClock
+_.start_mosquitto  # private servers
+_.start_redis
+_.start_router
+_.save_map
+_.find_channel
+_.person_at
+_.beats  # counters and views that tests assert on
+_.frames
+_.lost_bytes
+_.particles
+_.recomputed
+_.refused
+_.resyncs
+_.scanning
+_.seeking_dock
+_.skipped_bytes
+_.axes
+_.reveal  # the way to the value of a secret setting
+_.Core  # the protocol that every core with a table of handlers fulfils

@@ -1,0 +1,88 @@
+"""What must hold of the code without running it: format, lint, types, import contracts, dead code, generated files.
+
+Each check is a program that ends with 0 when it holds. All of them run, as many at once as there are cores.
+"""
+
+import asyncio
+import os
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+
+@dataclass(frozen=True)
+class Check:
+    """A check: its name, the program and its arguments, and what a person does about a failure."""
+
+    name: str
+    command: tuple[str, ...]
+    remedy: str
+
+
+@dataclass(frozen=True)
+class CheckResult:
+    """How a check went, how long it took, and all that it printed."""
+
+    check: Check
+    ok: bool
+    seconds: float
+    output: str
+
+
+_TOOLS: Final = Path(sys.executable).parent
+CHECKS: Final = (
+    # The longest first: the others fit in beside it.
+    Check("types", (str(_TOOLS / "mypy"),), "correct the types that it names"),
+    Check("import contracts", (str(_TOOLS / "lint-imports"),), "import inwards only: [tool.importlinter]"),
+    Check("lint", (str(_TOOLS / "ruff"), "check", "."), "ruff check --fix . mends what can be mended by itself"),
+    Check("format", (str(_TOOLS / "ruff"), "format", "--check", "."), "ruff format ."),
+    Check(
+        "dead code", (str(_TOOLS / "vulture"),), "remove it, or name it with its reason in .ci/dead-code-allowlist.py"
+    ),
+    Check(
+        "generated files: servers",
+        (sys.executable, "-m", "fog_supervisor.configurations", "--check", "deploy"),
+        "python -m fog_supervisor.configurations --write deploy",
+    ),
+)
+
+
+async def _run(check: Check, folder: Path, environment: Mapping[str, str]) -> CheckResult:
+    begun = time.monotonic()
+    try:
+        process = await asyncio.create_subprocess_exec(
+            *check.command,
+            cwd=folder,
+            env=dict(environment),
+            stdin=asyncio.subprocess.DEVNULL,
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.STDOUT,
+        )
+    except OSError as error:
+        said = f"{check.command[0]} can't be started: {error.strerror}"
+        return CheckResult(check, ok=False, seconds=time.monotonic() - begun, output=said)
+    output, _ = await process.communicate()
+    ok = process.returncode == 0
+    return CheckResult(check, ok, time.monotonic() - begun, output.decode("utf-8", "replace").strip())
+
+
+async def run_checks(
+    checks: Sequence[Check], folder: Path, on_result: Callable[[CheckResult], None], cores: int | None = None
+) -> list[CheckResult]:
+    """Run all checks in `folder`, as many at once as there are `cores`; return them in their order.
+
+    `on_result` is called as each ends. None stops another.
+    """
+    places = asyncio.Semaphore(cores or os.cpu_count() or 1)
+    environment = {**os.environ, "NO_COLOR": "1"}
+
+    async def one(check: Check) -> CheckResult:
+        async with places:
+            result = await _run(check, folder, environment)
+        on_result(result)
+        return result
+
+    return list(await asyncio.gather(*(one(check) for check in checks)))

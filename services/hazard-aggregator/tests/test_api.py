@@ -1,7 +1,14 @@
 """Areas and nodes over REST, with a running aggregator."""
 
+import asyncio
+import json
+
 import httpx
+import msgspec
 import pytest
+from redis.asyncio import Redis
+
+from fog_contracts.messages import AreaDefinition
 
 pytestmark = pytest.mark.live
 POLYGON = [[1.0, 1.0], [2.0, 1.0], [2.0, 2.0], [1.0, 2.0]]
@@ -28,6 +35,38 @@ async def test_areas_are_changed_by_version_and_survive_a_kill(fog, client, toke
     async with httpx.AsyncClient(base_url=await fog.ready("hazard_aggregator")) as again:
         kept = (await again.get("/api/v1/areas/hall")).json()["definition"]
     assert (kept["polygon"], kept["debounce"]["to_blocked"], kept["version"]) == (POLYGON, 3, 1)
+
+
+async def test_of_eight_concurrent_changes_to_one_version_one_is_made(fog, client, tokens):
+    async def put(number: int) -> httpx.Response:
+        body = {"polygon": POLYGON, "nodes": ["n1"], "label": f"by writer {number}"}
+        return await client.put("/api/v1/areas/hall", json=body, headers={**tokens["operator"], "If-Match": '"0"'})
+
+    answers = await asyncio.gather(*(put(number) for number in range(8)))
+    assert sorted(answer.status_code for answer in answers) == [200] + 7 * [412]
+    (label,) = [answer.json()["label"] for answer in answers if answer.status_code == 200]
+    assert (await client.get("/api/v1/areas/hall")).json()["definition"]["label"] == label
+    async with Redis.from_url(fog.redis.url) as raw:
+        assert json.loads(await raw.hget("fog:test:areas", "hall"))["label"] == label
+        ((_, entry),) = await raw.xrange("fog:test:audit")
+    assert (entry[b"who"], entry[b"area"]) == (b"anna", b"hall")
+    assert json.loads(entry[b"before"])["version"] == 0, "the site's own definition, which was not stored"
+
+
+async def test_a_version_that_somebody_else_stored_is_taken_over_after_the_conflict(fog, client, tokens):
+    other = AreaDefinition(id="hall", polygon=[(1.0, 1.0), (2.0, 1.0), (2.0, 2.0)], label="elsewhere", version=5)
+    async with Redis.from_url(fog.redis.url) as raw:
+        await raw.hset("fog:test:areas", "hall", msgspec.json.encode(other))
+    body = {"polygon": POLYGON, "nodes": ["n1"]}
+    refused = await client.put("/api/v1/areas/hall", json=body, headers=tokens["operator"])
+    assert refused.status_code == 412
+    async with asyncio.timeout(15):
+        for _ in iter(int, 1):
+            if (await client.get("/api/v1/areas/hall")).json()["definition"]["label"] == "elsewhere":
+                break
+            await asyncio.sleep(0.05)
+    again = await client.put("/api/v1/areas/hall", json=body, headers={**tokens["operator"], "If-Match": '"5"'})
+    assert (again.status_code, again.headers["etag"]) == (200, '"6"')
 
 
 async def test_bad_areas_are_refused_by_field_and_a_dead_store_is_said(fog, client, tokens):

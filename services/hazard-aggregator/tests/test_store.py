@@ -8,9 +8,10 @@ from redis.asyncio import Redis
 
 from fog_contracts.messages import AreaDefinition, AreaHazard
 from fog_supervisor.servers import Server, start_redis
-from hazard_aggregator.store import Store, StoreError
+from hazard_aggregator.store import Audit, Store, StoreError
 
 pytestmark = pytest.mark.live
+AUDIT = Audit(at=1.0, who="anna", action="put")
 
 
 @pytest.fixture
@@ -28,7 +29,7 @@ async def test_stored_hazards_and_areas_survive_kills(redis: Server):
     async with Store(redis.url, "test", timeout_s=5.0) as store:
         first = await store.load()
         assert (first.definitions, first.hazards) == ([], [])
-        await store.save_area(area, {"who": "anna"})
+        assert await store.put_area(area, expected=0, audit=AUDIT) == "ok"
         for seq in range(1, 6):
             await store.save_hazards([hazard(seq)])
             await asyncio.to_thread(redis.kill)

@@ -163,6 +163,17 @@ async def test_zones_are_changed_by_version_and_audited(calm, tokens):
         assert entries[1]["before"]["reason"] == "wet floor"
 
 
+async def test_of_eight_concurrent_changes_to_one_version_one_is_made(shared, tokens):
+    body = {**CIRCLE, "id": "contested"}
+    assert (await shared.post("/api/v1/zones", json=body, headers=tokens["operator"])).status_code == 201
+    headers = {**tokens["operator"], "If-Match": '"1"'}
+    answers = await asyncio.gather(
+        *(shared.put("/api/v1/zones/contested", json=CIRCLE, headers=headers) for _ in range(8))
+    )
+    assert sorted(answer.status_code for answer in answers) == [200] + 7 * [412]
+    assert (await shared.get("/api/v1/zones/contested")).headers["etag"] == '"2"'
+
+
 async def test_a_zone_that_cannot_be_is_refused_by_field(shared, tokens):
     bowtie = [[1, 1], [2, 2], [2, 1], [1, 2]]
     for change, field, words in (

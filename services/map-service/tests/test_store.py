@@ -58,13 +58,13 @@ async def test_acknowledged_zones_survive_kills_of_redis(redis: Server):
 
 async def test_a_dead_redis_is_a_store_error_and_epochs_go_on(redis: Server):
     async with Store(redis.url, "test") as store:
-        first = await store.begin_epoch()
-        assert await store.begin_epoch() > first
+        first = await store.begin_epoch("map")
+        assert await store.begin_epoch("map") > first
         assert await store.weakness() == ""
         await asyncio.to_thread(redis.kill)
         with pytest.raises(StoreError):
             await store.put(zone(), expected=0, audit=AUDIT)
-        assert await store.begin_epoch() > first
+        assert await store.begin_epoch("map") > first
 
 
 async def test_what_is_no_zone_is_an_error_not_a_missing_zone(redis: Server):

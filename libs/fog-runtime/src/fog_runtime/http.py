@@ -180,6 +180,14 @@ async def read_body(request: Request, kind: type[T]) -> T:
         raise _InvalidBodyError([{"field": "body", "problem": f"no valid JSON: {error}"}]) from error
 
 
+def expected_version(if_match: str | None) -> int | None:
+    """Return the version that an If-Match header names: None when any will do, -1 for what no version ever is."""
+    if if_match is None or if_match.strip() == "*":
+        return None
+    tag = re.fullmatch(r'"([0-9]{1,16})"', if_match.strip())
+    return int(tag[1]) if tag else -1
+
+
 class _InvalidBodyError(ProblemError):
     def __init__(self, errors: list[dict[str, str]]) -> None:
         super().__init__(422, f"{errors[0]['field']}: {errors[0]['problem']}")

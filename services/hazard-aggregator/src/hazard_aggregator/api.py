@@ -19,8 +19,18 @@ from fog_contracts.messages import (
 )
 from fog_runtime.clock import Clock
 from fog_runtime.health import Health
-from fog_runtime.http import Caller, ProblemError, Tokens, answer_schema, body_schema, make_app, read_body, require
-from hazard_aggregator.service import Service
+from fog_runtime.http import (
+    Caller,
+    ProblemError,
+    Tokens,
+    answer_schema,
+    body_schema,
+    expected_version,
+    make_app,
+    read_body,
+    require,
+)
+from hazard_aggregator.service import ConflictError, Service
 from hazard_aggregator.store import StoreError
 
 RETRY_AFTER: Final = {"Retry-After": "1"}
@@ -97,20 +107,11 @@ def make_api(service: Service, geometry: GridGeometry, clock: Clock, health: Hea
     ) -> Response:
         """Change or add an area; the answer comes once it is stored for good. With If-Match only if unchanged."""
         body = await read_body(request, AreaBody)
-        old = next((d for d in service.core.definitions() if d.id == area_id), None)
-        if if_match is not None and if_match != "*" and (old is None or if_match != f'"{old.version}"'):
-            raise ProblemError(412, f"area {area_id} was changed by somebody else: read it again and decide")
-        definition = _checked(area_id, body, (old.version if old else 0) + 1, service, geometry)
-        audit = {
-            "at": f"{clock.stamp():.3f}",
-            "who": caller.name,
-            "action": "put",
-            "area": area_id,
-            "before": msgspec.json.encode(old).decode() if old else "",
-            "after": msgspec.json.encode(definition).decode(),
-        }
+        definition = _checked(area_id, body, service, geometry)
         try:
-            await service.put_area(definition, audit)
+            definition = await service.put_area(definition, caller.name, expected=expected_version(if_match))
+        except ConflictError as error:
+            raise ProblemError(412, f"{error}: read it again and decide") from error
         except StoreError as error:
             detail = f"the store does not answer, so nothing was changed for certain: try again ({error})"
             raise ProblemError(503, detail, headers=RETRY_AFTER) from error
@@ -138,7 +139,7 @@ def make_api(service: Service, geometry: GridGeometry, clock: Clock, health: Hea
     return app
 
 
-def _checked(area_id: str, body: AreaBody, version: int, service: Service, geometry: GridGeometry) -> AreaDefinition:
+def _checked(area_id: str, body: AreaBody, service: Service, geometry: GridGeometry) -> AreaDefinition:
     try:
         polygon = normalized_polygon(body.polygon)
     except GeometryError as error:
@@ -153,9 +154,7 @@ def _checked(area_id: str, body: AreaBody, version: int, service: Service, geome
             detail = f"the site has no node {node}: add it to site.toml first, with its place and its limits"
             raise ProblemError(422, detail, field=f"body.nodes.{index}")
     try:
-        return msgspec.convert(
-            {**msgspec.to_builtins(body), "id": area_id, "polygon": polygon, "version": version}, AreaDefinition
-        )
+        return msgspec.convert({**msgspec.to_builtins(body), "id": area_id, "polygon": polygon}, AreaDefinition)
     except msgspec.ValidationError as error:  # the id comes from the path
         raise ProblemError(422, f"{area_id!r} is no id: use a to z, 0 to 9 and -, at most 32", field="path") from error
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING
 
+from msgspec import structs
 from prometheus_client import Gauge
 
 from fog_contracts import channels as ch
@@ -12,7 +13,7 @@ from fog_contracts.messages import AreaHazard
 from fog_runtime import logs, metrics
 from fog_runtime.clock import ticker
 from fog_runtime.edges import Edges
-from hazard_aggregator.store import StoreError
+from hazard_aggregator.store import Audit, StoreError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -35,6 +36,13 @@ WITHHELD = Gauge("fognav_hazards_withheld", "Areas whose relief waits for the st
 _log = logs.get("aggregator")
 
 
+class ConflictError(Exception):
+    """An area has another version than its writer expected."""
+
+    def __init__(self, area: str) -> None:
+        super().__init__(f"area {area} was changed by somebody else")
+
+
 class Service:
     """The running aggregator; its loops are tasks of the process."""
 
@@ -49,16 +57,51 @@ class Service:
         self._health = health
         self._write = asyncio.Event()
         self._store_read = asyncio.Event()
+        self._writing = asyncio.Lock()
+        self._in_doubt = False
 
     def subscribe(self) -> None:
         """Register the core's handlers; call before the connections run."""
         self._edges.subscribe(self.core.handlers(), self._announce, numbers=self.core.thesis_numbers())
         self._mqtt.on_connect(self._republish_all)
 
-    async def put_area(self, definition: AreaDefinition, audit: dict[str, str]) -> None:
-        """Store an area, then let it count; raises `StoreError` and changes nothing when it can't be stored."""
-        await self._store.save_area(definition, audit)
-        self._announce(self.core.put_area(definition, self._edges.now()))
+    async def put_area(self, definition: AreaDefinition, who: str, *, expected: int | None = None) -> AreaDefinition:
+        """Store an area as its next version, then let it count; with `expected`, only if that is its version still.
+
+        Raises `ConflictError` when it is not, and `StoreError`; then nothing has changed for certain.
+        """
+        async with self._writing:
+            old = next((known for known in self.core.definitions() if known.id == definition.id), None)
+            if expected is not None and (old is None or old.version != expected):
+                raise ConflictError(definition.id)
+            version = 0 if old is None else old.version
+            definition = structs.replace(definition, version=version + 1)
+            audit = Audit(at=self._clock.stamp(), who=who, action="put")
+            try:
+                outcome = await self._store.put_area(definition, expected=version, audit=audit, before=old)
+                if outcome == "missing":
+                    # Redis lost what it had acknowledged: what is in force is the record now.
+                    outcome = await self._store.put_area(definition, expected=0, audit=audit, before=old)
+            except StoreError as error:
+                # It may have been written although the answer was lost: read again before trusting the memory.
+                self._in_doubt = True
+                self._health.set("store", ok=False, detail=str(error))
+                raise
+            if outcome != "ok":
+                self._in_doubt = True
+                raise ConflictError(definition.id)
+            self._announce(self.core.put_area(definition, self._edges.now()))
+        await self._subscribe_numbers()
+        return definition
+
+    async def _read_areas_again(self) -> None:
+        """Take the stored areas that are newer than those in force; raises `StoreError`."""
+        async with self._writing:
+            known = {definition.id: definition.version for definition in self.core.definitions()}
+            for definition in await self._store.areas():
+                if definition.version > known.get(definition.id, -1):
+                    self._announce(self.core.put_area(definition, self._edges.now()))
+            self._in_doubt = False
         await self._subscribe_numbers()
 
     # --- What goes out ----------------------------------------------------------------------------------------------
@@ -126,6 +169,8 @@ class Service:
             await asyncio.sleep(RETRY_S)
             try:
                 if self._store_read.is_set():
+                    if self._in_doubt:
+                        await self._read_areas_again()
                     await self._store.ping()
                     self._health.set("store", ok=True)
                     continue

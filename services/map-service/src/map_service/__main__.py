@@ -35,7 +35,7 @@ async def main() -> None:
         core = MapCore(
             site,
             loaded.map,
-            await store.begin_epoch(),
+            await store.begin_epoch("map"),
             settings.inflation,
             definitions=loaded.site.definitions(),
             hazards_wait_s=settings.hazards_wait_s,

@@ -108,6 +108,9 @@ class Service:
     async def replace(self, zone: Zone, expected: int, who: str) -> Zone:
         """Store a new version of a zone; raises `ZoneError`, `ConflictError` (stale, missing), `StoreError`."""
         async with self._writing:
+            if not any(known.id == zone.id and known.version == expected for known in self.core.zones()):
+                # The store would take a zone that is the very same for a repeated attempt.
+                raise ConflictError("stale", zone.id)
             stamp = self._clock.stamp()
             zone = checked_zone(structs.replace(zone, version=expected + 1), self.core.costmap.geometry, stamp)
             audit = Audit(at=stamp, who=who, action="replace")

@@ -38,7 +38,7 @@ async def main() -> None:
         Store(settings.redis_url, site) as store,
         ZenohEdge.open(connect=settings.zenoh_endpoints, clock=clock, role="planner", id=site, site=site) as zenoh,
     ):
-        service = Service(PlannerCore(await store.begin_epoch(), config), store, zenoh, clock, health)
+        service = Service(PlannerCore(await store.begin_epoch("planner"), config), store, zenoh, clock, health)
         service.listen()
         zenoh.alive("planner", site)
         app = make_api(service, loaded.site, health, load_tokens(settings.tokens_file))

@@ -1,0 +1,107 @@
+"""The store base against a real Redis: compare-and-swap, epochs, unreadable records, audit entries."""
+
+import asyncio
+from pathlib import Path
+
+import pytest
+from redis.asyncio import Redis
+
+from fog_contracts.messages import Message
+from fog_runtime.redis_store import ABSENT, ANY, Audit, RedisStore, StoreError, Table
+from fog_supervisor.servers import Server, start_redis
+
+pytestmark = pytest.mark.live
+AUDIT = Audit(at=1.5, who="anna", action="put")
+THINGS = Table("things", "thing")
+JOBS = Table("jobs", "robot", version="job.id")
+
+
+class Thing(Message, frozen=True, kw_only=True):
+    label: str
+    version: int = 1
+
+
+class Job(Message, frozen=True, kw_only=True):
+    job: dict[str, str]
+
+
+@pytest.fixture
+def redis(tmp_path: Path):
+    with start_redis(tmp_path) as server:
+        yield server
+
+
+async def test_of_eight_writers_that_expect_one_version_one_writes(redis: Server):
+    async with RedisStore(redis.url, "test") as store:
+        for expected in (ABSENT, "1"):
+            version = int(expected) + 1
+            things = [Thing(label=f"by {number}", version=version) for number in range(8)]
+            outcomes = await asyncio.gather(*(store._swap(THINGS, "a", thing, expected, AUDIT) for thing in things))
+            refusal = "exists" if expected == ABSENT else "stale"
+            assert sorted(outcomes) == sorted(["ok"] + 7 * [refusal])
+            assert await store._records("things", Thing) == {"a": things[outcomes.index("ok")]}
+        assert len(await store.audit_entries(100)) == 2
+
+
+async def test_a_deletion_needs_the_version_and_a_repeated_one_finds_nothing(redis: Server):
+    async with RedisStore(redis.url, "test") as store:
+        assert await store._swap(THINGS, "a", Thing(label="x"), "7", AUDIT) == "missing"
+        assert await store._swap(THINGS, "a", Thing(label="x"), ABSENT, AUDIT) == "ok"
+        assert await store._swap(THINGS, "a", None, "7", AUDIT) == "stale"
+        assert await store._swap(THINGS, "a", None, "1", AUDIT) == "ok"
+        assert await store._swap(THINGS, "a", None, "1", AUDIT) == "missing"
+        assert await store._swap(THINGS, "a", None, ANY, AUDIT) == "missing"
+
+
+async def test_a_version_may_lie_deeper_and_any_version_can_be_written_over(redis: Server):
+    async with RedisStore(redis.url, "test") as store:
+        for name in ("first", "second"):
+            assert await store._swap(JOBS, "r1", Job(job={"id": name}), ANY, AUDIT) == "ok"
+        assert await store._swap(JOBS, "r1", None, "first", AUDIT) == "stale"
+        assert await store._swap(JOBS, "r1", None, "second", AUDIT) == "ok"
+
+
+async def test_audit_entries_tell_who_what_before_and_after_newest_first(redis: Server):
+    async with RedisStore(redis.url, "test") as store:
+        site = Thing(label="from the site", version=0)
+        await store._swap(THINGS, "a", Thing(label="x"), ABSENT, AUDIT, before=site)
+        await store._swap(THINGS, "a", Thing(label="x"), ABSENT, AUDIT)  # an attempt whose answer was lost
+        await store._swap(THINGS, "a", Thing(label="y", version=2), "1", AUDIT)
+        assert await store.audit_entries(100) == [
+            {"at": "1.500", "who": "anna", "action": "put", "thing": "a",
+             "before": '{"label":"x","version":1}', "after": '{"label":"y","version":2}'},
+            {"at": "1.500", "who": "anna", "action": "put", "thing": "a",
+             "before": '{"label":"from the site","version":0}', "after": '{"label":"x","version":1}'},
+        ]  # fmt: skip
+        assert len(await store.audit_entries(1)) == 1
+
+
+async def test_an_unreadable_record_is_an_error_or_left_out_as_its_reader_needs(redis: Server):
+    async with RedisStore(redis.url, "test") as store, Redis.from_url(redis.url) as raw:
+        await store._write_records("things", {"a": Thing(label="x")})
+        await raw.hset("fog:test:things", "b", b"nonsense")
+        assert await store._readable_records("things", Thing) == {"a": Thing(label="x")}
+        with pytest.raises(StoreError, match=r"fog:test:things holds what is no Thing \(b\)"):
+            await store._records("things", Thing)
+
+
+async def test_epochs_grow_also_beyond_a_clock_that_went_back_and_go_on_without_redis(redis: Server):
+    async with RedisStore(redis.url, "test") as store, Redis.from_url(redis.url) as raw:
+        first = await store.begin_epoch("map")
+        assert await store.begin_epoch("map") > first
+        await raw.set("fog:test:map:epoch", first + 10**9)
+        assert await store.claim_epoch("map") == first + 10**9 + 1
+        assert await store.claim_epoch("map", running=first) == first + 10**9 + 1
+        assert await store.claim_epoch("map", running=first + 2 * 10**9) == first + 2 * 10**9
+        assert await store.weakness() == ""
+        await asyncio.to_thread(redis.kill)
+        assert await store.begin_epoch("map") >= first
+        for attempt in (store.ping(), store.claim_epoch("map"), store._swap(THINGS, "a", None, ANY, AUDIT)):
+            with pytest.raises(StoreError, match="Redis: "):
+                await attempt
+
+
+async def test_a_redis_that_may_lose_acknowledged_writes_is_reported(redis: Server):
+    async with RedisStore(redis.url, "test") as store, Redis.from_url(redis.url) as raw:
+        await raw.config_set("appendfsync", "everysec")
+        assert "appendfsync always" in await store.weakness()

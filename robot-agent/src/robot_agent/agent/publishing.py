@@ -27,7 +27,7 @@ class PublishingPolicy:
 
     def __init__(self, robot: str) -> None:
         self._ids = {"robot": robot}
-        self._pose_at = self._state_at = self._obstacles_at = -math.inf
+        self._pose_due = self._state_at = self._obstacles_at = -math.inf
         self._content: object = None
 
     def choose(
@@ -35,8 +35,9 @@ class PublishingPolicy:
     ) -> list[Publication]:
         """Return what is due; `obstacles` is called only when a report of them is."""
         due: list[tuple[ch.Channel, Message]] = []
-        if pose is not None and now - self._pose_at >= POSE_S - _SLACK_S:
-            self._pose_at = now
+        if pose is not None and now >= self._pose_due - _SLACK_S:
+            # Counted from when it was due, so that uneven ticks keep the rate.
+            self._pose_due = max(self._pose_due, now - _SLACK_S) + POSE_S
             due.append((ch.ROBOT_POSE, pose))
         content = _content(state)
         if content != self._content or now - self._state_at >= STATE_S - _SLACK_S:

@@ -1,0 +1,98 @@
+from __future__ import annotations
+
+import msgspec
+import pytest
+
+from fog_contracts.messages import Pose, Refusal, RobotGoal, RobotPath
+from robot_agent.agent.mission import Mission
+
+GOAL = RobotGoal(goal_id="g1", pose=Pose(x=5.0, y=0.0, theta=0.0))
+PATH = RobotPath(
+    plan_id=5, planner_epoch=3, goal_id="g1", points=[(0.0, 0.0), (5.0, 0.0)], map_epoch=7, map_seq=0,
+    released_length=2.0,
+)  # fmt: skip
+
+
+def changed(message, **changes):
+    return msgspec.structs.replace(message, **changes)
+
+
+@pytest.fixture
+def mission():
+    mission = Mission()
+    assert mission.on_goal(GOAL, 1.0)
+    assert mission.on_path(PATH, 2.0)
+    return mission
+
+
+def test_a_new_robot_has_no_mission():
+    mission = Mission()
+    assert (mission.active, mission.goal_id, mission.reached, mission.path_name) == (False, None, False, None)
+    assert mission.planner_age(10.0) == float("inf")
+    assert mission.cancel() is None
+    assert not mission.on_path(PATH, 1.0)
+    assert mission.path is None
+
+
+def test_the_planner_is_as_old_as_its_last_goal_or_path(mission):
+    assert mission.planner_age(3.0) == 1.0
+    mission.on_path(PATH, 3.5)
+    assert mission.planner_age(4.0) == 0.5
+    mission.on_goal(GOAL, 9.0)  # the same one again tells nothing of the path
+    assert mission.planner_age(10.0) == 6.5
+
+
+def test_an_extension_releases_more_of_the_path_and_keeps_the_progress(mission):
+    mission.follower.advance(1.0, 0.0, 2.0)
+    follower = mission.follower
+    assert not mission.on_path(changed(PATH, released_length=4.0), 3.0)
+    assert mission.follower is follower
+    assert follower.released_left == pytest.approx(3.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "followed"),
+    [
+        ({"plan_id": 4}, False),
+        ({"planner_epoch": 2, "plan_id": 99}, False),
+        ({"plan_id": 6}, True),
+        ({"planner_epoch": 4, "plan_id": 1}, True),
+        ({"plan_id": 6, "goal_id": "g0"}, False),
+    ],
+)
+def test_only_a_newer_path_of_the_same_goal_replaces_the_one_followed(mission, changes, followed):
+    other = changed(PATH, **changes)
+    assert mission.on_path(other, 3.0) == followed
+    assert (mission.path is other) == followed
+
+
+def test_a_refusal_leaves_nothing_to_follow_and_the_next_path_is_a_new_one(mission):
+    refusal = changed(PATH, points=[], refusal=Refusal(code=208, reason="cut off", causes=[]))
+    assert not mission.on_path(refusal, 3.0)
+    assert mission.follower is None
+    assert mission.active
+    assert mission.on_path(PATH, 4.0)
+
+
+def test_the_same_goal_at_another_place_keeps_the_path_until_the_planner_sends_another(mission):
+    assert not mission.on_goal(changed(GOAL, pose=Pose(x=6.0, y=0.0, theta=0.0)), 3.0)
+    assert mission.path is PATH
+
+
+@pytest.mark.parametrize("end", [Mission.reach, Mission.cancel])
+def test_a_mission_that_ended_begins_again_only_with_another_goal(mission, end):
+    end(mission)
+    assert not mission.active
+    assert mission.path is None
+    assert mission.goal_id == "g1"
+    assert mission.reached == (end is Mission.reach)
+    assert not mission.on_goal(GOAL, 3.0)
+    assert not mission.active
+    assert mission.on_goal(changed(GOAL, goal_id="g2"), 4.0)
+    assert mission.active
+    assert not mission.reached
+
+
+def test_a_goal_that_was_withdrawn_is_no_mission(mission):
+    mission.on_goal(changed(GOAL, pose=None), 3.0)
+    assert (mission.active, mission.goal_id, mission.cancel()) == (False, None, None)

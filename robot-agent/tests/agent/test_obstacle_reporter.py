@@ -1,0 +1,176 @@
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from fog_contracts import channels as ch
+from fog_contracts.grid import GridGeometry
+from fog_contracts.handlers import Moment
+from fog_contracts.messages import AreaHazard, CircleShape, CorridorShape, HazardArea, RectangleShape, Zone, ZoneSet
+from robot_agent.agent.blocked_places import BlockedPlaces
+from robot_agent.agent.obstacle_reporter import ObstacleReporter, view
+from robot_agent.localization.localizer import Pose2
+
+GEOMETRY = GridGeometry(100, 100, 0.1, 0.0, 0.0)
+HERE = Pose2(5.0, 5.0, 0.0)
+
+
+class FakeLocalizer:
+    def __init__(self, points):
+        self.points = np.array(points, dtype=np.float64).reshape(-1, 2)
+        self.status = "good"
+        self.turning = 0.0
+        self.sweep = SimpleNamespace(points=self.points - (HERE.x, HERE.y))
+
+    def points_in_map(self):
+        return self.points
+
+    def pose(self, _now):
+        return HERE
+
+    def seen_from(self):
+        return HERE
+
+    def twist(self):
+        return 0.0, self.turning
+
+    def wall_distance(self, points):
+        return np.abs(points[:, 0] - 9.0)  # a wall at x = 9
+
+
+def replica():
+    return SimpleNamespace(
+        geometry=GEOMETRY, static=np.zeros(GEOMETRY.shape, np.uint8), cost=np.zeros(GEOMETRY.shape, np.uint8)
+    )
+
+
+def report(points, *, copy=None, reporter=None, scan_age=0.1, now=0.0, **changes):
+    localizer = FakeLocalizer(points)
+    for name, value in changes.items():
+        setattr(localizer, name, value)
+    reporter = reporter or ObstacleReporter(600.0, 3)
+    return reporter.report(localizer, copy or replica(), scan_age, Moment(now, 1_000.0 + now))
+
+
+TWO = [(6.03, 5.02), (6.06, 5.04)]
+
+
+def test_cells_with_two_points_or_more_are_reported_once_each():
+    seen = report([*TWO, (7.05, 5.05)])
+    assert seen.points == [pytest.approx((6.05, 5.05))]
+    assert (seen.stamp, seen.ttl) == (1_000.0, 600.0)
+
+
+@pytest.mark.parametrize(
+    ("x", "y"), [(8.9, 5.05), (-0.5, 5.0), (5.0, 12.0)], ids=["wall of the map", "left of the map", "above the map"]
+)
+def test_points_that_the_map_explains_or_does_not_have_are_not_reported(x, y):
+    assert report([(x, y), (x, y + 0.01)]).points == []
+
+
+def test_only_the_nearest_cells_are_reported():
+    far = [point for x in (5.5, 6.5, 7.5, 8.5, 4.0) for point in [(x + 0.02, 5.02), (x + 0.04, 5.04)]]
+    assert [x for x, _ in report(far).points] == pytest.approx([5.55, 4.05, 6.55])
+
+
+@pytest.mark.parametrize("change", [{"status": "weak"}, {"turning": 0.6}, {"scan_age": 0.6}, {"sweep": None}])
+def test_nothing_is_told_when_the_points_can_not_be_placed(change):
+    assert report(TWO) is not None
+    assert report(TWO, **change) is None
+
+
+def test_what_others_blocked_is_no_news_and_what_it_reported_itself_is_until_its_memory_ends():
+    reporter, blocked = ObstacleReporter(10.0, 3), replica()
+    blocked.cost[45:56, 55:66] = 254
+    assert report(TWO, copy=blocked).points == []
+    assert len(report(TWO, reporter=reporter).points) == 1
+    assert len(report(TWO, copy=blocked, reporter=reporter, now=11.9).points) == 1
+    assert report(TWO, copy=blocked, reporter=reporter, now=24.0).points == []
+
+
+def test_its_view_gives_the_nearest_echo_of_each_sector_and_zero_without_one():
+    points = np.array([(7.0, 5.01), (6.0, 5.01), (5.01, 8.0)])
+    seen = view(HERE, points, GEOMETRY)
+    assert (seen.x, seen.y) == (5.0, 5.0)
+    assert seen.reach_cm[0] == 100
+    assert seen.reach_cm[44] == 300
+    assert sum(reach > 0 for reach in seen.reach_cm) == 2
+    assert view(Pose2(-1.0, 5.0, 0.0), points, GEOMETRY) is None
+    assert view(None, points, GEOMETRY) is None
+
+
+# --- blocked places ---
+
+
+def places(hazards=(), zones=()):
+    found = BlockedPlaces()
+    at = Moment(0.0, 0.0)
+    for state, polygon in hazards:
+        area = AreaHazard(
+            area="z4", state=state, severity=1, penalty=254, since=0.0, seq=1, epoch=1, cause="", nodes={}
+        )
+        found.handlers()[ch.HAZARD]({}, HazardArea(hazard=area, polygon=polygon, label="Z4"), at)
+    found.handlers()[ch.ZONES]({}, ZoneSet(epoch=1, seq=1, zones=list(zones)), at)
+    return found
+
+
+def lethal():
+    copy = replica()
+    copy.cost[50, 50] = 254
+    return copy
+
+
+SQUARE = [(4.0, 4.0), (6.0, 4.0), (6.0, 6.0), (4.0, 6.0)]
+
+
+@pytest.mark.parametrize(
+    ("shape", "inside"),
+    [
+        (CircleShape(centre=(5.0, 5.5), radius=0.6), True),
+        (CircleShape(centre=(5.0, 5.7), radius=0.6), False),
+        (RectangleShape(corner=(6.0, 6.0), opposite=(4.0, 4.0)), True),
+        (RectangleShape(corner=(6.0, 6.0), opposite=(5.5, 4.0)), False),
+        (CorridorShape(line=[(0.0, 5.4), (9.0, 5.4)], width=1.0), True),
+        (CorridorShape(line=[(0.0, 5.6), (9.0, 5.6)], width=1.0), False),
+    ],
+)
+def test_a_zone_of_any_shape_is_named_only_by_a_robot_inside_it(shape, inside):
+    zone = Zone(id="wet", kind="BLOCKED", shape=shape, reason="mopped")
+    words = places(zones=[zone]).around(HERE, lethal(), ObstacleReporter(10.0, 3), 0.0)
+    assert words == ("the no-go zone wet (mopped)" if inside else "a blocked part of the map")
+
+
+@pytest.mark.parametrize("changes", [{"enabled": False}, {"kind": "PENALTY", "factor": 2.0}])
+def test_only_zones_that_block_are_named(changes):
+    zone = Zone(**{"id": "wet", "kind": "BLOCKED", "shape": CircleShape(centre=(5.0, 5.0), radius=1.0), **changes})
+    assert places(zones=[zone]).around(HERE, lethal(), ObstacleReporter(10.0, 3), 0.0) == "a blocked part of the map"
+
+
+@pytest.mark.parametrize(
+    ("state", "words", "caution"),
+    [("blocked", "the blocked area Z4", False), ("unknown", "the unknown area Z4", True), ("clear", None, False)],
+)
+def test_an_area_is_named_by_its_label_unless_it_is_clear(state, words, caution):
+    found = places(hazards=[(state, SQUARE)])
+    assert found.around(HERE, lethal(), ObstacleReporter(10.0, 3), 0.0) == (words or "a blocked part of the map")
+    assert (found.caution(HERE) is not None) == caution
+    assert found.caution(Pose2(1.0, 1.0, 0.0)) is None
+
+
+def test_the_map_alone_decides_whether_a_place_is_blocked():
+    found, reporter = places(hazards=[("blocked", SQUARE)]), ObstacleReporter(10.0, 3)
+    assert found.around(HERE, replica(), reporter, 0.0) is None
+    beside_a_wall = lethal()
+    beside_a_wall.static[50, 50] = 254
+    assert found.around(HERE, beside_a_wall, reporter, 0.0) is None
+    assert found.around(Pose2(-5.0, math.pi, 0.0), lethal(), reporter, 0.0) is None
+
+
+def test_a_robot_does_not_stop_for_what_its_own_lidar_reported_under_it():
+    reporter = ObstacleReporter(10.0, 3)
+    assert report([(5.02, 5.02), (5.04, 5.04)], reporter=reporter).points
+    assert places().around(HERE, lethal(), reporter, 0.0) is None
+    assert places().around(HERE, lethal(), reporter, 13.0) == "a blocked part of the map"

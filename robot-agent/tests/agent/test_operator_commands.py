@@ -1,0 +1,91 @@
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from fog_contracts.commands import sign
+from fog_contracts.grid import GridGeometry
+from fog_contracts.handlers import Moment
+from fog_contracts.messages import Pose, RobotCommand
+from robot_agent.agent.operator_commands import OperatorCommands, initial_pose_refusal
+
+KEY = b"k" * 32
+AT = Moment(10.0, 1_000.0)
+
+
+class FakeRobot:
+    """Takes note of what it is commanded."""
+
+    def __init__(self, refusal=None, goal=None):
+        self.refusal = refusal
+        self.goal = goal
+        self.done = []
+
+    def request(self, request, now):
+        self.done.append((request, now))
+        return SimpleNamespace(refusal=self.refusal, mode="NORMAL")
+
+    def cancel_goal(self):
+        self.done.append("cancel")
+        return self.goal
+
+    def take_initial_pose(self, pose):
+        self.done.append(pose)
+        return self.refusal
+
+
+def answer(robot, kind, *, key=KEY, at=AT, **more):
+    command = RobotCommand(kind=kind, robot="r1", operator="ann", nonce="n" * 16, issued_at=AT.stamp, **more)
+    return OperatorCommands("r1", KEY, robot).answer(sign(command, key), at)
+
+
+@pytest.mark.parametrize("kind", ["enable", "disable", "reset"])
+def test_requests_go_to_the_safety_gate_whose_refusal_is_the_reply(kind):
+    robot = FakeRobot()
+    assert answer(robot, kind).accepted
+    assert robot.done == [(kind, 10.0)]
+    reply = answer(FakeRobot(refusal="the cause is still there: " + "x" * 600), kind)
+    assert not reply.accepted
+    assert reply.reason.startswith("the cause is still there")
+    assert len(reply.reason) == 500
+
+
+def test_cancel_names_the_goal_or_says_that_there_is_none():
+    assert "g7" in answer(FakeRobot(goal="g7"), "cancel").reason
+    assert not answer(FakeRobot(), "cancel").accepted
+
+
+def test_an_initial_pose_is_passed_on_with_its_refusal():
+    pose = Pose(x=1.0, y=2.0, theta=0.5)
+    robot = FakeRobot()
+    assert answer(robot, "initial_pose", pose=pose).accepted
+    assert robot.done == [pose]
+    assert answer(FakeRobot(refusal="off the map"), "initial_pose", pose=pose).reason == "off the map"
+
+
+@pytest.mark.parametrize("more", [{"key": b"x" * 32}, {"at": Moment(10.0, 1_005.1)}])
+def test_a_command_that_does_not_pass_the_gate_reaches_nothing(more):
+    robot = FakeRobot()
+    assert not answer(robot, "enable", **more).accepted
+    assert robot.done == []
+
+
+@pytest.mark.parametrize(
+    ("pose", "geometry", "at_rest", "word"),
+    [
+        (None, True, True, "no pose"),
+        (Pose(x=0.5, y=0.5, theta=0.0), False, True, "no map"),
+        (Pose(x=0.5, y=0.5, theta=0.0), True, False, "disable it first"),
+        (Pose(x=1.5, y=0.5, theta=0.0), True, True, "off the map"),
+        (Pose(x=0.05, y=0.5, theta=0.0), True, True, "in a wall"),
+        (Pose(x=0.5, y=0.5, theta=0.0), True, True, None),
+    ],
+)
+def test_where_a_robot_can_not_be_is_no_initial_pose(pose, geometry, at_rest, word):
+    static = np.zeros((10, 10), np.uint8)
+    static[:, 0] = 254
+    replica = SimpleNamespace(geometry=GridGeometry(10, 10, 0.1, 0.0, 0.0) if geometry else None, static=static)
+    refusal = initial_pose_refusal(pose, replica, at_rest=at_rest)
+    assert refusal is None if word is None else word in refusal

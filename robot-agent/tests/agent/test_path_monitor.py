@@ -1,0 +1,129 @@
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+
+from fog_contracts.grid import GridGeometry, Window
+from fog_contracts.messages import Pose, Refusal, RobotGoal, RobotPath
+from fog_contracts.replica import MasterMap, Replica, Version
+from robot_agent.agent.mission import Mission
+from robot_agent.agent.path_monitor import BLOCK_NEAR_M, PLANNER_GRACE_S, PathMonitor
+
+GEOMETRY = GridGeometry(200, 20, 0.1, 0.0, 0.0)
+PATH = RobotPath(
+    plan_id=1, planner_epoch=3, goal_id="g1", points=[(1.05, 1.05), (15.05, 1.05)], map_epoch=7, map_seq=0,
+    released_length=99.0,
+)  # fmt: skip
+
+
+class Rig:
+    def __init__(self):
+        free = np.zeros(GEOMETRY.shape, np.uint8)
+        self.master = MasterMap("lab", GEOMETRY, free, free, epoch=7)
+        self.replica = Replica()
+        self.replica.load(self.master.snapshot())
+        self.mission = Mission()
+        self.mission.on_goal(RobotGoal(goal_id="g1", pose=Pose(x=15.05, y=1.05, theta=0.0)), 0.0)
+        self.monitor = PathMonitor()
+        self.follow(PATH)
+
+    def follow(self, path, now=0.0):
+        assert self.mission.on_path(path, now)
+        self.mission.follower.advance(1.05, 1.05, now)
+        self.monitor.begin()
+
+    def set(self, x, cost, *, tell=True):
+        """Give all cells at x (m) a cost."""
+        window = Window(round(x / 0.1), 0, 1, 20)
+        deltas = self.master.write([("cost", window, np.full((20, 1), cost, np.uint8))], [], [])
+        for delta in deltas if tell else ():
+            self.replica.apply(delta)
+
+    def problem(self, now):
+        self.monitor.check(self.mission, self.replica, now)
+        return self.monitor.problem(self.mission, self.replica.version, now)
+
+
+@pytest.fixture
+def rig():
+    return Rig()
+
+
+def test_a_free_path_has_no_problem(rig):
+    assert rig.problem(0.0) is None
+    assert rig.problem(99.0) is None
+
+
+def test_a_block_nearby_is_a_problem_at_once_and_over_when_it_is_cleared(rig):
+    rig.set(1.0 + BLOCK_NEAR_M - 0.2, 254)
+    assert "the path is blocked 2.8 m ahead" in rig.problem(1.0)
+    rig.set(1.0 + BLOCK_NEAR_M - 0.2, 0)
+    assert rig.problem(1.1) is None
+
+
+def test_a_block_far_ahead_leaves_the_planner_its_grace(rig):
+    rig.set(8.0, 254)
+    assert rig.problem(1.0) is None
+    assert rig.problem(1.0 + PLANNER_GRACE_S) is None
+    assert rig.problem(1.1 + PLANNER_GRACE_S) is not None
+
+
+def test_driving_up_to_a_block_makes_it_near(rig):
+    rig.set(5.0, 254)
+    assert rig.problem(1.0) is None
+    rig.mission.follower.advance(2.5, 1.05, 1.1)
+    assert rig.problem(1.1) is not None
+
+
+def test_a_new_path_that_is_blocked_too_gets_no_second_grace(rig):
+    rig.set(8.0, 254)
+    assert rig.problem(1.0) is None
+    rig.follow(msgspec.structs.replace(PATH, plan_id=2), 1.8)
+    assert rig.problem(1.8) is None
+    assert rig.problem(1.1 + PLANNER_GRACE_S) is not None
+
+
+def test_a_blocked_goal_is_called_so(rig):
+    rig.set(15.0, 253)
+    assert rig.problem(1.0) is None
+    assert "the goal is blocked" in rig.problem(1.1 + PLANNER_GRACE_S)
+
+
+def test_a_planner_that_knew_the_map_may_lead_the_robot_out_of_a_lethal_cell(rig):
+    rig.set(1.2, 254)
+    assert rig.problem(1.0) is not None
+    rig.follow(msgspec.structs.replace(PATH, plan_id=2, map_seq=1), 1.1)
+    assert rig.problem(1.1) is None
+
+
+def test_a_path_of_a_newer_map_is_checked_when_the_robots_has_caught_up(rig):
+    rig.set(2.0, 254, tell=False)
+    rig.follow(msgspec.structs.replace(PATH, plan_id=2, map_seq=2), 1.0)
+    assert rig.problem(1.0) is None
+    rig.set(9.0, 254, tell=False)
+    rig.replica.load(rig.master.snapshot())
+    assert rig.problem(1.1) is not None
+
+
+def test_a_path_of_another_map_is_a_problem_after_a_grace(rig):
+    other = Version(8, 0, 0)
+    assert rig.monitor.problem(rig.mission, other, 1.0) is None
+    assert rig.monitor.problem(rig.mission, other, 1.0 + PLANNER_GRACE_S) is None
+    assert "another map" in rig.monitor.problem(rig.mission, other, 1.1 + PLANNER_GRACE_S)
+    assert rig.monitor.problem(rig.mission, rig.replica.version, 3.0) is None
+    assert rig.monitor.problem(rig.mission, other, 3.1) is None
+
+
+def test_a_refusal_is_a_problem_in_the_planners_words(rig):
+    refusal = Refusal(code=208, reason="Z4 cuts the only way", causes=[])
+    rig.mission.on_path(msgspec.structs.replace(PATH, plan_id=2, points=[], refusal=refusal), 1.0)
+    assert "Z4 cuts the only way" in rig.problem(1.0)
+
+
+def test_a_mission_that_ended_has_no_problem(rig):
+    rig.set(2.0, 254)
+    assert rig.problem(1.0) is not None
+    rig.mission.cancel()
+    rig.monitor.reset()
+    assert rig.problem(1.1) is None

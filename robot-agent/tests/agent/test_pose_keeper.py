@@ -1,0 +1,120 @@
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import msgspec
+import numpy as np
+import pytest
+
+from fog_contracts.grid import GridGeometry
+from robot_agent.agent.pose_keeper import SEARCH_AGAIN_S, PoseKeeper
+from robot_agent.localization.localizer import SavedPose
+
+POSE = SavedPose(site="lab", x=1.0, y=2.0, theta=3.1, sigma_xy=0.1, sigma_theta=0.1)
+
+
+class FakeLocalizer:
+    def __init__(self):
+        self.status = "none"
+        self.searching = False
+        self.known = None
+        self.can_search = True
+        self.searches = 0
+        self.restored = []
+        self.trusted = POSE
+
+    def pose(self, _now):
+        return self.known
+
+    def global_localization(self):
+        self.searches += self.can_search
+        return self.can_search
+
+    def restore(self, saved):
+        self.restored.append(saved)
+
+    def load_map(self, static, geometry):
+        self.map = static, geometry
+
+    def save(self, site, _now):
+        return self.trusted and msgspec.structs.replace(self.trusted, site=site)
+
+
+@pytest.fixture
+def localizer():
+    return FakeLocalizer()
+
+
+@pytest.fixture
+def keeper(localizer):
+    return PoseKeeper(localizer)
+
+
+def replica(site):
+    return SimpleNamespace(site=site, static=np.zeros((2, 2), np.uint8), geometry=GridGeometry(2, 2, 0.1, 0.0, 0.0))
+
+
+def test_a_search_begins_when_nobody_gave_a_pose_and_not_again_for_a_while(keeper, localizer):
+    assert keeper.search("INIT", 0.0, at_rest=True)
+    assert not keeper.search("INIT", SEARCH_AGAIN_S, at_rest=True)
+    assert keeper.search("INIT", SEARCH_AGAIN_S + 0.1, at_rest=True)
+    assert localizer.searches == 2
+
+
+def test_a_search_that_could_not_begin_is_tried_again_at_once(keeper, localizer):
+    localizer.can_search = False
+    assert not keeper.search("INIT", 0.0, at_rest=True)
+    localizer.can_search = True
+    assert keeper.search("INIT", 0.1, at_rest=True)
+
+
+@pytest.mark.parametrize("change", [{"status": "lost"}, {"searching": True}, {"known": (1.0, 2.0, 0.0)}])
+def test_no_search_begins_while_there_is_a_pose_or_a_search(keeper, localizer, change):
+    for name, value in change.items():
+        setattr(localizer, name, value)
+    assert not keeper.search("INIT", 0.0, at_rest=True)
+
+
+@pytest.mark.parametrize(("mode", "at_rest"), [("NORMAL", True), ("HOLD", True), ("INIT", False)])
+def test_no_search_begins_in_a_robot_that_is_enabled_or_moves(keeper, mode, at_rest):
+    assert not keeper.search(mode, 0.0, at_rest=at_rest)
+
+
+@pytest.mark.parametrize(("site", "restored"), [("lab", [POSE]), ("office", [])])
+def test_a_stored_pose_waits_for_the_map_of_its_site(keeper, localizer, site, restored):
+    keeper.restore(POSE, "")
+    assert localizer.restored == []
+    keeper.load_map(replica(site))
+    keeper.load_map(replica("lab"))
+    assert localizer.restored == restored
+
+
+def test_a_stored_pose_counts_at_once_on_the_map_of_its_site(keeper, localizer):
+    keeper.restore(POSE, "lab")
+    assert localizer.restored == [POSE]
+
+
+@pytest.mark.parametrize(
+    ("change", "worth"),
+    [
+        ({"x": 1.01}, False),
+        ({"x": 1.02, "y": 2.01}, True),
+        ({"theta": 3.12}, False),
+        ({"theta": 3.15}, True),
+        ({"theta": 3.1 - 2 * math.pi}, False),
+        ({"sigma_xy": 0.2}, True),
+        ({"sigma_theta": 0.04}, True),
+    ],
+)
+def test_only_a_pose_that_differs_is_worth_a_write(keeper, localizer, change, worth):
+    assert keeper.to_store("lab", 0.0) == POSE
+    assert keeper.to_store("lab", 1.0) is None
+    localizer.trusted = msgspec.structs.replace(POSE, **change)
+    assert (keeper.to_store("lab", 2.0) is not None) == worth
+
+
+def test_a_pose_that_is_not_trusted_or_of_no_site_is_not_stored(keeper, localizer):
+    assert keeper.to_store("", 0.0) is None
+    localizer.trusted = None
+    assert keeper.to_store("lab", 0.0) is None

@@ -1,0 +1,83 @@
+from __future__ import annotations
+
+import msgspec
+import pytest
+
+from fog_contracts import channels as ch
+from fog_contracts.messages import RobotObstacles, RobotPose, RobotState, Trace
+from robot_agent.agent.path_traces import PathTraces
+from robot_agent.agent.publishing import PublishingPolicy
+
+POSE = RobotPose(x=0.0, y=0.0, theta=0.0, covariance=[0.0] * 9, v=0.0, w=0.0, radius=0.2, height=0.3, stamp=0.0)
+STATE = RobotState(mode="HOLD", reasons=["the map is 1.2 s old"], enabled=True, battery=0.8, goal_id=None, map_epoch=1,
+                   map_seq=1, plan_id=None)  # fmt: skip
+REPORT = RobotObstacles(points=[], stamp=0.0, ttl=10.0)
+
+
+def run(seconds, *, step=0.1, state=lambda _now: STATE, pose=POSE, report=REPORT):
+    """Return the times at which each channel was published."""
+    policy = PublishingPolicy("r1")
+    times = {ch.ROBOT_POSE: [], ch.ROBOT_STATE: [], ch.ROBOT_OBSTACLES: []}
+    for number in range(round(seconds / step)):
+        now = 100.0 + number * step
+        for publication in policy.choose(pose, state(now), lambda: report, now):
+            assert publication.ids == {"robot": "r1"}
+            times[publication.channel].append(round(now - 100.0, 3))
+    return times
+
+
+@pytest.mark.parametrize("step", [0.1, 0.05, 0.025])
+def test_pose_goes_out_ten_times_a_second_state_and_obstacles_once(step):
+    times = run(3.0, step=step)
+    assert len(times[ch.ROBOT_POSE]) == pytest.approx(30, abs=1)
+    assert len(times[ch.ROBOT_STATE]) == len(times[ch.ROBOT_OBSTACLES]) == pytest.approx(3, abs=1)
+
+
+@pytest.mark.parametrize(
+    ("change", "times"),
+    [
+        ({"mode": "NORMAL"}, [0.0, 0.5, 1.5]),
+        ({"goal_reached": True}, [0.0, 0.5, 1.5]),
+        ({"map_seq": 2}, [0.0, 0.5, 1.5]),
+        ({"reasons": ["the lidar is silent"]}, [0.0, 0.5, 1.5]),
+        ({"reasons": ["the map is 1.3 s old"]}, [0.0, 1.0]),
+        ({"goal_distance": 3.0, "battery": 0.7, "stamp": 5.0}, [0.0, 1.0]),
+    ],
+)
+def test_a_state_that_says_something_new_goes_out_at_once(change, times):
+    other = msgspec.structs.replace(STATE, **change)
+    assert run(1.6, state=lambda now: other if now >= 100.49 else STATE)[ch.ROBOT_STATE] == times
+
+
+def test_without_pose_and_report_the_state_goes_out_alone():
+    times = run(1.0, pose=None, report=None)
+    assert times == {ch.ROBOT_POSE: [], ch.ROBOT_STATE: [0.0], ch.ROBOT_OBSTACLES: []}
+
+
+def test_obstacles_are_looked_for_only_when_a_report_is_due():
+    calls = []
+    policy = PublishingPolicy("r1")
+    for number in range(20):
+        policy.choose(None, STATE, lambda at=number: calls.append(at), 100.0 + number * 0.1)
+    assert calls == [0, 10]
+
+
+def test_traces_of_a_path_that_was_replaced_before_its_first_command_are_void():
+    traces = PathTraces()
+    for area in ("z1", "z2"):
+        traces.begin([Trace(area=area, epoch=1, seq=1, first_reading=1.0, confirmed=2.0)], 3.0)
+    traces.close(4.0)
+    traces.close(5.0)
+    (closed,) = traces.take_finished()
+    assert (closed.area, closed.path_received, closed.first_command) == ("z2", 3.0, 4.0)
+    assert traces.take_finished() == []
+    assert traces.recent == [closed]
+
+
+def test_only_the_last_traces_are_kept_for_the_state():
+    traces = PathTraces()
+    for number in range(20):
+        traces.begin([Trace(area=f"z{number}", epoch=1, seq=1, first_reading=1.0, confirmed=2.0)], 3.0)
+        traces.close(4.0)
+    assert [trace.area for trace in traces.recent] == [f"z{number}" for number in range(4, 20)]
+    assert len(traces.take_finished()) == 20

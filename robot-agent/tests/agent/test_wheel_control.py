@@ -1,0 +1,77 @@
+from __future__ import annotations
+
+import pytest
+
+from robot_agent.agent.wheel_control import WheelControl
+from robot_agent.config import AgentConfig
+from robot_agent.motion.local_planner import Decision
+from robot_agent.safety.gate import SafetyOutputs
+
+CONFIG = AgentConfig(robot="r1", operator_key=b"k" * 32)
+DT = 0.05
+
+
+def outputs(stop="none", cap=0.3):
+    return SafetyOutputs(mode="NORMAL", reasons=(), cap=cap, stop=stop, changed=False, refusal=None)
+
+
+def decision(made_at=0.0, left=0.2, right=0.3):
+    return Decision(plan_id=1, planner_epoch=1, made_at=made_at, left=left, right=right)
+
+
+@pytest.fixture
+def driving():
+    control = WheelControl(CONFIG)
+    for step in range(5):
+        control.decision = decision(step * DT)
+        control.command(outputs(), step * DT)
+    assert control.speeds == pytest.approx((0.2, 0.3))
+    return control
+
+
+def test_commands_are_counted_and_reach_the_decision_within_the_acceleration(driving):
+    control = WheelControl(CONFIG)
+    control.decision = decision()
+    first, second = control.command(outputs(), 0.0), control.command(outputs(), DT)
+    assert (first.seq, first.left, first.right) == (1, 0.0, 0.0)
+    assert second.seq == 2
+    assert second.right == pytest.approx(CONFIG.motion.acceleration * DT)
+    assert second.left == pytest.approx(second.right * 0.2 / 0.3)
+    assert driving.follows
+
+
+@pytest.mark.parametrize(
+    ("stale", "stop"), [(False, "ramp"), (True, "none"), (True, "ramp")], ids=["held", "stale", "both"]
+)
+def test_a_hold_and_a_stale_decision_bring_the_wheels_to_rest_by_a_ramp(driving, stale, stop):
+    driving.decision = decision(0.0 - CONFIG.decision_max_age if stale else 0.25)
+    before, now = driving.speeds, 5 * DT
+    driving.command(outputs(stop), now)
+    assert 0.0 < driving.speeds[1] < before[1]
+    assert driving.speeds[0] / driving.speeds[1] == pytest.approx(before[0] / before[1])
+    assert not driving.follows
+    while not driving.at_rest:
+        now += DT
+        driving.command(outputs(stop), now)
+    assert now <= 5 * DT + CONFIG.safety.ramp
+
+
+def test_a_protective_stop_is_zero_at_once(driving):
+    driving.decision = decision(0.25)
+    driving.command(outputs("now", cap=0.0), 0.25)
+    assert driving.at_rest
+    assert not driving.follows
+
+
+def test_a_long_pause_is_no_licence_to_jump():
+    control = WheelControl(CONFIG)
+    control.command(outputs(), 0.0)
+    control.decision = decision(100.0, left=0.5, right=0.5)
+    command = control.command(outputs(cap=0.5), 100.0)
+    assert command.left <= CONFIG.motion.acceleration * 0.2 + 1e-9
+
+
+def test_a_reset_is_passed_on_once():
+    control = WheelControl(CONFIG)
+    control.pass_reset()
+    assert [control.command(outputs(), step * DT).reset for step in range(3)] == [True, False, False]

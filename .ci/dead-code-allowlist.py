@@ -13,6 +13,7 @@ _.severity
 _.uptime_ms  # messages: of a sensor node
 _.rssi
 _.fw
+_.after_input  # robot_agent.agent.replay: where a replay differs
 _.hazard_clearance_m  # lockstep: fields of its result
 _.operator_commands
 _.pose_error_m

@@ -33,7 +33,7 @@ class SafetySupervisor:
 def safety_inputs(
     base: BaseSource,
     lidar: LidarSource,
-    the_map: MapFollower,
+    map_copy: MapFollower,
     localizer: Localizer,
     mission: Mission,
     *,
@@ -45,9 +45,9 @@ def safety_inputs(
     """Gather age, value and complaint of every source at `now` (s, monotonic)."""
     feedback, follower = base.feedback, mission.follower
     return SafetyInputs(
-        map_loaded=the_map.version is not None,
-        map_age=the_map.age(now),
-        map_gap=the_map.gap(now),
+        map_loaded=map_copy.version is not None,
+        map_age=map_copy.age(now),
+        map_gap=map_copy.gap(now),
         localization=localizer.status,
         localization_detail=localizer.detail,
         lidar_node_age=lidar.node_age(now),

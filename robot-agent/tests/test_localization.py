@@ -13,7 +13,8 @@ from little_world import L_ROOMS, grid_of
 from fog_kernels.raycast import cast
 from robot_agent.config import LocalizationConfig
 from robot_agent.hardware import LaserScan
-from robot_agent.localization.localizer import Localizer, Pose2, SavedPose, wrap
+from robot_agent.localization.localizer import Localizer, SavedPose
+from robot_agent.localization.pose import Pose2, wrap
 
 STATIC, GEOMETRY = grid_of(L_ROOMS, 15.0, 12.0)
 SOLID = (STATIC == 254).astype(np.uint8)
@@ -65,7 +66,7 @@ poses = st.builds(Pose2, st.floats(-50, 50), st.floats(-50, 50), st.floats(-3, 3
 
 @given(poses, poses)
 def test_a_pose_seen_from_another_and_put_back_is_the_same(a, b):
-    again = b.then(a.seen_from(b))
+    again = b.compose(a.relative_to(b))
     assert (again.x, again.y) == pytest.approx((a.x, a.y), abs=1e-9)
     assert wrap(again.theta - a.theta) == pytest.approx(0.0, abs=1e-9)
 
@@ -84,21 +85,16 @@ def test_a_turn_taken_in_motion_is_straightened(v, w):
     localizer.load_map(STATIC, GEOMETRY)
     origin = pose_at(0.0)
     for i in range(9):
-        localizer.on_odometry(0.025 * i, *(pose_at(0.025 * i).seen_from(origin)))
+        localizer.on_odometry(0.025 * i, *(pose_at(0.025 * i).relative_to(origin)))
     localizer.on_scan(look(pose_at, 0.0, 0.18), 0.18)
     still = Localizer()
     still.load_map(STATIC, GEOMETRY)
     still.on_odometry(0.0, 0.0, 0.0, 0.0)
     still.on_scan(look(pose_at, 0.0, 0.18), 0.18)
     end = pose_at(0.18)
-    fits = [one.wall_distance(_placed(one.sweep.points, end)).mean() for one in (localizer, still)]
+    fits = [one.wall_distance(end.transform(one.scan.points)).mean() for one in (localizer, still)]
     assert fits[0] < 0.04
     assert fits[0] < fits[1]
-
-
-def _placed(points, pose):
-    cos, sin = math.cos(pose.theta), math.sin(pose.theta)
-    return points @ np.array([[cos, sin], [-sin, cos]]) + (pose.x, pose.y)
 
 
 @pytest.mark.parametrize("place", PLACES)
@@ -178,7 +174,7 @@ def test_between_turns_the_pose_follows_the_odometry():
     before = localizer.pose(now)
     localizer.on_odometry(now + 0.05, 0.1, 0.0, 0.2)
     after = localizer.pose(now + 0.05)
-    assert after.seen_from(before) == pytest.approx((0.1, 0.0, 0.2), abs=1e-6)
+    assert after.relative_to(before) == pytest.approx((0.1, 0.0, 0.2), abs=1e-6)
 
 
 def test_the_number_of_particles_stays_within_its_bounds_and_the_seed_decides_everything():

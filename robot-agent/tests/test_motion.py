@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from fog_contracts.grid import GridGeometry
 from robot_agent.config import MotionConfig
-from robot_agent.localization.localizer import Pose2
+from robot_agent.localization.pose import Pose2
 from robot_agent.motion.local_planner import PathFollower, decide, detour, first_blocked, make_job, twist, wheels
 
 GRID = GridGeometry(200, 120, 0.05, 0.0, 0.0)

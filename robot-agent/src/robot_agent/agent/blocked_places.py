@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from fog_contracts.messages import HazardArea, Shape, Zone, ZoneSet
     from fog_contracts.replica import Replica
     from robot_agent.agent.obstacle_reporter import ObstacleReporter
-    from robot_agent.localization.localizer import Pose2
+    from robot_agent.localization.pose import Pose2
 
 
 class BlockedPlaces:

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from fog_contracts.grid import GridGeometry
     from fog_contracts.handlers import Moment
     from fog_contracts.replica import Replica
-    from robot_agent.localization.localizer import Localizer, Pose2
+    from robot_agent.localization.localizer import Localizer
+    from robot_agent.localization.pose import Pose2
 
 _EXPLAINED_M: Final = 0.25
 """A lidar point this near to a wall of the map is that wall."""
@@ -50,7 +51,7 @@ class ObstacleReporter:
 
         What others put on the map is no news, what this robot did is reported for as long as it is in sight.
         """
-        points, scan, pose = localizer.points_in_map(), localizer.sweep, localizer.pose(at.now)
+        points, scan, pose = localizer.points_in_map(), localizer.scan, localizer.pose(at.now)
         if localizer.status != "good" or replica.geometry is None or points is None or scan is None or pose is None:
             return None
         if scan_age > _SCAN_AGE_S or abs(localizer.twist()[1]) > _TURN_RATE:
@@ -64,7 +65,7 @@ class ObstacleReporter:
             points=[((cx + 0.5) * _CELL_M, (cy + 0.5) * _CELL_M) for cx, cy in cells],
             stamp=at.stamp,
             ttl=self._ttl,
-            view=view(localizer.seen_from(), points, replica.geometry),
+            view=view(localizer.scan_pose(), points, replica.geometry),
         )
 
     def is_self_reported(self, points: NDArray[np.float64], now: float) -> NDArray[np.bool_]:

@@ -16,7 +16,7 @@ from fog_contracts.costs import INSCRIBED, LETHAL, NO_SPEED_LIMIT, UNKNOWN
 from fog_kernels.astar import Planner
 from fog_kernels.dwa import DwaLimits, DwaSettings, dwa
 from fog_kernels.inflation import InflationTable, inflate, inflation_table
-from robot_agent.localization.localizer import Pose2, wrap
+from robot_agent.localization.pose import Pose2, wrap
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -1,0 +1,117 @@
+"""Finding the robot anywhere on the map: candidate poses everywhere, scored coarse to fine.
+
+Method: in the manner of Olson 2009, over the likelihood field. The work is done in shares, one with each scan, while
+the robot stands.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from robot_agent.localization.fit import Fit, evaluate_fit
+from robot_agent.localization.pose import Pose2, wrap
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from robot_agent.localization.map_fields import MapFields
+
+_CHUNK: Final = 40_000
+"""Candidate poses that one scan's share of a search scores: some 10 ms."""
+_SPACING_M: Final = 0.3
+_HEADINGS: Final = 36
+_REFINED: Final = 400
+"""Candidates that are refined."""
+_PLACES: Final = 8
+"""Places that are compared in the end, ..."""
+_APART_M: Final = 0.6
+_APART_RAD: Final = 0.5
+"""... apart from one another by this distance or this angle."""
+_AMBIGUOUS: Final = 0.85
+"""A second place that fits this well, as a share of the best, makes the search undecided."""
+
+
+class SearchResult(NamedTuple):
+    """The pose in `map` that was found, or None and why there is none, in words."""
+
+    pose: Pose2 | None
+    detail: str
+
+
+class GlobalSearch:
+    """A search under way, for where the robot stood when it saw `points`."""
+
+    def __init__(self, fields: MapFields, points: NDArray[np.float64], odom: Pose2, range_max: float) -> None:
+        """Begin; points (n, 2; m, frame `base`) were seen at `odom`, by a lidar with a rated range of `range_max` m."""
+        places = fields.free_places
+        spaced = places[np.unique(np.floor(places / _SPACING_M).astype(np.int64), axis=0, return_index=True)[1]]
+        headings = np.arange(_HEADINGS) * (2.0 * math.pi / _HEADINGS)
+        self._candidates = np.column_stack((np.repeat(spaced, len(headings), axis=0), np.tile(headings, len(spaced))))
+        self._scores = np.zeros(len(self._candidates))
+        self._scored = 0
+        self._points = points
+        self._range_max = range_max
+        self.odom = odom
+        """Pose in `odom` to which the result belongs."""
+
+    def advance(self, fields: MapFields) -> SearchResult | None:
+        """Do a share of the work on a map; return the result once there is one."""
+        if self._scored < len(self._candidates):
+            part = slice(self._scored, self._scored + _CHUNK)
+            self._scores[part] = fields.scores(self._candidates[part], self._points, fields.coarse)
+            self._scored += _CHUNK
+            return None
+        return self._conclude(fields, *self._refined(fields))
+
+    def _refined(self, fields: MapFields) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the best candidates (n, 3), each moved to the best pose around it, and their scores."""
+        kept = np.argsort(-self._scores, kind="stable")[:_REFINED]
+        poses, scores = self._candidates[kept], self._scores[kept]
+        step = np.array([0.15, 0.15, math.radians(5.0)])
+        shifts = np.array([(i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)], dtype=np.float64)
+        for field in (fields.coarse, fields.fine, fields.fine, fields.fine):
+            tried = (poses[:, None, :] + shifts[None, :, :] * step).reshape(-1, 3)
+            table = fields.scores(tried, self._points, field).reshape(len(poses), -1)
+            best = table.argmax(axis=1)
+            poses = tried.reshape(len(poses), -1, 3)[np.arange(len(poses)), best]
+            scores = table[np.arange(len(poses)), best]
+            step *= 0.6
+        return poses, scores
+
+    def _conclude(self, fields: MapFields, poses: NDArray[np.float64], scores: NDArray[np.float64]) -> SearchResult:
+        """Keep the best place unless another one, elsewhere, explains the scan nearly as well."""
+        fitting: list[tuple[float, Pose2]] = []
+        for score, pose in _places(poses, scores):
+            fit = evaluate_fit(fields, pose, self._points, self._range_max)
+            if _fits(fit):
+                fitting.append((score * (1.0 - fit.contradict) * fit.explained, pose))
+        if not fitting:
+            return SearchResult(None, "the lidar's view fits no place of the map: give the initial pose")
+        fitting.sort(key=lambda entry: -entry[0])
+        if len(fitting) > 1 and fitting[1][0] > _AMBIGUOUS * fitting[0][0]:
+            return SearchResult(None, "several places of the map look like this one: give the initial pose")
+        return SearchResult(fitting[0][1], "")
+
+
+def _places(poses: NDArray[np.float64], scores: NDArray[np.float64]) -> list[tuple[float, Pose2]]:
+    """Return the best poses that lie apart, each with its score, best first."""
+    places: list[tuple[float, Pose2]] = []
+    for index in np.argsort(-scores, kind="stable"):
+        pose = Pose2(float(poses[index, 0]), float(poses[index, 1]), wrap(float(poses[index, 2])))
+        if all(_apart(pose, other) for _, other in places):
+            places.append((float(scores[index]), pose))
+        if len(places) == _PLACES:
+            break
+    return places
+
+
+def _apart(pose: Pose2, other: Pose2) -> bool:
+    far = math.hypot(pose.x - other.x, pose.y - other.y) > _APART_M
+    return far or abs(wrap(pose.theta - other.theta)) > _APART_RAD
+
+
+def _fits(fit: Fit) -> bool:
+    return fit.contradict < 0.2 and fit.agree > 0.4

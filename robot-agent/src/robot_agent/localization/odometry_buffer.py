@@ -1,0 +1,78 @@
+"""The last seconds of odometry: where the robot was in `odom` at any time in them, and how fast it moves."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from robot_agent.localization.pose import Pose2
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+_HISTORY_S: Final = 3.0
+_EXTRAPOLATION_S: Final = 0.15
+_TWIST_OVER_S: Final = 0.15
+_TWIST_LEAST_S: Final = 0.03
+
+
+class OdometryBuffer:
+    """Poses in `odom` (m, rad; theta not wrapped) by the time (s) at which they arrived, at most 3 s of them."""
+
+    def __init__(self) -> None:
+        self._history: deque[tuple[float, float, float, float]] = deque()
+
+    def add(self, at: float, x: float, y: float, theta: float) -> None:
+        """Append a pose; one that is not newer than the last is ignored."""
+        if self._history and at <= self._history[-1][0]:
+            return
+        self._history.append((at, x, y, theta))
+        while self._history[0][0] < at - _HISTORY_S:
+            self._history.popleft()
+
+    def reaches_back_to(self, at: float) -> bool:
+        """Whether there is a pose at this time (s) or before."""
+        return bool(self._history) and self._history[0][0] <= at
+
+    def latest(self) -> Pose2 | None:
+        """Return the newest pose; None before the first."""
+        return self.pose(self._history[-1][0]) if self._history else None
+
+    def pose(self, at: float) -> Pose2 | None:
+        """Return the pose at a time (s), interpolated; extrapolated by at most 0.15 s. None before the first."""
+        if not self._history:
+            return None
+        x, y, theta = self.poses(np.array([at]))
+        return Pose2(float(x[0]), float(y[0]), float(theta[0]))
+
+    def poses(self, times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return x, y (m) and theta (rad) at times (n; s), as `pose` does; there must be a pose."""
+        known = np.array(self._history)
+        x, y, theta = (np.interp(times, known[:, 0], known[:, i]) for i in (1, 2, 3))
+        late = np.clip(times - known[-1, 0], 0.0, _EXTRAPOLATION_S)
+        if late.any():
+            v, w = self.twist()
+            heading = known[-1, 3] + 0.5 * w * late
+            x, y, theta = x + v * late * np.cos(heading), y + v * late * np.sin(heading), theta + w * late
+        return x, y, theta
+
+    def twist(self) -> tuple[float, float]:
+        """Return forward speed (m/s) and turning rate (rad/s) over the last 0.15 s or more; zeros without that.
+
+        Readings that were held up arrive together: between them no time passes, so a stretch must not begin within
+        such a bunch.
+        """
+        if len(self._history) < 2:
+            return 0.0, 0.0
+        at, x, y, theta = self._history[-1]
+        earlier = (entry for entry in reversed(self._history) if entry[0] <= at - _TWIST_OVER_S)
+        old = next(earlier, self._history[0])
+        span = at - old[0]
+        if span < _TWIST_LEAST_S:
+            return 0.0, 0.0
+        heading = 0.5 * (theta + old[3])
+        forward = (x - old[1]) * math.cos(heading) + (y - old[2]) * math.sin(heading)
+        return forward / span, (theta - old[3]) / span

@@ -1,0 +1,73 @@
+"""Deskewing: what the robot's motion did to a scan is undone, whatever the motion."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robot_agent.config import LocalizationConfig
+from robot_agent.hardware import LaserScan
+from robot_agent.localization.deskew import deskew, spread
+from robot_agent.localization.odometry_buffer import OdometryBuffer
+from robot_agent.localization.pose import Pose2
+
+POST = (2.0, 1.0)
+"""Where the only thing in sight stands, in `odom`."""
+
+
+def scan_of(ranges, angles=None, begin=0.0, end=0.18) -> LaserScan:
+    count = len(ranges)
+    return LaserScan(
+        angles_rad=np.zeros(count) if angles is None else np.array(angles),
+        ranges_m=np.array(ranges),
+        quality=np.full(count, 40, np.uint8),
+        started_at=begin,
+        ended_at=end,
+        repeats=1,
+    )
+
+
+def at_rest(*, since: float = 0.0) -> OdometryBuffer:
+    buffer = OdometryBuffer()
+    buffer.add(since, 0.0, 0.0, 0.0)
+    buffer.add(since + 0.3, 0.0, 0.0, 0.0)
+    return buffer
+
+
+@given(v=st.floats(-0.3, 0.3), w=st.floats(-2.5, 2.5), x=st.floats(-0.1, 0.1), yaw=st.floats(-3.0, 3.0))
+def test_every_sample_of_one_post_falls_on_the_post(v, w, x, yaw):
+    config = LocalizationConfig(lidar_x=x, lidar_yaw=yaw)
+    odometry = OdometryBuffer()
+    pose = Pose2(0.0, 0.0, 0.3)
+    ranges, angles = [], []
+    for i in range(91):
+        odometry.add(0.002 * i, *pose)
+        if i % 10 == 0:
+            lidar = pose.compose(Pose2(config.lidar_x, config.lidar_y, config.lidar_yaw))
+            seen = Pose2(*POST, 0.0).relative_to(lidar)
+            ranges.append(math.hypot(seen.x, seen.y))
+            angles.append(math.atan2(seen.y, seen.x))
+        turned = pose.theta + 0.002 * w  # not wrapped, as odometry is
+        pose = Pose2(pose.x + 0.002 * v * math.cos(turned), pose.y + 0.002 * v * math.sin(turned), turned)
+    straight = deskew(scan_of(ranges, angles, 0.0, 0.18), odometry, config)
+    assert straight.odom.transform(straight.points) == pytest.approx(np.tile(POST, (10, 1)), abs=1e-6)
+
+
+def test_samples_without_a_return_or_out_of_range_are_left_out():
+    scan = scan_of([math.nan, 0.05, 1.0, 13.0, math.inf, 2.0])
+    assert deskew(scan, at_rest(), LocalizationConfig()).points == pytest.approx(np.array([(1.0, 0.0), (2.0, 0.0)]))
+
+
+def test_scan_from_before_the_odometry_is_refused():
+    assert deskew(scan_of([1.0]), at_rest(since=0.2), LocalizationConfig()) is None
+    assert deskew(scan_of([1.0]), OdometryBuffer(), LocalizationConfig()) is None
+
+
+def test_beams_are_spread_over_the_whole_scan():
+    points = np.arange(20.0).reshape(10, 2)
+    assert spread(points, 4)[:, 0].tolist() == [0.0, 6.0, 12.0, 18.0]
+    assert spread(points, 99) is points

@@ -1,0 +1,136 @@
+"""How a scan fits the map, and the status that follows from the last scans, with hysteresis."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from little_world import L_ROOMS, grid_of
+
+from robot_agent.config import LocalizationConfig
+from robot_agent.localization.fit import Fit, FitMonitor, evaluate_fit, grade_fit
+from robot_agent.localization.map_fields import map_fields
+from robot_agent.localization.pose import Pose2
+
+FIELDS = map_fields(*grid_of(L_ROOMS, 15.0, 12.0), LocalizationConfig())
+PLACE = Pose2(5.0, 2.0, 1.0)
+GOOD = Fit(agree=0.95, explained=0.9, contradict=0.02, informative=80)
+FAIR = Fit(agree=0.9, explained=0.8, contradict=0.12, informative=80)
+VAGUE = Fit(agree=0.9, explained=0.1, contradict=0.0, informative=4)
+DOUBTFUL = Fit(agree=0.6, explained=0.5, contradict=0.3, informative=80)
+WRONG = Fit(agree=0.2, explained=0.2, contradict=0.6, informative=80)
+SURE = (0.05, 0.02)
+
+
+def seen_at(pose: Pose2, *, shorten: float = 0.0):
+    angles = np.linspace(-math.pi, math.pi, 120, endpoint=False)
+    ranges = FIELDS.ranges(pose.x, pose.y, angles + pose.theta, 12.0) - shorten
+    hit = np.isfinite(ranges)
+    return np.column_stack((ranges[hit] * np.cos(angles[hit]), ranges[hit] * np.sin(angles[hit])))
+
+
+def monitor_after(*fits: Fit, trial: int = 0) -> FitMonitor:
+    monitor = FitMonitor()
+    monitor.begin("checking", trial)
+    for fit in fits:
+        monitor.add(fit, *SURE)
+    return monitor
+
+
+def test_what_the_map_shows_agrees_and_contradicts_nothing():
+    fit = evaluate_fit(FIELDS, PLACE, seen_at(PLACE), 12.0)
+    assert fit.agree > 0.95
+    assert fit.explained > 0.95
+    assert fit.contradict < 0.05
+
+
+def test_beams_through_walls_contradict_and_things_before_walls_do_not():
+    through = evaluate_fit(FIELDS, PLACE, seen_at(PLACE, shorten=-0.6), 12.0)
+    assert through.contradict > 0.5
+    before = evaluate_fit(FIELDS, PLACE, seen_at(PLACE, shorten=0.45), 12.0)
+    assert before.contradict < 0.2
+    assert before.explained < 0.5
+
+
+def test_no_beam_tells_nothing_and_counts_as_contradiction():
+    fit = evaluate_fit(FIELDS, PLACE, np.zeros((0, 2)), 12.0)
+    assert (fit.informative, fit.contradict) == (0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("fit", "sigmas", "grade", "why"),
+    [
+        (GOOD, SURE, "good", ""),
+        (DOUBTFUL, SURE, "weak", "look through walls"),
+        (WRONG, SURE, "lost", "look through walls"),
+        (VAGUE, SURE, "weak", "too few beams"),
+        (GOOD, (1.2, 0.1), "lost", "uncertain by 1.2 m"),
+        (GOOD, (0.4, 0.1), "weak", "0.40 m"),
+        (GOOD, (0.1, 0.4), "weak", "0.40 rad"),
+    ],
+)
+def test_grade_and_reason(fit, sigmas, grade, why):
+    found = grade_fit(fit, *sigmas)
+    assert found[0] == grade
+    assert why in found[1]
+
+
+def test_two_good_scans_make_a_good_pose():
+    assert monitor_after(GOOD).status == "none"
+    assert monitor_after(GOOD, GOOD).status == "good"
+    assert monitor_after(GOOD, GOOD).detail == ""
+
+
+def test_pose_that_has_not_proved_itself_needs_a_better_fit():
+    assert monitor_after(FAIR, FAIR).status == "none"
+    assert monitor_after(GOOD, GOOD, FAIR, FAIR, FAIR).status == "good"
+
+
+def test_single_bad_scan_is_no_loss_and_five_of_nine_are():
+    assert monitor_after(GOOD, GOOD, WRONG).status == "good"
+    assert monitor_after(GOOD, GOOD, WRONG, WRONG, WRONG).status == "weak"
+    assert monitor_after(GOOD, GOOD, *[WRONG] * 5).status == "lost"
+
+
+def test_lasting_doubt_is_a_loss():
+    assert monitor_after(GOOD, GOOD, *[DOUBTFUL] * 24).status == "weak"
+    assert monitor_after(GOOD, GOOD, *[DOUBTFUL] * 25).status == "lost"
+
+
+def test_four_weak_scans_make_a_new_pose_weak_but_not_one_on_trial():
+    assert monitor_after(*[VAGUE] * 3).status == "none"
+    assert monitor_after(*[VAGUE] * 4).status == "weak"
+    assert monitor_after(*[VAGUE] * 4, trial=8).status == "none"
+
+
+def test_trial_ends_with_a_good_pose_or_fails_when_its_scans_are_used_up():
+    passed = monitor_after(FAIR, GOOD, GOOD, *[WRONG] * 3, trial=5)
+    assert not passed.trial_failed
+    monitor = monitor_after(*[FAIR] * 4, trial=5)
+    assert not monitor.trial_failed
+    monitor.add(FAIR, *SURE)
+    assert monitor.trial_failed
+    monitor.add(FAIR, *SURE)
+    assert not monitor.trial_failed
+
+
+def test_lost_pose_stays_lost_while_the_map_is_searched():
+    monitor = monitor_after(GOOD, GOOD, *[WRONG] * 5)
+    monitor.begin_search()
+    assert monitor.status == "lost"
+    monitor.restart()
+    monitor.add(GOOD, *SURE)
+    assert monitor.status == "lost"
+    monitor.add(GOOD, *SURE)
+    assert monitor.status == "good"
+
+
+@given(st.lists(st.sampled_from([GOOD, FAIR, VAGUE, DOUBTFUL, WRONG]), max_size=60))
+def test_any_status_but_good_has_a_reason(fits):
+    monitor = FitMonitor()
+    for fit in fits:
+        monitor.add(fit, *SURE)
+        assert bool(monitor.detail) == (monitor.status != "good")

@@ -1,0 +1,67 @@
+"""Search of the whole map: the place is found, undecided searches say so, the work comes in shares."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from little_world import L_ROOMS, grid_of
+
+from robot_agent.config import LocalizationConfig
+from robot_agent.localization import global_search
+from robot_agent.localization.global_search import GlobalSearch, SearchResult
+from robot_agent.localization.map_fields import MapFields, map_fields
+from robot_agent.localization.pose import Pose2, wrap
+
+CONFIG = LocalizationConfig()
+ORIGIN = Pose2(0.0, 0.0, 0.0)
+
+
+def view(fields: MapFields, pose: Pose2):
+    angles = np.linspace(-math.pi, math.pi, 60, endpoint=False)
+    ranges = fields.ranges(pose.x, pose.y, angles + pose.theta, 12.0)
+    hit = np.isfinite(ranges)
+    return np.column_stack((ranges[hit] * np.cos(angles[hit]), ranges[hit] * np.sin(angles[hit])))
+
+
+def search(fields: MapFields, points) -> tuple[SearchResult, int]:
+    one = GlobalSearch(fields, points, ORIGIN, CONFIG.range_max)
+    for shares in range(1, 1000):
+        result = one.advance(fields)
+        if result is not None:
+            return result, shares
+    raise AssertionError("the search never ends")
+
+
+@pytest.mark.parametrize("place", [Pose2(5.0, 2.0, 1.0), Pose2(12.0, 8.0, -2.0)])
+def test_robot_is_found_anywhere(place):
+    fields = map_fields(*grid_of(L_ROOMS, 15.0, 12.0), CONFIG)
+    result, _ = search(fields, view(fields, place))
+    assert math.hypot(result.pose.x - place.x, result.pose.y - place.y) < 0.1
+    assert abs(wrap(result.pose.theta - place.theta)) < 0.05
+
+
+def test_twin_rooms_leave_the_search_undecided():
+    fields = map_fields(*grid_of([(1, 1, 4, 4), (6, 1, 9, 4)], 10, 5), CONFIG)
+    result, _ = search(fields, view(fields, Pose2(2.0, 2.2, 0.0)))
+    assert result.pose is None
+    assert "look like this one" in result.detail
+
+
+def test_view_of_another_building_fits_no_place():
+    fields = map_fields(*grid_of([(1, 1, 4, 4)], 6, 6), CONFIG)
+    elsewhere = map_fields(*grid_of([(1, 1, 11, 9)], 12, 10), CONFIG)
+    result, _ = search(fields, view(elsewhere, Pose2(6.0, 5.0, 0.4)))
+    assert result.pose is None
+    assert "fits no place" in result.detail
+
+
+def test_work_is_done_in_shares_and_their_size_does_not_matter(monkeypatch):
+    fields = map_fields(*grid_of(L_ROOMS, 15.0, 12.0), CONFIG)
+    points = view(fields, Pose2(5.0, 2.0, 1.0))
+    whole, few = search(fields, points)
+    monkeypatch.setattr(global_search, "_CHUNK", 1000)
+    parts, many = search(fields, points)
+    assert parts == whole
+    assert many > 5 * few

@@ -1,0 +1,61 @@
+"""Odometry of the last seconds: interpolation, extrapolation with a bound, speed."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robot_agent.localization.odometry_buffer import OdometryBuffer
+
+
+def driven(v: float, w: float, *, until: float = 1.0) -> OdometryBuffer:
+    """Odometry at 50 Hz of a robot that drives from (0, 0, 0) with these speeds."""
+    buffer = OdometryBuffer()
+    for at in np.arange(0.0, until + 1e-9, 0.02):
+        x, y = (v * at, 0.0) if w == 0.0 else (v / w * math.sin(w * at), v / w * (1.0 - math.cos(w * at)))
+        buffer.add(float(at), x, y, w * at)
+    return buffer
+
+
+@given(v=st.floats(-0.3, 0.3), w=st.floats(-2.0, 2.0).filter(lambda w: abs(w) > 0.01), at=st.floats(0.0, 1.0))
+def test_pose_between_two_readings_lies_on_the_way(v, w, at):
+    pose = driven(v, w).pose(at)
+    assert pose == pytest.approx((v / w * math.sin(w * at), v / w * (1.0 - math.cos(w * at)), w * at), abs=1e-4)
+
+
+def test_speed_is_that_of_the_last_stretch():
+    assert driven(0.25, 0.8).twist() == pytest.approx((0.25, 0.8), abs=1e-3)
+    assert driven(-0.1, 0.0).twist() == pytest.approx((-0.1, 0.0), abs=1e-6)
+
+
+def test_pose_is_extrapolated_by_015_s_and_no_further():
+    buffer = driven(0.3, 0.0)
+    assert buffer.pose(1.1).x == pytest.approx(0.33)
+    assert buffer.pose(9.0).x == buffer.pose(1.15).x == pytest.approx(0.345)
+
+
+def test_history_ends_after_three_seconds():
+    buffer = driven(0.3, 0.0, until=8.0)
+    assert buffer.reaches_back_to(5.1)
+    assert not buffer.reaches_back_to(4.9)
+    assert buffer.pose(1.0).x == pytest.approx(0.3 * 5.0, abs=0.01)
+
+
+def test_reading_that_is_not_newer_is_ignored():
+    buffer = driven(0.3, 0.0)
+    before = buffer.latest()
+    buffer.add(1.0, 9.0, 9.0, 9.0)
+    buffer.add(0.5, 9.0, 9.0, 9.0)
+    assert buffer.latest() == before
+
+
+def test_without_readings_nothing_is_known():
+    buffer = OdometryBuffer()
+    assert buffer.pose(1.0) is None
+    assert buffer.latest() is None
+    assert buffer.twist() == (0.0, 0.0)
+    assert not buffer.reaches_back_to(1.0)

@@ -35,11 +35,11 @@ def wait_for(condition, what: str, deadline_s: float = DEADLINE_S):
 
 
 class Base:
-    """A Roomba behind a pty, run by a thread; it remembers since when its wheels have been at rest."""
+    """A base behind a pty, run by a thread; it remembers since when its wheels have been at rest."""
 
-    def __init__(self, link: Path) -> None:
+    def __init__(self, link: Path, robot=None) -> None:
         self.link = link
-        self.robot = RoombaEmulator()
+        self.robot = robot or RoombaEmulator()
         self.lock = threading.Lock()
         self.stopped_at: float | None = time.monotonic()
         self._port: PtyPort | None = None
@@ -196,9 +196,10 @@ class Agent:
 class Rig:
     """Base, watchdog, guardian and agent, ready to drive."""
 
-    def __init__(self, folder: Path) -> None:
-        self.base = Base(folder / "roomba")
+    def __init__(self, folder: Path, base: str = "roomba600", robot=None) -> None:
+        self.base = Base(folder / "base", robot)
         self.watchdog = Watchdog(folder, self.base.link)
+        self.watchdog.environment["FOGNAV_BASE"] = base
         self.agent = Agent(self.watchdog.socket)
         self._stack = ExitStack()
 

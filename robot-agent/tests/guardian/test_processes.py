@@ -14,6 +14,8 @@ import guardian_rig as rigs
 import pytest
 from guardian_rig import STOP_S, wait_for
 
+from robot_agent.bases.diffdrive.emulator import DiffDriveEmulator
+
 pytestmark = [pytest.mark.live, pytest.mark.timeout(120)]
 
 
@@ -37,6 +39,22 @@ def test_wheels_stop_each_time_the_guardian_is_killed_and_drive_again(rig):
         begun = rig.end_guardian(signal.SIGKILL)
         assert rig.base.stopped_within(begun) < STOP_S
         wait_for(lambda dead=dead: rig.watchdog.guardian() not in {None, dead}, "another guardian runs")
+
+
+def test_another_base_is_guarded_and_watched_just_as_well(tmp_path):
+    board = DiffDriveEmulator()
+    board.timeout_s = 1e9  # what stops it here must not be the board itself
+    with rigs.Rig(tmp_path, "diffdrive", board) as rig:
+        rig.drive()
+        begun = rig.end_guardian(signal.SIGKILL)
+        assert rig.base.stopped_within(begun) < STOP_S
+        rig.drive()
+        rig.agent.wheels = None
+        assert rig.base.stopped_within(time.monotonic()) < STOP_S
+        rig.drive()
+        board.bump_left = True
+        assert rig.base.stopped_within(time.monotonic()) < STOP_S
+        wait_for(lambda: "bumper" in (rig.agent.feedback.fault or ""), "the fault is told")
 
 
 def test_wheels_stop_when_the_guardian_hangs_and_drive_again(rig):

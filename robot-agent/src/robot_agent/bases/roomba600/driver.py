@@ -62,9 +62,10 @@ class Roomba600Driver:
 
     def wake(self) -> bytes:
         """Return Start, Safe, zero speed and the request for the stream."""
-        # Start puts the OI into Passive mode, which stops the wheels by itself; the zero after Safe is for a base
-        # whose receiver was in the middle of a command and swallowed the Start.
-        return oi.start() + oi.safe() + oi.drive_direct(0, 0) + oi.stream(oi.GUARDIAN_STREAM)
+        # Start puts the OI into Passive mode, which stops the wheels by itself. The zeros after Safe are for a base
+        # whose receiver was in the middle of a command: that takes Start, Safe and the beginning of the first zero for
+        # its missing bytes, and what speed they make ends with the second.
+        return oi.start() + oi.safe() + 2 * oi.drive_direct(0, 0) + oi.stream(oi.GUARDIAN_STREAM)
 
     def drive(self, left_m_s: float, right_m_s: float) -> bytes:
         """Return Drive Direct; speeds beyond what the base can do are scaled, which keeps the curve."""

@@ -15,10 +15,12 @@ from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 import numpy as np
 
-from robot_agent.hardware import LaserScan, RepeatCounter
+from robot_agent.lidars.scan_builder import Samples, ScanBuilder
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+    from robot_agent.hardware import LaserScan
 
 BAUD: Final = 115200
 RANGE_MIN_M: Final = 0.15
@@ -451,97 +453,31 @@ def decode_capsule(capsule: bytes, next_start: int) -> Nodes:
 # --- scans ------------------------------------------------------------------------------------------------------------
 
 
-_SECTORS: Final = 36
-_SECTORS_NEEDED: Final = 33
-_NODES_MAX: Final = 4096
 # Recorded heads start their turns between 350 and 360 degrees; a start flag far from zero is a damaged node.
 _START_WINDOW_Q6: Final = 45 * 64
-_ARRIVAL_GAP_S: Final = 0.5
 
 
 class ScanAssembler:
-    """Nodes -> whole scans. A scan runs from one start flag to the next and must have looked in nearly all directions.
-
-    `incomplete` counts scans that were thrown away because nodes were missing; the piece before the first start flag
-    does not count.
-    """
+    """Nodes -> whole scans, each from one start flag to the next."""
 
     def __init__(self) -> None:
-        self._pieces: list[Nodes] = []
-        self._times: list[NDArray[np.float64]] = []
-        self._count = 0
-        self._started = False
-        self._arrived: float | None = None
-        self._repeats = RepeatCounter()
-        self.incomplete = 0
+        self._builder = ScanBuilder()
+
+    @property
+    def incomplete(self) -> int:
+        """Scans that were thrown away because nodes were missing."""
+        return self._builder.incomplete
 
     def feed(self, nodes: Nodes, now: float) -> list[LaserScan]:
         """Take a batch that arrived at `now` (seconds, monotonic); the scans that it completes."""
-        times = self._arrival_times(len(nodes.start), now)
         angle = nodes.angle_q6
         near_zero = (angle < _START_WINDOW_Q6) | (angle >= _FULL_TURN_Q6 - _START_WINDOW_Q6)
-        scans: list[LaserScan] = []
-        begin = 0
-        for boundary in np.flatnonzero(nodes.start & near_zero):
-            self._append(nodes, times, begin, int(boundary))
-            scans.extend(self._finish())
-            begin = int(boundary)
-            self._started = True
-        self._append(nodes, times, begin, len(nodes.start))
-        return scans
+        boundaries = [int(index) for index in np.flatnonzero(nodes.start & near_zero)]
+        clockwise = angle.astype(np.float64) * (np.pi / (180.0 * 64.0))
+        ranges = nodes.distance_q2.astype(np.float64) * 0.00025
+        ranges[nodes.distance_q2 == 0] = np.nan
+        return self._builder.feed(Samples(clockwise, ranges, nodes.quality), boundaries, now)
 
     def reset(self) -> None:
-        """Forget the scan at hand, after the scan was started anew."""
-        self._clear()
-        self._started = False
-        self._arrived = None
-
-    def _arrival_times(self, count: int, now: float) -> NDArray[np.float64]:
-        before = self._arrived
-        self._arrived = now
-        if before is None or not 0.0 <= now - before <= _ARRIVAL_GAP_S:
-            return np.full(count, now)
-        return before + (now - before) * np.arange(1, count + 1) / max(count, 1)
-
-    def _append(self, nodes: Nodes, times: NDArray[np.float64], begin: int, end: int) -> None:
-        if not self._started or begin == end:
-            return
-        part = slice(begin, end)
-        self._pieces.append(
-            Nodes(nodes.start[part], nodes.quality[part], nodes.angle_q6[part], nodes.distance_q2[part])
-        )
-        self._times.append(times[begin:end])
-        self._count += end - begin
-        if self._count > _NODES_MAX:
-            self.incomplete += 1
-            self._clear()
-            self._started = False
-
-    def _clear(self) -> None:
-        self._pieces, self._times, self._count = [], [], 0
-
-    def _finish(self) -> list[LaserScan]:
-        if not self._count:
-            return []
-        quality = np.concatenate([piece.quality for piece in self._pieces])
-        angle_q6 = np.concatenate([piece.angle_q6 for piece in self._pieces])
-        distance_q2 = np.concatenate([piece.distance_q2 for piece in self._pieces])
-        times = np.concatenate(self._times)
-        self._clear()
-        sectors = np.bincount(angle_q6 // (_FULL_TURN_Q6 // _SECTORS), minlength=_SECTORS)
-        if np.count_nonzero(sectors) < _SECTORS_NEEDED:
-            self.incomplete += 1
-            return []
-        clockwise = angle_q6 * (np.pi / (180.0 * 64.0))
-        ranges = distance_q2 * 0.00025
-        ranges[distance_q2 == 0] = np.nan
-        return [
-            LaserScan(
-                angles_rad=np.where(clockwise < np.pi, 0.0, 2.0 * np.pi) - clockwise,
-                ranges_m=ranges,
-                quality=quality,
-                started_at=float(times[0]),
-                ended_at=float(times[-1]),
-                repeats=self._repeats.count(quality, angle_q6, distance_q2),
-            )
-        ]
+        """Forget the scan at hand, after the device was told to begin anew."""
+        self._builder.reset()

@@ -1,0 +1,103 @@
+"""A diffdrive board as a base: it reports by itself every 20 ms, and drives while its motors are on."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Final
+
+import msgspec
+from msgspec import Meta
+
+from robot_agent.bases.diffdrive import protocol
+from robot_agent.bases.diffdrive.protocol import Flag
+from robot_agent.bases.diffdrive.stop import STOP
+from robot_agent.hardware import BaseFactory, BaseReading, BaseStatus, BaseTiming, DriveTrain, WheelOdometry
+
+
+class DiffDriveOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The machine around the board; README.md beside this file lists the options."""
+
+    counts_per_turn: Annotated[float, Meta(gt=0.0, le=1e6)] = 1440.0
+    wheel_diameter_m: Annotated[float, Meta(ge=0.02, le=0.5)] = 0.09
+    axle_m: Annotated[float, Meta(ge=0.05, le=1.0)] = 0.28
+    wheel_speed_max_m_s: Annotated[float, Meta(gt=0.0, le=protocol.SPEED_MAX_MM_S / 1000.0)] = 0.6
+    battery_empty_v: Annotated[float, Meta(ge=0.0, le=60.0)] = 10.5
+    battery_full_v: Annotated[float, Meta(ge=0.0, le=60.0)] = 12.6
+
+    def __post_init__(self) -> None:
+        if self.battery_full_v <= self.battery_empty_v:
+            raise ValueError(
+                f"battery_full_v ({self.battery_full_v}) must be above battery_empty_v ({self.battery_empty_v})"
+            )
+
+
+class DiffDriveDriver:
+    """One board's conversation; see `robot_agent.hardware.BaseDriver`."""
+
+    timing = BaseTiming(silence=0.3, wake=1.0, settle=0.1)
+
+    def __init__(self, options: DiffDriveOptions) -> None:
+        self._options = options
+        self._parser = protocol.StatusParser()
+        self._metres_per_count = math.pi * options.wheel_diameter_m / options.counts_per_turn
+        self.drive_train = DriveTrain(
+            axle_m=options.axle_m,
+            wheel_speed_max_m_s=options.wheel_speed_max_m_s,
+            travel_wrap_m=protocol.COUNTS * self._metres_per_count,
+        )
+
+    @property
+    def corrupted(self) -> int:
+        """Status lines that came damaged, or again."""
+        return self._parser.corrupted
+
+    def receive_data(self, data: bytes, now: float) -> None:
+        """Take what the port gave."""
+        del now
+        self._parser.receive_data(data)
+
+    def next_event(self) -> BaseReading | None:
+        """Return the oldest status not yet taken."""
+        status = self._parser.next_event()
+        if status is None:
+            return None
+        travel = WheelOdometry(
+            left_m=status.left * self._metres_per_count, right_m=status.right * self._metres_per_count
+        )
+        return BaseReading(self._base_status(status), travel)
+
+    def wake(self) -> bytes:
+        """Return zero speeds and the command that switches the motors on, after an end to whatever was cut off."""
+        return b"\n" + protocol.velocity(0, 0) + protocol.enable()
+
+    def drive(self, left_m_s: float, right_m_s: float) -> bytes:
+        """Return the wheels' speeds; beyond what the base can do both are scaled, which keeps the curve."""
+        return protocol.wheels(left_m_s, right_m_s, self._options.wheel_speed_max_m_s)
+
+    def _base_status(self, status: protocol.Status) -> BaseStatus:
+        flags = status.flags
+        return BaseStatus(
+            bumper_left=Flag.BUMPER_LEFT in flags,
+            bumper_right=Flag.BUMPER_RIGHT in flags,
+            cliff=Flag.CLIFF in flags,
+            wheel_drop=Flag.WHEEL_DROP in flags,
+            overcurrent=Flag.OVERCURRENT in flags,
+            battery=self._charge(status.battery_mv),
+            charging=Flag.CHARGER in flags,
+            mode_problem=_mode_problem(flags),
+        )
+
+    def _charge(self, battery_mv: int) -> float | None:
+        if battery_mv == 0:
+            return None
+        empty, full = self._options.battery_empty_v, self._options.battery_full_v
+        return min(1.0, max(0.0, (battery_mv / 1000.0 - empty) / (full - empty)))
+
+
+def _mode_problem(flags: Flag) -> str | None:
+    if Flag.EMERGENCY_STOP in flags:
+        return "its emergency button is pressed"
+    return None if Flag.ENABLED in flags else "its motors are switched off"
+
+
+FACTORY: Final = BaseFactory(options=DiffDriveOptions, make=DiffDriveDriver, stop=STOP)

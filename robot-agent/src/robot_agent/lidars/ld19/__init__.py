@@ -1,0 +1,1 @@
+"""LDROBOT LD19, also sold as LD06 with another housing."""

@@ -1,0 +1,124 @@
+"""An LD19 as its serial port shows it: packets of twelve samples from power-on. Pure; deaf, as the real one is.
+
+The world's function gives the distances. The head's control holds 10 turns a second about, so that no two turns have
+their samples at the same angles.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+Measure = Callable[["NDArray[np.float64]", float], "NDArray[np.float64]"]
+"""(angles in rad, counter-clockwise in the lidar's frame; time in s) -> ranges in m, nan for no return."""
+
+BAUD: Final = 230_400
+SAMPLES_PER_S: Final = 4500.0
+TURNS_PER_S: Final = 10.03
+RANGE_MIN_M: Final = 0.02
+RANGE_MAX_M: Final = 12.0
+_SAMPLES: Final = 12
+_PACKET_S: Final = _SAMPLES / SAMPLES_PER_S
+# A simulation that paused gives no burst of what it missed.
+_CATCH_UP_S: Final = 0.5
+# Packets whose samples one call of the world's function measures: 11 ms.
+_CHUNK: Final = 4
+
+
+class Ld19Emulator:
+    """The lidar's end of the serial line, as `fognav_sim.devices.LidarEmulator` asks for it.
+
+    Two faults can be set at any time: `stalled` sends nothing more, `frozen` sends the same turn again and again, as a
+    stuck bridge does.
+    """
+
+    def __init__(self, measure: Measure) -> None:
+        """Take the world's measuring function."""
+        self._measure = measure
+        self._sent_until: float | None = None
+        self._position = 0.25
+        self._milliseconds = 0.0
+        self._turn: list[bytes] = []
+        self._last_turn: list[bytes] = []
+        self._replayed = 0
+        self.stalled = False
+        self.frozen = False
+
+    @property
+    def baud(self) -> int:
+        """Speed of the serial line."""
+        return BAUD
+
+    def receive(self, data: bytes, now: float) -> None:
+        """Take bytes of the host: the LD19 has no input."""
+
+    def outgoing(self, now: float) -> bytes:
+        """Return what the lidar has sent up to `now`, once; this is where the world is measured."""
+        if self._sent_until is None or now - self._sent_until > _CATCH_UP_S:
+            self._sent_until = now
+        due = math.floor((now - self._sent_until) / _PACKET_S + 1e-9)
+        sent: list[bytes] = []
+        while due > 0:
+            count = min(due, _CHUNK)
+            due -= count
+            self._sent_until += count * _PACKET_S
+            if self.frozen and self._last_turn:
+                sent += self._again(count)
+            elif not self.stalled:
+                sent += self._packets(count, self._sent_until)
+        return b"".join(sent)
+
+    def _again(self, count: int) -> list[bytes]:
+        chosen = [self._last_turn[(self._replayed + i) % len(self._last_turn)] for i in range(count)]
+        self._replayed += count
+        return chosen
+
+    def _packets(self, count: int, at: float) -> list[bytes]:
+        step = TURNS_PER_S / SAMPLES_PER_S
+        # Angles on the wire have hundredths of a degree; the host puts a packet's samples on the line between them.
+        starts = np.floor((self._position + np.arange(count) * _SAMPLES * step) % 1.0 * 36_000.0)
+        span = round((_SAMPLES - 1) * step * 36_000.0)
+        angles = (starts[:, None] + span * np.arange(_SAMPLES) / (_SAMPLES - 1)) % 36_000.0
+        counter_clockwise = np.deg2rad(-angles.reshape(-1) / 100.0)
+        ranges = np.asarray(self._measure((counter_clockwise + math.pi) % math.tau - math.pi, at), np.float64)
+        seen = np.isfinite(ranges) & (ranges >= RANGE_MIN_M) & (ranges <= RANGE_MAX_M)
+        millimetres = np.where(seen, np.rint(np.where(seen, ranges, 0.0) * 1000.0), 0.0).astype(int)
+        strength = np.where(seen, np.clip(240.0 - 12.0 * np.where(seen, ranges, 0.0), 0.0, 255.0), 0.0).astype(int)
+        made = []
+        for number in range(count):
+            part = slice(number * _SAMPLES, (number + 1) * _SAMPLES)
+            start = int(starts[number])
+            samples = list(zip(millimetres[part].tolist(), strength[part].tolist(), strict=True))
+            made.append(self._packet(start, (start + span) % 36_000, samples))
+        return made
+
+    def _packet(self, start: int, end: int, samples: list[tuple[int, int]]) -> bytes:
+        body = bytearray((0x54, 0x2C))
+        body += round(TURNS_PER_S * 360.0).to_bytes(2, "little") + start.to_bytes(2, "little")
+        for millimetres, strength in samples:
+            body += millimetres.to_bytes(2, "little") + bytes((strength,))
+        body += end.to_bytes(2, "little") + (int(self._milliseconds) % 30_000).to_bytes(2, "little")
+        body.append(crc8(body))
+        before = self._position
+        self._position = (before + _SAMPLES * TURNS_PER_S / SAMPLES_PER_S) % 1.0
+        self._milliseconds += 1000.0 * _PACKET_S
+        if self._position < before:
+            self._last_turn, self._turn, self._replayed = self._turn, [], 0
+        self._turn.append(bytes(body))
+        return bytes(body)
+
+
+def crc8(data: bytes | bytearray) -> int:
+    """CRC-8, polynomial 0x4D, initial value 0, bit by bit."""
+    crc = 0
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = ((crc << 1) ^ 0x4D if crc & 0x80 else crc << 1) & 0xFF
+    return crc

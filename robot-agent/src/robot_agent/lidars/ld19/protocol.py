@@ -1,0 +1,167 @@
+"""LD19: the packets that it sends from power-on, without being asked; it takes no commands.
+
+Nothing here touches a port or a clock. Packets are decoded in bulk by numpy: 375 of them come every second.
+Packet, 47 bytes, little-endian: 0x54, 0x2C (12 samples), speed u16 (degrees/s), start angle u16 (degrees / 100,
+clockwise), 12 x (distance u16 in mm, intensity u8), end angle u16, timestamp u16 (ms), CRC-8 of the 46 bytes before.
+Source: LDROBOT, LD19 development manual, and the header file of its SDK.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from robot_agent.lidars.scan_builder import Samples, ScanBuilder
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from robot_agent.hardware import LaserScan
+
+BAUD: Final = 230_400
+PACKET_BYTES: Final = 47
+SAMPLES: Final = 12
+SAMPLES_PER_S: Final = 4500
+RANGE_MIN_M: Final = 0.02
+RANGE_MAX_M: Final = 12.0
+_HEADER: Final = b"\x54\x2c"
+_FULL_TURN: Final = 36_000
+# Twelve samples can't span more than half as much again as the head turns in their time.
+_SPAN_MARGIN: Final = 1.5
+
+
+class Packets(NamedTuple):
+    """n good packets in order of arrival, 12 n samples.
+
+    angle: float64[12 n], degrees / 100, clockwise seen from above, 0 <= angle < 36000.
+    distance_mm: uint16[12 n], 0 for no return. intensity: uint8[12 n].
+    """
+
+    angle: NDArray[np.float64]
+    distance_mm: NDArray[np.uint16]
+    intensity: NDArray[np.uint8]
+
+
+def _crc_table() -> NDArray[np.uint8]:
+    """CRC-8 of each single byte: polynomial 0x4D, initial value 0, not reflected."""
+    table = np.zeros(256, np.uint8)
+    for value in range(256):
+        crc = value
+        for _ in range(8):
+            crc = (crc << 1) ^ 0x4D if crc & 0x80 else crc << 1
+        table[value] = crc & 0xFF
+    return table
+
+
+_CRC: Final = _crc_table()
+
+
+class Parser:
+    """Bytes of the lidar -> packets. Never raises on what it is fed; finds its place again after damage.
+
+    `corrupted` counts damaged packets: once per loss of the packet boundary, and every packet that fails its checksum
+    or whose angles the head could not have; `skipped_bytes` counts every byte that belonged to no good packet.
+    """
+
+    def __init__(self) -> None:
+        self._buffer = b""
+        self._events: deque[Packets] = deque()
+        self._synced = False
+        self.corrupted = 0
+        self.skipped_bytes = 0
+
+    def receive_data(self, data: bytes) -> None:
+        """Take what a port gave, in pieces of any size."""
+        buffer = self._buffer + data
+        at = 0
+        while at < len(buffer):
+            if not _HEADER.startswith(buffer[at : at + 2]):
+                at = self._skip(buffer, at, damaged=self._synced)
+                continue
+            count = (len(buffer) - at) // PACKET_BYTES
+            if not count:
+                break
+            raw = np.frombuffer(buffer, np.uint8, count * PACKET_BYTES, at).reshape(count, PACKET_BYTES)
+            packets, good = _decode(raw)
+            if good:
+                self._synced = True
+                self._events.append(packets)
+                at += good * PACKET_BYTES
+            else:
+                at = self._skip(buffer, at, damaged=True)
+        self._buffer = buffer[at:]
+
+    def next_event(self) -> Packets | None:
+        """Oldest packets not yet taken, or None: feed more bytes."""
+        return self._events.popleft() if self._events else None
+
+    def reset(self) -> None:
+        """Forget half a packet, after the port was reopened; counters stay."""
+        self._buffer = b""
+        self._events.clear()
+        self._synced = False
+
+    def _skip(self, buffer: bytes, at: int, *, damaged: bool) -> int:
+        self.corrupted += damaged
+        self._synced = False
+        found = buffer.find(_HEADER[:1], at + 1)
+        following = len(buffer) if found < 0 else found
+        self.skipped_bytes += following - at
+        return following
+
+
+def _decode(raw: NDArray[np.uint8]) -> tuple[Packets, int]:
+    """Decode uint8[n, 47] up to the first packet that is damaged; return how many are good."""
+    crc = np.zeros(len(raw), np.uint8)
+    for column in range(PACKET_BYTES - 1):
+        crc = _CRC[crc ^ raw[:, column]]
+    speed, start, end = (_u16(raw, column) for column in (2, 4, 42))
+    span = (end - start) % _FULL_TURN
+    possible = _SPAN_MARGIN * 100.0 * speed * (SAMPLES / SAMPLES_PER_S)
+    right = (raw[:, 0] == _HEADER[0]) & (raw[:, 1] == _HEADER[1]) & (crc == raw[:, -1])
+    right &= (start < _FULL_TURN) & (end < _FULL_TURN) & (span <= possible)
+    good = len(raw) if right.all() else int(np.argmin(right))
+    samples = raw[:good, 6:42].reshape(good * SAMPLES, 3)
+    steps = np.arange(SAMPLES) / (SAMPLES - 1)
+    angle = (start[:good, None] + span[:good, None] * steps).reshape(-1) % _FULL_TURN
+    distance = (samples[:, 0].astype(np.uint16)) | samples[:, 1].astype(np.uint16) << np.uint16(8)
+    return Packets(angle, distance, samples[:, 2].copy()), good
+
+
+def _u16(raw: NDArray[np.uint8], column: int) -> NDArray[np.int64]:
+    return raw[:, column].astype(np.int64) | raw[:, column + 1].astype(np.int64) << 8
+
+
+class ScanAssembler:
+    """Packets -> whole scans, each from one passage through straight ahead to the next.
+
+    `intensity_min`: a weaker return (0..255) counts as none.
+    """
+
+    def __init__(self, intensity_min: int = 0) -> None:
+        self._intensity_min = intensity_min
+        self._builder = ScanBuilder()
+        self._angle: float | None = None
+
+    @property
+    def incomplete(self) -> int:
+        """Scans that were thrown away because packets were missing."""
+        return self._builder.incomplete
+
+    def feed(self, packets: Packets, now: float) -> list[LaserScan]:
+        """Take packets that arrived at `now` (seconds, monotonic); return the scans that they complete."""
+        before = packets.angle[:1] if self._angle is None else np.array([self._angle])
+        self._angle = float(packets.angle[-1])
+        # The head only ever turns on: an angle that falls has passed straight ahead.
+        falls = np.diff(packets.angle, prepend=before) < -_FULL_TURN / 2
+        seen = (packets.distance_mm > 0) & (packets.intensity >= self._intensity_min)
+        ranges = np.where(seen, packets.distance_mm / 1000.0, np.nan)
+        samples = Samples(packets.angle * (np.pi / 18_000.0), ranges, packets.intensity)
+        return self._builder.feed(samples, (int(index) for index in np.flatnonzero(falls)), now)
+
+    def reset(self) -> None:
+        """Forget the scan at hand, after the port was reopened."""
+        self._builder.reset()
+        self._angle = None

@@ -1,0 +1,114 @@
+"""From batches of samples to whole scans, for any lidar whose head turns. Pure."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from robot_agent.hardware import LaserScan, RepeatCounter
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from numpy.typing import NDArray
+
+_SECTORS: Final = 36
+_SECTORS_NEEDED: Final = 33
+_SAMPLES_MAX: Final = 4096
+_ARRIVAL_GAP_S: Final = 0.5
+
+
+class Samples(NamedTuple):
+    """A batch of n samples in order of arrival; how they are cut into batches means nothing.
+
+    clockwise_rad: float64[n], clockwise seen from above, 0 straight ahead, in [0, 2 pi).
+    ranges_m: float64[n], nan for no return. quality: uint8[n].
+    """
+
+    clockwise_rad: NDArray[np.float64]
+    ranges_m: NDArray[np.float64]
+    quality: NDArray[np.uint8]
+
+
+class ScanBuilder:
+    """Samples -> whole scans. A scan runs from one boundary to the next and must have looked in nearly all directions.
+
+    `incomplete` counts scans that were thrown away because samples were missing; the piece before the first boundary
+    does not count.
+    """
+
+    def __init__(self) -> None:
+        self._pieces: list[Samples] = []
+        self._times: list[NDArray[np.float64]] = []
+        self._count = 0
+        self._started = False
+        self._arrived: float | None = None
+        self._repeats = RepeatCounter()
+        self.incomplete = 0
+
+    def feed(self, samples: Samples, boundaries: Iterable[int], now: float) -> list[LaserScan]:
+        """Take a batch that arrived at `now` (s, monotonic); return the scans that it completes.
+
+        `boundaries` are the indices, in order, of the samples with which a new scan begins.
+        """
+        count = len(samples.ranges_m)
+        times = self._arrival_times(count, now)
+        scans: list[LaserScan] = []
+        begin = 0
+        for boundary in boundaries:
+            self._append(samples, times, begin, boundary)
+            scans.extend(self._finish())
+            begin = boundary
+            self._started = True
+        self._append(samples, times, begin, count)
+        return scans
+
+    def reset(self) -> None:
+        """Forget the scan at hand, after a gap or a new beginning."""
+        self._clear()
+        self._started = False
+        self._arrived = None
+
+    def _arrival_times(self, count: int, now: float) -> NDArray[np.float64]:
+        before = self._arrived
+        self._arrived = now
+        if before is None or not 0.0 <= now - before <= _ARRIVAL_GAP_S:
+            return np.full(count, now)
+        return before + (now - before) * np.arange(1, count + 1) / max(count, 1)
+
+    def _append(self, samples: Samples, times: NDArray[np.float64], begin: int, end: int) -> None:
+        if not self._started or begin == end:
+            return
+        part = slice(begin, end)
+        self._pieces.append(Samples(samples.clockwise_rad[part], samples.ranges_m[part], samples.quality[part]))
+        self._times.append(times[part])
+        self._count += end - begin
+        if self._count > _SAMPLES_MAX:
+            self.incomplete += 1
+            self._clear()
+            self._started = False
+
+    def _clear(self) -> None:
+        self._pieces, self._times, self._count = [], [], 0
+
+    def _finish(self) -> list[LaserScan]:
+        if not self._count:
+            return []
+        clockwise, ranges, quality = (np.concatenate(fields) for fields in zip(*self._pieces, strict=True))
+        times = np.concatenate(self._times)
+        self._clear()
+        sectors = np.bincount((clockwise * (_SECTORS / (2.0 * np.pi))).astype(np.int64), minlength=_SECTORS)
+        if np.count_nonzero(sectors) < _SECTORS_NEEDED:
+            self.incomplete += 1
+            return []
+        return [
+            LaserScan(
+                angles_rad=np.where(clockwise < np.pi, 0.0, 2.0 * np.pi) - clockwise,
+                ranges_m=ranges,
+                quality=quality,
+                started_at=float(times[0]),
+                ended_at=float(times[-1]),
+                repeats=self._repeats.count(clockwise, ranges, quality),
+            )
+        ]

@@ -1,0 +1,312 @@
+"""What every base and every lidar that is installed has to do, ours or anybody's: driver and emulator face to face."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fog_runtime import parts
+from fog_runtime.settings import SettingsError
+from fognav_sim import devices
+from robot_agent import registry
+from robot_agent.guardian.core import GuardianCore
+from robot_agent.guardian.link import WheelCommand
+from robot_agent.guardian.watchdog import STOPS
+from robot_agent.odometry import Motion, Odometry
+from robot_agent.stop_command import StopCommand
+
+STEP = 0.01
+BASES = parts.names(registry.BASES)
+LIDARS = parts.names(registry.LIDARS)
+
+every_base = pytest.mark.parametrize("name", BASES)
+every_lidar = pytest.mark.parametrize("name", LIDARS)
+
+
+def test_ours_are_there_and_each_has_its_stop_command_and_its_emulator():
+    assert {"roomba600", "diffdrive"} <= set(BASES)
+    assert {"rplidar-a1", "ld19"} <= set(LIDARS)
+    assert parts.names(STOPS) == parts.names(devices.BASES) == BASES
+    assert parts.names(devices.LIDARS) == LIDARS
+
+
+@pytest.mark.parametrize("make", [registry.make_base, registry.make_lidar])
+def test_an_unknown_name_is_refused_with_the_known_ones(make):
+    with pytest.raises(SettingsError, match=r"FOGNAV_(BASE|LIDAR): .*'tank' \(known: "):
+        make("tank")
+
+
+@pytest.mark.parametrize(("make", "name"), [(registry.make_base, "diffdrive"), (registry.make_lidar, "ld19")])
+def test_a_wrong_option_is_refused_by_its_name(make, name):
+    with pytest.raises(SettingsError, match=r"FOGNAV_(BASE|LIDAR)_OPTIONS: .*wings"):
+        make(name, '{"wings": 2}')
+
+
+class Wire:
+    """A guardian, a driver and an emulator on one line, in emulated time."""
+
+    def __init__(self, name: str) -> None:
+        self.driver = registry.make_base(name)
+        self.core = GuardianCore(self.driver)
+        self.base = devices.make_base(name)
+        self.stop: StopCommand = parts.load(STOPS, name, StopCommand)
+        self.now = 10.0
+        self.feedback = []
+        self.seq = 0
+
+    def take(self, output) -> None:
+        self.feedback += output.feedback
+        if output.data:
+            self.base.receive(output.data, self.now)
+
+    def run(self, seconds: float, wheels: tuple[float, float] | None = None) -> None:
+        for number in range(round(seconds / STEP)):
+            if wheels is not None and number % 5 == 0:
+                self.seq += 1
+                command = WheelCommand(seq=self.seq, left=wheels[0], right=wheels[1])
+                self.take(self.core.on_command(command, self.now))
+            self.now += STEP
+            left, right = self.base.wheel_speeds_m_s
+            self.base.add_wheel_travel(left * STEP, right * STEP)
+            self.base.tick(self.now, STEP)
+            self.take(self.core.on_bytes(self.base.outgoing(self.now), self.now))
+            self.take(self.core.tick(self.now))
+
+    def ready(self) -> Wire:
+        self.run(0.5)
+        assert self.core.latched is None
+        assert self.feedback[-1].status.mode_problem is None
+        return self
+
+
+@every_base
+def test_a_base_wakes_drives_and_stops(name):
+    wire = Wire(name).ready()
+    wire.run(0.6, (0.3, 0.15))
+    assert wire.base.wheel_speeds_m_s == (0.3, 0.15)
+    wire.run(0.25)
+    assert wire.base.wheel_speeds_m_s == (0.0, 0.0)
+    assert wire.core.latched is None
+
+
+@every_base
+def test_driver_and_emulator_agree_on_the_geometry(name):
+    wire = Wire(name)
+    assert wire.driver.drive_train.axle_m == wire.base.axle_m
+    assert wire.stop.baud == wire.base.baud
+    odometry = Odometry(wire.driver.drive_train)
+    wire.ready()
+    wire.run(0.5, (0.25, 0.2))
+    left = right = 0.0
+    for _ in range(100):
+        moved = odometry.update(wire.feedback[-1].odometry, wire.now)
+        assert isinstance(moved, Motion)
+        left, right = left + moved.left_m, right + moved.right_m
+        wire.run(0.05, (0.25, 0.2))
+    # The first reading is the zero; feedback comes every few frames.
+    assert (left, right) == pytest.approx((0.25 * 4.95, 0.2 * 4.95), abs=0.02)
+    assert odometry.pose[2] == pytest.approx((right - left) / wire.base.axle_m)
+
+
+@every_base
+@pytest.mark.parametrize("felt", [{"bump_left": True}, {"bump_right": True}, {"cliff": True}])
+def test_what_a_base_feels_stops_it_and_latches(name, felt):
+    wire = Wire(name).ready()
+    wire.run(0.5, (0.3, 0.3))
+    wire.base.feel(**{"bump_left": False, "bump_right": False, "cliff": False, **felt})
+    wire.run(0.05, (0.3, 0.3))
+    assert wire.base.wheel_speeds_m_s == (0.0, 0.0)
+    status = wire.feedback[-1].status
+    assert {key: getattr(status, key.replace("bump", "bumper")) for key in felt} == felt
+    assert wire.core.latched is not None
+
+
+@every_base
+def test_a_silent_base_is_a_fault(name):
+    wire = Wire(name).ready()
+    for _ in range(round(wire.driver.timing.silence / STEP) + 2):
+        wire.now += STEP
+        wire.take(wire.core.tick(wire.now))
+    assert "no valid frame" in wire.core.latched
+
+
+@every_base
+@pytest.mark.parametrize("command", ["stop", "hold", "wake", "zero"])
+def test_every_stop_works_after_a_command_that_was_cut_off_anywhere(name, command):
+    cut_off = Wire(name).driver.drive(0.31, 0.29)
+    for cut in range(len(cut_off)):
+        wire = Wire(name).ready()
+        wire.run(0.5, (0.3, 0.3))
+        assert wire.base.wheel_speeds_m_s == (0.3, 0.3)
+        wire.base.receive(cut_off[:cut], wire.now)
+        data = {
+            "stop": wire.stop.stop,
+            # Repeated until somebody drives again: the first may end what was cut off.
+            "hold": wire.stop.hold * 2,
+            "wake": wire.driver.wake(),
+            "zero": wire.core.stop_command() * 2,
+        }[command]
+        wire.base.receive(data, wire.now)
+        assert wire.base.wheel_speeds_m_s == (0.0, 0.0), cut
+
+
+@every_base
+def test_a_base_that_was_stopped_by_the_watchdog_is_woken_by_the_next_guardian(name):
+    wire = Wire(name).ready()
+    wire.run(0.5, (0.3, 0.3))
+    wire.base.receive(wire.stop.stop, wire.now)
+    wire.core = GuardianCore(registry.make_base(name))
+    wire.ready()
+    wire.run(0.6, (0.2, 0.2))
+    assert wire.base.wheel_speeds_m_s == (0.2, 0.2)
+
+
+@every_base
+@given(st.integers(0, 2**32), st.lists(st.integers(1, 80), min_size=1, max_size=20))
+@settings(max_examples=20, deadline=None)
+def test_a_base_is_understood_in_pieces_of_any_size_and_damage_is_counted_and_never_believed(name, seed, sizes):
+    rng = np.random.default_rng(seed)
+    base, whole, cut, spoilt = devices.make_base(name), *(registry.make_base(name) for _ in range(3))
+    base.receive(whole.wake(), 0.0)
+    base.add_wheel_travel(3.0, 2.0)
+    clean, dirty, now = b"", b"", 0.0
+    for _ in range(40):
+        now += STEP
+        base.tick(now, STEP)
+        piece = base.outgoing(now)
+        clean += piece
+        damaged = bytearray(piece)
+        if damaged and len(dirty) > 200 and rng.random() < 0.3:
+            damaged[rng.integers(len(damaged))] ^= 1 << int(rng.integers(8))
+        dirty += damaged
+    whole.receive_data(clean, now)
+    for begin, end in itertools.pairwise([0, *np.minimum(np.cumsum(sizes), len(clean)), len(clean)]):
+        cut.receive_data(clean[begin:end], now)
+    spoilt.receive_data(dirty, now)
+    expected = list(iter(whole.next_event, None))
+    assert len(expected) >= 15
+    assert list(iter(cut.next_event, None)) == expected
+    survived = list(iter(spoilt.next_event, None))
+    assert all(reading in expected for reading in survived)
+    assert (spoilt.corrupted > 0) == (dirty != clean) or len(survived) == len(expected)
+    assert whole.corrupted == cut.corrupted == 0
+
+
+# --- lidars ---
+
+
+def box(angles, now):
+    """Walls of a room 6 m by 4 m with a door without return ahead."""
+    ranges = 1.0 / np.maximum(np.abs(np.cos(angles)) / 3.0, np.abs(np.sin(angles)) / 2.0)
+    return np.where(np.abs(angles) < 0.1, np.nan, ranges)
+
+
+def scans_of(name, lidar, seconds, *, pieces=lambda data: [data], begin=0.0):
+    driver = registry.make_lidar(name)
+    lidar.receive(driver.begin(begin), begin)
+    scans = []
+    for number in range(1, round(seconds / STEP) + 1):
+        now = begin + number * STEP
+        for piece in pieces(lidar.outgoing(now)):
+            events = driver.receive(piece, now)
+            scans += events.scans
+            lidar.receive(events.data, now)
+        lidar.receive(driver.tick(now), now)
+    return scans, driver
+
+
+@every_lidar
+def test_scans_show_the_room_as_it_is(name):
+    scans, driver = scans_of(name, devices.make_lidar(name, box), 3.0)
+    traits = driver.traits
+    assert len(scans) >= 2.0 / traits.scan_period_s
+    for scan in scans:
+        truth = box(scan.angles_rad, 0.0)
+        # Angles come in small steps: at the edges of the door a sample may fall to either side.
+        edge = np.abs(np.abs(scan.angles_rad) - 0.1) < 0.005
+        assert (np.isnan(scan.ranges_m) == np.isnan(truth))[~edge].all()
+        seen = ~np.isnan(scan.ranges_m) & ~edge
+        np.testing.assert_allclose(scan.ranges_m[seen], truth[seen], atol=0.003)
+        assert scan.repeats == 1
+        assert scan.ended_at - scan.started_at == pytest.approx(traits.scan_period_s, abs=0.02)
+        assert scan.angles_rad.size > 300
+        assert (scan.quality[seen] > 0).all()
+    assert driver.trouble == ""
+
+
+@every_lidar
+def test_a_lidar_is_understood_one_byte_at_a_time(name):
+    whole, _ = scans_of(name, devices.make_lidar(name, box), 1.0)
+    single, _ = scans_of(
+        name, devices.make_lidar(name, box), 1.0, pieces=lambda data: [bytes((byte,)) for byte in data]
+    )
+    assert len(whole) == len(single) > 3
+    for one, other in zip(whole, single, strict=True):
+        assert (one.angles_rad == other.angles_rad).all()
+        np.testing.assert_array_equal(one.ranges_m, other.ranges_m)
+
+
+@every_lidar
+def test_a_lidar_that_runs_already_gives_whole_scans(name):
+    lidar = devices.make_lidar(name, box)
+    scans_of(name, lidar, 0.77)
+    scans, _ = scans_of(name, lidar, 1.0, begin=0.77)
+    assert len(scans) >= 3
+    assert all(np.ptp(np.unwrap(scan.angles_rad)) > 6.2 for scan in scans)
+
+
+@every_lidar
+def test_a_stuck_link_shows_as_equal_scans(name):
+    lidar = devices.make_lidar(name, box)
+    driver = registry.make_lidar(name)
+    lidar.receive(driver.begin(0.0), 0.0)
+    repeats = []
+    for number in range(300):
+        lidar.frozen = number > 100
+        now = number * STEP
+        events = driver.receive(lidar.outgoing(now), now)
+        repeats += [scan.repeats for scan in events.scans]
+        lidar.receive(events.data + driver.tick(now), now)
+    assert repeats[:2] == [1, 1]
+    assert repeats[-1] >= 3
+
+
+@every_lidar
+def test_a_silent_lidar_is_trouble_and_the_trouble_ends(name):
+    lidar = devices.make_lidar(name, box)
+    driver = registry.make_lidar(name)
+    lidar.receive(driver.begin(0.0), 0.0)
+    troubles = []
+    for number in range(500):
+        lidar.stalled = 100 < number <= 300
+        now = number * STEP
+        events = driver.receive(lidar.outgoing(now), now)
+        lidar.receive(events.data + driver.tick(now), now)
+        troubles.append(driver.trouble)
+    assert troubles[100] == ""
+    assert "the lidar" in troubles[300]
+    assert troubles[-1] == ""
+
+
+@every_lidar
+@given(st.binary(max_size=400), st.integers(0, 2**32))
+@settings(max_examples=20, deadline=None)
+def test_no_bytes_raise_and_a_damaged_scan_never_shows_a_wall_that_is_not_there(name, garbage, seed):
+    rng = np.random.default_rng(seed)
+
+    def spoil(data):
+        spoilt = bytearray(data)
+        if spoilt and rng.random() < 0.05:
+            spoilt[rng.integers(len(spoilt))] ^= int(rng.integers(1, 256))
+        return [bytes(spoilt)]
+
+    lidar, driver = devices.make_lidar(name, box), registry.make_lidar(name)
+    driver.begin(0.0)
+    driver.receive(garbage, 0.0)
+    driver.tick(0.1)
+    scans, _ = scans_of(name, lidar, 1.0, pieces=spoil)
+    assert all(np.isfinite(scan.angles_rad).all() and np.ptp(scan.angles_rad) <= 2 * np.pi for scan in scans)

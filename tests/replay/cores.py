@@ -22,12 +22,11 @@ from fog_contracts.messages import (
     MapHeartbeat,
     MapSnapshot,
     Message,
+    PlanReply,
     PlanRequest,
     Pose,
     RobotGoal,
     RobotPath,
-    RobotPose,
-    RobotState,
     ZoneSet,
 )
 from fog_runtime.record import read
@@ -147,25 +146,15 @@ def copy(heard: list[Heard], site: LoadedSite) -> list[MapHeartbeat]:
 
 def inform(core: PlannerCore, event: Heard) -> bool:
     """Give a planner a recorded input; return whether it wakes it."""
-    at, _, ids, message = event
-    if isinstance(message, MapDelta):
-        core.on_delta(message, at)
-        return True
-    if isinstance(message, MapHeartbeat):
-        core.on_heartbeat(message, at)
-    elif isinstance(message, HazardArea):
-        core.on_hazard(message)
-    elif isinstance(message, ZoneSet):
-        core.on_zones(message)
-    elif isinstance(message, RobotPose):
-        core.on_pose(ids["robot"], message, at)
-    elif isinstance(message, RobotState):
-        core.on_state(ids["robot"], message, at)
-    elif isinstance(message, RobotGoal):
+    at, channel, ids, message = event
+    if isinstance(message, RobotGoal):
         # The recorded goal is what the planner made of a person's wish: a place that asks for no heading is not in it.
         core.set_goal(ids["robot"], message, any_heading=True)
         return True
-    return False
+    handler = core.handlers().get(channel)
+    if handler is not None:
+        handler(ids, message, Moment(at, at))
+    return channel in core.URGENT
 
 
 def guide(core: PlannerCore) -> None:
@@ -190,7 +179,8 @@ def decide(heard: list[Heard], site: LoadedSite) -> list[RobotPath | RobotGoal]:
     for at, event in beating(heard, heard[0][0]):
         if event is not None and not inform(core, event):
             continue
-        told += [message for _, message in core.tick(at, at)]
+        published = (publication.message for publication in core.tick(Moment(at, at)))
+        told += [message for message in published if isinstance(message, (RobotPath, RobotGoal))]
         guide(core)
     return told
 
@@ -208,7 +198,9 @@ def plan_again(heard: list[Heard], site: LoadedSite) -> list[RobotPath]:
         elif isinstance(message, RobotPath) and message.plan_id != known and message.points and goal is not None:
             known = message.plan_id
             x, y = message.points[0]
-            reply = core.plan(PlanRequest(start=Pose(x=x, y=y, theta=0.0), goal=goal))
+            request = PlanRequest(start=Pose(x=x, y=y, theta=0.0), goal=goal)
+            reply = core.answerers()[ch.PLANNER_PLAN]({}, request, Moment(event[0], event[0]))
+            assert isinstance(reply, PlanReply)
             again.append(
                 msgspec.structs.replace(
                     message,

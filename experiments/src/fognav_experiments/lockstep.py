@@ -319,7 +319,7 @@ def _free_way(site: LoadedSite, start: Pose, goal: Place, seed: int) -> list[tup
         fog.step((step + 1) * STEP_S)
         fog.inform_planner((step + 1) * STEP_S)
     assert mission.pose is not None
-    reply = fog.planner.plan(PlanRequest(start=start, goal=mission.pose))
+    reply = fog.preview(PlanRequest(start=start, goal=mission.pose), 200 * STEP_S)
     if reply.refusal is not None:
         raise ScenarioError(f"there is no way even without a hazard: {reply.refusal.reason}")
     return list(reply.points)

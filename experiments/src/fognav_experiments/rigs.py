@@ -18,6 +18,7 @@ from fog_contracts.messages import (
     MapDelta,
     MapHeartbeat,
     Message,
+    PlanReply,
     RobotCommand,
     RobotGoal,
     RobotObstacles,
@@ -43,7 +44,7 @@ if TYPE_CHECKING:
 
     from fog_contracts.channels import Channel
     from fog_contracts.handlers import Publication
-    from fog_contracts.messages import CommandKind, MapSnapshot
+    from fog_contracts.messages import CommandKind, MapSnapshot, PlanRequest
     from fog_contracts.site import RobotSite
     from fog_runtime.site import LoadedSite
     from fognav_sim.world import World
@@ -236,14 +237,14 @@ class FogRig:
     def inform_planner(self, now: float) -> None:
         """Give the planner the map's news; the robot gets the same right after."""
         planner = self.planner
-        for told in self._told:
-            planner.on_hazard(told)
-        for zones in self._zones:
-            planner.on_zones(zones)
-        for delta in self._deltas:
-            planner.on_delta(delta, now)
-        for heartbeat in self._heartbeats:
-            planner.on_heartbeat(heartbeat, now)
+        for channel, messages in (
+            (ch.HAZARD, self._told),
+            (ch.ZONES, self._zones),
+            (ch.MAP_DELTA, self._deltas),
+            (ch.MAP_HEARTBEAT, self._heartbeats),
+        ):
+            for message in messages:
+                self._inform(channel, {}, message, now)
         if planner.wants_snapshot(now):
             planner.load(self.snapshot, now)
         for job in planner.field_jobs():
@@ -258,16 +259,15 @@ class FogRig:
         if pose is not None:
             self._aggregate(ch.ROBOT_POSE, {"robot": robot}, pose, now)
             self._map(ch.ROBOT_POSE, {"robot": robot}, pose, now)
-            self.planner.on_pose(robot, pose, now)
+            self._inform(ch.ROBOT_POSE, {"robot": robot}, pose, now)
         if state is not None:
-            self.planner.on_state(robot, state, now)
+            self._inform(ch.ROBOT_STATE, {"robot": robot}, state, now)
         if obstacles is not None:
             self._map(ch.ROBOT_OBSTACLES, {"robot": robot}, obstacles, now)
 
     def deliver(self, robot: RobotRig) -> list[RobotPath | RobotGoal]:
         """Bring the robot what the fog published since the last time; return its paths and goals."""
-        now, stamp = robot.now, STAMP + robot.now
-        self.inform_planner(now)
+        self.inform_planner(robot.now)
         for told in self._told:
             robot.hear(ch.HAZARD, told)
         for zones in self._zones:
@@ -278,18 +278,23 @@ class FogRig:
             robot.hear(ch.MAP_HEARTBEAT, heartbeat)
         self._told, self._zones, self._deltas, self._heartbeats = [], [], [], []
         published: list[RobotPath | RobotGoal] = []
-        for name, message in self.planner.tick(now, stamp):
-            if name != robot.id:
+        for publication in self.planner.tick(robot.moment):
+            message = publication.message
+            if publication.ids["robot"] != robot.id or not isinstance(message, (RobotPath, RobotGoal)):
                 continue
-            taken: RobotPath | RobotGoal
-            if isinstance(message, RobotPath):
-                taken = carry(ch.ROBOT_PATH, message)
-                robot.hear(ch.ROBOT_PATH, taken)
-            else:
-                taken = carry(ch.ROBOT_GOAL, message)
-                robot.hear(ch.ROBOT_GOAL, taken)
+            taken = carry(publication.channel, message)
+            robot.hear(publication.channel, taken)
             published.append(taken)
         return published
+
+    def preview(self, request: PlanRequest, now: float) -> PlanReply:
+        """Ask the planner for a path, without side effects."""
+        reply = self.planner.answerers()[ch.PLANNER_PLAN]({}, request, Moment(now, STAMP + now))
+        assert isinstance(reply, PlanReply)
+        return reply
+
+    def _inform(self, channel: Channel, ids: dict[str, str], message: Message, now: float) -> None:
+        self.planner.handlers()[channel](ids, message, Moment(now, STAMP + now))
 
     def _aggregate(self, channel: Channel, ids: dict[str, str], message: Message, now: float) -> None:
         handler = self.aggregator.handlers()[channel]

@@ -46,7 +46,7 @@ def cells(writer):
 
 
 def copied(follower):
-    return {"cost": follower.cost, "speed": follower.speed}
+    return {"cost": follower.replica.cost, "speed": follower.replica.speed}
 
 
 class Network:
@@ -231,7 +231,7 @@ def test_new_follower_wants_a_snapshot_and_knows_no_age():
     assert not follower.up_to_date
     assert follower.age(1e9) == math.inf
     assert follower.gap(1e9) == 0.0
-    assert (follower.version, follower.geometry, follower.site) == (None, None, "")
+    assert (follower.version, follower.replica.geometry, follower.replica.site) == (None, None, "")
 
 
 def test_snapshot_alone_does_not_confirm_the_map_and_a_heartbeat_does():
@@ -241,8 +241,8 @@ def test_snapshot_alone_does_not_confirm_the_map_and_a_heartbeat_does():
     assert follower.age(5.0) == math.inf
     follower.on_heartbeat(writer.heartbeat(0.0), 5.0)
     assert follower.age(5.5) == 0.5
-    assert (follower.site, follower.geometry) == ("lab", writer.geometry)
-    assert np.array_equal(follower.static, writer.static)
+    assert (follower.replica.site, follower.replica.geometry) == ("lab", writer.geometry)
+    assert np.array_equal(follower.replica.static, writer.static)
 
 
 def test_delta_does_not_confirm_the_map_when_a_heartbeat_named_a_newer_version():

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -9,8 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from fog_contracts import channels as ch
 from fog_contracts.costs import DEFAULT_INFLATION
 from fog_contracts.grid import GridGeometry, Window
+from fog_contracts.handlers import Moment, Publication
 from fog_contracts.messages import (
     AreaHazard,
     AreaState,
@@ -20,6 +23,8 @@ from fog_contracts.messages import (
     EgressRequest,
     HazardArea,
     MapDelta,
+    Message,
+    PlanReply,
     PlanRequest,
     Pose,
     RobotGoal,
@@ -127,26 +132,44 @@ class Drive:
     def __init__(self, the_map: Map | None = None, start: tuple[float, float] = (1.0, 6.0)) -> None:
         self.map = the_map or Map()
         self.core = PlannerCore(epoch=7)
-        self.core.load(self.map.master.snapshot(), 100.0)
         self.now = 100.0
+        self.core.load(self.map.master.snapshot(), self.now)
         self.at = start
         self.paths: list[RobotPath] = []
         self.goals: list[RobotGoal] = []
+
+    @property
+    def moment(self) -> Moment:
+        return Moment(self.now, self.now + 1000.0)
+
+    def hear(self, channel: ch.Channel, message: Message, **ids: str) -> None:
+        self.core.handlers()[channel](ids, message, self.moment)
+
+    def ask(self, channel: ch.Channel, request: Message) -> PlanReply:
+        reply = self.core.answerers()[channel]({}, request, self.moment)
+        assert isinstance(reply, PlanReply)
+        return reply
 
     def step(self, seconds: float = 0.1, *, heartbeat: bool = True, posed: bool = True) -> None:
         for _ in range(round(seconds / 0.1)):
             self.now += 0.1
             if heartbeat:
-                self.core.on_heartbeat(self.map.master.heartbeat(self.now), self.now)
+                self.hear(ch.MAP_HEARTBEAT, self.map.master.heartbeat(self.now))
             if posed:
-                self.core.on_pose("r1", pose(*self.at), self.now)
-            for name, message in self.core.tick(self.now, self.now + 1000.0):
-                assert name == "r1"
-                (self.paths if isinstance(message, RobotPath) else self.goals).append(message)  # type: ignore[attr-defined]
+                self.hear(ch.ROBOT_POSE, pose(*self.at), robot="r1")
+            self.publish(self.core.tick(self.moment))
+
+    def publish(self, publications: Sequence[Publication]) -> None:
+        for publication in publications:
+            assert publication.ids == {"robot": "r1"}
+            if isinstance(publication.message, RobotPath):
+                self.paths.append(publication.message)
+            elif isinstance(publication.message, RobotGoal):
+                self.goals.append(publication.message)
 
     def send(self, deltas: list[MapDelta]) -> None:
         for delta in deltas:
-            self.core.on_delta(delta, self.now)
+            self.hear(ch.MAP_DELTA, delta)
 
     def go(self, x: float, y: float, name: str = "g1") -> RobotPath:
         self.core.set_goal("r1", goal(x, y, name))
@@ -255,7 +278,7 @@ def test_nothing_is_planned_for_a_robot_that_is_silent_or_lost() -> None:
     drive.core.set_goal("r1", goal(*RIGHT))
     drive.step(1.0, posed=False)
     assert drive.paths == []
-    drive.core.on_pose("r1", pose(*LEFT, localized=False), drive.now)
+    drive.hear(ch.ROBOT_POSE, pose(*LEFT, localized=False), robot="r1")
     drive.step(1.0, posed=False)
     assert drive.paths == []
     drive.step()
@@ -312,7 +335,7 @@ def test_a_cut_way_is_refused_naming_each_area_whose_end_would_open_it_and_the_n
     drive = Drive(start=LEFT)
     for name, box in (("z1", UPPER), ("z2", LOWER), ("aside", (5.0, 5.0, 6.0, 6.0))):
         drive.send(drive.map.put(name, box))
-        drive.core.on_hazard(drive.map.told(name))
+        drive.hear(ch.HAZARD, drive.map.told(name))
     path = drive.go(*RIGHT)
     assert path.points == []
     assert path.refusal
@@ -331,7 +354,7 @@ def test_areas_that_cut_only_together_are_named_together() -> None:
     boxes = {"z1": UPPER, "z2": (5.0, 10.0, 6.0, 12.0), "z3": LOWER, "z4": (5.0, 0.0, 6.0, 2.0)}
     for name, box in boxes.items():
         drive.send(drive.map.put(name, box))
-        drive.core.on_hazard(drive.map.told(name))
+        drive.hear(ch.HAZARD, drive.map.told(name))
     refusal = drive.go(*RIGHT).refusal
     assert refusal
     assert len(refusal.causes) == 2
@@ -365,7 +388,7 @@ def test_a_goal_that_can_never_be_reached_is_known_at_once(x: float, y: float, c
 def test_a_goal_inside_a_hazard_is_refused_by_the_path_until_the_hazard_ends() -> None:
     drive = Drive(start=LEFT)
     drive.send(drive.map.put("z1", UPPER))
-    drive.core.on_hazard(drive.map.told("z1"))
+    drive.hear(ch.HAZARD, drive.map.told("z1"))
     assert drive.core.check_goal(10.0, 11.0) is None
     refusal = drive.go(10.0, 11.0).refusal
     assert refusal
@@ -380,7 +403,7 @@ def test_a_no_go_zone_is_a_cause_like_a_hazard() -> None:
     drive.send(drive.map.put("circle", (9.2, 10.2, 10.8, 11.8)) + drive.map.put("strip", LOWER))
     circle = Zone(id="circle", kind="BLOCKED", shape=CircleShape(centre=(10.0, 11.0), radius=0.85), reason="wet floor")
     strip = Zone(id="strip", kind="BLOCKED", shape=CorridorShape(line=[(10.0, 0.0), (10.0, 2.0)], width=2.0))
-    drive.core.on_zones(ZoneSet(epoch=1, seq=2, zones=[circle, strip]))
+    drive.hear(ch.ZONES, ZoneSet(epoch=1, seq=2, zones=[circle, strip]))
     refusal = drive.go(*RIGHT).refusal
     assert refusal
     assert [(cause.kind, cause.id) for cause in refusal.causes] == [("zone", "circle"), ("zone", "strip")]
@@ -393,7 +416,7 @@ def test_a_start_inside_the_inscribed_band_is_led_out_and_one_inside_a_hazard_is
     assert path.refusal is None
     drive = Drive(start=(10.0, 11.0))
     drive.send(drive.map.put("z1", UPPER))
-    drive.core.on_hazard(drive.map.told("z1"))
+    drive.hear(ch.HAZARD, drive.map.told("z1"))
     refusal = drive.go(*RIGHT).refusal
     assert refusal
     assert (refusal.code, [cause.id for cause in refusal.causes]) == (205, ["z1"])
@@ -408,8 +431,8 @@ def test_a_start_outside_the_map_is_refused() -> None:
 def test_egress_leads_out_of_a_blocked_area_by_the_nearer_end_and_not_through_walls() -> None:
     drive = Drive()
     drive.send(drive.map.put("z1", UPPER))
-    drive.core.on_hazard(drive.map.told("z1"))
-    reply = drive.core.egress(EgressRequest(robot="r1", pose=Pose(x=9.63, y=11.02, theta=0.0)))
+    drive.hear(ch.HAZARD, drive.map.told("z1"))
+    reply = drive.ask(ch.PLANNER_EGRESS, EgressRequest(robot="r1", pose=Pose(x=9.63, y=11.02, theta=0.0)))
     assert reply.refusal is None
     assert reply.points[0] == pytest.approx((9.65, 11.05))
     x, y = reply.points[-1]
@@ -423,9 +446,9 @@ def test_egress_is_refused_when_another_area_blocks_the_way_out() -> None:
     drive = Drive(Map(walls=((2.0, 2.0, 18.0, 10.0), (11.0, 10.0, 12.0, 12.0))))
     for name, box in (("z1", UPPER), ("z2", (2.0, 10.0, 7.0, 12.0))):
         drive.send(drive.map.put(name, box))
-        drive.core.on_hazard(drive.map.told(name))
+        drive.hear(ch.HAZARD, drive.map.told(name))
     drive.send(drive.map.put("boxes", (8.0, 10.0, 8.9, 12.0)))
-    reply = drive.core.egress(EgressRequest(robot="r1", pose=Pose(x=10.5, y=11.0, theta=0.0)))
+    reply = drive.ask(ch.PLANNER_EGRESS, EgressRequest(robot="r1", pose=Pose(x=10.5, y=11.0, theta=0.0)))
     assert reply.refusal
     assert reply.refusal.code == 205
 
@@ -440,9 +463,9 @@ def test_a_reached_goal_ends_and_the_robot_is_told_until_it_gets_another() -> No
             goal_reached=True,
         )  # fmt: skip
 
-    drive.core.on_state("r1", state("another"), drive.now)
+    drive.hear(ch.ROBOT_STATE, state("another"), robot="r1")
     assert drive.core.goal("r1")
-    drive.core.on_state("r1", state("g1"), drive.now)
+    drive.hear(ch.ROBOT_STATE, state("g1"), robot="r1")
     count = len(drive.paths)
     drive.step(1.2)
     assert drive.core.goal("r1") is None
@@ -454,7 +477,9 @@ def test_a_reached_goal_ends_and_the_robot_is_told_until_it_gets_another() -> No
 def test_a_preview_answers_without_touching_any_mission() -> None:
     drive = Drive(start=LEFT)
     first = drive.go(*RIGHT)
-    reply = drive.core.plan(PlanRequest(start=Pose(x=1.0, y=1.0, theta=0.0), goal=Pose(x=19.0, y=1.0, theta=0.0)))
+    reply = drive.ask(
+        ch.PLANNER_PLAN, PlanRequest(start=Pose(x=1.0, y=1.0, theta=0.0), goal=Pose(x=19.0, y=1.0, theta=0.0))
+    )
     assert reply.refusal is None
     assert 17.9 < reply.length < 19.0
     drive.step(1.0)

@@ -8,9 +8,8 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
-from fog_contracts.grid import GridGeometry
 from fog_contracts.messages import MapDelta, MapHeartbeat, MapSnapshot
-from fog_contracts.replica import Applied, Grid, MapError, Replica, Version
+from fog_contracts.replica import Applied, MapError, Replica, Version
 
 GRACE_S: Final = 0.5
 """How long a delta that a heartbeat announced may be under way before it is taken for lost (5 heartbeats)."""
@@ -113,38 +112,13 @@ class MapFollower:
 
     @property
     def replica(self) -> Replica:
-        """The copy itself, for reading."""
+        """The copy, for reading: of one version, even while it is behind or broken."""
         return self._replica
-
-    @property
-    def site(self) -> str:
-        """The site's id; empty before the first snapshot."""
-        return self._replica.site
 
     @property
     def version(self) -> Version | None:
         """The copy's version; None before the first snapshot."""
         return self._replica.version
-
-    @property
-    def geometry(self) -> GridGeometry | None:
-        """The map's geometry; None before the first snapshot."""
-        return self._replica.geometry
-
-    @property
-    def cost(self) -> Grid:
-        """The master costmap (height, width); of one version, even while the copy is behind or broken."""
-        return self._replica.cost
-
-    @property
-    def speed(self) -> Grid:
-        """The speed layer (height, width), cm/s, 0 = no limit."""
-        return self._replica.speed
-
-    @property
-    def static(self) -> Grid:
-        """The static map (height, width); no cells before the first snapshot."""
-        return self._replica.static
 
     # --- Inside -----------------------------------------------------------------------------------------------------
 

@@ -13,7 +13,8 @@ from fog_runtime.settings import describe, load
 from fog_runtime.site import load_site
 from fog_runtime.zenoh_edge import ZenohEdge
 from planner.api import make_api
-from planner.core import PlannerConfig, PlannerCore
+from planner.config import PlannerConfig
+from planner.core import PlannerCore
 from planner.service import Service
 from planner.settings import Settings
 from planner.store import Store
@@ -39,7 +40,7 @@ async def main() -> None:
         ZenohEdge.open(connect=settings.zenoh_endpoints, clock=clock, role="planner", id=site, site=site) as zenoh,
     ):
         service = Service(PlannerCore(await store.begin_epoch("planner"), config), store, zenoh, clock, health)
-        service.listen()
+        service.subscribe()
         zenoh.alive("planner", site)
         app = make_api(service, loaded.site, health, load_tokens(settings.tokens_file))
         try:

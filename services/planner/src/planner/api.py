@@ -139,7 +139,7 @@ def make_api(service: Service, site: Site, health: Health, tokens: Tokens) -> Fa
                 pose=service.poses.get(robot),
                 state=service.states.get(robot),
                 goal=_goal_view(robot, service.goals[robot]) if robot in service.goals else None,
-                plan=_plan_view(service.paths[robot]) if robot in service.paths else None,
+                plan=_plan_view(path) if (path := service.path(robot)) else None,
             )
             for robot in robots()
         ]

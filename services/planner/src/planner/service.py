@@ -1,27 +1,24 @@
-"""Between the core and the world: poses and map versions in, paths out, missions stored before they count.
+"""Between the core and the world: messages to the core's thread, what it returns to the robots, missions to the store.
 
 The core runs on one thread of its own, one turn after another, so that a long search never keeps the event loop from
-its beats; the kernels release the GIL.
+its heartbeats; the kernels release the GIL. Inputs are dated when they arrive, however long the turn before takes.
 """
 
 from __future__ import annotations
 
 import asyncio
 import secrets
+from collections import deque
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from msgspec import structs
 from prometheus_client import Counter, Gauge, Histogram
 
 from fog_contracts import channels as ch
 from fog_contracts.codec import ContractError
 from fog_contracts.messages import (
-    EgressRequest,
-    HazardArea,
-    MapDelta,
-    MapHeartbeat,
     MapSnapshot,
     PlanReply,
     PlanRequest,
@@ -31,29 +28,32 @@ from fog_contracts.messages import (
     RobotPath,
     RobotPose,
     RobotState,
-    ZoneSet,
 )
 from fog_contracts.replica import MapError
 from fog_runtime import logs, metrics
+from fog_runtime.edges import Edges
 from planner.store import StoredGoal, StoreError
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
+    from collections.abc import Awaitable, Callable, Sequence
 
+    from fog_contracts.handlers import Answerer, Handler, Ids, Moment, Publication
+    from fog_contracts.messages import Message
     from fog_runtime.clock import Clock
     from fog_runtime.health import Health
     from fog_runtime.zenoh_edge import ZenohEdge
-    from planner.core import FieldJob, PlannerCore
+    from planner.core import PlannerCore
+    from planner.goal_fields import FieldJob
     from planner.store import Store
 
 T = TypeVar("T")
 
-BEAT_S = 0.1
+TICK_S = 0.1
 RETRY_S = 0.5
 SNAPSHOT_TIMEOUT_S = 3.0
 
-PLANS = Counter("fognav_plans_total", "Ways that were computed, by reason", ["reason"])
-REFUSALS = Counter("fognav_plan_refusals_total", "Computed ways that ended in a refusal, by Nav2's code", ["code"])
+PLANS = Counter("fognav_plans_total", "Paths that were searched, by reason", ["reason"])
+REFUSALS = Counter("fognav_plan_refusals_total", "Searches that ended in a refusal, by Nav2's code", ["code"])
 TURN_SECONDS = Histogram(
     "fognav_plan_turn_seconds",
     "One turn of the planner: its inputs, all searches that they lead to",
@@ -65,6 +65,16 @@ SNAPSHOTS = Counter("fognav_planner_snapshots_total", "Whole maps that were fetc
 _log = logs.get("planner")
 
 
+@dataclass(frozen=True)
+class _TurnResult:
+    """What one turn of the core leads to."""
+
+    publications: Sequence[Publication]
+    reached: list[tuple[str, str]]
+    field_jobs: list[FieldJob]
+    wants_snapshot: bool
+
+
 class Service:
     """The running planner; its loops are tasks of the process."""
 
@@ -72,72 +82,72 @@ class Service:
         self._core = core
         self._store = store
         self._zenoh = zenoh
+        self._edges = Edges(clock, zenoh=zenoh)
         self._clock = clock
         self._health = health
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="planner")
         self._field_thread = ThreadPoolExecutor(1, thread_name_prefix="field")
-        self._inbox: list[Callable[[], object]] = []
+        self._inputs: deque[Callable[[], object]] = deque()
+        self._goal_changes: deque[Callable[[], object]] = deque()
         self._wake = asyncio.Event()
         self._wants_map = asyncio.Event()
         self._wants_map.set()
         self._fields: set[asyncio.Task[None]] = set()
         self._goals_read = asyncio.Event()
         self._writing = asyncio.Lock()
-        self._over: dict[str, str] = {}
-        self._told: dict[str, int] = {}
+        self._reached: dict[str, str] = {}
         self._counted: dict[tuple[int, object], int] = {}
         self.poses: dict[str, RobotPose] = {}
         self.states: dict[str, RobotState] = {}
         self.goals: dict[str, StoredGoal] = {}
-        self.paths: dict[str, RobotPath] = {}
+        self._paths: dict[str, RobotPath] = {}
+
+    def path(self, robot: str) -> RobotPath | None:
+        """Return the path or refusal that was published last for the robot's present goal."""
+        path, stored = self._paths.get(robot), self.goals.get(robot)
+        return path if path and stored and path.goal_id == stored.goal.goal_id else None
 
     # --- What comes in ----------------------------------------------------------------------------------------------
 
-    def listen(self) -> None:
-        """Say what to be called for."""
-        core, clock = self._core, self._clock
-        zenoh = self._zenoh
-        zenoh.subscribe(
-            ch.MAP_DELTA, MapDelta, lambda _, m: self._post(lambda: core.on_delta(m, clock.now()), wake=True)
-        )
-        zenoh.subscribe(
-            ch.MAP_HEARTBEAT, MapHeartbeat, lambda _, m: self._post(lambda: core.on_heartbeat(m, clock.now()))
-        )
-        zenoh.subscribe(ch.HAZARD, HazardArea, lambda _, m: self._post(lambda: core.on_hazard(m)))
-        zenoh.subscribe(ch.ZONES, ZoneSet, lambda _, m: self._post(lambda: core.on_zones(m)))
-        zenoh.subscribe(ch.ROBOT_POSE, RobotPose, self._on_pose)
-        zenoh.subscribe(ch.ROBOT_STATE, RobotState, self._on_state)
-        zenoh.serve(ch.PLANNER_PLAN, lambda _, request: self.preview(request))
-        zenoh.serve(ch.PLANNER_EGRESS, lambda _, request: self._egress(request))
+    def subscribe(self) -> None:
+        """Register subscriptions and queries."""
+        handlers = {channel: self._dated(channel, handler) for channel, handler in self._core.handlers().items()}
+        self._edges.subscribe(handlers, self._publish)
+        for channel, answerer in self._core.answerers().items():
+            self._zenoh.serve(channel, partial(self._answer, answerer))
 
-    def _post(self, job: Callable[[], object], *, wake: bool = False) -> None:
-        """Leave an input for the core's next turn; inputs are taken in the order in which they came."""
-        self._inbox.append(job)
-        if wake:
-            self._wake.set()
+    def _dated(self, channel: ch.Channel, handler: Handler) -> Handler:
+        """Return a handler that leaves its message, dated now, for the core's next turn, in order of arrival."""
 
-    def _on_pose(self, ids: dict[str, str], pose: RobotPose) -> None:
-        robot = ids["robot"]
-        self.poses[robot] = pose
-        # The age counts from the arrival here, however long the core's turn before takes.
-        self._post(partial(self._core.on_pose, robot, pose, self._clock.now()))
+        def leave(ids: Ids, message: Any, at: Moment) -> Sequence[Publication]:
+            self._note(ids, message)
+            self._inputs.append(partial(handler, ids, message, at))
+            if channel in self._core.URGENT:
+                self._wake.set()
+            return ()
 
-    def _on_state(self, ids: dict[str, str], state: RobotState) -> None:
-        robot = ids["robot"]
-        self.states[robot] = state
-        self._post(partial(self._core.on_state, robot, state, self._clock.now()))
+        return leave
+
+    def _note(self, ids: Ids, message: Message) -> None:
+        """Keep what the API shows."""
+        if isinstance(message, RobotPose):
+            self.poses[ids["robot"]] = message
+        elif isinstance(message, RobotState):
+            self.states[ids["robot"]] = message
 
     # --- Questions --------------------------------------------------------------------------------------------------
 
     async def _in_core(self, function: Callable[[], T]) -> T:
         return await asyncio.get_running_loop().run_in_executor(self._thread, function)
 
+    async def _answer(self, answerer: Answerer, ids: Ids, request: Any) -> Message:
+        return await self._in_core(partial(answerer, ids, request, self._edges.now()))
+
     async def preview(self, request: PlanRequest) -> PlanReply:
         """Plan without side effects."""
-        return await self._in_core(lambda: self._core.plan(request))
-
-    async def _egress(self, request: EgressRequest) -> PlanReply:
-        return await self._in_core(lambda: self._core.egress(request))
+        reply = await self._answer(self._core.answerers()[ch.PLANNER_PLAN], {}, request)
+        assert isinstance(reply, PlanReply)
+        return reply
 
     # --- Missions: stored first, then they count --------------------------------------------------------------------
 
@@ -167,7 +177,7 @@ class Service:
             goal_id = stored.goal.goal_id
             await self._stored(lambda: self._store.delete(robot, goal_id, who, "cancel", stamp))
             del self.goals[robot]
-            self._post(lambda: self._core.cancel(robot), wake=True)
+            self._change_goal(partial(self._core.cancel, robot))
         _log.info("goal_cancelled", robot=robot, goal=stored.goal.goal_id, who=who)
         return True
 
@@ -182,9 +192,11 @@ class Service:
 
     def _begin(self, robot: str, stored: StoredGoal) -> None:
         self.goals[robot] = stored
-        self.paths.pop(robot, None)
-        goal, any_heading = stored.goal, stored.any_heading
-        self._post(lambda: self._core.set_goal(robot, goal, any_heading=any_heading), wake=True)
+        self._change_goal(partial(self._core.set_goal, robot, stored.goal, any_heading=stored.any_heading))
+
+    def _change_goal(self, change: Callable[[], object]) -> None:
+        self._goal_changes.append(change)
+        self._wake.set()
 
     async def store_loop(self) -> None:
         """Read the missions, however long it takes; afterwards delete those that are over, and watch the store."""
@@ -195,9 +207,10 @@ class Service:
                         self._begin(robot, stored)
                     self._goals_read.set()
                     self._health.set("goals", ok=True, detail=f"{len(self.goals)} read")
-                for robot, goal_id in list(self._over.items()):
+                for robot, goal_id in list(self._reached.items()):
                     await self._store.delete(robot, goal_id, robot, "reached", self._clock.stamp())
-                    del self._over[robot]
+                    if self._reached.get(robot) == goal_id:
+                        del self._reached[robot]
                 await self._store.ping()
                 self._health.set("store", ok=True)
             except StoreError as error:
@@ -212,7 +225,7 @@ class Service:
         """Fetch the whole map whenever the core needs it."""
         while True:
             await self._wants_map.wait()
-            if not self._core.wants_snapshot(self._clock.now()):
+            if not await self._in_core(self._wants_snapshot):
                 self._wants_map.clear()
                 continue
             try:
@@ -230,70 +243,65 @@ class Service:
             except (MapError, ContractError) as error:
                 SNAPSHOTS.labels("refused").inc()
                 self._health.set("map", ok=False, detail=str(error))
-            await self._clock.sleep(BEAT_S)
+            await self._clock.sleep(TICK_S)
+
+    def _wants_snapshot(self) -> bool:
+        return self._core.wants_snapshot(self._clock.now())
 
     # --- What goes out ----------------------------------------------------------------------------------------------
 
     async def plan_loop(self) -> None:
-        """Give the core its inputs and publish what it says: at 10 Hz, and at once after a change of the map."""
+        """Run the core's turns and publish what they return: at 10 Hz, and at once after an urgent message."""
         while True:
             try:
-                async with asyncio.timeout(self._clock.real(BEAT_S)):
+                async with asyncio.timeout(self._clock.real(TICK_S)):
                     await self._wake.wait()
             except TimeoutError:
                 pass
             self._wake.clear()
-            jobs, self._inbox = self._inbox, []
             with TURN_SECONDS.time():
-                told = await self._in_core(partial(self._turn, jobs))
-            for robot, message in told:
-                self._publish(robot, message)
-            if self._core.wants_snapshot(self._clock.now()):
+                result = await self._in_core(self._turn)
+            self._publish(result.publications)
+            for robot, goal_id in result.reached:
+                self._end(robot, goal_id)
+            for job in result.field_jobs:
+                self._compute(job)
+            if result.wants_snapshot:
                 self._wants_map.set()
             self._health.set("zenoh", ok=self._zenoh.connected, detail="" if self._zenoh.connected else "no router")
             self._measure()
 
-    def _turn(self, jobs: list[Callable[[], object]]) -> list[tuple[str, RobotPath | RobotGoal]]:
-        """One turn on the core's thread."""
-        for job in jobs:
-            job()
-        told = self._core.tick(self._clock.now(), self._clock.stamp())
-        for field in self._core.field_jobs():
-            self._zenoh.call(self._compute, field)
-        return told
+    def _turn(self) -> _TurnResult:
+        """Run one turn on the core's thread; goals that change while it searches count before it publishes."""
+        core = self._core
+        _run_all(self._inputs)
+        _run_all(self._goal_changes)
+        core.plan(self._edges.now())
+        _run_all(self._goal_changes)
+        publications = core.publish(self._edges.now())
+        return _TurnResult(publications, core.take_reached(), core.field_jobs(), self._wants_snapshot())
 
     def _compute(self, job: FieldJob) -> None:
         async def work() -> None:
             await asyncio.get_running_loop().run_in_executor(self._field_thread, job.run)
-            self._post(partial(self._core.take_field, job))
+            self._inputs.append(partial(self._core.take_field, job))
 
         task = asyncio.get_running_loop().create_task(work(), name="field")
         self._fields.add(task)
         task.add_done_callback(self._fields.discard)
 
-    def _publish(self, robot: str, message: RobotPath | RobotGoal) -> None:
-        if isinstance(message, RobotGoal):
-            self._publish_goal(robot, message)
-            return
-        current = self.goals.get(robot)
-        if current is None or current.goal.goal_id != message.goal_id:
-            return  # cancelled or replaced while it was planned
-        new = self._told.get(robot) != message.plan_id
-        stamp = self._clock.stamp()
-        if new:
-            self._told[robot] = message.plan_id
-            # The searches took a while: what counts is when the path leaves.
-            traces = [structs.replace(trace, plan_published=stamp) for trace in message.traces]
-            message = structs.replace(message, traces=traces)
-        elif (before := self.paths.get(robot)) is not None:
-            message = structs.replace(message, traces=before.traces)
-        message = structs.replace(message, stamp=stamp)
-        self._zenoh.publish(ch.ROBOT_PATH, message, robot=robot)
-        self.paths[robot] = message
-        if new:
-            self._tell_new(robot, message)
+    def _publish(self, publications: Sequence[Publication]) -> None:
+        for publication in publications:
+            if isinstance(path := publication.message, RobotPath):
+                self._note_path(publication.ids["robot"], path)
+            self._edges.publish(publication)
 
-    def _tell_new(self, robot: str, path: RobotPath) -> None:
+    def _note_path(self, robot: str, path: RobotPath) -> None:
+        """Keep what the API shows, and report a plan that is published for the first time."""
+        before = self._paths.get(robot)
+        self._paths[robot] = path
+        if before is not None and before.plan_id == path.plan_id:
+            return
         for trace in path.traces:
             metrics.observe_trace(trace, ["plan"])
         if path.refusal is not None:
@@ -302,14 +310,13 @@ class Service:
             _log.info("plan", robot=robot, plan=path.plan_id, points=len(path.points), map_seq=path.map_seq,
                       because=[trace.area for trace in path.traces])  # fmt: skip
 
-    def _publish_goal(self, robot: str, goal: RobotGoal) -> None:
-        self._zenoh.publish(ch.ROBOT_GOAL, goal, robot=robot)
+    def _end(self, robot: str, goal_id: str) -> None:
+        """Have a goal that was reached deleted, unless the robot has another one by now."""
         stored = self.goals.get(robot)
-        if goal.pose is None and stored is not None and stored.goal.goal_id == goal.goal_id:
+        if stored is not None and stored.goal.goal_id == goal_id:
             del self.goals[robot]
-            self.paths.pop(robot, None)
-            self._over[robot] = goal.goal_id
-            _log.info("goal_reached", robot=robot, goal=goal.goal_id)
+            self._reached[robot] = goal_id
+            _log.info("goal_reached", robot=robot, goal=goal_id)
 
     def _measure(self) -> None:
         ROBOTS.set(len(self.goals))
@@ -323,3 +330,9 @@ class Service:
         """Let the threads end when their work is done."""
         for thread in (self._thread, self._field_thread):
             thread.shutdown(wait=False, cancel_futures=True)
+
+
+def _run_all(waiting: deque[Callable[[], object]]) -> None:
+    """Run what waits, oldest first; the event loop may append meanwhile, for a deque's ends are safe to share."""
+    while waiting:
+        waiting.popleft()()

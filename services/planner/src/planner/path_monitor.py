@@ -1,0 +1,77 @@
+"""Whether something happened that a robot's path must be planned again for: a change of the map, or where it drove."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+from fog_contracts.costs import NEUTRAL_WEIGHT
+
+if TYPE_CHECKING:
+    from fog_contracts.grid import Window
+    from fog_contracts.messages import PointXY, RobotPose
+    from planner.config import PlannerConfig
+    from planner.mission import Mission, Plan, ReplanReason
+    from planner.planning_map import Cell, CostChange, PlanningMap
+    from planner.route import Route
+
+_PROGRESS_WINDOW_M: Final = 5.0
+"""How far ahead of its last place a robot is looked for on its path, so that a loop is not cut short."""
+
+
+def reason_from_change(
+    mission: Mission, change: CostChange, planning_map: PlanningMap, config: PlannerConfig
+) -> ReplanReason | None:
+    """Return why a change of the map calls for planning again; None when it does not matter to the mission."""
+    plan = mission.plan
+    if plan is None or mission.target is None:
+        return None
+    if plan.route is None:
+        return "refused"
+    if touches_corridor(plan, plan.route, change, planning_map, config.corridor):
+        return "map"
+    if change.fell.any():
+        robot = (mission.pose.x, mission.pose.y) if mission.pose else _point_at(plan.route, plan.progress)
+        if may_save(plan, plan.route, change.window, planning_map, robot, config.saving):
+            return "clearing"
+    return None
+
+
+def touches_corridor(
+    plan: Plan, route: Route, change: CostChange, planning_map: PlanningMap, half_width: float
+) -> bool:
+    """Whether a changed cell lies within `half_width` (m) of what remains of the path."""
+    return route.touched(change.changed, change.window, planning_map.geometry, half_width, plan.progress)
+
+
+def may_save(
+    plan: Plan, route: Route, window: Window, planning_map: PlanningMap, robot: PointXY, saving: float
+) -> bool:
+    """Whether a path through the window, were everything on it free, could save the share `saving` of what remains."""
+    geometry = planning_map.geometry
+    end_x, end_y = route.corners[-1]
+    cells = _cells_away(geometry.cell(*robot), window) + _cells_away(geometry.cell(float(end_x), float(end_y)), window)
+    remaining = route.cost(planning_map.cost, geometry, plan.progress)
+    return cells * NEUTRAL_WEIGHT < (1.0 - saving) * remaining
+
+
+def reason_from_pose(plan: Plan, pose: RobotPose, config: PlannerConfig) -> ReplanReason | None:
+    """Note how far the robot has come; return why it must be planned again from here, None when it is on its path."""
+    if plan.route is None:
+        moved = math.hypot(pose.x - plan.planned_from[0], pose.y - plan.planned_from[1])
+        return "refused" if moved > config.stray else None
+    along, away = plan.route.nearest(pose.x, pose.y, plan.progress, window=_PROGRESS_WINDOW_M)
+    plan.progress = max(plan.progress, along)
+    return "strayed" if away > config.stray else None
+
+
+def _cells_away(cell: Cell, window: Window) -> float:
+    """Return the distance (cells) from a cell to a window; 0 inside."""
+    dx = max(window.x - cell[0], 0, cell[0] - window.x - window.width + 1)
+    dy = max(window.y - cell[1], 0, cell[1] - window.y - window.height + 1)
+    return math.hypot(dx, dy)
+
+
+def _point_at(route: Route, along: float) -> PointXY:
+    x, y = route.rest(along)[0]
+    return float(x), float(y)

@@ -16,7 +16,8 @@ runner = CliRunner()
 
 
 @pytest.mark.parametrize(
-    "command", [["doctor"], ["test"], ["demo"], ["site", "new"], ["site", "check"], ["record"], ["replay"]]
+    "command",
+    [["doctor"], ["test"], ["channels"], ["demo"], ["site", "new"], ["site", "check"], ["record"], ["replay"]],
 )
 def test_every_command_has_help_with_an_example(command: list[str]) -> None:
     done = runner.invoke(app, [*command, "--help"])

@@ -12,6 +12,7 @@ import typer
 from rich.table import Table
 
 from fognav import __version__, checkout, doctor, kernels, system
+from fognav.channels_command import channels_command
 from fognav.output import NOT_TRUE, OK, WRONG_USE, WrongUseError, check_writable, console, print_json, write_report
 
 app = typer.Typer(
@@ -24,6 +25,7 @@ app = typer.Typer(
 )
 site_app = typer.Typer(help="Make and check sites.", no_args_is_help=True)
 app.add_typer(site_app, name="site")
+app.command("channels", epilog="Example: fognav channels --format acl --broker mqtt")(channels_command)
 
 Yes = Annotated[
     bool, typer.Option("--yes", help="Install missing system packages without asking (CI=true says so too).")
@@ -99,9 +101,10 @@ def run_tests(context: typer.Context, *, yes: Yes = False) -> None:
 
 @app.command("check", epilog="Example: fognav check --json")
 def check_command(*, json: Json = False) -> None:
-    """Check format, lint, types, import contracts, dead code and generated files.
+    """Check everything that needs no running.
 
-    All checks run; exit code 1 if one of them fails.
+    Format, lint, types, import contracts, dead code and generated files: all of them run, and the exit code is 1 if one
+    fails.
     """
     from fognav import checks  # noqa: PLC0415  # the other commands need not wait for its imports
 

@@ -47,6 +47,11 @@ CHECKS: Final = (
         (sys.executable, "-m", "fog_supervisor.configurations", "--check", "deploy"),
         "python -m fog_supervisor.configurations --write deploy",
     ),
+    Check(
+        "generated files: channels",
+        (sys.executable, "-m", "fognav", "channels", "--check"),
+        "./fognav channels --write",
+    ),
 )
 
 

@@ -80,6 +80,7 @@ def test_site_loads_with_its_map_and_counter_clockwise_areas(folder):
         ("angle = 0.2", "angel = 0.2", "nodes[0].sonars[1].angel", "spelling"),
         ('goal = "desk"', 'goal = "roof"', "demo.goal", "one of: desk, door"),
         ('areas = ["a1"]', 'areas = ["a7"]', "demo.areas[0]", "one of: a1"),
+        ('id = "n1"', 'id = "planner"', "nodes[0].id", "name of a role"),
         ("[demo]", '[[robots]]\nid = "r1"\nstart = { x = 1, y = 1, theta = 0 }\n[demo]', "robots.id", "twice"),
         ('name = "A small lab"', 'map = "none.yaml"', "map", "none.yaml"),
         ("range_limit = 1.5 }, {", "range_limit = 9 }, {", "nodes[0].sonars[0].range_limit", "4.0"),

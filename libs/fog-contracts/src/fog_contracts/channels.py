@@ -44,7 +44,9 @@ DURABILITIES: Final[Mapping[Durability, str]] = {
 }
 """What becomes of messages that a subscriber missed. MQTT: `latest` is retained, `recovered` does not exist."""
 
-_ID = r"[a-z0-9][a-z0-9-]{0,31}"
+ID_MAX: Final = 32
+"""Characters of the longest id."""
+_ID: Final = rf"[a-z0-9][a-z0-9-]{{0,{ID_MAX - 1}}}"
 _FIELDS: Final[Mapping[str, str]] = {"number": r"[0-9]{1,4}"}
 
 

@@ -12,13 +12,15 @@ from msgspec import Meta, Struct
 Id = Annotated[str, Meta(pattern=r"^[a-z0-9][a-z0-9-]{0,31}$(?!\n)")]
 # Bounds keep NaN and infinity out: no comparison with a bound holds for NaN.
 Finite = Annotated[float, Meta(ge=-1e12, le=1e12)]
-Metres = Annotated[float, Meta(ge=-100_000.0, le=100_000.0)]
-Radians = Annotated[float, Meta(ge=-1_000.0, le=1_000.0)]
-Speed = Annotated[float, Meta(ge=-10.0, le=10.0)]
-Stamp = Annotated[float, Meta(ge=0.0, le=1e12)]
+# Units go into the documents and the firmware's header.
+Metres = Annotated[float, Meta(ge=-100_000.0, le=100_000.0, extra={"unit": "m"})]
+Radians = Annotated[float, Meta(ge=-1_000.0, le=1_000.0, extra={"unit": "rad"})]
+Speed = Annotated[float, Meta(ge=-10.0, le=10.0, extra={"unit": "m/s"})]
+TurnSpeed = Annotated[float, Meta(ge=-10.0, le=10.0, extra={"unit": "rad/s"})]
+Stamp = Annotated[float, Meta(ge=0.0, le=1e12, extra={"unit": "s"})]
 Count = Annotated[int, Meta(ge=0, le=2**53)]
 Hash = Annotated[int, Meta(ge=0, le=2**63 - 1)]
-Cells = Annotated[int, Meta(ge=0, le=65_535)]
+Cells = Annotated[int, Meta(ge=0, le=65_535, extra={"unit": "cells"})]
 Sentence = Annotated[str, Meta(max_length=500)]
 PointXY = tuple[Metres, Metres]
 Ring = Annotated[list[PointXY], Meta(min_length=3, max_length=500)]
@@ -145,9 +147,9 @@ MAX_CELLS = 50_000_000
 class MapGeometry(Message, frozen=True, kw_only=True):
     """Size in cells, resolution in m per cell, lower-left corner in the frame `map`."""
 
-    width: Annotated[int, Meta(ge=1, le=65_535)]
-    height: Annotated[int, Meta(ge=1, le=65_535)]
-    resolution: Annotated[float, Meta(gt=0.0, le=10.0)]
+    width: Annotated[int, Meta(ge=1, le=65_535, extra={"unit": "cells"})]
+    height: Annotated[int, Meta(ge=1, le=65_535, extra={"unit": "cells"})]
+    resolution: Annotated[float, Meta(gt=0.0, le=10.0, extra={"unit": "m/cell"})]
     origin_x: Metres
     origin_y: Metres
 
@@ -177,13 +179,13 @@ class MapDelta(Message, frozen=True, kw_only=True):
 
     epoch: Count
     seq: Count
-    part: Cells
+    part: Annotated[int, Meta(ge=0, le=65_535)]
     parts: Annotated[int, Meta(ge=1, le=65_535)]
     layer: Layer
     x: Cells
     y: Cells
-    w: Annotated[int, Meta(ge=1, le=65_535)]
-    h: Annotated[int, Meta(ge=1, le=65_535)]
+    w: Annotated[int, Meta(ge=1, le=65_535, extra={"unit": "cells"})]
+    h: Annotated[int, Meta(ge=1, le=65_535, extra={"unit": "cells"})]
     packing: Packing
     cells: bytes
     hash: Hash
@@ -244,14 +246,14 @@ class CircleShape(Message, frozen=True, kw_only=True, tag="circle", tag_field="t
     """A circle by centre and radius."""
 
     centre: PointXY
-    radius: Annotated[float, Meta(gt=0.0, le=1000.0)]
+    radius: Annotated[float, Meta(gt=0.0, le=1000.0, extra={"unit": "m"})]
 
 
 class CorridorShape(Message, frozen=True, kw_only=True, tag="corridor", tag_field="type"):
     """Everything within half a width of a polyline."""
 
     line: Annotated[list[PointXY], Meta(min_length=2, max_length=500)]
-    width: Annotated[float, Meta(gt=0.0, le=1000.0)]
+    width: Annotated[float, Meta(gt=0.0, le=1000.0, extra={"unit": "m"})]
 
 
 Shape = PolygonShape | RectangleShape | CircleShape | CorridorShape
@@ -264,7 +266,7 @@ class Zone(Message, frozen=True, kw_only=True):
     kind: ZoneKind
     shape: Shape
     factor: Annotated[float, Meta(ge=1.0, le=100.0)] | None = None
-    speed: Annotated[float, Meta(ge=0.01, le=2.54)] | None = None
+    speed: Annotated[float, Meta(ge=0.01, le=2.54, extra={"unit": "m/s"})] | None = None
     reason: Sentence = ""
     author: Annotated[str, Meta(max_length=100)] = ""
     starts_at: Stamp | None = None
@@ -323,7 +325,7 @@ class PlanReply(Message, frozen=True, kw_only=True):
     """A path (its points 5 cm or more apart, frame `map`) with its length in metres, or the refusal."""
 
     points: Points = []
-    length: Annotated[float, Meta(ge=0.0, le=1e6)] = 0.0
+    length: Annotated[float, Meta(ge=0.0, le=1e6, extra={"unit": "m"})] = 0.0
     cost: Annotated[float, Meta(ge=0.0, le=1e12)] = 0.0
     map_epoch: Count = 0
     map_seq: Count = 0
@@ -352,7 +354,7 @@ class RobotPath(Message, frozen=True, kw_only=True):
     points: Points
     map_epoch: Count
     map_seq: Count
-    released_length: Annotated[float, Meta(ge=0.0, le=1e6)]
+    released_length: Annotated[float, Meta(ge=0.0, le=1e6, extra={"unit": "m"})]
     goal_theta: Radians | None = None
     refusal: Refusal | None = None
     traces: list[Trace] = []
@@ -370,9 +372,9 @@ class RobotPose(Message, frozen=True, kw_only=True):
     theta: Radians
     covariance: Annotated[list[Finite], Meta(min_length=9, max_length=9)]
     v: Speed
-    w: Speed
-    radius: Annotated[float, Meta(gt=0.0, le=2.0)]
-    height: Annotated[float, Meta(gt=0.0, le=3.0)]
+    w: TurnSpeed
+    radius: Annotated[float, Meta(gt=0.0, le=2.0, extra={"unit": "m"})]
+    height: Annotated[float, Meta(gt=0.0, le=3.0, extra={"unit": "m"})]
     stamp: Stamp
     localized: bool = True
 
@@ -401,7 +403,7 @@ class RobotState(Message, frozen=True, kw_only=True):
     plan_id: Count | None
     planner_epoch: Count | None = None
     goal_reached: bool = False
-    goal_distance: Finite | None = None
+    goal_distance: Annotated[Finite, Meta(extra={"unit": "m"})] | None = None
     loop: LoopHealth = LoopHealth()
     traces: list[Trace] = []
     stamp: Stamp = 0.0
@@ -430,7 +432,7 @@ class RobotObstacles(Message, frozen=True, kw_only=True):
 
     points: Annotated[list[PointXY], Meta(max_length=2_000)]
     stamp: Stamp
-    ttl: Annotated[float, Meta(gt=0.0, le=600.0)]
+    ttl: Annotated[float, Meta(gt=0.0, le=600.0, extra={"unit": "s"})]
     view: View | None = None
 
 
@@ -471,7 +473,7 @@ class SimObstacle(Message, frozen=True, kw_only=True):
 
     id: Id
     polygon: Ring
-    height: Annotated[float, Meta(gt=0.0, le=5.0)] = 1.0
+    height: Annotated[float, Meta(gt=0.0, le=5.0, extra={"unit": "m"})] = 1.0
 
 
 class SimTruth(Message, frozen=True, kw_only=True):
@@ -483,9 +485,9 @@ class SimTruth(Message, frozen=True, kw_only=True):
     theta: Radians
     left: Speed
     right: Speed
-    distance: Annotated[float, Meta(ge=0.0)]
-    clearance: float
-    min_clearance: float
+    distance: Annotated[float, Meta(ge=0.0, extra={"unit": "m"})]
+    clearance: Annotated[float, Meta(extra={"unit": "m"})]
+    min_clearance: Annotated[float, Meta(extra={"unit": "m"})]
     contacts: Count
     obstacles: list[SimObstacle] = []
     stamp: Stamp = 0.0

@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import msgspec
 
+from fog_contracts.channels import ROLES
 from fog_contracts.costs import is_traversable
 from fog_contracts.geometry import GeometryError, normalized_polygon
 from fog_contracts.site import AreaSite, Place, Site
@@ -131,6 +132,11 @@ def _check_ids(file: Path, site: Site) -> None:
     _check_unique(file, "areas.number", (area.number for area in site.areas if area.number is not None))
     _check_unique(file, "nodes.id", (node.id for node in site.nodes))
     _check_unique(file, "robots.id", (robot.id for robot in site.robots))
+    for kind, ids in (("nodes", (node.id for node in site.nodes)), ("robots", (robot.id for robot in site.robots))):
+        for index, name in enumerate(ids):
+            if name in ROLES:
+                remedy = "Rename it: the brokers give whoever has a role's name that role's rights"
+                raise SiteError(file, f"{kind}[{index}].id", f"{name!r} is the name of a role", remedy)
     areas = [area.id for area in site.areas]
     for index, node in enumerate(site.nodes):
         _check_known(file, f"nodes[{index}].area", node.area, areas)

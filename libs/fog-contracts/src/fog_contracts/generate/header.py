@@ -1,0 +1,124 @@
+"""The firmware's header: topics, sizes, spellings and limits of everything that a sensor node says or hears.
+
+Preprocessor lines only, so that it serves C, C++17 and the Arduino core alike and costs no memory where unused.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import TYPE_CHECKING, Final
+
+from msgspec import inspect
+
+from fog_contracts.channels import CHANNELS, ID_MAX, NODE, Channel
+from fog_contracts.generate import NOTE
+from fog_contracts.generate.fields import Field, bounds, message_fields, summary
+
+if TYPE_CHECKING:
+    from fog_contracts.messages import Message
+
+_INT_MAX: Final = 2**15
+_LONG_MAX: Final = 2**31
+"""Beyond these a number may need a suffix: a board's int may have 16 bits, its long 32."""
+
+_HEAD: Final = f"""\
+/* What a sensor node says and hears over MQTT.
+ * {NOTE}
+ *
+ * FOGNAV_X_TOPIC is a format for snprintf with the ids named behind it, FOGNAV_X_TOPIC_SIZE the bytes that its longest
+ * topic takes with the closing zero; FOGNAV_X_LIMIT is how many bytes a payload of channel X may have. Field names and
+ * words are text; a _MIN that is followed by _EXCLUSIVE is itself not allowed.
+ */
+#ifndef FOGNAV_CONTRACT_H
+#define FOGNAV_CONTRACT_H
+
+"""
+
+
+def firmware_header() -> str:
+    """Return the header's text."""
+    blocks = [_define("FOGNAV_ID_MAX", str(ID_MAX), "characters of the longest id: a-z, 0-9, and - but not first")]
+    blocks += [_channel(row) for row in CHANNELS.values() if NODE in (*row.publishers, *row.subscribers)]
+    return _HEAD + "\n".join(blocks) + "\n#endif /* FOGNAV_CONTRACT_H */\n"
+
+
+def _channel(row: Channel) -> str:
+    name = _macro(row.name)
+    direction = "published" if NODE in row.publishers else "subscribed"
+    size = len(re.sub(r"\{\w+\}", "", row.template)) + ID_MAX * len(row.fields) + 1
+    about = summary(row.message) if row.message else row.about
+    lines = [
+        f"/* {row.name}, {direction} by a node: {about} */\n",
+        _define(f"{name}_TOPIC", _text(re.sub(r"\{\w+\}", "%s", row.template)), ", ".join(row.fields)),
+        _define(f"{name}_TOPIC_SIZE", str(size)),
+        _define(f"{name}_LIMIT", str(row.limit), "bytes"),
+        _define(f"{name}_QOS", str(row.qos)),
+        _define(f"{name}_RETAINED", str(int(row.retained))),
+    ]
+    if row.rate_hz is not None:
+        lines.append(_define(f"{name}_PERIOD_MS", str(round(row.period_s * 1000))))
+    if math.isfinite(row.max_age_s):
+        lines.append(_define(f"{name}_MAX_AGE_MS", str(round(row.max_age_s * 1000)), "older is stale"))
+    lines += [_define(f"{name}_{_upper(word)}", _text(word)) for word in row.words]
+    if row.message is not None:
+        lines += _message(name, row.message)
+    return "".join(lines)
+
+
+def _message(name: str, kind: type[Message]) -> list[str]:
+    lines: list[str] = []
+    for each in message_fields(kind):
+        macro = f"{name}_{_upper(each.name)}"
+        unit = each.unit or ""
+        remark = ", ".join(part for part in (unit, "may be null" if each.nullable else "") if part)
+        lines.append(_define(f"{macro}_FIELD", _text(each.name), remark))
+        lines += _lengths(macro, each)
+        low_sign, low, high_sign, high = bounds(each.element)
+        if low is not None:
+            lines.append(_define(f"{macro}_MIN", _number(low)))
+            lines += [_define(f"{macro}_MIN_EXCLUSIVE", "1")] if low_sign == ">" else []
+        if high is not None:
+            lines.append(_define(f"{macro}_MAX", _number(high)))
+            lines += [_define(f"{macro}_MAX_EXCLUSIVE", "1")] if high_sign == "<" else []
+        if isinstance(each.default, int | float) and not isinstance(each.default, bool):
+            lines.append(_define(f"{macro}_DEFAULT", _number(each.default)))
+        lines += [_define(f"{macro}_{_upper(word)}", _text(word)) for word in each.words]
+    return lines
+
+
+def _lengths(macro: str, each: Field) -> list[str]:
+    lines: list[str] = []
+    for kind in (each.type, each.element):
+        if isinstance(kind, inspect.ListType | inspect.StrType):
+            noun = "ITEMS" if isinstance(kind, inspect.ListType) else "LENGTH"
+            if kind.min_length is not None:
+                lines.append(_define(f"{macro}_{noun}_MIN", str(kind.min_length)))
+            if kind.max_length is not None:
+                lines.append(_define(f"{macro}_{noun}_MAX", str(kind.max_length)))
+        if each.type is each.element:
+            break
+    return lines
+
+
+def _define(name: str, value: str, remark: str = "") -> str:
+    return f"#define {name} {value}" + (f" /* {remark} */" if remark else "") + "\n"
+
+
+def _macro(name: str) -> str:
+    return f"FOGNAV_{_upper(name)}"
+
+
+def _upper(word: str) -> str:
+    return re.sub(r"\W", "_", word).upper()
+
+
+def _text(text: str) -> str:
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+
+
+def _number(value: float) -> str:
+    text = repr(value)
+    if isinstance(value, int) and abs(value) >= _INT_MAX:
+        text += "L" if abs(value) < _LONG_MAX else "LL"
+    return f"({text})" if value < 0 else text

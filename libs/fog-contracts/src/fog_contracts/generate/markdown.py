@@ -1,0 +1,229 @@
+"""`docs/channels.md`: the channel table, the messages field by field, and the REST routes, for people."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
+
+from fog_contracts.channels import CHANNELS, DURABILITIES, KIB, MIB, ROLES, Channel, Role
+from fog_contracts.generate import NOTE
+from fog_contracts.generate.fields import Field, bounds, message_fields, parts, summary, type_text
+
+if TYPE_CHECKING:
+    from fog_contracts.messages import Message
+
+OpenApi = Mapping[str, Any]
+
+_HEAD: Final = f"""\
+<!-- {NOTE} -->
+
+# Channels, messages and routes
+
+Everything that crosses from one process to another: over MQTT between sensor nodes and the fog, over zenoh between the
+fog and the robots, and the REST routes of the services. An id in angle brackets is `[a-z0-9][a-z0-9-]{{0,31}}`,
+an area's number on the thesis's topics has one to four digits. Lengths are in metres, angles in radians, in the frame
+`map`, unless a field says otherwise; a stamp counts seconds since 1970 by its sender's clock and is for people and
+traces, never for deciding what is fresh. Unknown fields are ignored; a message that is too long, lacks a field or has
+one out of range is refused, counted and logged.
+
+"""
+_STALE: Final = """\
+*Stale after* counts from a message's arrival by the receiver's own clock. Without it
+the value holds until the next one, or as long as the message says.
+"""
+_LARGE: Final = 2**31
+_METHODS: Final = ("get", "put", "post", "patch", "delete")
+
+
+def channels_markdown(services: Mapping[str, OpenApi]) -> str:
+    """Return the whole document; `services` are the OpenAPI descriptions by the name of the service."""
+    return _HEAD + "\n".join([_roles(), _durabilities(), _mqtt(), _zenoh(), _messages(), _routes(services)])
+
+
+def _roles() -> str:
+    return "## Who speaks\n\n" + _table(["role", "what it is"], ([f"`{role}`", what] for role, what in ROLES.items()))
+
+
+def _durabilities() -> str:
+    rows = ([f"`{name}`", what] for name, what in DURABILITIES.items())
+    head = "## What becomes of missed messages\n\n"
+    tail = "\nOver MQTT `latest` means retained. A zenoh channel of durability `latest` can be queried, too.\n"
+    return head + _table(["durability", "what a subscriber gets"], rows) + tail
+
+
+def _mqtt() -> str:
+    rows = (
+        [
+            _key(row), _carried(row), _ends(row), str(row.qos), f"`{row.durability}`", _rate(row), _age(row),
+            _size(row.limit),
+        ]
+        for row in CHANNELS.values()
+        if row.transport == "mqtt"
+    )  # fmt: skip
+    columns = ["topic", "carries", "from → to", "QoS", "durability", "rate", "stale after", "at most"]
+    return f"## MQTT\n\nMessages are JSON in UTF-8, or plain text. {_STALE}\n" + _table(columns, rows)
+
+
+def _zenoh() -> str:
+    published = [row for row in CHANNELS.values() if row.transport == "zenoh" and row.kind == "pub"]
+    asked = [row for row in CHANNELS.values() if row.kind == "query"]
+    alive = [row for row in CHANNELS.values() if row.kind == "liveliness"]
+    columns = ["key", "carries", "from → to", "durability", "rate", "stale after", "at most"]
+    rows = (
+        [_key(row), _carried(row), _ends(row), f"`{row.durability}`", _rate(row), _age(row), _size(row.limit)]
+        for row in published
+    )
+    queries = (
+        [
+            _key(row), _message(row.message), _message(row.reply), _names(row.subscribers), _names(row.publishers),
+            f"{_size(row.limit)}, {_size(row.reply_limit)}",
+        ]
+        for row in asked
+    )  # fmt: skip
+    return "\n".join(
+        [
+            f"## zenoh\n\nMessages are msgpack. {_STALE}",
+            "### Published\n\n" + _table(columns, rows),
+            "### Queries\n\n" + _table(["key", "asks", "answers", "who asks", "who answers", "at most"], queries),
+            "### Presence\n\n"
+            + _table(["key", "says", "from → to"], ([_key(row), row.about, _ends(row)] for row in alive)),
+        ]
+    )
+
+
+def _messages() -> str:
+    found: list[type[Message]] = []
+
+    def add(kind: type[Message] | None) -> None:
+        if kind is not None and kind not in found:
+            found.append(kind)
+            for part in parts(kind):
+                add(part)
+
+    for row in CHANNELS.values():
+        add(row.message)
+        add(row.reply)
+    return "## Messages\n\n" + "\n".join(_one(kind) for kind in found)
+
+
+def _one(kind: type[Message]) -> str:
+    rows = ([f"`{f.name}`", _linked(type_text(f.type)), f.unit, _limits(f), _default(f)] for f in message_fields(kind))
+    return f"### {kind.__name__}\n\n{summary(kind)}\n\n" + _table(["field", "type", "unit", "limits", "default"], rows)
+
+
+def _routes(services: Mapping[str, OpenApi]) -> str:
+    sections = ["## REST\n\nErrors are RFC 9457 problem documents. Writing needs a bearer token.\n"]
+    for name, described in services.items():
+        rows = [_route(method, path, path_item[method]) for path, path_item in sorted(described["paths"].items())
+                for method in _METHODS if method in path_item]  # fmt: skip
+        sections.append(f"### {name}\n\n" + _table(["route", "does", "parameters", "body", "answers", "token"], rows))
+    return "\n".join(sections)
+
+
+def _route(method: str, path: str, operation: Mapping[str, Any]) -> list[str]:
+    does = operation.get("description") or operation.get("summary") or ""
+    parameters = [f"`{each['name']}`" for each in operation.get("parameters", []) if each["in"] != "path"]
+    body = _schema((operation.get("requestBody") or {}).get("content"))
+    # 422 is the framework's own for parameters; every service answers all refusals as problem documents.
+    answers = [
+        " ".join(part for part in (code, _schema(answer.get("content"))) if part)
+        for code, answer in sorted(operation.get("responses", {}).items())
+        if code != "422"
+    ]
+    return [
+        f"`{method.upper()} {path}`", _sentence(does), ", ".join(parameters), body, ", ".join(answers),
+        "yes" if operation.get("security") else "",
+    ]  # fmt: skip
+
+
+def _schema(content: Mapping[str, Any] | None) -> str:
+    for kind, described in (content or {}).items():
+        schema = described.get("schema", {})
+        reference = schema.get("$ref") or schema.get("items", {}).get("$ref") or ""
+        if reference:
+            name = reference.rsplit("/", 1)[1]
+            return f"list of {name}" if "items" in schema else name
+        if kind != "application/json":
+            return str(kind)
+    return ""
+
+
+def _sentence(text: str) -> str:
+    return " ".join(text.split("\n\n", maxsplit=1)[0].split()).replace("|", "\\|")
+
+
+# --- Cells of tables ------------------------------------------------------------------------------------------------
+
+
+def _table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = [columns, ["---"] * len(columns), *rows]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+def _key(row: Channel) -> str:
+    return "`" + re.sub(r"\{(\w+)\}", r"<\1>", row.template) + "`"
+
+
+def _carried(row: Channel) -> str:
+    if row.message is not None:
+        return _message(row.message)
+    words = " or ".join(f"`{word}`" for word in row.words)
+    return f"{words}: {row.about}" if words else row.about
+
+
+def _message(kind: type[Message] | None) -> str:
+    if kind is None:
+        return "nothing"
+    return f"[{kind.__name__}](#{kind.__name__.lower()})"
+
+
+def _linked(text: str) -> str:
+    """Link the names of messages; words in backticks are none."""
+    return text if "`" in text else re.sub(r"\b[A-Z]\w+", lambda name: f"[{name[0]}](#{name[0].lower()})", text)
+
+
+def _ends(row: Channel) -> str:
+    return f"{_names(row.publishers)} → {_names(row.subscribers)}"
+
+
+def _names(roles: Sequence[Role]) -> str:
+    return ", ".join(roles)
+
+
+def _rate(row: Channel) -> str:
+    return "on change" if row.rate_hz is None else f"{row.rate_hz:g} Hz"
+
+
+def _age(row: Channel) -> str:
+    return "" if math.isinf(row.max_age_s) else f"{row.max_age_s:g} s"
+
+
+def _size(limit: int) -> str:
+    for unit, size in (("MiB", MIB), ("KiB", KIB)):
+        if limit >= size and limit % size == 0:
+            return f"{limit // size} {unit}"
+    return f"{limit} B"
+
+
+def _limits(field: Field) -> str:
+    low_sign, low, high_sign, high = bounds(field.element)
+    pairs = ((low_sign, low), (high_sign, high))
+    return ", ".join(f"{sign} {_number(value)}" for sign, value in pairs if value is not None)
+
+
+def _number(value: float) -> str:
+    if not isinstance(value, int):
+        return f"{value:g}"
+    for less in (0, 1):
+        power = value + less
+        if power >= _LARGE and power.bit_count() == 1:
+            return f"2^{power.bit_length() - 1}" + " - 1" * less
+    return str(value)
+
+
+def _default(field: Field) -> str:
+    return "" if field.required else f"`{msgspec.json.encode(field.default).decode()}`"

@@ -1,0 +1,237 @@
+"""What the table generates: each text says what the table says, the header compiles, and each role gets its own."""
+
+import ctypes
+import json
+import re
+import shutil
+import subprocess
+
+import pytest
+
+from fog_contracts import channels as ch
+from fog_contracts import messages as m
+from fog_contracts.channels import CHANNELS
+from fog_contracts.generate.fields import bounds, message_fields, parts
+from fog_contracts.generate.header import firmware_header
+from fog_contracts.generate.markdown import channels_markdown
+from fog_contracts.generate.mqtt_acl import mqtt_acl
+from fog_contracts.generate.zenoh_acl import zenoh_acl
+
+OPENAPI = {
+    "paths": {
+        "/api/v1/zones/{zone_id}": {
+            "delete": {
+                "description": "Take a zone | away.\n\nMore.",
+                "parameters": [{"name": "If-Match", "in": "header"}, {"name": "zone_id", "in": "path"}],
+                "responses": {"204": {}, "422": {}},
+                "security": [{"bearer": []}],
+            },
+            "get": {
+                "summary": "One zone",
+                "responses": {
+                    "200": {"content": {"application/json": {"schema": {"$ref": "#/components/schemas/Zone"}}}}
+                },
+            },
+        }
+    }
+}
+
+
+def field(kind, name):
+    return next(each for each in message_fields(kind) if each.name == name)
+
+
+# --- Fields ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "unit"),
+    [
+        (m.NodeReading, "range_m", "m"), (m.NodeReading, "uptime_ms", "ms"), (m.RobotPose, "theta", "rad"),
+        (m.RobotPose, "w", "rad/s"), (m.RobotPose, "v", "m/s"), (m.AreaDefinition, "polygon", "m"),
+        (m.UnknownPolicy, "silent_after_s", "s"), (m.RobotState, "goal_distance", "m"), (m.MapDelta, "w", "cells"),
+        (m.Zone, "expires_at", "s"), (m.Refusal, "nearest", "m"), (m.NodeReading, "seq", ""), (m.Cause, "id", ""),
+    ],
+)  # fmt: skip
+def test_units_come_from_types_and_names(kind, name, unit):
+    assert field(kind, name).unit == unit
+
+
+def test_limits_and_choices_are_those_of_a_fields_values():
+    ranges = field(m.NodeReading, "range_m")
+    assert ranges.nullable
+    assert bounds(ranges.element) == (">", 0.0, "<=", 20.0)
+    assert set(field(m.NodeReading, "status").words) == {"ok", "no_echo", "stuck"}
+    assert not field(m.NodeReading, "status").nullable
+
+
+def test_parts_are_found_in_lists_maps_and_choices():
+    assert parts(m.Zone) == [m.PolygonShape, m.RectangleShape, m.CircleShape, m.CorridorShape]
+    assert parts(m.RobotState) == [m.LoopHealth, m.Trace]
+
+
+# --- The document ---------------------------------------------------------------------------------------------------
+
+
+def test_the_document_names_every_channel_and_explains_every_message_that_it_links():
+    text = channels_markdown({})
+    for row in CHANNELS.values():
+        assert "`" + row.template.replace("{", "<").replace("}", ">") + "`" in text
+    headings = set(re.findall(r"^### (\w+)$", text, re.MULTILINE))
+    linked = dict(re.findall(r"\[([A-Z]\w+)\]\(#(\w+)\)", text))
+    assert all(anchor == name.lower() for name, anchor in linked.items())
+    assert set(linked) <= headings
+    assert {row.message.__name__ for row in CHANNELS.values() if row.message} <= headings
+
+
+def test_every_line_of_a_table_has_as_many_cells_as_its_head():
+    width = 0
+    for line in channels_markdown({"map-service": OPENAPI}).splitlines():
+        cells = len(re.findall(r"(?<!\\)\|", line)) if line.startswith("|") else 0
+        assert cells in {0, width} or width == 0, line
+        width = cells
+
+
+def test_a_row_of_the_document_says_what_the_table_says():
+    line = next(line for line in channels_markdown({}).splitlines() if "map/heartbeat`" in line)
+    assert line == (
+        "| `fog/<site>/map/heartbeat` | [MapHeartbeat](#mapheartbeat) | map-service → planner, robot-agent, console "
+        "| `volatile` | 10 Hz | 1 s | 256 B |"
+    )
+
+
+def test_routes_are_listed_with_parameters_answers_and_whether_they_need_a_token():
+    lines = channels_markdown({"map-service": OPENAPI}).splitlines()
+    assert "| `DELETE /api/v1/zones/{zone_id}` | Take a zone \\| away. | `If-Match` |  | 204 | yes |" in lines
+    assert "| `GET /api/v1/zones/{zone_id}` | One zone |  |  | 200 Zone |  |" in lines
+
+
+# --- The firmware's header ------------------------------------------------------------------------------------------
+
+PROGRAM = r"""
+#include "fognav_contract.h"
+#include "fognav_contract.h"
+#include <stdio.h>
+#include <string.h>
+int main(void) {
+    char topic[FOGNAV_NODE_READING_TOPIC_SIZE];
+    const char *id = "abcdefghijklmnopqrstuvwxyz012345";
+    int ranges[FOGNAV_NODE_READING_RANGE_M_ITEMS_MAX];
+    if ((int)strlen(id) != FOGNAV_ID_MAX) return 1;
+    if (snprintf(topic, sizeof topic, FOGNAV_NODE_READING_TOPIC, id, id) != (int)sizeof topic - 1) return 2;
+    printf("%s\n%s\n%s\n", topic, FOGNAV_NODE_READING_STATUS_NO_ECHO, FOGNAV_NODE_AVAILABILITY_OFFLINE);
+    printf("%d %d %d %d %d %d\n", FOGNAV_NODE_READING_LIMIT, FOGNAV_NODE_CONFIG_QOS, FOGNAV_NODE_CONFIG_RETAINED,
+           (int)(sizeof ranges / sizeof *ranges), 1 - FOGNAV_NODE_READING_RSSI_MIN,
+           FOGNAV_NODE_CONFIG_PAUSE_MS_DEFAULT);
+    printf("%.1f %lld\n", FOGNAV_NODE_READING_RANGE_M_MAX, (long long)FOGNAV_NODE_READING_SEQ_MAX);
+    return 0;
+}
+"""
+
+
+@pytest.mark.parametrize(
+    ("compiler", "suffix", "standard"), [("gcc", "c", "c99"), ("gcc", "c", "c17"), ("g++", "cpp", "c++17")]
+)
+def test_the_header_compiles_and_says_what_the_table_says(tmp_path, compiler, suffix, standard):
+    if shutil.which(compiler) is None:
+        pytest.skip(f"{compiler} is not installed: apt-get install -y g++")
+    (tmp_path / "fognav_contract.h").write_text(firmware_header())
+    (tmp_path / f"main.{suffix}").write_text(PROGRAM)
+    flags = [f"-std={standard}", "-Wall", "-Wextra", "-pedantic", "-Werror"]
+    subprocess.run([compiler, *flags, f"main.{suffix}", "-o", "main"], cwd=tmp_path, check=True)
+    done = subprocess.run([tmp_path / "main"], capture_output=True, text=True, check=True)
+    longest = "abcdefghijklmnopqrstuvwxyz012345"
+    assert done.stdout.splitlines() == [
+        ch.NODE_READING.key(site=longest, node=longest), "no_echo", "offline", "1024 1 1 8 201 50",
+        f"20.0 {2**53}",
+    ]  # fmt: skip
+
+
+def test_the_header_has_every_channel_of_a_node_and_no_other():
+    topics = set(re.findall(r"#define FOGNAV_(\w+)_TOPIC ", firmware_header()))
+    ends = {row.name.upper() for row in CHANNELS.values() if "node" in (*row.publishers, *row.subscribers)}
+    assert topics == ends
+
+
+def test_numbers_fit_the_boards_smallest_types():
+    for name, text in re.findall(r"#define (\w+) \(?(-?\d+)\)?(?= |$)", firmware_header(), re.MULTILINE):
+        assert abs(int(text)) <= ctypes.c_int16(2**15 - 1).value, f"{name} needs a suffix where int has 16 bits"
+
+
+# --- Access control -------------------------------------------------------------------------------------------------
+
+
+def test_the_brokers_list_gives_each_role_what_its_rows_say():
+    sections = re.split(r"^user ", mqtt_acl("lab").partition("# a sensor node on the wall")[0], flags=re.MULTILINE)[1:]
+    rights = {
+        s.split("\n")[0]: [tuple(x.split()[1:3]) for x in s.splitlines() if x.startswith("topic")] for s in sections
+    }
+    assert rights["map-service"] == [("read", "fog/v1/lab/areas/+/hazard"), ("read", "fog/v1/lab/areas/+/definition")]
+    assert {access for access, _ in rights["recorder"]} == {"read"}
+    assert rights["thesis-node"] == [("write", "+"), ("deny", "WSN")]
+    assert ("write", "fog/v1/lab/areas/+/hazard") in rights["hazard-aggregator"]
+    assert [role for role, lines in rights.items() if ("write", "fog/v1/lab/areas/+/hazard") in lines] == [
+        "hazard-aggregator"
+    ]
+
+
+def test_a_node_is_let_to_its_own_topics_only():
+    patterns = [line for line in mqtt_acl().splitlines() if line.startswith("pattern")]
+    assert patterns
+    assert all("%u" in line for line in patterns)
+    assert "pattern write fog/v1/+/nodes/%u/reading" in patterns
+    assert "pattern read fog/v1/+/nodes/%u/config" in patterns
+
+
+def rules(text):
+    """Read the router's list (JSON with comments and commas at the ends): keys by subject, flow and kind of message."""
+    plain = re.sub(r",(\s*[\]}])", r"\1", re.sub(r"^//.*$", "", text, flags=re.MULTILINE))
+    found = json.loads(plain)["access_control"]
+    assert found["enabled"]
+    assert found["default_permission"] == "deny"
+    by_id = {rule["id"]: rule for rule in found["rules"]}
+    assert len(by_id) == len(found["rules"])
+    subjects = {s["id"]: (s.get("usernames") or s["cert_common_names"])[0] for s in found["subjects"]}
+    assert all(len(s) == 2 for s in found["subjects"]), "a subject that names both would need both"
+    given = {}
+    for policy in found["policies"]:
+        (name,) = {subjects[each] for each in policy["subjects"]}
+        for rule in (by_id[each] for each in policy["rules"]):
+            assert rule["permission"] == "allow"
+            for flow in rule["flows"]:
+                for message in rule["messages"]:
+                    given.setdefault((name, flow, message), set()).update(rule["key_exprs"])
+    return given
+
+
+@pytest.mark.parametrize("row", [r for r in CHANNELS.values() if r.transport == "zenoh"], ids=lambda r: r.name)
+def test_the_routers_list_accepts_each_row_from_its_publishers_only(row):
+    sent = {"pub": "put", "query": "reply", "liveliness": "liveliness_token"}[row.kind]
+    key = row.pattern().replace("live/*/*", "live/{}/*")
+    given = rules(zenoh_acl())
+    senders = {name for (name, flow, kind), keys in given.items()
+               if flow == "ingress" and kind == sent and key.format(name) in keys}  # fmt: skip
+    assert senders == set(row.publishers)
+
+
+def test_the_recorder_only_listens():
+    given = rules(zenoh_acl())
+    assert not {kind for name, flow, kind in given if name == "recorder" and flow == "ingress"} & {"put", "reply"}
+    assert "fog/*/robots/*/pose" in given["recorder", "ingress", "declare_subscriber"]
+    assert ("recorder", "ingress", "declare_queryable") not in given
+
+
+def test_named_robots_speak_for_themselves_only():
+    given = rules(zenoh_acl("lab", ["r1", "r2"]))
+    assert "fog/lab/robots/r1/pose" in given["r1", "ingress", "put"]
+    r1 = {key for (name, _, _), keys in given.items() if name == "r1" for key in keys}
+    assert not any("robots/r2" in key or "robots/*" in key for key in r1)
+    assert given["r1", "ingress", "liveliness_token"] == {"fog/lab/live/robot-agent/r1"}
+    assert not any(name == "robot-agent" for name, _, _ in given)
+
+
+@pytest.mark.parametrize("make", [mqtt_acl, zenoh_acl, firmware_header, lambda: channels_markdown({"x": OPENAPI})])
+def test_what_is_generated_is_the_same_every_time_and_ends_with_a_line(make):
+    assert make() == make()
+    assert make().endswith("\n")
+    assert "fognav channels --write" in make().split("#ifndef")[0][:400]

@@ -1,0 +1,332 @@
+"""The generated access control lists on a real Mosquitto and a real zenoh router: what is allowed works, no more."""
+
+import asyncio
+import contextlib
+import json
+import queue
+import time
+
+import paho.mqtt.client as paho
+import pytest
+import zenoh
+from paho.mqtt.enums import CallbackAPIVersion
+
+from fog_contracts import channels as ch
+from fog_contracts import messages as m
+from fog_contracts.generate.mqtt_acl import mqtt_acl
+from fog_contracts.generate.zenoh_acl import zenoh_acl
+from fog_runtime import zenoh_edge
+from fog_runtime.clock import SystemClock
+from fog_runtime.zenoh_edge import ZenohEdge, session_config
+from fog_supervisor.net import free_port
+from fog_supervisor.servers import start_mosquitto
+
+pytestmark = pytest.mark.live
+
+WAIT_S = 15.0
+
+# --- MQTT -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def broker(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("broker")
+    (folder / "acl").write_text(mqtt_acl("lab"))
+    # Names without passwords: this is about what a name is allowed.
+    with start_mosquitto(folder, extra=f"acl_file {folder}/acl") as server:
+        yield server
+
+
+@contextlib.contextmanager
+def mqtt_client(broker, user):
+    """Give a connected client of this name; what it is sent goes into `received`."""
+    client = paho.Client(CallbackAPIVersion.VERSION2, protocol=paho.MQTTv5)
+    if user is not None:
+        client.username_pw_set(user)
+    client.received, client.done = queue.Queue(), queue.Queue()
+    client.on_connect = lambda *_: client.done.put("connected")
+    client.on_subscribe = lambda *_: client.done.put("subscribed")
+    client.on_publish = lambda _client, _data, _mid, code, _properties: client.done.put(code.getName())
+    client.on_message = lambda _client, _data, message: client.received.put((message.topic, message.payload))
+    client.connect("127.0.0.1", broker.port)
+    client.loop_start()
+    try:
+        assert client.done.get(timeout=WAIT_S) == "connected"
+        yield client
+    finally:
+        client.disconnect()
+        client.loop_stop()
+
+
+def published(client, topic, payload=b"x", *, retain=False):
+    """Publish with QoS 1 and return what the broker answers: of QoS 0 a refusal can't be seen."""
+    client.publish(topic, payload, qos=1, retain=retain)
+    return client.done.get(timeout=WAIT_S)
+
+
+def lab(channel, **ids):
+    return channel.key(site="lab", **ids)
+
+
+READING = lab(ch.NODE_READING, node="n1")
+HAZARD = lab(ch.AREA_HAZARD, area="hall")
+
+
+@pytest.mark.parametrize(
+    ("user", "topic"),
+    [
+        ("n1", READING), ("n1", lab(ch.NODE_AVAILABILITY, node="n1")), ("n1", lab(ch.NODE_VALUE, node="n1")),
+        ("n1", ch.HOME_ASSISTANT.key(node="n1")), ("hazard-aggregator", HAZARD),
+        ("hazard-aggregator", lab(ch.AREA_DEFINITION, area="hall")), ("hazard-aggregator", ch.THESIS_WSN.key()),
+        ("hazard-aggregator", lab(ch.NODE_CONFIG, node="n1")), ("thesis-node", ch.THESIS_AREA.key(number="3")),
+    ],
+)  # fmt: skip
+def test_the_broker_takes_what_a_role_may_publish(broker, user, topic):
+    with mqtt_client(broker, user) as client:
+        assert published(client, topic) in {"Success", "No matching subscribers"}
+
+
+@pytest.mark.parametrize(
+    ("user", "topic"),
+    [
+        ("n1", lab(ch.NODE_READING, node="n2")), ("n1", HAZARD), ("n1", lab(ch.NODE_CONFIG, node="n1")),
+        ("n1", ch.NODE_READING.key(site="other", node="n1")), ("n1", ch.THESIS_AREA.key(number="3")),
+        ("n1", ch.THESIS_WSN.key()), ("n1", "anything/else"), ("+", READING), (None, READING), (None, HAZARD),
+        ("thesis-node", ch.THESIS_WSN.key()), ("thesis-node", READING), ("thesis-robot", ch.THESIS_WSN.key()),
+        ("map-service", HAZARD), ("recorder", READING), ("hazard-aggregator", READING),
+    ],
+)  # fmt: skip
+def test_the_broker_refuses_what_a_role_may_not_publish(broker, user, topic):
+    with mqtt_client(broker, user) as client:
+        assert published(client, topic) == "Not authorized"
+
+
+def test_the_broker_gives_each_role_its_own_messages_only(broker):
+    with contextlib.ExitStack() as stack:
+        users = ("hazard-aggregator", "map-service", "n1", "n2", "recorder", None)
+        clients = {user: stack.enter_context(mqtt_client(broker, user)) for user in users}
+        for client in clients.values():
+            client.subscribe([("fog/#", 1), ("WSN", 1), ("area 3", 1)])
+            assert client.done.get(timeout=WAIT_S) == "subscribed"
+        thesis = stack.enter_context(mqtt_client(broker, "thesis-node"))
+        aggregator = clients["hazard-aggregator"]
+        config = {node: lab(ch.NODE_CONFIG, node=node) for node in ("n1", "n2")}
+        assert published(clients["n1"], READING, b"reading") == "Success"
+        assert published(thesis, "area 3", b"blocked") == "Success"
+        assert published(aggregator, HAZARD, b"hazard") == "Success"
+        for topic in config.values():
+            assert published(aggregator, topic, b"config") == "Success"
+        # The broker delivers to one client in order: with the last message all that were allowed have come.
+        assert published(aggregator, "WSN", b"end") == "Success"
+        assert published(aggregator, lab(ch.AREA_DEFINITION, area="hall"), b"end") == "Success"
+        sent = [(READING, b"reading"), ("area 3", b"blocked"), (HAZARD, b"hazard"),
+                *((topic, b"config") for topic in config.values()), ("WSN", b"end")]  # fmt: skip
+        end = (lab(ch.AREA_DEFINITION, area="hall"), b"end")
+        expected = {
+            "recorder": [*sent, end],
+            "map-service": [(HAZARD, b"hazard"), end],
+            "n1": [(config["n1"], b"config")],
+            "n2": [(config["n2"], b"config")],
+        }
+        got = {user: [clients[user].received.get(timeout=WAIT_S) for _ in wanted] for user, wanted in expected.items()}
+        assert got == expected
+        heard = [aggregator.received.get(timeout=WAIT_S) for _ in range(3)]
+        assert heard[:2] == [(READING, b"reading"), ("area 3", b"blocked")]
+        for user in ("n1", "n2", "map-service", None):
+            # An answer to a question of its own comes after everything that was sent to it before.
+            clients[user].subscribe("$SYS/none", 1)
+            assert clients[user].done.get(timeout=WAIT_S) == "subscribed"
+            assert clients[user].received.empty(), user
+
+
+# --- zenoh ----------------------------------------------------------------------------------------------------------
+
+ROLES = ("hazard-aggregator", "map-service", "planner", "console", "recorder", "sim", "robot-agent", "r1", "r2")
+
+
+@contextlib.contextmanager
+def zenoh_router(folder, acl):
+    """Run a router with this access control; every user's password is its name."""
+    (folder / "users").write_text("".join(f"{role}:{role}\n" for role in ROLES))
+    (folder / "acl.json5").write_text(acl)
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    config = zenoh.Config.from_file(str(folder / "acl.json5"))
+    for key, value in {
+        "mode": "router", "listen/endpoints": [endpoint], "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False, "transport/shared_memory/enabled": False, "timestamping/enabled": True,
+        "transport/auth/usrpwd": {"user": "router", "password": "router", "dictionary_file": str(folder / "users")},
+    }.items():  # fmt: skip
+        config.insert_json5(key, json.dumps(value))
+    session = zenoh.open(config)
+    try:
+        yield endpoint
+    finally:
+        session.close()
+
+
+@pytest.fixture
+def opened(monkeypatch):
+    """Give what opens an edge under a name, which becomes its user and its password."""
+
+    @contextlib.asynccontextmanager
+    async def enter(endpoint, role, name=""):
+        user = name or role
+
+        def config(*arguments, **keys):
+            made = session_config(*arguments, **keys)
+            made.insert_json5("transport/auth/usrpwd", json.dumps({"user": user, "password": user}))
+            return made
+
+        monkeypatch.setattr(zenoh_edge, "session_config", config)
+        async with ZenohEdge.open(
+            connect=[endpoint], clock=SystemClock(), role=role, id=name or "lab", site="lab"
+        ) as edge:
+            assert edge.connected, f"{user} can't connect"
+            yield edge
+
+    return enter
+
+
+async def until(condition, what):
+    deadline = time.monotonic() + WAIT_S
+    while not condition():
+        assert time.monotonic() < deadline, what
+        await asyncio.sleep(0.01)
+
+
+async def repeat(edge, channel, message, condition, what, **ids):
+    """Publish again and again: a subscription takes a moment to reach the publisher."""
+    deadline = time.monotonic() + WAIT_S
+    while not condition():
+        assert time.monotonic() < deadline, what
+        edge.publish(channel, message, **ids)
+        await asyncio.sleep(0.05)
+
+
+def delta(seq):
+    return m.MapDelta(
+        epoch=1, seq=seq, part=0, parts=1, layer="cost", x=0, y=0, w=1, h=1, packing="raw", cells=b"0", hash=0
+    )
+
+
+def pose(x):
+    return m.RobotPose(x=x, y=0.0, theta=0.0, covariance=[0.0] * 9, v=0.0, w=0.0, radius=0.2, height=0.3, stamp=1.0)
+
+
+def heartbeat(seq):
+    return m.MapHeartbeat(epoch=1, seq=seq, hash=0, stamp=1.0)
+
+
+GOAL = m.RobotGoal(goal_id="g", pose=None)
+ZONES = m.ZoneSet(epoch=1, seq=1, zones=[])
+PLAN = m.PlanRequest(start=m.Pose(x=0.0, y=0.0, theta=0.0), goal=m.Pose(x=1.0, y=0.0, theta=0.0))
+
+
+async def test_every_way_of_talking_that_the_table_has_works_under_the_list(tmp_path, opened):
+    with zenoh_router(tmp_path, zenoh_acl("lab", ["r1", "r2"])) as endpoint:
+        async with (
+            opened(endpoint, "map-service") as map_service,
+            opened(endpoint, "planner") as planner,
+            opened(endpoint, "robot-agent", "r1") as robot,
+            opened(endpoint, "console") as console,
+            opened(endpoint, "recorder") as recorder,
+        ):
+            deltas, recorded, zones, poses, there = [], [], [], [], set()
+            map_service.publish(ch.MAP_DELTA, delta(1))
+            map_service.publish(ch.ZONES, ZONES)
+            map_service.serve(ch.ZONES, lambda *_: ZONES)
+            planner.serve(ch.PLANNER_PLAN, lambda _, request: m.PlanReply(length=request.goal.x))
+            map_service.alive("map-service", "lab")
+            robot.alive("robot-agent", "r1")
+            planner.subscribe(ch.MAP_DELTA, m.MapDelta, lambda _, message: deltas.append(message.seq))
+            robot.subscribe(ch.ZONES, m.ZoneSet, lambda _, message: zones.append(message))
+            planner.subscribe(ch.ROBOT_POSE, m.RobotPose, lambda ids, message: poses.append((ids["robot"], message.x)))
+            recorder.subscribe(ch.ROBOT_POSE, m.RobotPose, lambda ids, _: recorded.append(ids["robot"]))
+            console.watch_live(lambda role, name, alive: there.add((role, name, alive)))
+            await until(lambda: deltas == [1] and zones == [ZONES], "what was published before is given to latecomers")
+            map_service.publish(ch.MAP_DELTA, delta(2))
+            await until(lambda: deltas == [1, 2], "deltas arrive")
+            await repeat(robot, ch.ROBOT_POSE, pose(1.0), lambda: poses and recorded, "poses arrive", robot="r1")
+            await until(
+                lambda: there == {("map-service", "lab", True), ("robot-agent", "r1", True)}, "presence is seen"
+            )
+            assert await console.ask(ch.PLANNER_PLAN, PLAN, m.PlanReply, 5.0) == m.PlanReply(length=1.0)
+            assert await robot.ask(ch.ZONES, None, m.ZoneSet, 5.0) == ZONES
+
+
+async def test_a_role_without_the_right_reaches_nobody(tmp_path, opened):
+    with zenoh_router(tmp_path, zenoh_acl("lab", ["r1", "r2"])) as endpoint:
+        async with (
+            opened(endpoint, "map-service") as map_service,
+            opened(endpoint, "planner") as planner,
+            opened(endpoint, "robot-agent", "r1") as r1,
+            opened(endpoint, "robot-agent", "r2") as r2,
+            opened(endpoint, "console") as console,
+        ):
+            deltas, goals, poses, there = [], [], [], set()
+            console.subscribe(ch.MAP_DELTA, m.MapDelta, lambda _, message: deltas.append(message.seq))
+            console.subscribe(ch.ROBOT_GOAL, m.RobotGoal, lambda ids, _: goals.append(ids["robot"]))
+            console.subscribe(ch.ROBOT_POSE, m.RobotPose, lambda ids, _: poses.append(ids["robot"]))
+            console.watch_live(lambda role, name, alive: there.add((role, name, alive)))
+            planner.serve(ch.MAP_SNAPSHOT, lambda *_: None)
+            planner.alive("map-service", "lab")
+            r1.alive("robot-agent", "r2")
+            # Everything that one session sends arrives in order: what is forbidden is sent before what is allowed.
+            for _ in range(3):
+                planner.publish(ch.MAP_DELTA, delta(666))
+                r1.publish(ch.ROBOT_POSE, pose(1.0), robot="r2")
+                r2.publish(ch.ROBOT_GOAL, GOAL, robot="r2")
+                await repeat(planner, ch.ROBOT_GOAL, GOAL, lambda: goals, "goals arrive", robot="r1")
+                await repeat(r1, ch.ROBOT_POSE, pose(1.0), lambda: "r1" in poses, "poses arrive", robot="r1")
+                await repeat(r2, ch.ROBOT_POSE, pose(1.0), lambda: "r2" in poses, "poses arrive", robot="r2")
+                await repeat(map_service, ch.MAP_DELTA, delta(1), lambda: deltas, "deltas arrive")
+                assert set(deltas) == {1}
+                assert set(goals) == {"r1"}
+                goals.clear()
+            assert await console.ask(ch.MAP_SNAPSHOT, None, m.MapSnapshot, 1.0) is None
+            r2.alive("robot-agent", "r2")
+            await until(lambda: ("robot-agent", "r2", True) in there, "presence is seen")
+            assert there == {("robot-agent", "r2", True)}
+
+
+async def test_a_robot_speaks_for_no_other_where_robots_are_named(tmp_path, opened):
+    with zenoh_router(tmp_path, zenoh_acl("lab", ["r1", "r2"])) as endpoint:
+        async with (
+            opened(endpoint, "robot-agent", "r1") as r1,
+            opened(endpoint, "planner") as planner,
+            opened(endpoint, "recorder") as recorder,
+        ):
+            poses, goals, recorded = [], [], []
+            planner.subscribe(ch.ROBOT_POSE, m.RobotPose, lambda ids, message: poses.append((ids["robot"], message.x)))
+            r1.subscribe(ch.ROBOT_GOAL, m.RobotGoal, lambda ids, _: goals.append(ids["robot"]), robot="r2")
+            r1.subscribe(ch.ROBOT_GOAL, m.RobotGoal, lambda ids, _: goals.append(ids["robot"]), robot="r1")
+            recorder.subscribe(ch.ROBOT_GOAL, m.RobotGoal, lambda ids, _: recorded.append(ids["robot"]))
+
+            def both():
+                r1.publish(ch.ROBOT_POSE, pose(6.0), robot="r2")
+                planner.publish(ch.ROBOT_GOAL, GOAL, robot="r2")
+                return poses and "r1" in goals and {"r1", "r2"} <= set(recorded)
+
+            deadline = time.monotonic() + WAIT_S
+            while not both():
+                assert time.monotonic() < deadline, (poses, goals, recorded)
+                r1.publish(ch.ROBOT_POSE, pose(1.0), robot="r1")
+                planner.publish(ch.ROBOT_GOAL, GOAL, robot="r1")
+                await asyncio.sleep(0.05)
+            assert set(poses) == {("r1", 1.0)}
+            assert set(goals) == {"r1"}
+
+
+async def test_the_list_for_any_site_knows_robots_by_their_role(tmp_path, opened):
+    with zenoh_router(tmp_path, zenoh_acl()) as endpoint:
+        async with opened(endpoint, "robot-agent") as robot, opened(endpoint, "planner") as planner:
+            poses, heartbeats = [], []
+            planner.subscribe(ch.ROBOT_POSE, m.RobotPose, lambda ids, _: poses.append(ids["robot"]))
+            planner.subscribe(ch.MAP_HEARTBEAT, m.MapHeartbeat, lambda _, message: heartbeats.append(message))
+
+            robot.publish(ch.MAP_HEARTBEAT, heartbeat(1))
+            await repeat(robot, ch.ROBOT_POSE, pose(1.0), lambda: poses, "poses arrive", robot="r7")
+            robot.publish(ch.MAP_HEARTBEAT, heartbeat(2))
+            poses.clear()
+            await repeat(robot, ch.ROBOT_POSE, pose(1.0), lambda: poses, "poses arrive", robot="r7")
+            assert heartbeats == []

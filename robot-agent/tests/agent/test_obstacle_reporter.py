@@ -23,7 +23,7 @@ class FakeLocalizer:
         self.points = np.array(points, dtype=np.float64).reshape(-1, 2)
         self.status = "good"
         self.turning = 0.0
-        self.sweep = SimpleNamespace(points=self.points - (HERE.x, HERE.y))
+        self.scan = SimpleNamespace(points=self.points - (HERE.x, HERE.y))
 
     def points_in_map(self):
         return self.points
@@ -31,7 +31,7 @@ class FakeLocalizer:
     def pose(self, _now):
         return HERE
 
-    def seen_from(self):
+    def scan_pose(self):
         return HERE
 
     def twist(self):
@@ -76,7 +76,7 @@ def test_only_the_nearest_cells_are_reported():
     assert [x for x, _ in report(far).points] == pytest.approx([5.55, 4.05, 6.55])
 
 
-@pytest.mark.parametrize("change", [{"status": "weak"}, {"turning": 0.6}, {"scan_age": 0.6}, {"sweep": None}])
+@pytest.mark.parametrize("change", [{"status": "weak"}, {"turning": 0.6}, {"scan_age": 0.6}, {"scan": None}])
 def test_nothing_is_told_when_the_points_can_not_be_placed(change):
     assert report(TWO) is not None
     assert report(TWO, **change) is None

@@ -32,7 +32,9 @@ from fog_contracts.messages import (
 from fog_runtime.record import read
 from fog_runtime.site import LoadedSite, load_site
 from hazard_aggregator.core import Aggregator
+from hazard_aggregator.registry import find_rule
 from map_service.core import MapCore
+from map_service.registry import make_layers
 from planner.core import PlannerCore
 
 if TYPE_CHECKING:
@@ -79,7 +81,7 @@ def aggregate(heard: list[Heard], site: LoadedSite) -> list[AreaHazard]:
     """Return the hazards that an aggregator announces, with a store that answers at once."""
     begin, hazard = first(heard, ch.AREA_HAZARD)
     assert isinstance(hazard, AreaHazard)
-    core = Aggregator(site.site.definitions(), site.site.nodes, hazard.epoch)
+    core = Aggregator(site.site.definitions(), site.site.nodes, hazard.epoch, registry=find_rule)
     handlers = core.handlers()
     announced: list[AreaHazard] = []
     for at, event in beating(heard, begin):
@@ -100,7 +102,13 @@ def empty_map(heard: list[Heard], site: LoadedSite) -> MapCore:
     """Return a map-service's core as it stands at its start: what no recording holds comes from the site."""
     _, heartbeat = first(heard, ch.MAP_HEARTBEAT)
     assert isinstance(heartbeat, MapHeartbeat)
-    return MapCore(site.site.id, site.map, heartbeat.epoch, definitions=site.site.definitions())
+    return MapCore(
+        site.site.id,
+        site.map,
+        heartbeat.epoch,
+        layers=make_layers(site.map, site.site.layers),
+        definitions=site.site.definitions(),
+    )
 
 
 def draw(heard: list[Heard], site: LoadedSite) -> tuple[list[MapDelta], MapSnapshot]:

@@ -31,7 +31,9 @@ from fognav_sim import devices
 from fognav_sim.hardware import STEP_S, Hardware
 from fognav_sim.node import SonarNode
 from hazard_aggregator.core import Aggregator
+from hazard_aggregator.registry import find_rule
 from map_service.core import MapCore
+from map_service.registry import make_layers
 from planner.core import PlannerCore
 from robot_agent.agent.core import AgentCore, SavedPose, decide
 from robot_agent.config import agent_config
@@ -201,8 +203,10 @@ class FogRig:
             SonarNode(node, boot=seed + index, start=start + 0.013 * (index % 8))
             for index, node in enumerate(site.site.nodes)
         ]
-        self.aggregator = Aggregator(definitions, site.site.nodes, epoch=1)
-        self.map = MapCore(site.site.id, site.map, epoch=1, definitions=definitions)
+        self.aggregator = Aggregator(definitions, site.site.nodes, epoch=1, registry=find_rule)
+        self.map = MapCore(
+            site.site.id, site.map, epoch=1, layers=make_layers(site.map, site.site.layers), definitions=definitions
+        )
         self.planner = PlannerCore(epoch=1)
         self.hazards: dict[str, HazardArea] = {}
         self._told: list[HazardArea] = []

@@ -75,6 +75,8 @@ async def test_bad_areas_are_refused_by_field_and_a_dead_store_is_said(fog, clie
         ({"polygon": [[1, 1], [90, 1], [2, 2]]}, "body.polygon.1"),
         ({"polygon": POLYGON, "nodes": ["n9"]}, "body.nodes.0"),
         ({"polygon": POLYGON, "unknown": {"penalty": 255}}, "body.unknown.penalty"),
+        ({"polygon": POLYGON, "debounce": {"rule": "majority"}}, "body.debounce.rule"),
+        ({"polygon": POLYGON, "debounce": {"to_clear": 0}}, "body.debounce.to_clear"),
     ):
         answer = await client.put("/api/v1/areas/hall", json=body, headers=tokens["operator"])
         assert answer.status_code == 422

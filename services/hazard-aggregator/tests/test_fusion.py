@@ -3,14 +3,16 @@
 import itertools
 import math
 
+import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fog_contracts.messages import AreaDefinition, AreaHazard, Debounce, NodeReading, RobotPose
+from fog_contracts.messages import AreaDefinition, AreaHazard, NodeReading, RobotPose
 from fog_contracts.site import NodeSite, Sonar
-from hazard_aggregator import debounce
+from hazard_aggregator.debounce import DebounceError, RuleFactory
 from hazard_aggregator.fusion import AreaFusion
+from hazard_aggregator.registry import find_rule
 
 SQUARE = [(0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (0.0, 1.0)]
 LIMIT = 1.2
@@ -45,7 +47,7 @@ class Rig:
     """A fusion with a clock that moves one node period per reading."""
 
     def __init__(self, *nodes: NodeSite, restored: list[AreaHazard] | None = None, **fields) -> None:
-        self.core = AreaFusion([area(*(n.id for n in nodes), **fields)], nodes, 1, restored or [])
+        self.core = AreaFusion([area(*(n.id for n in nodes), **fields)], nodes, 1, restored or [], registry=find_rule)
         self.now = 100.0
         self.seq = 0
         self.seen: list[AreaHazard] = []
@@ -110,7 +112,7 @@ def test_four_blocked_readings_and_one_clear_change_nothing():
 
 
 def test_debounce_counts_are_the_areas_own():
-    rig = Rig(site("n1"), debounce=Debounce(to_blocked=2, to_clear=7))
+    rig = Rig(site("n1"), debounce={"to_blocked": 2, "to_clear": 7})
     rig.read(0.8, 3.0, times=2)
     assert rig.hazard.state == "blocked"
     rig.read(3.0, 3.0, times=6)
@@ -292,7 +294,7 @@ def test_explaining_does_not_depend_on_how_the_site_is_turned(turn, distance, be
     def outcome(theta: float) -> str:
         x, y = distance * math.cos(theta + bearing), distance * math.sin(theta + bearing)
         node = NodeSite(id="n1", area="hall", x=0.0, y=0.0, theta=theta, sonars=[Sonar(range_limit=1.25)])
-        core = AreaFusion([area("n1")], [node], 1)
+        core = AreaFusion([area("n1")], [node], 1, registry=find_rule)
         core.on_pose("r1", pose(x, y), 0.0)
         for seq in range(5):
             echo = NodeReading(
@@ -382,7 +384,7 @@ def test_no_area_is_clear_after_a_restart_before_readings_say_so():
 
 
 def test_a_reading_before_the_first_tick_does_not_break_a_restored_state():
-    core = AreaFusion([area("n1")], [site("n1")], 2, [stored("blocked", 254)])
+    core = AreaFusion([area("n1")], [site("n1")], 2, [stored("blocked", 254)], registry=find_rule)
     reading = NodeReading(seq=1, boot=1, uptime_ms=0, range_m=[3.0, 3.0], status=["ok", "ok"], state="clear")
     core.on_reading("n1", reading, 1000.0, 0.0)
     core.tick(1000.1, 0.1)
@@ -422,7 +424,7 @@ def _with_penalty(definition: AreaDefinition, penalty: int) -> AreaDefinition:
 
 
 def test_the_thesiss_nodes_still_count():
-    core = AreaFusion([area()], [], 1)
+    core = AreaFusion([area()], [], 1, registry=find_rule)
     core.tick(0.0, 0.0)
     for i in range(5):
         changed = core.on_thesis_state(7, "blocked", i / 10, i / 10)
@@ -432,10 +434,52 @@ def test_the_thesiss_nodes_still_count():
     assert core.hazards()[0].state == "blocked"
 
 
-def test_a_debounce_rule_is_found_by_its_files_name():
-    assert "consecutive" in debounce.names()
-    with pytest.raises(ValueError, match="consecutive"):
-        debounce.find("majority")
+@pytest.mark.parametrize(
+    ("choice", "words"),
+    [
+        ({"rule": "majority"}, r"area hall: debounce\.rule: .*'majority' \(known: .*consecutive"),
+        ({"rule": "consecutive", "to_blocke": 3}, r"area hall: debounce\.to_blocke: .*known: to_blocked, to_clear"),
+        ({"to_blocked": 0}, r"area hall: debounce\.to_blocked: Expected `int` >= 1"),
+        ({"to_clear": "five"}, r"area hall: debounce\.to_clear: Expected `int`"),
+        ({"rule": 7}, r"area hall: debounce\.rule"),
+    ],
+)
+def test_a_debounce_rule_that_cannot_be_used_is_refused_by_area_field_and_what_there_is(choice, words):
+    with pytest.raises(DebounceError, match=words):
+        Rig(site("n1"), debounce=choice)
+    with pytest.raises(DebounceError, match=words):
+        AreaFusion([area(debounce=choice)], [], 1, registry=find_rule)
+
+
+class Patient:
+    """Settles what readings have said for `seconds` on end."""
+
+    class Options(msgspec.Struct):
+        seconds: float
+
+    def __init__(self, options: Options) -> None:
+        self.seconds, self.state, self.since = options.seconds, None, 0.0
+
+    def feed(self, state: str, at: float) -> str | None:
+        if state != self.state:
+            self.state, self.since = state, at
+        return state if at - self.since >= self.seconds else None
+
+    def reset(self) -> None:
+        self.state = None
+
+
+def test_a_rule_may_judge_by_time():
+    definition = area("n1", debounce={"seconds": 1.0})
+    factory = RuleFactory(options=Patient.Options, make=Patient)
+    fusion = AreaFusion(
+        [definition], [site("n1")], 1, registry={"patient": factory}.__getitem__, default_rule="patient"
+    )
+    for seq, now in enumerate((100.0, 100.5, 100.99, 101.0)):
+        assert fusion.hazards() == [] or fusion.hazards()[0].state == "unknown"
+        reading = NodeReading(seq=seq, boot=1, uptime_ms=0, range_m=[0.8, 3.0], status=["ok", "ok"], state="blocked")
+        fusion.on_reading("n1", reading, now, now)
+    assert fusion.hazards()[0].state == "blocked"
 
 
 # --- Invariants -----------------------------------------------------------------------------------------------------

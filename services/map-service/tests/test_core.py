@@ -18,6 +18,7 @@ from fog_contracts.messages import (
     VIEW_SECTORS,
     AreaDefinition,
     AreaHazard,
+    Cause,
     CircleShape,
     CorridorShape,
     HazardArea,
@@ -36,8 +37,10 @@ from fog_contracts.messages import (
 from fog_contracts.replica import Applied, Replica
 from map_service.core import MapCore
 from map_service.costmap import merged
+from map_service.layers.base import CostLayer, write_cost
 from map_service.layers.zones import penalty_cost
-from map_service.shapes import ZoneError, checked_zone, rasterize_shape
+from map_service.registry import LayersError, make_layers
+from map_service.shapes import ShapeMask, ZoneError, checked_zone, rasterize_shape
 
 
 @dataclass
@@ -68,7 +71,7 @@ class Rig:
     """A core that serves its map, fed through its table of handlers."""
 
     def __init__(self, plan: Plan) -> None:
-        self.core = MapCore("test", plan, 3)
+        self.core = MapCore("test", plan, 3, layers=make_layers(plan))
         at = Moment(0.0, 0.0)
         self.core.load_zones([], at)
         self.core.on_broker(at, connected=True)
@@ -270,11 +273,69 @@ def test_an_area_whose_polygon_crosses_itself_is_refused_and_leaves_the_known_on
     assert at(m, 0.75, 0.75) == (200, 15)
 
 
+# --- Layers ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("chosen", "words"),
+    [
+        (["hazards", "static", "zones"], r"layers\[0\]: 'static' has to be the first"),
+        (["static", "zones"], "'hazards' has to be there once"),
+        (["static", "hazards", "zones", "zones"], "'zones' has to be there once"),
+        (["static", "hazards", "zones", "lava"], r"layers\[3\]: .*'lava' \(known: hazards, obstacles, static, zones"),
+        (["static", "hazards", {"name": "zones", "depth": 3}], r"layers\[2\] \(zones\): depth: .*no such option"),
+        (["static", "hazards", "zones", {"cost": 3}], r"layers\[3\]: "),
+    ],
+)
+def test_layers_that_cannot_be_used_are_refused_by_entry(chosen, words):
+    with pytest.raises(LayersError, match=words):
+        make_layers(floor(), chosen)
+
+
+class Spot(CostLayer):
+    """Makes a cell dear once somebody has spoken on a channel that no layer of ours hears."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.cost = 0
+
+    def handlers(self):
+        return {ch.ROBOT_STATE: self.on_state, ch.ROBOT_POSE: self.on_state}
+
+    def on_state(self, _ids, _message, _at):
+        return self.set(90)
+
+    def tick(self, at):
+        return self.set(0) if at.now >= 10.0 else []
+
+    def set(self, cost: int):
+        self.cost = cost
+        self.mark_updated(Window(40, 30, 1, 1), Cause(kind="map", id="spot", state=str(cost)))
+        return []
+
+    def update_costs(self, window, cost, _speed):
+        write_cost(ShapeMask(Window(40, 30, 1, 1), np.ones((1, 1), dtype=bool)), window, cost, self.cost)
+
+
+def test_a_layer_that_the_core_knows_nothing_of_listens_ticks_and_writes_costs():
+    plan = floor()
+    m = MapCore("test", plan, 3, layers=[*make_layers(plan), Spot()])
+    m.load_zones([], moment(0.0))
+    m.tick(moment(0.0))
+    assert ch.ROBOT_STATE in m.handlers()
+    (delta,) = m.handlers()[ch.ROBOT_POSE]({"robot": "r1"}, pose(9.0, 9.0), moment(1.0))
+    assert (delta.channel, delta.message.causes[0].id, m.costmap.cost[30, 40]) == (ch.MAP_DELTA, "spot", 90)
+    m.tick(moment(10.0))
+    assert m.costmap.cost[30, 40] == 0
+
+
 # --- Serving --------------------------------------------------------------------------------------------------------
 
 
 def started(**arguments) -> MapCore:
-    return MapCore("test", floor(), 3, definitions=[definition(), definition("gate", x=1.5)], **arguments)
+    plan = floor()
+    areas = [definition(), definition("gate", x=1.5)]
+    return MapCore("test", plan, 3, layers=make_layers(plan), definitions=areas, **arguments)
 
 
 def moment(now: float) -> Moment:
@@ -625,7 +686,7 @@ def play(m: Rig, history: list[tuple]) -> list[MapDelta]:
         elif kind == "look":
             change = m.on_obstacles("r1", seen(view=looking(*rest[0], rest[1])), now, now)
         elif kind == "pose":
-            m.on_pose("r2", pose(*rest[0]), now)
+            deltas += m.on_pose("r2", pose(*rest[0]), now).deltas
             change = m.tick(now, now)
         elif kind == "watched":
             change = m.on_aggregator(present=rest[0], stamp=now)

@@ -4,7 +4,7 @@ Stamps are seconds since the Unix epoch by the sender's clock (`fog_runtime.cloc
 people. Freshness is never judged by them but by the receiver's own monotonic clock.
 """
 
-from typing import Annotated, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 from msgspec import Meta, Struct
 
@@ -117,22 +117,18 @@ class UnknownPolicy(Message, frozen=True, kw_only=True):
     penalty: Annotated[int, Meta(ge=0, le=254)] = 200
 
 
-class Debounce(Message, frozen=True, kw_only=True):
-    """How many readings in a row change an area's state (the thesis: five either way)."""
-
-    to_blocked: Annotated[int, Meta(ge=1, le=1000)] = 5
-    to_clear: Annotated[int, Meta(ge=1, le=1000)] = 5
-
-
 class AreaDefinition(Message, frozen=True, kw_only=True):
-    """What an area is: where it lies, who watches it, how it is judged; `number` is its name on the thesis's topics."""
+    """What an area is: where it lies, who watches it, how its readings are debounced.
+
+    `number` is its name on the thesis's topics. `debounce` names the aggregator's rule (`rule`) and holds its options.
+    """
 
     id: Id
     label: Annotated[str, Meta(max_length=100)] = ""
     polygon: Ring
     nodes: list[Id] = []
     number: Annotated[int, Meta(ge=0, le=9999)] | None = None
-    debounce: Debounce = Debounce()
+    debounce: dict[str, Any] = {}
     unknown: UnknownPolicy = UnknownPolicy()
     version: Count = 0
     removed: bool = False

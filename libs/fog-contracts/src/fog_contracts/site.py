@@ -1,10 +1,10 @@
 """What a site is: its map, places, areas, nodes and robots, as `site.toml` spells them; lengths in m, angles in rad."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 from msgspec import Meta, field
 
-from fog_contracts.messages import AreaDefinition, Debounce, Id, Message, Metres, Pose, Radians, Ring, UnknownPolicy
+from fog_contracts.messages import AreaDefinition, Id, Message, Metres, Pose, Radians, Ring, UnknownPolicy
 
 
 class Place(Message, frozen=True, kw_only=True):
@@ -41,13 +41,13 @@ class NodeSite(Message, frozen=True, kw_only=True):
 
 
 class AreaSite(Message, frozen=True, kw_only=True):
-    """A watched area: its polygon, how it is judged, and its number on the thesis's topics."""
+    """A watched area: its polygon, debounce (`rule` with its options beside) and number on the thesis's topics."""
 
     id: Id
     label: str = ""
     polygon: Ring
     number: Annotated[int, Meta(ge=0, le=9999)] | None = None
-    debounce: Debounce = Debounce()
+    debounce: dict[str, Any] = field(default_factory=dict)
     unknown: UnknownPolicy = UnknownPolicy()
 
 
@@ -69,7 +69,11 @@ class DemoPlan(Message, frozen=True, kw_only=True):
 
 
 class Site(Message, frozen=True, kw_only=True):
-    """A site as `site.toml` describes it."""
+    """A site as `site.toml` describes it.
+
+    `layers` are those of the costmap, bottom first, by name or as a table with `name` and the layer's own options;
+    without any, the standard ones are taken.
+    """
 
     id: Id
     name: str = ""
@@ -78,6 +82,7 @@ class Site(Message, frozen=True, kw_only=True):
     areas: list[AreaSite] = field(default_factory=list)
     nodes: list[NodeSite] = field(default_factory=list)
     robots: list[RobotSite] = field(default_factory=list)
+    layers: list[str | dict[str, Any]] = field(default_factory=list)
     demo: DemoPlan | None = None
 
     def definitions(self) -> list[AreaDefinition]:

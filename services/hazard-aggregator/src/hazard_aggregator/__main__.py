@@ -13,9 +13,9 @@ from fog_runtime.mqtt_edge import MqttEdge
 from fog_runtime.settings import describe, load
 from fog_runtime.site import load_site
 from fog_runtime.zenoh_edge import ZenohEdge
-from hazard_aggregator import debounce
 from hazard_aggregator.api import make_api
 from hazard_aggregator.core import Aggregator
+from hazard_aggregator.registry import find_rule
 from hazard_aggregator.service import Service
 from hazard_aggregator.settings import Settings
 from hazard_aggregator.store import Store, load_or_begin
@@ -35,8 +35,10 @@ async def main() -> None:
     async with Store(settings.redis_url, site) as store:
         stored, was_read = await load_or_begin(store)
         definitions = {d.id: d for d in [*loaded.site.definitions(), *stored.definitions]}
-        rule = debounce.find(settings.debounce)
-        core = Aggregator(definitions.values(), loaded.site.nodes, stored.epoch, stored.hazards, rule=rule)
+        core = Aggregator(
+            definitions.values(), loaded.site.nodes, stored.epoch, stored.hazards,
+            registry=find_rule, default_rule=settings.debounce,
+        )  # fmt: skip
         mqtt = MqttEdge(settings.mqtt_url, "hazard-aggregator", clock, site=site)
         async with ZenohEdge.open(
             connect=settings.zenoh_endpoints, clock=clock, role="hazard-aggregator", id=site, site=site

@@ -1,6 +1,6 @@
 """REST under /api/v1: areas with their state, and the health of nodes. Reading needs no token, PUT the operator's."""
 
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
 import msgspec
 from fastapi import Depends, FastAPI, Header, Request, Response
@@ -11,7 +11,6 @@ from fog_contracts.messages import (
     AreaDefinition,
     AreaHazard,
     AreaState,
-    Debounce,
     Id,
     Message,
     Ring,
@@ -30,6 +29,7 @@ from fog_runtime.http import (
     read_body,
     require,
 )
+from hazard_aggregator.debounce import DebounceError
 from hazard_aggregator.service import ConflictError, Service
 from hazard_aggregator.store import StoreError
 
@@ -43,7 +43,7 @@ class AreaBody(Message, frozen=True, kw_only=True):
     polygon: Ring
     nodes: list[Id] = msgspec.field(default_factory=list)
     number: Annotated[int, msgspec.Meta(ge=0, le=9999)] | None = None
-    debounce: Debounce = Debounce()
+    debounce: dict[str, Any] = msgspec.field(default_factory=dict)
     unknown: UnknownPolicy = UnknownPolicy()
     removed: bool = False
 
@@ -154,9 +154,14 @@ def _checked(area_id: str, body: AreaBody, service: Service, geometry: GridGeome
             detail = f"the site has no node {node}: add it to site.toml first, with its place and its limits"
             raise ProblemError(422, detail, field=f"body.nodes.{index}")
     try:
-        return msgspec.convert({**msgspec.to_builtins(body), "id": area_id, "polygon": polygon}, AreaDefinition)
+        definition = msgspec.convert({**msgspec.to_builtins(body), "id": area_id, "polygon": polygon}, AreaDefinition)
     except msgspec.ValidationError as error:  # the id comes from the path
         raise ProblemError(422, f"{area_id!r} is no id: use a to z, 0 to 9 and -, at most 32", field="path") from error
+    try:
+        service.core.check(definition)
+    except DebounceError as error:
+        raise ProblemError(422, error.problem, field=f"body.{error.field}") from error
+    return definition
 
 
 def _json(content: object, headers: dict[str, str] | None = None) -> Response:

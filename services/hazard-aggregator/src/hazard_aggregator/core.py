@@ -14,6 +14,7 @@ import msgspec
 from fog_contracts import channels as ch
 from fog_contracts.handlers import Publication, RefusedMessageError
 from fog_contracts.messages import NodeConfig
+from hazard_aggregator.debounce import DEFAULT_RULE
 from hazard_aggregator.fusion import AreaFusion
 from hazard_aggregator.outbox import Outbox
 
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from fog_contracts.handlers import Handler, Ids, Moment
     from fog_contracts.messages import AreaDefinition, AreaHazard, NodeReading, RobotPose
     from fog_contracts.site import NodeSite
-    from hazard_aggregator import debounce
+    from hazard_aggregator.debounce import Registry
     from hazard_aggregator.fusion import NodeReport
 
 
@@ -38,11 +39,14 @@ class Aggregator:
         epoch: int,
         restored: Iterable[AreaHazard] = (),
         *,
-        rule: debounce.RuleMaker | None = None,
+        registry: Registry,
+        default_rule: str = DEFAULT_RULE,
     ) -> None:
         self.epoch = epoch
         self.nodes = {node.id: node for node in nodes}
-        self._fusion = AreaFusion(definitions, self.nodes.values(), epoch, restored, rule=rule)
+        self._fusion = AreaFusion(
+            definitions, self.nodes.values(), epoch, restored, registry=registry, default_rule=default_rule
+        )
         self._outbox = Outbox()
 
     # --- What it holds ----------------------------------------------------------------------------------------------
@@ -70,6 +74,10 @@ class Aggregator:
     def node_reports(self, now: float) -> list[NodeReport]:
         """Return the health of every node of every area."""
         return self._fusion.node_reports(now)
+
+    def check(self, definition: AreaDefinition) -> None:
+        """Raise `DebounceError` when an area's debounce rule or its options can't be used."""
+        self._fusion.new_rule(definition)
 
     # --- Inputs -----------------------------------------------------------------------------------------------------
 

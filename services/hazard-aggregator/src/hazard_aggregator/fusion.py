@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from fog_contracts.channels import ROBOT_POSE
 from fog_contracts.costs import LETHAL
 from fog_contracts.messages import AreaDefinition, AreaHazard, Trace
-from hazard_aggregator import debounce
+from hazard_aggregator.debounce import DEFAULT_RULE, make_rule
 from hazard_aggregator.plausibility import Classification, classify_reading
 
 if TYPE_CHECKING:
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from fog_contracts.messages import AreaState, NodeReading, RobotPose
     from fog_contracts.site import NodeSite
+    from hazard_aggregator.debounce import Registry, Rule
 
 LATE_TICK_S: Final = 0.5
 """A tick that comes so long (s) after the last one tells of a process that was held up."""
@@ -34,7 +35,7 @@ class _Node:
 
     id: str
     site: NodeSite | None
-    rule: debounce.Rule
+    rule: Rule
     heard: float | None = None
     settled: float = 0.0
     state: AreaState = "unknown"
@@ -93,7 +94,8 @@ class AreaFusion:
 
     `restored` are the hazards that were stored last: a blocked area stays blocked until readings or silence say
     otherwise. All others start as unknown: nobody has looked since, and clear is only what readings of this run say.
-    `rule` makes the debounce rule of a node.
+    `registry` finds debounce rules by name, `default_rule` is the one of areas that name none; raises `DebounceError`
+    for an area's choice that can't be used.
     """
 
     def __init__(
@@ -103,11 +105,13 @@ class AreaFusion:
         epoch: int,
         restored: Iterable[AreaHazard] = (),
         *,
-        rule: debounce.RuleMaker | None = None,
+        registry: Registry,
+        default_rule: str = DEFAULT_RULE,
     ) -> None:
         self.epoch = epoch
         self._sites = {node.id: node for node in nodes}
-        self._rule = rule or debounce.find("consecutive")
+        self._registry = registry
+        self._default_rule = default_rule
         self._areas: dict[str, _Area] = {}
         self._tombstones: dict[str, AreaDefinition] = {}
         self._poses: dict[str, tuple[float, RobotPose]] = {}
@@ -181,7 +185,7 @@ class AreaFusion:
             name = THESIS_NODE.format(number=number)
             track = area.nodes.get(name)
             if track is None:
-                track = area.nodes[name] = _Node(name, None, self._rule(area.definition.debounce))
+                track = area.nodes[name] = _Node(name, None, self.new_rule(area.definition))
             said: AreaState = "blocked" if state == "blocked" else "clear" if state == "clear" else "unknown"
             reason = f"it says {said}" if said != "unknown" else "it says neither blocked nor clear"
             self._count(track, Classification(said, reason), now, stamp)
@@ -244,9 +248,14 @@ class AreaFusion:
                 changed += self._evaluate(area, stamp)
         return changed
 
+    def new_rule(self, definition: AreaDefinition) -> Rule:
+        """Return a fresh debounce rule for a node of an area; raises `DebounceError` for an unusable choice."""
+        return make_rule(definition.id, definition.debounce, self._registry, self._default_rule)
+
     # --- Inside -----------------------------------------------------------------------------------------------------
 
     def _define(self, definition: AreaDefinition) -> None:
+        self.new_rule(definition)  # an area without nodes must not hide a choice that can't be used
         old = self._areas.get(definition.id)
         if definition.removed:
             self._areas.pop(definition.id, None)
@@ -262,9 +271,9 @@ class AreaFusion:
             for name in [*definition.nodes, *sorted(thesis - set(definition.nodes))]:
                 node = old.nodes.get(name) if old is not None else None
                 if node is None:
-                    node = _Node(name, self._sites.get(name), self._rule(definition.debounce))
+                    node = _Node(name, self._sites.get(name), self.new_rule(definition))
                 elif not keep_rules:
-                    node.rule = self._rule(definition.debounce)
+                    node.rule = self.new_rule(definition)
                 area.nodes[name] = node
             self._areas[definition.id] = area
         self._by_node = {}
@@ -303,7 +312,7 @@ class AreaFusion:
         if classification.state != node.row_state:
             node.row_state = classification.state
             node.row_began = stamp
-        settled = node.rule.feed(classification.state)
+        settled = node.rule.feed(classification.state, now)
         if settled is None:
             return
         node.settled = now

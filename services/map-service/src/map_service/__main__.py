@@ -15,6 +15,7 @@ from fog_runtime.site import load_site
 from fog_runtime.zenoh_edge import ZenohEdge
 from map_service.api import make_api
 from map_service.core import MapCore
+from map_service.registry import make_layers
 from map_service.service import Service
 from map_service.settings import Settings
 from map_service.store import Store
@@ -37,6 +38,7 @@ async def main() -> None:
             loaded.map,
             await store.begin_epoch("map"),
             settings.inflation,
+            layers=make_layers(loaded.map, loaded.site.layers),
             definitions=loaded.site.definitions(),
             hazards_wait_s=settings.hazards_wait_s,
         )

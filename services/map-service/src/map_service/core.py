@@ -12,9 +12,9 @@ from fog_contracts import channels as ch
 from fog_contracts.costs import DEFAULT_INFLATION
 from fog_contracts.handlers import Publication
 from fog_contracts.messages import HazardArea, ZoneSet
-from map_service import layers as standard_layers
 from map_service.costmap import LayeredCostmap
-from map_service.layers import HazardsLayer, ZonesLayer
+from map_service.layers.hazards import HazardsLayer
+from map_service.layers.zones import ZonesLayer
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -36,7 +36,7 @@ AGGREGATOR_LOST_S: Final = 3.0
 class MapCore:
     """The map-service's core; nothing is published before the map is whole (`serving`).
 
-    `layers` are bottom first, with a `HazardsLayer` and a `ZonesLayer` among them; by default the standard ones.
+    `layers` are bottom first, with a `HazardsLayer` and a `ZonesLayer` among them (`map_service.registry`).
     `definitions` are areas known from the site: until the aggregator speaks of them they count as unknown.
     `hazards_wait_s` is how long the first tick's map waits for the hazards of all areas.
     """
@@ -48,12 +48,10 @@ class MapCore:
         epoch: int,
         inflation: Inflation = DEFAULT_INFLATION,
         *,
-        layers: Sequence[CostLayer] | None = None,
+        layers: Sequence[CostLayer],
         definitions: Iterable[AreaDefinition] = (),
         hazards_wait_s: float = 0.0,
     ) -> None:
-        if layers is None:
-            layers = standard_layers.standard(static.geometry, static.cells)
         self._layers = layers
         self._hazards = _only(layers, HazardsLayer)
         self._zones = _only(layers, ZonesLayer)

@@ -9,7 +9,7 @@ from msgspec import structs
 
 from fog_contracts.messages import Trace
 from fog_contracts.replica import MasterMap
-from map_service.layers import InflationLayer
+from map_service.layers.inflation import InflationLayer
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

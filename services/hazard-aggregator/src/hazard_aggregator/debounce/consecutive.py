@@ -2,28 +2,39 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+from msgspec import Meta, Struct
+
+from hazard_aggregator.debounce import RuleFactory
 
 if TYPE_CHECKING:
-    from fog_contracts.messages import AreaState, Debounce
+    from fog_contracts.messages import AreaState
+
+
+class Options(Struct, frozen=True, kw_only=True):
+    """How many readings in a row change a node's state (the thesis: five either way)."""
+
+    to_blocked: Annotated[int, Meta(ge=1, le=1000)] = 5
+    to_clear: Annotated[int, Meta(ge=1, le=1000)] = 5
 
 
 class Consecutive:
-    """Counts verdicts in a row; one that differs starts the count again.
+    """Counts readings in a row; one that says something else starts the count again.
 
     A row of implausible readings settles `unknown` after as many as settle `blocked`.
     """
 
-    def __init__(self, limits: Debounce) -> None:
-        self._needed = {"blocked": limits.to_blocked, "unknown": limits.to_blocked, "clear": limits.to_clear}
+    def __init__(self, options: Options) -> None:
+        self._needed = {"blocked": options.to_blocked, "unknown": options.to_blocked, "clear": options.to_clear}
         self._last: AreaState | None = None
         self._count = 0
 
-    def feed(self, verdict: AreaState) -> AreaState | None:
-        """Take the verdict of one reading; return it once it is the N-th in a row."""
-        self._count = self._count + 1 if verdict == self._last else 1
-        self._last = verdict
-        return verdict if self._count >= self._needed[verdict] else None
+    def feed(self, state: AreaState, at: float) -> AreaState | None:  # noqa: ARG002  # it counts, whatever the time
+        """Take what one reading says; return it once it is the N-th in a row."""
+        self._count = self._count + 1 if state == self._last else 1
+        self._last = state
+        return state if self._count >= self._needed[state] else None
 
     def reset(self) -> None:
         """Forget the row."""
@@ -31,6 +42,4 @@ class Consecutive:
         self._count = 0
 
 
-def make(limits: Debounce) -> Consecutive:
-    """Return a fresh rule for one node."""
-    return Consecutive(limits)
+RULE = RuleFactory(options=Options, make=Consecutive)

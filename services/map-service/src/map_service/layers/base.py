@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING, NamedTuple
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Generic, NamedTuple, TypeVar
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from fog_contracts.costs import combine_costs, combine_speed_limits
-from fog_contracts.grid import Window
+from fog_contracts.grid import GridGeometry, Window
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from fog_contracts.channels import Channel
     from fog_contracts.handlers import Handler, Moment, Publication
     from fog_contracts.messages import Cause, Trace
     from map_service.shapes import ShapeMask
 
+Options = TypeVar("Options", bound=msgspec.Struct)
 Grid = NDArray[np.uint8]
 
 
@@ -64,6 +67,25 @@ class CostLayer(ABC):
         """Return what was marked since this was last called."""
         updated, self._updated = self._updated, []
         return updated
+
+
+class FloorPlan(NamedTuple):
+    """What layers lie on: the grid, and the plan's cells, uint8 (height, width): 0 free, 254 occupied, 255 unknown."""
+
+    geometry: GridGeometry
+    cells: Grid
+
+
+class NoOptions(msgspec.Struct, frozen=True):
+    """The options of a layer that has none."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LayerFactory(Generic[Options]):
+    """What a layer registers under its name in the entry points `fognav.cost_layers`."""
+
+    options: type[Options]
+    make: Callable[[FloorPlan, Options], CostLayer]
 
 
 def write_cost(shape: ShapeMask, window: Window, cost: Grid, value: int) -> None:

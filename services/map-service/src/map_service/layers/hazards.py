@@ -15,7 +15,7 @@ from fog_contracts import channels as ch
 from fog_contracts.geometry import GeometryError, normalized_polygon, rasterize
 from fog_contracts.handlers import Publication, RefusedMessageError
 from fog_contracts.messages import AreaHazard, Cause, HazardArea
-from map_service.layers.base import CostLayer, write_cost, write_speed_limit
+from map_service.layers.base import CostLayer, LayerFactory, NoOptions, write_cost, write_speed_limit
 from map_service.shapes import ShapeMask
 
 if TYPE_CHECKING:
@@ -157,3 +157,6 @@ class HazardsLayer(CostLayer):
 def _published(definition: AreaDefinition, hazard: AreaHazard) -> Publication:
     described = HazardArea(hazard=hazard, polygon=definition.polygon, label=definition.label)
     return Publication(ch.HAZARD, described, {"area": hazard.area})
+
+
+LAYER = LayerFactory(options=NoOptions, make=lambda plan, _options: HazardsLayer(plan.geometry))

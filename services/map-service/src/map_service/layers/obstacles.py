@@ -19,7 +19,7 @@ from fog_contracts import channels as ch
 from fog_contracts.costs import LETHAL
 from fog_contracts.grid import Window
 from fog_contracts.messages import VIEW_SECTORS, Cause
-from map_service.layers.base import CostLayer, write_cost
+from map_service.layers.base import CostLayer, LayerFactory, NoOptions, write_cost
 from map_service.shapes import ShapeMask
 
 if TYPE_CHECKING:
@@ -182,3 +182,6 @@ class ObstaclesLayer(CostLayer):
 def _beside(pose: RobotPose, x: float, y: float) -> bool:
     reach = pose.radius + ROBOT_MARGIN
     return (x - pose.x) ** 2 + (y - pose.y) ** 2 <= reach * reach
+
+
+LAYER = LayerFactory(options=NoOptions, make=lambda plan, _options: ObstaclesLayer(plan.geometry))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from map_service.layers.base import CostLayer
+from map_service.layers.base import CostLayer, LayerFactory, NoOptions
 
 if TYPE_CHECKING:
     from fog_contracts.grid import Window
@@ -22,3 +22,6 @@ class StaticLayer(CostLayer):
         """Write the plan; it sets no speed limit."""
         cost[...] = self._cells[window.rows, window.columns]
         speed[...] = 0
+
+
+LAYER = LayerFactory(options=NoOptions, make=lambda plan, _options: StaticLayer(plan.cells))

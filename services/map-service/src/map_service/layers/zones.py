@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from fog_contracts.costs import COST_PER_FACTOR, LETHAL, PENALTY_MAX
 from fog_contracts.messages import Cause
-from map_service.layers.base import CostLayer, write_cost, write_speed_limit
+from map_service.layers.base import CostLayer, LayerFactory, NoOptions, write_cost, write_speed_limit
 from map_service.shapes import ZoneError, rasterize_shape
 
 if TYPE_CHECKING:
@@ -132,3 +132,6 @@ class ZonesLayer(CostLayer):
 
     def _mark(self, held: _Held, state: str) -> None:
         self.mark_updated(held.mask.window, Cause(kind="zone", id=held.zone.id, state=state))
+
+
+LAYER = LayerFactory(options=NoOptions, make=lambda plan, _options: ZonesLayer(plan.geometry))

@@ -1,0 +1,16 @@
+"""Debounce rules by name, ours like anybody's: what installed packages registered as entry points."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+from fog_runtime import parts
+from hazard_aggregator.debounce import RuleFactory
+
+GROUP: Final = "fognav.debounce_rules"
+
+
+def find_rule(name: str) -> RuleFactory[Any]:
+    """Return the factory of a debounce rule; raises `PartError`, which names the rules that there are."""
+    factory: RuleFactory[Any] = parts.load(GROUP, name, RuleFactory)
+    return factory

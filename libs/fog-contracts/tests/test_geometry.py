@@ -152,6 +152,13 @@ def test_points_in_bulk_get_the_cells_that_single_points_get(points):
     assert [tuple(centre) for centre in GRID.centres(cells).tolist()] == [GRID.centre(*cell) for cell in cells.tolist()]
 
 
+@given(st.lists(st.tuples(st.floats(-9, 9), st.floats(-9, 9)), max_size=12))
+def test_grid_coordinates_have_whole_numbers_at_centres_and_lead_back(points):
+    coordinates = GRID.grid_coordinates(np.array(points, dtype=np.float64))
+    assert GRID.centres(coordinates) == pytest.approx(np.array(points, dtype=np.float64).reshape(-1, 2), abs=1e-9)
+    assert GRID.grid_coordinates(np.array([GRID.centre(3, 5)]))[0] == pytest.approx((3.0, 5.0))
+
+
 def test_sampling_a_grid_gives_the_cells_values_and_the_stated_one_outside():
     grid = np.arange(GRID.width * GRID.height, dtype=np.uint8).reshape(GRID.shape)
     points = np.array([(-1.95, -0.95), (-1.85, -0.85), (-2.01, 0.0), (1.99, 1.99), (2.01, 0.0), (0.0, 9.0)])

@@ -9,19 +9,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from ring_map import LEFT, LOWER, RES, RIGHT, UPPER, Grid, Map, goal, pose, via
 
 from fog_contracts import channels as ch
-from fog_contracts.costs import DEFAULT_INFLATION
-from fog_contracts.grid import GridGeometry, Window
+from fog_contracts.grid import GridGeometry
 from fog_contracts.handlers import Moment, Publication
 from fog_contracts.messages import (
-    AreaHazard,
-    AreaState,
-    Cause,
     CircleShape,
     CorridorShape,
     EgressRequest,
-    HazardArea,
     MapDelta,
     Message,
     PlanReply,
@@ -29,85 +25,14 @@ from fog_contracts.messages import (
     Pose,
     RobotGoal,
     RobotPath,
-    RobotPose,
     RobotState,
     Trace,
     Zone,
     ZoneSet,
 )
-from fog_contracts.replica import MasterMap
 from fog_kernels.astar import Planner
-from fog_kernels.inflation import inflate, inflation_table
 from planner.core import PlannerCore
 from planner.route import Route
-
-Grid = NDArray[np.uint8]
-Box = tuple[float, float, float, float]
-
-RES = 0.1
-
-
-class Map:
-    """A ring of corridors 2 m wide, 20 x 12 m: an upper and a lower way from left to right."""
-
-    def __init__(self, epoch: int = 1, walls: tuple[Box, ...] = ((2.0, 2.0, 18.0, 10.0),)) -> None:
-        self.geometry = GridGeometry(200, 120, RES, 0.0, 0.0)
-        self.static = np.zeros(self.geometry.shape, np.uint8)
-        self.static[[0, -1], :] = 254
-        self.static[:, [0, -1]] = 254
-        for wall in walls:
-            self.paint(self.static, wall, 254)
-        self.table = inflation_table(RES, DEFAULT_INFLATION)
-        self.areas: dict[str, Box] = {}
-        self.penalties: dict[str, int] = {}
-        self.master = MasterMap("test", self.geometry, self.static, inflate(self.static, self.table), epoch)
-        self.epoch = epoch
-
-    def paint(self, grid: Grid, box: Box, value: int) -> None:
-        window = self.geometry.window_around(box[0], box[1], box[2] - 1e-6, box[3] - 1e-6)
-        cells = grid[window.rows, window.columns]
-        cells[:] = np.maximum(cells, value)
-
-    def cost(self) -> Grid:
-        raw = self.static.copy()
-        for name, box in self.areas.items():
-            self.paint(raw, box, self.penalties[name])
-        return inflate(raw, self.table)
-
-    def put(self, name: str, box: Box, penalty: int = 254, trace: Trace | None = None) -> list[MapDelta]:
-        self.areas[name], self.penalties[name] = box, penalty
-        return self._publish(name, trace)
-
-    def clear(self, name: str) -> list[MapDelta]:
-        del self.areas[name]
-        return self._publish(name, None)
-
-    def _publish(self, name: str, trace: Trace | None) -> list[MapDelta]:
-        old, new = self.master.layers["cost"], self.cost()
-        rows, columns = np.nonzero(old != new)
-        if len(rows) == 0:
-            return []
-        x, y = int(columns.min()), int(rows.min())
-        window = Window(x, y, int(columns.max()) - x + 1, int(rows.max()) - y + 1)
-        causes = [Cause(kind="hazard", id=name, state="blocked")]
-        cells = np.ascontiguousarray(new[window.rows, window.columns])
-        return self.master.write([("cost", window, cells)], causes, [trace] if trace else [])
-
-    def told(self, name: str, state: AreaState = "blocked") -> HazardArea:
-        x0, y0, x1, y1 = self.areas[name]
-        hazard = AreaHazard(area=name, state=state, severity=2, penalty=254, since=0.0, seq=1, epoch=1, cause="test")
-        return HazardArea(hazard=hazard, polygon=[(x0, y0), (x1, y0), (x1, y1), (x0, y1)])
-
-
-def pose(x: float, y: float, theta: float = 0.0, *, localized: bool = True) -> RobotPose:
-    return RobotPose(
-        x=x, y=y, theta=theta, covariance=[0.0] * 9, v=0.0, w=0.0, radius=0.17, height=0.1, stamp=0.0,
-        localized=localized,
-    )  # fmt: skip
-
-
-def goal(x: float, y: float, name: str = "g1") -> RobotGoal:
-    return RobotGoal(goal_id=name, pose=Pose(x=x, y=y, theta=0.0))
 
 
 def crosses(points: NDArray[np.float64], cost: Grid, geometry: GridGeometry) -> bool:
@@ -175,14 +100,6 @@ class Drive:
         self.core.set_goal("r1", goal(x, y, name))
         self.step()
         return self.paths[-1]
-
-
-LEFT, RIGHT = (1.0, 7.0), (19.0, 7.0)  # nearer to the upper corridor
-UPPER, LOWER = (9.0, 10.0, 11.0, 12.0), (9.0, 0.0, 11.0, 2.0)
-
-
-def via(path: RobotPath) -> str:
-    return "upper" if max(y for _, y in path.points) > 10.0 else "lower"
 
 
 def test_a_path_leads_from_the_robot_to_the_goal_with_points_ten_centimetres_apart() -> None:
@@ -453,25 +370,66 @@ def test_egress_is_refused_when_another_area_blocks_the_way_out() -> None:
     assert reply.refusal.code == 205
 
 
+def reached(goal_id: str) -> RobotState:
+    return RobotState(
+        mode="NORMAL", reasons=[], enabled=True, battery=None, goal_id=goal_id, map_epoch=1, map_seq=0, plan_id=1,
+        goal_reached=True,
+    )  # fmt: skip
+
+
 def test_a_reached_goal_ends_and_the_robot_is_told_until_it_gets_another() -> None:
     drive = Drive(start=LEFT)
     drive.go(*RIGHT)
 
-    def state(goal_id: str) -> RobotState:
-        return RobotState(
-            mode="NORMAL", reasons=[], enabled=True, battery=None, goal_id=goal_id, map_epoch=1, map_seq=0, plan_id=1,
-            goal_reached=True,
-        )  # fmt: skip
-
-    drive.hear(ch.ROBOT_STATE, state("another"), robot="r1")
+    drive.hear(ch.ROBOT_STATE, reached("another"), robot="r1")
     assert drive.core.goal("r1")
-    drive.hear(ch.ROBOT_STATE, state("g1"), robot="r1")
+    drive.hear(ch.ROBOT_STATE, reached("g1"), robot="r1")
     count = len(drive.paths)
     drive.step(1.2)
     assert drive.core.goal("r1") is None
     assert len(drive.paths) == count
     assert [(g.goal_id, g.pose) for g in drive.goals[-2:]] == [("g1", None), ("g1", None)]
     assert drive.go(*LEFT, name="g2").goal_id == "g2"
+
+
+def test_a_goal_that_changes_between_planning_and_publishing_gets_no_outdated_path() -> None:
+    drive = Drive(start=LEFT)
+    drive.go(*RIGHT)
+    drive.step(0.4)
+    for change in (lambda: drive.core.set_goal("r1", goal(*LEFT, name="g2")), lambda: drive.core.cancel("r1")):
+        count = len(drive.paths)
+        drive.now += 1.0
+        drive.hear(ch.MAP_HEARTBEAT, drive.map.master.heartbeat(drive.now))
+        drive.hear(ch.ROBOT_POSE, pose(*LEFT), robot="r1")
+        drive.core.plan(drive.moment)
+        change()
+        drive.publish(drive.core.publish(drive.moment))
+        assert len(drive.paths) == count
+    assert drive.goals[-1].pose is None
+
+
+def test_a_reached_goal_is_handed_over_once() -> None:
+    drive = Drive(start=LEFT)
+    drive.go(*RIGHT)
+    assert drive.core.take_reached() == []
+    drive.hear(ch.ROBOT_STATE, reached("g1"), robot="r1")
+    drive.hear(ch.ROBOT_STATE, reached("g1"), robot="r1")
+    assert drive.core.take_reached() == [("r1", "g1")]
+    assert drive.core.take_reached() == []
+    drive.go(*LEFT, name="g2")
+    drive.core.cancel("r1")
+    assert drive.core.take_reached() == []
+
+
+def test_what_counts_is_when_a_message_arrived_and_not_when_its_turn_came() -> None:
+    drive = Drive(start=LEFT)
+    drive.core.set_goal("r1", goal(*RIGHT))
+    arrived = drive.moment
+    drive.now += 1.5
+    drive.core.handlers()[ch.MAP_HEARTBEAT]({}, drive.map.master.heartbeat(0.0), arrived)
+    drive.core.handlers()[ch.ROBOT_POSE]({"robot": "r1"}, pose(*LEFT), arrived)
+    drive.publish(drive.core.tick(drive.moment))
+    assert drive.paths == []
 
 
 def test_a_preview_answers_without_touching_any_mission() -> None:

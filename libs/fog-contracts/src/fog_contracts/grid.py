@@ -112,8 +112,14 @@ class GridGeometry(msgspec.Struct, frozen=True):
         inside: NDArray[np.bool_] = np.all((cells >= 0) & (cells < (self.width, self.height)), axis=1)
         return cells, inside
 
-    def centres(self, cells: NDArray[np.integer]) -> NDArray[np.float64]:
-        """Return the centres (float64 (n, 2), m) of cells ((n, 2), each (column, row))."""
+    def grid_coordinates(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return where `points` ((n, 2), m) lie in columns and rows (float64 (n, 2)), centres being whole numbers."""
+        origin = np.array((self.origin_x, self.origin_y))
+        coordinates: NDArray[np.float64] = (np.asarray(points).reshape(-1, 2) - origin) / self.resolution - 0.5
+        return coordinates
+
+    def centres(self, cells: NDArray[np.integer | np.floating]) -> NDArray[np.float64]:
+        """Return the centres (float64 (n, 2), m) of cells ((n, 2), each (column, row)); inverts `grid_coordinates`."""
         origin = np.array((self.origin_x, self.origin_y))
         centres: NDArray[np.float64] = origin + (np.asarray(cells).reshape(-1, 2) + 0.5) * self.resolution
         return centres

@@ -80,9 +80,8 @@ class PathSearch:
         point's cell stays: at most 4 cm away.
         """
         geometry = self._geometry
-        origin = np.array((geometry.origin_x, geometry.origin_y))
         cells = corners.astype(np.float64)
-        exact_start, exact_goal = ((np.array(point) - origin) / geometry.resolution - 0.5 for point in (start, goal))
+        exact_start, exact_goal = geometry.grid_coordinates(np.array((start, goal)))
         if len(cells) == 1:
             cells = np.concatenate((cells, cells))
         if _is_passable(cost, cells[-2], exact_goal):
@@ -91,8 +90,7 @@ class PathSearch:
             cells = np.concatenate((exact_start[None, :], cells))
         elif _is_passable(cost, exact_start, cells[1]):
             cells[0] = exact_start
-        points: Floats = (cells + 0.5) * geometry.resolution + origin
-        return points
+        return geometry.centres(cells)
 
     def _free_start(self, planning_map: PlanningMap, blocking: Sequence[Region], start: Cell) -> Cell | None:
         """Return the start's cell, or the nearest one where a robot may be; None when it is in a hazard, zone or wall.

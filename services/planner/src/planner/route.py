@@ -76,7 +76,7 @@ class Route:
         Lines of an escape count by their length alone: they begin in impassable cells on purpose.
         """
         points = self.rest(max(along, float(self._corner_along[self.escape])))
-        cells = (points - (geometry.origin_x, geometry.origin_y)) / geometry.resolution - 0.5
+        cells = geometry.grid_coordinates(points)
         total = 0.0
         for (x0, y0), (x1, y1) in itertools.pairwise(cells):
             total += line_cost(costmap, float(x0), float(y0), float(x1), float(y1))
@@ -90,8 +90,8 @@ class Route:
         """Whether a changed cell of the window lies within `reach` (m) of the rest of the line from `along`."""
         cells = math.ceil(reach / geometry.resolution)
         rest = self.points[self.along >= along - geometry.resolution]
-        columns = np.floor((rest[:, 0] - geometry.origin_x) / geometry.resolution).astype(np.int64)
-        rows = np.floor((rest[:, 1] - geometry.origin_y) / geometry.resolution).astype(np.int64)
+        on_line, _ = geometry.cells(rest)
+        columns, rows = on_line.T
         grown = geometry.clip(window.grown(cells))
         inside = (columns >= grown.x) & (columns < grown.x + grown.width)
         inside &= (rows >= grown.y) & (rows < grown.y + grown.height)

@@ -53,10 +53,8 @@ class RecordingCore(PlannerCore):
 
 class Rig:
     def __init__(self) -> None:
-        self.core, self.clock, self.session = RecordingCore(), ManualClock(), Session()
-        self.service = Service(
-            self.core, cast("Any", None), cast("Any", self.session), cast("Any", self.clock), Health()
-        )
+        self.core, self.clock, self.session = RecordingCore(), ManualClock(10.0), Session()
+        self.service = Service(self.core, cast("Any", None), cast("Any", self.session), self.clock, Health())
         self.service.subscribe()
 
 

@@ -41,6 +41,8 @@ type_cells  # numba: a name that compiled signatures close over
 _.FACTORY  # bases and lidars are found by their entry points
 _.RoombaEmulator
 _.RplidarEmulator
+_.DiffDriveEmulator
+_.Ld19Emulator
 
 # --- Protocols that are written down whole, as their data sheets do. ---
 _.NOT_CHARGING  # Roomba Open Interface
@@ -59,6 +61,7 @@ _.power
 _.query_list
 _.seek_dock
 _.sensors
+_.TIMEOUT  # diffdrive: every bit of its flags has a name
 _.GOOD  # RPLidar
 _.express_scan
 _.express_us

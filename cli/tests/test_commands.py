@@ -91,6 +91,12 @@ def test_a_file_that_can_t_be_written_is_refused_before_anything_starts(option: 
     assert f"there is no folder {tmp_path / 'nowhere'}" in done.output.replace("\n", "")
 
 
+@pytest.mark.parametrize(("option", "known"), [("--base", "diffdrive, roomba600"), ("--lidar", "ld19, rplidar-a1")])
+def test_hardware_that_nobody_can_simulate_is_refused_with_what_can_be(option: str, known: str) -> None:
+    words = said("demo", "--headless", option, "tank")
+    assert f"{option}: there is no 'tank' to simulate; use one of: {known}" in words
+
+
 def said(*arguments: str | Path) -> str:
     """Return what the command says of something that it can't use, in one line."""
     done = runner.invoke(app, [str(argument) for argument in arguments])

@@ -38,6 +38,14 @@ def test_without_a_hazard_the_robot_takes_the_short_way_through_the_watched_area
     assert free.distance_m == pytest.approx(free.planned_m, abs=1.0)
 
 
+def test_another_base_and_another_lidar_drive_as_well(free):
+    other = drive(3, base="diffdrive", lidar="ld19")
+    assert (other.outcome, other.contacts) == ("reached", 0), other.detail
+    assert other.pose_error_m < 0.15
+    assert other.operator_commands == 1
+    assert other.distance_m == pytest.approx(free.distance_m, rel=0.03)
+
+
 def test_a_robot_that_crosses_a_watched_area_raises_no_hazard(free):
     assert not [event for event in free.events if event.what.startswith("area z1: blocked")]
     assert free.replans == 0

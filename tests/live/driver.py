@@ -24,6 +24,7 @@ from fognav.demo.operator import Operator
 from fognav.demo.scene import Scene
 from fognav.demo.usage import children
 from fognav.stack import AGENT, MAP_SERVICE, PLANNER, WATCHDOG, Stack, StackConfig
+from fognav_sim.devices import DEFAULT_BASE, DEFAULT_LIDAR
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -74,12 +75,18 @@ class Line:
 class Floor:
     """A running stack and its only operator."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, *, base: str = DEFAULT_BASE, lidar: str = DEFAULT_LIDAR) -> None:
         self.events: list[Event] = []
         self.readings: list[NodeReading] = []
         self._truth_log = folder / "truth.jsonl"
         self._site = load_site(site_that_starts_at(folder / "site", *START))
-        config = StackConfig(site_dir=self._site.directory, robot=ROBOT, extra={"TRUTH_LOG": str(self._truth_log)})
+        config = StackConfig(
+            site_dir=self._site.directory,
+            robot=ROBOT,
+            base=base,
+            lidar=lidar,
+            extra={"TRUTH_LOG": str(self._truth_log)},
+        )
         self.stack = Stack(config, self.events.append)
         self.clock = SystemClock()
         self.scene = Scene(self._site, ROBOT, 1, 1.0)

@@ -144,6 +144,12 @@ def demo_command(
         typer.Option("--speed", metavar="K", min=0.1, max=50.0, help="Simulated time against wall time."),
     ] = 1.0,
     no_hazard: Annotated[bool, typer.Option("--no-hazard", help="Block nothing on the way.")] = False,
+    base: Annotated[
+        str, typer.Option("--base", metavar="NAME", help="What the robot drives on: roomba600 or diffdrive.")
+    ] = "roomba600",
+    lidar: Annotated[
+        str, typer.Option("--lidar", metavar="NAME", help="What the robot sees with: rplidar-a1 or ld19.")
+    ] = "rplidar-a1",
     keep_running: Annotated[
         bool, typer.Option("--keep-running", help="Leave everything running after the drive, until Ctrl-C.")
     ] = False,
@@ -171,7 +177,15 @@ def demo_command(
     except WrongUseError as error:
         _fail(str(error), WRONG_USE)
     _prepare(yes=yes)
-    options = Options(seed=seed, speed=speed, hazard=not no_hazard, keep_running=keep_running, record=record)
+    options = Options(
+        seed=seed,
+        speed=speed,
+        hazard=not no_hazard,
+        base=base,
+        lidar=lidar,
+        keep_running=keep_running,
+        record=record,
+    )
     try:
         values = asyncio.run(run_demo(folder, options, headless=headless, page_port=page_port, say=_say))
         if report is not None:

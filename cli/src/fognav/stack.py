@@ -16,6 +16,7 @@ from typing import Final, Self
 
 from fog_supervisor import net, servers
 from fog_supervisor.supervisor import Event, Program, Supervisor
+from fognav_sim.devices import DEFAULT_BASE, DEFAULT_LIDAR
 
 BROKER: Final = "mosquitto"
 REDIS: Final = "redis"
@@ -40,10 +41,16 @@ Ready = Callable[[], Awaitable[str | None]]
 
 @dataclass(frozen=True, kw_only=True)
 class StackConfig:
-    """What to run. `robot` is the id of the site's robot; `extra` are further FOGNAV_ settings for every process."""
+    """What to run.
+
+    `robot` is the id of the site's robot, `base` and `lidar` name its hardware; `extra` are further FOGNAV_ settings
+    for every process.
+    """
 
     site_dir: Path
     robot: str
+    base: str = DEFAULT_BASE
+    lidar: str = DEFAULT_LIDAR
     seed: int = 1
     speed: float = 1.0
     extra: Mapping[str, str] | None = None
@@ -166,11 +173,13 @@ class Stack:
         _write_secret(self.folder / "tokens.toml", tokens)
         _write_secret(self.folder / "operator.key", self.operator_key.hex() + "\n")
         self._add_servers()
-        self._add_python(SIMULATOR, "fognav_sim", {"RUN_DIR": str(self.folder / "sim")})
+        hardware = {"BASE": self.config.base, "LIDAR": self.config.lidar}
+        self._add_python(SIMULATOR, "fognav_sim", {**hardware, "RUN_DIR": str(self.folder / "sim")})
         for name, module in zip(SERVICES, ("hazard_aggregator", "map_service", "planner"), strict=True):
             self._add_python(name, module, {})
         socket = self.folder / "guardian.sock"
         wires = {
+            **hardware,
             "ROBOT": self.config.robot,
             "BASE_PORT": str(self.folder / "sim" / "base"),
             "LIDAR_PORT": str(self.folder / "sim" / "lidar"),

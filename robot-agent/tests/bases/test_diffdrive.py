@@ -64,9 +64,9 @@ def test_the_checksum_is_the_one_of_the_specification():
 
 def test_commands_are_the_lines_of_the_specification():
     assert protocol.enable() == b"$E*F991\n"
-    assert protocol.disable() == b"$X*3A0D\n"
+    assert protocol.line(b"X") == b"$X*3A0D\n"
     assert protocol.velocity(300, -250) == f"$V,300,-250*{crc(b'V,300,-250'):04X}\n".encode()
-    assert STOP.stop == (b"\n" + protocol.velocity(0, 0) + protocol.disable()) * 2
+    assert STOP.stop == (b"\n" + protocol.velocity(0, 0) + protocol.line(b"X")) * 2
     assert STOP.hold == b"\n" + protocol.velocity(0, 0)
     assert STOP.baud == protocol.BAUD
 

@@ -57,7 +57,14 @@ class Attempt:
         options = self.plan.options
         clock = SystemClock(self.scene.speed)
         site_dir = self.plan.site.directory
-        config = StackConfig(site_dir=site_dir, robot=self.plan.robot, seed=options.seed, speed=self.scene.speed)
+        config = StackConfig(
+            site_dir=site_dir,
+            robot=self.plan.robot,
+            base=options.base,
+            lidar=options.lidar,
+            seed=options.seed,
+            speed=self.scene.speed,
+        )
         async with Stack(config, self._on_process) as stack, self._keeping_logs(stack):
             if options.hazard and not self.plan.hazard:
                 self.scene.say("the site's [demo] lists no areas: nothing will be blocked")

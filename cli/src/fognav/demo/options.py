@@ -4,8 +4,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fog_contracts.site import Place
+from fog_runtime import parts
 from fog_runtime.site import LoadedSite
 from fognav.output import WrongUseError
+from fognav_sim import devices
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -15,6 +17,8 @@ class Options:
     seed: int = 1
     speed: float = 1.0
     hazard: bool = True
+    base: str = devices.DEFAULT_BASE
+    lidar: str = devices.DEFAULT_LIDAR
     keep_running: bool = False
     record: Path | None = None
 
@@ -33,7 +37,14 @@ class DrivePlan:
 
     @classmethod
     def of(cls, site: LoadedSite, options: Options) -> "DrivePlan":
-        """Return the plan; raises `WrongUseError` for a site without `[demo]` or without a robot."""
+        """Return the plan; raises `WrongUseError` for a site without `[demo]` or robot, or for unknown hardware."""
+        for option, name, group in (
+            ("--base", options.base, devices.BASES),
+            ("--lidar", options.lidar, devices.LIDARS),
+        ):
+            known = parts.names(group)
+            if name not in known:
+                raise WrongUseError(f"{option}: there is no {name!r} to simulate; use one of: {', '.join(known)}")
         demo = site.site.demo
         if demo is None:
             raise WrongUseError(f"{site.directory}/site.toml has no [demo]: name a start, a goal and areas there")

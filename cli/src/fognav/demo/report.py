@@ -35,6 +35,8 @@ def _outcome(attempt: Attempt) -> dict[str, object]:
         "success": attempt.success(),
         "reason": outcome.reason if outcome else "it ended before there was an outcome",
         "site": attempt.plan.site.site.id,
+        "base": attempt.plan.options.base,
+        "lidar": attempt.plan.options.lidar,
         "seed": attempt.plan.options.seed,
     }
 

@@ -14,7 +14,6 @@ from enum import IntFlag
 from typing import Final
 
 BAUD: Final = 115_200
-STATUS_PERIOD_S: Final = 0.02
 LINE_BYTES_MAX: Final = 64
 SPEED_MAX_MM_S: Final = 2000
 COUNTS: Final = 1 << 32
@@ -61,11 +60,6 @@ def _crc(body: bytes) -> int:
 def enable() -> bytes:
     """Switch the motors on, wheels at rest."""
     return line(b"E")
-
-
-def disable() -> bytes:
-    """Switch the motors off."""
-    return line(b"X")
 
 
 def velocity(left_mm_s: int, right_mm_s: int) -> bytes:

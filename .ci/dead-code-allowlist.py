@@ -39,6 +39,8 @@ _.log_message
 _.pending_calls_threshold  # aiomqtt
 type_cells  # numba: a name that compiled signatures close over
 _.FACTORY  # bases and lidars are found by their entry points
+_.LAYER  # cost layers, likewise
+_.RULE  # debounce rules, likewise
 _.RoombaEmulator
 _.RplidarEmulator
 _.DiffDriveEmulator

@@ -6,6 +6,7 @@ named here. Run it by `./fognav check`.
 
 # --- Fields of messages, reports and API answers: other programs and people read them. ---
 _.age_s  # api: age of an area's last reading
+_.after_input  # the agent's replay: where a recording and its replay differ
 _.author  # messages: of a zone
 _.control_p99_s  # messages: how regular the agent's loops are
 _.stream_p99_s
@@ -38,9 +39,9 @@ _.do_GET
 _.log_message
 _.pending_calls_threshold  # aiomqtt
 type_cells  # numba: a name that compiled signatures close over
-_.FACTORY  # bases and lidars are found by their entry points
-_.LAYER  # cost layers, likewise
-_.RULE  # debounce rules, likewise
+_.FACTORY  # bases, lidars, debounce rules and cost layers are found by their entry points
+_.RULE
+_.LAYER
 _.RoombaEmulator
 _.RplidarEmulator
 _.DiffDriveEmulator
@@ -92,5 +93,7 @@ _.scanning
 _.seeking_dock
 _.skipped_bytes
 _.axes
+_.odom_at
+_.ABSENT  # a version that a store's writes may expect, beside ANY
 _.reveal  # the way to the value of a secret setting
 _.Core  # the protocol that every core with a table of handlers fulfils

@@ -149,7 +149,7 @@ def test_the_terminal_shows_mode_reason_hazard_and_latency(demo: Demo) -> None:
 async def page(demo: Demo) -> AsyncIterator[Page]:
     chromium = system.find(system.CHROMIUM)
     if chromium is None:
-        pytest.skip("no Chromium: apt-get install chromium")
+        pytest.skip(f"no Chromium: {system.how_to_get([system.CHROMIUM])}, or ./fognav test --yes as root")
     async with serve(demo) as url, async_playwright() as playwright:
         browser = await playwright.chromium.launch(executable_path=str(chromium), args=FLAGS)
         opened = await browser.new_page(viewport={"width": 1200, "height": 800})

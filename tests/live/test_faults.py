@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger("live")
 """Tells measured figures (`pytest --log-cli-level=info`)."""
 
-pytestmark = [pytest.mark.live, pytest.mark.asyncio(loop_scope="module"), pytest.mark.timeout(90)]
+pytestmark = [pytest.mark.live, pytest.mark.reaction, pytest.mark.asyncio(loop_scope="module"), pytest.mark.timeout(90)]
 
 STOPPED_WITHIN_S = 0.3
 LATE_S, LOST_S = 1.0, 3.0

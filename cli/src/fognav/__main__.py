@@ -89,13 +89,15 @@ def _prepare(*, yes: bool) -> None:
     epilog="Example: fognav test --yes -k replica",
 )
 def run_tests(context: typer.Context, *, yes: Yes = False) -> None:
-    """Set up what is missing, then run every test.
+    """Set up what is missing, then run every test on all cores.
 
-    Those with real brokers are among them; further arguments go to pytest.
+    Those with real brokers are among them; further arguments go to pytest (`-n 0` runs them one after the other).
     """
+    from fognav import testing  # noqa: PLC0415  # the other commands need not wait for its imports
+
     _prepare(yes=yes)
-    command = [sys.executable, "-m", "pytest", *context.args]
-    done = subprocess.run(command, check=False, cwd=checkout.root())
+    testing.get_browser(yes=yes, say=_say)
+    done = subprocess.run(testing.pytest_command(context.args), check=False, cwd=checkout.root())
     raise typer.Exit(done.returncode)
 
 
@@ -167,14 +169,16 @@ def demo_command(
     Exit code 0 only if the goal was reached without touching anything, by a way that avoids the blocked area; 1 if it
     was not, or was interrupted (the report says which); 2 if what was asked for can't be used.
     """
-    from fognav.demo.command import run_demo  # noqa: PLC0415  # the other commands need not wait for its imports
+    from fog_runtime.site import SiteError, load_site  # noqa: PLC0415  # the other commands need not wait for imports
+    from fognav.demo.command import run_demo  # noqa: PLC0415  # same
     from fognav.demo.options import Options  # noqa: PLC0415  # same
 
     try:
         folder = checkout.site_folder(site)
+        load_site(folder)  # what can't be used is refused before anything is installed or compiled for it
         for file in (report, record):
             check_writable(file)
-    except WrongUseError as error:
+    except (WrongUseError, SiteError) as error:
         _fail(str(error), WRONG_USE)
     _prepare(yes=yes)
     options = Options(

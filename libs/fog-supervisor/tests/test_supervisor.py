@@ -11,6 +11,7 @@ import pytest
 
 from fog_supervisor.supervisor import Event, NotReadyError, Program, Supervisor, log_tail
 
+pytestmark = pytest.mark.live
 DEADLINE_S = 10.0
 
 

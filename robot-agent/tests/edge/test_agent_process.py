@@ -16,7 +16,7 @@ from fog_supervisor.servers import start_router
 from robot_agent.agent.replay import replay
 from robot_agent.localization.localizer import SavedPose
 
-pytestmark = [pytest.mark.live, pytest.mark.timeout(150)]
+pytestmark = [pytest.mark.live, pytest.mark.reaction, pytest.mark.timeout(150)]
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ from guardian_rig import STOP_S, wait_for
 
 from robot_agent.bases.diffdrive.emulator import DiffDriveEmulator
 
-pytestmark = [pytest.mark.live, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.live, pytest.mark.reaction, pytest.mark.timeout(120)]
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 LOOPBACK: Final = "127.0.0.1"
-_FIRST, _LAST = 20_000, 31_999
+PORTS = range(20_000, 32_000)
 """Below the range from which systems take the ports of outgoing connections: a client that tries to reach a server
 that is just restarting could otherwise be given the server's port, and even connect to itself."""
 _TRIES: Final = 200
@@ -24,14 +24,14 @@ def free_port(taken: set[int] | None = None) -> int:
     taken = set() if taken is None else taken
     generator = random.SystemRandom()
     for _ in range(_TRIES):
-        port = generator.randint(_FIRST, _LAST)
+        port = generator.choice(PORTS)
         if port in taken:
             continue
         with socket.socket() as probe, contextlib.suppress(OSError):
             probe.bind((LOOPBACK, port))
             taken.add(port)
             return port
-    raise OSError(f"no free port between {_FIRST} and {_LAST} after {_TRIES} tries: who listens on them all?")
+    raise OSError(f"no free port from {PORTS[0]} to {PORTS[-1]} after {_TRIES} tries: who listens on them all?")
 
 
 def read_port(path: Path) -> int | None:

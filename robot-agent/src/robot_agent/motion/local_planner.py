@@ -98,8 +98,10 @@ def local_costs(
     The master costmap is inflated already: only the lidar's own points are inflated here. Unknown cells stay so.
     """
     marks = np.zeros(cost.shape, np.uint8)
-    cells, inside = window.cells(seen[:, :2])
-    marks[cells[inside, 1], cells[inside, 0]] = LETHAL
+    columns = np.floor((seen[:, 0] - window.origin_x) / window.resolution).astype(np.int64)
+    rows = np.floor((seen[:, 1] - window.origin_y) / window.resolution).astype(np.int64)
+    inside = (columns >= 0) & (rows >= 0) & (columns < window.width) & (rows < window.height)
+    marks[rows[inside], columns[inside]] = LETHAL
     return np.maximum(cost, inflate(marks, table))
 
 
@@ -173,7 +175,7 @@ def detour(
     """
     route = PathFollower(path, math.inf)
     points, ahead = route.ahead(0.5 * window.resolution)
-    cells = window.sample(costs, points, UNKNOWN)
+    cells = _cells_of(points, costs, window)
     bad = np.flatnonzero((cells >= INSCRIBED) & (cells != UNKNOWN))
     start = window.cell(pose.x, pose.y)
     if not len(bad) or not window.contains_cell(*start) or costs[start[1], start[0]] >= INSCRIBED:
@@ -187,7 +189,18 @@ def detour(
     if not found.found:
         return path
     way = search.shortcut(costs, found.cells) if len(found.cells) > 1 else found.cells.astype(np.float64)
-    return np.vstack((window.centres(way), path[route.along > ahead[clear[0]]]))
+    metres = (way + 0.5) * window.resolution + (window.origin_x, window.origin_y)
+    return np.vstack((metres, path[route.along > ahead[clear[0]]]))
+
+
+def _cells_of(points: NDArray[np.float64], costs: NDArray[np.uint8], geometry: GridGeometry) -> NDArray[np.uint8]:
+    """Return the cost at each point (n, 2; m); unknown off the grid."""
+    columns = np.floor((points[:, 0] - geometry.origin_x) / geometry.resolution).astype(np.int64)
+    rows = np.floor((points[:, 1] - geometry.origin_y) / geometry.resolution).astype(np.int64)
+    inside = (columns >= 0) & (rows >= 0) & (columns < geometry.width) & (rows < geometry.height)
+    cells = np.full(len(points), UNKNOWN, np.uint8)
+    cells[inside] = costs[rows[inside], columns[inside]]
+    return cells
 
 
 class PathFollower:
@@ -349,7 +362,7 @@ def first_blocked(
     tight place. Lethal ones count everywhere, unless the planner knew of them too (`led_out`).
     """
     points, ahead = follower.ahead(0.5 * geometry.resolution)
-    cells = geometry.sample(cost, points, UNKNOWN)
+    cells = _cells_of(points, cost, geometry)
     bad = (cells >= INSCRIBED) & (ahead > skip)
     if not led_out:
         bad |= cells == LETHAL

@@ -1,0 +1,100 @@
+"""How `fognav test` calls pytest, which tests share a worker, and what it says at the end."""
+
+import importlib.util
+import os
+import pty
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from fognav import checkout, testing
+
+TESTS = """
+import pytest
+
+@pytest.mark.parametrize("n", range(3))
+def test_without_a_sonar(n):
+    pytest.skip("no sonar: plug one in")
+
+def test_well():
+    pass
+
+def test_ill():
+    assert False
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "test_some.py").write_text(TESTS)
+    (tmp_path / "pytest.ini").write_text("[pytest]\nasyncio_default_fixture_loop_scope = function\n")
+    return tmp_path
+
+
+def command(*, terminal: bool = False) -> list[str]:
+    return testing.pytest_command(["-n", "0", "test_some.py"], terminal=terminal)
+
+
+def test_what_was_skipped_is_told_once_with_the_way_to_get_it(folder: Path) -> None:
+    done = subprocess.run(command(), cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stdout.count("no sonar") == 1
+    assert "3 skipped: no sonar: plug one in" in done.stdout
+    assert "test_some.py sss.F" in done.stdout  # no terminal, no bar
+    assert done.stderr == ""
+
+
+def test_on_a_terminal_a_bar_shows_how_far_it_is_and_names_what_failed_at_once(folder: Path) -> None:
+    own, theirs = pty.openpty()
+    environment = {**os.environ, "TERM": "xterm", "COLUMNS": "100"}
+    process = subprocess.Popen(command(terminal=True), cwd=folder, stdout=theirs, stderr=theirs, env=environment)
+    os.close(theirs)
+    shown = b""
+    try:
+        while chunk := os.read(own, 4096):
+            shown += chunk
+    except OSError:  # Linux says so when the other end is closed
+        pass
+    assert process.wait() == 1
+    text = shown.decode()
+    assert "5/5" in text
+    assert text.index("test_some.py::test_ill") < text.index("FAILURES")
+    assert "sss" not in text
+    assert "3 skipped: no sonar: plug one in" in text
+
+
+def test_tests_run_on_all_cores_unless_somebody_asks_for_another_way() -> None:
+    command = testing.pytest_command(["-k", "replica"], terminal=False)
+    assert command[:3] == [sys.executable, "-m", "pytest"]
+    assert command[command.index("-n") + 1] == str((os.cpu_count() or 1) + 1)
+    assert command[-2:] == ["-k", "replica"]
+    for own in (["-n", "0"], ["-n4"], ["--pdb"], ["-s"], ["--collect-only"]):
+        assert "--dist" not in testing.pytest_command(own, terminal=False)
+
+
+@pytest.fixture(scope="module")
+def grouping() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("root_conftest", checkout.root() / "conftest.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_tests_that_measure_reactions_share_one_worker(grouping: ModuleType) -> None:
+    faults = grouping.group_of("tests/live/test_faults.py")
+    assert faults == grouping.group_of("robot-agent/tests/guardian/test_processes.py")
+    assert faults[0] == grouping.REACTION
+    assert grouping.group_of("cli/tests/test_stack.py")[0] == grouping.LIVE
+    assert grouping.group_of("tests/replay/test_replay.py")[0] == grouping.SYSTEM
+
+
+def test_tests_that_compute_leave_a_core_free(grouping: ModuleType) -> None:
+    modules = [path.relative_to(checkout.root()) for path in checkout.root().glob("*/*/tests/test_*.py")]
+    groups = {grouping.group_of(str(module)) for module in modules}
+    computing = {group for group in groups if group[0] == grouping.COMPUTING}
+    assert 1 <= len(computing) <= max(1, (os.cpu_count() or 1) - 1)

@@ -1,8 +1,15 @@
-"""Lets the tests of this member import the reference implementation that lies beside them."""
+"""Lets the tests of this member import what lies beside them, and guards the kernels' arrays without the compiler."""
 
 from __future__ import annotations
 
+import importlib
 import sys
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
+
+from compiler import COMPILED, guard_kernels
+
+if not COMPILED:
+    for name in ("amcl", "astar", "distance", "dwa", "inflation", "raycast"):
+        guard_kernels(importlib.import_module(f"fog_kernels.{name}"))

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from compiler import compiled_only, examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -107,7 +108,7 @@ def test_backing_up_is_as_precise_as_driving_forward() -> None:
     assert odometry_delta((0.0, 0.0, 0.0), (0.001, 0.002, 0.3)) == pytest.approx((0.0, math.hypot(1, 2) / 1000, 0.3))
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=examples(25), deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_scores_follow_their_definition(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -231,6 +232,7 @@ def track(seed: int, steps: int) -> tuple[list[NDArray[np.float32]], tuple[float
     return [x, y, theta], (truth[0], truth[1], truth[2]), errors
 
 
+@compiled_only
 def test_the_filter_converges_and_keeps_the_pose() -> None:
     particles, truth, errors = track(11, 40)
     assert max(errors[10:]) < 0.15
@@ -239,6 +241,7 @@ def test_the_filter_converges_and_keeps_the_pose() -> None:
     assert len(particles[0]) < 2000
 
 
+@compiled_only
 def test_the_same_seed_repeats_bit_for_bit_and_another_does_not() -> None:
     first, second, other = track(11, 12)[0], track(11, 12)[0], track(12, 12)[0]
     for a, b in zip(first, second, strict=True):
@@ -246,6 +249,7 @@ def test_the_same_seed_repeats_bit_for_bit_and_another_does_not() -> None:
     assert first[0].tobytes() != other[0].tobytes()
 
 
+@compiled_only
 def test_global_localization_by_scoring_poses_everywhere() -> None:
     truth = (9.2, 1.6, 2.0)
     ranges = scan(*truth)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from compiler import compiled_only, examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -95,7 +96,7 @@ def assert_valid(costmap: NDArray[np.uint8], cells: NDArray[np.int32], start: Ce
     assert total / (2 * STRAIGHT) == cost
 
 
-@settings(max_examples=250, deadline=None)
+@settings(max_examples=examples(250), deadline=None)
 @given(costmaps(), st.data())
 def test_cost_equals_dijkstra_and_the_path_has_that_cost(costmap: NDArray[np.uint8], data: st.DataObject) -> None:
     start, goal = cell_of(data, costmap), cell_of(data, costmap)
@@ -113,7 +114,7 @@ def test_cost_equals_dijkstra_and_the_path_has_that_cost(costmap: NDArray[np.uin
             assert_valid(costmap, result.cells, start, goal, result.cost)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(costmaps(), st.integers(1, 3000), st.floats(0, 20), st.data())
 def test_any_weights_are_exact(costmap: NDArray[np.uint8], neutral: int, factor: float, data: st.DataObject) -> None:
     start, goal = cell_of(data, costmap), cell_of(data, costmap)
@@ -122,7 +123,7 @@ def test_any_weights_are_exact(costmap: NDArray[np.uint8], neutral: int, factor:
     assert result.cost == (math.inf if expected is None else expected / (2 * STRAIGHT))
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=examples(200), deadline=None)
 @given(costmaps(), st.data())
 def test_replanning_with_the_goal_field_equals_a_full_search(static: NDArray[np.uint8], data: st.DataObject) -> None:
     start, goal = cell_of(data, static), cell_of(data, static)
@@ -144,14 +145,17 @@ def test_replanning_with_the_goal_field_equals_a_full_search(static: NDArray[np.
     assert planner.plan(static, start, other).cost == (math.inf if expected is None else expected / (2 * STRAIGHT))
 
 
-def test_costs_beyond_32_bits_are_exact() -> None:
+@pytest.mark.parametrize(
+    ("side", "neutral", "factor"), [pytest.param(101, 2000, 30.0, marks=compiled_only), (13, 50_000, 198.0)]
+)
+def test_costs_beyond_32_bits_are_exact(side: int, neutral: int, factor: float) -> None:
     """A serpentine of the dearest cells costs more than 2^31."""
-    costmap = np.full((101, 101), 252, np.uint8)
+    costmap = np.full((side, side), 252, np.uint8)
     costmap[1::4, :-1] = 254
     costmap[3::4, 1:] = 254
-    planner = Planner(101, 101, neutral=2000, factor=30.0)
-    start, goal = (0, 0), (100, 100)
-    weight = 2000 + 252 * 30
+    planner = Planner(side, side, neutral, factor)
+    start, goal = (0, 0), (side - 1, side - 1)
+    weight = neutral + 252 * factor
     result = planner.plan(costmap, start, goal)
     assert result.cost * 2 * STRAIGHT > 2**31
     assert result.cost == weight * (len(result.cells) - 1)
@@ -159,11 +163,12 @@ def test_costs_beyond_32_bits_are_exact() -> None:
     guided = planner.plan(costmap, start, goal)
     assert guided.cost == result.cost
     assert guided.expansions < result.expansions + 1
-    fresh = Planner(101, 101, neutral=2000, factor=30.0)
+    fresh = Planner(side, side, neutral, factor)
     fresh.set_goal_field(costmap, goal)
     assert fresh.plan(costmap, start, goal).cost == result.cost
 
 
+@compiled_only
 def test_a_goal_field_set_in_another_thread_never_misleads_a_plan() -> None:
     """A plan sees the field of its goal or none, whatever is being set beside it."""
     rng = np.random.default_rng(2)
@@ -189,21 +194,23 @@ def test_a_goal_field_set_in_another_thread_never_misleads_a_plan() -> None:
         thread.join()
 
 
-def test_a_dear_plan_after_a_cheap_goal_field_stays_exact() -> None:
+@pytest.mark.parametrize("side", [pytest.param(101, marks=compiled_only), 17])
+def test_a_dear_plan_after_a_cheap_goal_field_stays_exact(side: int) -> None:
     """Going over to 64-bit costs converts the field that is already set."""
-    static = np.zeros((101, 101), np.uint8)
+    static = np.zeros((side, side), np.uint8)
+    goal = (side - 1, side - 1)
     static[1::4, :-1] = 254
     static[3::4, 1:] = 254
-    planner = Planner(101, 101, neutral=100, factor=300.0)
-    planner.set_goal_field(static, (100, 100))
+    planner = Planner(side, side, neutral=100, factor=300.0)
+    planner.set_goal_field(static, goal)
     raised = np.maximum(static, 252)
-    result = planner.plan(raised, (0, 0), (100, 100))
+    result = planner.plan(raised, (0, 0), goal)
     assert result.cost * 2 * STRAIGHT > 2**31
-    fresh = Planner(101, 101, neutral=100, factor=300.0)
-    assert fresh.plan(raised, (0, 0), (100, 100)).cost == result.cost
+    fresh = Planner(side, side, neutral=100, factor=300.0)
+    assert fresh.plan(raised, (0, 0), goal).cost == result.cost
     cut = raised.copy()
-    cut[50, 50] = 254
-    assert not planner.plan(cut, (0, 0), (100, 100)).found
+    cut[side // 4 * 2, side // 2] = 254
+    assert not planner.plan(cut, (0, 0), goal).found
 
 
 def test_the_bound_on_expansions_ends_a_search_and_leaves_the_planner_usable() -> None:
@@ -230,7 +237,7 @@ def test_cells_outside_and_wrong_shapes_are_refused() -> None:
         shortcut(costmap, np.array([[0, 0], [3, 3]], np.int32))
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=examples(80), deadline=None)
 @given(costmaps(), st.data())
 def test_nearest_reachable_is_the_nearest_of_all_reachable(costmap: NDArray[np.uint8], data: st.DataObject) -> None:
     start, goal = cell_of(data, costmap), cell_of(data, costmap)
@@ -249,7 +256,7 @@ def test_nearest_traversable_looks_around_the_cell() -> None:
     assert nearest_traversable(costmap, (4, 4), 4) == (7, 2)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=examples(200), deadline=None)
 @given(costmaps(), st.data())
 def test_a_shortcut_stays_off_walls_and_costs_no_more(costmap: NDArray[np.uint8], data: st.DataObject) -> None:
     start, goal = cell_of(data, costmap), cell_of(data, costmap)
@@ -311,6 +318,7 @@ def read_movingai(path: Path) -> NDArray[np.uint8]:
     return np.array([[0 if c in ".GS" else 254 for c in row] for row in rows if row], np.uint8)
 
 
+@compiled_only
 @pytest.mark.data
 @pytest.mark.parametrize(
     "scenario", sorted((DATA / "movingai").glob("*.scen")) or [None], ids=lambda path: path.stem if path else "none"

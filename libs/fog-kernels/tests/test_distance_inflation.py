@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from compiler import examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -39,7 +40,7 @@ def raw_maps(draw: st.DrawFn, max_side: int = 90) -> NDArray[np.uint8]:
     return raw
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(raw_maps(50), st.integers(1, 20))
 def test_distances_equal_brute_force(raw: NDArray[np.uint8], cap: int) -> None:
     occupied = raw == 254
@@ -54,14 +55,14 @@ def reference_inflation(raw: NDArray[np.uint8], table: InflationTable) -> NDArra
     return np.where(raw == 255, 255, np.maximum(raw, inflated)).astype(np.uint8)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(raw_maps(), st.floats(0.05, 0.8))
 def test_inflation_equals_its_definition(raw: NDArray[np.uint8], radius: float) -> None:
     table = inflation_table(0.05, Inflation(inflation_radius=radius))
     assert np.array_equal(inflate(raw, table), reference_inflation(raw, table))
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=examples(150), deadline=None)
 @given(raw_maps(), st.data())
 def test_a_window_brings_the_whole_map_up_to_date(raw: NDArray[np.uint8], data: st.DataObject) -> None:
     table = inflation_table(0.05, Inflation(inflation_radius=data.draw(st.sampled_from([0.0, 0.2, 0.55]))))

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from compiler import compiled_only
 
 from fog_contracts.costs import DEFAULT_INFLATION
 from fog_kernels.dwa import DwaLimits, DwaResult, DwaSettings, dwa
@@ -108,6 +109,7 @@ def off_path(run: Drive, path: list[Point]) -> float:
     return worst
 
 
+@compiled_only
 @pytest.mark.parametrize("noise", [0.0, 0.01, 0.03])
 @pytest.mark.parametrize("theta", [0.0, math.pi, -2.0])
 def test_an_l_shaped_corridor_is_followed_to_its_end(noise: float, theta: float) -> None:
@@ -123,6 +125,7 @@ def test_an_l_shaped_corridor_is_followed_to_its_end(noise: float, theta: float)
         assert np.abs(straight[:, 5]).max() < 0.1  # no weaving
 
 
+@compiled_only
 def test_dense_and_sparse_paths_are_driven_alike() -> None:
     sparse = [(1.0, 1.25), (5.25, 1.25), (5.25, 6.5)]
     dense = [(1 + i * 0.05, 1.25) for i in range(85)] + [(5.25, 1.25 + i * 0.05) for i in range(105)]
@@ -130,6 +133,7 @@ def test_dense_and_sparse_paths_are_driven_alike() -> None:
     assert abs(runs[0].log[-1, 0] - runs[1].log[-1, 0]) < 1.0
 
 
+@compiled_only
 @pytest.mark.parametrize("noise", [0.0, 0.01, 0.03])
 @pytest.mark.parametrize(
     "path",
@@ -144,6 +148,7 @@ def test_a_doorway_of_90_cm_is_passed_without_touching(noise: float, path: list[
     assert run.log[:, 6].max() < 254
 
 
+@compiled_only
 def test_a_path_that_starts_behind_is_turned_to_in_place() -> None:
     run = drive(OPEN, (3.0, 3.0, math.pi), [(3.0, 3.0), (6.0, 3.0)], (6.0, 3.0))
     moving = run.log[run.log[:, 4] > 0.02]
@@ -153,6 +158,7 @@ def test_a_path_that_starts_behind_is_turned_to_in_place() -> None:
     assert run.distance_to((6.0, 3.0)) < 0.1
 
 
+@compiled_only
 def test_it_brakes_within_the_tolerance_and_turns_to_the_goals_heading() -> None:
     run = drive(OPEN, (3.0, 3.0, 0.0), [(3.0, 3.0), (5.0, 3.0)], (5.0, 3.0), goal_theta=2.0)
     assert run.distance_to((5.0, 3.0)) < 0.10
@@ -160,11 +166,13 @@ def test_it_brakes_within_the_tolerance_and_turns_to_the_goals_heading() -> None
     assert run.log[-1, 4] == run.log[-1, 5] == 0.0
 
 
+@compiled_only
 def test_beside_the_paths_end_the_goal_is_still_reached() -> None:
     run = drive(OPEN, (5.05, 3.3, 0.0), [(3.0, 3.0), (5.0, 3.0)], (5.0, 3.0))
     assert run.distance_to((5.0, 3.0)) < 0.10
 
 
+@compiled_only
 def test_an_unmapped_wall_across_the_path_is_never_touched() -> None:
     costmap = world((0.5, 0.5, 4.0, 7.5), (4.2, 0.5, 7.5, 7.5))
     run = drive(costmap, (1.0, 3.0, 0.0), [(1.0, 3.0), (7.0, 3.0)], (7.0, 3.0), seconds=40)

@@ -6,8 +6,11 @@ import subprocess
 import sys
 
 import pytest
+from compiler import compiled_only
 
 from fog_kernels import warm
+
+pytestmark = compiled_only
 
 RUN_ALL = """
 import numpy as np

@@ -210,7 +210,7 @@ def _sample_size(
     bins = 0
     needed = n_min
     drawn = 0
-    total = cumulated[-1]
+    total = cumulated[cumulated.size - 1]
     s0, s1, s2, s3 = state[0], state[1], state[2], state[3]
     while drawn < needed:
         s0, s1, s2, s3, u = _draw(s0, s1, s2, s3)
@@ -273,7 +273,7 @@ def _draw_low_variance(
     last = x.size - 1
     s0, s1, s2, s3 = state[0], state[1], state[2], state[3]
     s0, s1, s2, s3, offset = _draw(s0, s1, s2, s3)
-    step = cumulated[-1] / n
+    step = cumulated[last] / n
     source = 0
     for i in range(n):
         target = (i + offset) * step

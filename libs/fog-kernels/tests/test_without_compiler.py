@@ -1,0 +1,43 @@
+"""Every kernel's tests once more as plain Python, where overflow warns and a wrong index raises."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from compiler import Guarded, compiled_only
+
+OVERFLOW_WANTED = "ignore:overflow encountered in scalar:RuntimeWarning:fog_kernels.amcl"
+"""The generator of random numbers counts modulo 2^64; nothing else may overflow."""
+
+
+@compiled_only
+def test_kernels_hold_as_plain_python() -> None:
+    # Its own process: numba decides at import. Seconds, not minutes, on one core; the limit is there for a hang.
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "-W", OVERFLOW_WANTED,
+         str(Path(__file__).parent)],
+        env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
+        capture_output=True,
+        text=True,
+        timeout=170,
+        check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-1000:]
+    assert "failed" not in done.stdout
+    assert " passed" in done.stdout
+
+
+def test_guarded_arrays_refuse_what_compiled_kernels_would_read() -> None:
+    array = np.arange(6).reshape(2, 3).view(Guarded)
+    assert array[1, np.int64(2)] == 5
+    with pytest.raises(IndexError, match="negative"):
+        array[0, -1]
+    with pytest.raises(IndexError, match="negative"):
+        array[1:][np.int64(-1)] = 0
+    with pytest.raises(IndexError, match="out of bounds"):
+        array[2, 0]

@@ -103,23 +103,24 @@ class Network:
                 self.beat()
             case ("hear", n):
                 self.hear(n)
-            case ("deliver", n) if self.deltas:
-                self.follower.on_delta(self.deltas.pop(n % len(self.deltas)), self.now)
-            case ("double", n) if self.deltas:
-                self.follower.on_delta(self.deltas[n % len(self.deltas)], self.now)
-            case ("lose", n) if self.deltas:
-                self.deltas.pop(n % len(self.deltas))
-            case ("damage", n, position) if self.deltas:
-                delta = self.deltas.pop(n % len(self.deltas))
-                raw = bytearray(delta.cells)
-                raw[position % len(raw)] ^= 0x55
-                self.follower.on_delta(replace(delta, cells=bytes(raw)), self.now)
+            case ("deliver" | "double" | "lose" | "damage" as fate, n, *position) if self.deltas:
+                self.let_arrive(fate, n % len(self.deltas), *position)
             case ("ask",) if self.follower.wants_snapshot(self.now):
                 self.snapshots.append(self.writer.snapshot())
             case ("answer", n) if self.snapshots:
                 self.answer(n)
             case ("wait", seconds):
                 self.wait(seconds)
+
+    def let_arrive(self, fate, index, position=0):
+        """Decide what becomes of a delta that is under way."""
+        delta = self.deltas[index] if fate == "double" else self.deltas.pop(index)
+        if fate == "damage":
+            raw = bytearray(delta.cells)
+            raw[position % len(raw)] ^= 0x55
+            delta = replace(delta, cells=bytes(raw))
+        if fate != "lose":
+            self.follower.on_delta(delta, self.now)
 
     def wait(self, seconds):
         """Let time pass, in which age and gap only grow and no wish for a snapshot vanishes."""

@@ -18,7 +18,7 @@ _READ_BYTES: Final = 65536
 _WRITE_WAIT_S: Final = 0.1
 
 
-class PortLost(Exception):  # noqa: N818 - named for what happened; it is an end of the link, not a mistake
+class PortLost(Exception):  # noqa: N818  # named for what happened; it is an end of the link, not a mistake
     """The serial device is not there, not ours, or not answering any more."""
 
     def __init__(self, path: str, reason: str) -> None:

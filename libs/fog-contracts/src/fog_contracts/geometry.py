@@ -48,6 +48,23 @@ def normalized_polygon(points: Sequence[Sequence[float]]) -> list[Point]:
     Raises `GeometryError` when it has fewer than three distinct vertices, a number that is not finite, no area, or
     sides that cross.
     """
+    ring = _open_ring(points)
+    if len(ring) < 3:
+        raise GeometryError(f"a polygon needs at least three distinct vertices; this one has {len(ring)}")
+    longest = max(math.dist(ring[0], vertex) for vertex in ring)
+    if all(abs(_cross(ring[0], ring[1], vertex)) <= _COLLINEAR * longest * longest for vertex in ring):
+        raise GeometryError("the polygon has no area: its vertices lie on one line")
+    crossing = _first_crossing(ring)
+    if crossing is not None:
+        raise GeometryError(f"the polygon crosses itself: side {crossing[0]} meets side {crossing[1]}")
+    area = signed_area(ring)
+    if abs(area) < 1e-9:
+        raise GeometryError(f"the polygon has next to no area ({abs(area):.1e} m2)")
+    return ring if area > 0 else ring[::-1]
+
+
+def _open_ring(points: Sequence[Sequence[float]]) -> list[Point]:
+    """Return the vertices without repetitions, and without the last one where it closes the ring."""
     ring: list[Point] = []
     for index, point in enumerate(points):
         if len(point) != 2 or not all(math.isfinite(v) for v in point):
@@ -57,22 +74,18 @@ def normalized_polygon(points: Sequence[Sequence[float]]) -> list[Point]:
             ring.append(vertex)
     if len(ring) > 1 and ring[0] == ring[-1]:
         ring.pop()
-    if len(ring) < 3:
-        raise GeometryError(f"a polygon needs at least three distinct vertices; this one has {len(ring)}")
+    return ring
+
+
+def _first_crossing(ring: Sequence[Point]) -> tuple[int, int] | None:
+    """Return the numbers of the first two sides that touch without being neighbours; None where none do."""
     count = len(ring)
-    longest = max(math.dist(ring[0], vertex) for vertex in ring)
-    if all(abs(_cross(ring[0], ring[1], vertex)) <= _COLLINEAR * longest * longest for vertex in ring):
-        raise GeometryError("the polygon has no area: its vertices lie on one line")
     for i in range(count):
-        for j in range(i + 1, count):
-            if j == i + 1 or (i == 0 and j == count - 1):
-                continue
+        # The neighbours of a side share a corner with it: the next one, and for the first side the last one.
+        for j in range(i + 2, count - 1 if i == 0 else count):
             if segments_touch(ring[i], ring[i + 1], ring[j], ring[(j + 1) % count]):
-                raise GeometryError(f"the polygon crosses itself: side {i} meets side {j}")
-    area = signed_area(ring)
-    if abs(area) < 1e-9:
-        raise GeometryError(f"the polygon has next to no area ({abs(area):.1e} m2)")
-    return ring if area > 0 else ring[::-1]
+                return i, j
+    return None
 
 
 def contains_point(polygon: Polygon, x: float, y: float) -> bool:

@@ -282,15 +282,9 @@ class Replica:
         """Take one delta; the copy changes only when a version is complete and its hash fits."""
         if self.version is None or self._hashes is None or self.needs_snapshot:
             return "gap"
-        if delta.epoch != self.version.epoch:
-            return self._broken()
-        if delta.seq <= self.version.seq:
+        if delta.epoch == self.version.epoch and delta.seq <= self.version.seq:
             return "old"
-        if delta.seq != self.version.seq + 1:
-            return self._broken()
-        if any(known.parts != delta.parts or known.hash != delta.hash for known in self._parts.values()):
-            return self._broken()
-        if delta.part >= delta.parts:
+        if not self._follows(delta, self.version):
             return self._broken()
         self._parts[delta.part] = delta
         if len(self._parts) < delta.parts:
@@ -301,6 +295,12 @@ class Replica:
         """Take that the copy is of another history than the writer's: only a snapshot helps from now on."""
         self.needs_snapshot = True
         self._parts = {}
+
+    def _follows(self, delta: MapDelta, version: Version) -> bool:
+        """Whether this is a part of the version after ours, and of the same one as the parts that are already here."""
+        if (delta.epoch, delta.seq) != (version.epoch, version.seq + 1) or delta.part >= delta.parts:
+            return False
+        return all(known.parts == delta.parts and known.hash == delta.hash for known in self._parts.values())
 
     def _complete(self, delta: MapDelta) -> Outcome:
         assert self.version is not None

@@ -159,13 +159,9 @@ def _channels(file: Path, image: Path) -> tuple[NDArray[np.float64], NDArray[np.
                 raise MapFileError(file, "image", size, "Use a coarser resolution")
             if opened.mode in {"I", "I;16", "I;16B", "I;16L"}:
                 return (np.asarray(opened, dtype=np.float64) / 65_535.0)[:, :, None], None
-            mode = opened.mode
-            if mode in {"1", "L"}:
-                mode = "LA" if "transparency" in opened.info else "L"
-            elif mode == "P":
-                mode = "RGBA" if "transparency" in opened.info else "RGB"
-            elif mode not in {"LA", "RGB", "RGBA"}:
-                raise MapFileError(file, "image", f"{image} has pixels of kind {mode}", "Save it as PNG in grey")
+            mode = _plain_mode(opened)
+            if mode is None:
+                raise MapFileError(file, "image", f"{image} has pixels of kind {opened.mode}", "Save it as PNG in grey")
             pixels = np.asarray(opened.convert(mode), dtype=np.float64) / 255.0
     except (
         UnidentifiedImageError, OSError, SyntaxError, ValueError, Image.DecompressionBombWarning,
@@ -176,14 +172,27 @@ def _channels(file: Path, image: Path) -> tuple[NDArray[np.float64], NDArray[np.
         raise MapFileError(
             file, "image", f"{image} can't be decoded ({error})", "Save it anew, as PGM or PNG"
         ) from error
-    if pixels.ndim == 2:
-        pixels = pixels[:, :, None]
+    return _without_alpha(pixels, mode)
+
+
+def _plain_mode(image: Image.Image) -> str | None:
+    """Return the mode of Pillow (L, LA, RGB or RGBA) that holds all that an image says; None for none of them."""
+    transparent = "transparency" in image.info
+    if image.mode in {"1", "L"}:
+        return "LA" if transparent else "L"
+    if image.mode == "P":
+        return "RGBA" if transparent else "RGB"
+    return image.mode if image.mode in {"LA", "RGB", "RGBA"} else None
+
+
+def _without_alpha(pixels: NDArray[np.float64], mode: str) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+    """Split the pixels of an image in one of the plain modes into colours (h, w, n) and alpha (h, w) or None."""
     if mode == "LA":
         # Alpha weighs as one of four channels, as if grey had been spread to red, green and blue.
         return np.repeat(pixels[:, :, :1], 3, axis=2), pixels[:, :, 1]
     if mode == "RGBA":
         return pixels[:, :, :3], pixels[:, :, 3]
-    return pixels, None
+    return pixels[:, :, None] if pixels.ndim == 2 else pixels, None
 
 
 def load_occupancy(yaml_path: Path) -> Occupancy:

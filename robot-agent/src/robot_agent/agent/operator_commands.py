@@ -46,17 +46,23 @@ class OperatorCommands:
             case "enable" | "disable" | "reset":
                 return self._request(command.kind, at.now)
             case "cancel":
-                goal = self._robot.cancel_goal()
-                if goal is None:
-                    return _refused("there is no goal to cancel")
-                return CommandReply(accepted=True, reason=f"the goal {goal} is cancelled on the robot")
+                return self._cancel()
             case "initial_pose":
-                refusal = self._robot.take_initial_pose(command.pose)
-                if refusal is not None:
-                    return _refused(refusal)
-                return CommandReply(accepted=True, reason="taken; the next turns of the lidar check it")
+                return self._start_localization(command.pose)
             case "egress":
                 return _refused("this robot can't leave a blocked area by itself yet: end the block or move it by hand")
+
+    def _cancel(self) -> CommandReply:
+        goal = self._robot.cancel_goal()
+        if goal is None:
+            return _refused("there is no goal to cancel")
+        return CommandReply(accepted=True, reason=f"the goal {goal} is cancelled on the robot")
+
+    def _start_localization(self, pose: Pose | None) -> CommandReply:
+        refusal = self._robot.take_initial_pose(pose)
+        if refusal is not None:
+            return _refused(refusal)
+        return CommandReply(accepted=True, reason="taken; the next turns of the lidar check it")
 
     def _request(self, request: Request, now: float) -> CommandReply:
         outputs = self._robot.request(request, now)

@@ -138,54 +138,64 @@ class _Run:
         """Hand an input to the core."""
         self.count += 1
         self._result.inputs[type(entry).__name__] += 1
-        agent = self._agent
         match entry:
-            case log.MessageReceived():
-                self._message(entry)
-            case log.QueryReceived():
-                self._query(entry)
-            case log.SnapshotLoaded():
+            case log.MessageReceived() | log.QueryReceived():
+                self._from_channel(entry)
+            case log.SnapshotLoaded() | log.PoseRestored():
                 self._load(entry)
-            case log.PoseRestored():
-                agent.restore(entry.pose)
-            case log.BaseReceived():
-                agent.on_base(entry.feedback, entry.now)
-            case log.BaseLost():
-                agent.on_base_lost(entry.now, entry.reason)
-            case log.LidarNodesReceived():
-                agent.on_lidar_nodes(entry.now)
-            case log.ScanReceived():
-                agent.on_scan(entry.scan(), entry.now)
+            case log.BaseReceived() | log.BaseLost() | log.LidarNodesReceived() | log.ScanReceived():
+                self._from_hardware(entry)
             case log.LoopHealthReceived():
-                agent.on_loop_health(entry.health)
-            case log.ControlCycle():
-                self._job = agent.control_job(entry.now)
-            case log.DecisionMade():
-                self._decide(entry)
-            case log.StreamCycle():
-                agent.stream(entry.now, entry.stamp)
-            case log.Tick():
-                agent.tick(Moment(entry.now, entry.stamp))
-            case log.StorageCheck():
-                agent.pose_to_store(entry.now)
+                self._agent.on_loop_health(entry.health)
+            case log.ControlCycle() | log.DecisionMade() | log.StreamCycle() | log.Tick() | log.StorageCheck():
+                self._cycle(entry)
             case _:
                 raise ReplayError(f"input {self.count}: a log can't go on with {type(entry).__name__}")
 
-    def _message(self, entry: log.MessageReceived) -> None:
-        channel = CHANNELS[entry.channel]
-        message = msgspec.convert(entry.message, channel.message)
-        self._agent.handlers()[channel](entry.ids, message, Moment(entry.now, entry.stamp))
+    def _from_channel(self, entry: log.MessageReceived | log.QueryReceived) -> None:
+        channel, at = CHANNELS[entry.channel], Moment(entry.now, entry.stamp)
+        if isinstance(entry, log.MessageReceived):
+            self._agent.handlers()[channel](entry.ids, msgspec.convert(entry.message, channel.message), at)
+        else:
+            request = None if channel.message is None else msgspec.convert(entry.request, channel.message)
+            self._agent.answerers()[channel](entry.ids, request, at)
 
-    def _query(self, entry: log.QueryReceived) -> None:
-        channel = CHANNELS[entry.channel]
-        request = None if channel.message is None else msgspec.convert(entry.request, channel.message)
-        self._agent.answerers()[channel](entry.ids, request, Moment(entry.now, entry.stamp))
-
-    def _load(self, entry: log.SnapshotLoaded) -> None:
+    def _load(self, entry: log.SnapshotLoaded | log.PoseRestored) -> None:
+        if isinstance(entry, log.PoseRestored):
+            self._agent.restore(entry.pose)
+            return
         try:
             self._agent.load(entry.snapshot, entry.now)
         except MapError:
             return  # as it was refused then: what follows would differ otherwise
+
+    def _from_hardware(
+        self, entry: log.BaseReceived | log.BaseLost | log.LidarNodesReceived | log.ScanReceived
+    ) -> None:
+        match entry:
+            case log.BaseReceived():
+                self._agent.on_base(entry.feedback, entry.now)
+            case log.BaseLost():
+                self._agent.on_base_lost(entry.now, entry.reason)
+            case log.LidarNodesReceived():
+                self._agent.on_lidar_nodes(entry.now)
+            case log.ScanReceived():
+                self._agent.on_scan(entry.scan(), entry.now)
+
+    def _cycle(
+        self, entry: log.ControlCycle | log.DecisionMade | log.StreamCycle | log.Tick | log.StorageCheck
+    ) -> None:
+        match entry:
+            case log.ControlCycle():
+                self._job = self._agent.control_job(entry.now)
+            case log.DecisionMade():
+                self._decide(entry)
+            case log.StreamCycle():
+                self._agent.stream(entry.now, entry.stamp)
+            case log.Tick():
+                self._agent.tick(Moment(entry.now, entry.stamp))
+            case log.StorageCheck():
+                self._agent.pose_to_store(entry.now)
 
     def _decide(self, entry: log.DecisionMade) -> None:
         recorded = msgspec.json.encode(entry.decision)

@@ -162,20 +162,26 @@ class GuardianCore:
             base.overcurrent_since = None
         elif base.overcurrent_since is None:
             base.overcurrent_since = now
+        fault = self._fault(status, now)
+        return b"" if fault is None else self._latch(fault, now)
+
+    def _fault(self, status: BaseStatus, now: float) -> str | None:
+        """Return what a base that is awake reports and wheels must not turn with, in words; None for no such thing."""
         # A base may leave its driving mode by itself on cliff or wheel drop: those say more than the mode does.
         if status.cliff:
-            return self._latch("a cliff sensor sees no floor", now)
+            return "a cliff sensor sees no floor"
         if status.wheel_drop:
-            return self._latch("a wheel has dropped: the robot was lifted or hangs over an edge", now)
+            return "a wheel has dropped: the robot was lifted or hangs over an edge"
         if status.bumper:
             both = status.bumper_left and status.bumper_right
             side = "both sides" if both else "left" if status.bumper_left else "right"
-            return self._latch(f"the bumper is pressed ({side})", now)
-        if base.overcurrent_since is not None and now - base.overcurrent_since >= OVERCURRENT_S:
-            return self._latch("a wheel motor draws too much current: it is blocked", now)
+            return f"the bumper is pressed ({side})"
+        since = self._base.overcurrent_since
+        if since is not None and now - since >= OVERCURRENT_S:
+            return "a wheel motor draws too much current: it is blocked"
         if status.mode_problem is not None:
-            return self._latch(f"the base left its driving mode: {status.mode_problem}", now)
-        return b""
+            return f"the base left its driving mode: {status.mode_problem}"
+        return None
 
     def _latch(self, reason: str, now: float) -> bytes:
         news = self._latched is None

@@ -16,6 +16,7 @@ import subprocess
 import sys
 import time
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from fog_runtime import parts
@@ -45,8 +46,12 @@ STOPS: Final = "fognav.base_stops"
 DEFAULT_BASE: Final = "roomba600"
 
 
-class _Terminated(Exception):  # noqa: N818 - an end, not an error
+class _Terminated(Exception):  # noqa: N818  # an end, not an error
     """SIGTERM or SIGINT arrived."""
+
+
+class _BadSettings(Exception):  # noqa: N818  # an end, too
+    """The settings can't be used: the process ends, and is not to be started again as it is."""
 
 
 def _log(event: str, **fields: object) -> None:
@@ -169,48 +174,84 @@ def refuse_speed(speed: float, device: str) -> str | None:
     return f"FOGNAV_SPEED is {speed:g}, but {device} is no simulated device: unset it, real wheels need real seconds"
 
 
-def main() -> int:
-    """Guard until told to end."""
+@dataclass(frozen=True, slots=True)
+class _Settings:
+    """What the environment says: the base's port, what stops it, and simulated over wall time."""
+
+    path: str
+    base: StopCommand
+    speed: float
+
+
+def _settings() -> _Settings:
+    """Read the environment.
+
+    Raises:
+        _BadSettings: when a variable is missing or means nothing.
+
+    """
     path = os.environ.get("FOGNAV_BASE_PORT", "")
     if not path:
-        _log("bad_settings", reason="FOGNAV_BASE_PORT is not set: name the base's serial device, e.g. /dev/ttyUSB0")
-        return BAD_SETTINGS
+        raise _BadSettings("FOGNAV_BASE_PORT is not set: name the base's serial device, e.g. /dev/ttyUSB0")
     try:
         speed = float(os.environ.get("FOGNAV_SPEED", "1"))
     except ValueError:
         speed = -1.0
     if not 0 < speed < 1000:
-        _log("bad_settings", reason="FOGNAV_SPEED must be a positive number such as 1 (simulated over wall time)")
-        return BAD_SETTINGS
+        raise _BadSettings("FOGNAV_SPEED must be a positive number such as 1 (simulated over wall time)")
     try:
         base = parts.load(STOPS, os.environ.get("FOGNAV_BASE") or DEFAULT_BASE, StopCommand)
     except parts.PartError as error:
-        _log("bad_settings", reason=f"FOGNAV_BASE: {error}")
-        return BAD_SETTINGS
-    signal.signal(signal.SIGTERM, _terminate)
-    signal.signal(signal.SIGINT, _terminate)
+        raise _BadSettings(f"FOGNAV_BASE: {error}") from error
+    return _Settings(path, base, speed)
+
+
+def _guard(port: Port, settings: _Settings) -> int:
+    """Run one guardian after the other on an open port; returns PORT_LOST, or BAD_SETTINGS of the guardian.
+
+    Raises:
+        PortLost: when the port is gone before a guardian's first beat.
+        _BadSettings: when this port must not be guarded at this speed.
+
+    """
+    base, speed = settings.base, settings.speed
+    # First of all: a log that nobody reads must not keep the wheels turning.
+    stop_wheels(port, base.stop)
+    if (refusal := refuse_speed(speed, os.ttyname(port.fileno()))) is not None:
+        raise _BadSettings(refusal)
+    _log("port_open", path=settings.path)
     silence_s = max(SILENCE_S / speed, SILENCE_LEAST_S)
-    told = ""
+    while (code := guard_once(port, base, silence_s)) not in {PORT_LOST, BAD_SETTINGS}:
+        hold(port, base.hold, RESTART_S / speed)
+    return code
+
+
+def _guard_always(settings: _Settings) -> int:
+    """Open the port and guard it, again whenever it is lost; returns BAD_SETTINGS of the guardian."""
+    last_logged = ""
+    while True:
+        try:
+            with open_port(settings.path, settings.base.baud) as port:
+                last_logged = ""
+                if _guard(port, settings) == BAD_SETTINGS:
+                    return BAD_SETTINGS
+        except PortLost as error:
+            if str(error) != last_logged:
+                last_logged = str(error)
+                _log("port_lost", reason=last_logged)
+        time.sleep(REOPEN_S / settings.speed)
+
+
+def main() -> int:
+    """Guard until told to end."""
     try:
-        while True:
-            try:
-                with open_port(path, base.baud) as port:
-                    # First of all: a log that nobody reads must not keep the wheels turning.
-                    stop_wheels(port, base.stop)
-                    if (refusal := refuse_speed(speed, os.ttyname(port.fileno()))) is not None:
-                        _log("bad_settings", reason=refusal)
-                        return BAD_SETTINGS
-                    _log("port_open", path=path)
-                    told = ""
-                    while (code := guard_once(port, base, silence_s)) != PORT_LOST:
-                        if code == BAD_SETTINGS:
-                            return code
-                        hold(port, base.hold, RESTART_S / speed)
-            except PortLost as error:
-                if str(error) != told:
-                    told = str(error)
-                    _log("port_lost", reason=told)
-            time.sleep(REOPEN_S / speed)
+        settings = _settings()
+        signal.signal(signal.SIGTERM, _terminate)
+        signal.signal(signal.SIGINT, _terminate)
+        return _guard_always(settings)
+    except _BadSettings as error:
+        _log("bad_settings", reason=str(error))
+        return BAD_SETTINGS
     except _Terminated as end:
         _log("ended", signal=str(end))
         return 0

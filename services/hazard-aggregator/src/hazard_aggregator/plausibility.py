@@ -44,11 +44,7 @@ def classify_sonar(sonar: Sonar, status: str, measured: float | None, shift: flo
     if status == "stuck":
         return "unknown", "the echo line is stuck"
     if status == "no_echo":
-        if measured is not None:
-            return "unknown", f"it reports no echo and yet a range of {measured:.2f} m"
-        if sonar.no_echo_is_clear:
-            return "clear", "no echo, as calibrated"
-        return "unknown", "no echo where the opposite wall should echo"
+        return _classify_silence(sonar, measured)
     if measured is None:
         return "unknown", "it reports an echo without a range"
     if measured < SHORTEST_RANGE:
@@ -56,6 +52,14 @@ def classify_sonar(sonar: Sonar, status: str, measured: float | None, shift: flo
     if measured < sonar.range_limit + shift:
         return "blocked", f"something at {measured:.2f} m, nearer than {sonar.range_limit:.2f} m"
     return "clear", f"nothing nearer than {sonar.range_limit:.2f} m"
+
+
+def _classify_silence(sonar: Sonar, measured: float | None) -> tuple[AreaState, str]:
+    if measured is not None:
+        return "unknown", f"it reports no echo and yet a range of {measured:.2f} m"
+    if sonar.no_echo_is_clear:
+        return "clear", "no echo, as calibrated"
+    return "unknown", "no echo where the opposite wall should echo"
 
 
 def expected_range(site: NodeSite, sonar: Sonar, pose: RobotPose) -> float | None:

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from fog_contracts.grid import GridGeometry
 from robot_agent.config import MotionConfig
 from robot_agent.localization.pose import Pose2
-from robot_agent.motion.local_planner import PathFollower, decide, detour, first_blocked, make_job, twist, wheels
+from robot_agent.motion.local_planner import decide, detour, make_job, twist, wheels
+from robot_agent.motion.path_follower import PathFollower, first_blocked
 
 GRID = GridGeometry(200, 120, 0.05, 0.0, 0.0)
 CONFIG = MotionConfig()

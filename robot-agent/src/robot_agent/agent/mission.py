@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from robot_agent.motion.local_planner import PathFollower
+from robot_agent.motion.path_follower import PathFollower
 
 if TYPE_CHECKING:
     from fog_contracts.messages import RobotGoal, RobotPath

@@ -9,13 +9,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from fog_contracts.costs import INSCRIBED
-from robot_agent.motion.local_planner import first_blocked
+from robot_agent.motion.path_follower import first_blocked
 
 if TYPE_CHECKING:
     from fog_contracts.messages import RobotPath
     from fog_contracts.replica import Replica, Version
     from robot_agent.agent.mission import Mission, PathName
-    from robot_agent.motion.local_planner import PathFollower
+    from robot_agent.motion.path_follower import PathFollower
 
 BLOCK_NEAR_M: Final = 3.0
 """A blocked path this near stops the robot at once; farther away the planner gets `PLANNER_GRACE_S` to replan."""

@@ -1,0 +1,133 @@
+"""Where on its path the robot is, how much of it is released, and where it is blocked. Frame: `map`."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from fog_contracts.costs import INSCRIBED, LETHAL, UNKNOWN
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from fog_contracts.grid import GridGeometry
+
+_SEARCH_BACK_M: Final = 0.5
+_SEARCH_AHEAD_M: Final = 2.5
+_OFF_PATH_M: Final = 1.0
+_PROGRESS_M: Final = 0.1
+_END_M: Final = 0.05
+"""A path released to within this of its end is released whole: rounded points make another length."""
+
+
+class PathFollower:
+    """Where on its path the robot is: progress only ever looks near the last one, so a path may cross itself."""
+
+    def __init__(self, points: NDArray[np.float64], released_length: float) -> None:
+        self.points = points
+        steps = np.hypot(*np.diff(points, axis=0).T) if len(points) > 1 else np.zeros(0)
+        self.along = np.concatenate(([0.0], np.cumsum(steps)))
+        """Metres from the path's start to each point."""
+        self.released = 0.0
+        self.release(released_length)
+        self.progress = 0.0
+        self.distance = 0.0
+        """Metres from the robot to the path, as of the last `advance`."""
+        self._started = False
+        self._best_progress = 0.0
+        self._best_at: float | None = None
+
+    @property
+    def length(self) -> float:
+        """Metres of the whole path."""
+        return float(self.along[-1])
+
+    @property
+    def released_left(self) -> float:
+        """Metres of released path ahead of the robot."""
+        return max(0.0, self.released - self.progress)
+
+    @property
+    def left(self) -> float:
+        """Metres of path ahead of the robot."""
+        return max(0.0, self.length - self.progress)
+
+    def release(self, length: float) -> None:
+        """Update how much of the path (m) is released."""
+        self.released = length if length < self.length - _END_M else self.length
+
+    def advance(self, x: float, y: float, now: float) -> None:
+        """Note where the robot is (m)."""
+        low, high = 0.0, math.inf
+        if self._started:
+            low, high = self.progress - _SEARCH_BACK_M, self.progress + _SEARCH_AHEAD_M
+        found = self._nearest(x, y, low, high)
+        if found[1] > _OFF_PATH_M:
+            found = self._nearest(x, y, 0.0, math.inf)
+        self.progress, self.distance = found
+        self._started = True
+        if self._best_at is None or self.progress > self._best_progress + _PROGRESS_M:
+            self._best_progress, self._best_at = self.progress, now
+
+    def rest_clock(self, now: float) -> None:
+        """Restart the clock of `stuck_for`: the robot stands because it must, that is no being stuck."""
+        self._best_at = now
+
+    def stuck_for(self, now: float) -> float:
+        """Seconds without progress while driving was allowed."""
+        return 0.0 if self._best_at is None else now - self._best_at
+
+    def rest(self, limit: float) -> tuple[NDArray[np.float64], bool]:
+        """Return the next `limit` metres of the released path (n, 2), and whether its last point is the path's end."""
+        end = min(self.progress + limit, self.released)
+        end = max(end, self.progress)
+        inner = self.points[(self.along > self.progress) & (self.along < end)]
+        points = np.vstack((self._at(self.progress), inner, self._at(end)))
+        return points, end >= self.length - 1e-6
+
+    def ahead(self, spacing: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return points (n, 2) every `spacing` metres of the rest of the path, and their distances ahead (m)."""
+        count = max(2, math.ceil(self.left / spacing) + 1)
+        at = np.linspace(self.progress, self.length, count)
+        xs, ys = (np.interp(at, self.along, self.points[:, i]) for i in (0, 1))
+        return np.column_stack((xs, ys)), at - self.progress
+
+    def _at(self, along: float) -> NDArray[np.float64]:
+        return np.array([np.interp(along, self.along, self.points[:, i]) for i in (0, 1)])
+
+    def _nearest(self, x: float, y: float, low: float, high: float) -> tuple[float, float]:
+        here = np.array([x, y])
+        if len(self.points) == 1:
+            return 0.0, float(np.hypot(*(self.points[0] - here)))
+        steps = np.diff(self.along)
+        usable = (self.along[:-1] <= high) & (self.along[1:] >= low) & (steps > 0.0)
+        if not usable.any():
+            return self.progress, math.inf
+        start, delta, length = self.points[:-1][usable], np.diff(self.points, axis=0)[usable], steps[usable]
+        part = np.clip(((here - start) * delta).sum(axis=1) / length**2, 0.0, 1.0)
+        away = np.hypot(*(start + part[:, None] * delta - here).T)
+        best = int(away.argmin())
+        return float(self.along[:-1][usable][best] + part[best] * length[best]), float(away[best])
+
+
+def first_blocked(
+    cost: NDArray[np.uint8],
+    geometry: GridGeometry,
+    follower: PathFollower,
+    skip: float = 0.5,
+    *,
+    led_out: bool = False,
+) -> float | None:
+    """Return how far ahead (m) the rest of the path first meets a cell that the robot must not enter, or None.
+
+    Inscribed and unknown cells count beyond the first `skip` metres, where the planner may have led the robot out of a
+    tight place. Lethal ones count everywhere, unless the planner knew of them too (`led_out`).
+    """
+    points, ahead = follower.ahead(0.5 * geometry.resolution)
+    cells = geometry.sample(cost, points, UNKNOWN)
+    bad = (cells >= INSCRIBED) & (ahead > skip)
+    if not led_out:
+        bad |= cells == LETHAL
+    return float(ahead[int(bad.argmax())]) if bad.any() else None

@@ -109,6 +109,9 @@ class Network:
                 self.snapshots.append(self.writer.snapshot())
             case ("answer", n) if self.snapshots:
                 self.answer(n)
+            case ("fetch",) if self.follower.wants_snapshot(self.now):
+                self.snapshots.append(self.writer.snapshot())
+                self.answer(len(self.snapshots) - 1)
             case ("wait", seconds):
                 self.wait(seconds)
 
@@ -154,6 +157,8 @@ class Network:
             self.wait(BEAT_S)
             self.follower.on_heartbeat(self.writer.heartbeat(self.now), self.now)
             self.check()
+            if self.follower.up_to_date and self.follower.age(self.now) == 0.0:
+                assert self.follower.version == self.writer.version
             if self.follower.wants_snapshot(self.now):
                 self.snapshots.append(self.writer.snapshot())
                 self.answer(len(self.snapshots) - 1)
@@ -180,17 +185,21 @@ STEPS = st.lists(
         st.tuples(st.just("lose"), POSITIONS),
         st.tuples(st.just("damage"), POSITIONS, st.integers(0, 10_000)),
         st.tuples(st.just("ask")),
+        st.tuples(st.just("fetch")),
         st.tuples(st.just("answer"), POSITIONS),
         st.tuples(st.just("wait"), st.floats(0.0, 0.8)),
     ),
+    min_size=10,
     max_size=60,
 )
 
 
 @settings(max_examples=HISTORIES, deadline=None)
-@given(steps=STEPS)
-def test_copy_is_one_version_of_the_writers_and_recovers_whatever_the_network_did(steps):
+@given(loaded=st.booleans(), steps=STEPS)
+def test_copy_is_one_version_of_the_writers_and_recovers_whatever_the_network_did(loaded, steps):
     network = Network()
+    if loaded:
+        network.play(("fetch",))
     for step in steps:
         network.play(step)
         network.check()
@@ -372,6 +381,17 @@ def test_late_heartbeat_of_a_writer_that_was_replaced_asks_for_nothing():
         assert not follower.wants_snapshot(now)
     follower.on_heartbeat(new.heartbeat(0.0), 1.3)
     assert not follower.wants_snapshot(9.9)
+
+
+def test_late_heartbeat_long_ago_does_not_turn_the_next_late_one_into_a_restart():
+    writer = master()
+    follower = loaded(writer)
+    for now in (1.0, 2.0):
+        late = writer.heartbeat(0.0)
+        write(writer, int(now))
+        follower.on_snapshot(writer.snapshot(), now)
+        follower.on_heartbeat(late, now)
+        assert not follower.wants_snapshot(now)
 
 
 @pytest.mark.parametrize("epoch", [3, 10])

@@ -74,7 +74,7 @@ class MapFollower:
         self._refuse_outdated(snapshot)
         loaded = self._replica.load(snapshot)
         if self._newest is None or _order(loaded.version) > _order(self._newest):
-            self._newest = loaded.version
+            self._newest, self._contradicted_since = loaded.version, None
         self._held = {key: delta for key, delta in self._held.items() if delta.epoch == snapshot.epoch}
         applied = _joined([loaded, *self._apply_held()])
         assert applied is not None

@@ -36,6 +36,8 @@ _.should_exit
 _.timeout_graceful_shutdown
 _.daemon_threads  # http.server
 _.do_GET
+_.on_start  # numba's events
+_.on_end
 _.log_message
 _.pending_calls_threshold  # aiomqtt
 type_cells  # numba: a name that compiled signatures close over

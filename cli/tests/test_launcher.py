@@ -14,6 +14,7 @@ def checkout(tmp_path: Path) -> Path:
     folder = tmp_path / "check out"
     (folder / "requirements").mkdir(parents=True)
     (folder / "requirements" / "dev.txt").write_text("pinned==1 --hash=sha256:0\n")
+    (folder / "VERSION").write_text("1.0\n")
     for member in ("libs/one", "services/two", "cli"):
         (folder / member).mkdir(parents=True)
         (folder / member / "pyproject.toml").write_text(f'[project]\nname = "{member}"\n')
@@ -47,6 +48,12 @@ def test_the_first_start_installs_pins_with_hashes_then_the_members(checkout: Pa
     done = start(checkout / "fognav", checkout, "doctor", "--json")
     assert done.returncode == 0, done.stderr
     assert done.stdout == "ran: -m fognav doctor --json\n"
+    steps = [line for line in done.stderr.splitlines() if "set-up, step" in line]
+    assert [line.partition(": the ")[0].partition(" Python")[0] for line in steps] == [
+        "fognav: set-up, step 1 of 3",
+        "fognav: set-up, step 2 of 3: 2",
+        "fognav: set-up, step 3 of 3",
+    ]
     venv, pins, members = uv_log(checkout)
     assert venv.startswith("venv")
     assert f"--require-hashes -r {checkout}/requirements/dev.txt -r {checkout}/cli/build.txt" in pins
@@ -73,7 +80,7 @@ def test_it_works_through_a_relative_symlink_from_another_folder(checkout: Path,
     assert [path.name for path in elsewhere.iterdir()] == ["link"]
 
 
-@pytest.mark.parametrize("changed", ["requirements/dev.txt", "cli/build.txt", "libs/one/pyproject.toml"])
+@pytest.mark.parametrize("changed", ["requirements/dev.txt", "cli/build.txt", "VERSION", "libs/one/pyproject.toml"])
 def test_a_change_of_what_it_was_made_from_sets_it_up_again(checkout: Path, changed: str) -> None:
     start(checkout / "fognav", checkout)
     calls = len(uv_log(checkout))

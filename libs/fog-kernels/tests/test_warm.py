@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 
@@ -84,3 +85,22 @@ def test_importing_one_module_loads_no_other_kernels(module: str, others: set[st
 def test_an_unknown_profile_is_refused_with_the_known_ones() -> None:
     with pytest.raises(ValueError, match="robot"):
         warm.warm("toaster")
+
+
+def test_progress_counts_every_kernel_once_and_names_it(tmp_path):
+    cold = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    command = [sys.executable, "-m", "fog_kernels.warm", "map"]
+    names = [f"{module}.{name}" for module in warm.PROFILES["map"] for name in warm.kernels(module)]
+    done = subprocess.run(command, env=cold, capture_output=True, text=True, check=True)
+    lines = [line for line in done.stdout.splitlines() if "kernels ready: " in line]
+    assert [line.rpartition(" ")[2] for line in lines if "." in line] == names
+    assert lines[-1].startswith(f"{len(names)} of {len(names)} ")
+    again = subprocess.run(command, env=cold, capture_output=True, text=True, check=True)
+    lines = [line for line in again.stdout.splitlines() if "kernels ready: " in line]
+    assert [line.rpartition(" ")[2] for line in lines] == list(warm.PROFILES["map"])
+    assert " 0 compiled now" in again.stdout
+
+
+def test_the_kernels_of_a_module_that_is_not_there_are_refused():
+    with pytest.raises(ValueError, match=r"no module fog_kernels\.nothing"):
+        warm.kernels("nothing")

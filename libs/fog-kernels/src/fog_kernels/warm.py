@@ -7,10 +7,18 @@ numba, and lies beside the sources or, where these can't be written, in NUMBA_CA
 from __future__ import annotations
 
 import argparse
+import ast
 import importlib
+import importlib.util
 import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
 
+from numba.core import event
 from numba.core.dispatcher import Dispatcher
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 PROFILES: dict[str, tuple[str, ...]] = {
     "robot": ("amcl", "astar", "distance", "dwa", "inflation", "likelihood", "raycast"),
@@ -31,15 +39,67 @@ def _dispatchers() -> list[Dispatcher]:
     return list(found.values())
 
 
-def warm(profile: str = "all") -> None:
+def kernels(module: str) -> list[str]:
+    """Return the kernels that importing a module of this package compiles: those with explicit signatures.
+
+    Looks at the source only. Raises ValueError for a module that is not there.
+    """
+    spec = importlib.util.find_spec(f"fog_kernels.{module}")
+    if spec is None or spec.origin is None:
+        raise ValueError(f"there is no module fog_kernels.{module}")
+    tree = ast.parse(Path(spec.origin).read_text("utf-8"))
+    return [
+        node.name
+        for node in tree.body
+        if isinstance(node, ast.FunctionDef)
+        and any(
+            isinstance(decorator, ast.Call)
+            and isinstance(decorator.func, ast.Name)
+            and decorator.func.id == "njit"
+            and decorator.args
+            for decorator in node.decorator_list
+        )
+    ]
+
+
+class _Compiled(event.Listener):
+    """Counts the kernels of one module as they are compiled; those that come from the cache raise no event."""
+
+    def __init__(self, names: list[str], on_kernel: Callable[[int, str], None]) -> None:
+        self._left = set(names)
+        self._total = len(names)
+        self._on_kernel = on_kernel
+
+    def on_start(self, _: event.Event) -> None:
+        """Nothing is known of a kernel before it is compiled."""
+
+    def on_end(self, ended: event.Event) -> None:
+        """Count a kernel once, whatever the number of its signatures."""
+        name = ended.data["dispatcher"].py_func.__name__
+        if name in self._left:
+            self._left.remove(name)
+            self._on_kernel(self._total - len(self._left), name)
+
+
+def warm(profile: str = "all", on_progress: Callable[[int, int, str], None] = lambda *_: None) -> None:
     """Compile, or load from the cache, every kernel that the profile's processes use.
 
-    All signatures are explicit, so importing a module is what compiles it. Raises ValueError for an unknown profile.
+    All signatures are explicit, so importing a module is what compiles it. `on_progress` is given how many kernels are
+    ready, of how many, and the name of the one that was compiled or the module that was loaded last. Raises ValueError
+    for an unknown profile.
     """
     if profile not in PROFILES:
         raise ValueError(f"profile must be one of {', '.join(sorted(PROFILES))}, not {profile!r}")
-    for name in PROFILES[profile]:
-        importlib.import_module(f"fog_kernels.{name}")
+    names = {module: kernels(module) for module in PROFILES[profile]}
+    total = sum(map(len, names.values()))
+    ready = 0
+    for module, own in names.items():
+        before = ready
+        listener = _Compiled(own, lambda done, name: on_progress(before + done, total, f"{module}.{name}"))  # noqa: B023
+        with event.install_listener("numba:compile", listener):
+            importlib.import_module(f"fog_kernels.{module}")
+        ready += len(own)
+        on_progress(ready, total, module)
 
 
 def cache_misses() -> int:
@@ -48,11 +108,16 @@ def cache_misses() -> int:
 
 
 def main() -> None:
-    """Warm a profile and say how many kernels had to be compiled."""
+    """Warm a profile, say how far it is, and how many kernels had to be compiled."""
     parser = argparse.ArgumentParser(prog="python -m fog_kernels.warm", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("profile", nargs="?", default="all", choices=sorted(PROFILES))
     profile: str = parser.parse_args().profile
-    warm(profile)
+
+    def show(ready: int, total: int, name: str) -> None:
+        sys.stdout.write(f"{ready} of {total} kernels ready: {name}\n")
+        sys.stdout.flush()
+
+    warm(profile, show)
     sys.stdout.write(f"{profile}: {len(_dispatchers())} kernels and helpers ready, {cache_misses()} compiled now\n")
 
 

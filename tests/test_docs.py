@@ -2,6 +2,9 @@
 
 import re
 import subprocess
+import sys
+import tomllib
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -27,3 +30,32 @@ def test_the_readme_names_only_test_folders_that_exist() -> None:
     folders = [folder for group in named for folder in group.split() if "/" in folder]
     assert folders
     assert [folder for folder in folders if not (ROOT / folder).exists()] == []
+
+
+@pytest.mark.parametrize("record", sorted((ROOT / "docs" / "adr").glob("0*.md")), ids=lambda path: path.stem)
+def test_every_decision_has_its_number_and_a_status_with_a_date(record: Path) -> None:
+    title, empty, status, *_ = record.read_text("utf-8").splitlines()
+    assert title.startswith(f"# {int(record.stem[:4])}. ")
+    assert empty == ""
+    assert re.fullmatch(
+        r"\*\*Status\.\*\* (Proposed|Accepted|Superseded by \[ADR \d+\]\(.+\)), \d{4}-\d\d-\d\d\.", status
+    )
+
+
+def test_all_members_have_the_one_version() -> None:
+    version = (ROOT / "VERSION").read_text("utf-8").strip()
+    members = [ROOT / line for line in ("robot-agent", "sim", "experiments", "cli")]
+    members += [*(ROOT / "libs").iterdir(), *(ROOT / "services").glob("*/")]
+    files = [member / "pyproject.toml" for member in members if (member / "pyproject.toml").is_file()]
+    assert len(files) >= 11
+    for file in files:
+        settings = tomllib.loads(file.read_text("utf-8"))
+        assert settings["project"]["dynamic"] == ["version"], file
+        assert (file.parent / settings["tool"]["hatch"]["version"]["path"]).resolve() == ROOT / "VERSION"
+        assert metadata.version(settings["project"]["name"]) == version
+    assert (
+        f"fognav {version}"
+        == subprocess.run(
+            [sys.executable, "-m", "fognav", "--version"], capture_output=True, text=True, check=True
+        ).stdout.strip()
+    )

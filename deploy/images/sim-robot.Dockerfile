@@ -4,6 +4,7 @@ FROM python:3.11-slim-bookworm AS wheels
 WORKDIR /src
 COPY requirements/build.txt requirements/
 RUN pip install --no-cache-dir --require-hashes -r requirements/build.txt
+COPY VERSION .
 COPY libs libs
 COPY robot-agent robot-agent
 COPY sim sim

@@ -1,5 +1,5 @@
 """The fognav command."""
 
-from importlib.metadata import version
+from fog_runtime.version import VERSION
 
-__version__ = version("fognav-cli")
+__version__ = VERSION

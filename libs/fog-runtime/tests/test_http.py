@@ -47,7 +47,7 @@ def tokens(tmp_path):
 @pytest.fixture
 async def client(tokens, tmp_path):
     health = Health("store")
-    app = make_app("Test", "1.0", health, tokens, body_limit=1000)
+    app = make_app("Test", health, tokens, body_limit=1000)
     app.state.health = health
 
     @app.post("/points")
@@ -188,7 +188,7 @@ async def test_large_bodies_are_refused_announced_or_not(client):
 async def test_taken_port_is_an_error(client):
     port = client.base_url.port
     with pytest.raises(OSError, match="in use"):
-        await serve(make_app("x", "1", Health(), load_tokens(None)), port=port)
+        await serve(make_app("x", Health(), load_tokens(None)), port=port)
 
 
 @pytest.mark.parametrize(

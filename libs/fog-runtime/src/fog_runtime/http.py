@@ -22,6 +22,7 @@ from starlette.exceptions import HTTPException
 from fog_runtime import logs, metrics
 from fog_runtime.files import write_port_file
 from fog_runtime.health import Health
+from fog_runtime.version import VERSION
 
 T = TypeVar("T")
 Role = Literal["viewer", "operator", "admin"]
@@ -305,10 +306,10 @@ def _add_health(app: FastAPI, health: Health) -> None:
         return Response(text, media_type=kind)
 
 
-def make_app(title: str, version: str, health: Health, tokens: Tokens, *, body_limit: int = BODY_LIMIT) -> FastAPI:
+def make_app(title: str, health: Health, tokens: Tokens, *, body_limit: int = BODY_LIMIT) -> FastAPI:
     """Build an app with health, metrics, problem documents, roles and a body limit; OpenAPI is at /openapi.json."""
     # The interactive pages would load scripts from the internet.
-    app = FastAPI(title=title, version=version, docs_url=None, redoc_url=None)
+    app = FastAPI(title=title, version=VERSION, docs_url=None, redoc_url=None)
     app.state.tokens = tokens
     app.state.schemas = {}
     _add_problems(app)

@@ -10,11 +10,13 @@ from prometheus_client import (
     Counter,
     Gauge,
     Histogram,
+    Info,
     generate_latest,
 )
 
 from fog_contracts.messages import Trace
 from fog_contracts.stages import SPANS, durations_s
+from fog_runtime.version import VERSION
 
 STAGE_SECONDS: Final = Histogram(
     "fognav_stage_seconds",
@@ -36,6 +38,8 @@ DROPPED: Final = Counter(
 HANDLER_ERRORS: Final = Counter(
     "fognav_handler_errors_total", "Messages whose handler raised an exception: a bug in this process", ["channel"]
 )
+BUILD: Final = Info("fognav_build", "Which code runs: its version")
+BUILD.info({"version": VERSION})
 CONNECTED: Final = Gauge("fognav_connected", "Whether the connection is up (1) or down (0)", ["transport"])
 CONNECTS: Final = Counter("fognav_connects_total", "Connections made, the first one included", ["transport"])
 

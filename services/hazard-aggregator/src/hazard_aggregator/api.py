@@ -71,7 +71,7 @@ class NodeView(Message, frozen=True, kw_only=True):
 
 def make_api(service: Service, geometry: GridGeometry, clock: Clock, health: Health, tokens: Tokens) -> FastAPI:
     """Return the app over a running service; areas must lie on the map of this geometry."""
-    app = make_app("Fognav hazard-aggregator", "1", health, tokens)
+    app = make_app("Fognav hazard-aggregator", health, tokens)
 
     def views() -> dict[str, AreaView]:
         announced, withheld = service.core.announced(), service.core.withheld()

@@ -83,7 +83,7 @@ class MapInfo(Message, frozen=True, kw_only=True):
 
 def make_api(service: Service, site: Site, clock: Clock, health: Health, tokens: Tokens) -> FastAPI:
     """Return the app over a running service."""
-    app = make_app("Fognav map-service", "1", health, tokens)
+    app = make_app("Fognav map-service", health, tokens)
     _add_zones(app, service, clock)
     _add_views(app, service, site)
     return app

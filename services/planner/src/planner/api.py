@@ -106,7 +106,7 @@ def _json(value: object, status: int = 200) -> Response:
 
 def make_api(service: Service, site: Site, health: Health, tokens: Tokens) -> FastAPI:
     """Return the app over a running service."""
-    app = make_app("Fognav planner", "1", health, tokens)
+    app = make_app("Fognav planner", health, tokens)
     configured = {robot.id for robot in site.robots}
     operator = Depends(require("operator"))
 

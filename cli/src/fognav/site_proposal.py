@@ -146,7 +146,7 @@ def _drives(floor: _Floor, generator: random.Random) -> Iterator[_Drive]:
         found = planner.plan(floor.cost, start, goal)
         if not found.found:
             continue
-        path = [floor.geometry.centre(int(c), int(r)) for c, r in found.cells]
+        path = [(x, y) for x, y in floor.geometry.centres(found.cells).tolist()]
         length = _length(path)
         if not DRIVE_M[0] <= length <= DRIVE_M[1]:
             continue
@@ -261,7 +261,7 @@ def _detour(
     found = planner.plan(floor.inflated(raw), start, goal)
     if not found.found:
         return None
-    return _length([floor.geometry.centre(int(c), int(r)) for c, r in found.cells])
+    return _length([(x, y) for x, y in floor.geometry.centres(found.cells).tolist()])
 
 
 def _number(value: float) -> str:

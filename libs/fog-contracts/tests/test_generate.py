@@ -1,17 +1,19 @@
 """What the table generates: each text says what the table says, the header compiles, and each role gets its own."""
 
 import ctypes
+import datetime as dt
 import json
 import re
 import shutil
 import subprocess
+from typing import Any
 
 import pytest
 
 from fog_contracts import channels as ch
 from fog_contracts import messages as m
 from fog_contracts.channels import CHANNELS
-from fog_contracts.generate.fields import bounds, message_fields, parts
+from fog_contracts.generate.fields import bounds, message_fields, parts, type_text
 from fog_contracts.generate.header import firmware_header
 from fog_contracts.generate.markdown import channels_markdown
 from fog_contracts.generate.mqtt_acl import mqtt_acl
@@ -68,6 +70,16 @@ def test_limits_and_choices_are_those_of_a_fields_values():
 def test_parts_are_found_in_lists_maps_and_choices():
     assert parts(m.Zone) == [m.PolygonShape, m.RectangleShape, m.CircleShape, m.CorridorShape]
     assert parts(m.RobotState) == [m.LoopHealth, m.Trace]
+
+
+def test_a_type_without_a_word_is_named():
+    class Odd(m.Message, frozen=True, kw_only=True):
+        at: dt.time
+        free: dict[str, Any]
+
+    with pytest.raises(TypeError, match=r"TimeType.*give it one"):
+        type_text(field(Odd, "at").type)
+    assert type_text(field(Odd, "free").type) == "map of text to anything"
 
 
 # --- The document ---------------------------------------------------------------------------------------------------

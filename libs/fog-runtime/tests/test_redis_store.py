@@ -7,10 +7,11 @@ import pytest
 from redis.asyncio import Redis
 
 from fog_contracts.messages import Message
-from fog_runtime.redis_store import ABSENT, ANY, Audit, RedisStore, StoreError, Table
+from fog_runtime.redis_store import ANY, Audit, RedisStore, StoreError, Table
 from fog_supervisor.servers import Server, start_redis
 
 pytestmark = pytest.mark.live
+ABSENT = "0"
 AUDIT = Audit(at=1.5, who="anna", action="put")
 THINGS = Table("things", "thing")
 JOBS = Table("jobs", "robot", version="job.id")

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fog_contracts import channels as ch
 from fog_contracts.costs import INSCRIBED, LETHAL, UNKNOWN
-from fog_contracts.geometry import GeometryError, normalized_polygon, rasterize
+from fog_contracts.geometry import ShapeMask
 from fog_contracts.grid import GridGeometry, Window
 from fog_contracts.handlers import Moment, Publication, RefusedMessageError
 from fog_contracts.messages import (
@@ -35,12 +35,13 @@ from fog_contracts.messages import (
     ZoneSet,
 )
 from fog_contracts.replica import Applied, Replica
+from fog_contracts.shapes import ShapeError
 from map_service.core import MapCore
 from map_service.costmap import merged
 from map_service.layers.base import CostLayer, write_cost
 from map_service.layers.zones import penalty_cost
 from map_service.registry import LayersError, make_layers
-from map_service.shapes import ShapeMask, ZoneError, checked_zone, rasterize_shape
+from map_service.zone_validation import ZoneError, validated_zone
 
 
 @dataclass
@@ -433,7 +434,7 @@ def test_stored_zones_replace_those_on_the_map_or_nothing_changes():
     m = started()
     m.load_zones([zone("old"), zone("kept")], moment(0.0))
     bad = zone("bad", shape=RectangleShape(corner=(0.0, 0.0), opposite=(0.0, 1.0)))
-    with pytest.raises(ZoneError, match=r"bad\.shape\.opposite"):
+    with pytest.raises(ShapeError, match=r"bad\.shape\.opposite"):
         m.load_zones([zone("new"), bad], moment(1.0))
     assert [z.id for z in m.zones()] == ["kept", "old"]
     m.load_zones([zone("new"), zone("kept")], moment(1.0))
@@ -441,24 +442,6 @@ def test_stored_zones_replace_those_on_the_map_or_nothing_changes():
 
 
 # --- Zones ----------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("shape", "inside", "outside"),
-    [
-        (PolygonShape(points=[(0.5, 0.5), (0.5, 1.5), (1.5, 0.5)]), (0.8, 0.8), (1.4, 1.4)),
-        (RectangleShape(corner=(1.5, 1.0), opposite=(0.5, 0.5)), (1.4, 0.6), (1.4, 1.2)),
-        (CircleShape(centre=(1.0, 1.0), radius=0.3), (1.2, 1.2), (1.25, 1.25)),
-        (CorridorShape(line=[(0.0, 0.5), (1.0, 0.5), (1.0, 1.5)], width=0.4), (1.15, 1.2), (0.7, 1.0)),
-    ],
-)
-def test_every_shape_covers_its_cells(shape, inside, outside):
-    geometry = floor().geometry
-    window, mask = rasterize_shape(shape, geometry)
-    whole = np.zeros(geometry.shape, dtype=bool)
-    whole[window.rows, window.columns] = mask
-    assert whole[geometry.cell(*inside)[::-1]]
-    assert not whole[geometry.cell(*outside)[::-1]]
 
 
 def test_kinds_write_cost_or_speed():
@@ -517,13 +500,13 @@ def test_zones_begin_and_end_by_the_stamp():
 )
 def test_a_zone_that_cannot_be_used_is_refused_by_field(bad, field):
     with pytest.raises(ZoneError) as caught:
-        checked_zone(bad, floor().geometry, 10.0)
+        validated_zone(bad, floor().geometry, 10.0)
     assert caught.value.field == field
 
 
 def test_a_polygon_is_stored_counter_clockwise():
     clockwise = [(0.5, 0.5), (0.5, 1.5), (1.5, 0.5)]
-    stored = checked_zone(zone(shape=PolygonShape(points=clockwise)), floor().geometry, 0.0)
+    stored = validated_zone(zone(shape=PolygonShape(points=clockwise)), floor().geometry, 0.0)
     assert stored.shape.points == clockwise[::-1]
 
 
@@ -728,21 +711,3 @@ def test_what_is_gone_leaves_the_plain_floor(history):
     m.tick(1e6, 1e6)
     assert np.array_equal(m.cost, plain)
     assert not m.speed.any()
-
-
-@given(st.lists(point, min_size=3, max_size=9))
-@example([(0.0, -1.0), (0.0, -1.5), (1.0, -1.0)])  # wholly below the map
-@settings(max_examples=200, deadline=None)
-def test_polygons_get_the_cells_that_the_contracts_give_them(points):
-    try:
-        ring = normalized_polygon(points)
-    except GeometryError:
-        return
-    geometry = floor().geometry
-    window, mask = rasterize(ring, geometry)
-    expected = np.zeros(geometry.shape, dtype=bool)
-    expected[window.rows, window.columns] = mask
-    window, mask = rasterize_shape(PolygonShape(points=points), geometry)
-    found = np.zeros(geometry.shape, dtype=bool)
-    found[window.rows, window.columns] = mask
-    assert np.array_equal(found, expected)

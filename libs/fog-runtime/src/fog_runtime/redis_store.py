@@ -25,8 +25,6 @@ M = TypeVar("M", bound=Message)
 Outcome = Literal["ok", "exists", "missing", "stale"]
 """What became of a write: done (or done already), or refused as a record exists, is missing, or has another version."""
 
-ABSENT: Final = "0"
-"""The version to expect where no record may be stored yet."""
 ANY: Final = "*"
 """Expect no version: write over whatever is stored."""
 
@@ -182,9 +180,9 @@ class RedisStore:
     ) -> Outcome:
         """Write a record durably, or delete it (None), if the stored version is `expected`, with its audit entry.
 
-        `expected` is the text of the version, ABSENT or ANY; `before` is what held until now where nothing was stored,
-        for the audit entry. A repeated attempt, whose first answer was lost, is `ok`
-        for a write and `missing` for a deletion.
+        `expected` is the text of the version, `0` where none may be stored yet, or ANY; `before` is what held until now
+        where nothing was stored, for the audit entry. A repeated attempt, whose first answer was lost, is `ok` for a
+        write and `missing` for a deletion.
         """
         data = b"" if record is None else msgspec.json.encode(record)
         arguments: list[str | bytes] = [

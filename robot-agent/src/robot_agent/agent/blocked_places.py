@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from fog_contracts import channels as ch
 from fog_contracts.costs import LETHAL
-from fog_contracts.geometry import contains_point, distance_to_segment
-from fog_contracts.messages import CircleShape, PolygonShape, RectangleShape
+from fog_contracts.geometry import contains_point
+from fog_contracts.shapes import shape_contains
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from fog_contracts.handlers import Handler, Ids, Moment, Publication
-    from fog_contracts.messages import HazardArea, Shape, Zone, ZoneSet
+    from fog_contracts.messages import HazardArea, Zone, ZoneSet
     from fog_contracts.replica import Replica
     from robot_agent.agent.obstacle_reporter import ObstacleReporter
     from robot_agent.localization.pose import Pose2
@@ -59,7 +58,7 @@ class BlockedPlaces:
             if hazard.hazard.state != "clear" and contains_point(hazard.polygon, pose.x, pose.y):
                 return f"the {hazard.hazard.state} area {hazard.label or hazard.hazard.area}"
         for zone in self._zones:
-            if _contains(zone.shape, pose.x, pose.y):
+            if shape_contains(zone.shape, pose.x, pose.y):
                 return f"the no-go zone {zone.id}" + (f" ({zone.reason})" if zone.reason else "")
         if reporter.is_self_reported(np.array([[pose.x, pose.y]]), now)[0]:
             return None
@@ -71,15 +70,3 @@ class BlockedPlaces:
             if hazard.hazard.state == "unknown" and contains_point(hazard.polygon, pose.x, pose.y):
                 return f"nobody can tell whether the area {hazard.label or hazard.hazard.area} is clear"
         return None
-
-
-def _contains(shape: Shape, x: float, y: float) -> bool:
-    if isinstance(shape, PolygonShape):
-        return contains_point(shape.points, x, y)
-    if isinstance(shape, RectangleShape):
-        (x0, y0), (x1, y1) = shape.corner, shape.opposite
-        return min(x0, x1) <= x <= max(x0, x1) and min(y0, y1) <= y <= max(y0, y1)
-    if isinstance(shape, CircleShape):
-        return math.hypot(x - shape.centre[0], y - shape.centre[1]) <= shape.radius
-    sides = zip(shape.line, shape.line[1:], strict=False)
-    return any(distance_to_segment(a, b, x, y) <= shape.width / 2 for a, b in sides)

@@ -190,8 +190,7 @@ def detour(
     if not found.found:
         return path
     way = search.shortcut(costs, found.cells) if len(found.cells) > 1 else found.cells.astype(np.float64)
-    metres = (way + 0.5) * window.resolution + (window.origin_x, window.origin_y)
-    return np.vstack((metres, path[route.along > ahead[clear[0]]]))
+    return np.vstack((window.centres(way), path[route.along > ahead[clear[0]]]))
 
 
 def make_job(

@@ -41,8 +41,8 @@ from fog_runtime.http import (
 )
 from map_service.layers.base import Grid
 from map_service.service import ConflictError, Service
-from map_service.shapes import ZoneError
 from map_service.store import AuditEntry, StoreError
+from map_service.zone_validation import ZoneError
 
 RETRY_AFTER: Final = {"Retry-After": "1"}
 _IMAGE: Final[dict[int | str, dict[str, Any]]] = {200: {"description": "The picture", "content": {"image/png": {}}}}

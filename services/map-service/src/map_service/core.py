@@ -145,13 +145,13 @@ class MapCore:
         return self._commit(self._check_aggregator_liveness(at), at)
 
     def load_zones(self, zones: Iterable[Zone], at: Moment) -> list[Publication]:
-        """Make the map's zones those that are stored; raises `ZoneError`, and changes nothing, for an unusable one."""
+        """Make the map's zones those that are stored; raises `ShapeError`, and changes nothing, for an unusable one."""
         self._zones.replace_all(zones, at.stamp)
         self._zones_read = True
         return self._commit([], at)
 
     def put_zone(self, zone: Zone, at: Moment) -> list[Publication]:
-        """Add or replace a zone that is stored; raises `ZoneError` for a shape that can't be used."""
+        """Add or replace a zone that is stored; raises `ShapeError` for a shape that can't be used."""
         self._zones.put(zone, at.stamp)
         return self._commit([], at)
 

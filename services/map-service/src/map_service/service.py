@@ -10,11 +10,12 @@ from prometheus_client import Counter, Gauge, Histogram
 
 from fog_contracts import channels as ch
 from fog_contracts.messages import MapDelta, Zone, ZoneSet
+from fog_contracts.shapes import ShapeError
 from fog_runtime import logs, metrics
 from fog_runtime.clock import ticker
 from fog_runtime.edges import Edges
-from map_service.shapes import ZoneError, checked_zone
 from map_service.store import Audit, StoreError
+from map_service.zone_validation import validated_zone
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Sequence
@@ -95,7 +96,7 @@ class Service:
         """Store a new zone and put it on the map; raises `ZoneError`, `ConflictError` (exists), `StoreError`."""
         async with self._writing:
             stamp = self._clock.stamp()
-            zone = checked_zone(structs.replace(zone, version=1), self.core.costmap.geometry, stamp)
+            zone = validated_zone(structs.replace(zone, version=1), self.core.costmap.geometry, stamp)
             if any(known.id == zone.id for known in self.core.zones()):
                 # The store would take a zone that is the very same for a repeated attempt.
                 raise ConflictError("exists", zone.id)
@@ -112,7 +113,7 @@ class Service:
                 # The store would take a zone that is the very same for a repeated attempt.
                 raise ConflictError("stale", zone.id)
             stamp = self._clock.stamp()
-            zone = checked_zone(structs.replace(zone, version=expected + 1), self.core.costmap.geometry, stamp)
+            zone = validated_zone(structs.replace(zone, version=expected + 1), self.core.costmap.geometry, stamp)
             audit = Audit(at=stamp, who=who, action="replace")
             await self._write(self._store.put(zone, expected=expected, audit=audit), zone.id)
             self._publish(self.core.put_zone(zone, self._edges.now()))
@@ -149,7 +150,7 @@ class Service:
             zones = await self._store.zones()
             try:
                 self._publish(self.core.load_zones(zones, self._edges.now()))
-            except ZoneError as error:
+            except ShapeError as error:
                 raise StoreError(f"a stored zone can't be used: {error}; repair or delete it") from error
             self._in_doubt = False
         self._health.set("zones", ok=True, detail=f"{len(zones)} read")

@@ -8,18 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fog_contracts.costs import LETHAL
-from fog_contracts.geometry import GeometryError, Point, normalized_polygon, rasterize
+from fog_contracts.geometry import GeometryError, normalized_polygon, rasterize
 from fog_contracts.grid import GridGeometry, Window
-from fog_contracts.messages import (
-    Cause,
-    CircleShape,
-    CorridorShape,
-    HazardArea,
-    PolygonShape,
-    RectangleShape,
-    Shape,
-    Zone,
-)
+from fog_contracts.messages import Cause, HazardArea, Zone
+from fog_contracts.shapes import rasterize_shape
 from fog_kernels.distance import squared_distance_capped
 
 Grid = NDArray[np.uint8]
@@ -51,39 +43,6 @@ class Region:
         return 0 <= x < self.window.width and 0 <= y < self.window.height and bool(self.reach[y, x])
 
 
-def _capsules(line: Sequence[Point], radius: float, geometry: GridGeometry) -> tuple[Window, Mask]:
-    """Rasterize everything within `radius` of a polyline (m), as generously as `rasterize` does."""
-    radius += geometry.resolution * math.sqrt(0.5)
-    xs, ys = [x for x, _ in line], [y for _, y in line]
-    window = geometry.window_around(min(xs) - radius, min(ys) - radius, max(xs) + radius, max(ys) + radius)
-    part = geometry.part(window) if not window.empty else geometry
-    mask = np.zeros((max(window.height, 0), max(window.width, 0)), dtype=np.bool_)
-    if window.empty:
-        return window, mask
-    px = part.origin_x + (np.arange(window.width) + 0.5)[None, :] * part.resolution
-    py = part.origin_y + (np.arange(window.height) + 0.5)[:, None] * part.resolution
-    for (x0, y0), (x1, y1) in zip(line, [*line[1:], line[-1]], strict=True):
-        dx, dy = x1 - x0, y1 - y0
-        squared = dx * dx + dy * dy
-        t = np.clip(((px - x0) * dx + (py - y0) * dy) / squared, 0.0, 1.0) if squared else 0.0
-        mask |= np.hypot(px - x0 - t * dx, py - y0 - t * dy) <= radius
-    return window, mask
-
-
-def shape_cells(shape: Shape, geometry: GridGeometry) -> tuple[Window, Mask]:
-    """Return the window that a zone's shape touches and the mask of its cells; raises `GeometryError`."""
-    match shape:
-        case PolygonShape():
-            return rasterize(normalized_polygon(shape.points), geometry)
-        case RectangleShape():
-            (x0, y0), (x1, y1) = shape.corner, shape.opposite
-            return rasterize(normalized_polygon([(x0, y0), (x1, y0), (x1, y1), (x0, y1)]), geometry)
-        case CircleShape():
-            return _capsules([shape.centre], shape.radius, geometry)
-        case CorridorShape():
-            return _capsules(shape.line, shape.width / 2, geometry)
-
-
 def _region(cause: Cause, words: str, window: Window, mask: Mask, geometry: GridGeometry, reach: float) -> Region:
     cells = max(1, math.ceil(reach / geometry.resolution))
     grown = geometry.clip(window.grown(cells))
@@ -113,7 +72,7 @@ def zone_region(zone: Zone, geometry: GridGeometry, reach: float) -> Region | No
     if zone.kind != "BLOCKED":
         return None
     try:
-        window, mask = shape_cells(zone.shape, geometry)
+        window, mask = rasterize_shape(zone.shape, geometry)
     except GeometryError:
         return None
     if window.empty:

@@ -79,6 +79,8 @@ def type_text(kind: inspect.Type) -> str:
         case inspect.BytesType():
             return f"bytes{_between(kind.min_length, kind.max_length)}"
         case _:
+            if type(kind) not in _PLAIN:
+                raise TypeError(f"{kind}: documents have no word for this type; give it one in {__name__}._PLAIN")
             return _PLAIN[type(kind)]
 
 
@@ -87,7 +89,7 @@ _PLAIN: Final[Mapping[type[inspect.Type], str]] = {
     inspect.FloatType: "number",
     inspect.BoolType: "boolean",
     inspect.NoneType: "null",
-    inspect.AnyType: "any value",
+    inspect.AnyType: "anything",
 }
 
 

@@ -16,13 +16,13 @@ from fog_contracts.geometry import GeometryError, normalized_polygon, rasterize
 from fog_contracts.handlers import Publication, RefusedMessageError
 from fog_contracts.messages import AreaHazard, Cause, HazardArea
 from map_service.layers.base import CostLayer, LayerFactory, NoOptions, write_cost, write_speed_limit
-from map_service.shapes import ShapeMask
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from typing import Final
 
     from fog_contracts.channels import Channel
+    from fog_contracts.geometry import ShapeMask
     from fog_contracts.grid import GridGeometry, Window
     from fog_contracts.handlers import Handler, Ids, Moment
     from fog_contracts.messages import AreaDefinition
@@ -76,7 +76,7 @@ class HazardsLayer(CostLayer):
                 old.effective, state="clear", severity=0, penalty=0, cause="the area was removed", trace=None
             )
             return [_published(old.definition, gone)]
-        mask = ShapeMask(*rasterize(normalized_polygon(definition.polygon), self._geometry))
+        mask = rasterize(normalized_polygon(definition.polygon), self._geometry)
         area = _Area(definition, mask, self._effective(definition))
         self._areas[definition.id] = area
         cause = Cause(kind="hazard", id=definition.id, state=area.effective.state)

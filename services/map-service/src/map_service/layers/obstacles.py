@@ -17,10 +17,10 @@ import numpy as np
 
 from fog_contracts import channels as ch
 from fog_contracts.costs import LETHAL
+from fog_contracts.geometry import ShapeMask
 from fog_contracts.grid import Window
 from fog_contracts.messages import VIEW_SECTORS, Cause
 from map_service.layers.base import CostLayer, LayerFactory, NoOptions, write_cost
-from map_service.shapes import ShapeMask
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -11,17 +11,17 @@ from typing import TYPE_CHECKING
 
 from fog_contracts.costs import COST_PER_FACTOR, LETHAL, PENALTY_MAX
 from fog_contracts.messages import Cause
+from fog_contracts.shapes import ShapeError, rasterize_shape
 from map_service.layers.base import CostLayer, LayerFactory, NoOptions, write_cost, write_speed_limit
-from map_service.shapes import ZoneError, rasterize_shape
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from fog_contracts.geometry import ShapeMask
     from fog_contracts.grid import GridGeometry, Window
     from fog_contracts.handlers import Moment, Publication
     from fog_contracts.messages import Zone
     from map_service.layers.base import Grid
-    from map_service.shapes import ShapeMask
 
 
 def penalty_cost(factor: float) -> int:
@@ -58,7 +58,7 @@ class ZonesLayer(CostLayer):
         self._changed = False
 
     def put(self, zone: Zone, stamp: float) -> None:
-        """Add or replace a zone; raises `ZoneError` for a shape that can't be used."""
+        """Add or replace a zone; raises `ShapeError` for a shape that can't be used."""
         self._put(zone, rasterize_shape(zone.shape, self._geometry), stamp)
 
     def remove(self, zone_id: str) -> None:
@@ -70,13 +70,13 @@ class ZonesLayer(CostLayer):
                 self._mark(old, "removed")
 
     def replace_all(self, zones: Iterable[Zone], stamp: float) -> None:
-        """Hold exactly these zones; raises `ZoneError`, which names it, and changes nothing for an unusable one."""
+        """Hold exactly these zones; raises `ShapeError`, which names it, and changes nothing for an unusable one."""
         masks: dict[str, tuple[Zone, ShapeMask]] = {}
         for zone in zones:
             try:
                 masks[zone.id] = zone, rasterize_shape(zone.shape, self._geometry)
-            except ZoneError as error:
-                raise ZoneError(f"{zone.id}.{error.field}", error.message) from error
+            except ShapeError as error:
+                raise ShapeError(f"{zone.id}.shape.{error.field}", error.problem) from error
         for name in [name for name in self._held if name not in masks]:
             self.remove(name)
         for zone, mask in masks.values():

@@ -1,0 +1,130 @@
+"""What each shape of a zone is: how it is checked, which points it holds, which cells it covers.
+
+To add a shape, define its message in `fog_contracts.messages` (and name it in `Shape`), write its class here and add
+both to `KINDS`. Nobody else asks which shape it has before them.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Any, Final, Generic, TypeVar
+
+from fog_contracts.geometry import (
+    GeometryError,
+    ShapeMask,
+    contains_point,
+    distance_to_segment,
+    normalized_polygon,
+    rasterize,
+    rasterize_line,
+)
+from fog_contracts.grid import GridGeometry
+from fog_contracts.messages import CircleShape, CorridorShape, PolygonShape, RectangleShape, Shape
+
+S = TypeVar("S")
+
+
+class ShapeError(GeometryError):
+    """A shape that can't be used: `field` is the path in it, the message says what is wrong and what to do."""
+
+    def __init__(self, field: str, problem: str) -> None:
+        super().__init__(f"{field}: {problem}")
+        self.field = field
+        self.problem = problem
+
+
+class ShapeKind(ABC, Generic[S]):
+    """One kind of shape."""
+
+    def normalized(self, shape: S) -> S:
+        """Return the shape as it is stored; raises `ShapeError` for one that can't be used."""
+        return shape
+
+    @abstractmethod
+    def contains(self, shape: S, x: float, y: float) -> bool:
+        """Whether a point (m, frame `map`) lies in the shape."""
+
+    @abstractmethod
+    def rasterized(self, shape: S, geometry: GridGeometry) -> ShapeMask:
+        """Return the cells of a shape, as generously as `rasterize` does; raises `ShapeError`."""
+
+
+class _Polygon(ShapeKind[PolygonShape]):
+    def normalized(self, shape: PolygonShape) -> PolygonShape:
+        """Return it open and counter-clockwise."""
+        try:
+            return PolygonShape(points=normalized_polygon(shape.points))
+        except GeometryError as error:
+            raise ShapeError("points", f"{error}; draw one simple outline with at least three corners") from error
+
+    def contains(self, shape: PolygonShape, x: float, y: float) -> bool:
+        return contains_point(shape.points, x, y)
+
+    def rasterized(self, shape: PolygonShape, geometry: GridGeometry) -> ShapeMask:
+        return rasterize(self.normalized(shape).points, geometry)
+
+
+class _Rectangle(ShapeKind[RectangleShape]):
+    def normalized(self, shape: RectangleShape) -> RectangleShape:
+        (x0, y0), (x1, y1) = shape.corner, shape.opposite
+        if x0 == x1 or y0 == y1:
+            raise ShapeError("opposite", "the rectangle has no area: give the corner that lies diagonally opposite")
+        return shape
+
+    def contains(self, shape: RectangleShape, x: float, y: float) -> bool:
+        (x0, y0), (x1, y1) = shape.corner, shape.opposite
+        return min(x0, x1) <= x <= max(x0, x1) and min(y0, y1) <= y <= max(y0, y1)
+
+    def rasterized(self, shape: RectangleShape, geometry: GridGeometry) -> ShapeMask:
+        (x0, y0), (x1, y1) = self.normalized(shape).corner, shape.opposite
+        left, right, bottom, top = min(x0, x1), max(x0, x1), min(y0, y1), max(y0, y1)
+        return rasterize([(left, bottom), (right, bottom), (right, top), (left, top)], geometry)
+
+
+class _Circle(ShapeKind[CircleShape]):
+    def contains(self, shape: CircleShape, x: float, y: float) -> bool:
+        return math.dist(shape.centre, (x, y)) <= shape.radius
+
+    def rasterized(self, shape: CircleShape, geometry: GridGeometry) -> ShapeMask:
+        return rasterize_line([shape.centre], shape.radius, geometry)
+
+
+class _Corridor(ShapeKind[CorridorShape]):
+    def normalized(self, shape: CorridorShape) -> CorridorShape:
+        if len(set(shape.line)) < 2:
+            raise ShapeError("line", "a corridor needs at least two different points")
+        return shape
+
+    def contains(self, shape: CorridorShape, x: float, y: float) -> bool:
+        sides = zip(shape.line, shape.line[1:], strict=False)
+        return any(distance_to_segment(a, b, x, y) <= shape.width / 2 for a, b in sides)
+
+    def rasterized(self, shape: CorridorShape, geometry: GridGeometry) -> ShapeMask:
+        return rasterize_line(shape.line, shape.width / 2, geometry)
+
+
+KINDS: Final[Mapping[type, ShapeKind[Any]]] = {
+    PolygonShape: _Polygon(),
+    RectangleShape: _Rectangle(),
+    CircleShape: _Circle(),
+    CorridorShape: _Corridor(),
+}
+
+
+def normalized_shape(shape: Shape) -> Shape:
+    """Return a shape as it is stored (polygons counter-clockwise); raises `ShapeError` for one that can't be used."""
+    normalized: Shape = KINDS[type(shape)].normalized(shape)
+    return normalized
+
+
+def shape_contains(shape: Shape, x: float, y: float) -> bool:
+    """Whether a point (m, frame `map`) lies in a shape."""
+    return KINDS[type(shape)].contains(shape, x, y)
+
+
+def rasterize_shape(shape: Shape, geometry: GridGeometry) -> ShapeMask:
+    """Return the cells of a shape: those within half a cell's diagonal of it, so that none is drawn too small.
+
+    The window is empty for a shape off the grid. Raises `ShapeError` for one that can't be used.
+    """
+    return KINDS[type(shape)].rasterized(shape, geometry)

@@ -1,0 +1,49 @@
+"""Zones checked before they are stored, in the operator's words. Pure."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from msgspec import structs
+
+from fog_contracts.shapes import ShapeError, normalized_shape, rasterize_shape
+
+if TYPE_CHECKING:
+    from fog_contracts.grid import GridGeometry
+    from fog_contracts.messages import Zone
+
+
+class ZoneError(ValueError):
+    """A zone that can't be used: `field` is its path in the zone, the message says what is wrong and what to do."""
+
+    def __init__(self, field: str, message: str) -> None:
+        super().__init__(f"{field}: {message}")
+        self.field = field
+        self.message = message
+
+
+def validated_zone(zone: Zone, geometry: GridGeometry, stamp: float) -> Zone:
+    """Return the zone as it is stored (polygons counter-clockwise); raises `ZoneError` that names field and remedy."""
+    if zone.kind == "PENALTY" and zone.factor is None:
+        raise ZoneError("factor", "a PENALTY zone needs a factor of 1 or more: how much dearer its floor is")
+    if zone.kind == "SPEED_LIMIT" and zone.speed is None:
+        raise ZoneError("speed", "a SPEED_LIMIT zone needs a speed in m/s")
+    if zone.kind != "PENALTY" and zone.factor is not None:
+        raise ZoneError("factor", f"a {zone.kind} zone has no factor: leave it out or make the kind PENALTY")
+    if zone.kind != "SPEED_LIMIT" and zone.speed is not None:
+        raise ZoneError("speed", f"a {zone.kind} zone has no speed: leave it out or make the kind SPEED_LIMIT")
+    if zone.expires_at is not None and zone.expires_at <= max(stamp, zone.starts_at or 0.0):
+        raise ZoneError("expires_at", "the zone would be over before it begins: give a later time, or leave it out")
+    try:
+        shape = normalized_shape(zone.shape)
+        on_map = rasterize_shape(shape, geometry).mask.any()
+    except ShapeError as error:
+        raise ZoneError(f"shape.{error.field}", error.problem) from error
+    if not on_map:
+        left, bottom, right, top = geometry.bounds
+        raise ZoneError(
+            "shape",
+            f"the zone lies off the map, which reaches from ({left:.2f}, {bottom:.2f}) to ({right:.2f}, {top:.2f}) m:"
+            " draw it there",
+        )
+    return structs.replace(zone, shape=shape)

@@ -1,6 +1,6 @@
 """Feed a recording to fresh cores and write down all that they say: `python cores.py RECORDING SITE OUT`.
 
-Time is the recording's: an input is taken when it was recorded, and every core beats each 0.1 s of recorded time.
+Time is the recording's: an input is taken when it was recorded, and every core ticks each 0.1 s of recorded time.
 A program of its own, so that a test can run it twice with other hash seeds.
 """
 
@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from fog_contracts import channels as ch
+from fog_contracts.bus import Bus
 from fog_contracts.follower import MapFollower
-from fog_contracts.handlers import Moment
+from fog_contracts.handlers import Moment, Publication
 from fog_contracts.messages import (
     AreaHazard,
-    HazardArea,
     MapDelta,
     MapHeartbeat,
     MapSnapshot,
@@ -31,6 +31,7 @@ from fog_contracts.messages import (
 )
 from fog_runtime.record import read
 from fog_runtime.site import LoadedSite, load_site
+from fognav_experiments.processes import AggregatorProcess, MapProcess, PlannerProcess
 from hazard_aggregator.core import Aggregator
 from hazard_aggregator.registry import find_rule
 from map_service.core import MapCore
@@ -38,13 +39,13 @@ from map_service.registry import make_layers
 from planner.core import PlannerCore
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Sequence
 
-    from fog_contracts.handlers import Publication
+    from fog_contracts.handlers import Ids
 
 Heard = tuple[float, ch.Channel, dict[str, str], Message | str]
 
-BEAT_S: Final = 0.1
+TICK_S: Final = 0.1
 
 
 class ReplayError(Exception):
@@ -64,38 +65,58 @@ def first(heard: list[Heard], channel: ch.Channel) -> tuple[float, Message]:
     raise ReplayError(f"no message of {channel.name} was recorded")
 
 
-def beating(heard: list[Heard], begin: float) -> Iterator[tuple[float, Heard | None]]:
-    """Yield the messages since `begin`, and None at every beat between them."""
-    due = begin
-    for message in heard:
-        at = message[0]
-        if at < begin:
-            continue
-        while due <= at:
-            yield due, None
-            due += BEAT_S
-        yield at, message
+class Replay:
+    """One core on a bus of its own, which hears what the other parts of the system published in a recording."""
+
+    def __init__(self, heard: list[Heard], site: LoadedSite, role: ch.Role, begin: float) -> None:
+        self.bus = Bus(site.site.id)
+        self.published: list[Message] = []
+        """What the core has published, without text."""
+        self._heard = [event for event in heard if event[0] >= begin]
+        self._role = role
+        self._begin = begin
+        own = [c for c in ch.CHANNELS.values() if c.kind == "pub" and role in c.publishers and c.message is not None]
+        self.bus.subscribe(dict.fromkeys(own, self._note))
+
+    def _note(self, _ids: Ids, message: Message, _at: Moment) -> Sequence[Publication]:
+        self.published.append(message)
+        return ()
+
+    def run(
+        self,
+        tick: Callable[[Moment], object],
+        deliver: Callable[[Moment], object] | None = None,
+        *,
+        own: Callable[[Heard, Moment], object] | None = None,
+    ) -> None:
+        """Deliver every message when it was recorded, and tick each 0.1 s of recorded time.
+
+        What the core itself had published is handed to `own`: it tells of inputs that cross no channel.
+        """
+        deliver = deliver or self.bus.deliver
+        due = self._begin
+        for event in self._heard:
+            at = Moment(event[0], event[0])
+            while due <= at.now:
+                tick(Moment(due, due))
+                deliver(Moment(due, due))
+                due += TICK_S
+            _, channel, ids, message = event
+            if self._role not in channel.publishers:
+                self.bus.publish([Publication(channel, message, ids)])
+            elif own is not None:
+                own(event, at)
+            deliver(at)
 
 
 def aggregate(heard: list[Heard], site: LoadedSite) -> list[AreaHazard]:
     """Return the hazards that an aggregator announces, with a store that answers at once."""
     begin, hazard = first(heard, ch.AREA_HAZARD)
     assert isinstance(hazard, AreaHazard)
+    replay = Replay(heard, site, "hazard-aggregator", begin)
     core = Aggregator(site.site.definitions(), site.site.nodes, hazard.epoch, registry=find_rule)
-    handlers = core.handlers()
-    announced: list[AreaHazard] = []
-    for at, event in beating(heard, begin):
-        moment = Moment(at, at)
-        if event is None:
-            publications = core.tick(moment)
-        else:
-            _, channel, ids, message = event
-            if channel not in handlers:
-                continue
-            publications = [*handlers[channel](ids, message, moment)]
-        published = (*publications, *core.stored(core.to_store()))
-        announced += [p.message for p in published if isinstance(p.message, AreaHazard)]
-    return announced
+    replay.run(AggregatorProcess(core, replay.bus).tick)
+    return [message for message in replay.published if isinstance(message, AreaHazard)]
 
 
 def empty_map(heard: list[Heard], site: LoadedSite) -> MapCore:
@@ -113,28 +134,18 @@ def empty_map(heard: list[Heard], site: LoadedSite) -> MapCore:
 
 def draw(heard: list[Heard], site: LoadedSite) -> tuple[list[MapDelta], MapSnapshot]:
     """Return the deltas that a map-service publishes, and its last map."""
-    core, deltas = empty_map(heard, site), []
-    handlers = core.handlers()
-
-    def take(publications: Sequence[Publication]) -> None:
-        deltas.extend(p.message for p in publications if isinstance(p.message, MapDelta))
-
+    replay = Replay(heard, site, "map-service", heard[0][0])
+    process = MapProcess(empty_map(heard, site), replay.bus)
     begin = Moment(heard[0][0], heard[0][0])
-    # What crosses no channel: the aggregator lives, and the broker is connected.
-    take(core.load_zones([], begin))
-    take(core.on_broker(begin, connected=True))
-    take(core.on_aggregator("recorded", begin, alive=True))
-    for at, event in beating(heard, begin.now):
-        moment = Moment(at, at)
-        if event is None:
-            take(core.tick(moment))
-            continue
-        _, channel, ids, message = event
-        if isinstance(message, ZoneSet):
-            take(core.load_zones(message.zones, moment))
-        elif channel in handlers:
-            take(handlers[channel](ids, message, moment))
-    return deltas, core.costmap.snapshot()
+    process.load_zones([], begin)
+    process.connect(begin)
+
+    def take_stored_zones(event: Heard, at: Moment) -> None:
+        if isinstance(zones := event[3], ZoneSet):
+            process.load_zones(zones.zones, at)
+
+    replay.run(process.tick, own=take_stored_zones)
+    return [m for m in replay.published if isinstance(m, MapDelta)], process.core.costmap.snapshot()
 
 
 def copy(heard: list[Heard], site: LoadedSite) -> list[MapHeartbeat]:
@@ -152,63 +163,47 @@ def copy(heard: list[Heard], site: LoadedSite) -> list[MapHeartbeat]:
     return versions
 
 
-def inform(core: PlannerCore, event: Heard) -> bool:
-    """Give a planner a recorded input; return whether it wakes it."""
-    at, channel, ids, message = event
-    if isinstance(message, RobotGoal):
-        # The recorded goal is what the planner made of a person's wish: a place that asks for no heading is not in it.
-        core.set_goal(ids["robot"], message, any_heading=True)
-        return True
-    handler = core.handlers().get(channel)
-    if handler is not None:
-        handler(ids, message, Moment(at, at))
-    return channel in core.URGENT
-
-
-def guide(core: PlannerCore) -> None:
-    """Compute the distance fields that it wants, as its process does after a turn."""
-    for job in core.field_jobs():
-        job.run()
-        core.take_field(job)
-
-
-def new_planner(heard: list[Heard], site: LoadedSite) -> PlannerCore:
+def new_planner(heard: list[Heard], site: LoadedSite, replay: Replay) -> PlannerProcess:
     """Return a planner that knows the first map."""
     _, path = first(heard, ch.ROBOT_PATH)
     assert isinstance(path, RobotPath)
     core = PlannerCore(path.planner_epoch)
     core.load(empty_map(heard, site).costmap.snapshot(), heard[0][0])
-    return core
+    return PlannerProcess(core, replay.bus)
 
 
 def decide(heard: list[Heard], site: LoadedSite) -> list[RobotPath | RobotGoal]:
     """Return what a planner tells the robots."""
-    core, told = new_planner(heard, site), []
-    for at, event in beating(heard, heard[0][0]):
-        if event is not None and not inform(core, event):
-            continue
-        published = (publication.message for publication in core.tick(Moment(at, at)))
-        told += [message for message in published if isinstance(message, (RobotPath, RobotGoal))]
-        guide(core)
-    return told
+    replay = Replay(heard, site, "planner", heard[0][0])
+    planner = new_planner(heard, site, replay)
+
+    def take_mission(event: Heard, _at: Moment) -> None:
+        _, _, ids, goal = event
+        if isinstance(goal, RobotGoal):
+            # The recorded goal is what the planner made of a person's wish: a place that asks for no heading is not
+            # in it.
+            planner.set_goal(ids["robot"], goal, any_heading=True)
+
+    replay.run(planner.tick, planner.deliver, own=take_mission)
+    return [message for message in replay.published if isinstance(message, (RobotPath, RobotGoal))]
 
 
 def plan_again(heard: list[Heard], site: LoadedSite) -> list[RobotPath]:
     """Return each recorded plan anew: from where it begins, on the map version that it names."""
-    core, known, goal, again = new_planner(heard, site), 0, None, []
-    for event in heard:
+    replay = Replay(heard, site, "planner", heard[0][0])
+    planner, again, known, goal = new_planner(heard, site, replay), [], 0, None
+
+    def plan(event: Heard, at: Moment) -> None:
+        nonlocal known, goal
         message = event[3]
-        if isinstance(message, (MapDelta, HazardArea, ZoneSet)):
-            inform(core, event)
-            guide(core)
-        elif isinstance(message, RobotGoal):
+        if isinstance(message, RobotGoal):
             goal = message.pose or goal
         elif isinstance(message, RobotPath) and message.plan_id != known and message.points and goal is not None:
             known = message.plan_id
             x, y = message.points[0]
             request = PlanRequest(start=Pose(x=x, y=y, theta=0.0), goal=goal)
-            reply = core.answerers()[ch.PLANNER_PLAN]({}, request, Moment(event[0], event[0]))
-            assert isinstance(reply, PlanReply)
+            reply = replay.bus.ask(ch.PLANNER_PLAN, request, PlanReply, at)
+            assert reply is not None
             again.append(
                 msgspec.structs.replace(
                     message,
@@ -218,8 +213,10 @@ def plan_again(heard: list[Heard], site: LoadedSite) -> list[RobotPath]:
                     refusal=reply.refusal,
                 )
             )
-            core.set_goal("r", RobotGoal(goal_id="again", pose=goal))
-            guide(core)
+            # Its distance field speeds up the search for the next plan, as it does in the planner.
+            planner.set_goal("r", RobotGoal(goal_id="again", pose=goal))
+
+    replay.run(planner.tick, planner.deliver, own=plan)
     return again
 
 

@@ -64,6 +64,7 @@ from fognav.demo.speed import SpeedWatch
 from fognav.output import WrongUseError
 from fognav.recording import recording, summary
 from fognav.stack import AGENT, MAP_SERVICE, SERVERS, SERVICES, SIMULATOR, WATCHDOG, Stack, StackConfig
+from robot_agent.agent.replay import replay
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -151,6 +152,11 @@ async def drive(attempt: Attempt, stack: Stack, edge: ZenohEdge, clock: SystemCl
             await asyncio.gather(driving, return_exceptions=True)
 
 
+def input_log(recording: Path) -> Path:
+    """Return where the agent of a recorded demo logs all that reaches its core."""
+    return recording.with_name("agent.mcap")
+
+
 async def record(path: Path) -> tuple[MapSnapshot, str]:
     """Record a demo; return the last map and the area that was blocked."""
     site = load_site(SITE)
@@ -165,8 +171,8 @@ async def record(path: Path) -> tuple[MapSnapshot, str]:
         faded_at = clock.now() + seen.ttl + FADED_S
 
     # So long a memory as robots have by themselves would make the recording long too.
-    memory = {"OBSTACLE_MEMORY_S": "30"}
-    async with Stack(StackConfig(site_dir=SITE, robot=plan.robot, seed=1, speed=SPEED, extra=memory)) as stack:
+    extra = {"OBSTACLE_MEMORY_S": "30", "INPUT_LOG": str(input_log(path))}
+    async with Stack(StackConfig(site_dir=SITE, robot=plan.robot, seed=1, speed=SPEED, extra=extra)) as stack:
         keeper = stack.supervisor
         for name in SERVERS:
             keeper.start(name)
@@ -319,6 +325,16 @@ def test_the_replayed_planner_leads_around_the_area_for_the_recorded_reason(reco
         assert [trace.area for trace in turn.traces] == [area.id]
         assert all(path.refusal is None for path in paths)
     assert told[-1].points[-1] == live[-1].points[-1]
+
+
+def test_the_agent_replayed_from_its_log_decides_the_same_to_the_last_bit(recorded):
+    result = replay(input_log(recorded.path))
+    assert result.differences == []
+    paths = {path.plan_id for path in recorded.of(ch.ROBOT_PATH)}
+    assert result.inputs["MessageReceived"] > len(paths) >= 2
+    assert result.inputs["ScanReceived"] > 100
+    assert result.inputs["DecisionMade"] > 50
+    assert "NORMAL" in result.modes
 
 
 # --- The file ---

@@ -17,11 +17,13 @@ from typing import TYPE_CHECKING, Final
 
 import msgspec
 
+from fog_contracts import channels as ch
+from fog_contracts.bus import Bus
 from fog_contracts.geometry import distance_to_polygon
-from fog_contracts.messages import PlanRequest, RobotGoal, RobotPath, SimObstacle
+from fog_contracts.messages import PlanRequest, RobotGoal, SimObstacle
 from fog_contracts.stages import SPANS, durations_ms
 from fog_runtime.site import LoadedSite, load_site
-from fognav_experiments.rigs import STAMP, FogRig, RobotRig
+from fognav_experiments.rigs import STAMP, TICK_STEPS, FogRig, System, moment
 from fognav_sim.devices import DEFAULT_BASE, DEFAULT_LIDAR
 from fognav_sim.drive.evaluation import DriveEvaluation, DriveOutcome, OutcomeKind
 from fognav_sim.drive.hazard import draw_hazard, draw_trigger
@@ -31,7 +33,10 @@ from fognav_sim.scenario import Event, Scenario, ScenarioError, barrier_across
 from fognav_sim.world import Noise, World
 
 if TYPE_CHECKING:
-    from fog_contracts.messages import Pose, Trace
+    from collections.abc import Sequence
+
+    from fog_contracts.handlers import Ids, Moment, Publication
+    from fog_contracts.messages import AreaState, HazardArea, Pose, RobotPath, RobotPose, RobotState, Trace
     from fog_contracts.site import AreaSite, Place
 
 WARM_UP_S: Final = 12.0
@@ -40,6 +45,8 @@ TRACK_M: Final = 0.25
 """Spacing of the recorded track."""
 OPERATE_STEPS: Final = 50
 """Steps of 10 ms between two looks of the operator."""
+_LOOK_STEPS: Final = 200
+"""Steps of 10 ms after which all areas are known to be clear."""
 TRUTH_STEPS: Final = 10
 """Steps of 10 ms between two looks of the evaluation, as the simulator publishes the truth."""
 
@@ -96,14 +103,17 @@ class _Drive:
     ) -> None:
         robot = msgspec.structs.replace(site.site.robots[0], start=start)
         self.site, self.goal, self.seed = site, goal, seed
-        self.world = World(site.map.geometry, site.map.cells, robot, seed, noise=noise)
-        self.robot = RobotRig(site, robot, self.world, seed, 0.0, base=base, lidar=lidar)
-        self.fog = FogRig(site, self.world, seed, 0.0)
+        self.system = System(site, robot, seed, noise=noise, base=base, lidar=lidar)
+        self.world = self.system.world
+        self.robot = self.system.robot
         self.scenario = Scenario((), start=0.0)
         self.events: list[Happening] = []
         self.track: list[tuple[float, float]] = []
         self.planned_m = 0.0
         self.path: RobotPath | None = None
+        self.pose: RobotPose | None = None
+        self.state: RobotState | None = None
+        self.hazards: dict[str, AreaState] = {}
         self.barrier: SimObstacle | None = None
         self.barrier_since: float | None = None
         self.hazard_clearance = math.inf
@@ -117,6 +127,14 @@ class _Drive:
         self._steps = 0
         self._mode = ""
         self._crossed = 0
+        self.system.bus.subscribe(
+            {
+                ch.HAZARD: self._on_hazard,
+                ch.ROBOT_PATH: self._on_path,
+                ch.ROBOT_POSE: self._on_pose,
+                ch.ROBOT_STATE: self._on_state,
+            }
+        )
 
     @property
     def now(self) -> float:
@@ -137,29 +155,43 @@ class _Drive:
     def step(self) -> None:
         """Let 10 ms pass everywhere."""
         self._steps += 1
-        robot, fog = self.robot, self.fog
-        robot.step(fog.snapshot if robot.agent.wants_snapshot(robot.now) else None)
         for happened in self.scenario.step(self.world, self.now):
             self.barrier_since = self.now
             self.say(happened.name)
-        known = {area: told.hazard.state for area, told in fog.hazards.items()}
-        fog.step(self.now)
-        fog.hear(robot.id, robot.tell(), self.now)
-        for message in fog.deliver(robot):
-            if isinstance(message, RobotPath):
-                self._on_path(message)
-        for area, told in fog.hazards.items():
-            if known.get(area) != told.hazard.state:
-                self.say(f"area {area}: {told.hazard.state} ({told.hazard.cause})")
-        self.traces += robot.agent.finished_traces()
+        self.system.step()
+        if refused := self.system.bus.refused:
+            raise RuntimeError(f"messages of the system's own were refused: {'; '.join(refused)}")
+        self.traces += self.robot.agent.finished_traces()
         self._watch()
 
-    def _on_path(self, path: RobotPath) -> None:
+    def _on_hazard(self, ids: Ids, message: HazardArea, at: Moment) -> Sequence[Publication]:
+        del at
+        area, hazard = ids["area"], message.hazard
+        if self.hazards.get(area) != hazard.state:
+            self.hazards[area] = hazard.state
+            self.say(f"area {area}: {hazard.state} ({hazard.cause})")
+        return ()
+
+    def _on_pose(self, ids: Ids, pose: RobotPose, at: Moment) -> Sequence[Publication]:
+        del ids, at
+        self.pose = pose
+        return ()
+
+    def _on_state(self, ids: Ids, state: RobotState, at: Moment) -> Sequence[Publication]:
+        del ids, at
+        self.state = state
+        return ()
+
+    def _on_path(self, ids: Ids, path: RobotPath, at: Moment) -> Sequence[Publication]:
+        del ids
         known, self.path = self.path, path
         if self.evaluation is not None:
-            self.evaluation.on_path(path, self.now)
-        if known is not None and known.plan_id == path.plan_id:
-            return
+            self.evaluation.on_path(path, at.now)
+        if known is None or known.plan_id != path.plan_id:
+            self._on_plan(path)
+        return ()
+
+    def _on_plan(self, path: RobotPath) -> None:
         if path.refusal is not None:
             self.say(f"no way: {path.refusal.reason}")
             return
@@ -171,13 +203,13 @@ class _Drive:
         x, y, _ = self.world.pose
         if not self.track or math.dist(self.track[-1], (x, y)) >= TRACK_M:
             self.track.append((round(float(x), 3), round(float(y), 3)))
-            pose = self.robot.pose
+            pose = self.pose
             if pose is not None and pose.localized:
                 self.pose_error = max(self.pose_error, math.hypot(pose.x - x, pose.y - y))
         if self.barrier is not None and self.barrier_since is not None:
             gap = distance_to_polygon(self.barrier.polygon, x, y) - self.world.robot.radius
             self.hazard_clearance = min(self.hazard_clearance, gap)
-        state = self.robot.state
+        state = self.state
         if state is not None:
             self.operator.on_state(state, self.now)
             if state.mode != self._mode:
@@ -196,8 +228,8 @@ class _Drive:
 
     def _evaluate(self, evaluation: DriveEvaluation) -> None:
         evaluation.on_truth(self.world.truth(STAMP + self.now))
-        if self.robot.state is not None:
-            evaluation.on_state(self.robot.state, self.now)
+        if self.state is not None:
+            evaluation.on_state(self.state, self.now)
         for area in evaluation.route_areas[self._crossed :]:
             self.say(f"enters {area}")
         self._crossed = len(evaluation.route_areas)
@@ -220,12 +252,12 @@ class _Drive:
         until = self.now + WARM_UP_S
         while self.now < until:
             self.step()
-            state = self.robot.state
-            judged = all(told.hazard.state != "unknown" for told in self.fog.hazards.values())
+            state = self.state
+            judged = "unknown" not in self.hazards.values()
             if state is not None and state.mode == "NORMAL" and judged:
                 return None
-        unknown = [area for area, told in self.fog.hazards.items() if told.hazard.state == "unknown"]
-        reasons = self.robot.state.reasons if self.robot.state else []
+        unknown = [area for area, state in self.hazards.items() if state == "unknown"]
+        reasons = self.state.reasons if self.state else []
         return f"not ready after {WARM_UP_S:.0f} s: {'; '.join(reasons)}; unknown areas: {unknown}"
 
     def result(self, outcome: DriveOutcome, area: str | None) -> LockstepResult:
@@ -295,7 +327,7 @@ def run_lockstep(
         at = hazard_at_m if hazard_at_m is not None else draw_trigger(seed)
         event = Event(name=f"barrier appears in {hazard_area}", place=(barrier,), at_distance=at)
         drive.scenario = Scenario([event], start=drive.now, distance=drive.world.distance)
-    drive.fog.planner.set_goal(drive.robot.id, mission, any_heading=goal.theta is None)
+    drive.system.fog.planner.set_goal(drive.robot.id, mission, any_heading=goal.theta is None)
     evaluation = drive.evaluation
     assert evaluation is not None
     while (outcome := evaluation.outcome(drive.now)) is None:
@@ -314,12 +346,16 @@ def _free_way(site: LoadedSite, start: Pose, goal: Place, seed: int) -> list[tup
     """Plan the way on the empty floor, without driving it."""
     mission = RobotGoal(goal_id="look", pose=msgspec.structs.replace(start, x=goal.x, y=goal.y))
     robot = msgspec.structs.replace(site.site.robots[0], start=start)
-    fog = FogRig(site, World(site.map.geometry, site.map.cells, robot, seed), seed, 0.0)
-    for step in range(200):
-        fog.step((step + 1) * STEP_S)
-        fog.inform_planner((step + 1) * STEP_S)
+    fog = FogRig(site, World(site.map.geometry, site.map.cells, robot, seed), Bus(site.site.id), seed, start=0.0)
+    now = 0.0
+    for step in range(_LOOK_STEPS):
+        now = (step + 1) * STEP_S
+        fog.measure(now)
+        fog.deliver(moment(now))
+        if step % TICK_STEPS == 0:
+            fog.tick(moment(now))
     assert mission.pose is not None
-    reply = fog.preview(PlanRequest(start=start, goal=mission.pose), 200 * STEP_S)
+    reply = fog.preview(PlanRequest(start=start, goal=mission.pose), now)
     if reply.refusal is not None:
         raise ScenarioError(f"there is no way even without a hazard: {reply.refusal.reason}")
     return list(reply.points)

@@ -58,6 +58,18 @@ def decode(channel: Channel, data: bytes, kind: type[M], *, reply: bool = False)
         raise ContractError(channel.name, str(error)) from error
 
 
+def encode_text(channel: Channel, text: str) -> bytes:
+    """Encode the text of a plain-text channel; raises `ContractError` for another channel, or over the limit."""
+    if channel.message is not None or channel.kind != "pub":
+        raise ContractError(
+            channel.name, f"carries {channel.message.__name__ if channel.message else 'nothing'}, not text"
+        )
+    data = text.encode()
+    if len(data) > channel.limit:
+        raise ContractError(channel.name, f"{len(data)} bytes are over the limit of {channel.limit}")
+    return data
+
+
 def decode_text(channel: Channel, data: bytes) -> str:
     """Decode a plain-text channel; raises `ContractError`."""
     if len(data) > channel.limit:

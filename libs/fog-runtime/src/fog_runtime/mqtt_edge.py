@@ -17,7 +17,7 @@ from paho.mqtt.reasoncodes import ReasonCode
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
 from fog_contracts.channels import Channel
-from fog_contracts.codec import ContractError, decode, decode_text, encode
+from fog_contracts.codec import ContractError, decode, decode_text, encode, encode_text
 from fog_contracts.handlers import RefusedMessageError
 from fog_contracts.messages import Message
 from fog_runtime import logs, metrics
@@ -78,14 +78,7 @@ def _address(url: str) -> _Address:
 
 
 def _encoded(channel: Channel, message: Message | str) -> bytes:
-    if isinstance(message, Message):
-        return encode(channel, message)
-    if channel.message is not None:
-        raise ContractError(channel.name, f"carries {channel.message.__name__}, not text")
-    data = message.encode()
-    if len(data) > channel.limit:
-        raise ContractError(channel.name, f"{len(data)} bytes are over the limit of {channel.limit}")
-    return data
+    return encode(channel, message) if isinstance(message, Message) else encode_text(channel, message)
 
 
 def _tell_refused(topics: Sequence[str], codes: Sequence[object]) -> None:

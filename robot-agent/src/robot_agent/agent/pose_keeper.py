@@ -5,16 +5,22 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
+from robot_agent.localization.localizer import SavedPose
+
 if TYPE_CHECKING:
     from fog_contracts.messages import Mode
     from fog_contracts.replica import Replica
-    from robot_agent.localization.localizer import Localizer, SavedPose
+    from fog_contracts.site import RobotSite
+    from robot_agent.localization.localizer import Localizer
 
 SEARCH_AGAIN_S: Final = 15.0
 """A global search is not begun again before this time has passed."""
 _MOVED_M: Final = 0.02
 _TURNED_RAD: Final = 0.03
 _SIGMA_CHANGED: Final = 0.05
+_START_SIGMA_M: Final = 0.25
+_START_SIGMA_RAD: Final = 0.15
+"""How well (standard deviations) somebody puts a robot on its start pose."""
 
 
 class PoseKeeper:
@@ -64,6 +70,14 @@ class PoseKeeper:
             return None
         self._stored = pose
         return pose
+
+
+def start_pose(site: str, robot: RobotSite) -> SavedPose:
+    """Return where the site says that the robot starts, as a pose to restore when none was stored."""
+    start = robot.start
+    return SavedPose(
+        site=site, x=start.x, y=start.y, theta=start.theta, sigma_xy=_START_SIGMA_M, sigma_theta=_START_SIGMA_RAD
+    )
 
 
 def _differs(new: SavedPose, old: SavedPose) -> bool:

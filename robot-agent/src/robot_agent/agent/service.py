@@ -17,7 +17,8 @@ from fog_contracts.replica import MapError
 from fog_runtime import logs, metrics
 from fog_runtime.clock import Ticker
 from fog_runtime.edges import Edges
-from robot_agent.agent.core import SavedPose, decide
+from robot_agent.agent.core import decide
+from robot_agent.agent.pose_keeper import start_pose
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -83,8 +84,7 @@ class Service:
                 _log.warning("stored_map_refused", reason=str(error))
         saved = self._store.pose(self._site)
         if saved is None and body is not None:
-            start = body.start
-            saved = SavedPose(site=self._site, x=start.x, y=start.y, theta=start.theta, sigma_xy=0.25, sigma_theta=0.15)
+            saved = start_pose(self._site, body)
         if saved is not None:
             self._core.restore(saved)
         _log.info("restored", map=snapshot is not None, x=saved and saved.x, y=saved and saved.y)

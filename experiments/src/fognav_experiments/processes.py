@@ -1,0 +1,187 @@
+"""The cores as their processes run them, on a bus in place of brokers: wired from their tables, one turn after another.
+
+Each class stands for one service and adds to its core what no channel carries: a store that answers at once, the
+connection to the broker, the fetching of snapshots, distance fields. Lockstep and replays share them.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from fog_contracts import channels as ch
+from fog_contracts.messages import MapSnapshot
+from robot_agent.agent.core import decide
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from fog_contracts.bus import Bus
+    from fog_contracts.handlers import Handler, Ids, Moment, Publication
+    from fog_contracts.messages import Message, RobotGoal, Zone
+    from hazard_aggregator.core import Aggregator
+    from map_service.core import MapCore
+    from planner.core import PlannerCore
+    from robot_agent.agent.core import AgentCore
+    from robot_agent.guardian.link import WheelCommand
+
+
+class AggregatorProcess:
+    """The hazard aggregator, with a store that answers at once."""
+
+    def __init__(self, core: Aggregator, bus: Bus) -> None:
+        self.core = core
+        self._bus = bus
+        bus.subscribe({channel: self._storing(handler) for channel, handler in core.handlers().items()})
+
+    def connect(self) -> None:
+        """Publish what a broker must hear after each connection."""
+        self._bus.publish(self.core.republish_all())
+
+    def tick(self, at: Moment) -> None:
+        """Let time pass; call it ten times a second."""
+        self._bus.publish(self._store(self.core.tick(at)))
+
+    def _storing(self, handler: Handler) -> Handler:
+        def handle(ids: Ids, message: Message | str, at: Moment) -> Sequence[Publication]:
+            return self._store(handler(ids, message, at))
+
+        return handle
+
+    def _store(self, publications: Sequence[Publication]) -> Sequence[Publication]:
+        """Return these publications, and those that waited for the store."""
+        return [*publications, *self.core.stored(self.core.to_store())]
+
+
+class MapProcess:
+    """The map-service; operators' zones reach it by `load_zones` and `put_zone`, as if they were stored."""
+
+    def __init__(self, core: MapCore, bus: Bus) -> None:
+        self.core = core
+        self._bus = bus
+        self._serving = False
+        bus.subscribe(core.handlers())
+
+    def connect(self, at: Moment) -> None:
+        """Take that the broker is connected and the aggregator alive."""
+        self._bus.publish(self.core.on_broker(at, connected=True))
+        self._bus.publish(self.core.on_aggregator("bus", at, alive=True))
+
+    def load_zones(self, zones: Iterable[Zone], at: Moment) -> None:
+        """Take the stored zones; the map is not served before."""
+        self._bus.publish(self.core.load_zones(zones, at))
+
+    def put_zone(self, zone: Zone, at: Moment) -> None:
+        """Take a zone that an operator has added or changed."""
+        self._bus.publish(self.core.put_zone(zone, at))
+
+    def tick(self, at: Moment) -> None:
+        """Let time pass, and answer queries once the map is whole; call it ten times a second."""
+        self._bus.publish(self.core.tick(at))
+        if self.core.serving and not self._serving:
+            self._serving = True
+            self._bus.serve(self.core.answerers())
+
+
+class PlannerProcess:
+    """The planner; what arrives waits for its next turn, and some of it makes that turn due at once."""
+
+    def __init__(self, core: PlannerCore, bus: Bus) -> None:
+        self.core = core
+        self._bus = bus
+        self.due = False
+        """Whether `tick` is due before its time."""
+        bus.subscribe({channel: self._waking(channel, handler) for channel, handler in core.handlers().items()})
+        bus.serve(core.answerers())
+
+    def set_goal(self, robot: str, goal: RobotGoal, *, any_heading: bool = False) -> None:
+        """Give a robot a mission, as an operator does."""
+        self.core.set_goal(robot, goal, any_heading=any_heading)
+        self.due = True
+
+    def tick(self, at: Moment) -> None:
+        """Take a turn, then compute the distance fields and fetch the map that the core asks for.
+
+        Call it ten times a second, and when it is `due`.
+        """
+        self.due = False
+        self._bus.publish(self.core.tick(at))
+        self.core.take_reached()
+        for job in self.core.field_jobs():
+            job.run()
+            self.core.take_field(job)
+        if self.core.wants_snapshot(at.now):
+            snapshot = self._bus.ask(ch.MAP_SNAPSHOT, None, MapSnapshot, at)
+            if snapshot is not None:
+                self.core.load(snapshot, at.now)
+                self.due = True
+
+    def deliver(self, at: Moment) -> None:
+        """Deliver what is on the bus to all, and take turns as long as they are due."""
+        self._bus.deliver(at)
+        while self.due:
+            self.tick(at)
+            self._bus.deliver(at)
+
+    def _waking(self, channel: ch.Channel, handler: Handler) -> Handler:
+        def handle(ids: Ids, message: Message, at: Moment) -> Sequence[Publication]:
+            self.due = self.due or channel in self.core.URGENT
+            return handler(ids, message, at)
+
+        return handle
+
+
+class AgentProcess:
+    """A robot's agent; whoever runs it hands the core what base and lidar send."""
+
+    def __init__(self, core: AgentCore, robot: str, bus: Bus) -> None:
+        self.core = core
+        self._bus = bus
+        bus.subscribe(core.handlers(), only={"robot": robot})
+        bus.serve(core.answerers(), only={"robot": robot})
+
+    def fetch_map(self, at: Moment) -> None:
+        """Load a snapshot if the core wants one and the map is served; call it 20 times a second."""
+        if self.core.wants_snapshot(at.now):
+            snapshot = self._bus.ask(ch.MAP_SNAPSHOT, None, MapSnapshot, at)
+            if snapshot is not None:
+                self.core.load(snapshot, at.now)
+
+    def control(self, at: Moment) -> None:
+        """Decide how to drive; call it 5 times a second."""
+        job = self.core.control_job(at.now)
+        if job is not None:
+            self.core.accept(decide(job))
+
+    def stream(self, at: Moment) -> WheelCommand:
+        """Return the wheel command for the guardian; call it 20 times a second."""
+        return self.core.stream(at.now, at.stamp)
+
+    def tick(self, at: Moment) -> None:
+        """Let time pass; call it ten times a second."""
+        self._bus.publish(self.core.tick(at))
+
+
+class Fog:
+    """Aggregator, map-service and planner together."""
+
+    def __init__(self, aggregator: Aggregator, map_: MapCore, planner: PlannerCore, bus: Bus) -> None:
+        self.aggregator = AggregatorProcess(aggregator, bus)
+        self.map = MapProcess(map_, bus)
+        self.planner = PlannerProcess(planner, bus)
+
+    def start(self, at: Moment) -> None:
+        """Connect everything, with no zones stored."""
+        self.map.load_zones([], at)
+        self.map.connect(at)
+        self.aggregator.connect()
+        self.deliver(at)
+
+    def deliver(self, at: Moment) -> None:
+        """Deliver what is on the bus, to the last message that comes of it."""
+        self.planner.deliver(at)
+
+    def tick(self, at: Moment) -> None:
+        """Let time pass in all three; call it ten times a second."""
+        for process in (self.aggregator, self.map, self.planner):
+            process.tick(at)
+            self.deliver(at)

@@ -25,20 +25,20 @@ numbers = st.from_regex(r"[0-9]{1,4}", fullmatch=True)
 
 
 def matches(pattern, key):
-    """MQTT's and zenoh's one-level wildcards."""
+    """Whether a key matches a pattern with MQTT's or zenoh's one-level wildcards."""
     parts, levels = pattern.split("/"), key.split("/")
     return len(parts) == len(levels) and all(p in {"+", "*", k} for p, k in zip(parts, levels, strict=True))
 
 
 @given(data=st.data(), channel=st.sampled_from(list(CHANNELS.values())))
-def test_key_and_ids_are_each_others_inverse(data, channel):
-    chosen = {name: data.draw(numbers if name == "number" else ids) for name in channel.fields}
-    key = channel.key(**chosen)
-    assert channel.match(key) == chosen
-    assert find_channel(channel.transport, key) == (channel, chosen)
-    if "number" not in chosen:
+def test_matching_a_key_returns_the_ids_that_it_was_made_from(data, channel):
+    channel_ids = {name: data.draw(numbers if name == "number" else ids) for name in channel.fields}
+    key = channel.key(**channel_ids)
+    assert channel.match(key) == channel_ids
+    assert find_channel(channel.transport, key) == (channel, channel_ids)
+    if "number" not in channel_ids:
         assert matches(channel.pattern(), key)
-        some = dict(list(chosen.items())[:1])
+        some = dict(list(channel_ids.items())[:1])
         assert matches(channel.pattern(**some), key)
 
 
@@ -49,21 +49,21 @@ def test_a_key_belongs_to_at_most_one_channel(key):
 
 
 @pytest.mark.parametrize("bad", ["", "A", "a/b", "+", "#", "*", "**", "a b", "a\n", "-a", "x" * 33, "é"])
-def test_malformed_ids_make_no_key_and_match_none(bad):
+def test_malformed_id_is_refused_in_a_key_and_does_not_match(bad):
     with pytest.raises(ValueError, match="node"):
         NODE_READING.key(site="lab", node=bad)
     assert NODE_READING.match(f"fog/v1/lab/nodes/{bad}/reading") is None
     assert NODE_READING.match(f"fog/v1/{bad}/nodes/n1/reading") is None
 
 
-def test_missing_and_unknown_ids_are_named():
+def test_missing_and_unknown_ids_are_refused_by_name():
     with pytest.raises(ValueError, match=re.escape("['robot', 'site']")):
         ROBOT_POSE.key(robot="r1")
     with pytest.raises(ValueError, match="colour"):
         MAP_DELTA.key(site="lab", colour="red")
 
 
-def test_thesis_topics_are_spelt_as_in_the_thesis():
+def test_thesis_topics_are_those_of_the_thesis():
     assert THESIS_AREA.key(number="3") == "area 3"
     assert THESIS_WSN.key() == "WSN"
     with pytest.raises(ValueError, match="wildcard"):
@@ -71,17 +71,17 @@ def test_thesis_topics_are_spelt_as_in_the_thesis():
 
 
 @pytest.mark.parametrize("channel", CHANNELS.values(), ids=lambda c: c.name)
-def test_row_is_consistent(channel):
+def test_channel_row_is_consistent(channel):
     assert CHANNELS[channel.name] is channel is getattr(channels, channel.name.upper())
     assert channel.publishers
     assert channel.subscribers
     assert {*channel.publishers, *channel.subscribers} <= set(ROLES)
     assert channel.durability in DURABILITIES
-    assert channel.message or channel.reply or channel.about, "nothing says what it carries"
+    assert channel.message or channel.reply or channel.about, "the row does not describe its payload"
     assert (channel.reply is None) == (channel.reply_limit == 0) == (channel.kind != "query")
     assert (channel.limit > 0) == (channel.message is not None or channel.encoding == "text")
     assert bool(channel.message) == (channel.encoding != "text") or channel.kind != "pub"
-    assert all(len(word) <= channel.limit for word in channel.words)
+    assert all(len(value) <= channel.limit for value in channel.values)
     if channel.transport == "zenoh":
         assert channel.template.startswith("fog/{site}/")
         assert channel.encoding == "msgpack"
@@ -105,16 +105,16 @@ def test_every_channel_of_the_module_is_in_the_table_once():
     assert len({(row.transport, row.template) for row in rows}) == len(rows) == len(CHANNELS)
 
 
-def test_every_role_stands_at_the_end_of_a_channel():
-    ends = {role for row in CHANNELS.values() for role in (*row.publishers, *row.subscribers)}
-    assert ends | {"recorder"} == set(ROLES)
+def test_every_role_publishes_or_subscribes():
+    used = {role for row in CHANNELS.values() for role in (*row.publishers, *row.subscribers)}
+    assert used | {"recorder"} == set(ROLES)
 
 
-def test_an_area_becomes_unknown_when_its_nodes_readings_are_stale():
+def test_default_silence_limit_of_an_area_is_the_maximum_age_of_readings():
     assert NODE_READING.max_age_s == UnknownPolicy().silent_after_s
 
 
-def test_channels_are_told_apart_by_identity_and_quick_to_hash():
-    twin = copy.copy(NODE_READING)
-    assert {NODE_READING: 1}.get(twin) is None
+def test_channels_are_compared_and_hashed_by_identity():
+    duplicate = copy.copy(NODE_READING)
+    assert {NODE_READING: 1}.get(duplicate) is None
     assert hash(NODE_READING) == object.__hash__(NODE_READING)

@@ -30,7 +30,7 @@ def pose(**changes):
     seq=st.integers(0, 2**53),
     state=st.sampled_from(["blocked", "clear", "unknown"]),
 )
-def test_reading_survives_the_wire(ranges, seq, state):
+def test_decoding_an_encoded_reading_returns_it(ranges, seq, state):
     status = ["no_echo" if r is None else "ok" for r in ranges]
     message = m.NodeReading(seq=seq, boot=1, uptime_ms=5, range_m=ranges, status=status, state=state)
     assert decode(ch.NODE_READING, encode(ch.NODE_READING, message), m.NodeReading) == message
@@ -73,23 +73,23 @@ def test_missing_field_is_refused_by_name(field):
 
 @pytest.mark.parametrize("field", ["x", "y", "theta", "v", "w", "radius", "height", "stamp"])
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_no_number_of_a_pose_can_be_nan_or_infinite(field, value):
+def test_nan_or_infinity_in_a_pose_is_refused_by_name(field, value):
     with pytest.raises(ContractError, match=field):
         decode(ch.ROBOT_POSE, pose(**{field: value}), m.RobotPose)
 
 
-def test_no_covariance_can_be_nan():
+def test_nan_in_a_covariance_is_refused():
     with pytest.raises(ContractError, match="covariance"):
         decode(ch.ROBOT_POSE, pose(covariance=[0.0] * 8 + [math.nan]), m.RobotPose)
 
 
 @pytest.mark.parametrize("name", ["a1", "x" * 32, "0-0"])
-def test_good_ids_pass(name):
+def test_valid_id_is_accepted(name):
     assert decode(ch.NODE_VALUE, value(name), m.NodeValue).kind == name
 
 
 @pytest.mark.parametrize("name", ["", "-a", "A", "x" * 33, "a b", "a/b", "a\n", "a\x00", "é", "+", "#"])
-def test_bad_ids_are_refused(name):
+def test_malformed_id_is_refused(name):
     with pytest.raises(ContractError, match="kind"):
         decode(ch.NODE_VALUE, value(name), m.NodeValue)
 
@@ -98,42 +98,44 @@ def value(kind):
     return msgspec.json.encode({"seq": 1, "boot": 1, "kind": kind, "value": 1.0, "unit": "C"})
 
 
-@given(junk=st.binary(max_size=300), channel=st.sampled_from(CHANNELS))
-def test_arbitrary_bytes_give_a_message_or_a_contract_error(junk, channel):
+@given(data=st.binary(max_size=300), channel=st.sampled_from(CHANNELS))
+def test_arbitrary_bytes_decode_to_a_message_or_raise_contract_error(data, channel):
     try:
-        message = decode(channel, junk, channel.message)
+        message = decode(channel, data, channel.message)
     except ContractError as error:
-        assert error.channel == channel.name  # noqa: PT017  # both ends are right
+        assert error.channel == channel.name  # noqa: PT017  # a message and an error are both correct
     else:
         assert isinstance(message, channel.message)
 
 
 @given(flips=st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 255)), min_size=1, max_size=5))
-def test_damaged_messages_never_escape_the_contract(flips):
+def test_damaged_pose_raises_contract_error_or_has_finite_numbers(flips):
     data = bytearray(pose())
     for position, byte in flips:
         data[position % len(data)] = byte
     try:
-        got = decode(ch.ROBOT_POSE, bytes(data), m.RobotPose)
+        decoded = decode(ch.ROBOT_POSE, bytes(data), m.RobotPose)
     except ContractError:
         return
-    assert all(math.isfinite(v) for v in (got.x, got.y, got.theta, got.v, got.w, got.stamp, *got.covariance))
+
+    numbers = [decoded.x, decoded.y, decoded.theta, decoded.v, decoded.w, decoded.stamp, *decoded.covariance]
+    assert all(math.isfinite(number) for number in numbers)
 
 
 @pytest.mark.parametrize("channel", [ch.AREA_DEFINITION, ch.ROBOT_STATE], ids=lambda c: c.name)
-def test_endless_nesting_is_refused(channel):
+def test_deeply_nested_unknown_field_is_refused(channel):
     data = b'{"x":' + b"[" * 30_000 if channel.encoding == "json" else b"\x81\xa1x" + b"\x91" * 16_000
     with pytest.raises(ContractError):
         decode(channel, data, channel.message)
 
 
 @pytest.mark.parametrize("channel", CHANNELS, ids=lambda c: c.name)
-def test_size_is_judged_before_the_content(channel):
+def test_oversized_payload_is_refused_before_decoding(channel):
     with pytest.raises(ContractError, match="over the limit"):
         decode(channel, b"\x00" * (channel.limit + 1), channel.message)
 
 
-def test_encoding_refuses_the_wrong_type_and_too_much():
+def test_encoding_refuses_wrong_type_and_oversized_message():
     with pytest.raises(ContractError, match="RobotPose"):
         encode(ch.ROBOT_POSE, m.RobotGoal(goal_id="g", pose=None))
     with pytest.raises(ContractError, match="over the limit"):
@@ -150,7 +152,7 @@ def test_replies_have_their_own_type_and_limit():
         decode(ch.ROBOT_COMMAND, data, m.CommandReply)
 
 
-def test_text_is_bounded_utf8():
+def test_text_that_is_too_long_or_not_utf8_is_refused():
     assert decode_text(ch.NODE_AVAILABILITY, b"online") == "online"
     with pytest.raises(ContractError, match="UTF-8"):
         decode_text(ch.NODE_AVAILABILITY, b"\xff")
@@ -158,7 +160,7 @@ def test_text_is_bounded_utf8():
         decode_text(ch.NODE_AVAILABILITY, b"x" * 17)
 
 
-def test_map_geometry_is_bounded():
+def test_map_geometry_with_too_many_cells_is_refused():
     good = {"width": 5000, "height": 5000, "resolution": 0.05, "origin_x": 0.0, "origin_y": 0.0}
     assert msgspec.convert(good, m.MapGeometry).width == 5000
     with pytest.raises(msgspec.ValidationError, match="cells"):

@@ -1,4 +1,4 @@
-"""What the table generates: each text says what the table says, the header compiles, and each role gets its own."""
+"""Generated texts agree with the channel table, the header compiles, and each role gets its own rights."""
 
 import ctypes
 import datetime as dt
@@ -23,7 +23,7 @@ OPENAPI = {
     "paths": {
         "/api/v1/zones/{zone_id}": {
             "delete": {
-                "description": "Take a zone | away.\n\nMore.",
+                "description": "Remove a zone | for good.\n\nMore.",
                 "parameters": [{"name": "If-Match", "in": "header"}, {"name": "zone_id", "in": "path"}],
                 "responses": {"204": {}, "422": {}},
                 "security": [{"bearer": []}],
@@ -55,19 +55,19 @@ def field(kind, name):
         (m.Zone, "expires_at", "s"), (m.Refusal, "nearest", "m"), (m.NodeReading, "seq", ""), (m.Cause, "id", ""),
     ],
 )  # fmt: skip
-def test_units_come_from_types_and_names(kind, name, unit):
+def test_field_units_come_from_types_and_names(kind, name, unit):
     assert field(kind, name).unit == unit
 
 
-def test_limits_and_choices_are_those_of_a_fields_values():
+def test_field_limits_and_choices_are_those_of_its_values():
     ranges = field(m.NodeReading, "range_m")
     assert ranges.nullable
     assert bounds(ranges.element) == (">", 0.0, "<=", 20.0)
-    assert set(field(m.NodeReading, "status").words) == {"ok", "no_echo", "stuck"}
+    assert set(field(m.NodeReading, "status").choices) == {"ok", "no_echo", "stuck"}
     assert not field(m.NodeReading, "status").nullable
 
 
-def test_parts_are_found_in_lists_maps_and_choices():
+def test_message_parts_are_found_in_lists_and_unions():
     assert parts(m.Zone) == [m.PolygonShape, m.RectangleShape, m.CircleShape, m.CorridorShape]
     assert parts(m.RobotState) == [m.LoopHealth, m.Trace]
 
@@ -85,7 +85,7 @@ def test_a_type_without_a_word_is_named():
 # --- The document ---------------------------------------------------------------------------------------------------
 
 
-def test_the_document_names_every_channel_and_explains_every_message_that_it_links():
+def test_document_lists_every_channel_and_describes_every_linked_message():
     text = channels_markdown({})
     for row in CHANNELS.values():
         assert "`" + row.template.replace("{", "<").replace("}", ">") + "`" in text
@@ -96,7 +96,7 @@ def test_the_document_names_every_channel_and_explains_every_message_that_it_lin
     assert {row.message.__name__ for row in CHANNELS.values() if row.message} <= headings
 
 
-def test_every_line_of_a_table_has_as_many_cells_as_its_head():
+def test_every_table_row_has_as_many_cells_as_its_header():
     width = 0
     for line in channels_markdown({"map-service": OPENAPI}).splitlines():
         cells = len(re.findall(r"(?<!\\)\|", line)) if line.startswith("|") else 0
@@ -104,7 +104,7 @@ def test_every_line_of_a_table_has_as_many_cells_as_its_head():
         width = cells
 
 
-def test_a_row_of_the_document_says_what_the_table_says():
+def test_document_row_shows_the_channels_properties():
     line = next(line for line in channels_markdown({}).splitlines() if "map/heartbeat`" in line)
     assert line == (
         "| `fog/<site>/map/heartbeat` | [MapHeartbeat](#mapheartbeat) | map-service → planner, robot-agent, console "
@@ -112,9 +112,9 @@ def test_a_row_of_the_document_says_what_the_table_says():
     )
 
 
-def test_routes_are_listed_with_parameters_answers_and_whether_they_need_a_token():
+def test_routes_are_listed_with_parameters_responses_and_token():
     lines = channels_markdown({"map-service": OPENAPI}).splitlines()
-    assert "| `DELETE /api/v1/zones/{zone_id}` | Take a zone \\| away. | `If-Match` |  | 204 | yes |" in lines
+    assert "| `DELETE /api/v1/zones/{zone_id}` | Remove a zone \\| for good. | `If-Match` |  | 204 | yes |" in lines
     assert "| `GET /api/v1/zones/{zone_id}` | One zone |  |  | 200 Zone |  |" in lines
 
 
@@ -144,7 +144,7 @@ int main(void) {
 @pytest.mark.parametrize(
     ("compiler", "suffix", "standard"), [("gcc", "c", "c99"), ("gcc", "c", "c17"), ("g++", "cpp", "c++17")]
 )
-def test_the_header_compiles_and_says_what_the_table_says(tmp_path, compiler, suffix, standard):
+def test_header_compiles_and_agrees_with_the_channel_table(tmp_path, compiler, suffix, standard):
     if shutil.which(compiler) is None:
         pytest.skip(f"{compiler} is not installed: apt-get install -y g++")
     (tmp_path / "fognav_contract.h").write_text(firmware_header())
@@ -159,13 +159,13 @@ def test_the_header_compiles_and_says_what_the_table_says(tmp_path, compiler, su
     ]  # fmt: skip
 
 
-def test_the_header_has_every_channel_of_a_node_and_no_other():
+def test_header_has_every_channel_of_a_node_and_no_other():
     topics = set(re.findall(r"#define FOGNAV_(\w+)_TOPIC ", firmware_header()))
-    ends = {row.name.upper() for row in CHANNELS.values() if "node" in (*row.publishers, *row.subscribers)}
-    assert topics == ends
+    expected = {row.name.upper() for row in CHANNELS.values() if "node" in (*row.publishers, *row.subscribers)}
+    assert topics == expected
 
 
-def test_numbers_fit_the_boards_smallest_types():
+def test_header_numbers_have_a_suffix_where_int_has_16_bits():
     for name, text in re.findall(r"#define (\w+) \(?(-?\d+)\)?(?= |$)", firmware_header(), re.MULTILINE):
         assert abs(int(text)) <= ctypes.c_int16(2**15 - 1).value, f"{name} needs a suffix where int has 16 bits"
 
@@ -173,7 +173,7 @@ def test_numbers_fit_the_boards_smallest_types():
 # --- Access control -------------------------------------------------------------------------------------------------
 
 
-def test_the_brokers_list_gives_each_role_what_its_rows_say():
+def test_mqtt_acl_gives_each_role_the_rights_of_its_channels():
     sections = re.split(r"^user ", mqtt_acl("lab").partition("# a sensor node on the wall")[0], flags=re.MULTILINE)[1:]
     rights = {
         s.split("\n")[0]: [tuple(x.split()[1:3]) for x in s.splitlines() if x.startswith("topic")] for s in sections
@@ -187,7 +187,7 @@ def test_the_brokers_list_gives_each_role_what_its_rows_say():
     ]
 
 
-def test_a_node_is_let_to_its_own_topics_only():
+def test_mqtt_acl_restricts_a_node_to_its_own_topics():
     patterns = [line for line in mqtt_acl().splitlines() if line.startswith("pattern")]
     assert patterns
     assert all("%u" in line for line in patterns)
@@ -196,54 +196,56 @@ def test_a_node_is_let_to_its_own_topics_only():
 
 
 def rules(text):
-    """Read the router's list (JSON with comments and commas at the ends): keys by subject, flow and kind of message."""
+    """Parse the router's list (JSON with comments and trailing commas) to keys by subject, flow and kind of message."""
     plain = re.sub(r",(\s*[\]}])", r"\1", re.sub(r"^//.*$", "", text, flags=re.MULTILINE))
-    found = json.loads(plain)["access_control"]
-    assert found["enabled"]
-    assert found["default_permission"] == "deny"
-    by_id = {rule["id"]: rule for rule in found["rules"]}
-    assert len(by_id) == len(found["rules"])
-    subjects = {s["id"]: (s.get("usernames") or s["cert_common_names"])[0] for s in found["subjects"]}
-    assert all(len(s) == 2 for s in found["subjects"]), "a subject that names both would need both"
-    given = {}
-    for policy in found["policies"]:
+    acl = json.loads(plain)["access_control"]
+    assert acl["enabled"]
+    assert acl["default_permission"] == "deny"
+    by_id = {rule["id"]: rule for rule in acl["rules"]}
+    assert len(by_id) == len(acl["rules"])
+    subjects = {s["id"]: (s.get("usernames") or s["cert_common_names"])[0] for s in acl["subjects"]}
+    assert all(len(s) == 2 for s in acl["subjects"]), (
+        "a subject with both kinds of name would match only clients that have both"
+    )
+    rights = {}
+    for policy in acl["policies"]:
         (name,) = {subjects[each] for each in policy["subjects"]}
         for rule in (by_id[each] for each in policy["rules"]):
             assert rule["permission"] == "allow"
             for flow in rule["flows"]:
                 for message in rule["messages"]:
-                    given.setdefault((name, flow, message), set()).update(rule["key_exprs"])
-    return given
+                    rights.setdefault((name, flow, message), set()).update(rule["key_exprs"])
+    return rights
 
 
 @pytest.mark.parametrize("row", [r for r in CHANNELS.values() if r.transport == "zenoh"], ids=lambda r: r.name)
-def test_the_routers_list_accepts_each_row_from_its_publishers_only(row):
-    sent = {"pub": "put", "query": "reply", "liveliness": "liveliness_token"}[row.kind]
+def test_zenoh_acl_accepts_each_channel_from_its_publishers_only(row):
+    message = {"pub": "put", "query": "reply", "liveliness": "liveliness_token"}[row.kind]
     key = row.pattern().replace("live/*/*", "live/{}/*")
-    given = rules(zenoh_acl())
-    senders = {name for (name, flow, kind), keys in given.items()
-               if flow == "ingress" and kind == sent and key.format(name) in keys}  # fmt: skip
+    rights = rules(zenoh_acl())
+    senders = {name for (name, flow, kind), keys in rights.items()
+               if flow == "ingress" and kind == message and key.format(name) in keys}  # fmt: skip
     assert senders == set(row.publishers)
 
 
-def test_the_recorder_only_listens():
-    given = rules(zenoh_acl())
-    assert not {kind for name, flow, kind in given if name == "recorder" and flow == "ingress"} & {"put", "reply"}
-    assert "fog/*/robots/*/pose" in given["recorder", "ingress", "declare_subscriber"]
-    assert ("recorder", "ingress", "declare_queryable") not in given
+def test_recorder_may_subscribe_and_not_publish():
+    rights = rules(zenoh_acl())
+    assert not {kind for name, flow, kind in rights if name == "recorder" and flow == "ingress"} & {"put", "reply"}
+    assert "fog/*/robots/*/pose" in rights["recorder", "ingress", "declare_subscriber"]
+    assert ("recorder", "ingress", "declare_queryable") not in rights
 
 
-def test_named_robots_speak_for_themselves_only():
-    given = rules(zenoh_acl("lab", ["r1", "r2"]))
-    assert "fog/lab/robots/r1/pose" in given["r1", "ingress", "put"]
-    r1 = {key for (name, _, _), keys in given.items() if name == "r1" for key in keys}
+def test_named_robots_may_publish_only_as_themselves():
+    rights = rules(zenoh_acl("lab", ["r1", "r2"]))
+    assert "fog/lab/robots/r1/pose" in rights["r1", "ingress", "put"]
+    r1 = {key for (name, _, _), keys in rights.items() if name == "r1" for key in keys}
     assert not any("robots/r2" in key or "robots/*" in key for key in r1)
-    assert given["r1", "ingress", "liveliness_token"] == {"fog/lab/live/robot-agent/r1"}
-    assert not any(name == "robot-agent" for name, _, _ in given)
+    assert rights["r1", "ingress", "liveliness_token"] == {"fog/lab/live/robot-agent/r1"}
+    assert not any(name == "robot-agent" for name, _, _ in rights)
 
 
-@pytest.mark.parametrize("make", [mqtt_acl, zenoh_acl, firmware_header, lambda: channels_markdown({"x": OPENAPI})])
-def test_what_is_generated_is_the_same_every_time_and_ends_with_a_line(make):
-    assert make() == make()
-    assert make().endswith("\n")
-    assert "fognav channels --write" in make().split("#ifndef")[0][:400]
+@pytest.mark.parametrize("generate", [mqtt_acl, zenoh_acl, firmware_header, lambda: channels_markdown({"x": OPENAPI})])
+def test_generated_text_is_deterministic_and_ends_with_a_newline(generate):
+    assert generate() == generate()
+    assert generate().endswith("\n")
+    assert "fognav channels --write" in generate().split("#ifndef")[0][:400]

@@ -11,12 +11,12 @@ class Limits(msgspec.Struct, kw_only=True):
     high: float
 
 
-def test_options_are_their_own_type_with_defaults():
+def test_options_are_converted_to_their_type_with_defaults():
     assert read_options(Limits, {"high": 2}) == Limits(low=1.0, high=2.0)
 
 
 @pytest.mark.parametrize(
-    ("given", "field", "words"),
+    ("given", "field", "text"),
     [
         ({"high": 2, "mid": 1}, "mid", "known: low, high"),
         ({"high": 2, "low": -1}, "low", "Expected `float` >= 0.0"),
@@ -24,8 +24,8 @@ def test_options_are_their_own_type_with_defaults():
         ({}, "", "missing required field `high`"),
     ],
 )
-def test_an_option_that_cannot_be_used_is_named(given, field, words):
+def test_unknown_invalid_or_missing_option_is_refused_by_name(given, field, text):
     with pytest.raises(OptionError) as caught:
         read_options(Limits, given)
     assert caught.value.field == field
-    assert words in caught.value.problem
+    assert text in caught.value.problem

@@ -34,7 +34,7 @@ class HazardPlacement:
         """Return the way of the placed hazard through the stages, as far as it is known."""
         if self.area is None or self.placed_at is None:
             return None
-        return self._scene.traces.first_of(self.area, self.placed_at)
+        return self._scene.traces.earliest(self.area, self.placed_at)
 
     async def place_if_due(self, operator: Operator, evaluation: DriveEvaluation, clock: Clock) -> None:
         """Place the barrier if its moment has come; raises `WrongUseError` when no area fits the robot's way."""

@@ -1,7 +1,7 @@
 """The one table of channels: key, message, size limit, who publishes, who subscribes, durability, rate, maximum age.
 
 Both edges, the freshness limits of every receiver, `docs/channels.md`, the brokers' access control lists and the
-firmware's header derive from it; nothing else spells a topic or key.
+firmware's header derive from it; no other file contains a topic or key.
 """
 
 import math
@@ -23,26 +23,26 @@ Role = Literal[
 ]  # fmt: skip
 
 ROLES: Final[Mapping[Role, str]] = {
-    "node": "a sensor node on the wall",
-    "thesis-node": "a sensor node that speaks the topics of the thesis",
-    "thesis-robot": "a robot that listens to the topic of the thesis",
+    "node": "a sensor node",
+    "thesis-node": "a sensor node that publishes on the thesis's topics",
+    "thesis-robot": "a robot that subscribes to the thesis's topic",
     "home-assistant": "Home Assistant, which discovers nodes",
     "hazard-aggregator": "turns readings into the state of each area",
-    "map-service": "keeps the costmap",
-    "planner": "plans paths and keeps missions",
+    "map-service": "maintains the costmap",
+    "planner": "plans paths and stores missions",
     "robot-agent": "a robot's agent",
     "console": "operators' tools: the `fognav` command, the demo and its page",
     "sim": "the simulated world",
     "recorder": "`fognav record`: subscribes to everything and publishes nothing",
 }
-"""Who may stand at the ends of a channel."""
+"""The processes that may publish on a channel or subscribe to it."""
 
 DURABILITIES: Final[Mapping[Durability, str]] = {
     "volatile": "a late subscriber waits for the next message; a lost one stays lost",
     "latest": "a late subscriber is given the latest message of each key at once; older ones may be lost",
     "recovered": "a late subscriber is given the recent messages, lost ones are sent again, all arrive in order",
 }
-"""What becomes of messages that a subscriber missed. MQTT: `latest` is retained, `recovered` does not exist."""
+"""How messages reach a subscriber that missed them. MQTT: `latest` is retained, `recovered` does not exist."""
 
 ID_MAX: Final = 32
 """Characters of the longest id."""
@@ -54,9 +54,10 @@ _FIELDS: Final[Mapping[str, str]] = {"number": r"[0-9]{1,4}"}
 class Channel:
     """One row of the table. Channels are compared and hashed by identity: they are keys of tables of handlers.
 
-    `template` names the variable parts in braces. `message` is what is published or, for a query, asked (None: text,
-    or a query without a request), and `reply` what is answered; publishers of a query answer it, subscribers ask.
-    A published zenoh channel of durability `latest` may be asked as well: for its latest message, without a request.
+    `template` names the variable parts in braces. `message` is the type of what is published or, for a query, of the
+    request (None: text, or a query without a request), and `reply` the type of the reply; publishers of a query answer
+    it, subscribers send it. A published zenoh channel of durability `latest` can also be queried for its latest
+    message, without a request.
     `limit` and `reply_limit` are in bytes. `rate_hz` is the rate in normal operation (None: on change). A value that
     arrived more than `max_age_s` ago is stale (infinite: it holds until the next, or the message says how long).
     """
@@ -77,10 +78,10 @@ class Channel:
     rate_hz: float | None = None
     max_age_s: float = math.inf
     qos: Literal[0, 1] = 0
-    words: tuple[str, ...] = ()
-    """The texts that a text channel carries, where they are few."""
+    values: tuple[str, ...] = ()
+    """The payloads of a text channel with a fixed set of them."""
     about: str = ""
-    """What it carries, where no message type says it."""
+    """Description of the payload of a channel without a message type."""
     fields: tuple[str, ...] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -97,21 +98,21 @@ class Channel:
         return math.inf if self.rate_hz is None else 1.0 / self.rate_hz
 
     def key(self, **ids: str) -> str:
-        """Spell the topic or key with these ids; raises `ValueError` for a missing, unknown or malformed id."""
+        """Return the topic or key with these ids; raises `ValueError` for a missing, unknown or malformed id."""
         if set(ids) != set(self.fields):
             raise ValueError(f"channel {self.name} needs the ids {sorted(self.fields)}, not {sorted(ids)}")
         for name, value in ids.items():
             if not re.fullmatch(_FIELDS.get(name, _ID), value):
-                raise ValueError(f"channel {self.name}: {name} {value!r} is no id ({_FIELDS.get(name, _ID)})")
+                raise ValueError(f"channel {self.name}: {name} {value!r} is not a valid id ({_FIELDS.get(name, _ID)})")
         return self.template.format(**ids)
 
     def pattern(self, **ids: str) -> str:
-        """Spell the subscription for every id that is not given (`+` in MQTT, `*` in zenoh)."""
+        """Return the subscription with a wildcard (`+` in MQTT, `*` in zenoh) for every id that is not given."""
         wildcard = "+" if self.transport == "mqtt" else "*"
         if "number" in self.fields and "number" not in ids:
-            raise ValueError(f"channel {self.name}: MQTT has no wildcard for a part of a level; subscribe per number")
-        known = {name: ids.get(name, wildcard) for name in self.fields}
-        return self.template.format(**known)
+            raise ValueError(f"channel {self.name}: MQTT has no wildcard for part of a level: give the number")
+        parts = {name: ids.get(name, wildcard) for name in self.fields}
+        return self.template.format(**parts)
 
     @cached_property
     def _regex(self) -> re.Pattern[str]:
@@ -122,7 +123,7 @@ class Channel:
         return re.compile("".join(re.escape(text) + group for text, group in pairs))
 
     def match(self, key: str) -> dict[str, str] | None:
-        """Return the ids in a topic or key of this channel, or None when it is not one."""
+        """Return the ids in a topic or key, or None when it does not belong to this channel."""
         found = self._regex.fullmatch(key)
         return found.groupdict() if found else None
 
@@ -158,7 +159,7 @@ _live = partial(Channel, transport="zenoh", kind="liveliness", encoding="msgpack
 # Sensor nodes and areas: MQTT, JSON or text
 NODE_AVAILABILITY = _text( "node_availability", V1 + "nodes/{node}/availability",                       limit=16,
     publishers=(NODE,),          subscribers=(AGGREGATOR,),       durability=LATEST,   qos=1,
-    words=("online", "offline"), about="whether a node is connected; `offline` is its last will")
+    values=("online", "offline"), about="whether a node is connected; `offline` is its last will")
 NODE_READING      = _mqtt( "node_reading",      V1 + "nodes/{node}/reading",          m.NodeReading,    limit=KIB,
     publishers=(NODE,),          subscribers=(AGGREGATOR,),       durability=VOLATILE, qos=0, rate_hz=10, max_age_s=3)
 NODE_VALUE        = _mqtt( "node_value",        V1 + "nodes/{node}/value",            m.NodeValue,      limit=KIB,
@@ -171,7 +172,7 @@ AREA_DEFINITION   = _mqtt( "area_definition",   V1 + "areas/{area}/definition", 
     publishers=(AGGREGATOR,),    subscribers=(MAP,),              durability=LATEST,   qos=1)
 THESIS_AREA       = _text( "thesis_area",       "area {number}",                                        limit=16,
     publishers=("thesis-node",), subscribers=(AGGREGATOR,),       durability=VOLATILE, qos=0,
-    words=("blocked", "clear"), about="what a node of the thesis says of its area")
+    values=("blocked", "clear"), about="state of a thesis node's area")
 THESIS_WSN        = _text( "thesis_wsn",        "WSN",                                                  limit=64,
     publishers=(AGGREGATOR,),    subscribers=("thesis-robot",),   durability=VOLATILE, qos=1,
     about="`n,x,y` for a blocked area, `n,-999,-999` for a clear one")
@@ -179,7 +180,7 @@ HOME_ASSISTANT    = _text( "home_assistant",    "homeassistant/device/{node}/con
     publishers=(NODE, AGGREGATOR), subscribers=("home-assistant",), durability=LATEST, qos=1,
     about="Home Assistant's device discovery (JSON)")
 
-# The map and what stands behind its cells: zenoh, msgpack
+# The map, and the hazards and zones in it: zenoh, msgpack
 MAP_DELTA         = _pub(  "map_delta",         FOG + "map/delta",      m.MapDelta,     limit=DELTA_LIMIT,
     publishers=(MAP,), subscribers=(PLANNER, ROBOT, CONSOLE), durability=RECOVERED)
 MAP_HEARTBEAT     = _pub(  "map_heartbeat",     FOG + "map/heartbeat",  m.MapHeartbeat, limit=256,
@@ -208,7 +209,7 @@ ROBOT_OBSTACLES   = _pub(  "robot_obstacles",   FOG + "robots/{robot}/obstacles"
     publishers=(ROBOT,),   subscribers=(MAP, CONSOLE),     durability=VOLATILE, rate_hz=1)
 ROBOT_COMMAND     = _query("robot_command",     FOG + "robots/{robot}/command",   m.RobotCommand,   limit=KIB,
     publishers=(ROBOT,),   subscribers=(CONSOLE,),         reply=m.CommandReply, reply_limit=2 * KIB)
-LIVE              = _live( "live",              FOG + "live/{role}/{id}", about="who is there; no safety signal",
+LIVE              = _live( "live",              FOG + "live/{role}/{id}", about="presence, no safety signal",
     publishers=(AGGREGATOR, MAP, PLANNER, ROBOT), subscribers=(CONSOLE,))
 
 # The simulated world: zenoh, msgpack

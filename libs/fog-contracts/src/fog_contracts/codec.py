@@ -11,7 +11,7 @@ M = TypeVar("M", bound=Message)
 
 
 class ContractError(ValueError):
-    """Bytes that don't keep the contract of their channel: too long, malformed, a field missing or out of range."""
+    """Bytes that violate the contract of their channel: too long, malformed, a field missing or out of range."""
 
     def __init__(self, channel: str, reason: str) -> None:
         super().__init__(f"{channel}: {reason}")
@@ -27,9 +27,9 @@ _decoders: dict[tuple[str, type[Message]], msgspec.json.Decoder[Message] | msgsp
 def _decoder(encoding: str, kind: type[M]) -> msgspec.json.Decoder[M] | msgspec.msgpack.Decoder[M]:
     decoder = _decoders.get((encoding, kind))
     if decoder is None:
-        made = msgspec.json.Decoder(kind) if encoding == "json" else msgspec.msgpack.Decoder(kind)
-        _decoders[encoding, kind] = made  # type: ignore[assignment]  # a dict can't say: the value is a decoder of its key's type
-        return made
+        new = msgspec.json.Decoder(kind) if encoding == "json" else msgspec.msgpack.Decoder(kind)
+        _decoders[encoding, kind] = new  # type: ignore[assignment]  # no dict type says that a value decodes its key's type
+        return new
     return decoder  # type: ignore[return-value]  # same
 
 
@@ -45,7 +45,7 @@ def encode(channel: Channel, message: Message, *, reply: bool = False) -> bytes:
 
 
 def decode(channel: Channel, data: bytes, kind: type[M], *, reply: bool = False) -> M:
-    """Decode what came over a channel as `kind`; raises `ContractError` that names the field and what is wrong."""
+    """Decode a payload of the channel as `kind`; raises `ContractError` that names the field and what is wrong."""
     expected, limit = (channel.reply, channel.reply_limit) if reply else (channel.message, channel.limit)
     if expected is not kind:
         raise ContractError(channel.name, f"carries {expected and expected.__name__}, not {kind.__name__}")
@@ -54,7 +54,7 @@ def decode(channel: Channel, data: bytes, kind: type[M], *, reply: bool = False)
     try:
         return _decoder(channel.encoding, kind).decode(data)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        # An unknown field is skipped, but one that nests without end exhausts the decoder's stack.
+        # The decoder skips unknown fields, but a deeply nested one exhausts its stack.
         raise ContractError(channel.name, str(error)) from error
 
 
@@ -71,7 +71,7 @@ def encode_text(channel: Channel, text: str) -> bytes:
 
 
 def decode_text(channel: Channel, data: bytes) -> str:
-    """Decode a plain-text channel; raises `ContractError`."""
+    """Decode a payload of a plain-text channel; raises `ContractError`."""
     if len(data) > channel.limit:
         raise ContractError(channel.name, f"{len(data)} bytes are over the limit of {channel.limit}")
     try:

@@ -1,4 +1,4 @@
-"""Signing and judging of operators' commands to a robot (HMAC-SHA256 over the encoded command without signature)."""
+"""Signing and validation of operators' commands to a robot (HMAC-SHA256 over the encoded command without signature)."""
 
 import hmac
 from typing import Final
@@ -8,7 +8,7 @@ import msgspec
 from fog_contracts.messages import RobotCommand
 
 VALID_S: Final = 5.0
-"""How long after `issued_at` a command may be carried out."""
+"""Seconds after `issued_at` during which a command is valid."""
 KEY_BYTES: Final = 32
 
 
@@ -25,29 +25,30 @@ def sign(command: RobotCommand, key: bytes) -> RobotCommand:
 
 
 class CommandGate:
-    """Lets a command through once: right robot, right signature, not older than 5 s, nonce never seen.
+    """Accepts a command once: for this robot, correctly signed, at most 5 s old, with a nonce that was not used before.
 
-    A nonce is remembered as long as its command could still be valid, so memory stays bounded by the command rate.
+    A nonce is kept only while its command could still be valid, so the command rate bounds the memory.
     """
 
     def __init__(self, robot: str, key: bytes) -> None:
         self._robot = robot
         self._key = key
-        self._seen: dict[str, float] = {}
+        self._nonce_expiry: dict[str, float] = {}
 
     def refusal(self, command: RobotCommand, stamp: float) -> str | None:
-        """Return why the command must not be carried out at `stamp`, or None; a command passes at most once."""
+        """Return why the command is refused at `stamp`, or None to accept it; each command is accepted at most once."""
         if command.robot != self._robot:
             return f"this robot is {self._robot}, the command is for {command.robot}"
         if not hmac.compare_digest(command.signature, _signature(command, self._key)):
-            return "the signature does not fit: sign with the site's operator key"
+            return "the signature does not match: sign the command with the site's operator key"
         age = stamp - command.issued_at
         if not -VALID_S <= age <= VALID_S:
             return (
-                f"the command is {age:.1f} s old, more than {VALID_S:.0f} s: issue it again (are the clocks in step?)"
+                f"the command is {age:.1f} s old, more than {VALID_S:.0f} s: issue it again, and check that the clocks "
+                "of both hosts agree"
             )
-        self._seen = {nonce: until for nonce, until in self._seen.items() if until >= stamp}
-        if command.nonce in self._seen:
-            return "this command was carried out already: issue a new one"
-        self._seen[command.nonce] = command.issued_at + 2 * VALID_S
+        self._nonce_expiry = {nonce: expiry for nonce, expiry in self._nonce_expiry.items() if expiry >= stamp}
+        if command.nonce in self._nonce_expiry:
+            return "this command was already carried out: issue a new one"
+        self._nonce_expiry[command.nonce] = command.issued_at + 2 * VALID_S
         return None

@@ -1,4 +1,4 @@
-"""Cost values of every costmap cell, what they weigh on a path, how they are inflated, and how layers are combined.
+"""Cost values of costmap cells, their weight on a path, their inflation, and how layers are combined.
 
 The values are those of Nav2 (`nav2_costmap_2d/cost_values.hpp`), so that maps can be exchanged with it; the weights are
 those of NavFn. Compiled kernels hold these values as constants, and numba does not notice that an imported constant
@@ -13,24 +13,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 FREE: Final = 0
-"""Nothing is known against driving here."""
+"""No layer assigns a cost to the cell."""
 PENALTY_MAX: Final = 252
 """The highest graded cost: undesired, still passable."""
 INSCRIBED: Final = 253
-"""A robot whose centre is here surely touches something."""
+"""A robot whose centre is in the cell is certain to be in collision."""
 LETHAL: Final = 254
-"""Something is here."""
+"""The cell holds an obstacle."""
 UNKNOWN: Final = 255
-"""Nobody has looked here; impassable to planner and robot by default."""
+"""The cell has not been observed; impassable to planner and robot by default."""
 
 NO_SPEED_LIMIT: Final = 0
 """In the speed layer (uint8, cm/s): the cell sets no limit."""
 
 NEUTRAL_WEIGHT: Final = 50
-"""What a length over free cells weighs on a path; over cells of cost c it weighs NEUTRAL_WEIGHT + COST_WEIGHT * c."""
+"""Weight of a free cell on a path; a cell of cost c weighs NEUTRAL_WEIGHT + COST_WEIGHT * c."""
 COST_WEIGHT: Final = 0.8
 COST_PER_FACTOR: Final = NEUTRAL_WEIGHT / COST_WEIGHT
-"""The cost that makes a cell as heavy as one free cell more: cost c makes it 1 + c / COST_PER_FACTOR free cells."""
+"""The cost that adds the weight of one free cell: cost c weighs as much as 1 + c / COST_PER_FACTOR free cells."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,7 +54,7 @@ class Inflation:
 
 
 DEFAULT_INFLATION: Final = Inflation()
-"""That of the master costmap: a Roomba's radius, and costs that keep paths in the middle of a corridor."""
+"""Inflation of the master costmap: the radius of a Roomba, and costs that keep paths in the middle of a corridor."""
 
 
 def is_traversable(cost: int) -> bool:
@@ -62,15 +62,15 @@ def is_traversable(cost: int) -> bool:
     return cost < INSCRIBED
 
 
-def combine_costs(below: NDArray[np.uint8], layer: NDArray[np.uint8], opinion: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """Combine a layer with what lies below it; all arrays have the same shape.
+def combine_costs(below: NDArray[np.uint8], layer: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Combine a layer with the layers below it; all arrays have the same shape.
 
-    A layer has a say only where `opinion` is true. There the higher cost wins, and no layer lowers a cost.
-    Unknown (255) is no cost but the lack of one: it yields to `LETHAL` alone, so that a danger seen in unexplored
-    space counts, while a mere penalty does not make unexplored space passable.
+    A layer changes cells only where `mask` is true. There the higher cost wins, and no layer lowers a cost.
+    Unknown (255) is the absence of a cost: only `LETHAL` replaces it, so that an obstacle seen in unexplored space
+    counts, while a penalty does not make unexplored space traversable.
     """
     graded = np.where(below == UNKNOWN, np.where(layer == LETHAL, layer, below), np.maximum(below, layer))
-    return np.where(opinion & (layer != UNKNOWN), graded, below).astype(np.uint8)
+    return np.where(mask & (layer != UNKNOWN), graded, below).astype(np.uint8)
 
 
 def combine_speed_limits(below: NDArray[np.uint8], layer: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -45,7 +45,7 @@ class Window(NamedTuple):
         return Window(x, y, right - x, top - y)
 
     def intersection(self, other: "Window") -> "Window":
-        """Return the cells that both windows have; it may be empty."""
+        """Return the window of the cells that are in both; it may be empty."""
         x, y = max(self.x, other.x), max(self.y, other.y)
         right = min(self.x + self.width, other.x + other.width)
         top = min(self.y + self.height, other.y + other.height)
@@ -60,7 +60,7 @@ class GridGeometry(msgspec.Struct, frozen=True):
     """Size, resolution (m per cell) and origin (m, lower-left corner of cell (0, 0), frame `map`) of a grid.
 
     Arrays over it are row-major with shape (height, width); row 0 is at the bottom. The grid is aligned with the
-    frame: a map_server origin yaw is resolved when a map is loaded, never carried around.
+    frame: the yaw of a map_server origin is resolved when the map is loaded.
     """
 
     width: int

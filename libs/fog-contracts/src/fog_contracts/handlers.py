@@ -1,8 +1,8 @@
-"""How a pure core meets the world: handlers by channel with one signature, and what they return to be published.
+"""The interface of a pure core: handlers by channel with one signature, and the messages that they return to publish.
 
-A core offers one table (`handlers`) and one `tick`. Services subscribe to every channel of the table and publish what
-comes back, lockstep carries the messages from core to core, and a replay feeds recorded ones: none of them names a
-handler by hand, so all three run the same decisions.
+A core has one table (`handlers`) and one `tick`. Services subscribe to every channel of the table and publish what
+the handlers return, lockstep delivers the messages from core to core, and a replay feeds in recorded ones. None of
+them names a handler, so all three run the same decisions.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -20,7 +20,7 @@ Ids = Mapping[str, str]
 class Moment:
     """When an input is handled: `now` in seconds of the receiver's monotonic clock, `stamp` in seconds since the epoch.
 
-    Ages and timeouts are judged by `now` alone; `stamp` names moments in traces and for people.
+    Ages and timeouts are computed from `now` alone; `stamp` is for traces and people.
     """
 
     now: float
@@ -37,24 +37,24 @@ class Publication:
 
 
 class RefusedMessageError(ValueError):
-    """A handler can't use a message although its type is right; the text says why.
+    """A handler can't use a message although it is well-formed; the text says why.
 
-    The edge that delivered the message counts and reports it as it does with messages that break their contract.
+    The edge that delivered the message counts and logs it like one that violates its channel's contract.
     """
 
 
 Handler = Callable[[Ids, Any, Moment], Sequence[Publication]]
-"""Takes one message of a channel; its second argument is the channel's message type (text for a text channel)."""
+"""Handles one message of a channel; its second argument is the channel's message type (text for a text channel)."""
 
 Answerer = Callable[[Ids, Any, Moment], Message]
 """Answers one query; its second argument is the channel's request type, or None for a query without one."""
 
 
 class Core(Protocol):
-    """What decides inside a process, without touching the world."""
+    """The decisions of a process, without I/O and without a clock."""
 
     def handlers(self) -> Mapping[Channel, Handler]:
-        """Return the handler of every channel that this core listens to."""
+        """Return the handler of every channel that this core subscribes to."""
 
     def tick(self, at: Moment) -> Sequence[Publication]:
-        """Let time pass, at least ten times a second; return what is to be published now."""
+        """Advance to `at`, at least ten times a second; return what is to be published now."""

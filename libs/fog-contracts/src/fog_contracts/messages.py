@@ -1,22 +1,22 @@
 """Every message that crosses a process border, as frozen types; units are metres, radians and seconds, frame `map`.
 
 Stamps are seconds since the Unix epoch by the sender's clock (`fog_runtime.clock.Clock.stamp`); they serve traces and
-people. Freshness is never judged by them but by the receiver's own monotonic clock.
+people. Freshness is never computed from them but from the receiver's own monotonic clock.
 """
 
 from typing import Annotated, Any, Final, Literal
 
 from msgspec import Meta, Struct
 
-# The last part says "not before a line feed either": a bare $ would let one pass at the end.
+# The lookahead refuses a line feed at the end, which a bare $ accepts.
 Id = Annotated[str, Meta(pattern=r"^[a-z0-9][a-z0-9-]{0,31}$(?!\n)")]
-# Bounds keep NaN and infinity out: no comparison with a bound holds for NaN.
+# Bounds also refuse NaN and infinity: no comparison with a bound holds for NaN.
 Finite = Annotated[float, Meta(ge=-1e12, le=1e12)]
-# Units go into the documents and the firmware's header.
+# The units appear in the generated documents and in the firmware's header.
 Metres = Annotated[float, Meta(ge=-100_000.0, le=100_000.0, extra={"unit": "m"})]
 Radians = Annotated[float, Meta(ge=-1_000.0, le=1_000.0, extra={"unit": "rad"})]
 Speed = Annotated[float, Meta(ge=-10.0, le=10.0, extra={"unit": "m/s"})]
-TurnSpeed = Annotated[float, Meta(ge=-10.0, le=10.0, extra={"unit": "rad/s"})]
+AngularSpeed = Annotated[float, Meta(ge=-10.0, le=10.0, extra={"unit": "rad/s"})]
 Stamp = Annotated[float, Meta(ge=0.0, le=1e12, extra={"unit": "s"})]
 Count = Annotated[int, Meta(ge=0, le=2**53)]
 Hash = Annotated[int, Meta(ge=0, le=2**63 - 1)]
@@ -62,7 +62,7 @@ class NodeReading(Message, frozen=True, kw_only=True):
 
 
 class NodeValue(Message, frozen=True, kw_only=True):
-    """A danger that a number can tell (temperature, gas, ...); the threshold is the aggregator's."""
+    """A measured quantity (temperature, gas, ...) that is a hazard above the aggregator's threshold."""
 
     seq: Count
     boot: Count
@@ -72,7 +72,7 @@ class NodeValue(Message, frozen=True, kw_only=True):
 
 
 class NodeConfig(Message, frozen=True, kw_only=True):
-    """What a node is told about its place: per sonar the range below which an echo means `blocked`."""
+    """Settings of a node: per sonar the range below which an echo means `blocked`."""
 
     version: Count
     range_limit_m: Annotated[list[Annotated[float, Meta(gt=0.0, le=20.0)]], Meta(min_length=1, max_length=8)]
@@ -81,7 +81,7 @@ class NodeConfig(Message, frozen=True, kw_only=True):
 
 
 class Trace(Message, frozen=True, kw_only=True):
-    """Stamps of one hazard's way through the stages; 0 = not reached yet."""
+    """Stamps of the stages that one hazard passes, from first reading to first wheel command; 0 = not reached yet."""
 
     area: Id
     epoch: Count
@@ -95,7 +95,7 @@ class Trace(Message, frozen=True, kw_only=True):
 
 
 class AreaHazard(Message, frozen=True, kw_only=True):
-    """State of one area as the aggregator judges it; `seq` grows by one with each change, `epoch` with each start."""
+    """State of one area; `seq` grows by one with each change, `epoch` with each start of the aggregator."""
 
     area: Id
     state: AreaState
@@ -111,16 +111,16 @@ class AreaHazard(Message, frozen=True, kw_only=True):
 
 
 class UnknownPolicy(Message, frozen=True, kw_only=True):
-    """What silence costs: how long a node may be silent, and what an unknown area costs when it was clear before."""
+    """When a silent node's area becomes unknown, and the cost of an unknown area that was clear before."""
 
     silent_after_s: Annotated[float, Meta(ge=0.5, le=3600.0)] = 3.0
     penalty: Annotated[int, Meta(ge=0, le=254)] = 200
 
 
 class AreaDefinition(Message, frozen=True, kw_only=True):
-    """What an area is: where it lies, who watches it, how its readings are debounced.
+    """An area: its polygon, the nodes that watch it, and how their readings are debounced.
 
-    `number` is its name on the thesis's topics. `debounce` names the aggregator's rule (`rule`) and holds its options.
+    `number` identifies it on the thesis's topics. `debounce` holds the rule's name (`rule`) and its options.
     """
 
     id: Id
@@ -135,7 +135,7 @@ class AreaDefinition(Message, frozen=True, kw_only=True):
 
 
 MAX_CELLS = 50_000_000
-"""More cells than any map has (350 m x 350 m at 5 cm): a broken or hostile snapshot must not fill the memory."""
+"""Limit of a map (350 m x 350 m at 5 cm), so that a damaged or hostile snapshot can't exhaust the memory."""
 
 # --- Map (zenoh, msgpack) -------------------------------------------------------------------------------------------
 
@@ -155,7 +155,7 @@ class MapGeometry(Message, frozen=True, kw_only=True):
 
 
 class Cause(Message, frozen=True, kw_only=True):
-    """Why cells changed: a hazard area or a zone, and what became of it."""
+    """Why cells changed: the hazard, zone, obstacle or map that changed, and its new state."""
 
     kind: Literal["hazard", "zone", "obstacle", "map"]
     id: Annotated[str, Meta(max_length=64)]
@@ -167,7 +167,7 @@ Packing = Literal["raw", "zlib"]
 
 
 class MapDelta(Message, frozen=True, kw_only=True):
-    """One window of one layer of a new map version; a version is applied when all its `parts` are there.
+    """One window of one layer of a new map version; a version is applied when all its `parts` have arrived.
 
     `cells` is uint8, row-major, row 0 at the bottom, `w * h` values after unpacking. `hash` is the hash of the whole
     map (`fog_contracts.replica`) after the version.
@@ -190,7 +190,7 @@ class MapDelta(Message, frozen=True, kw_only=True):
 
 
 class MapHeartbeat(Message, frozen=True, kw_only=True):
-    """The version that the map-service holds now, 10 times a second."""
+    """The map-service's current version, 10 times a second."""
 
     epoch: Count
     seq: Count
@@ -201,7 +201,7 @@ class MapHeartbeat(Message, frozen=True, kw_only=True):
 class MapSnapshot(Message, frozen=True, kw_only=True):
     """The whole map at one version; the layers are zlib-packed uint8 grids of the same geometry.
 
-    `static` is the plain map for localization (0 free, 254 occupied, 255 unknown), never touched by hazards or zones.
+    `static` is the floor plan for localization (0 free, 254 occupied, 255 unknown), without hazards and zones.
     """
 
     site: Id
@@ -215,7 +215,7 @@ class MapSnapshot(Message, frozen=True, kw_only=True):
 
 
 class HazardArea(Message, frozen=True, kw_only=True):
-    """A hazard with its place: the reason behind cells of the costmap."""
+    """A hazard with its area's polygon: the reason for costs inside it."""
 
     hazard: AreaHazard
     polygon: Ring
@@ -256,7 +256,7 @@ Shape = PolygonShape | RectangleShape | CircleShape | CorridorShape
 
 
 class Zone(Message, frozen=True, kw_only=True):
-    """An operator's zone: where, what it does (factor for PENALTY, m/s for SPEED_LIMIT), why, by whom, until when."""
+    """An operator's zone: shape, effect (factor for PENALTY, m/s for SPEED_LIMIT), reason, author and validity."""
 
     id: Id
     kind: ZoneKind
@@ -272,7 +272,7 @@ class Zone(Message, frozen=True, kw_only=True):
 
 
 class ZoneSet(Message, frozen=True, kw_only=True):
-    """All zones that are stored, with the map version that shows them."""
+    """All stored zones, with the map version that contains them."""
 
     epoch: Count
     seq: Count
@@ -297,7 +297,7 @@ Points = Annotated[list[PointXY], Meta(max_length=100_000)]
 
 
 class Refusal(Message, frozen=True, kw_only=True):
-    """Why there is no path: Nav2's code, a sentence, what cuts the way, and the nearest point that can be reached."""
+    """Why there is no path: Nav2's code, a sentence, what blocks the path, and the nearest reachable point."""
 
     code: PlanCode
     reason: Sentence
@@ -311,14 +311,14 @@ class Refusal(Message, frozen=True, kw_only=True):
 
 
 class PlanRequest(Message, frozen=True, kw_only=True):
-    """Ask for a path between two poses, without side effects."""
+    """Request for a path between two poses, without side effects."""
 
     start: Pose
     goal: Pose
 
 
 class PlanReply(Message, frozen=True, kw_only=True):
-    """A path (its points 5 cm or more apart, frame `map`) with its length in metres, or the refusal."""
+    """A path (points at least 5 cm apart, frame `map`) with its length in metres, or the refusal."""
 
     points: Points = []
     length: Annotated[float, Meta(ge=0.0, le=1e6, extra={"unit": "m"})] = 0.0
@@ -338,7 +338,7 @@ class RobotGoal(Message, frozen=True, kw_only=True):
 
 
 class RobotPath(Message, frozen=True, kw_only=True):
-    """The way to the goal, or why there is none.
+    """The path to the goal, or why there is none.
 
     The robot may drive the first `released_length` metres of `points` without hearing from the planner again; the
     planner publishes the same `plan_id` again with more of it released while all is well.
@@ -361,14 +361,14 @@ class RobotPath(Message, frozen=True, kw_only=True):
 
 
 class RobotPose(Message, frozen=True, kw_only=True):
-    """Where a robot believes to be; `covariance` is row-major 3 x 3 over (x, y, theta)."""
+    """A robot's estimated pose and twist; `covariance` is row-major 3 x 3 over (x, y, theta)."""
 
     x: Metres
     y: Metres
     theta: Radians
     covariance: Annotated[list[Finite], Meta(min_length=9, max_length=9)]
     v: Speed
-    w: TurnSpeed
+    w: AngularSpeed
     radius: Annotated[float, Meta(gt=0.0, le=2.0, extra={"unit": "m"})]
     height: Annotated[float, Meta(gt=0.0, le=3.0, extra={"unit": "m"})]
     stamp: Stamp
@@ -387,7 +387,7 @@ class LoopHealth(Message, frozen=True, kw_only=True):
 
 
 class RobotState(Message, frozen=True, kw_only=True):
-    """What a robot is doing and why, and which map version and path it acts on."""
+    """A robot's mode with its reasons, and the map version and plan that it follows."""
 
     mode: Mode
     reasons: list[Sentence]
@@ -410,9 +410,9 @@ VIEW_SECTORS: Final = 180
 
 
 class View(Message, frozen=True, kw_only=True):
-    """How far a robot's lidar sees from (x, y) (m, frame `map`): per sector the nearest echo, cm; 0 = no echo at all.
+    """What a robot's lidar sees from (x, y) (m, frame `map`): per sector the nearest range in cm, 0 without any echo.
 
-    Up to there the floor is free at the lidar's height, but a sector without any echo tells nothing.
+    Up to that range the floor is free at the lidar's height; a sector without an echo carries no information.
     """
 
     x: Metres
@@ -421,7 +421,7 @@ class View(Message, frozen=True, kw_only=True):
 
 
 class RobotObstacles(Message, frozen=True, kw_only=True):
-    """Points (m, frame `map`) that a robot's lidar sees and the map doesn't know.
+    """Points (m, frame `map`) that a robot's lidar sees and the map does not contain.
 
     They hold until a robot's view shows that they are gone, and at most for `ttl` seconds after they were last seen.
     """
@@ -448,24 +448,24 @@ class RobotCommand(Message, frozen=True, kw_only=True):
 
 
 class CommandReply(Message, frozen=True, kw_only=True):
-    """Whether the robot did as told, and why not."""
+    """Whether the command was accepted, and if not, why."""
 
     accepted: bool
     reason: Sentence
 
 
 class EgressRequest(Message, frozen=True, kw_only=True):
-    """A robot inside a blocked area asks for a way out."""
+    """Request of a robot inside a blocked area for a path that leaves it."""
 
     robot: Id
     pose: Pose
 
 
-# --- Simulation (zenoh, msgpack): no part of the real system listens ------------------------------------------------
+# --- Simulation (zenoh, msgpack): not part of a real system ---------------------------------------------------------
 
 
 class SimObstacle(Message, frozen=True, kw_only=True):
-    """Something that stands on the simulated floor: an upright box by its polygon and height (m)."""
+    """An obstacle on the simulated floor: an upright prism with this polygon and height (m)."""
 
     id: Id
     polygon: Ring
@@ -473,7 +473,7 @@ class SimObstacle(Message, frozen=True, kw_only=True):
 
 
 class SimTruth(Message, frozen=True, kw_only=True):
-    """What is really so in the simulated world; `clearance` is from the robot's rim to the nearest thing (m)."""
+    """Ground truth of the simulated world; `clearance` is the distance (m) from the robot's rim to what is nearest."""
 
     robot: Id
     x: Metres
@@ -491,7 +491,7 @@ class SimTruth(Message, frozen=True, kw_only=True):
 
 
 class SimCommand(Message, frozen=True, kw_only=True):
-    """Change the simulated world: put obstacles there, take them away by id, carry the robot elsewhere."""
+    """Change the simulated world: place obstacles, remove them by id, move the robot elsewhere (`kidnap`)."""
 
     place: list[SimObstacle] = []
     remove: list[Id] = []

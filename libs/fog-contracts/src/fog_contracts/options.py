@@ -1,4 +1,4 @@
-"""A part's own options as a mapping in a message, a site or a request, checked by the part's own type."""
+"""Options of a debounce rule, layer or other part: a mapping in a message, site or request, checked by a type."""
 
 from collections.abc import Mapping
 from typing import Any, TypeVar
@@ -9,7 +9,7 @@ Options = TypeVar("Options", bound=msgspec.Struct)
 
 
 class OptionError(ValueError):
-    """An option that can't be used: `field` is its name (empty: the whole), the message says what is wrong."""
+    """An unknown, missing or invalid option: `field` is its name (empty: the whole mapping), `problem` says why."""
 
     def __init__(self, field: str, problem: str) -> None:
         super().__init__(f"{field}: {problem}" if field else problem)
@@ -18,7 +18,7 @@ class OptionError(ValueError):
 
 
 def read_options(kind: type[Options], given: Mapping[str, Any]) -> Options:
-    """Return the options as their own type; raises `OptionError` for one that is unknown or has a wrong value."""
+    """Return the options as `kind`; raises `OptionError` for one that is unknown or has a wrong value."""
     known = [field.encode_name for field in msgspec.structs.fields(kind)]
     for name in given:
         if name not in known:

@@ -1,4 +1,4 @@
-"""What a site is: its map, places, areas, nodes and robots, as `site.toml` spells them; lengths in m, angles in rad."""
+"""A site as `site.toml` describes it: map, places, areas, nodes and robots; lengths in m, angles in rad."""
 
 from typing import Annotated, Any
 
@@ -8,7 +8,7 @@ from fog_contracts.messages import AreaDefinition, Id, Message, Metres, Pose, Ra
 
 
 class Place(Message, frozen=True, kw_only=True):
-    """A named pose; without `theta` any heading will do."""
+    """A named pose; without `theta` any heading is accepted."""
 
     x: Metres
     y: Metres
@@ -20,7 +20,7 @@ class Sonar(Message, frozen=True, kw_only=True):
     """One sonar of a node: its direction relative to the node's, and the calibrated range limit.
 
     An echo nearer than `range_limit` means `blocked`. `no_echo_is_clear` is true only where calibration recorded
-    that nothing is in range; elsewhere the opposite wall echoes, and silence means `unknown`.
+    that nothing is in range; elsewhere the opposite wall normally echoes, and a missing echo means `unknown`.
     """
 
     angle: Radians = 0.0
@@ -29,7 +29,7 @@ class Sonar(Message, frozen=True, kw_only=True):
 
 
 class NodeSite(Message, frozen=True, kw_only=True):
-    """Where a node hangs: position, direction (frame `map`) and height above the floor, and the area it watches."""
+    """A sensor node: position, direction (frame `map`), height above the floor, and the area that it watches."""
 
     id: Id
     area: Id
@@ -41,7 +41,7 @@ class NodeSite(Message, frozen=True, kw_only=True):
 
 
 class AreaSite(Message, frozen=True, kw_only=True):
-    """A watched area: its polygon, debounce (`rule` with its options beside) and number on the thesis's topics."""
+    """A watched area: polygon, debounce (the name `rule` and that rule's options), number on the thesis's topics."""
 
     id: Id
     label: str = ""
@@ -52,7 +52,7 @@ class AreaSite(Message, frozen=True, kw_only=True):
 
 
 class RobotSite(Message, frozen=True, kw_only=True):
-    """A robot of this site: where it starts, and its body."""
+    """A robot of this site: its start pose, and the radius and height of its body."""
 
     id: Id
     start: Pose
@@ -61,7 +61,7 @@ class RobotSite(Message, frozen=True, kw_only=True):
 
 
 class DemoPlan(Message, frozen=True, kw_only=True):
-    """What the demonstration does here: a drive from one place to another, and the areas that may become blocked."""
+    """The drive that the demo shows here: from one place to another, and the areas that may become blocked."""
 
     start: Id
     goal: Id
@@ -71,8 +71,8 @@ class DemoPlan(Message, frozen=True, kw_only=True):
 class Site(Message, frozen=True, kw_only=True):
     """A site as `site.toml` describes it.
 
-    `layers` are those of the costmap, bottom first, by name or as a table with `name` and the layer's own options;
-    without any, the standard ones are taken.
+    `layers` are those of the costmap, bottom first, each by name or as a table with `name` and the layer's own
+    options; an empty list means the standard layers.
     """
 
     id: Id

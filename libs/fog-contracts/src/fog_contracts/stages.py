@@ -1,4 +1,4 @@
-"""The stages of a hazard's way from the first reading to the wheels, and how long each took. Pure."""
+"""The stages between a hazard's first reading and the first wheel command, and how long each took. Pure."""
 
 from collections.abc import Mapping, Sequence
 from typing import Final
@@ -22,9 +22,9 @@ HAZARD_TO_PATH: Final[Mapping[str, tuple[str, str]]] = {"hazard_to_path": ("firs
 
 
 def durations_s(trace: Trace | None, spans: Mapping[str, tuple[str, str]] = STAGES) -> dict[str, float]:
-    """Return the seconds that each of the spans took, as far as the trace got.
+    """Return the duration (s) of each span whose two stamps are set.
 
-    A span is negative when its two stamps are of hosts whose clocks differ.
+    A duration is negative when its two stamps come from hosts whose clocks differ.
     """
     if trace is None:
         return {}
@@ -33,37 +33,37 @@ def durations_s(trace: Trace | None, spans: Mapping[str, tuple[str, str]] = STAG
 
 
 def durations_ms(trace: Trace | None, spans: Mapping[str, tuple[str, str]] = STAGES) -> dict[str, float]:
-    """Return the milliseconds, to a tenth, that each of the spans took, as far as the trace got."""
+    """Return the duration (ms, rounded to a tenth) of each span whose two stamps are set."""
     return {name: round(1000.0 * seconds, 1) for name, seconds in durations_s(trace, spans).items()}
 
 
 def hazard_to_path_ms(trace: Trace | None) -> float | None:
-    """Milliseconds from the first reading that saw the hazard to the robot's new path, None until then."""
+    """Return the milliseconds from the hazard's first reading to the robot's new path; None until both are stamped."""
     return durations_ms(trace, HAZARD_TO_PATH).get("hazard_to_path")
 
 
 class Traces:
-    """Collects what messages tell of each hazard's way through the stages."""
+    """Merges the traces of many messages into one per state of a hazard (area, epoch, seq)."""
 
     def __init__(self) -> None:
-        self._known: dict[tuple[str, int, int], Trace] = {}
+        self._merged: dict[tuple[str, int, int], Trace] = {}
 
     def update(self, traces: Sequence[Trace]) -> None:
-        """Merge traces: a stage that was reached once stays reached."""
+        """Merge traces; the first stamp of a stage is kept."""
         for trace in traces:
             key = (trace.area, trace.epoch, trace.seq)
-            known = self._known.get(key)
-            if known is None:
-                self._known[key] = trace
+            earlier = self._merged.get(key)
+            if earlier is None:
+                self._merged[key] = trace
                 continue
             stamps = {
-                name: getattr(known, name) or getattr(trace, name)
+                name: getattr(earlier, name) or getattr(trace, name)
                 for name in trace.__struct_fields__
                 if name not in {"area", "epoch", "seq"}
             }
-            self._known[key] = msgspec.structs.replace(known, **stamps)
+            self._merged[key] = msgspec.structs.replace(earlier, **stamps)
 
-    def first_of(self, area: str, since: float) -> Trace | None:
-        """Return the first trace of an area whose first reading is not older than `since` (stamp)."""
-        found = [t for t in self._known.values() if t.area == area and t.first_reading >= since]
+    def earliest(self, area: str, since: float) -> Trace | None:
+        """Return the trace of an area with the earliest first reading that is not before `since` (stamp), or None."""
+        found = [t for t in self._merged.values() if t.area == area and t.first_reading >= since]
         return min(found, key=lambda t: t.first_reading, default=None)

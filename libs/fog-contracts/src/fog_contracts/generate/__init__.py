@@ -1,6 +1,6 @@
-"""What the channel table and the message types generate: documents, access control lists and the firmware's header.
+"""Generators from the channel table and the message types: documents, access control lists and the firmware's header.
 
-Pure: tables in, text out, the same text every time. `fognav channels` prints it, and writes the files of a checkout.
+Pure and deterministic: tables in, text out. `fognav channels` prints the text and writes the files of a checkout.
 """
 
 from typing import Final

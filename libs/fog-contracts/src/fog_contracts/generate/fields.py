@@ -1,4 +1,4 @@
-"""The fields of a message type as a reader wants them: kind, unit, limits, default; read from the type itself."""
+"""The fields of a message type for documentation: type, unit, limits and default, read from the type itself."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 _SUFFIXES: Final[Mapping[str, str]] = {"_m": "m", "_cm": "cm", "_s": "s", "_ms": "ms"}
-"""Units that the ends of names tell."""
+"""Units by the suffix of a field's name."""
 _NUMBERS: Final = (inspect.IntType, inspect.FloatType)
 
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """One field; `element` is the type of its values: that of a list's items or a dictionary's values, or its own."""
+    """One field; `element` is the type of a list's items or of a dictionary's values, else the field's own type."""
 
     name: str
     type: inspect.Type
@@ -31,14 +31,14 @@ class Field:
     nullable: bool
 
     @property
-    def words(self) -> tuple[str, ...]:
-        """The texts that its values may be; empty where any may be."""
+    def choices(self) -> tuple[str, ...]:
+        """The allowed values of a field with a fixed set of them; else empty."""
         element = self.element
         return tuple(str(value) for value in element.values) if isinstance(element, inspect.LiteralType) else ()
 
 
 def message_fields(kind: type[Message]) -> list[Field]:
-    """Return the fields of a message type in their order."""
+    """Return the fields of a message type in the order of their definition."""
     described = inspect.type_info(kind)
     assert isinstance(described, inspect.StructType)
     return [_field(each) for each in described.fields]
@@ -50,7 +50,7 @@ def summary(kind: type[Message]) -> str:
 
 
 def parts(kind: type[Message]) -> list[type[Message]]:
-    """Return the message types that the fields of this one consist of, directly, in their order."""
+    """Return the message types of this one's fields, without those nested deeper."""
     found: list[type[Message]] = []
     for each in message_fields(kind):
         _collect(each.type, found)
@@ -58,7 +58,7 @@ def parts(kind: type[Message]) -> list[type[Message]]:
 
 
 def type_text(kind: inspect.Type) -> str:
-    """Name a type in a few words: `number`, `list of 1 to 8 numbers or null`, a message's own name."""
+    """Return a readable name of a type: `number`, `list (1 to 8) of number or null`, a message's own name."""
     match kind:
         case inspect.Metadata():
             return type_text(kind.type)
@@ -94,7 +94,7 @@ _PLAIN: Final[Mapping[type[inspect.Type], str]] = {
 
 
 def bounds(kind: inspect.Type) -> tuple[str, float | None, str, float | None]:
-    """Return how a number is bounded: the signs `>` or `>=` and `<` or `<=`, each with its bound or None."""
+    """Return the bounds of a number: `>` or `>=` with the lower one, `<` or `<=` with the upper one, None for none."""
     plain = _bare(kind)
     if not isinstance(plain, _NUMBERS):
         return "", None, "", None

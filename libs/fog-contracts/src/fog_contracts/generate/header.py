@@ -1,6 +1,6 @@
-"""The firmware's header: topics, sizes, spellings and limits of everything that a sensor node says or hears.
+"""The firmware's header: topics, field names, values and limits of all channels of a sensor node.
 
-Preprocessor lines only, so that it serves C, C++17 and the Arduino core alike and costs no memory where unused.
+Preprocessor directives only: usable from C, C++17 and the Arduino core, without memory for what is unused.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ if TYPE_CHECKING:
 
 _INT_MAX: Final = 2**15
 _LONG_MAX: Final = 2**31
-"""Beyond these a number may need a suffix: a board's int may have 16 bits, its long 32."""
+"""From these on a number needs a suffix: a board's int may have 16 bits, its long 32."""
 
 _HEAD: Final = f"""\
-/* What a sensor node says and hears over MQTT.
+/* What a sensor node publishes and subscribes to over MQTT.
  * {NOTE}
  *
- * FOGNAV_X_TOPIC is a format for snprintf with the ids named behind it, FOGNAV_X_TOPIC_SIZE the bytes that its longest
- * topic takes with the closing zero; FOGNAV_X_LIMIT is how many bytes a payload of channel X may have. Field names and
- * words are text; a _MIN that is followed by _EXCLUSIVE is itself not allowed.
+ * FOGNAV_X_TOPIC is a format for snprintf; the comment behind it names its ids. FOGNAV_X_TOPIC_SIZE is the size of its
+ * longest topic with the terminating zero, FOGNAV_X_LIMIT the largest payload of channel X, both in bytes. Field names
+ * and values are text. Where _MIN_EXCLUSIVE is defined, _MIN itself is not allowed.
  */
 #ifndef FOGNAV_CONTRACT_H
 #define FOGNAV_CONTRACT_H
@@ -38,7 +38,9 @@ _HEAD: Final = f"""\
 
 def firmware_header() -> str:
     """Return the header's text."""
-    blocks = [_define("FOGNAV_ID_MAX", str(ID_MAX), "characters of the longest id: a-z, 0-9, and - but not first")]
+    blocks = [
+        _define("FOGNAV_ID_MAX", str(ID_MAX), "characters of the longest id: a-z, 0-9, and - except at the start")
+    ]
     blocks += [_channel(row) for row in CHANNELS.values() if NODE in (*row.publishers, *row.subscribers)]
     return _HEAD + "\n".join(blocks) + "\n#endif /* FOGNAV_CONTRACT_H */\n"
 
@@ -60,7 +62,7 @@ def _channel(row: Channel) -> str:
         lines.append(_define(f"{name}_PERIOD_MS", str(round(row.period_s * 1000))))
     if math.isfinite(row.max_age_s):
         lines.append(_define(f"{name}_MAX_AGE_MS", str(round(row.max_age_s * 1000)), "older is stale"))
-    lines += [_define(f"{name}_{_upper(word)}", _text(word)) for word in row.words]
+    lines += [_define(f"{name}_{_upper(value)}", _text(value)) for value in row.values]
     if row.message is not None:
         lines += _message(name, row.message)
     return "".join(lines)
@@ -71,8 +73,8 @@ def _message(name: str, kind: type[Message]) -> list[str]:
     for each in message_fields(kind):
         macro = f"{name}_{_upper(each.name)}"
         unit = each.unit or ""
-        remark = ", ".join(part for part in (unit, "may be null" if each.nullable else "") if part)
-        lines.append(_define(f"{macro}_FIELD", _text(each.name), remark))
+        comment = ", ".join(part for part in (unit, "may be null" if each.nullable else "") if part)
+        lines.append(_define(f"{macro}_FIELD", _text(each.name), comment))
         lines += _lengths(macro, each)
         low_sign, low, high_sign, high = bounds(each.element)
         if low is not None:
@@ -83,7 +85,7 @@ def _message(name: str, kind: type[Message]) -> list[str]:
             lines += [_define(f"{macro}_MAX_EXCLUSIVE", "1")] if high_sign == "<" else []
         if isinstance(each.default, int | float) and not isinstance(each.default, bool):
             lines.append(_define(f"{macro}_DEFAULT", _number(each.default)))
-        lines += [_define(f"{macro}_{_upper(word)}", _text(word)) for word in each.words]
+        lines += [_define(f"{macro}_{_upper(value)}", _text(value)) for value in each.choices]
     return lines
 
 
@@ -101,16 +103,16 @@ def _lengths(macro: str, each: Field) -> list[str]:
     return lines
 
 
-def _define(name: str, value: str, remark: str = "") -> str:
-    return f"#define {name} {value}" + (f" /* {remark} */" if remark else "") + "\n"
+def _define(name: str, value: str, comment: str = "") -> str:
+    return f"#define {name} {value}" + (f" /* {comment} */" if comment else "") + "\n"
 
 
 def _macro(name: str) -> str:
     return f"FOGNAV_{_upper(name)}"
 
 
-def _upper(word: str) -> str:
-    return re.sub(r"\W", "_", word).upper()
+def _upper(name: str) -> str:
+    return re.sub(r"\W", "_", name).upper()
 
 
 def _text(text: str) -> str:

@@ -23,17 +23,17 @@ _HEAD: Final = f"""\
 
 # Channels, messages and routes
 
-Everything that crosses from one process to another: over MQTT between sensor nodes and the fog, over zenoh between the
+Everything that processes exchange: over MQTT between sensor nodes and the fog, over zenoh between the
 fog and the robots, and the REST routes of the services. An id in angle brackets is `[a-z0-9][a-z0-9-]{{0,31}}`,
 an area's number on the thesis's topics has one to four digits. Lengths are in metres, angles in radians, in the frame
-`map`, unless a field says otherwise; a stamp counts seconds since 1970 by its sender's clock and is for people and
-traces, never for deciding what is fresh. Unknown fields are ignored; a message that is too long, lacks a field or has
+`map`, unless a field says otherwise; a stamp is in seconds since 1970 by the sender's clock and serves people and
+traces, never freshness checks. Unknown fields are ignored; a message that is too long, lacks a field or has
 one out of range is refused, counted and logged.
 
 """
 _STALE: Final = """\
-*Stale after* counts from a message's arrival by the receiver's own clock. Without it
-the value holds until the next one, or as long as the message says.
+*Stale after* is measured from a message's arrival by the receiver's own clock. Without it
+the value holds until the next message, or as long as the message itself says.
 """
 _LARGE: Final = 2**31
 _METHODS: Final = ("get", "put", "post", "patch", "delete")
@@ -45,14 +45,15 @@ def channels_markdown(services: Mapping[str, OpenApi]) -> str:
 
 
 def _roles() -> str:
-    return "## Who speaks\n\n" + _table(["role", "what it is"], ([f"`{role}`", what] for role, what in ROLES.items()))
+    rows = ([f"`{role}`", description] for role, description in ROLES.items())
+    return "## Roles\n\n" + _table(["role", "description"], rows)
 
 
 def _durabilities() -> str:
-    rows = ([f"`{name}`", what] for name, what in DURABILITIES.items())
-    head = "## What becomes of missed messages\n\n"
-    tail = "\nOver MQTT `latest` means retained. A zenoh channel of durability `latest` can be queried, too.\n"
-    return head + _table(["durability", "what a subscriber gets"], rows) + tail
+    rows = ([f"`{name}`", description] for name, description in DURABILITIES.items())
+    head = "## Durability\n\n"
+    tail = "\nOver MQTT `latest` means retained. A zenoh channel of durability `latest` can also be queried.\n"
+    return head + _table(["durability", "what a late or disconnected subscriber receives"], rows) + tail
 
 
 def _mqtt() -> str:
@@ -64,15 +65,15 @@ def _mqtt() -> str:
         for row in CHANNELS.values()
         if row.transport == "mqtt"
     )  # fmt: skip
-    columns = ["topic", "carries", "from → to", "QoS", "durability", "rate", "stale after", "at most"]
+    columns = ["topic", "carries", "from → to", "QoS", "durability", "rate", "stale after", "size limit"]
     return f"## MQTT\n\nMessages are JSON in UTF-8, or plain text. {_STALE}\n" + _table(columns, rows)
 
 
 def _zenoh() -> str:
     published = [row for row in CHANNELS.values() if row.transport == "zenoh" and row.kind == "pub"]
-    asked = [row for row in CHANNELS.values() if row.kind == "query"]
-    alive = [row for row in CHANNELS.values() if row.kind == "liveliness"]
-    columns = ["key", "carries", "from → to", "durability", "rate", "stale after", "at most"]
+    queried = [row for row in CHANNELS.values() if row.kind == "query"]
+    presence = [row for row in CHANNELS.values() if row.kind == "liveliness"]
+    columns = ["key", "carries", "from → to", "durability", "rate", "stale after", "size limit"]
     rows = (
         [_key(row), _carried(row), _ends(row), f"`{row.durability}`", _rate(row), _age(row), _size(row.limit)]
         for row in published
@@ -82,15 +83,15 @@ def _zenoh() -> str:
             _key(row), _message(row.message), _message(row.reply), _names(row.subscribers), _names(row.publishers),
             f"{_size(row.limit)}, {_size(row.reply_limit)}",
         ]
-        for row in asked
+        for row in queried
     )  # fmt: skip
     return "\n".join(
         [
             f"## zenoh\n\nMessages are msgpack. {_STALE}",
             "### Published\n\n" + _table(columns, rows),
-            "### Queries\n\n" + _table(["key", "asks", "answers", "who asks", "who answers", "at most"], queries),
+            "### Queries\n\n" + _table(["key", "request", "reply", "sent by", "answered by", "size limit"], queries),
             "### Presence\n\n"
-            + _table(["key", "says", "from → to"], ([_key(row), row.about, _ends(row)] for row in alive)),
+            + _table(["key", "meaning", "from → to"], ([_key(row), row.about, _ends(row)] for row in presence)),
         ]
     )
 
@@ -116,26 +117,28 @@ def _one(kind: type[Message]) -> str:
 
 
 def _routes(services: Mapping[str, OpenApi]) -> str:
-    sections = ["## REST\n\nErrors are RFC 9457 problem documents. Writing needs a bearer token.\n"]
+    sections = ["## REST\n\nErrors are RFC 9457 problem documents. Writing requires a bearer token.\n"]
     for name, described in services.items():
         rows = [_route(method, path, path_item[method]) for path, path_item in sorted(described["paths"].items())
                 for method in _METHODS if method in path_item]  # fmt: skip
-        sections.append(f"### {name}\n\n" + _table(["route", "does", "parameters", "body", "answers", "token"], rows))
+        sections.append(
+            f"### {name}\n\n" + _table(["route", "description", "parameters", "body", "responses", "token"], rows)
+        )
     return "\n".join(sections)
 
 
 def _route(method: str, path: str, operation: Mapping[str, Any]) -> list[str]:
-    does = operation.get("description") or operation.get("summary") or ""
+    description = operation.get("description") or operation.get("summary") or ""
     parameters = [f"`{each['name']}`" for each in operation.get("parameters", []) if each["in"] != "path"]
     body = _schema((operation.get("requestBody") or {}).get("content"))
-    # 422 is the framework's own for parameters; every service answers all refusals as problem documents.
-    answers = [
-        " ".join(part for part in (code, _schema(answer.get("content"))) if part)
-        for code, answer in sorted(operation.get("responses", {}).items())
+    # 422 is added by the framework for parameters; every service answers refusals with problem documents.
+    responses = [
+        " ".join(part for part in (code, _schema(response.get("content"))) if part)
+        for code, response in sorted(operation.get("responses", {}).items())
         if code != "422"
     ]
     return [
-        f"`{method.upper()} {path}`", _sentence(does), ", ".join(parameters), body, ", ".join(answers),
+        f"`{method.upper()} {path}`", _sentence(description), ", ".join(parameters), body, ", ".join(responses),
         "yes" if operation.get("security") else "",
     ]  # fmt: skip
 
@@ -171,8 +174,8 @@ def _key(row: Channel) -> str:
 def _carried(row: Channel) -> str:
     if row.message is not None:
         return _message(row.message)
-    words = " or ".join(f"`{word}`" for word in row.words)
-    return f"{words}: {row.about}" if words else row.about
+    values = " or ".join(f"`{value}`" for value in row.values)
+    return f"{values}: {row.about}" if values else row.about
 
 
 def _message(kind: type[Message] | None) -> str:
@@ -182,7 +185,7 @@ def _message(kind: type[Message] | None) -> str:
 
 
 def _linked(text: str) -> str:
-    """Link the names of messages; words in backticks are none."""
+    """Link the names of messages, which a text with backticks does not contain."""
     return text if "`" in text else re.sub(r"\b[A-Z]\w+", lambda name: f"[{name[0]}](#{name[0].lower()})", text)
 
 
@@ -218,10 +221,10 @@ def _limits(field: Field) -> str:
 def _number(value: float) -> str:
     if not isinstance(value, int):
         return f"{value:g}"
-    for less in (0, 1):
-        power = value + less
+    for offset in (0, 1):
+        power = value + offset
         if power >= _LARGE and power.bit_count() == 1:
-            return f"2^{power.bit_length() - 1}" + " - 1" * less
+            return f"2^{power.bit_length() - 1}" + " - 1" * offset
     return str(value)
 
 

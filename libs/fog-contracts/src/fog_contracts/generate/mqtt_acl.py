@@ -1,6 +1,6 @@
-"""Mosquitto's access control list (`acl_file`): what each role may publish and what it is given, by the channel table.
+"""Mosquitto's access control list (`acl_file`): what each role may publish and receive, by the channel table.
 
-A topic that no line allows is denied. A node's user is named like the node (`%u`); all other users like their role.
+Topics that no line allows are denied. A node's user name is the node's id (`%u`), any other user name is a role.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from fog_contracts.generate import NOTE
 Access = Literal["read", "write"]
 
 _HEAD: Final = f"""\
-# Who may publish what on the MQTT broker, and is given what: Mosquitto's `acl_file`.
+# Who may publish and receive what through the MQTT broker: Mosquitto's `acl_file`.
 # {NOTE}
 #
-# A sensor node's user is named like the node, all other users like their role. What no line allows is denied.
-# A `pattern` line holds for every user, with its name for %u, so no node may be named like a role.
-# Mosquitto 2.0 lets anybody subscribe and checks each message when it is delivered.
+# A sensor node's user name is the node's id, any other user name is a role. Topics that no line allows are denied.
+# A `pattern` line holds for every user, with the user name for %u, so no node's id may be a role's name.
+# Mosquitto 2.0 accepts every subscription and checks each message when it is delivered.
 """
 
 
 def mqtt_acl(site: str = "+") -> str:
-    """Return the list for one site, or without its id for all sites that share the broker."""
+    """Return the list for one site, or, without a site's id, for all sites that share the broker."""
     sections = [_HEAD]
     sections += [_section(role, site) for role in ROLES if role != NODE and _lines(role, site)]
     sections.append(_nodes(site))
@@ -38,19 +38,19 @@ def _section(role: Role, site: str) -> str:
 
 def _nodes(site: str) -> str:
     lines = [f"pattern {access} {_topic(row, site, '%u')}" for access, row in _rights(NODE)]
-    return "\n".join([f"# {ROLES[NODE]}: itself only", *lines, ""])
+    return "\n".join([f"# {ROLES[NODE]}: only its own topics", *lines, ""])
 
 
 def _lines(role: Role, site: str) -> list[str]:
     rights = _rights(role)
     lines = [f"{access:5} {_topic(row, site)}" for access, row in rights]
-    own = {row for _, row in rights}
-    # MQTT knows no wildcard for a part of a level: `area 3` needs `+`, which must not let other topics in.
-    broad = [re.compile("[^/]+") for _, row in rights if "number" in row.fields]
+    allowed = {row for _, row in rights}
+    # MQTT has no wildcard for part of a level: `area 3` needs `+`, so all other topics that match `+` are denied.
+    one_level = [re.compile("[^/]+") for _, row in rights if "number" in row.fields]
     return lines + [
         f"deny  {row.template}"
         for row in CHANNELS.values()
-        if row.transport == "mqtt" and row not in own and any(each.fullmatch(row.template) for each in broad)
+        if row.transport == "mqtt" and row not in allowed and any(each.fullmatch(row.template) for each in one_level)
     ]
 
 

@@ -1,6 +1,6 @@
-"""The zenoh router's access control: what each role may send to it and is sent by it, by the channel table.
+"""The zenoh router's access control: what each role may send to it and receive from it, by the channel table.
 
-Everything that no rule allows is denied. A client says who it is by its user name or by its certificate's common name.
+What no rule allows is denied. A client is identified by its user name or by its certificate's common name.
 """
 
 from __future__ import annotations
@@ -18,17 +18,19 @@ if TYPE_CHECKING:
 Flow = Literal["ingress", "egress"]
 
 _HEAD: Final = f"""\
-// Who may publish, subscribe, ask and answer through the zenoh router: a part of its configuration.
+// Who may publish, subscribe, query and reply through the zenoh router: a part of its configuration.
 // {NOTE}
 //
-// A client is known by its user name (transport/auth/usrpwd) or by its certificate's common name (mutual TLS).
+// A client is identified by its user name (transport/auth/usrpwd) or by its certificate's common name (mutual TLS).
 // %s
 // What no rule allows is denied.
-// ingress: what the router accepts from a client; egress: what it passes on to one. `@adv` is zenoh's own: by it an
-// advanced publisher offers what it keeps, and an advanced subscriber recovers what it missed.
+// ingress: what the router accepts from a client; egress: what it forwards to one. Below `@adv`, zenoh's own suffix, an
+// advanced publisher serves its cache, from which an advanced subscriber recovers missed messages.
 """
-_ROLES_ONLY: Final = "Each is named like its role; any robot may speak for any other: name the robots to forbid that."
-_ROBOTS: Final = "Each is named like its role, but robots like their ids, and each speaks for itself only."
+_ROLES_ONLY: Final = (
+    "The name is the role; a robot may publish as any other robot: generate with the robots' ids to forbid that."
+)
+_ROBOTS: Final = "The name is the role, for a robot its id; a robot may publish only as itself."
 
 
 @dataclass
@@ -39,11 +41,11 @@ class _Rights:
 
     def allow(self, flow: Flow, messages: str, *keys: str) -> None:
         for message in messages.split():
-            known = self.keys.setdefault((flow, message), [])
-            known += [key for key in keys if key not in known]
+            expressions = self.keys.setdefault((flow, message), [])
+            expressions += [key for key in keys if key not in expressions]
 
     def rules(self, name: str) -> list[dict[str, object]]:
-        """Return the rules, with those messages in one that have the same keys."""
+        """Return the rules; messages with the same keys share one."""
         merged: dict[tuple[Flow, tuple[str, ...]], list[str]] = {}
         for (flow, message), keys in self.keys.items():
             merged.setdefault((flow, tuple(keys)), []).append(message)
@@ -61,27 +63,30 @@ class _Rights:
 
 def zenoh_acl(site: str = "*", robots: Sequence[str] = ()) -> str:
     """Return the router's `access_control` as JSON5: for one site and its robots by id, or for all sites by role."""
-    subjects: list[tuple[str, Role]] = []
+    clients: list[tuple[str, Role]] = []
     for role in ROLES:
         names = robots if role == ROBOT and robots else (role,)
-        subjects += [(name, role) for name in names]
+        clients += [(name, role) for name in names]
     rules: list[dict[str, object]] = []
-    known: list[dict[str, object]] = []
+    subjects: list[dict[str, object]] = []
     policies: list[dict[str, object]] = []
-    for name, role in subjects:
+    for name, role in clients:
         robot = name if role == ROBOT and robots else "*"
-        found = _rights(role, site, robot).rules(name)
-        if not found:
+        client_rules = _rights(role, site, robot).rules(name)
+        if not client_rules:
             continue
-        rules += found
+        rules += client_rules
         by_user, by_certificate = f"{name} by user name", f"{name} by certificate"
-        known += [{"id": by_user, "usernames": [name]}, {"id": by_certificate, "cert_common_names": [name]}]
-        policies.append({"subjects": [by_user, by_certificate], "rules": [rule["id"] for rule in found]})
+        subjects += [{"id": by_user, "usernames": [name]}, {"id": by_certificate, "cert_common_names": [name]}]
+        policies.append({"subjects": [by_user, by_certificate], "rules": [rule["id"] for rule in client_rules]})
     return "".join(
         [
             _HEAD % (_ROBOTS if robots else _ROLES_ONLY),
             '{\n  "access_control": {\n    "enabled": true,\n    "default_permission": "deny",\n',
-            *(_array(title, rows) for title, rows in (("rules", rules), ("subjects", known), ("policies", policies))),
+            *(
+                _array(title, rows)
+                for title, rows in (("rules", rules), ("subjects", subjects), ("policies", policies))
+            ),
             "  },\n}\n",
         ]
     )
@@ -106,23 +111,23 @@ def _rights(role: Role, site: str, robot: str) -> _Rights:
         if row.transport != "zenoh":
             continue
         key = _key(row, site, robot, role)
-        offers = role in row.publishers
-        takes = role in row.subscribers or (role == "recorder" and row.kind == "pub")
+        publishes = role in row.publishers
+        subscribes = role in row.subscribers or (role == "recorder" and row.kind == "pub")
         if row.kind == "liveliness":
-            if offers:
+            if publishes:
                 rights.allow("ingress", "liveliness_token", key)
-            if takes:
+            if subscribes:
                 rights.allow("ingress", "declare_liveliness_subscriber liveliness_query", key)
                 rights.allow("egress", "liveliness_token", key)
             continue
-        if offers:
-            _allow_offering(rights, row, key)
-        if takes:
-            _allow_taking(rights, row, key)
+        if publishes:
+            _allow_publishing(rights, row, key)
+        if subscribes:
+            _allow_subscribing(rights, row, key)
     return rights
 
 
-def _allow_offering(rights: _Rights, row: Channel, key: str) -> None:
+def _allow_publishing(rights: _Rights, row: Channel, key: str) -> None:
     if row.kind == "query":
         rights.allow("ingress", "declare_queryable reply", key)
         rights.allow("egress", "query", key)
@@ -130,14 +135,14 @@ def _allow_offering(rights: _Rights, row: Channel, key: str) -> None:
     rights.allow("ingress", "put", key)
     rights.allow("egress", "declare_subscriber", key)
     if row.durability != "volatile":
-        kept = f"{key}/@adv/**"
-        rights.allow("ingress", "put declare_queryable reply liveliness_token", kept)
+        cache = f"{key}/@adv/**"
+        rights.allow("ingress", "put declare_queryable reply liveliness_token", cache)
         rights.allow("ingress", "declare_queryable reply", key)
-        rights.allow("egress", "declare_subscriber", kept)
-        rights.allow("egress", "query", key, kept)
+        rights.allow("egress", "declare_subscriber", cache)
+        rights.allow("egress", "query", key, cache)
 
 
-def _allow_taking(rights: _Rights, row: Channel, key: str) -> None:
+def _allow_subscribing(rights: _Rights, row: Channel, key: str) -> None:
     if row.kind == "query":
         rights.allow("ingress", "query", key)
         rights.allow("egress", "declare_queryable reply", key)
@@ -145,15 +150,15 @@ def _allow_taking(rights: _Rights, row: Channel, key: str) -> None:
     rights.allow("ingress", "declare_subscriber", key)
     rights.allow("egress", "put", key)
     if row.durability != "volatile":
-        kept = f"{key}/@adv/**"
-        rights.allow("ingress", "declare_subscriber declare_liveliness_subscriber liveliness_query", kept)
-        rights.allow("ingress", "query", key, kept)
-        rights.allow("egress", "put liveliness_token", kept)
-        rights.allow("egress", "declare_queryable reply", key, kept)
+        cache = f"{key}/@adv/**"
+        rights.allow("ingress", "declare_subscriber declare_liveliness_subscriber liveliness_query", cache)
+        rights.allow("ingress", "query", key, cache)
+        rights.allow("egress", "put liveliness_token", cache)
+        rights.allow("egress", "declare_queryable reply", key, cache)
 
 
 def _key(row: Channel, site: str, robot: str, role: Role) -> str:
-    own = {"site": site, "robot": robot}
+    ids = {"site": site, "robot": robot}
     if row.kind == "liveliness" and role in row.publishers:
-        own |= {"role": role, "id": robot}
-    return row.template.format(**{name: own.get(name, "*") for name in row.fields})
+        ids |= {"role": role, "id": robot}
+    return row.template.format(**{name: ids.get(name, "*") for name in row.fields})

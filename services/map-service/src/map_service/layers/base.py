@@ -53,7 +53,7 @@ class CostLayer(ABC):
 
     @abstractmethod
     def update_costs(self, window: Window, cost: Grid, speed: Grid) -> None:
-        """Combine the layer's opinion into `cost` and `speed`, both uint8 (window.height, window.width).
+        """Combine the layer's costs into `cost` and `speed`, both uint8 (window.height, window.width).
 
         They hold what the layers below wrote inside the window. No layer lowers a cost or raises a speed limit:
         `write_cost` and `write_speed_limit` see to it.

@@ -14,7 +14,7 @@ from fognav_sim.drive.evaluation import DriveEvaluation, DriveOutcome
 
 REACHED = DriveOutcome("reached", "the robot stands 0.08 m from its goal")
 TIMEOUT = DriveOutcome("timeout", "the goal was not reached within 600 s")
-SILENT = "no word from the guardian for 0.6 s"
+SILENT = "no message from the guardian for 0.6 s"
 
 
 class Drive:
@@ -140,7 +140,7 @@ def test_neither_a_touch_nor_a_blocked_area_entered_is_ever_excused(late: int) -
     z1 = next(area for area in entered.attempt.plan.site.site.areas if area.id == "z1")
     entered.evaluation.block(z1)
     entered.is_at(40.0, 28.0)
-    entered.robot_is("PROTECTIVE_STOP", "the robot stands in z1", late=late)
+    entered.robot_is("PROTECTIVE_STOP", "the robot is in z1", late=late)
     for _ in range(3):
         entered.check()
         entered.robot_is("NORMAL", late=2 * late)

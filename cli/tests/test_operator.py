@@ -95,7 +95,7 @@ async def floor() -> AsyncIterator[Floor]:
 async def test_a_robot_that_starts_as_it_should_makes_a_calm_story(floor: Floor) -> None:
     floor.operator.held_back = True
     await floor.area_is("z1", "unknown", "not heard yet")
-    await floor.robot_says("INIT", "no word from the guardian for as long as it runs", ASKS)
+    await floor.robot_says("INIT", "no message from the guardian for as long as the agent runs", ASKS)
     await floor.area_is("z1", "clear", "node n1: 5 in a row")
     await floor.robot_says("INIT", "the pose is not known yet: checking the saved pose", ASKS)
     await floor.robot_says("INIT", ASKS)
@@ -131,11 +131,11 @@ async def test_trouble_that_comes_later_is_told_with_its_reasons(floor: Floor) -
     await floor.area_is("z2", "blocked", "node n2: something at 0.20 m")
     await floor.robot_says("NORMAL")
     await floor.robot_says("PROTECTIVE_STOP", "the lidar has been silent for 0.4 s")
-    await floor.robot_says("INIT", "no word from the guardian for as long as it runs", ASKS)
+    await floor.robot_says("INIT", "no message from the guardian for as long as the agent runs", ASKS)
     assert [text for text in floor.told if not text.startswith("operator")] == [
         "area z1: unknown (node n1 is silent)",
         "area z2: blocked (node n2: something at 0.20 m)",
         "robot: NORMAL",
         "robot: PROTECTIVE_STOP (the lidar has been silent for 0.4 s)",
-        f"robot: INIT (no word from the guardian for as long as it runs; {ASKS})",
+        f"robot: INIT (no message from the guardian for as long as the agent runs; {ASKS})",
     ]

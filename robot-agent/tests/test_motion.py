@@ -60,7 +60,7 @@ def test_only_the_released_part_is_handed_out_and_the_rest_follows_when_released
     points, ends = follower.rest(2.5)
     assert points[-1] == pytest.approx((4.0, 1.0))
     assert not ends
-    assert follower.released_left == pytest.approx(0.5)
+    assert follower.released_remaining == pytest.approx(0.5)
     follower.release(100.0)
     points, ends = follower.rest(2.5)
     assert points[-1] == pytest.approx((6.0, 1.0))
@@ -72,7 +72,7 @@ def test_driving_past_the_released_end_hands_out_no_way_back():
     follower.advance(3.3, 1.0, 0.0)
     points, _ = follower.rest(2.5)
     assert np.ptp(points[:, 0]) == pytest.approx(0.0)
-    assert follower.released_left == 0.0
+    assert follower.released_remaining == 0.0
 
 
 def test_being_stuck_is_counted_from_the_last_progress():

@@ -1,4 +1,4 @@
-"""The safety gate: what each finding does, and what must hold in every state that can be reached."""
+"""The safety gate: the effect of each finding, and invariants of every reachable state."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from robot_agent.safety.gate import (
     SafetyInputs,
     SafetyOutputs,
     SafetyState,
-    judge,
+    collect_findings,
     limit_wheels,
     ramp_down,
     step,
@@ -27,8 +27,8 @@ HEALTHY = {
     "map_loaded": True,
     "map_age": 0.1,
     "localization": "good",
-    "lidar_node_age": 0.02,
-    "turn_age": 0.1,
+    "lidar_age": 0.02,
+    "scan_age": 0.1,
     "base_age": 0.02,
 }
 
@@ -57,7 +57,7 @@ class Gate:
         return self
 
 
-def test_a_robot_that_was_switched_on_waits_for_an_operator_however_healthy():
+def test_healthy_robot_stays_in_init_until_an_operator_enables_it():
     gate = Gate()
     out = gate.run(60.0)
     assert out.mode == "INIT"
@@ -70,13 +70,13 @@ def test_a_robot_that_was_switched_on_waits_for_an_operator_however_healthy():
     [
         ({"map_loaded": False}, "no map"),
         ({"localization": "none"}, "pose"),
-        ({"turn_age": math.inf}, "turn"),
+        ({"scan_age": math.inf}, "scan"),
         ({"base_age": math.inf}, "guardian"),
         ({"inside_blocked": "the zone wet-floor"}, "wet-floor"),
         ({"bumper": True}, "bumper"),
     ],
 )
-def test_enable_is_refused_with_the_cause_while_something_is_missing(missing, word):
+def test_enable_is_refused_with_the_cause_while_an_input_is_missing(missing, word):
     gate = Gate()
     out = gate.run(request="enable", **missing)
     assert out.refusal is not None
@@ -84,12 +84,12 @@ def test_enable_is_refused_with_the_cause_while_something_is_missing(missing, wo
     assert gate.run(5.0).mode == "INIT"
 
 
-def test_enable_works_once_all_is_there():
+def test_enable_is_accepted_when_all_inputs_are_healthy():
     assert Gate().enabled().out.cap == 0.30
 
 
 @pytest.mark.parametrize(
-    ("trouble", "mode"),
+    ("changes", "mode"),
     [
         ({"map_age": 1.1}, "DEGRADED"),
         ({"map_age": 3.1}, "HOLD"),
@@ -97,16 +97,16 @@ def test_enable_works_once_all_is_there():
         ({"map_gap": 1.1}, "HOLD"),
         ({"localization": "weak"}, "DEGRADED"),
         ({"localization": "lost"}, "PROTECTIVE_STOP"),
-        ({"mission": True, "plan_age": 1.6, "released_left": 5.0}, "DEGRADED"),
-        ({"mission": True, "plan_age": 1.6, "released_left": 0.0}, "HOLD"),
+        ({"mission": True, "plan_age": 1.6, "released_remaining": 5.0}, "DEGRADED"),
+        ({"mission": True, "plan_age": 1.6, "released_remaining": 0.0}, "HOLD"),
         ({"mission": True, "path_problem": "goal blocked"}, "HOLD"),
         ({"mission": False, "path_problem": "goal blocked", "plan_age": math.inf}, "NORMAL"),
-        ({"lidar_node_age": 0.31}, "PROTECTIVE_STOP"),
-        ({"turn_age": 0.46}, "PROTECTIVE_STOP"),
-        ({"identical_turns": 2}, "NORMAL"),
-        ({"identical_turns": 3}, "PROTECTIVE_STOP"),
+        ({"lidar_age": 0.31}, "PROTECTIVE_STOP"),
+        ({"scan_age": 0.46}, "PROTECTIVE_STOP"),
+        ({"identical_scans": 2}, "NORMAL"),
+        ({"identical_scans": 3}, "PROTECTIVE_STOP"),
         ({"base_age": 0.31}, "PROTECTIVE_STOP"),
-        ({"base_silent": "connection closed"}, "PROTECTIVE_STOP"),
+        ({"guardian_lost": "connection closed"}, "PROTECTIVE_STOP"),
         ({"base_stopped": "commands are stale"}, "PROTECTIVE_STOP"),
         ({"inside_blocked": "zone x"}, "PROTECTIVE_STOP"),
         ({"base_fault": "OI mode is PASSIVE"}, "FAULT"),
@@ -114,49 +114,49 @@ def test_enable_works_once_all_is_there():
         ({"cliff": True}, "FAULT"),
         ({"wheel_drop": True}, "FAULT"),
         ({"map_age": math.nan}, "HOLD"),
-        ({"turn_age": math.nan}, "PROTECTIVE_STOP"),
+        ({"scan_age": math.nan}, "PROTECTIVE_STOP"),
         ({"base_age": math.nan}, "PROTECTIVE_STOP"),
         ({"caution": "area z4 is unknown"}, "DEGRADED"),
     ],
 )
-def test_a_finding_takes_effect_in_the_same_step_and_says_why(trouble, mode):
+def test_finding_changes_the_mode_in_the_same_step_and_gives_a_reason(changes, mode):
     gate = Gate().enabled()
-    out = gate.run(DT, **trouble)
+    out = gate.run(DT, **changes)
     assert out.mode == mode
     assert out.changed == (mode != "NORMAL")
     assert bool(out.reasons) == (mode != "NORMAL")
 
 
-@pytest.mark.parametrize("trouble", [{"map_age": 2.0}, {"map_gap": 2.0}, {"turn_age": 1.0}])
-def test_relaxing_takes_two_seconds_of_unbroken_health(trouble):
+@pytest.mark.parametrize("changes", [{"map_age": 2.0}, {"map_gap": 2.0}, {"scan_age": 1.0}])
+def test_mode_relaxes_after_two_seconds_without_findings(changes):
     gate = Gate().enabled()
-    stopped = gate.run(DT, **trouble).mode
+    stopped = gate.run(DT, **changes).mode
     assert gate.run(1.5).mode == stopped
-    assert gate.run(DT, **trouble).mode == stopped
+    assert gate.run(DT, **changes).mode == stopped
     assert gate.run(1.9).mode == stopped
     assert gate.run(0.2).mode == "NORMAL"
 
 
-def test_health_of_the_last_two_seconds_counts_not_only_of_the_last_moment():
+def test_mode_relaxes_to_the_worst_finding_of_the_last_two_seconds():
     gate = Gate().enabled()
-    gate.run(DT, turn_age=1.0)
+    gate.run(DT, scan_age=1.0)
     gate.run(1.8, map_age=3.5)
     assert gate.run(0.3).mode == "HOLD"
 
 
-def test_after_a_stale_map_only_a_newer_plan_lets_the_robot_go_on():
+def test_hold_for_a_stale_map_ends_only_with_a_newer_plan():
     gate = Gate().enabled()
-    driving = {"mission": True, "plan_age": 0.3, "released_left": 5.0}
+    driving = {"mission": True, "plan_age": 0.3, "released_remaining": 5.0}
     assert gate.run(1.0, **driving).mode == "NORMAL"
     assert gate.run(1.0, **{**driving, "map_age": 4.0}).mode == "HOLD"
-    for age in (0.9, 1.2):  # the plan from before the map was heard again
+    for age in (0.9, 1.2):  # a plan from before the map was received again
         out = gate.run(DT, **{**driving, "plan_age": age})
         assert out.mode == "HOLD"
         assert "waiting for a plan on the fresh map" in out.reasons
     assert gate.run(2.2, **{**driving, "plan_age": 0.0}).mode == "NORMAL"
 
 
-def test_a_short_hold_ends_by_itself_a_long_one_needs_an_operator():
+def test_short_hold_ends_by_itself_and_long_hold_needs_an_operator():
     gate = Gate().enabled()
     gate.run(50.0, map_age=9.0)
     assert gate.run(2.2).mode == "NORMAL"
@@ -170,11 +170,11 @@ def test_a_short_hold_ends_by_itself_a_long_one_needs_an_operator():
     assert gate.run(2.2).mode == "NORMAL"
 
 
-@pytest.mark.parametrize("trouble", [{"localization": "lost"}, {"inside_blocked": "zone x"}])
-def test_a_lost_pose_and_a_blocked_zone_need_an_operator_even_when_they_are_over(trouble):
+@pytest.mark.parametrize("changes", [{"localization": "lost"}, {"inside_blocked": "zone x"}])
+def test_lost_pose_and_blocked_zone_need_an_operator_after_they_end(changes):
     gate = Gate().enabled()
-    gate.run(DT, **trouble)
-    assert gate.run(request="enable", **trouble).refusal is not None
+    gate.run(DT, **changes)
+    assert gate.run(request="enable", **changes).refusal is not None
     out = gate.run(30.0)
     assert out.mode == "PROTECTIVE_STOP"
     assert any("an operator must enable" in reason for reason in out.reasons)
@@ -182,30 +182,30 @@ def test_a_lost_pose_and_a_blocked_zone_need_an_operator_even_when_they_are_over
     assert gate.run(2.2).mode == "NORMAL"
 
 
-def test_a_silent_lidar_ends_by_itself():
+def test_protective_stop_for_a_silent_lidar_ends_by_itself():
     gate = Gate().enabled()
-    assert gate.run(1.0, turn_age=1.0).mode == "PROTECTIVE_STOP"
+    assert gate.run(1.0, scan_age=1.0).mode == "PROTECTIVE_STOP"
     assert gate.run(2.2).mode == "NORMAL"
 
 
-def test_the_third_protective_stop_within_a_minute_is_a_fault():
+def test_third_protective_stop_within_a_minute_is_a_fault():
     gate = Gate().enabled()
     for _ in range(2):
-        assert gate.run(DT, turn_age=1.0).mode == "PROTECTIVE_STOP"
+        assert gate.run(DT, scan_age=1.0).mode == "PROTECTIVE_STOP"
         assert gate.run(2.5).mode == "NORMAL"
-    out = gate.run(DT, turn_age=1.0)
+    out = gate.run(DT, scan_age=1.0)
     assert out.mode == "FAULT"
     assert "3 protective stops" in out.reasons[0]
 
 
-def test_protective_stops_that_lie_apart_are_no_fault():
+def test_protective_stops_half_a_minute_apart_are_no_fault():
     gate = Gate().enabled()
     for _ in range(4):
-        assert gate.run(DT, turn_age=1.0).mode == "PROTECTIVE_STOP"
+        assert gate.run(DT, scan_age=1.0).mode == "PROTECTIVE_STOP"
         assert gate.run(31.0).mode == "NORMAL"
 
 
-def test_a_fault_stays_until_a_reset_after_its_cause_is_gone_and_then_needs_an_enable():
+def test_fault_needs_its_cause_gone_then_a_reset_then_an_enable():
     gate = Gate().enabled()
     gate.run(DT, bumper=True)
     assert gate.run(100.0).mode == "FAULT"
@@ -219,7 +219,7 @@ def test_a_fault_stays_until_a_reset_after_its_cause_is_gone_and_then_needs_an_e
     gate.enabled()
 
 
-def test_a_fault_that_the_guardian_latched_while_disabled_is_reset_by_the_operator_too():
+def test_fault_latched_by_the_guardian_while_disabled_can_be_reset():
     gate = Gate()
     fault = {"base_fault": "the bumper is pressed (left)"}
     assert gate.run(request="enable", **fault).refusal is not None
@@ -228,25 +228,25 @@ def test_a_fault_that_the_guardian_latched_while_disabled_is_reset_by_the_operat
     gate.enabled()
 
 
-def test_disable_stops_at_once_and_lasts():
+def test_disable_stops_immediately_and_lasts():
     gate = Gate().enabled()
-    assert gate.run(request="disable").stop == "now"
+    assert gate.run(request="disable").stop == "immediate"
     assert gate.run(10.0).mode == "INIT"
 
 
 AGES = st.sampled_from([0.0, 0.2, 0.35, 0.5, 1.2, 2.0, 3.5, math.inf])
-TROUBLE = st.fixed_dictionaries(
+CHANGES = st.fixed_dictionaries(
     {},
     optional={
         "map_loaded": st.booleans(),
         "map_age": AGES,
         "map_gap": AGES,
         "localization": st.sampled_from(["good", "weak", "lost", "none"]),
-        "lidar_node_age": AGES,
-        "turn_age": AGES,
-        "identical_turns": st.integers(1, 4),
+        "lidar_age": AGES,
+        "scan_age": AGES,
+        "identical_scans": st.integers(1, 4),
         "base_age": AGES,
-        "base_silent": st.sampled_from([None, "gone"]),
+        "guardian_lost": st.sampled_from([None, "gone"]),
         "base_fault": st.sampled_from([None, None, None, "serial"]),
         "base_stopped": st.sampled_from([None, None, "stale"]),
         "bumper": st.sampled_from([False, False, False, True]),
@@ -254,14 +254,14 @@ TROUBLE = st.fixed_dictionaries(
         "wheel_drop": st.sampled_from([False, False, False, True]),
         "mission": st.booleans(),
         "plan_age": AGES,
-        "released_left": st.sampled_from([0.0, 3.0]),
+        "released_remaining": st.sampled_from([0.0, 3.0]),
         "path_problem": st.sampled_from([None, "goal blocked"]),
         "inside_blocked": st.sampled_from([None, None, "zone x"]),
         "caution": st.sampled_from([None, "unknown"]),
     },
 )
 EPISODE = st.tuples(
-    TROUBLE,
+    CHANGES,
     st.sampled_from([None, None, "enable", "enable", "reset", "disable"]),
     st.sampled_from([1, 2, 10, 41]),
     st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5)),
@@ -275,21 +275,21 @@ def test_invariants_of_every_reachable_state(episodes):
     wheels = (0.0, 0.0)
     levels: list[tuple[float, Level]] = []
     rank = {"NORMAL": 0, "DEGRADED": 1, "HOLD": 2, "PROTECTIVE_STOP": 3, "FAULT": 4}
-    # Start enabled half of the time's worth: the first episode follows an enable of a healthy robot.
-    for trouble, request, ticks, wanted in [({}, "enable", 50, (0.3, 0.3)), *episodes]:
+    # The first episode enables a healthy robot, so that the others start from NORMAL.
+    for changes, request, ticks, requested in [({}, "enable", 50, (0.3, 0.3)), *episodes]:
         for tick in range(ticks):
-            asked = request if tick == 0 else None
-            given_inputs = inputs(**{**trouble, "request": asked})
+            current_request = request if tick == 0 else None
+            given_inputs = inputs(**{**changes, "request": current_request})
             before = gate.state.mode
             was_enabled = gate.state.enabled
             gate.now += DT
             gate.state, out = step(gate.state, given_inputs, gate.now)
-            found = judge(given_inputs, CONFIG)
-            level = max((f.level for f in found), default=Level.NORMAL)
+            findings = collect_findings(given_inputs, CONFIG)
+            level = max((f.level for f in findings), default=Level.NORMAL)
             levels.append((gate.now, level))
 
             last = wheels
-            wheels = limit_wheels(wanted, wheels, out, DT, acceleration=2.5, wheel_speed=0.5)
+            wheels = limit_wheels(requested, wheels, out, DT, acceleration=2.5, wheel_speed=0.5)
             assert max(abs(wheels[0]), abs(wheels[1])) <= 0.5 + 1e-9
             assert abs(sum(wheels)) / 2 <= max(0.30, abs(sum(last)) / 2) + 1e-9
             assert out.cap <= 0.30
@@ -302,46 +302,46 @@ def test_invariants_of_every_reachable_state(episodes):
                 assert rank[out.mode] >= min(level, 4)
                 # ... nor than anything found in the last 2 s, unless an operator's enable or reset came between
                 if before in rank:
-                    recent = max(lv for at, lv in levels if gate.now - at < 2.0 - 1e-9)
+                    recent = max(lv for when, lv in levels if gate.now - when < 2.0 - 1e-9)
                     if not (before == "INIT" or recent == Level.FAULT):
                         assert rank[out.mode] >= recent
             if before == "FAULT" and out.mode != "FAULT":
-                assert asked == "reset"
+                assert current_request == "reset"
                 assert out.refusal is None
                 assert not (given_inputs.bumper)
                 assert not (given_inputs.cliff)
                 assert not (given_inputs.wheel_drop)
                 assert out.mode == "INIT"
             if before == "INIT" and out.mode != "INIT":
-                assert asked == "enable"
+                assert current_request == "enable"
                 assert not was_enabled
                 assert level < Level.PROTECTIVE_STOP
             if out.mode != "NORMAL":
                 assert out.reasons
-            if asked == "enable" and out.refusal is not None:
+            if current_request == "enable" and out.refusal is not None:
                 assert out.mode != "NORMAL"
 
 
-def test_no_word_of_the_fog_raises_the_cap():
+def test_no_input_from_the_fog_raises_the_speed_cap():
     fog = {
         "map_loaded": [True, False],
         "map_age": [0.0, 2.0, 9.0],
         "map_gap": [0.0, 2.0],
         "mission": [True, False],
         "plan_age": [0.0, 2.0],
-        "released_left": [0.0, 99.0],
+        "released_remaining": [0.0, 99.0],
         "path_problem": [None, "x"],
         "inside_blocked": [None, "x"],
         "caution": [None, "x"],
     }
     for values in itertools.product(*fog.values()):
-        for own, allowed in (({}, 0.30), ({"localization": "weak"}, 0.15), ({"turn_age": 9.0}, 0.0)):
+        for own, allowed in (({}, 0.30), ({"localization": "weak"}, 0.15), ({"scan_age": 9.0}, 0.0)):
             gate = Gate().enabled()
             assert gate.run(DT, **{**dict(zip(fog, values, strict=True)), **own}).cap <= allowed
 
 
 @given(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5))
-def test_a_ramp_ends_within_half_a_second_and_keeps_the_arc(left, right):
+def test_ramp_ends_within_half_a_second_and_keeps_the_arc(left, right):
     wheels = (left, right)
     for _ in range(10):
         after = ramp_down(wheels, DT, 0.5 / 0.5)
@@ -350,7 +350,7 @@ def test_a_ramp_ends_within_half_a_second_and_keeps_the_arc(left, right):
     assert wheels == (0.0, 0.0)
 
 
-def test_wheels_that_are_no_numbers_become_a_stop():
+def test_nan_wheel_speeds_ramp_down_to_a_stop():
     gate = Gate().enabled()
     out = gate.run()
     wheels = (0.3, 0.3)

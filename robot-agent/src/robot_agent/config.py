@@ -1,4 +1,4 @@
-"""Settings of the robot's pure parts, as plain values; defaults are the thesis's where the base can do them.
+"""Configuration of the robot's pure parts, as plain values; defaults are the thesis's where the base can do them.
 
 Lengths in m, angles in rad, times in s.
 """
@@ -19,17 +19,17 @@ if TYPE_CHECKING:
 LOCAL_INFLATION: Final = Inflation(
     inscribed_radius=DEFAULT_INFLATION.inscribed_radius, inflation_radius=0.45, cost_scaling=8.0
 )
-"""That of what the lidar sees, in the local window: narrower and steeper than the map's, because the robot sees such a
-thing where it is and passes it closely at need, whereas the map's costs keep whole paths in the middle of corridors."""
+"""Inflation of lidar points in the local window: narrower and steeper than the map's, because the robot sees where an
+obstacle really is and may pass it closely, whereas the map's costs keep whole paths in the middle of corridors."""
 
 
-_SCANS_LOST: Final = 2.4
-"""No whole scan for so many revolutions counts as a lost one."""
+_LOST_AFTER_REVOLUTIONS: Final = 2.4
+"""Without a whole scan for so many revolutions the scan counts as lost."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SafetyConfig:
-    """Limits of the safety gate."""
+    """Limits of the safety gate: speeds in m/s, ages and durations in s."""
 
     speed_normal: float = 0.30
     speed_degraded: float = 0.15
@@ -40,12 +40,12 @@ class SafetyConfig:
     gap_lost: float = 1.0
     plan_late: float = ROBOT_PATH.max_age_s
     released_end: float = 0.15
-    """With less released path ahead (m) the robot stands at its end, within the goal tolerance."""
-    lidar_node_lost: float = 0.3
-    turn_lost: float = 0.45
-    identical_turns: int = 3
+    """With less released path ahead (m) the robot has come to its end, within the goal tolerance."""
+    lidar_lost: float = 0.3
+    scan_lost: float = 0.45
+    identical_scans: int = 3
     base_lost: float = 0.3
-    hold_operator_after: float = 60.0
+    hold_needs_operator_after: float = 60.0
     stops_to_fault: int = 3
     stops_within: float = 60.0
     ramp: float = 0.5
@@ -87,9 +87,9 @@ class MotionConfig:
     """Path follower and dynamic window (Fox, Burgard, Thrun 1997)."""
 
     speed: float = 0.30
-    turn_speed: float = 2.75
+    angular_speed: float = 2.75
     acceleration: float = 2.5
-    turn_acceleration: float = 3.2
+    angular_acceleration: float = 3.2
     wheel_speed: float = 0.5
     axle: float = 0.235
     samples_v: int = 25
@@ -106,7 +106,7 @@ class MotionConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AgentConfig:
-    """Everything that the agent's core needs to know of its robot."""
+    """Configuration of one robot's agent."""
 
     robot: str
     operator_key: bytes
@@ -114,7 +114,7 @@ class AgentConfig:
     height: float = 0.35
     decision_max_age: float = 0.4
     obstacle_ttl: float = 600.0
-    """How long (s) what the lidar saw counts while nobody looks there again: longer than the way around it takes."""
+    """How long (s) a reported obstacle counts while no lidar looks there again: longer than a detour takes."""
     obstacle_limit: int = 400
     drive_train: DriveTrain = field(default_factory=DriveTrain)
     safety: SafetyConfig = field(default_factory=SafetyConfig)
@@ -122,23 +122,25 @@ class AgentConfig:
     motion: MotionConfig = field(default_factory=MotionConfig)
 
     def with_hardware(self, drive_train: DriveTrain, lidar: LidarTraits) -> Self:
-        """Return the same, fitted to a base and a lidar: geometry, top speed, ranges, and how long a scan may take."""
+        """Return a copy fitted to a base and a lidar: geometry, top speed, ranges, and how long a scan may take."""
         speed = min(self.motion.wheel_speed, drive_train.wheel_speed_max_m_s)
         return replace(
             self,
             drive_train=drive_train,
             motion=replace(self.motion, axle=drive_train.axle_m, wheel_speed=speed),
             localization=replace(self.localization, range_min=lidar.range_min_m, range_max=lidar.range_max_m),
-            safety=replace(self.safety, turn_lost=max(self.safety.turn_lost, _SCANS_LOST * lidar.scan_period_s)),
+            safety=replace(
+                self.safety, scan_lost=max(self.safety.scan_lost, _LOST_AFTER_REVOLUTIONS * lidar.scan_period_s)
+            ),
         )
 
 
 def agent_config(
     robot: str, operator_key: bytes, body: RobotSite | None = None, *, obstacle_ttl: float | None = None
 ) -> AgentConfig:
-    """Return the configuration of a robot with this id, in the body that its site describes, if it does.
+    """Return the configuration of a robot with this id, with the radius and height that its site gives, if any.
 
-    obstacle_ttl: how long (s) what its lidar saw counts while nobody looks there again; None for the default.
+    obstacle_ttl: how long (s) a reported obstacle counts while no lidar looks there again; None for the default.
     """
     defaults = AgentConfig(robot=robot, operator_key=operator_key)
     ttl = defaults.obstacle_ttl if obstacle_ttl is None else obstacle_ttl

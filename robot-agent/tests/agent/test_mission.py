@@ -47,7 +47,7 @@ def test_an_extension_releases_more_of_the_path_and_keeps_the_progress(mission):
     follower = mission.follower
     assert not mission.on_path(changed(PATH, released_length=4.0), 3.0)
     assert mission.follower is follower
-    assert follower.released_left == pytest.approx(3.0)
+    assert follower.released_remaining == pytest.approx(3.0)
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,7 @@ def driving():
     return control
 
 
-def test_commands_are_counted_and_reach_the_decision_within_the_acceleration(driving):
+def test_commands_are_numbered_and_approach_the_decision_within_the_acceleration(driving):
     control = WheelControl(CONFIG)
     control.decision = decision()
     first, second = control.command(outputs(), 0.0), control.command(outputs(), DT)
@@ -37,33 +37,33 @@ def test_commands_are_counted_and_reach_the_decision_within_the_acceleration(dri
     assert second.seq == 2
     assert second.right == pytest.approx(CONFIG.motion.acceleration * DT)
     assert second.left == pytest.approx(second.right * 0.2 / 0.3)
-    assert driving.follows
+    assert driving.following
 
 
 @pytest.mark.parametrize(
     ("stale", "stop"), [(False, "ramp"), (True, "none"), (True, "ramp")], ids=["held", "stale", "both"]
 )
-def test_a_hold_and_a_stale_decision_bring_the_wheels_to_rest_by_a_ramp(driving, stale, stop):
+def test_hold_and_stale_decision_ramp_the_wheels_to_rest(driving, stale, stop):
     driving.decision = decision(0.0 - CONFIG.decision_max_age if stale else 0.25)
     before, now = driving.speeds, 5 * DT
     driving.command(outputs(stop), now)
     assert 0.0 < driving.speeds[1] < before[1]
     assert driving.speeds[0] / driving.speeds[1] == pytest.approx(before[0] / before[1])
-    assert not driving.follows
+    assert not driving.following
     while not driving.at_rest:
         now += DT
         driving.command(outputs(stop), now)
     assert now <= 5 * DT + CONFIG.safety.ramp
 
 
-def test_a_protective_stop_is_zero_at_once(driving):
+def test_protective_stop_sets_zero_speed_immediately(driving):
     driving.decision = decision(0.25)
-    driving.command(outputs("now", cap=0.0), 0.25)
+    driving.command(outputs("immediate", cap=0.0), 0.25)
     assert driving.at_rest
-    assert not driving.follows
+    assert not driving.following
 
 
-def test_a_long_pause_is_no_licence_to_jump():
+def test_speed_step_after_a_long_pause_is_limited():
     control = WheelControl(CONFIG)
     control.command(outputs(), 0.0)
     control.decision = decision(100.0, left=0.5, right=0.5)
@@ -71,7 +71,7 @@ def test_a_long_pause_is_no_licence_to_jump():
     assert command.left <= CONFIG.motion.acceleration * 0.2 + 1e-9
 
 
-def test_a_reset_is_passed_on_once():
+def test_reset_is_passed_on_once():
     control = WheelControl(CONFIG)
     control.pass_reset()
     assert [control.command(outputs(), step * DT).reset for step in range(3)] == [True, False, False]

@@ -12,7 +12,7 @@ from fognav.demo.options import DrivePlan
 from fognav.demo.scene import Scene
 from fognav_sim.drive.evaluation import DriveOutcome
 from robot_agent.config import SafetyConfig
-from robot_agent.safety.gate import STOP_AT_ONCE
+from robot_agent.safety.gate import IMMEDIATE_STOP_MODES
 
 TRUTH_S: Final = 90.0
 """Real seconds until the simulator speaks."""
@@ -92,4 +92,4 @@ class Preparation:
 
     def _is_enabled(self) -> bool:
         state = self._scene.state
-        return state is not None and state.enabled and state.mode not in STOP_AT_ONCE
+        return state is not None and state.enabled and state.mode not in IMMEDIATE_STOP_MODES

@@ -161,7 +161,7 @@ class AgentCore:
     def on_scan(self, scan: LaserScan, now: float) -> None:
         """Take a whole scan of the lidar that arrived at `now`; a repeated one tells nothing of the world."""
         self._lidar.on_scan(scan.repeats, now)
-        if scan.repeats < self._config.safety.identical_turns:
+        if scan.repeats < self._config.safety.identical_scans:
             self._localizer.on_scan(scan, now)
 
     def on_loop_health(self, health: LoopHealth) -> None:
@@ -173,7 +173,7 @@ class AgentCore:
     def stream(self, now: float, stamp: float) -> WheelCommand:
         """Evaluate safety and return the wheel speeds to send now; call it 20 times a second."""
         command = self._wheels.command(self._evaluate_safety(now), now)
-        if self._wheels.follows:
+        if self._wheels.following:
             self._traces.close(stamp)
         return command
 
@@ -228,7 +228,7 @@ class AgentCore:
             now=now,
         )
         outputs = self._safety.evaluate(inputs, now, request)
-        if outputs.stop == "now" or (outputs.changed and outputs.stop != "none"):
+        if outputs.stop == "immediate" or (outputs.changed and outputs.stop != "none"):
             self._wheels.decision = None
         return outputs
 

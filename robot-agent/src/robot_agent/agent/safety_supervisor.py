@@ -1,4 +1,4 @@
-"""Gathers what the safety gate judges, and keeps the gate's state and its last outputs."""
+"""Gathers the inputs of the safety gate, and keeps its state and its last outputs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class SafetySupervisor:
-    """The safety gate with its memory."""
+    """The safety gate with its state."""
 
     def __init__(self, config: SafetyConfig) -> None:
         self._config = config
@@ -42,7 +42,7 @@ def safety_inputs(
     caution: str | None,
     now: float,
 ) -> SafetyInputs:
-    """Gather age, value and complaint of every source at `now` (s, monotonic)."""
+    """Gather age, value and fault of every source at `now` (s, monotonic)."""
     feedback, follower = base.feedback, mission.follower
     return SafetyInputs(
         map_loaded=map_copy.version is not None,
@@ -50,11 +50,11 @@ def safety_inputs(
         map_gap=map_copy.gap(now),
         localization=localizer.status,
         localization_detail=localizer.detail,
-        lidar_node_age=lidar.node_age(now),
-        turn_age=lidar.scan_age(now),
-        identical_turns=lidar.identical_scans,
+        lidar_age=lidar.node_age(now),
+        scan_age=lidar.scan_age(now),
+        identical_scans=lidar.identical_scans,
         base_age=base.age(now),
-        base_silent=base.lost,
+        guardian_lost=base.lost,
         base_fault=feedback.fault if feedback else None,
         base_stopped=feedback.stopped if feedback else None,
         bumper=feedback is not None and feedback.status.bumper,
@@ -62,7 +62,7 @@ def safety_inputs(
         wheel_drop=feedback is not None and feedback.status.wheel_drop,
         mission=mission.active,
         plan_age=mission.planner_age(now),
-        released_left=follower.released_left if follower else 0.0,
+        released_remaining=follower.released_remaining if follower else 0.0,
         path_problem=path_problem,
         inside_blocked=inside_blocked,
         caution=caution,

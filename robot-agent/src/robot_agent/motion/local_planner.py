@@ -145,9 +145,9 @@ def _limits(config: MotionConfig, cap: float) -> DwaLimits:
     """Return what the base can do, no faster than `cap` (m/s)."""
     return DwaLimits(
         v_max=max(0.0, min(cap, config.speed)),
-        w_max=config.turn_speed,
+        w_max=config.angular_speed,
         acc_v=config.acceleration,
-        acc_w=config.turn_acceleration,
+        acc_w=config.angular_acceleration,
         wheel_max=config.wheel_speed,
         axle=config.axle,
     )

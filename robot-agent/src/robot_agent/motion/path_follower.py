@@ -45,7 +45,7 @@ class PathFollower:
         return float(self.along[-1])
 
     @property
-    def released_left(self) -> float:
+    def released_remaining(self) -> float:
         """Metres of released path ahead of the robot."""
         return max(0.0, self.released - self.progress)
 

@@ -1,9 +1,9 @@
 """The safety gate: which mode the robot is in and what its wheels may do, decided on the robot alone.
 
 `step` is a pure state machine, called 20 times a second and with each operator's request. Every input is a source's
-age, value or complaint; the most restrictive finding wins. Escalation is immediate. A level is left only when nothing
-has asked for it during the last 2 s. What the fog says can only ever add findings, so it can slow or stop the robot
-but not speed it up.
+age, value or fault; the most restrictive finding wins. Escalation is immediate. A level is left only when no
+finding has demanded it during the last 2 s. Messages from the fog can only ever add findings, so they can slow or stop
+the robot but not speed it up.
 """
 
 from __future__ import annotations
@@ -39,20 +39,21 @@ MODE_OF: Final[dict[Level, Mode]] = {
     Level.PROTECTIVE_STOP: "PROTECTIVE_STOP",
     Level.FAULT: "FAULT",
 }
-STANDING: Final[frozenset[Mode]] = frozenset({"INIT", "HOLD", "PROTECTIVE_STOP", "FAULT"})
-"""Modes that let no wheel turn (HOLD after its ramp). EGRESS and DOCK drive slowly; nothing enters them yet."""
-STOP_AT_ONCE: Final[frozenset[Mode]] = frozenset({"INIT", "PROTECTIVE_STOP", "FAULT"})
+STOPPED_MODES: Final[frozenset[Mode]] = frozenset({"INIT", "HOLD", "PROTECTIVE_STOP", "FAULT"})
+"""Modes in which no wheel turns (in HOLD after a ramp). EGRESS and DOCK drive slowly; nothing enters them yet."""
+IMMEDIATE_STOP_MODES: Final[frozenset[Mode]] = frozenset({"INIT", "PROTECTIVE_STOP", "FAULT"})
 _NEVER: Final = -math.inf
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SafetyInputs:
-    """What the gate judges; ages in s by the robot's own monotonic clock, infinite for what never came.
+    """Inputs of one step; ages in s by the robot's own monotonic clock, infinite for what was never received.
 
     map_age: since the map copy was last confirmed to be the newest version. map_gap: for how long deltas have been
-    missing, 0 when none are. plan_age: since the planner last spoke of the goal. released_left: m of released path
-    ahead. path_problem: why the path must not be driven. inside_blocked: the blocked zone that the robot stands in.
-    caution: a reason to be slow here. base_silent: the link to the guardian broke, in words.
+    missing, 0 when none are. plan_age: since the planner's last message about the goal. released_remaining: m of
+    released path ahead. path_problem: why the path must not be driven. inside_blocked: the blocked area or zone that
+    the robot is in. caution: a reason to drive slowly here. guardian_lost: why there is no link to the guardian.
+    base_stopped: why the guardian keeps the wheels at zero.
     """
 
     map_loaded: bool = False
@@ -60,11 +61,11 @@ class SafetyInputs:
     map_gap: float = 0.0
     localization: Localization = "none"
     localization_detail: str = ""
-    lidar_node_age: float = math.inf
-    turn_age: float = math.inf
-    identical_turns: int = 1
+    lidar_age: float = math.inf
+    scan_age: float = math.inf
+    identical_scans: int = 1
     base_age: float = math.inf
-    base_silent: str | None = None
+    guardian_lost: str | None = None
     base_fault: str | None = None
     base_stopped: str | None = None
     bumper: bool = False
@@ -72,7 +73,7 @@ class SafetyInputs:
     wheel_drop: bool = False
     mission: bool = False
     plan_age: float = 0.0
-    released_left: float = 0.0
+    released_remaining: float = 0.0
     path_problem: str | None = None
     inside_blocked: str | None = None
     caution: str | None = None
@@ -80,7 +81,7 @@ class SafetyInputs:
 
 
 class Finding(NamedTuple):
-    """One reason to be careful: how much, in words, and whether a person must look before it is over."""
+    """One reason to restrict the robot: the level, the reason, and whether an operator must enable it again."""
 
     level: Level
     reason: str
@@ -89,50 +90,50 @@ class Finding(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class SafetyState:
-    """Everything that the gate remembers; a new one is a robot that was just switched on."""
+    """State that the gate keeps from step to step; the default is that of a robot that was just switched on."""
 
     mode: Mode = "INIT"
     enabled: bool = False
-    asked: tuple[float, ...] = (_NEVER,) * len(Level)
-    """Per level, when a finding last asked for at least it."""
-    map_held: float = _NEVER
-    """When the map last was a reason to hold: a path must be newer than that."""
-    standing_since: float = math.inf
+    last_demanded: tuple[float, ...] = (_NEVER,) * len(Level)
+    """Per level, when a finding last demanded at least it."""
+    map_held_at: float = _NEVER
+    """When the map was last a reason to hold: a path must be newer than that."""
+    stopped_since: float = math.inf
     stops: tuple[float, ...] = ()
     latched: tuple[Finding, ...] = ()
-    """What stays until an operator acts: faults until reset, the others until enable."""
+    """Findings that stay until an operator acts: faults until a reset, the others until an enable."""
     reasons: tuple[str, ...] = field(default=("just started",))
-    last_words: tuple[str, ...] = ()
-    """Reasons of the last escalation, told while the robot waits out its 2 s."""
+    last_reasons: tuple[str, ...] = ()
+    """Reasons of the last escalation, reported during the 2 s before the mode is relaxed."""
 
 
 @dataclass(frozen=True, slots=True)
 class SafetyOutputs:
-    """The verdict: mode, why, the cap on speed (m/s), and how a moving robot comes to rest.
+    """Mode, its reasons, the cap on speed (m/s), and how a moving robot comes to rest.
 
-    `refusal`: why the request was not followed (None when it was, or when there was none).
+    `refusal`: why the operator's request was refused (None when it was accepted, or when there was none).
     """
 
     mode: Mode
     reasons: tuple[str, ...]
     cap: float
-    stop: Literal["none", "ramp", "now"]
+    stop: Literal["none", "ramp", "immediate"]
     changed: bool
     refusal: str | None
 
 
-def judge(inputs: SafetyInputs, config: SafetyConfig) -> list[Finding]:
-    """Return every reason to be careful, in no particular order."""
+def collect_findings(inputs: SafetyInputs, config: SafetyConfig) -> list[Finding]:
+    """Return every finding that restricts the robot, in no particular order."""
     found: list[Finding] = []
-    found.extend(_judge_base(inputs, config))
-    found.extend(_judge_lidar(inputs, config))
-    found.extend(_judge_pose(inputs))
-    found.extend(_judge_map(inputs, config))
-    found.extend(_judge_plan(inputs, config))
+    found.extend(_check_base(inputs, config))
+    found.extend(_check_lidar(inputs, config))
+    found.extend(_check_pose(inputs))
+    found.extend(_check_map(inputs, config))
+    found.extend(_check_plan(inputs, config))
     return found
 
 
-def _judge_base(inputs: SafetyInputs, config: SafetyConfig) -> list[Finding]:
+def _check_base(inputs: SafetyInputs, config: SafetyConfig) -> list[Finding]:
     found: list[Finding] = []
     if inputs.base_fault is not None:
         found.append(Finding(Level.FAULT, f"base: {inputs.base_fault}"))
@@ -142,29 +143,29 @@ def _judge_base(inputs: SafetyInputs, config: SafetyConfig) -> list[Finding]:
         found.append(Finding(Level.FAULT, "a cliff sensor sees no floor"))
     if inputs.wheel_drop:
         found.append(Finding(Level.FAULT, "a wheel has dropped"))
-    if inputs.base_silent is not None:
-        found.append(Finding(Level.PROTECTIVE_STOP, f"the guardian is not there: {inputs.base_silent}"))
+    if inputs.guardian_lost is not None:
+        found.append(Finding(Level.PROTECTIVE_STOP, f"the guardian is not connected: {inputs.guardian_lost}"))
     elif not inputs.base_age <= config.base_lost:
-        found.append(Finding(Level.PROTECTIVE_STOP, f"no word from the guardian for {_seconds(inputs.base_age)}"))
+        found.append(Finding(Level.PROTECTIVE_STOP, f"no message from the guardian for {_seconds(inputs.base_age)}"))
     elif inputs.base_stopped is not None:
         found.append(Finding(Level.PROTECTIVE_STOP, f"the guardian holds the wheels: {inputs.base_stopped}"))
     return found
 
 
-def _judge_lidar(inputs: SafetyInputs, config: SafetyConfig) -> list[Finding]:
+def _check_lidar(inputs: SafetyInputs, config: SafetyConfig) -> list[Finding]:
     found: list[Finding] = []
-    if not inputs.lidar_node_age <= config.lidar_node_lost:
-        found.append(Finding(Level.PROTECTIVE_STOP, f"the lidar has been silent for {_seconds(inputs.lidar_node_age)}"))
-    if not inputs.turn_age <= config.turn_lost:
-        found.append(Finding(Level.PROTECTIVE_STOP, f"no complete turn of the lidar for {_seconds(inputs.turn_age)}"))
-    if inputs.identical_turns >= config.identical_turns:
+    if not inputs.lidar_age <= config.lidar_lost:
+        found.append(Finding(Level.PROTECTIVE_STOP, f"the lidar has been silent for {_seconds(inputs.lidar_age)}"))
+    if not inputs.scan_age <= config.scan_lost:
+        found.append(Finding(Level.PROTECTIVE_STOP, f"no complete scan of the lidar for {_seconds(inputs.scan_age)}"))
+    if inputs.identical_scans >= config.identical_scans:
         found.append(
-            Finding(Level.PROTECTIVE_STOP, f"the lidar repeats itself: {inputs.identical_turns} identical turns")
+            Finding(Level.PROTECTIVE_STOP, f"the lidar repeats itself: {inputs.identical_scans} identical scans")
         )
     return found
 
 
-def _judge_pose(inputs: SafetyInputs) -> list[Finding]:
+def _check_pose(inputs: SafetyInputs) -> list[Finding]:
     detail = f": {inputs.localization_detail}" if inputs.localization_detail else ""
     found: list[Finding] = []
     if inputs.localization == "none":
@@ -174,11 +175,11 @@ def _judge_pose(inputs: SafetyInputs) -> list[Finding]:
     elif inputs.localization == "weak":
         found.append(Finding(Level.DEGRADED, f"the pose is uncertain{detail}"))
     if inputs.inside_blocked is not None:
-        found.append(Finding(Level.PROTECTIVE_STOP, f"the robot stands in {inputs.inside_blocked}", operator=True))
+        found.append(Finding(Level.PROTECTIVE_STOP, f"the robot is in {inputs.inside_blocked}", operator=True))
     return found
 
 
-def _judge_map(inputs: SafetyInputs, config: SafetyConfig) -> list[Finding]:
+def _check_map(inputs: SafetyInputs, config: SafetyConfig) -> list[Finding]:
     found: list[Finding] = []
     if not inputs.map_loaded:
         found.append(Finding(Level.HOLD, "no map was received yet"))
@@ -191,7 +192,7 @@ def _judge_map(inputs: SafetyInputs, config: SafetyConfig) -> list[Finding]:
     return found
 
 
-def _judge_plan(inputs: SafetyInputs, config: SafetyConfig) -> list[Finding]:
+def _check_plan(inputs: SafetyInputs, config: SafetyConfig) -> list[Finding]:
     found: list[Finding] = []
     if inputs.caution is not None:
         found.append(Finding(Level.DEGRADED, inputs.caution))
@@ -201,7 +202,7 @@ def _judge_plan(inputs: SafetyInputs, config: SafetyConfig) -> list[Finding]:
         found.append(Finding(Level.HOLD, inputs.path_problem))
     if not inputs.plan_age <= config.plan_late:
         silent = f"the planner has been silent for {_seconds(inputs.plan_age)}"
-        if inputs.released_left > config.released_end:
+        if inputs.released_remaining > config.released_end:
             found.append(Finding(Level.DEGRADED, silent))
         else:
             found.append(Finding(Level.HOLD, f"{silent} and no released path is left"))
@@ -211,23 +212,25 @@ def _judge_plan(inputs: SafetyInputs, config: SafetyConfig) -> list[Finding]:
 def step(
     state: SafetyState, inputs: SafetyInputs, now: float, config: SafetyConfig | None = None
 ) -> tuple[SafetyState, SafetyOutputs]:
-    """Judge the inputs at `now` (s, monotonic, never going back); return the new state and the verdict.
+    """Evaluate the inputs at `now` (s, monotonic, never going back); return the new state and the outputs.
 
     Modes and their conditions: the table of modes in docs/architecture.md, guided by ISO 3691-4 without claiming
     conformity.
     """
     config = config or SafetyConfig()
-    findings = judge(inputs, config)
-    map_held = state.map_held
-    if any(finding.level == Level.HOLD for finding in _judge_map(inputs, config)):
-        map_held = now
-    elif inputs.mission and now - inputs.plan_age <= map_held:
+    findings = collect_findings(inputs, config)
+    map_held_at = state.map_held_at
+    if any(finding.level == Level.HOLD for finding in _check_map(inputs, config)):
+        map_held_at = now
+    elif inputs.mission and now - inputs.plan_age <= map_held_at:
         findings.append(Finding(Level.HOLD, "waiting for a plan on the fresh map"))
 
     demanded = max((finding.level for finding in findings), default=Level.NORMAL)
-    asked = tuple(now if demanded >= level else last for level, last in zip(Level, state.asked, strict=True))
-    state = replace(state, asked=asked, map_held=map_held)
-    state, refusal = _follow_request(state, inputs, findings, config)
+    last_demanded = tuple(
+        now if demanded >= level else last for level, last in zip(Level, state.last_demanded, strict=True)
+    )
+    state = replace(state, last_demanded=last_demanded, map_held_at=map_held_at)
+    state, refusal = _apply_request(state, inputs, findings, config)
 
     mode = state.mode
     if mode == "FAULT":
@@ -239,16 +242,16 @@ def step(
             mode="INIT",
             stops=(),
             latched=(),
-            standing_since=math.inf,
-            last_words=worst or state.last_words,
+            stopped_since=math.inf,
+            last_reasons=worst or state.last_reasons,
         )
     else:
         new = _advance(state, findings, demanded, now, config)
     new = replace(new, reasons=_reasons(new, findings))
-    return new, _verdict(new, mode, refusal, config)
+    return new, _outputs(new, mode, refusal, config)
 
 
-def _follow_request(
+def _apply_request(
     state: SafetyState, inputs: SafetyInputs, findings: list[Finding], config: SafetyConfig
 ) -> tuple[SafetyState, str | None]:
     if inputs.request is None:
@@ -258,8 +261,8 @@ def _follow_request(
     if inputs.request == "reset":
         if state.mode != "FAULT" and inputs.base_fault is None:
             return state, f"there is no fault to reset: the mode is {state.mode}"
-        # The base's own fault is latched by the guardian, which judges its cause again when it is told to reset.
-        causes = judge(replace(inputs, base_fault=None), config)
+        # The guardian latches the base's own faults, and checks their causes again when it is reset.
+        causes = collect_findings(replace(inputs, base_fault=None), config)
         present = [finding.reason for finding in causes if finding.level == Level.FAULT]
         if present:
             return state, f"the cause is still there: {'; '.join(present)}"
@@ -270,10 +273,10 @@ def _follow_request(
 def _enable(state: SafetyState, inputs: SafetyInputs, findings: list[Finding]) -> tuple[SafetyState, str | None]:
     if state.mode == "FAULT":
         return state, f"a fault is latched, reset it first: {'; '.join(f.reason for f in state.latched)}"
-    bar = min((finding.level for finding in state.latched), default=Level.PROTECTIVE_STOP)
+    limit = min((finding.level for finding in state.latched), default=Level.PROTECTIVE_STOP)
     if not inputs.map_loaded:
-        bar = Level.HOLD
-    present = [finding.reason for finding in findings if finding.level >= bar]
+        limit = Level.HOLD
+    present = [finding.reason for finding in findings if finding.level >= limit]
     if present:
         return state, f"the cause is still there: {'; '.join(present)}"
     return replace(state, enabled=True, latched=()), None
@@ -282,14 +285,14 @@ def _enable(state: SafetyState, inputs: SafetyInputs, findings: list[Finding]) -
 def _advance(
     state: SafetyState, findings: list[Finding], demanded: Level, now: float, config: SafetyConfig
 ) -> SafetyState:
-    """Move an enabled robot, not in FAULT, to the mode that the last 2 s ask for."""
+    """Move an enabled robot, not in FAULT, to the mode that the findings of the last 2 s demand."""
     latched = state.latched
     known = {finding.reason for finding in latched}
     needing = [Finding(f.level, f.reason, operator=True) for f in findings if f.operator and f.reason not in known]
     if needing and not any(finding.level >= Level.PROTECTIVE_STOP for finding in latched):
         latched = (*latched, *needing)
 
-    stops = tuple(at for at in state.stops if now - at < config.stops_within)
+    stops = tuple(stop for stop in state.stops if now - stop < config.stops_within)
     if demanded >= Level.PROTECTIVE_STOP and state.mode not in {"INIT", "PROTECTIVE_STOP", "FAULT"}:
         stops = (*stops, now)
     faults = tuple(finding for finding in findings if finding.level == Level.FAULT)
@@ -302,21 +305,27 @@ def _advance(
             ),
         )
     if faults:
-        words = tuple(finding.reason for finding in faults)
-        return replace(state, mode="FAULT", latched=faults, stops=stops, standing_since=math.inf, last_words=words)
+        fault_reasons = tuple(finding.reason for finding in faults)
+        return replace(
+            state, mode="FAULT", latched=faults, stops=stops, stopped_since=math.inf, last_reasons=fault_reasons
+        )
 
-    recent = max(level for level, at in zip(Level, state.asked, strict=True) if _is_recent(level, at, now, config))
+    recent = max(
+        level for level, last in zip(Level, state.last_demanded, strict=True) if _is_recent(level, last, now, config)
+    )
     latch = max((finding.level for finding in latched), default=Level.NORMAL)
-    # A fault that was reset a moment ago still echoes in the last 2 s; the latch is what keeps FAULT, not the echo.
+    # A fault that was reset a moment ago still counts during 2 s, but only its latch keeps the mode FAULT.
     level = min(max(recent, latch), Level.PROTECTIVE_STOP)
-    standing_since = state.standing_since
+    stopped_since = state.stopped_since
     if level < Level.HOLD:
-        standing_since = math.inf
-    elif standing_since == math.inf:
-        standing_since = now
-    if level == Level.HOLD and latch < Level.HOLD and now - standing_since >= config.hold_operator_after:
-        why = "; ".join(state.last_words) or "unknown"
-        held = f"standing for more than {config.hold_operator_after:.0f} s, an operator must enable again ({why})"
+        stopped_since = math.inf
+    elif stopped_since == math.inf:
+        stopped_since = now
+    if level == Level.HOLD and latch < Level.HOLD and now - stopped_since >= config.hold_needs_operator_after:
+        causes = "; ".join(state.last_reasons) or "unknown"
+        held = (
+            f"stopped for more than {config.hold_needs_operator_after:.0f} s, an operator must enable again ({causes})"
+        )
         latched = (*latched, Finding(Level.HOLD, held, operator=True))
     worst = tuple(finding.reason for finding in findings if finding.level == demanded)
     return replace(
@@ -324,40 +333,40 @@ def _advance(
         mode=MODE_OF[level],
         latched=latched,
         stops=stops,
-        standing_since=standing_since,
-        last_words=worst if demanded >= level and worst else state.last_words,
+        stopped_since=stopped_since,
+        last_reasons=worst if demanded >= level and worst else state.last_reasons,
     )
 
 
-def _is_recent(level: Level, at: float, now: float, config: SafetyConfig) -> bool:
-    return level == Level.NORMAL or now - at < config.relax_after
+def _is_recent(level: Level, last_demanded: float, now: float, config: SafetyConfig) -> bool:
+    return level == Level.NORMAL or now - last_demanded < config.relax_after
 
 
 def _reasons(state: SafetyState, findings: list[Finding]) -> tuple[str, ...]:
-    """Say in words why the mode is what it is, the worst first."""
-    now_true = [finding.reason for finding in sorted(findings, key=lambda f: f.level, reverse=True)]
+    """Return why the mode is what it is, the most restrictive reason first."""
+    current = [finding.reason for finding in sorted(findings, key=lambda f: f.level, reverse=True)]
     if state.mode == "FAULT":
         latched = [finding.reason for finding in state.latched]
-        return (*latched, *(reason for reason in now_true if reason not in latched))
+        return (*latched, *(reason for reason in current if reason not in latched))
     if state.mode == "INIT":
-        return (*now_true, "waiting for an operator to enable")
-    latched = [f"{f.reason} (an operator must enable again)" for f in state.latched if f.reason not in now_true]
-    said = (*now_true, *latched)
-    if not said and state.mode != "NORMAL":
-        return tuple(f"over, waiting until healthy for 2 s: {reason}" for reason in state.last_words)
-    return said
+        return (*current, "waiting for an operator to enable")
+    latched = [f"{f.reason} (an operator must enable again)" for f in state.latched if f.reason not in current]
+    reasons = (*current, *latched)
+    if not reasons and state.mode != "NORMAL":
+        return tuple(f"over, waiting until healthy for 2 s: {reason}" for reason in state.last_reasons)
+    return reasons
 
 
-def _verdict(state: SafetyState, before: Mode, refusal: str | None, config: SafetyConfig) -> SafetyOutputs:
+def _outputs(state: SafetyState, before: Mode, refusal: str | None, config: SafetyConfig) -> SafetyOutputs:
     caps: dict[Mode, float] = {
         "NORMAL": config.speed_normal,
         "DEGRADED": config.speed_degraded,
         "EGRESS": config.speed_egress,
         "DOCK": config.speed_egress,
     }
-    stop: Literal["none", "ramp", "now"] = "none"
-    if state.mode in STANDING:
-        stop = "now" if state.mode in STOP_AT_ONCE else "ramp"
+    stop: Literal["none", "ramp", "immediate"] = "none"
+    if state.mode in STOPPED_MODES:
+        stop = "immediate" if state.mode in IMMEDIATE_STOP_MODES else "ramp"
     return SafetyOutputs(
         mode=state.mode,
         reasons=state.reasons,
@@ -369,9 +378,9 @@ def _verdict(state: SafetyState, before: Mode, refusal: str | None, config: Safe
 
 
 def limit_wheels(
-    wanted: tuple[float, float],
+    requested: tuple[float, float],
     last: tuple[float, float],
-    verdict: SafetyOutputs,
+    outputs: SafetyOutputs,
     dt: float,
     *,
     acceleration: float,
@@ -380,42 +389,42 @@ def limit_wheels(
 ) -> tuple[float, float]:
     """Return the wheel speeds (left, right; m/s) that may be streamed now, `dt` s after `last` was.
 
-    Standing modes bring the wheels to rest, at once or along a straight ramp that ends within `config.ramp` s whatever
+    Stopped modes bring the wheels to rest, at once or along a straight ramp that ends within `config.ramp` s whatever
     the speed; the ratio of the wheels is kept, so the robot brakes along its arc. Driving modes cap the robot's speed,
     then each wheel's speed and rate of change; never does a wheel speed up while the other limits apply.
     """
     config = config or SafetyConfig()
-    if verdict.stop == "now":
+    if outputs.stop == "immediate":
         return 0.0, 0.0
-    if verdict.stop == "ramp":
+    if outputs.stop == "ramp":
         return ramp_down(last, dt, wheel_speed / config.ramp)
-    left, right = wanted
+    left, right = requested
     if not (math.isfinite(left) and math.isfinite(right)):
         return ramp_down(last, dt, wheel_speed / config.ramp)
     scale = 1.0
     centre = 0.5 * abs(left + right)
-    if centre > verdict.cap:
-        scale = verdict.cap / centre
+    if centre > outputs.cap:
+        scale = outputs.cap / centre
     fastest = max(abs(left), abs(right)) * scale
     if fastest > wheel_speed:
         scale *= wheel_speed / fastest
     target = left * scale, right * scale
     change = acceleration * max(dt, 0.0)
-    biggest = max(abs(target[0] - last[0]), abs(target[1] - last[1]))
-    if biggest <= change:
+    largest = max(abs(target[0] - last[0]), abs(target[1] - last[1]))
+    if largest <= change:
         return target
-    share = change / biggest
+    share = change / largest
     return last[0] + (target[0] - last[0]) * share, last[1] + (target[1] - last[1]) * share
 
 
 def ramp_down(last: tuple[float, float], dt: float, deceleration: float) -> tuple[float, float]:
     """Return wheel speeds (m/s) on the way from `last` to rest, the faster wheel slowing by `deceleration` (m/s2)."""
     fastest = max(abs(last[0]), abs(last[1]))
-    left_over = fastest - deceleration * max(dt, 0.0)
-    if left_over <= 1e-9:
+    slowed = fastest - deceleration * max(dt, 0.0)
+    if slowed <= 1e-9:
         return 0.0, 0.0
-    return last[0] * left_over / fastest, last[1] * left_over / fastest
+    return last[0] * slowed / fastest, last[1] * slowed / fastest
 
 
 def _seconds(age: float) -> str:
-    return "as long as it runs" if math.isinf(age) else f"{age:.1f} s"
+    return "as long as the agent runs" if math.isinf(age) else f"{age:.1f} s"

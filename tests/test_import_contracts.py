@@ -119,11 +119,11 @@ def test_a_planted_import_breaks_a_contract(copied_sources: Path, file: str, imp
 
 
 def test_a_world_imported_by_way_of_another_module_breaks_a_contract(copied_sources: Path) -> None:
-    helper = copied_sources / "services/map-service/src/map_service/shapes.py"
+    helper = copied_sources / "services/map-service/src/map_service/costmap.py"
     helper.write_text(f"{helper.read_text('utf-8')}\nimport fog_runtime.clock as _planted  # noqa\n", "utf-8")
     result = checked(copied_sources)
     assert result.returncode == 1
-    assert "map_service.layers" in result.stdout.split("Broken contracts")[-1]
+    assert "map_service.core" in result.stdout.split("Broken contracts")[-1]
 
 
 def test_the_sources_as_they_are_keep_every_contract(copied_sources: Path) -> None:

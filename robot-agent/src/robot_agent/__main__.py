@@ -46,7 +46,7 @@ async def main() -> None:
             open_core(config, settings.seed, settings.input_log) as core,
             serve_plain(health, settings.http_host, settings.http_port, settings.port_file),
         ):
-            agent = Service(core, zenoh, Store(settings.data_dir), clock, health, robot=settings.robot, site=site)
+            agent = Service(core, zenoh, Store(settings.data_dir), clock, health, site=site)
             link = GuardianClient(settings.guardian_socket, clock, agent.on_feedback, agent.on_base_lost)
             lidar = LidarEdge(settings.lidar_port, scanner, clock, core.on_lidar_nodes, agent.on_scan)
             agent.restore(body)

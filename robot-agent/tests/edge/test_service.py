@@ -56,9 +56,7 @@ class Rig:
         self.master = self.world.master
         self.fog = Fog()
         self.core = AgentCore(AGENT, seed=1)
-        self.service = Service(
-            self.core, self.fog, Store(tmp_path), SystemClock(), Health(), robot="r1", site=self.master.site
-        )
+        self.service = Service(self.core, self.fog, Store(tmp_path), SystemClock(), Health(), site=self.master.site)
         self.service.subscribe()
         self.changes = 0
 

@@ -88,7 +88,6 @@ class World:
         seed: int,
         *,
         noise: Noise | None = None,
-        axle: float = 0.235,
         wheel_lag: float = 0.05,
     ) -> None:
         """Put the robot at its start; `cells` is the static map (0 free, 254 occupied, 255 unknown)."""
@@ -97,8 +96,8 @@ class World:
         self.geometry = geometry
         self.robot = robot
         self.noise = noise or Noise()
-        self.axle = axle
-        """Distance (m) between the wheels of the base that drives."""
+        self.axle = 0.235
+        """Distance (m) between the wheels of the base that drives; the hardware that is put on the floor sets it."""
         self._wheel_lag = wheel_lag
         self._occupied = np.ascontiguousarray(cells == LETHAL, dtype=np.uint8)
         squared = squared_distance_capped(self._occupied, math.ceil(_FAR_M / geometry.resolution))

@@ -46,23 +46,21 @@ class BlockedPlaces:
         The map decides whether it is blocked, the areas and zones only name the reason. What the robot's own lidar
         reported does not count: it would be the robot's own side, or a thing that it stands beside.
         """
-        geometry = replica.geometry
-        if geometry is None:
+        if not _is_blocked(replica, pose):
             return None
-        column, row = geometry.cell(pose.x, pose.y)
-        if not geometry.contains_cell(column, row) or replica.cost[row, column] != LETHAL:
-            return None
-        if replica.static[row, column] == LETHAL:
-            return None  # a pose that is some centimetres off, beside a wall
+        named = self._named(pose)
+        if named is None and not reporter.is_self_reported(np.array([[pose.x, pose.y]]), now)[0]:
+            return "a blocked part of the map"
+        return named
+
+    def _named(self, pose: Pose2) -> str | None:
         for hazard in self._hazards.values():
             if hazard.hazard.state != "clear" and contains_point(hazard.polygon, pose.x, pose.y):
                 return f"the {hazard.hazard.state} area {hazard.label or hazard.hazard.area}"
         for zone in self._zones:
             if shape_contains(zone.shape, pose.x, pose.y):
                 return f"the no-go zone {zone.id}" + (f" ({zone.reason})" if zone.reason else "")
-        if reporter.is_self_reported(np.array([[pose.x, pose.y]]), now)[0]:
-            return None
-        return "a blocked part of the map"
+        return None
 
     def caution(self, pose: Pose2) -> str | None:
         """Return why the robot must be slow where it is (m, frame `map`), in words; None when it need not be."""
@@ -70,3 +68,14 @@ class BlockedPlaces:
             if hazard.hazard.state == "unknown" and contains_point(hazard.polygon, pose.x, pose.y):
                 return f"nobody can tell whether the area {hazard.label or hazard.hazard.area} is clear"
         return None
+
+
+def _is_blocked(replica: Replica, pose: Pose2) -> bool:
+    """Whether the map says lethal where the pose is, and not because of a wall: a pose may be some centimetres off."""
+    geometry = replica.geometry
+    if geometry is None:
+        return False
+    column, row = geometry.cell(pose.x, pose.y)
+    if not geometry.contains_cell(column, row):
+        return False
+    return bool(replica.cost[row, column] == LETHAL and replica.static[row, column] != LETHAL)

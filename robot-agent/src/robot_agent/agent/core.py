@@ -84,6 +84,11 @@ class AgentCore:
         self._publishing = PublishingPolicy(config.robot)
         self._loop_health = LoopHealth()
 
+    @property
+    def robot(self) -> str:
+        """The robot's id."""
+        return self._config.robot
+
     # --- what the fog says ---
 
     def handlers(self) -> Mapping[ch.Channel, Handler]:

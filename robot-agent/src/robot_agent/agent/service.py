@@ -54,7 +54,7 @@ class Service:
     """The running agent; its loops are tasks of the process. The core is touched on the loop's thread only."""
 
     def __init__(
-        self, core: AgentCore, zenoh: ZenohEdge, store: Store, clock: Clock, health: Health, *, robot: str, site: str
+        self, core: AgentCore, zenoh: ZenohEdge, store: Store, clock: Clock, health: Health, *, site: str
     ) -> None:
         self._core = core
         self._zenoh = zenoh
@@ -62,7 +62,7 @@ class Service:
         self._store = store
         self._clock = clock
         self._health = health
-        self._robot = robot
+        self._robot = core.robot
         self._site = site
         self._stream = Ticker(clock, STREAM_S)
         self._control = Ticker(clock, CONTROL_S)

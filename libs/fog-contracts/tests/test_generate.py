@@ -25,7 +25,7 @@ OPENAPI = {
             "delete": {
                 "description": "Remove a zone | for good.\n\nMore.",
                 "parameters": [{"name": "If-Match", "in": "header"}, {"name": "zone_id", "in": "path"}],
-                "responses": {"204": {}, "422": {}},
+                "responses": {"204": {}, "412": {}, "422": {}, "default": {}},
                 "security": [{"bearer": []}],
             },
             "get": {
@@ -114,8 +114,11 @@ def test_document_row_shows_the_channels_properties():
 
 def test_routes_are_listed_with_parameters_responses_and_token():
     lines = channels_markdown({"map-service": OPENAPI}).splitlines()
-    assert "| `DELETE /api/v1/zones/{zone_id}` | Remove a zone \\| for good. | `If-Match` |  | 204 | yes |" in lines
-    assert "| `GET /api/v1/zones/{zone_id}` | One zone |  |  | 200 Zone |  |" in lines
+    assert (
+        "| `DELETE /api/v1/zones/{zone_id}` | Remove a zone \\| for good. | `If-Match` |  | 204 | 412, 422 | yes |"
+        in lines
+    )
+    assert "| `GET /api/v1/zones/{zone_id}` | One zone |  |  | 200 Zone |  |  |" in lines
 
 
 # --- The firmware's header ------------------------------------------------------------------------------------------

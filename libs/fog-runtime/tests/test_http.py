@@ -6,26 +6,31 @@ from typing import Annotated
 
 import httpx
 import pytest
-from fastapi import Depends, Request
 from pydantic import BaseModel, Field
 
 from fog_contracts.messages import Zone
 from fog_runtime.health import Health
 from fog_runtime.http import (
-    Caller,
+    Answer,
+    Body,
+    IfMatch,
+    Operator,
     ProblemError,
+    Routes,
     TokensError,
-    answer_schema,
-    body_schema,
+    etag,
+    expected_version,
     load_tokens,
     make_app,
-    read_body,
-    require,
     serve,
     token_hash,
 )
 
 pytestmark = pytest.mark.live
+
+
+class BusyError(Exception):
+    """What a service raises and knows no HTTP of."""
 
 
 class Point(BaseModel):
@@ -54,12 +59,26 @@ async def client(tokens, tmp_path):
     async def points(point: Point) -> Point:
         return point
 
-    @app.put("/zones/{zone}", openapi_extra=body_schema(app, Zone), responses=answer_schema(app, Zone))
-    async def zones(zone: str, request: Request) -> dict[str, str]:
-        return {"kind": (await read_body(request, Zone)).kind}
+    routes = Routes(app, "test")
+    routes.raises(BusyError, {503: "It is busy"}, lambda error: ProblemError(503, f"busy: {error}"))
 
-    @app.get("/secret")
-    async def secret(caller: Annotated[Caller, Depends(require("operator"))]) -> str:
+    @routes.put("/zones/{zone}")
+    async def zones(zone: str, body: Body[Zone]) -> dict[str, str]:
+        return {"kind": body.kind}
+
+    @routes.post("/zones", status=201, raises=[BusyError], problems={409: "It is there"})
+    async def make_zone(body: Body[Zone], caller: Operator, if_match: IfMatch = None) -> Answer[Zone]:
+        """Make a zone."""
+        if body.reason:
+            raise BusyError(body.reason)
+        return Answer(body, {**etag(body.version), "X-Expected": str(expected_version(if_match))})
+
+    @routes.delete("/zones/{zone}")
+    async def delete_zone(zone: str, caller: Operator) -> None:
+        """Delete a zone."""
+
+    @routes.get("/secret")
+    async def secret(caller: Operator) -> str:
         return caller.name
 
     @app.get("/stale")
@@ -123,6 +142,43 @@ async def test_contract_body_is_checked_by_its_type(client):
     body = is_problem(await client.put("/zones/z1", json=zone), 422)
     assert body["errors"][0]["field"] == "body.shape.radius"
     assert is_problem(await client.put("/zones/z1", content=b"\xff{"), 422)["errors"][0]["field"] == "body"
+
+
+async def test_a_route_answers_as_its_signature_and_its_exceptions_say(client):
+    zone = {"id": "z1", "kind": "BLOCKED", "shape": {"type": "circle", "centre": [1, 2], "radius": 1}, "version": 3}
+    headers = {"Authorization": "Bearer op-token", "If-Match": '"7"'}
+    made = await client.post("/zones", json=zone, headers=headers)
+    assert (made.status_code, made.headers["etag"], made.headers["x-expected"]) == (201, '"3"', "7")
+    assert made.json()["version"] == 3
+    busy = await client.post("/zones", json={**zone, "reason": "lunch"}, headers=headers)
+    assert is_problem(busy, 503)["detail"] == "busy: lunch"
+    gone = await client.delete("/zones/z1", headers=headers)
+    assert (gone.status_code, gone.content) == (204, b"")
+    # Who may not call is told so before the body is looked at.
+    is_problem(await client.post("/zones", content=b"{"), 401)
+
+
+@pytest.mark.parametrize(
+    ("header", "version"), [(None, None), ("*", None), ('"12"', 12), ("12", -1), ('"x"', -1), ('W/"1"', -1)]
+)
+def test_an_if_match_names_a_version_any_or_none_that_ever_is(header, version):
+    assert expected_version(header) == version
+
+
+async def test_openapi_tells_answers_errors_and_tokens_from_the_same_signature(client):
+    paths = (await client.get("/openapi.json")).json()["paths"]
+    post = paths["/zones"]["post"]
+    assert set(post["responses"]) == {"201", "401", "403", "409", "413", "422", "503", "default"}
+    assert post["responses"]["201"]["content"]["application/json"]["schema"] == {"$ref": "#/components/schemas/Zone"}
+    problem = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
+    assert post["responses"]["503"] == {"description": "It is busy", "content": problem}
+    assert post["security"] == [{"HTTPBearer": []}]
+    assert [parameter["name"] for parameter in post["parameters"]] == ["If-Match"]
+    put = paths["/zones/{zone}"]["put"]
+    assert set(put["responses"]) == {"200", "413", "422", "default"}
+    assert "security" not in put
+    assert set(paths["/zones/{zone}"]["delete"]["responses"]) == {"204", "401", "403", "default"}
+    assert "content" not in paths["/zones/{zone}"]["delete"]["responses"]["204"]
 
 
 async def test_openapi_describes_contract_bodies_and_resolves_all_references(client):

@@ -1,9 +1,9 @@
 """REST under /api/v1: areas with their state, and the health of nodes. Reading needs no token, PUT the operator's."""
 
-from typing import Annotated, Any, Final
+from typing import Annotated, Any
 
 import msgspec
-from fastapi import Depends, FastAPI, Header, Request, Response
+from fastapi import FastAPI
 
 from fog_contracts.geometry import GeometryError, normalized_polygon
 from fog_contracts.grid import GridGeometry
@@ -19,21 +19,20 @@ from fog_contracts.messages import (
 from fog_runtime.clock import Clock
 from fog_runtime.health import Health
 from fog_runtime.http import (
-    Caller,
+    Answer,
+    Body,
+    IfMatch,
+    Operator,
     ProblemError,
+    Routes,
     Tokens,
-    answer_schema,
-    body_schema,
+    etag,
     expected_version,
     make_app,
-    read_body,
-    require,
 )
 from hazard_aggregator.debounce import DebounceError
 from hazard_aggregator.service import ConflictError, Service
 from hazard_aggregator.store import StoreError
-
-RETRY_AFTER: Final = {"Retry-After": "1"}
 
 
 class AreaBody(Message, frozen=True, kw_only=True):
@@ -72,6 +71,26 @@ class NodeView(Message, frozen=True, kw_only=True):
 def make_api(service: Service, geometry: GridGeometry, clock: Clock, health: Health, tokens: Tokens) -> FastAPI:
     """Return the app over a running service; areas must lie on the map of this geometry."""
     app = make_app("Fognav hazard-aggregator", health, tokens)
+    _add_areas(Routes(app, "areas"), service, geometry)
+    _add_nodes(Routes(app, "nodes"), service, clock)
+    return app
+
+
+def _add_areas(routes: Routes, service: Service, geometry: GridGeometry) -> None:
+    routes.raises(
+        StoreError,
+        {503: "The store does not answer, so nothing was changed for certain"},
+        lambda error: ProblemError(
+            503,
+            f"the store does not answer, so nothing was changed for certain: try again ({error})",
+            headers={"Retry-After": "1"},
+        ),
+    )
+    routes.raises(
+        ConflictError,
+        {412: "Somebody else changed it"},
+        lambda error: ProblemError(412, f"{error}: read it again and decide"),
+    )
 
     def views() -> dict[str, AreaView]:
         announced, withheld = service.core.announced(), service.core.withheld()
@@ -81,62 +100,46 @@ def make_api(service: Service, geometry: GridGeometry, clock: Clock, health: Hea
             if not d.removed
         }
 
-    def known(area_id: str) -> AreaView:
+    @routes.get("/api/v1/areas")
+    async def list_areas() -> list[AreaView]:
+        """List all areas with their state."""
+        return list(views().values())
+
+    @routes.get("/api/v1/areas/{area_id}", problems={404: "There is no such area"})
+    async def get_area(area_id: str) -> Answer[AreaView]:
+        """Return one area with its ETag."""
         view = views().get(area_id)
         if view is None:
             raise ProblemError(404, f"there is no area {area_id}")
-        return view
+        return Answer(view, etag(view.definition.version))
 
-    @app.get("/api/v1/areas", tags=["areas"], responses=answer_schema(app, list[AreaView]))
-    async def list_areas() -> Response:
-        """List all areas with their state."""
-        return _json(list(views().values()))
-
-    @app.get("/api/v1/areas/{area_id}", tags=["areas"], responses=answer_schema(app, AreaView))
-    async def get_area(area_id: str) -> Response:
-        """Return one area with its ETag."""
-        view = known(area_id)
-        return _json(view, {"ETag": f'"{view.definition.version}"'})
-
-    @app.put("/api/v1/areas/{area_id}", tags=["areas"], openapi_extra=body_schema(app, AreaBody))
+    @routes.put("/api/v1/areas/{area_id}", raises=[ConflictError, StoreError])
     async def put_area(
-        request: Request,
-        area_id: str,
-        caller: Annotated[Caller, Depends(require("operator"))],
-        if_match: Annotated[str | None, Header(alias="If-Match")] = None,
-    ) -> Response:
+        area_id: str, body: Body[AreaBody], caller: Operator, if_match: IfMatch = None
+    ) -> Answer[AreaDefinition]:
         """Change or add an area; the answer comes once it is stored for good. With If-Match only if unchanged."""
-        body = await read_body(request, AreaBody)
         definition = _checked(area_id, body, service, geometry)
-        try:
-            definition = await service.put_area(definition, caller.name, expected=expected_version(if_match))
-        except ConflictError as error:
-            raise ProblemError(412, f"{error}: read it again and decide") from error
-        except StoreError as error:
-            detail = f"the store does not answer, so nothing was changed for certain: try again ({error})"
-            raise ProblemError(503, detail, headers=RETRY_AFTER) from error
-        return _json(definition, {"ETag": f'"{definition.version}"'})
+        definition = await service.put_area(definition, caller.name, expected=expected_version(if_match))
+        return Answer(definition, etag(definition.version))
 
-    @app.get("/api/v1/nodes", tags=["nodes"], responses=answer_schema(app, list[NodeView]))
-    async def nodes() -> Response:
+
+def _add_nodes(routes: Routes, service: Service, clock: Clock) -> None:
+    @routes.get("/api/v1/nodes")
+    async def nodes() -> list[NodeView]:
         """Return the health of every node in every area that it watches."""
-        return _json(
-            [
-                NodeView(
-                    id=node.id,
-                    area=node.area,
-                    state=node.state,
-                    reason=node.reason,
-                    online=node.online,
-                    age_s=node.age,
-                    received=node.received,
-                    ignored=node.ignored,
-                )
-                for node in service.core.node_reports(clock.now())
-            ]
-        )
-
-    return app
+        return [
+            NodeView(
+                id=node.id,
+                area=node.area,
+                state=node.state,
+                reason=node.reason,
+                online=node.online,
+                age_s=node.age,
+                received=node.received,
+                ignored=node.ignored,
+            )
+            for node in service.core.node_reports(clock.now())
+        ]
 
 
 def _checked(area_id: str, body: AreaBody, service: Service, geometry: GridGeometry) -> AreaDefinition:
@@ -162,7 +165,3 @@ def _checked(area_id: str, body: AreaBody, service: Service, geometry: GridGeome
     except DebounceError as error:
         raise ProblemError(422, error.problem, field=f"body.{error.field}") from error
     return definition
-
-
-def _json(content: object, headers: dict[str, str] | None = None) -> Response:
-    return Response(msgspec.json.encode(content), 200, headers, media_type="application/json")

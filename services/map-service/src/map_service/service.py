@@ -48,6 +48,7 @@ class ConflictError(Exception):
     def __init__(self, outcome: Outcome, zone_id: str) -> None:
         super().__init__(f"zone {zone_id}: {outcome}")
         self.outcome = outcome
+        self.zone = zone_id
 
 
 class Service:

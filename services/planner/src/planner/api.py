@@ -1,9 +1,6 @@
 """REST under /api/v1: robots with their missions, and previews of ways. Reading needs no token, writing an operator."""
 
-from typing import Annotated, Final
-
-import msgspec
-from fastapi import Depends, FastAPI, Request, Response
+from fastapi import FastAPI
 
 from fog_contracts.messages import (
     Id,
@@ -21,11 +18,9 @@ from fog_contracts.messages import (
 )
 from fog_contracts.site import Site
 from fog_runtime.health import Health
-from fog_runtime.http import Caller, ProblemError, Tokens, answer_schema, body_schema, make_app, read_body, require
+from fog_runtime.http import Body, Operator, ProblemError, Routes, Tokens, make_app
 from planner.service import Service
 from planner.store import StoredGoal, StoreError
-
-RETRY_AFTER: Final = {"Retry-After": "1"}
 
 
 class GoalPose(Message, frozen=True, kw_only=True):
@@ -100,15 +95,21 @@ def _plan_view(path: RobotPath) -> PlanView:
     )
 
 
-def _json(value: object, status: int = 200) -> Response:
-    return Response(msgspec.json.encode(value), status, media_type="application/json")
-
-
 def make_api(service: Service, site: Site, health: Health, tokens: Tokens) -> FastAPI:
     """Return the app over a running service."""
     app = make_app("Fognav planner", health, tokens)
+    _add_robots(Routes(app, "robots"), service, site)
+    _add_plan(Routes(app, "plan"), service)
+    return app
+
+
+def _add_robots(routes: Routes, service: Service, site: Site) -> None:
     configured = {robot.id for robot in site.robots}
-    operator = Depends(require("operator"))
+    routes.raises(
+        StoreError,
+        {503: "The mission is as it was: the store does not answer"},
+        lambda error: ProblemError(503, f"the mission is as it was: {error}", headers={"Retry-After": "1"}),
+    )
 
     def robots() -> list[str]:
         return sorted({*configured, *service.poses, *service.states, *service.goals})
@@ -130,9 +131,10 @@ def make_api(service: Service, site: Site, health: Health, tokens: Tokens) -> Fa
             raise ProblemError(422, f"there is no place {body.place}: known are {names}", field="body.place")
         return Pose(x=place.x, y=place.y, theta=place.theta or 0.0), place.theta is None
 
-    @app.get("/api/v1/robots", tags=["robots"], summary="All robots", responses=answer_schema(app, list[RobotView]))
-    async def list_robots() -> Response:
-        views = [
+    @routes.get("/api/v1/robots")
+    async def list_robots() -> list[RobotView]:
+        """List all robots with pose, state, mission and plan."""
+        return [
             RobotView(
                 id=robot,
                 configured=robot in configured,
@@ -143,52 +145,49 @@ def make_api(service: Service, site: Site, health: Health, tokens: Tokens) -> Fa
             )
             for robot in robots()
         ]
-        return _json(views)
 
-    @app.get(
-        "/api/v1/robots/{robot}/goal", tags=["robots"], summary="A robot's mission",
-        responses=answer_schema(app, GoalView),
-    )  # fmt: skip
-    async def get_goal(robot: str) -> Response:
+    @routes.get("/api/v1/robots/{robot}/goal", problems={404: "There is no such robot, or it has no mission"})
+    async def get_goal(robot: str) -> GoalView:
+        """Return a robot's mission."""
         stored = service.goals.get(known(robot))
         if stored is None:
             raise ProblemError(404, f"robot {robot} has no mission")
-        return _json(_goal_view(robot, stored))
+        return _goal_view(robot, stored)
 
-    @app.put(
-        "/api/v1/robots/{robot}/goal", tags=["robots"], summary="Send a robot to a place or pose",
-        responses=answer_schema(app, GoalView), openapi_extra=body_schema(app, GoalBody),
-    )  # fmt: skip
-    async def put_goal(robot: str, request: Request, caller: Annotated[Caller, operator]) -> Response:
+    @routes.put(
+        "/api/v1/robots/{robot}/goal",
+        raises=[StoreError],
+        problems={
+            404: "There is no such robot",
+            422: "The body can't be used, or the goal can never be reached: then with Nav2's `code` and `name`, and"
+            " the `nearest` point that can",
+        },
+    )
+    async def put_goal(robot: str, body: Body[GoalBody], caller: Operator) -> GoalView:
+        """Send a robot to a place or pose."""
         known(robot)
-        body = await read_body(request, GoalBody)
         pose, any_heading = wanted(body)
-        try:
-            answer = await service.send(robot, pose, caller.name, place=body.place, any_heading=any_heading)
-        except StoreError as error:
-            raise ProblemError(503, f"the mission is not stored: {error}", headers=RETRY_AFTER) from error
+        answer = await service.send(robot, pose, caller.name, place=body.place, any_heading=any_heading)
         if isinstance(answer, Refusal):
             field = "body.place" if body.place else "body.pose"
             raise ProblemError(
                 422, answer.reason, field=field, code=answer.code, name=answer.name, nearest=answer.nearest
             )
-        return _json(_goal_view(robot, answer))
+        return _goal_view(robot, answer)
 
-    @app.delete("/api/v1/robots/{robot}/goal", tags=["robots"], summary="Cancel a robot's mission", status_code=204)
-    async def delete_goal(robot: str, caller: Annotated[Caller, operator]) -> Response:
-        try:
-            there = await service.cancel(known(robot), caller.name)
-        except StoreError as error:
-            raise ProblemError(503, f"the mission is not cancelled: {error}", headers=RETRY_AFTER) from error
-        if not there:
+    @routes.delete(
+        "/api/v1/robots/{robot}/goal",
+        raises=[StoreError],
+        problems={404: "There is no such robot, or it has no mission"},
+    )
+    async def delete_goal(robot: str, caller: Operator) -> None:
+        """Cancel a robot's mission."""
+        if not await service.cancel(known(robot), caller.name):
             raise ProblemError(404, f"robot {robot} has no mission")
-        return Response(status_code=204)
 
-    @app.post(
-        "/api/v1/plan", tags=["plan"], summary="Preview a way; a refusal is an answer, too",
-        responses=answer_schema(app, PlanReply), openapi_extra=body_schema(app, PlanRequest),
-    )  # fmt: skip
-    async def preview(request: Request) -> Response:
-        return _json(await service.preview(await read_body(request, PlanRequest)))
 
-    return app
+def _add_plan(routes: Routes, service: Service) -> None:
+    @routes.post("/api/v1/plan")
+    async def preview(body: Body[PlanRequest]) -> PlanReply:
+        """Preview a path; a refusal is an answer, too."""
+        return await service.preview(body)

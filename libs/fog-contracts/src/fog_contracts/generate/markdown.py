@@ -122,7 +122,8 @@ def _routes(services: Mapping[str, OpenApi]) -> str:
         rows = [_route(method, path, path_item[method]) for path, path_item in sorted(described["paths"].items())
                 for method in _METHODS if method in path_item]  # fmt: skip
         sections.append(
-            f"### {name}\n\n" + _table(["route", "description", "parameters", "body", "responses", "token"], rows)
+            f"### {name}\n\n"
+            + _table(["route", "description", "parameters", "body", "responses", "errors", "token"], rows)
         )
     return "\n".join(sections)
 
@@ -131,15 +132,17 @@ def _route(method: str, path: str, operation: Mapping[str, Any]) -> list[str]:
     description = operation.get("description") or operation.get("summary") or ""
     parameters = [f"`{each['name']}`" for each in operation.get("parameters", []) if each["in"] != "path"]
     body = _schema((operation.get("requestBody") or {}).get("content"))
-    # 422 is added by the framework for parameters; every service answers refusals with problem documents.
+    described = sorted(operation.get("responses", {}).items())
     responses = [
         " ".join(part for part in (code, _schema(response.get("content"))) if part)
-        for code, response in sorted(operation.get("responses", {}).items())
-        if code != "422"
+        for code, response in described
+        if code[0] in "123"
     ]
+    # What else may go wrong (`default`) goes without saying.
+    errors = [code for code, _ in described if code[0] in "45"]
     return [
         f"`{method.upper()} {path}`", _sentence(description), ", ".join(parameters), body, ", ".join(responses),
-        "yes" if operation.get("security") else "",
+        ", ".join(errors), "yes" if operation.get("security") else "",
     ]  # fmt: skip
 
 

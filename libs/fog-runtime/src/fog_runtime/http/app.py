@@ -1,0 +1,100 @@
+"""The frame of every service's REST interface: health, metrics, problem documents, roles, a body limit, OpenAPI."""
+
+from collections.abc import Awaitable, Callable, MutableMapping
+from typing import Any, Final
+
+from fastapi import FastAPI, Response
+from fastapi.responses import JSONResponse
+
+from fog_runtime import metrics
+from fog_runtime.health import Health
+from fog_runtime.http.problems import add_problem_handlers, problem
+from fog_runtime.http.tokens import Tokens
+from fog_runtime.version import VERSION
+
+BODY_LIMIT: Final = 1024 * 1024
+_DRAINED: Final = 16
+
+Scope = MutableMapping[str, Any]
+Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
+Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
+
+
+class _BodyLimit:
+    """Takes a request's body in before the app runs, up to the limit: no handler can be made to hold more."""
+
+    def __init__(self, app: Callable[[Scope, Receive, Send], Awaitable[None]], limit: int) -> None:
+        self._app = app
+        self._limit = limit
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        body = bytearray()
+        size = 0
+        more = True
+        # What is too much is read on for a while and thrown away: a client that is cut off in the middle of its
+        # sending sees a reset connection instead of the answer.
+        while more and size <= _DRAINED * self._limit:
+            message = await receive()
+            if message["type"] != "http.request":
+                return  # the client went away
+            part = message.get("body", b"")
+            size += len(part)
+            more = message.get("more_body", False)
+            if size <= self._limit:
+                body += part
+        if size > self._limit:
+            headers = {"Connection": "close"} if more else None
+            answer = problem(413, f"the body has more than {self._limit} bytes", headers=headers)
+            await answer(scope, receive, send)
+            return
+        given = False
+
+        async def replay() -> MutableMapping[str, Any]:
+            nonlocal given
+            if given:
+                return await receive()
+            given = True
+            return {"type": "http.request", "body": bytes(body), "more_body": False}
+
+        await self._app(scope, replay, send)
+
+
+def _add_health(app: FastAPI, health: Health) -> None:
+    @app.get("/healthz", tags=["health"], summary="Whether the process runs")
+    async def healthz() -> dict[str, str]:
+        return {"status": "ok"}
+
+    @app.get("/readyz", tags=["health"], summary="Whether it can do its work; 503 names what is missing")
+    async def readyz() -> JSONResponse:
+        report = health.report()
+        return JSONResponse(report, 200 if report["ready"] else 503)
+
+    @app.get("/metrics", tags=["health"], summary="Metrics for Prometheus", response_class=Response)
+    async def prometheus() -> Response:
+        text, kind = metrics.exposition()
+        return Response(text, media_type=kind)
+
+
+def make_app(title: str, health: Health, tokens: Tokens, *, body_limit: int = BODY_LIMIT) -> FastAPI:
+    """Build an app with health, metrics, problem documents, roles and a body limit; OpenAPI is at /openapi.json."""
+    # The interactive pages would load scripts from the internet.
+    app = FastAPI(title=title, version=VERSION, docs_url=None, redoc_url=None)
+    app.state.tokens = tokens
+    app.state.schemas = {}
+    add_problem_handlers(app)
+    _add_health(app, health)
+    app.add_middleware(_BodyLimit, limit=body_limit)
+    generate = app.openapi
+
+    def openapi() -> dict[str, Any]:
+        if app.openapi_schema is None:
+            described = generate()
+            described.setdefault("components", {}).setdefault("schemas", {}).update(app.state.schemas)
+            app.openapi_schema = described
+        return app.openapi_schema
+
+    app.openapi = openapi  # type: ignore[method-assign]  # FastAPI's documented way to extend the schema
+    return app

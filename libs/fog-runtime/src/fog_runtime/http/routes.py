@@ -1,0 +1,242 @@
+"""Routes that say what they take and give once, in their signature; OpenAPI and behaviour both follow from it.
+
+routes = Routes(app, "zones")
+routes.raises(StoreError, {503: "The store does not answer"}, lambda error: ProblemError(503, str(error)))
+
+@routes.put("/api/v1/zones/{zone_id}", raises=[StoreError], problems={404: "There is no such zone"})
+async def put_zone(zone_id: str, body: Body[ZoneBody], caller: Operator, if_match: IfMatch = None) -> Answer[Zone]:
+...
+"""
+
+import functools
+import inspect
+import re
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Annotated, Any, Final, Generic, TypeVar, get_args, get_origin, get_type_hints
+
+import msgspec
+from fastapi import Depends, FastAPI, Header, Request, Response
+
+from fog_runtime.http.problems import PROBLEM, Problem, ProblemError
+from fog_runtime.http.tokens import Caller
+
+T = TypeVar("T")
+E = TypeVar("E", bound=Exception)
+Handler = TypeVar("Handler", bound=Callable[..., Awaitable[object]])
+
+_SCHEMAS: Final = "#/components/schemas/{name}"
+
+
+class _BodyMarker:
+    """Marks the parameter of a route that takes the decoded body."""
+
+
+Body = Annotated[T, _BodyMarker()]
+"""A parameter that takes the JSON body, decoded and checked as this msgspec type."""
+
+IfMatch = Annotated[
+    str | None, Header(alias="If-Match", description="The ETag that was read: refuse if it has changed since")
+]
+
+
+@dataclass(frozen=True, slots=True)
+class Answer(Generic[T]):
+    """An answer with headers."""
+
+    value: T
+    headers: Mapping[str, str] = field(default_factory=dict)
+
+
+def etag(version: int) -> dict[str, str]:
+    """Return the header that names a record's version."""
+    return {"ETag": f'"{version}"'}
+
+
+def expected_version(if_match: str | None) -> int | None:
+    """Return the version that an If-Match header names: None when any will do, -1 for what no version ever is."""
+    if if_match is None or if_match.strip() == "*":
+        return None
+    tag = re.fullmatch(r'"([0-9]{1,16})"', if_match.strip())
+    return int(tag[1]) if tag else -1
+
+
+class Routes:
+    """Adds routes to an app, all under one tag.
+
+    A route is an async function. `Body[T]` names the type of its body, `Viewer` or `Operator` who may call it, and what
+    it returns what it answers: a msgspec type, an `Answer` of one, None for 204, or a ready `Response`. `raises` lists
+    exceptions that become the problem documents which `Routes.raises` was told of; `problems` describes further ones.
+    """
+
+    def __init__(self, app: FastAPI, tag: str) -> None:
+        self._app = app
+        self._tag = tag
+        self._raised: dict[type[Exception], Mapping[int, str]] = {}
+
+    def raises(self, kind: type[E], described: Mapping[int, str], convert: Callable[[E], ProblemError]) -> None:
+        """Have exceptions of this kind answered by the problem that `convert` makes, described by status."""
+        self._raised[kind] = described
+        handle = self._app.exception_handlers[ProblemError]
+
+        async def answer(request: Request, error: Exception) -> Response:
+            assert isinstance(error, kind)
+            response: Response = await handle(request, convert(error))  # type: ignore[misc]  # Starlette's loose type
+            return response
+
+        self._app.add_exception_handler(kind, answer)
+
+    def get(self, path: str, **options: Any) -> Callable[[Handler], Handler]:
+        """Add a route that reads."""
+        return self._route("GET", path, **options)
+
+    def post(self, path: str, **options: Any) -> Callable[[Handler], Handler]:
+        """Add a route that makes something, or asks with a body."""
+        return self._route("POST", path, **options)
+
+    def put(self, path: str, **options: Any) -> Callable[[Handler], Handler]:
+        """Add a route that writes."""
+        return self._route("PUT", path, **options)
+
+    def delete(self, path: str, **options: Any) -> Callable[[Handler], Handler]:
+        """Add a route that deletes."""
+        return self._route("DELETE", path, **options)
+
+    def _route(
+        self,
+        method: str,
+        path: str,
+        *,
+        status: int = 200,
+        media_type: str = "",
+        raises: Sequence[type[Exception]] = (),
+        problems: Mapping[int, str] | None = None,
+    ) -> Callable[[Handler], Handler]:
+        def add(handler: Handler) -> Handler:
+            signature = _Signature(handler)
+            answered = 204 if signature.answer is type(None) else status
+            described = {status: text for kind in raises for status, text in self._raised[kind].items()} | dict(
+                problems or {}
+            )
+            self._app.add_api_route(
+                path,
+                _endpoint(handler, signature, answered),
+                methods=[method],
+                tags=[self._tag],
+                status_code=answered,
+                response_model=None,
+                response_class=Response,
+                responses=self._responses(signature, answered, media_type, described),
+                openapi_extra=self._body(signature),
+            )
+            return handler
+
+        return add
+
+    def _body(self, signature: "_Signature") -> dict[str, Any] | None:
+        if signature.body is None:
+            return None
+        content = {"application/json": {"schema": schema(self._app, signature.body[1])}}
+        return {"requestBody": {"required": True, "content": content}}
+
+    def _responses(
+        self, signature: "_Signature", status: int, media_type: str, problems: Mapping[int, str]
+    ) -> dict[int | str, dict[str, Any]]:
+        answer: dict[str, Any] = {"description": "Done" if status == 204 else "The answer"}
+        if media_type:
+            answer["content"] = {media_type: {}}
+        elif status != 204:
+            answer["content"] = {"application/json": {"schema": schema(self._app, signature.answer)}}
+        described: dict[int, str] = {}
+        if signature.needs_token:
+            described |= {401: "No token, or one that nobody has", 403: "The token's role may not do this"}
+        if signature.body is not None:
+            described |= {413: "The body is too large", 422: "The body can't be used: `errors` names its fields"}
+        described.update(problems)
+        content = {PROBLEM: {"schema": schema(self._app, Problem)}}
+        responses: dict[int | str, dict[str, Any]] = {status: answer}
+        for code, text in described.items():
+            responses[code] = {"description": text, "content": content}
+        responses["default"] = {"description": "Any other error", "content": content}
+        return responses
+
+
+class _Signature:
+    """What a route's function says of itself."""
+
+    def __init__(self, handler: Callable[..., object]) -> None:
+        hints = get_type_hints(handler, include_extras=True)
+        self.body: tuple[str, Any] | None = None
+        first: list[inspect.Parameter] = []
+        others: list[inspect.Parameter] = []
+        for name, parameter in inspect.signature(handler).parameters.items():
+            kind = hints[name]
+            arguments = get_args(kind) if get_origin(kind) is Annotated else (kind,)
+            if any(isinstance(mark, _BodyMarker) for mark in arguments[1:]):
+                self.body = (name, arguments[0])
+                kind = Annotated[arguments[0], Depends(_reader(arguments[0]))]
+            # By keyword, so that one without a default may follow one with.
+            replaced = parameter.replace(annotation=kind, kind=inspect.Parameter.KEYWORD_ONLY)
+            # Who may not call is told so before anything else is looked at.
+            (first if arguments[0] is Caller else others).append(replaced)
+        self.needs_token = bool(first)
+        self.parameters = [*first, *others]
+        answer = hints["return"]
+        self.answer = get_args(answer)[0] if get_origin(answer) is Answer else answer
+
+
+def _endpoint(
+    handler: Callable[..., Awaitable[object]], signature: _Signature, status: int
+) -> Callable[..., Awaitable[Response]]:
+    """Return what FastAPI calls: the function with its body decoded before, and its answer encoded after."""
+
+    @functools.wraps(handler)
+    async def endpoint(**arguments: Any) -> Response:
+        answer = await handler(**arguments)
+        if isinstance(answer, Response):
+            return answer
+        if answer is None:
+            return Response(status_code=status)
+        value, headers = (answer.value, dict(answer.headers)) if isinstance(answer, Answer) else (answer, None)
+        return Response(msgspec.json.encode(value), status, headers, media_type="application/json")
+
+    setattr(endpoint, "__signature__", inspect.Signature(signature.parameters))  # noqa: B010  # what FastAPI reads
+    return endpoint
+
+
+def _reader(kind: Any) -> Callable[[Request], Awaitable[Any]]:
+    async def read(request: Request) -> Any:
+        return await read_body(request, kind)
+
+    return read
+
+
+class InvalidBodyError(ProblemError):
+    """A body that is not of its type; raised again with other words by whoever knows better ones."""
+
+    def __init__(self, errors: list[dict[str, str]]) -> None:
+        super().__init__(422, "; ".join(f"{error['field']}: {error['problem']}" for error in errors))
+        self.errors = errors
+
+
+def _error_of(error: msgspec.DecodeError) -> dict[str, str]:
+    problem_text, _, path = str(error).partition(" - at ")
+    path = path.strip("`").removeprefix("$").replace("[", ".").replace("]", "").lstrip(".")
+    return {"field": f"body.{path}".rstrip("."), "problem": problem_text}
+
+
+async def read_body(request: Request, kind: type[T]) -> T:
+    """Decode a JSON body as a msgspec type; a body that is none becomes a problem that names the field."""
+    try:
+        return msgspec.json.decode(await request.body(), type=kind)
+    except msgspec.ValidationError as error:
+        raise InvalidBodyError([_error_of(error)]) from error
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise InvalidBodyError([{"field": "body", "problem": f"no valid JSON: {error}"}]) from error
+
+
+def schema(app: FastAPI, kind: Any) -> dict[str, Any]:
+    """Return the JSON schema of a msgspec type; the types that it refers to become components of the app's OpenAPI."""
+    (described,), components = msgspec.json.schema_components([kind], ref_template=_SCHEMAS)
+    app.state.schemas.update(components)
+    return described

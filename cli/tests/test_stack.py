@@ -50,7 +50,7 @@ async def test_two_stacks_run_side_by_side_and_leave_nothing_behind(tmp_path: Pa
         folders = (one.folder, two.folder)
     assert not any(psutil.pid_exists(pid) for pid in pids)
     assert not any(folder.exists() for folder in folders)
-    assert [await net.listens(port) is None for port in ports] == [False] * 6
+    assert [await net.server_problem(port) is None for port in ports] == [False] * 6
 
 
 @pytest.mark.parametrize("name", SERVERS)
@@ -63,17 +63,17 @@ async def test_a_killed_server_comes_back_on_its_port(tmp_path: Path, name: str)
         await restarted(stack, name)
         await stack.supervisor.wait_ready([name], TIMEOUT_S)
         assert stack.supervisor.pid(name) != first
-    assert [event.what for event in events] == ["started", "killed", "died", "started", "stopped"]
+    assert [event.kind for event in events] == ["started", "killed", "exited", "started", "stopped"]
 
 
 async def test_redis_keeps_over_a_kill_what_it_acknowledged(stack: Stack) -> None:
     stack.supervisor.start(REDIS)
     await stack.supervisor.wait_ready([REDIS], TIMEOUT_S)
-    assert await net.listens(stack.redis_port, b"SET zone kept\r\n", b"+OK") is None
+    assert await net.server_problem(stack.redis_port, b"SET zone kept\r\n", b"+OK") is None
     stack.supervisor.kill(REDIS)
     await restarted(stack, REDIS)
     await stack.supervisor.wait_ready([REDIS], TIMEOUT_S)
-    assert await net.listens(stack.redis_port, b"GET zone\r\n", b"$4\r\nkept") is None
+    assert await net.server_problem(stack.redis_port, b"GET zone\r\n", b"$4\r\nkept") is None
 
 
 async def test_the_servers_are_not_to_be_had_from_other_machines(stack: Stack) -> None:

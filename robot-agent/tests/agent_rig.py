@@ -160,7 +160,7 @@ class Fog:
         unsigned = RobotCommand(
             kind=kind, robot=ROBOT, operator="ann", nonce=uuid.uuid4().hex, issued_at=self.clock.stamp()
         )
-        return await self.edge.ask(ch.ROBOT_COMMAND, sign(unsigned, key), CommandReply, 3.0, robot=ROBOT)
+        return await self.edge.query(ch.ROBOT_COMMAND, sign(unsigned, key), CommandReply, 3.0, robot=ROBOT)
 
 
 class AgentProcess:

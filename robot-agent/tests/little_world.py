@@ -108,7 +108,7 @@ class LittleWorld:
 
     def ask(self, command):
         """Hand the agent an operator's command as it is; return its reply."""
-        return self.agent.answerers()[ch.ROBOT_COMMAND]({"robot": "r1"}, command, self.moment)
+        return self.agent.query_handlers()[ch.ROBOT_COMMAND]({"robot": "r1"}, command, self.moment)
 
     def obstacles(self):
         """Let time pass until the agent next reports obstacles; return the report."""

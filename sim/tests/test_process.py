@@ -74,7 +74,7 @@ class Rig:
         return await asyncio.create_subprocess_exec(sys.executable, "-m", "fognav_sim", env=environment)
 
     async def ask(self, **command):
-        return await self.edge.ask(ch.SIM_COMMAND, SimCommand(**command), CommandReply, 5.0, robot="r1")
+        return await self.edge.query(ch.SIM_COMMAND, SimCommand(**command), CommandReply, 5.0, robot="r1")
 
     def log(self):
         return [json.loads(line) for line in self.truth_log.read_bytes().splitlines()]

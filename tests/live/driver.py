@@ -141,18 +141,18 @@ class Floor:
             await _end(self._enabling)
             self._enabling = None
 
-    async def goal(self, x: float, y: float) -> net.Answer:
+    async def goal(self, x: float, y: float) -> net.Response:
         """Send the robot somewhere; any heading will do."""
         body = {"pose": {"x": x, "y": y}}
         return await self.rest(PLANNER, "PUT", f"/api/v1/robots/{ROBOT}/goal", body)
 
-    async def rest(self, service: str, method: str, path: str, body: object) -> net.Answer:
+    async def rest(self, service: str, method: str, path: str, body: object) -> net.Response:
         """Ask a service over HTTP as the administrator."""
         port = self.stack.port(service)
         assert port is not None
         return await asyncio.to_thread(net.request, method, port, path, body=body, token=self.stack.token)
 
-    async def zone(self, body: object) -> net.Answer:
+    async def zone(self, body: object) -> net.Response:
         """Draw a zone."""
         return await self.rest(MAP_SERVICE, "POST", "/api/v1/zones", body)
 

@@ -202,7 +202,7 @@ def plan_again(heard: list[Heard], site: LoadedSite) -> list[RobotPath]:
             known = message.plan_id
             x, y = message.points[0]
             request = PlanRequest(start=Pose(x=x, y=y, theta=0.0), goal=goal)
-            reply = replay.bus.ask(ch.PLANNER_PLAN, request, PlanReply, at)
+            reply = replay.bus.query(ch.PLANNER_PLAN, request, PlanReply, at)
             assert reply is not None
             again.append(
                 msgspec.structs.replace(

@@ -187,7 +187,7 @@ async def record(path: Path) -> tuple[MapSnapshot, str]:
                     keeper.start(name)
                 await keeper.wait_ready([name for name in names if name != AGENT], READY_S)
             edge.subscribe(ch.ROBOT_OBSTACLES, RobotObstacles, on_obstacles)
-            stood = await edge.ask(ch.SIM_COMMAND, SimCommand(place=[BOX]), CommandReply, 10.0, robot=plan.robot)
+            stood = await edge.query(ch.SIM_COMMAND, SimCommand(place=[BOX]), CommandReply, 10.0, robot=plan.robot)
             assert stood is not None
             assert stood.accepted, stood.reason
             for zone in ZONES:
@@ -197,7 +197,7 @@ async def record(path: Path) -> tuple[MapSnapshot, str]:
                 await keeper.stop(name)
             await ask_map_service(stack, "DELETE", "/api/v1/zones/wet")
             await until(lambda: clock.now() > faded_at, "all obstacles had faded", READY_S)
-            last = await edge.ask(ch.MAP_SNAPSHOT, None, MapSnapshot, 10.0)
+            last = await edge.query(ch.MAP_SNAPSHOT, None, MapSnapshot, 10.0)
             assert last is not None
     assert attempt.hazard.area is not None
     return last, attempt.hazard.area

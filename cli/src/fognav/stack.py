@@ -197,7 +197,7 @@ class Stack:
             servers.redis_program(data / REDIS, self.redis_port),
             servers.router_program(self.zenoh_port),
         ):
-            ready = partial(net.listens, program.port, program.hello, program.answer)
+            ready = partial(net.server_problem, program.port, program.probe, program.reply)
             self._add(program.name, program.command, ready=ready)
 
     def _add_python(

@@ -79,7 +79,7 @@ class MapProcess:
         self._bus.publish(self.core.tick(at))
         if self.core.serving and not self._serving:
             self._serving = True
-            self._bus.serve(self.core.answerers())
+            self._bus.serve(self.core.query_handlers())
 
 
 class PlannerProcess:
@@ -91,7 +91,7 @@ class PlannerProcess:
         self.due = False
         """Whether `tick` is due before its time."""
         bus.subscribe({channel: self._waking(channel, handler) for channel, handler in core.handlers().items()})
-        bus.serve(core.answerers())
+        bus.serve(core.query_handlers())
 
     def set_goal(self, robot: str, goal: RobotGoal, *, any_heading: bool = False) -> None:
         """Give a robot a mission, as an operator does."""
@@ -110,7 +110,7 @@ class PlannerProcess:
             job.run()
             self.core.take_field(job)
         if self.core.wants_snapshot(at.now):
-            snapshot = self._bus.ask(ch.MAP_SNAPSHOT, None, MapSnapshot, at)
+            snapshot = self._bus.query(ch.MAP_SNAPSHOT, None, MapSnapshot, at)
             if snapshot is not None:
                 self.core.load(snapshot, at.now)
                 self.due = True
@@ -137,12 +137,12 @@ class AgentProcess:
         self.core = core
         self._bus = bus
         bus.subscribe(core.handlers(), only={"robot": robot})
-        bus.serve(core.answerers(), only={"robot": robot})
+        bus.serve(core.query_handlers(), only={"robot": robot})
 
     def fetch_map(self, at: Moment) -> None:
         """Load a snapshot if the core wants one and the map is served; call it 20 times a second."""
         if self.core.wants_snapshot(at.now):
-            snapshot = self._bus.ask(ch.MAP_SNAPSHOT, None, MapSnapshot, at)
+            snapshot = self._bus.query(ch.MAP_SNAPSHOT, None, MapSnapshot, at)
             if snapshot is not None:
                 self.core.load(snapshot, at.now)
 

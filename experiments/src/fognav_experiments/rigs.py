@@ -150,7 +150,7 @@ class RobotRig:
             issued_at=STAMP + self.now,
         )
         command = sign(unsigned, OPERATOR_KEY)
-        reply = self._bus.ask(ch.ROBOT_COMMAND, command, CommandReply, moment(self.now), robot=self.id)
+        reply = self._bus.query(ch.ROBOT_COMMAND, command, CommandReply, moment(self.now), robot=self.id)
         assert reply is not None
         return reply
 
@@ -189,7 +189,7 @@ class FogRig(Fog):
 
     def preview(self, request: PlanRequest, now: float) -> PlanReply:
         """Ask the planner for a path, without side effects."""
-        reply = self._bus.ask(ch.PLANNER_PLAN, request, PlanReply, moment(now))
+        reply = self._bus.query(ch.PLANNER_PLAN, request, PlanReply, moment(now))
         assert reply is not None
         return reply
 

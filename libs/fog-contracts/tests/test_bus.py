@@ -131,17 +131,17 @@ def test_queries_reach_who_serves_these_ids_and_nobody_else(bus):
     for robot in ("r1", "r2"):
         reply = CommandReply(accepted=True, reason=robot)
         bus.serve({ch.ROBOT_COMMAND: always(reply)}, only={"robot": robot})
-    reply = bus.ask(ch.ROBOT_COMMAND, command, CommandReply, AT, robot="r2")
+    reply = bus.query(ch.ROBOT_COMMAND, command, CommandReply, AT, robot="r2")
     assert reply == CommandReply(accepted=True, reason="r2")
-    assert bus.ask(ch.ROBOT_COMMAND, command, CommandReply, AT, robot="r3") is None
+    assert bus.query(ch.ROBOT_COMMAND, command, CommandReply, AT, robot="r3") is None
 
 
 def test_a_published_channel_can_be_asked_for_its_latest_message(bus):
     zones = ZoneSet(epoch=1, seq=2, zones=[])
     bus.serve({ch.ZONES: always(zones)})
-    assert bus.ask(ch.ZONES, None, ZoneSet, AT) == zones
+    assert bus.query(ch.ZONES, None, ZoneSet, AT) == zones
     with pytest.raises(ContractError, match="ZoneSet"):
-        bus.ask(ch.ZONES, None, PlanReply, AT)
+        bus.query(ch.ZONES, None, PlanReply, AT)
 
 
 def test_a_roundtrip_enforces_the_limit():

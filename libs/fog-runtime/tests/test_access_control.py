@@ -236,13 +236,13 @@ async def test_every_way_of_talking_that_the_table_has_works_under_the_list(tmp_
             map_service.publish(ch.ZONES, ZONES)
             map_service.serve(ch.ZONES, lambda *_: ZONES)
             planner.serve(ch.PLANNER_PLAN, lambda _, request: m.PlanReply(length=request.goal.x))
-            map_service.alive("map-service", "lab")
-            robot.alive("robot-agent", "r1")
+            map_service.declare_liveliness("map-service", "lab")
+            robot.declare_liveliness("robot-agent", "r1")
             planner.subscribe(ch.MAP_DELTA, m.MapDelta, lambda _, message: deltas.append(message.seq))
             robot.subscribe(ch.ZONES, m.ZoneSet, lambda _, message: zones.append(message))
             planner.subscribe(ch.ROBOT_POSE, m.RobotPose, lambda ids, message: poses.append((ids["robot"], message.x)))
             recorder.subscribe(ch.ROBOT_POSE, m.RobotPose, lambda ids, _: recorded.append(ids["robot"]))
-            console.watch_live(lambda role, name, alive: there.add((role, name, alive)))
+            console.subscribe_liveliness(lambda role, name, alive: there.add((role, name, alive)))
             await until(lambda: deltas == [1] and zones == [ZONES], "what was published before is given to latecomers")
             map_service.publish(ch.MAP_DELTA, delta(2))
             await until(lambda: deltas == [1, 2], "deltas arrive")
@@ -250,8 +250,8 @@ async def test_every_way_of_talking_that_the_table_has_works_under_the_list(tmp_
             await until(
                 lambda: there == {("map-service", "lab", True), ("robot-agent", "r1", True)}, "presence is seen"
             )
-            assert await console.ask(ch.PLANNER_PLAN, PLAN, m.PlanReply, 5.0) == m.PlanReply(length=1.0)
-            assert await robot.ask(ch.ZONES, None, m.ZoneSet, 5.0) == ZONES
+            assert await console.query(ch.PLANNER_PLAN, PLAN, m.PlanReply, 5.0) == m.PlanReply(length=1.0)
+            assert await robot.query(ch.ZONES, None, m.ZoneSet, 5.0) == ZONES
 
 
 async def test_a_role_without_the_right_reaches_nobody(tmp_path, opened):
@@ -267,10 +267,10 @@ async def test_a_role_without_the_right_reaches_nobody(tmp_path, opened):
             console.subscribe(ch.MAP_DELTA, m.MapDelta, lambda _, message: deltas.append(message.seq))
             console.subscribe(ch.ROBOT_GOAL, m.RobotGoal, lambda ids, _: goals.append(ids["robot"]))
             console.subscribe(ch.ROBOT_POSE, m.RobotPose, lambda ids, _: poses.append(ids["robot"]))
-            console.watch_live(lambda role, name, alive: there.add((role, name, alive)))
+            console.subscribe_liveliness(lambda role, name, alive: there.add((role, name, alive)))
             planner.serve(ch.MAP_SNAPSHOT, lambda *_: None)
-            planner.alive("map-service", "lab")
-            r1.alive("robot-agent", "r2")
+            planner.declare_liveliness("map-service", "lab")
+            r1.declare_liveliness("robot-agent", "r2")
             # Everything that one session sends arrives in order: what is forbidden is sent before what is allowed.
             for _ in range(3):
                 planner.publish(ch.MAP_DELTA, delta(666))
@@ -283,8 +283,8 @@ async def test_a_role_without_the_right_reaches_nobody(tmp_path, opened):
                 assert set(deltas) == {1}
                 assert set(goals) == {"r1"}
                 goals.clear()
-            assert await console.ask(ch.MAP_SNAPSHOT, None, m.MapSnapshot, 1.0) is None
-            r2.alive("robot-agent", "r2")
+            assert await console.query(ch.MAP_SNAPSHOT, None, m.MapSnapshot, 1.0) is None
+            r2.declare_liveliness("robot-agent", "r2")
             await until(lambda: ("robot-agent", "r2", True) in there, "presence is seen")
             assert there == {("robot-agent", "r2", True)}
 

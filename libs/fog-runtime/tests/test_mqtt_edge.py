@@ -156,10 +156,10 @@ async def test_broker_killed_and_restarted_subscriptions_and_publishing_go_on(br
         await until(lambda: seen == [1] and greetings == [True], "nothing before the crash")
         broker.kill()
         await until(lambda: not a.connected and not b.connected, "the loss was not noticed")
-        before = counted("fognav_unsent_messages_total", ch.NODE_READING)
+        before = counted("fognav_dropped_messages_total", ch.NODE_READING)
         assert not await a.publish(ch.NODE_READING, reading(2), node="n1")
         assert not await a.publish(ch.AREA_HAZARD, hazard(9), wait=True, area="a1")
-        assert counted("fognav_unsent_messages_total", ch.NODE_READING) == before + 1
+        assert counted("fognav_dropped_messages_total", ch.NODE_READING) == before + 1
         broker.start()
         await until(lambda: a.connected and b.connected and greetings == [True, True], "no reconnection")
         assert await a.publish(ch.NODE_READING, reading(3), node="n1")

@@ -94,7 +94,7 @@ async def test_epochs_grow_also_beyond_a_clock_that_went_back_and_go_on_without_
         assert await store.claim_epoch("map") == first + 10**9 + 1
         assert await store.claim_epoch("map", running=first) == first + 10**9 + 1
         assert await store.claim_epoch("map", running=first + 2 * 10**9) == first + 2 * 10**9
-        assert await store.weakness() == ""
+        assert await store.durability_warning() == ""
         await asyncio.to_thread(redis.kill)
         assert await store.begin_epoch("map") >= first
         for attempt in (store.ping(), store.claim_epoch("map"), store._swap(THINGS, "a", None, ANY, AUDIT)):
@@ -105,4 +105,4 @@ async def test_epochs_grow_also_beyond_a_clock_that_went_back_and_go_on_without_
 async def test_a_redis_that_may_lose_acknowledged_writes_is_reported(redis: Server):
     async with RedisStore(redis.url, "test") as store, Redis.from_url(redis.url) as raw:
         await raw.config_set("appendfsync", "everysec")
-        assert "appendfsync always" in await store.weakness()
+        assert "appendfsync always" in await store.durability_warning()

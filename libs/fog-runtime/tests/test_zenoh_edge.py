@@ -143,7 +143,7 @@ async def test_router_killed_and_restarted_all_goes_on_and_no_delta_is_lost(rout
         await until(lambda: not a.connected and not b.connected, "the loss was not noticed")
         for n in range(1, 21):
             a.publish(ch.MAP_DELTA, delta(n))
-        assert await b.ask(ch.PLANNER_PLAN, plan(2.0), m.PlanReply, 0.5) is None
+        assert await b.query(ch.PLANNER_PLAN, plan(2.0), m.PlanReply, 0.5) is None
         router.start()
         await until(lambda: a.connected and b.connected, "no reconnection")
         poses.clear()
@@ -161,7 +161,7 @@ async def answered(asker, x, seconds=10.0):
     """Ask until somebody answers."""
     deadline = time.monotonic() + seconds
     while True:
-        reply = await asker.ask(ch.PLANNER_PLAN, plan(x), m.PlanReply, 1.0)
+        reply = await asker.query(ch.PLANNER_PLAN, plan(x), m.PlanReply, 1.0)
         if reply is not None:
             assert reply.length == x
             return
@@ -177,16 +177,16 @@ async def test_edge_opened_before_any_router_does_all_once_there_is_one(tmp_path
         assert not a.connected
         b.subscribe(ch.ZONES, m.ZoneSet, lambda _, message: got.append(message.seq))
         b.subscribe(ch.MAP_DELTA, m.MapDelta, lambda _, message: deltas.append(message.seq))
-        b.watch_live(lambda *event: live.append(event))
-        a.alive("planner", "p1")
+        b.subscribe_liveliness(lambda *event: live.append(event))
+        a.declare_liveliness("planner", "p1")
         a.serve(ch.PLANNER_PLAN, lambda _, request: m.PlanReply(length=request.goal.x))
         for n in range(3):
             a.publish(ch.ZONES, zones(n))
             a.publish(ch.MAP_DELTA, delta(n))
-        before = counted("fognav_unsent_messages_total", ch.ROBOT_POSE)
+        before = counted("fognav_dropped_messages_total", ch.ROBOT_POSE)
         a.publish(ch.ROBOT_POSE, pose(1.0), robot="r1")
-        assert counted("fognav_unsent_messages_total", ch.ROBOT_POSE) == before + 1
-        assert await b.ask(ch.PLANNER_PLAN, plan(1.0), m.PlanReply, 0.5) is None
+        assert counted("fognav_dropped_messages_total", ch.ROBOT_POSE) == before + 1
+        assert await b.query(ch.PLANNER_PLAN, plan(1.0), m.PlanReply, 0.5) is None
         with start_router(tmp_path, port):
             await until(lambda: a.connected and b.connected, "no connection")
             await answered(b, 4.0)
@@ -206,11 +206,11 @@ async def test_queries_are_answered_by_plain_and_async_handlers_with_ids(router)
         a.serve(ch.PLANNER_PLAN, lambda _, request: m.PlanReply(length=request.goal.x))
         await answered(b, 5.0)
         order = m.RobotCommand(kind="enable", robot="r1", operator="o", nonce="n" * 16, issued_at=1.0)
-        reply = await b.ask(ch.ROBOT_COMMAND, order, m.CommandReply, 5.0, robot="r1")
+        reply = await b.query(ch.ROBOT_COMMAND, order, m.CommandReply, 5.0, robot="r1")
         assert reply == m.CommandReply(accepted=True, reason="r1 enable")
-        assert await b.ask(ch.ZONES, None, m.ZoneSet, 5.0) == snapshot
+        assert await b.query(ch.ZONES, None, m.ZoneSet, 5.0) == snapshot
         # Nobody serves r2: none comes, long before the time is over.
-        assert await b.ask(ch.ROBOT_COMMAND, order, m.CommandReply, 5.0, robot="r2") is None
+        assert await b.query(ch.ROBOT_COMMAND, order, m.CommandReply, 5.0, robot="r2") is None
 
 
 async def test_a_large_reply_arrives_whole(router):
@@ -222,7 +222,7 @@ async def test_a_large_reply_arrives_whole(router):
         a.serve(ch.MAP_SNAPSHOT, lambda *_: big)
         a.serve(ch.PLANNER_PLAN, lambda _, request: m.PlanReply(length=request.goal.x))
         await answered(b, 1.0)
-        assert await b.ask(ch.MAP_SNAPSHOT, None, m.MapSnapshot, 20.0) == big
+        assert await b.query(ch.MAP_SNAPSHOT, None, m.MapSnapshot, 20.0) == big
 
 
 async def test_asker_learns_of_failure_silence_and_broken_answers(router):
@@ -239,9 +239,9 @@ async def test_asker_learns_of_failure_silence_and_broken_answers(router):
         a.serve(ch.PLANNER_EGRESS, fails)
         a.serve(ch.PLANNER_PLAN, lambda _, request: m.PlanReply(length=request.goal.x))
         await answered(b, 1.0)
-        assert await b.ask(ch.MAP_SNAPSHOT, None, m.MapSnapshot, 0.2) is None
+        assert await b.query(ch.MAP_SNAPSHOT, None, m.MapSnapshot, 0.2) is None
         with pytest.raises(ContractError, match="failed"):
-            await b.ask(ch.PLANNER_EGRESS, m.EgressRequest(robot="r1", pose=plan(0.0).start), m.PlanReply, 5.0)
+            await b.query(ch.PLANNER_EGRESS, m.EgressRequest(robot="r1", pose=plan(0.0).start), m.PlanReply, 5.0)
         await answered(b, 2.0)
 
 
@@ -322,11 +322,11 @@ async def test_liveliness_tells_who_comes_and_goes(router):
     seen = []
     async with edge(router.endpoint, "w") as watchdog:
         async with edge(router.endpoint, "early") as early:
-            early.alive("planner", "p1")
-            watchdog.watch_live(lambda *event: seen.append(event))
+            early.declare_liveliness("planner", "p1")
+            watchdog.subscribe_liveliness(lambda *event: seen.append(event))
             await until(lambda: ("planner", "p1", True) in seen, "the early one is not seen")
             async with edge(router.endpoint, "late") as late:
-                late.alive("robot-agent", "r1")
+                late.declare_liveliness("robot-agent", "r1")
                 await until(lambda: ("robot-agent", "r1", True) in seen, "the late one is not seen")
             await until(lambda: ("robot-agent", "r1", False) in seen, "its end is not seen")
         assert ("planner", "p1", False) not in seen[:-1]

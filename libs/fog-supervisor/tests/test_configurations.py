@@ -1,4 +1,4 @@
-"""One source for the servers' configurations: what is deployed is what demonstration and tests run."""
+"""One source for the servers' configurations: deployed servers are configured like those of demo and tests."""
 
 import shlex
 import subprocess
@@ -13,19 +13,19 @@ from fog_supervisor import configurations
 from fog_supervisor.servers import mosquitto_program, redis_program, router_program, start_mosquitto, start_redis
 
 ROOT = Path(__file__).parents[3]
-OWN_OF_A_PLACE = ("listener ", "persistence_location ", "user ", "bind ", "port ", "dir ")
+INSTANCE_SETTINGS = ("listener ", "persistence_location ", "user ", "bind ", "port ", "dir ")
 
 
 def shared_lines(text: str) -> list[str]:
-    """The lines that may not differ between the ways to run a server."""
-    return [line for line in text.splitlines() if line and not line.startswith(OWN_OF_A_PLACE)]
+    """Return the lines that must be the same for every instance of a server."""
+    return [line for line in text.splitlines() if line and not line.startswith(INSTANCE_SETTINGS)]
 
 
-def test_the_deployed_files_are_what_the_source_makes() -> None:
+def test_deployed_configurations_are_up_to_date() -> None:
     assert configurations.stale(ROOT / "deploy") == []
 
 
-def test_a_stale_file_is_named_with_the_remedy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_stale_configuration_is_reported_with_the_remedy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert configurations.main(["--write", str(tmp_path)]) == 0
     assert configurations.main(["--check", str(tmp_path)]) == 0
     (tmp_path / "redis" / "redis.conf").write_text("appendfsync everysec\n")
@@ -33,7 +33,7 @@ def test_a_stale_file_is_named_with_the_remedy(tmp_path: Path, capsys: pytest.Ca
     assert "redis.conf is stale: run python -m fog_supervisor.configurations --write" in capsys.readouterr().out
 
 
-def test_private_servers_have_the_limits_and_the_durability_of_the_deployed_ones(tmp_path: Path) -> None:
+def test_private_servers_have_the_limits_and_durability_of_deployed_ones(tmp_path: Path) -> None:
     deployed = configurations.deployed()
     mosquitto_program(tmp_path, 1)
     redis_program(tmp_path, 1)
@@ -44,7 +44,7 @@ def test_private_servers_have_the_limits_and_the_durability_of_the_deployed_ones
         assert "0.0.0.0" not in private
 
 
-def test_the_composed_router_is_given_the_arguments_of_the_private_one() -> None:
+def test_compose_starts_the_router_with_the_arguments_of_a_private_one() -> None:
     service = yaml.safe_load((ROOT / "docker-compose.yml").read_text())["services"]["zenoh"]
     endpoint = service["command"][1]
     assert service["command"] == configurations.router_arguments(endpoint)
@@ -53,16 +53,16 @@ def test_the_composed_router_is_given_the_arguments_of_the_private_one() -> None
     assert list(private.command[1:]) == ["-m", router.__name__, *configurations.router_arguments(private.url)]
 
 
-def test_every_message_fits_into_the_brokers_packets() -> None:
+def test_every_mqtt_message_fits_into_the_brokers_packet_limit() -> None:
     largest = max(channel.limit for channel in CHANNELS.values() if channel.transport == "mqtt")
     assert largest + 1024 < configurations.MQTT_PACKET_LIMIT  # topic and properties
 
 
 @pytest.mark.live
-def test_a_folder_with_a_space_in_its_name_serves_as_well(tmp_path: Path) -> None:
+def test_servers_start_in_a_folder_with_a_space_in_its_name(tmp_path: Path) -> None:
     with start_redis(tmp_path / "my data") as redis, start_mosquitto(tmp_path / "my broker"):
-        done = subprocess.run(
+        result = subprocess.run(
             shlex.split(f"redis-cli -p {redis.port} config get appendfsync"), capture_output=True, text=True, check=True
         )
-        assert done.stdout.split() == ["appendfsync", "always"]
+        assert result.stdout.split() == ["appendfsync", "always"]
         assert (redis.folder / "appendonlydir").exists()

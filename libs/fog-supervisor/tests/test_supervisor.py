@@ -43,21 +43,21 @@ class Bench:
             )
         )
 
-    def whats(self, name: str) -> list[str]:
-        return [event.what for event in self.events if event.program == name]
+    def event_kinds(self, name: str) -> list[str]:
+        return [event.kind for event in self.events if event.program == name]
 
 
 @pytest.fixture
 async def bench(tmp_path: Path) -> AsyncIterator[Bench]:
-    made = Bench(tmp_path)
-    async with made.supervisor:
-        yield made
+    bench = Bench(tmp_path)
+    async with bench.supervisor:
+        yield bench
 
 
 SLEEPER = "import time\nprint('up', flush=True)\ntime.sleep(600)"
 STUBBORN = (
     "import os, pathlib, signal, time\nsignal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
-    "(pathlib.Path(os.environ['FOLDER']) / 'deaf').touch()\ntime.sleep(600)"
+    "(pathlib.Path(os.environ['FOLDER']) / 'ignores_sigterm').touch()\ntime.sleep(600)"
 )
 PARENT = (
     "import os, pathlib, subprocess, sys, time\n"
@@ -69,54 +69,52 @@ PARENT = (
 )
 
 
-async def test_a_program_that_dies_is_started_again(bench: Bench) -> None:
+async def test_killed_program_is_restarted(bench: Bench) -> None:
     bench.add("sleeper", SLEEPER)
     bench.supervisor.start("sleeper")
     await until(lambda: bench.supervisor.pid("sleeper") is not None, "the start")
     first = bench.supervisor.kill("sleeper")
     await until(lambda: bench.supervisor.pid("sleeper") not in {None, first}, "the restart")
-    assert bench.whats("sleeper") == ["started", "killed", "died", "started"]
+    assert bench.event_kinds("sleeper") == ["started", "killed", "exited", "started"]
     assert not psutil.pid_exists(first)
 
 
-async def test_a_program_that_keeps_dying_is_started_ever_more_rarely(bench: Bench) -> None:
+async def test_restart_delay_doubles_while_a_program_keeps_exiting(bench: Bench) -> None:
     bench.add("broken", "raise SystemExit(3)")
     bench.supervisor.start("broken")
-    await until(lambda: bench.whats("broken").count("died") == 3, "the third death")
-    deaths = [event for event in bench.events if event.what == "died"]
-    assert [event.detail for event in deaths] == [
-        "exit code 3; starting again in 0.2 s",
-        "exit code 3; starting again in 0.4 s",
-        "exit code 3; starting again in 0.8 s",
+    await until(lambda: bench.event_kinds("broken").count("exited") == 3, "the third exit")
+    exits = [event for event in bench.events if event.kind == "exited"]
+    assert [event.detail for event in exits] == [
+        "exit code 3; restarting in 0.2 s",
+        "exit code 3; restarting in 0.4 s",
+        "exit code 3; restarting in 0.8 s",
     ]
 
 
-async def test_a_stopped_program_stays_stopped(bench: Bench) -> None:
+async def test_stopped_program_stays_stopped_until_started(bench: Bench) -> None:
     bench.add("sleeper", SLEEPER)
     bench.supervisor.start("sleeper")
     await until(lambda: bench.supervisor.pid("sleeper") is not None, "the start")
     await bench.supervisor.stop("sleeper")
     assert bench.supervisor.pid("sleeper") is None
-    assert bench.whats("sleeper")[-1] == "stopped"
+    assert bench.event_kinds("sleeper")[-1] == "stopped"
     bench.supervisor.start("sleeper")
     await until(lambda: bench.supervisor.starts("sleeper") == 2, "the second start")
 
 
-async def test_stopping_while_it_waits_for_its_restart_cancels_that(bench: Bench) -> None:
+async def test_stopping_during_the_restart_delay_cancels_the_restart(bench: Bench) -> None:
     bench.add("broken", "raise SystemExit(3)")
     bench.supervisor.start("broken")
-    await until(lambda: bench.whats("broken")[-1:] == ["died"], "the death")
+    await until(lambda: bench.event_kinds("broken")[-1:] == ["exited"], "the exit")
     await bench.supervisor.stop("broken")
     starts = bench.supervisor.starts("broken")
     await asyncio.sleep(0.5)  # longer than the backoff that was cancelled
     assert bench.supervisor.starts("broken") == starts
 
 
-async def test_a_program_that_ignores_the_request_to_end_is_ended_by_force(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_program_that_ignores_sigterm_is_killed(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fog_supervisor.supervisor.END_TIMEOUT_S", 0.2)
-    bench.add("stubborn", STUBBORN, ready="deaf")
+    bench.add("stubborn", STUBBORN, ready="ignores_sigterm")
     bench.supervisor.start("stubborn")
     await bench.supervisor.wait_ready(["stubborn"], DEADLINE_S)
     pid = bench.supervisor.pid("stubborn")
@@ -125,7 +123,7 @@ async def test_a_program_that_ignores_the_request_to_end_is_ended_by_force(
     assert not psutil.pid_exists(pid)
 
 
-async def test_a_frozen_program_can_be_stopped(bench: Bench) -> None:
+async def test_program_paused_by_sigstop_can_be_stopped(bench: Bench) -> None:
     bench.add("sleeper", SLEEPER)
     bench.supervisor.start("sleeper")
     await until(lambda: bench.supervisor.pid("sleeper") is not None, "the start")
@@ -134,7 +132,7 @@ async def test_a_frozen_program_can_be_stopped(bench: Bench) -> None:
     assert not psutil.pid_exists(pid)
 
 
-async def test_nothing_that_a_program_started_outlives_it(bench: Bench) -> None:
+async def test_children_of_a_program_end_with_it(bench: Bench) -> None:
     bench.add("parent", PARENT, ready="child")
     bench.supervisor.start("parent")
     await bench.supervisor.wait_ready(["parent"], DEADLINE_S)
@@ -143,7 +141,7 @@ async def test_nothing_that_a_program_started_outlives_it(bench: Bench) -> None:
     await until(lambda: not child.is_running() or child.status() == psutil.STATUS_ZOMBIE, "the end of the child")
 
 
-async def test_who_does_not_get_ready_is_named_with_its_log(bench: Bench) -> None:
+async def test_program_that_is_not_ready_in_time_is_named_with_its_log(bench: Bench) -> None:
     bench.add("sleeper", SLEEPER, ready="never")
     bench.supervisor.start("sleeper")
     await until(lambda: log_tail(bench.folder / "sleeper.log") == "up", "the log line")
@@ -151,17 +149,17 @@ async def test_who_does_not_get_ready_is_named_with_its_log(bench: Bench) -> Non
         await bench.supervisor.wait_ready(["sleeper"], 0.1)
 
 
-async def test_higher_ranks_end_first(bench: Bench) -> None:
+async def test_programs_with_higher_rank_are_stopped_first(bench: Bench) -> None:
     bench.add("server", SLEEPER, rank=0)
     bench.add("robot", SLEEPER, rank=2)
     for name in ("server", "robot"):
         bench.supervisor.start(name)
     await until(lambda: bench.supervisor.starts("server") + bench.supervisor.starts("robot") == 2, "both starts")
     await bench.supervisor.close()
-    assert [event.program for event in bench.events if event.what == "stopped"] == ["robot", "server"]
+    assert [event.program for event in bench.events if event.kind == "stopped"] == ["robot", "server"]
 
 
-def test_programs_die_with_the_command_even_when_it_is_killed(tmp_path: Path) -> None:
+def test_programs_end_with_their_supervising_process_even_when_it_is_killed(tmp_path: Path) -> None:
     code = (
         "import asyncio, os, pathlib, sys\n"
         "from fog_supervisor.supervisor import Program, Supervisor\n"

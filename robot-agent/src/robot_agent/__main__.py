@@ -51,7 +51,7 @@ async def main() -> None:
             lidar = LidarEdge(settings.lidar_port, scanner, clock, core.on_lidar_nodes, agent.on_scan)
             agent.restore(body)
             agent.subscribe()
-            zenoh.alive("robot-agent", settings.robot)
+            zenoh.declare_liveliness("robot-agent", settings.robot)
             async with asyncio.TaskGroup() as tasks:
                 tasks.create_task(link.run(), name="base")
                 tasks.create_task(lidar.run(), name="lidar")

@@ -36,7 +36,7 @@ class Fog:
     def serve(self, _channel, _handler, **_ids):
         pass
 
-    async def ask(self, _channel, _request, kind, _timeout):
+    async def query(self, _channel, _request, kind, _timeout):
         assert kind is MapSnapshot
         self.asked += 1
         return await self.answers.get()

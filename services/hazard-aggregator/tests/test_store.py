@@ -38,7 +38,7 @@ async def test_stored_hazards_and_areas_survive_kills(redis: Server):
         again = await store.load()
         assert again.definitions == [area]
         assert again.epoch > first.epoch
-        assert await store.weakness() == ""
+        assert await store.durability_warning() == ""
         await asyncio.to_thread(redis.kill)
         with pytest.raises(StoreError):
             await store.save_hazards([hazard(9)])

@@ -383,7 +383,7 @@ def test_queries_get_the_map_its_zones_and_one_areas_hazard():
     m = started()
     m.load_zones([zone()], moment(0.0))
     m.tick(moment(0.0))
-    answers = m.answerers()
+    answers = m.query_handlers()
     assert answers[ch.MAP_SNAPSHOT]({}, None, moment(1.0)) is m.costmap.snapshot()
     assert [z.id for z in answers[ch.ZONES]({}, None, moment(1.0)).zones] == ["z1"]
     assert answers[ch.HAZARD]({"area": "gate"}, None, moment(1.0)).hazard.area == "gate"

@@ -60,7 +60,7 @@ def pose(x: float, y: float) -> RobotPose:
 
 async def cost(zenoh, x: float, y: float) -> int | None:
     """Return the cost of a place on the map as the map-service serves it, or None before it does."""
-    snapshot = await zenoh.ask(ch.MAP_SNAPSHOT, None, MapSnapshot, 1.0)
+    snapshot = await zenoh.query(ch.MAP_SNAPSHOT, None, MapSnapshot, 1.0)
     if snapshot is None:
         return None
     replica = Replica()

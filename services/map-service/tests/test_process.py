@@ -59,7 +59,7 @@ class Robot:
             self.deltas.append(delta)
 
     async def load(self) -> None:
-        ask = partial(self.zenoh.ask, ch.MAP_SNAPSHOT, None, MapSnapshot, 1.0)
+        ask = partial(self.zenoh.query, ch.MAP_SNAPSHOT, None, MapSnapshot, 1.0)
         self.replica.load(await first(ask, lambda snapshot: snapshot is not None))
 
     def cost(self, x: float, y: float) -> int:
@@ -104,7 +104,7 @@ async def test_five_readings_in_the_corridor_become_lethal_cells_at_the_robot(fo
         trace = delta.traces[0]
         assert trace.first_reading <= trace.confirmed <= trace.costmap_published
         await until(lambda: robot.hazards and robot.hazards[-1].hazard.state == "blocked", "the reason")
-        asked = await robot.zenoh.ask(ch.HAZARD, None, HazardArea, 5.0, area="hall")
+        asked = await robot.zenoh.query(ch.HAZARD, None, HazardArea, 5.0, area="hall")
         assert asked.hazard.state == "blocked"
 
 

@@ -60,7 +60,7 @@ async def test_a_dead_redis_is_a_store_error_and_epochs_go_on(redis: Server):
     async with Store(redis.url, "test") as store:
         first = await store.begin_epoch("map")
         assert await store.begin_epoch("map") > first
-        assert await store.weakness() == ""
+        assert await store.durability_warning() == ""
         await asyncio.to_thread(redis.kill)
         with pytest.raises(StoreError):
             await store.put(zone(), expected=0, audit=AUDIT)

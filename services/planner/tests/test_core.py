@@ -70,8 +70,8 @@ class Drive:
     def hear(self, channel: ch.Channel, message: Message, **ids: str) -> None:
         self.core.handlers()[channel](ids, message, self.moment)
 
-    def ask(self, channel: ch.Channel, request: Message) -> PlanReply:
-        reply = self.core.answerers()[channel]({}, request, self.moment)
+    def query(self, channel: ch.Channel, request: Message) -> PlanReply:
+        reply = self.core.query_handlers()[channel]({}, request, self.moment)
         assert isinstance(reply, PlanReply)
         return reply
 
@@ -349,7 +349,7 @@ def test_egress_leads_out_of_a_blocked_area_by_the_nearer_end_and_not_through_wa
     drive = Drive()
     drive.send(drive.map.put("z1", UPPER))
     drive.hear(ch.HAZARD, drive.map.told("z1"))
-    reply = drive.ask(ch.PLANNER_EGRESS, EgressRequest(robot="r1", pose=Pose(x=9.63, y=11.02, theta=0.0)))
+    reply = drive.query(ch.PLANNER_EGRESS, EgressRequest(robot="r1", pose=Pose(x=9.63, y=11.02, theta=0.0)))
     assert reply.refusal is None
     assert reply.points[0] == pytest.approx((9.65, 11.05))
     x, y = reply.points[-1]
@@ -365,7 +365,7 @@ def test_egress_is_refused_when_another_area_blocks_the_way_out() -> None:
         drive.send(drive.map.put(name, box))
         drive.hear(ch.HAZARD, drive.map.told(name))
     drive.send(drive.map.put("boxes", (8.0, 10.0, 8.9, 12.0)))
-    reply = drive.ask(ch.PLANNER_EGRESS, EgressRequest(robot="r1", pose=Pose(x=10.5, y=11.0, theta=0.0)))
+    reply = drive.query(ch.PLANNER_EGRESS, EgressRequest(robot="r1", pose=Pose(x=10.5, y=11.0, theta=0.0)))
     assert reply.refusal
     assert reply.refusal.code == 205
 
@@ -435,7 +435,7 @@ def test_what_counts_is_when_a_message_arrived_and_not_when_its_turn_came() -> N
 def test_a_preview_answers_without_touching_any_mission() -> None:
     drive = Drive(start=LEFT)
     first = drive.go(*RIGHT)
-    reply = drive.ask(
+    reply = drive.query(
         ch.PLANNER_PLAN, PlanRequest(start=Pose(x=1.0, y=1.0, theta=0.0), goal=Pose(x=19.0, y=1.0, theta=0.0))
     )
     assert reply.refusal is None

@@ -266,7 +266,7 @@ async def test_what_cannot_be_is_refused_with_a_reason_and_nothing_is_promised_w
 async def test_questions_are_answered_without_side_effects_over_both_transports(tmp_path: Path) -> None:
     async with world(tmp_path) as here, here.ready() as client:
         request = PlanRequest(start=Pose(x=1.0, y=7.0, theta=0.0), goal=Pose(x=19.0, y=7.0, theta=0.0))
-        reply = await here.edge.ask(ch.PLANNER_PLAN, request, PlanReply, 5.0)
+        reply = await here.edge.query(ch.PLANNER_PLAN, request, PlanReply, 5.0)
         assert reply
         assert reply.refusal is None
         body = {"start": {"x": 1.0, "y": 7.0, "theta": 0.0}, "goal": {"x": 10.0, "y": 6.0, "theta": 0.0}}
@@ -277,7 +277,7 @@ async def test_questions_are_answered_without_side_effects_over_both_transports(
 
         async def way_out() -> PlanReply | None:
             asked = EgressRequest(robot="r1", pose=Pose(x=9.5, y=11.0, theta=0.0))
-            return await here.edge.ask(ch.PLANNER_EGRESS, asked, PlanReply, 5.0)
+            return await here.edge.query(ch.PLANNER_EGRESS, asked, PlanReply, 5.0)
 
         deadline = time.monotonic() + 10.0
         while not (out := await way_out()) or len(out.points) < 5:
@@ -286,6 +286,6 @@ async def test_questions_are_answered_without_side_effects_over_both_transports(
         assert out.points[-1][0] < 9.0
         assert here.paths == []
         assert (await client.get("/openapi.json")).status_code == 200
-        snapshot = await here.edge.ask(ch.MAP_SNAPSHOT, None, MapSnapshot, 5.0)
+        snapshot = await here.edge.query(ch.MAP_SNAPSHOT, None, MapSnapshot, 5.0)
         assert snapshot
         assert snapshot.seq == out.map_seq

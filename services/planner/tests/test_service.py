@@ -65,7 +65,7 @@ def rig() -> Rig:
 
 def test_every_channel_of_the_core_is_subscribed_to_and_every_query_served(rig: Rig) -> None:
     assert rig.session.subscribed.keys() == rig.core.handlers().keys()
-    assert rig.session.served == rig.core.answerers().keys()
+    assert rig.session.served == rig.core.query_handlers().keys()
 
 
 def test_messages_are_dated_when_they_arrive_however_late_the_core_gets_round_to_them(rig: Rig) -> None:

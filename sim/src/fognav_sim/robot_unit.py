@@ -84,7 +84,7 @@ class _Operator:
         )
         try:
             command = sign(unsigned, self._key)
-            reply = await self._edge.ask(ch.ROBOT_COMMAND, command, CommandReply, _TIMEOUT_S, robot=self._robot)
+            reply = await self._edge.query(ch.ROBOT_COMMAND, command, CommandReply, _TIMEOUT_S, robot=self._robot)
         except ContractError as error:
             _log.warning("command_failed", kind=kind, reason=str(error))
             return
@@ -142,7 +142,7 @@ def _programs(settings: Settings, robot: str) -> list[Program]:
 
 
 def _say(event: Event) -> None:
-    _log.info(event.what, program=event.program, detail=event.detail)
+    _log.info(f"program_{event.kind}", program=event.program, detail=event.detail)
 
 
 async def main() -> None:

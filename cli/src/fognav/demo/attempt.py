@@ -118,10 +118,10 @@ class Attempt:
         return ZenohEdge.open(connect=[stack.zenoh_endpoint], clock=clock, role="console", id=name, site=site)
 
     def _on_process(self, event: Event) -> None:
-        if event.what == "died":
+        if event.kind == "exited":
             self.restarts[event.program] = self.restarts.get(event.program, 0) + 1
             self.scene.say(f"{event.program} died ({event.detail})")
-        elif event.what == "started" and event.program in self.restarts:
+        elif event.kind == "started" and event.program in self.restarts:
             self.scene.say(f"{event.program} was started again")
 
     async def _sample_usage(self, stack: Stack) -> None:

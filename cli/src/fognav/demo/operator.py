@@ -141,12 +141,12 @@ class Operator:
 
     async def _ask(self, channel: ch.Channel, request: Message) -> CommandReply | None:
         try:
-            return await self._edge.ask(channel, request, CommandReply, _ASK_TIMEOUT_S, robot=self._robot)
+            return await self._edge.query(channel, request, CommandReply, _ASK_TIMEOUT_S, robot=self._robot)
         except ContractError as error:
             self._scene.say(f"an answer on {channel.name} can't be used: {error.reason}")
             return None
 
-    async def put_goal(self, place: str) -> net.Answer:
+    async def put_goal(self, place: str) -> net.Response:
         """Give the robot its goal over the planner's REST interface; raises `OSError` when the planner is away."""
         port = self._stack.port(PLANNER)
         if port is None:

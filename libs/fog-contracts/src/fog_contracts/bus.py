@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
     from fog_contracts.channels import Channel
-    from fog_contracts.handlers import Answerer, Handler, Ids, Moment, Publication
+    from fog_contracts.handlers import Handler, Ids, Moment, Publication, QueryHandler
 
 M = TypeVar("M", bound=Message)
 
@@ -32,7 +32,7 @@ class _Subscription:
 @dataclass(frozen=True)
 class _Service:
     channel: Channel
-    answerer: Answerer
+    query_handler: QueryHandler
     only: Ids
 
 
@@ -61,9 +61,9 @@ class Bus:
         """
         self._subscriptions += [_Subscription(c, handler, _fitting(c, only)) for c, handler in handlers.items()]
 
-    def serve(self, answerers: Mapping[Channel, Answerer], *, only: Ids | None = None) -> None:
-        """Have each queryable's requests go to its answerer; `only` as for `subscribe`."""
-        self._services += [_Service(c, answerer, _fitting(c, only)) for c, answerer in answerers.items()]
+    def serve(self, query_handlers: Mapping[Channel, QueryHandler], *, only: Ids | None = None) -> None:
+        """Have each queryable's requests go to its query_handler; `only` as for `subscribe`."""
+        self._services += [_Service(c, query_handler, _fitting(c, only)) for c, query_handler in query_handlers.items()]
 
     def publish(self, publications: Iterable[Publication]) -> None:
         """Put messages on their way; raises `ContractError` for one that breaks its channel's contract."""
@@ -87,7 +87,7 @@ class Bus:
             count += 1
         return count
 
-    def ask(self, channel: Channel, request: Message | None, kind: type[M], at: Moment, **ids: str) -> M | None:
+    def query(self, channel: Channel, request: Message | None, kind: type[M], at: Moment, **ids: str) -> M | None:
         """Ask a queryable; return its answer, or None when nobody serves it.
 
         Raises `ContractError` when request or answer break the channel's contract.
@@ -96,7 +96,7 @@ class Bus:
         for service in self._services:
             if service.channel is channel and _matches(service.only, asked):
                 taken = None if request is None else roundtrip(channel, request)
-                reply = service.answerer(asked, taken, at)
+                reply = service.query_handler(asked, taken, at)
                 if not isinstance(reply, kind):
                     raise ContractError(channel.name, f"was answered by {type(reply).__name__}, not {kind.__name__}")
                 return roundtrip(channel, reply, reply=channel.kind == "query")

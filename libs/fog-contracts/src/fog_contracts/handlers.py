@@ -46,7 +46,7 @@ class RefusedMessageError(ValueError):
 Handler = Callable[[Ids, Any, Moment], Sequence[Publication]]
 """Handles one message of a channel; its second argument is the channel's message type (text for a text channel)."""
 
-Answerer = Callable[[Ids, Any, Moment], Message]
+QueryHandler = Callable[[Ids, Any, Moment], Message]
 """Answers one query; its second argument is the channel's request type, or None for a query without one."""
 
 

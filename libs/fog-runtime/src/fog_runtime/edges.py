@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from fog_contracts.channels import Channel
-    from fog_contracts.handlers import Answerer, Handler, Ids, Publication
+    from fog_contracts.handlers import Handler, Ids, Publication, QueryHandler
     from fog_runtime.clock import Clock
     from fog_runtime.mqtt_edge import MqttEdge
     from fog_runtime.zenoh_edge import ZenohEdge
@@ -46,12 +46,12 @@ class Edges:
         for channel, handler in handlers.items():
             self._subscribe(channel, self._delivery(handler, publish), numbers, only or {})
 
-    def serve(self, answerers: Mapping[Channel, Answerer], **ids: str) -> None:
-        """Have each queryable's requests go to its answerer; `ids` are the variable parts of the keys served."""
-        for channel, answerer in answerers.items():
+    def serve(self, query_handlers: Mapping[Channel, QueryHandler], **ids: str) -> None:
+        """Have each queryable's requests go to its query_handler; `ids` are the variable parts of the keys served."""
+        for channel, query_handler in query_handlers.items():
             if self._zenoh is None:
                 raise ValueError(f"channel {channel.name} is carried by zenoh, to which this process is not connected")
-            self._zenoh.serve(channel, self._reply(answerer), **_fitting(channel, ids))
+            self._zenoh.serve(channel, self._reply(query_handler), **_fitting(channel, ids))
 
     def publish(self, publication: Publication) -> None:
         """Publish without waiting; raises `ContractError` when the message breaks the channel's contract."""
@@ -73,9 +73,9 @@ class Edges:
 
         return deliver
 
-    def _reply(self, answerer: Answerer) -> Callable[[dict[str, str], Any], Message]:
+    def _reply(self, query_handler: QueryHandler) -> Callable[[dict[str, str], Any], Message]:
         def reply(ids: dict[str, str], request: Any) -> Message:
-            return answerer(ids, request, self.now())
+            return query_handler(ids, request, self.now())
 
         return reply
 

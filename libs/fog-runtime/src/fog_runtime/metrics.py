@@ -33,7 +33,7 @@ REFUSED: Final = Counter("fognav_refused_messages_total", "Messages that broke t
 RECEIVED: Final = Counter("fognav_received_messages_total", "Messages taken from a channel", ["channel"])
 PUBLISHED: Final = Counter("fognav_published_messages_total", "Messages given to a channel", ["channel"])
 DROPPED: Final = Counter(
-    "fognav_unsent_messages_total", "Messages that could not be sent because the connection was down", ["channel"]
+    "fognav_dropped_messages_total", "Messages that could not be sent because the connection was down", ["channel"]
 )
 HANDLER_ERRORS: Final = Counter(
     "fognav_handler_errors_total", "Messages whose handler raised an exception: a bug in this process", ["channel"]
@@ -41,7 +41,7 @@ HANDLER_ERRORS: Final = Counter(
 BUILD: Final = Info("fognav_build", "Which code runs: its version")
 BUILD.info({"version": VERSION})
 CONNECTED: Final = Gauge("fognav_connected", "Whether the connection is up (1) or down (0)", ["transport"])
-CONNECTS: Final = Counter("fognav_connects_total", "Connections made, the first one included", ["transport"])
+CONNECTS: Final = Counter("fognav_connections_total", "Connections made, the first one included", ["transport"])
 
 
 def observe_trace(trace: Trace, stages: Collection[str] = tuple(SPANS)) -> None:

@@ -101,7 +101,7 @@ class RedisStore:
         """Return when Redis answers."""
         await self._ask(cast("Awaitable[Any]", self._redis.ping()))
 
-    async def weakness(self) -> str:
+    async def durability_warning(self) -> str:
         """Return why Redis's acknowledgements can't be trusted, or an empty text (a server may refuse to tell)."""
         try:
             config = await self._redis.config_get("appendonly", "appendfsync")

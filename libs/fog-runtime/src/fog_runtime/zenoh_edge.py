@@ -347,7 +347,7 @@ class ZenohEdge:
         self.subscribe(channel, kind, lambda _, message: slot.put(message, self._clock.now()), **ids)
         return slot
 
-    async def ask(
+    async def query(
         self, channel: Channel, request: Message | None, kind: type[M], timeout_s: float, **ids: str
     ) -> M | None:
         """Ask a queryable; return its first answer, or None when nobody answers within `timeout_s` of the clock.
@@ -396,12 +396,12 @@ class ZenohEdge:
         """Answer queries with `handler(ids, request)`, plain or async; `request` is None where the channel has none."""
         self._declare(_Answerer(self, channel, handler, self._key(channel, ids)).declare)
 
-    def alive(self, role: str, id: str) -> None:  # noqa: A002  # as in the channel `live`
+    def declare_liveliness(self, role: str, id: str) -> None:  # noqa: A002  # as in the channel `live`
         """Declare that this process is there, for as long as its session lives."""
         key = LIVE.key(site=self._site, role=role, id=id)
         self._declare(lambda session: session.liveliness().declare_token(key))
 
-    def watch_live(self, handler: Callable[[str, str, bool], object]) -> None:
+    def subscribe_liveliness(self, handler: Callable[[str, str, bool], object]) -> None:
         """Have `handler(role, id, alive)` called for all who are there now, and whenever one comes or goes.
 
         When this process itself loses its router, all go.

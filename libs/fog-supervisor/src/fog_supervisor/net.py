@@ -1,4 +1,4 @@
-"""Loopback ports, and the small HTTP client that a local operator needs."""
+"""Loopback ports, and a small HTTP client for local services."""
 
 import asyncio
 import contextlib
@@ -13,14 +13,14 @@ from typing import Any, Final
 
 LOOPBACK: Final = "127.0.0.1"
 PORTS = range(20_000, 32_000)
-"""Below the range from which systems take the ports of outgoing connections: a client that tries to reach a server
-that is just restarting could otherwise be given the server's port, and even connect to itself."""
+"""Below the ephemeral ports: a client that connects to a restarting server could otherwise be assigned the server's
+own port, and even connect to itself."""
 _TRIES: Final = 200
 HTTP_TIMEOUT_S: Final = 5.0
 
 
 def free_port(taken: set[int] | None = None) -> int:
-    """Return a port that nobody listens on and that is not in `taken`, and add it there."""
+    """Return a port that is free and not in `taken`, and add it to `taken`."""
     taken = set() if taken is None else taken
     generator = random.SystemRandom()
     for _ in range(_TRIES):
@@ -31,11 +31,13 @@ def free_port(taken: set[int] | None = None) -> int:
             probe.bind((LOOPBACK, port))
             taken.add(port)
             return port
-    raise OSError(f"no free port from {PORTS[0]} to {PORTS[-1]} after {_TRIES} tries: who listens on them all?")
+    raise OSError(
+        f"no free port from {PORTS[0]} to {PORTS[-1]} after {_TRIES} tries: stop programs that listen on them"
+    )
 
 
 def read_port(path: Path) -> int | None:
-    """Return the port that a process wrote to its port file, or None when it has not yet."""
+    """Return the port that a process wrote to its port file, or None when there is none yet."""
     try:
         return int(path.read_text("ascii"))
     except (FileNotFoundError, ValueError):
@@ -43,15 +45,15 @@ def read_port(path: Path) -> int | None:
 
 
 @dataclass(frozen=True)
-class Answer:
-    """Status and JSON body of an HTTP answer; a body that is no JSON is its text."""
+class Response:
+    """Status and JSON body of an HTTP response; a body that is not JSON is its text."""
 
     status: int
     body: Any
 
     @property
     def reason(self) -> str:
-        """What a problem document (RFC 9457) says, or the whole body."""
+        """The detail of a problem document (RFC 9457), else the whole body."""
         if isinstance(self.body, dict):
             return str(self.body.get("detail") or self.body.get("title") or self.body)
         return str(self.body)
@@ -65,58 +67,58 @@ def request(
     body: object = None,
     token: str | None = None,
     headers: Mapping[str, str] | None = None,
-) -> Answer:
-    """Ask a server on the loopback address; raises `OSError` or `http.client.HTTPException` when it can't be had."""
-    sent = {"Accept": "application/json", **(headers or {})}
+) -> Response:
+    """Send a request to a server on the loopback address; raises `OSError` or `http.client.HTTPException`."""
+    sent_headers = {"Accept": "application/json", **(headers or {})}
     data = None
     if body is not None:
         data = json.dumps(body).encode()
-        sent["Content-Type"] = "application/json"
+        sent_headers["Content-Type"] = "application/json"
     if token is not None:
-        sent["Authorization"] = f"Bearer {token}"
+        sent_headers["Authorization"] = f"Bearer {token}"
     connection = http.client.HTTPConnection(LOOPBACK, port, timeout=HTTP_TIMEOUT_S)
     try:
-        connection.request(method, path, body=data, headers=sent)
-        answer = connection.getresponse()
-        text = answer.read().decode("utf-8", "replace")
+        connection.request(method, path, body=data, headers=sent_headers)
+        response = connection.getresponse()
+        text = response.read().decode("utf-8", "replace")
     finally:
         connection.close()
     try:
-        return Answer(answer.status, json.loads(text))
+        return Response(response.status, json.loads(text))
     except json.JSONDecodeError:
-        return Answer(answer.status, text)
+        return Response(response.status, text)
 
 
 async def readiness(port_file: Path) -> str | None:
-    """Return what a process says that it still misses (`/readyz`), or None when it is ready."""
+    """Return what a process still waits for by its `/readyz`, or None when it is ready."""
     port = read_port(port_file)
     if port is None:
-        return "it has not said where it listens"
+        return "it has not written its port file yet"
     try:
-        answer = await asyncio.to_thread(request, "GET", port, "/readyz")
+        response = await asyncio.to_thread(request, "GET", port, "/readyz")
     except (OSError, http.client.HTTPException) as error:
         return f"/readyz does not answer: {error}"
-    if answer.status == http.client.OK:
+    if response.status == http.client.OK:
         return None
-    if isinstance(answer.body, dict) and isinstance(answer.body.get("parts"), dict):
-        parts = answer.body["parts"]
-        lacking = [f"{name} ({part.get('detail') or 'not yet'})" for name, part in parts.items() if not part.get("ok")]
-        return "it waits for " + ", ".join(lacking)
-    return answer.reason
+    if isinstance(response.body, dict) and isinstance(response.body.get("parts"), dict):
+        parts = response.body["parts"]
+        missing = [f"{name} ({part.get('detail') or 'not yet'})" for name, part in parts.items() if not part.get("ok")]
+        return "it waits for " + ", ".join(missing)
+    return response.reason
 
 
-async def listens(port: int, hello: bytes = b"", wanted: bytes = b"") -> str | None:
-    """Return None when a server takes connections on the port (and answers `hello` with `wanted`), or what is wrong."""
+async def server_problem(port: int, probe: bytes = b"", expected: bytes = b"") -> str | None:
+    """Return None when a server accepts connections on the port and answers `probe` as expected, else what is wrong."""
     try:
         reader, writer = await asyncio.wait_for(asyncio.open_connection(LOOPBACK, port), HTTP_TIMEOUT_S)
     except (OSError, TimeoutError) as error:
-        return f"nobody listens on port {port}: {error}"
+        return f"no server listens on port {port}: {error}"
     try:
-        if hello:
-            writer.write(hello)
-            said = await asyncio.wait_for(reader.read(64), HTTP_TIMEOUT_S)
-            if not said.startswith(wanted):
-                return f"port {port} answers {said!r} instead of {wanted!r}"
+        if probe:
+            writer.write(probe)
+            reply = await asyncio.wait_for(reader.read(64), HTTP_TIMEOUT_S)
+            if not reply.startswith(expected):
+                return f"port {port} answers {reply!r} instead of {expected!r}"
     except (OSError, TimeoutError) as error:
         return f"port {port} does not answer: {error}"
     finally:

@@ -1,8 +1,8 @@
-"""Private Mosquitto, Redis and zenoh router processes on loopback ports: for the demonstration and for tests.
+"""Private Mosquitto, Redis and zenoh router processes on loopback ports, for the demo and for tests.
 
-A `ServerProgram` says how to run one and how to see that it is ready; the demonstration gives it to its `Supervisor`.
-`start_mosquitto`, `start_redis` and `start_router` run one at once, each with its own configuration, data and log in a
-folder; it is ready when the function returns, which blocks for some 30 ms (the router for some 0.5 s).
+A `ServerProgram` describes how to run one and how to check that it is ready; the demo gives it to its `Supervisor`.
+`start_mosquitto`, `start_redis` and `start_router` start one with its own configuration, data and log in a folder, and
+return when it is ready; they block for about 30 ms (the router for about 0.5 s).
 """
 
 import os
@@ -22,68 +22,68 @@ from fog_supervisor.net import LOOPBACK, free_port
 _READY_S: Final = 15.0
 _STOP_S: Final = 5.0
 _ATTEMPTS: Final = 5
-"""Free ports to try: another process may take one between its choice and its use."""
+"""Ports to try: another process may take one between its choice and its use."""
 _SERVER_FOLDERS: Final = ("/usr/sbin", "/usr/local/sbin", "/opt/homebrew/sbin", "/opt/homebrew/bin")
 """Debian keeps servers in /usr/sbin, which is not on every user's path."""
 
 
 class ServerError(RuntimeError):
-    """A server that is not installed or does not start; the message says what to do, or holds the end of its log."""
+    """A server is not installed or does not start; the message names the remedy or contains the end of its log."""
 
 
 def find_program(*names: str) -> Path | None:
-    """Return where the first of these programs is, on the PATH or where systems keep their servers."""
+    """Return the path of the first of these programs, on the PATH or in the usual folders of servers."""
     folders = os.pathsep.join([os.environ.get("PATH", ""), *_SERVER_FOLDERS])
     return next((Path(found) for name in names if (found := shutil.which(name, path=folders))), None)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ServerProgram:
-    """How to run a server on a loopback port; it is ready when it takes connections and answers `hello` so."""
+    """How to run a server on a loopback port; it is ready when it accepts connections and sends `reply` to `probe`."""
 
     name: str
     port: int
     url: str
     command: tuple[str, ...]
-    hello: bytes = b""
-    answer: bytes = b""
+    probe: bytes = b""
+    reply: bytes = b""
 
     def ready(self) -> bool:
-        """Whether it takes connections and answers as it should."""
+        """Whether it accepts connections and sends the expected reply."""
         try:
             with socket.create_connection((LOOPBACK, self.port), timeout=0.5) as connection:
-                if not self.hello:
+                if not self.probe:
                     return True
-                connection.sendall(self.hello)
-                return connection.recv(64).startswith(self.answer)
+                connection.sendall(self.probe)
+                return connection.recv(64).startswith(self.reply)
         except OSError:
             return False
 
 
 def _installed(name: str, package: str) -> str:
-    found = find_program(name)
-    if found is None:
+    path = find_program(name)
+    if path is None:
         raise ServerError(f"{name} is not installed: apt-get install -y --no-install-recommends {package}")
-    return str(found)
+    return str(path)
 
 
 def mosquitto_program(folder: Path, port: int, *, extra: str = "") -> ServerProgram:
-    """Return an MQTT broker for anonymous clients, configured in `folder`; `extra` lines end its configuration.
+    """Return an MQTT broker for anonymous clients, configured in `folder`; `extra` is appended to its configuration.
 
     Raises `ServerError` when it is not installed.
     """
     program = _installed("mosquitto", "mosquitto")
-    # Root would become another user, who may not enter a private folder.
+    # As root, Mosquitto switches to another user, who may have no access to a private folder.
     lines = [*(["user root"] if os.geteuid() == 0 else []), *extra.splitlines()]
     file = folder / "mosquitto.conf"
-    file.write_text(configurations.mosquitto(f"{port} {LOOPBACK}", str(folder), further=lines), "utf-8")
+    file.write_text(configurations.mosquitto(f"{port} {LOOPBACK}", str(folder), extra=lines), "utf-8")
     return ServerProgram(
         name="mosquitto", port=port, url=f"mqtt://{LOOPBACK}:{port}", command=(program, "-c", str(file))
     )
 
 
 def redis_program(folder: Path, port: int) -> ServerProgram:
-    """Return a Redis that keeps what it acknowledged, configured in `folder`; raises `ServerError` without one."""
+    """Return a Redis with durable writes, configured in `folder`; raises `ServerError` when it is not installed."""
     program = _installed("redis-server", "redis-server")
     file = folder / "redis.conf"
     file.write_text(configurations.redis(LOOPBACK, str(folder), port=port), "utf-8")
@@ -92,8 +92,8 @@ def redis_program(folder: Path, port: int) -> ServerProgram:
         port=port,
         url=f"redis://{LOOPBACK}:{port}/0",
         command=(program, str(file)),
-        hello=b"PING\r\n",
-        answer=b"+PONG",
+        probe=b"PING\r\n",
+        reply=b"+PONG",
     )
 
 
@@ -105,7 +105,7 @@ def router_program(port: int) -> ServerProgram:
 
 
 class Server:
-    """A running server process; a context manager that stops it. Belongs to the thread that made it."""
+    """A running server process; a context manager that stops it. For use from one thread."""
 
     def __init__(self, program: ServerProgram, folder: Path) -> None:
         """Start it at once, in `folder`, and wait until it is ready; raises `ServerError`."""
@@ -116,22 +116,22 @@ class Server:
 
     @property
     def name(self) -> str:
-        """What it is called in messages."""
+        """Its name in messages."""
         return self.program.name
 
     @property
     def port(self) -> int:
-        """Where it listens on the loopback interface."""
+        """Its port on the loopback interface."""
         return self.program.port
 
     @property
     def url(self) -> str:
-        """How clients name it."""
+        """Its address for clients."""
         return self.program.url
 
     @property
     def endpoint(self) -> str:
-        """The same as `url`: what zenoh calls it."""
+        """The same as `url`, under zenoh's name for it."""
         return self.program.url
 
     @property
@@ -143,11 +143,11 @@ class Server:
 
     @property
     def log(self) -> Path:
-        """File with everything that it printed."""
+        """The file with its output."""
         return self.folder / f"{self.name}.log"
 
     def running(self) -> bool:
-        """Whether the process lives."""
+        """Whether the process is running."""
         return self._process is not None and self._process.poll() is None
 
     def start(self) -> None:
@@ -165,7 +165,7 @@ class Server:
             time.sleep(0.01)
 
     def _spawn(self, log: IO[bytes]) -> subprocess.Popen[bytes]:
-        # Its own session: Ctrl-C in a terminal is for whoever started it, who stops it in the right order.
+        # Its own session, so that Ctrl-C reaches only the process that started it, which stops it in the right order.
         return subprocess.Popen(  # noqa: S603  # a fixed command, no shell
             self.program.command,
             stdin=subprocess.DEVNULL,
@@ -176,7 +176,7 @@ class Server:
         )
 
     def stop(self) -> None:
-        """End it in good order (SIGTERM), or by force when it does not end within 5 s."""
+        """Stop it with SIGTERM, after 5 s with SIGKILL."""
         if self._process is None:
             return
         self._process.terminate()
@@ -187,14 +187,14 @@ class Server:
         self._process = None
 
     def kill(self) -> None:
-        """End it as a crash would (SIGKILL)."""
+        """End it with SIGKILL, as a crash would."""
         if self._process is not None:
             self._process.kill()
             self._process.wait()
             self._process = None
 
     def restart(self) -> None:
-        """Stop it in good order, if it still runs, and start it again on the same port with the same data."""
+        """Stop it, if it is running, and start it again on the same port with the same data."""
         self.stop()
         self.start()
 
@@ -215,21 +215,21 @@ def _start(folder: Path, port: int, program: Callable[[Path, int], ServerProgram
         try:
             return Server(program(folder, free_port(taken)), folder)
         except ServerError:
-            # Somebody took the port first; whatever else is wrong, the last attempt says.
+            # Another process probably took the port; any other error is raised by the last attempt.
             continue
     return Server(program(folder, free_port(taken)), folder)
 
 
 def start_mosquitto(folder: Path, port: int = 0, *, extra: str = "") -> Server:
-    """Start an MQTT broker for anonymous clients; `extra` lines end its configuration. Port 0 takes a free one."""
-    return _start(folder, port, lambda place, chosen: mosquitto_program(place, chosen, extra=extra))
+    """Start an MQTT broker for anonymous clients; `extra` is appended to its configuration. Port 0: any free port."""
+    return _start(folder, port, lambda folder, port: mosquitto_program(folder, port, extra=extra))
 
 
 def start_redis(folder: Path, port: int = 0) -> Server:
-    """Start a Redis whose acknowledged writes survive a crash. Port 0 takes a free one."""
+    """Start a Redis whose acknowledged writes survive a crash. Port 0: any free port."""
     return _start(folder, port, redis_program)
 
 
 def start_router(folder: Path, port: int = 0) -> Server:
-    """Start a zenoh router (`python -m fog_runtime.router`). Port 0 takes a free one."""
-    return _start(folder, port, lambda _, chosen: router_program(chosen))
+    """Start a zenoh router (`python -m fog_runtime.router`). Port 0: any free port."""
+    return _start(folder, port, lambda _, port: router_program(port))

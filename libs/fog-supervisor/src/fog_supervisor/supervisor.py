@@ -1,4 +1,4 @@
-"""Keeps programs running as systemd or a container engine would: starts, restarts with backoff, ends all of a group."""
+"""Supervision of programs, as systemd does it: start, restart with backoff, end whole process groups."""
 
 import asyncio
 import contextlib
@@ -16,31 +16,31 @@ _CHILD: Final = Path(__file__).with_name("child.py")
 BACKOFF_MIN_S: Final = 0.2
 BACKOFF_MAX_S: Final = 5.0
 STABLE_S: Final = 10.0
-"""A program that ran this long starts again with the shortest delay."""
+"""A program that ran this long is restarted with the shortest delay."""
 END_TIMEOUT_S: Final = 5.0
-_SWEEP_TIMEOUT_S: Final = 1.0
+_LEFTOVERS_TIMEOUT_S: Final = 1.0
 _POLL_S: Final = 0.05
 _LOG_TAIL: Final = 15
 
-What = Literal["started", "died", "stopped", "killed"]
+EventKind = Literal["started", "exited", "stopped", "killed"]
 
 
 @dataclass(frozen=True)
 class Event:
-    """Something that happened to a program; `at` is in monotonic seconds."""
+    """A change of a program's state; `time_s` is in monotonic seconds."""
 
     program: str
-    what: What
+    kind: EventKind
     detail: str
-    at: float
+    time_s: float
 
 
 class NotReadyError(RuntimeError):
-    """A program did not get ready in time; the message names it, what it misses and the end of its log."""
+    """A program was not ready in time; the message names it, what it waits for and the end of its log."""
 
 
 async def always_ready() -> str | None:
-    """Readiness of a program that has none."""
+    """Readiness check of a program without one."""
     return None
 
 
@@ -50,9 +50,9 @@ def _nothing() -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Program:
-    """What to run. `ready` says what is still missing, or None; `before` runs before each start.
+    """A program to run. `ready` returns what it still waits for, or None; `before` is called before each start.
 
-    Programs of a higher `rank` are ended first.
+    Programs with a higher `rank` are stopped first.
     """
 
     name: str
@@ -64,8 +64,8 @@ class Program:
     rank: int = 0
 
 
-class _Kept:
-    """A program with its life."""
+class _Supervised:
+    """A program with its process and the task that restarts it."""
 
     def __init__(self, program: Program) -> None:
         self.program = program
@@ -73,19 +73,19 @@ class _Kept:
         self.process: asyncio.subprocess.Process | None = None
         self.task: asyncio.Task[None] | None = None
         self.starts = 0
-        self.why = ""
+        self.last_exit = ""
 
 
 def log_tail(path: Path, lines: int = _LOG_TAIL) -> str:
-    """Return the last lines of a log, for messages."""
+    """Return the last lines of a log file."""
     try:
         return "\n".join(path.read_text("utf-8", "replace").splitlines()[-lines:])
     except FileNotFoundError:
-        return "(it logged nothing)"
+        return "(the log is empty)"
 
 
 def _signal_group(group: int, number: int) -> bool:
-    """Send a signal to every process of a group; False when it has none left."""
+    """Send a signal to every process of a group; False when the group is empty."""
     try:
         os.killpg(group, number)
     except ProcessLookupError:
@@ -94,10 +94,10 @@ def _signal_group(group: int, number: int) -> bool:
 
 
 async def _end_leftovers(group: int) -> None:
-    """End what the leader of a group left behind, as systemd does with a service's control group."""
+    """End the processes that a group's leader left behind, as systemd does with a service's control group."""
     if not _signal_group(group, signal.SIGTERM):
         return
-    deadline = time.monotonic() + _SWEEP_TIMEOUT_S
+    deadline = time.monotonic() + _LEFTOVERS_TIMEOUT_S
     while time.monotonic() < deadline:
         if not _signal_group(group, 0):
             return
@@ -106,14 +106,14 @@ async def _end_leftovers(group: int) -> None:
 
 
 class Supervisor:
-    """Runs programs, each in a process group of its own; leaving the context ends them all.
+    """Runs programs, each in its own process group; leaving the context stops them all.
 
     `on_event` is called on the loop's thread.
     """
 
     def __init__(self, on_event: Callable[[Event], None]) -> None:
         self._on_event = on_event
-        self._kept: dict[str, _Kept] = {}
+        self._programs: dict[str, _Supervised] = {}
 
     async def __aenter__(self) -> Self:
         return self
@@ -124,60 +124,60 @@ class Supervisor:
         await self.close()
 
     def add(self, program: Program) -> None:
-        """Make a program known; it does not run yet."""
-        if program.name in self._kept:
-            raise ValueError(f"there is a program {program.name} already")
-        self._kept[program.name] = _Kept(program)
+        """Add a program without starting it."""
+        if program.name in self._programs:
+            raise ValueError(f"there is already a program {program.name!r}")
+        self._programs[program.name] = _Supervised(program)
 
     @property
     def names(self) -> list[str]:
         """The programs, in the order in which they were added."""
-        return list(self._kept)
+        return list(self._programs)
 
     def pid(self, name: str) -> int | None:
         """Process id of the running program, or None."""
-        process = self._of(name).process
+        process = self._get(name).process
         return process.pid if process is not None else None
 
     def starts(self, name: str) -> int:
         """How often the program was started."""
-        return self._of(name).starts
+        return self._get(name).starts
 
     def start(self, name: str) -> None:
-        """Run the program from now on, and again whenever it ends; nothing happens when it runs already."""
-        kept = self._of(name)
-        if kept.task is None or kept.task.done():
-            kept.wanted = True
-            kept.task = asyncio.create_task(self._keep(kept), name=f"keep {name}")
+        """Start the program and restart it whenever it exits; does nothing while it runs."""
+        supervised = self._get(name)
+        if supervised.task is None or supervised.task.done():
+            supervised.wanted = True
+            supervised.task = asyncio.create_task(self._supervise(supervised), name=f"supervise {name}")
 
     async def stop(self, name: str) -> None:
-        """End the program with SIGTERM, then with SIGKILL; it stays stopped."""
-        kept = self._of(name)
-        kept.wanted = False
-        if kept.task is None:
+        """Stop the program with SIGTERM, after a timeout with SIGKILL; it is not restarted."""
+        supervised = self._get(name)
+        supervised.wanted = False
+        if supervised.task is None:
             return
-        if kept.process is None:
-            # It waits for its next start.
-            kept.task.cancel()
+        if supervised.process is None:
+            # It waits for its restart.
+            supervised.task.cancel()
         else:
-            _signal_group(kept.process.pid, signal.SIGTERM)
-            # A stopped process (SIGSTOP) would never see the signal.
-            _signal_group(kept.process.pid, signal.SIGCONT)
-            await asyncio.wait({kept.task}, timeout=END_TIMEOUT_S)
-            if not kept.task.done() and kept.process is not None:
-                _signal_group(kept.process.pid, signal.SIGKILL)
+            _signal_group(supervised.process.pid, signal.SIGTERM)
+            # A process that SIGSTOP has paused would never handle the signal.
+            _signal_group(supervised.process.pid, signal.SIGCONT)
+            await asyncio.wait({supervised.task}, timeout=END_TIMEOUT_S)
+            if not supervised.task.done() and supervised.process is not None:
+                _signal_group(supervised.process.pid, signal.SIGKILL)
         with contextlib.suppress(asyncio.CancelledError):
-            await kept.task
-        kept.task = None
+            await supervised.task
+        supervised.task = None
 
     def kill(self, name: str, number: signal.Signals = signal.SIGKILL) -> int:
-        """Send a signal to the program itself (not to its children) and return its pid; if it dies it is restarted."""
-        kept = self._of(name)
-        if kept.process is None:
-            raise ProcessLookupError(f"{name} does not run")
-        os.kill(kept.process.pid, number)
-        self._say(kept, "killed", f"sent {number.name} to pid {kept.process.pid}")
-        return kept.process.pid
+        """Send a signal to the program (not to its children) and return its pid; it is restarted if it exits."""
+        supervised = self._get(name)
+        if supervised.process is None:
+            raise ProcessLookupError(f"{name} is not running")
+        os.kill(supervised.process.pid, number)
+        self._emit(supervised, "killed", f"sent {number.name} to pid {supervised.process.pid}")
+        return supervised.process.pid
 
     async def restart(self, name: str) -> None:
         """Stop the program and start it again."""
@@ -185,54 +185,54 @@ class Supervisor:
         self.start(name)
 
     async def missing(self, names: Iterable[str]) -> dict[str, str]:
-        """Return what each of the programs still misses; those that are ready are left out."""
+        """Return what each of the programs waits for, without those that are ready."""
         found = {}
         for name in names:
-            kept = self._of(name)
-            why = "it does not run" if kept.process is None else await kept.program.ready()
-            if why is not None:
-                found[name] = why
+            supervised = self._get(name)
+            reason = "it is not running" if supervised.process is None else await supervised.program.ready()
+            if reason is not None:
+                found[name] = reason
         return found
 
     async def wait_ready(self, names: Iterable[str], timeout_s: float) -> None:
-        """Wait until the programs are ready; raises `NotReadyError` when the time (real seconds) is over."""
-        left = list(names)
+        """Wait until the programs are ready; raises `NotReadyError` after `timeout_s` real seconds."""
+        remaining = list(names)
         deadline = time.monotonic() + timeout_s
         while True:
-            found = await self.missing(left)
-            if not found:
+            not_ready = await self.missing(remaining)
+            if not not_ready:
                 return
-            left = list(found)
+            remaining = list(not_ready)
             if time.monotonic() > deadline:
-                raise NotReadyError("\n".join(self._complaint(name, why) for name, why in found.items()))
+                raise NotReadyError("\n".join(self._not_ready_text(name, reason) for name, reason in not_ready.items()))
             await asyncio.sleep(_POLL_S)
 
     async def close(self) -> None:
-        """End every program, those of a higher rank first."""
-        for rank in sorted({kept.program.rank for kept in self._kept.values()}, reverse=True):
-            same = [name for name, kept in self._kept.items() if kept.program.rank == rank]
-            await asyncio.gather(*(self.stop(name) for name in same))
+        """Stop every program, those with a higher rank first."""
+        for rank in sorted({supervised.program.rank for supervised in self._programs.values()}, reverse=True):
+            names = [name for name, supervised in self._programs.items() if supervised.program.rank == rank]
+            await asyncio.gather(*(self.stop(name) for name in names))
 
-    async def _keep(self, kept: _Kept) -> None:
+    async def _supervise(self, supervised: _Supervised) -> None:
         delay = BACKOFF_MIN_S
         while True:
-            begun = time.monotonic()
-            process = await self._spawn(kept)
+            started = time.monotonic()
+            process = await self._spawn(supervised)
             code = await process.wait()
-            kept.process = None
+            supervised.process = None
             await _end_leftovers(process.pid)
-            how = f"exit code {code}" if code >= 0 else f"ended by {signal.Signals(-code).name}"
-            if not kept.wanted:
-                self._say(kept, "stopped", how)
+            exit_text = f"exit code {code}" if code >= 0 else f"ended by {signal.Signals(-code).name}"
+            if not supervised.wanted:
+                self._emit(supervised, "stopped", exit_text)
                 return
-            kept.why = how
-            delay = BACKOFF_MIN_S if time.monotonic() - begun >= STABLE_S else min(delay, BACKOFF_MAX_S)
-            self._say(kept, "died", f"{how}; starting again in {delay:.1f} s")
+            supervised.last_exit = exit_text
+            delay = BACKOFF_MIN_S if time.monotonic() - started >= STABLE_S else min(delay, BACKOFF_MAX_S)
+            self._emit(supervised, "exited", f"{exit_text}; restarting in {delay:.1f} s")
             await asyncio.sleep(delay)
             delay *= 2
 
-    async def _spawn(self, kept: _Kept) -> asyncio.subprocess.Process:
-        program = kept.program
+    async def _spawn(self, supervised: _Supervised) -> asyncio.subprocess.Process:
+        program = supervised.program
         program.before()
         with program.log.open("ab") as log:
             process = await asyncio.create_subprocess_exec(
@@ -248,21 +248,24 @@ class Supervisor:
                 env=dict(program.environment),
                 start_new_session=True,
             )
-        kept.process = process
-        kept.starts += 1
-        self._say(kept, "started", f"pid {process.pid}")
+        supervised.process = process
+        supervised.starts += 1
+        self._emit(supervised, "started", f"pid {process.pid}")
         return process
 
-    def _of(self, name: str) -> _Kept:
+    def _get(self, name: str) -> _Supervised:
         try:
-            return self._kept[name]
+            return self._programs[name]
         except KeyError:
-            raise KeyError(f"there is no program {name!r}; there are {', '.join(self._kept)}") from None
+            raise KeyError(f"there is no program {name!r}; use one of: {', '.join(self._programs)}") from None
 
-    def _say(self, kept: _Kept, what: What, detail: str) -> None:
-        self._on_event(Event(kept.program.name, what, detail, time.monotonic()))
+    def _emit(self, supervised: _Supervised, kind: EventKind, detail: str) -> None:
+        self._on_event(Event(supervised.program.name, kind, detail, time.monotonic()))
 
-    def _complaint(self, name: str, why: str) -> str:
-        kept = self._of(name)
-        ended = f" (it was started {kept.starts} times; last: {kept.why})" if kept.starts > 1 else ""
-        return f"{name} is not ready: {why}{ended}. The end of {kept.program.log}:\n{log_tail(kept.program.log)}"
+    def _not_ready_text(self, name: str, reason: str) -> str:
+        supervised = self._get(name)
+        restarts = (
+            f" (started {supervised.starts} times; last exit: {supervised.last_exit})" if supervised.starts > 1 else ""
+        )
+        log = supervised.program.log
+        return f"{name} is not ready: {reason}{restarts}. The end of {log}:\n{log_tail(log)}"

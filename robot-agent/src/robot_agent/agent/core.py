@@ -2,7 +2,7 @@
 
 Values and times go in, values come out. `now` is the robot's own monotonic clock (s), by which every age is judged;
 `stamp` is the wall clock (s) and only names moments for people and traces. Whoever runs the core
-- hands it every message of `handlers()` and every query of `answerers()`, and what base and lidar send;
+- hands it every message of `handlers()` and every query of `query_handlers()`, and what base and lidar send;
 - calls `stream` 20 times a second and sends the wheel command to the guardian;
 - runs `decide(control_job(now))` 5 times a second, on a thread if it likes, and hands the decision to `accept`;
 - calls `tick` 10 times a second and publishes what it returns;
@@ -38,7 +38,7 @@ from robot_agent.odometry import EncoderFault, Odometry
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from fog_contracts.handlers import Answerer, Handler, Ids, Moment, Publication
+    from fog_contracts.handlers import Handler, Ids, Moment, Publication, QueryHandler
     from fog_contracts.messages import (
         CommandReply,
         MapDelta,
@@ -101,7 +101,7 @@ class AgentCore:
             ch.ROBOT_PATH: self._on_path,
         }
 
-    def answerers(self) -> Mapping[ch.Channel, Answerer]:
+    def query_handlers(self) -> Mapping[ch.Channel, QueryHandler]:
         """Return what answers every query that the robot serves."""
         return {ch.ROBOT_COMMAND: self._on_command}
 

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from fog_contracts.channels import Channel
-    from fog_contracts.handlers import Answerer, Handler, Ids, Moment, Publication
+    from fog_contracts.handlers import Handler, Ids, Moment, Publication, QueryHandler
     from fog_contracts.messages import Message
     from robot_agent.motion.local_planner import Job
 
@@ -242,9 +242,12 @@ class LoggedAgent(AgentCore):
         """Return the core's handlers, each of which logs what it takes and returns."""
         return {channel: partial(self._handle, channel, handler) for channel, handler in super().handlers().items()}
 
-    def answerers(self) -> Mapping[Channel, Answerer]:
-        """Return the core's answerers, each of which logs what it is asked and answers."""
-        return {channel: partial(self._answer, channel, answerer) for channel, answerer in super().answerers().items()}
+    def query_handlers(self) -> Mapping[Channel, QueryHandler]:
+        """Return the core's query_handlers, each of which logs what it is asked and answers."""
+        return {
+            channel: partial(self._answer, channel, query_handler)
+            for channel, query_handler in super().query_handlers().items()
+        }
 
     def _handle(
         self, channel: Channel, handler: Handler, ids: Ids, message: Message, at: Moment
@@ -252,10 +255,10 @@ class LoggedAgent(AgentCore):
         self._write(MessageReceived(channel=channel.name, ids=dict(ids), message=message, now=at.now, stamp=at.stamp))
         return self._log_publications(handler(ids, message, at))
 
-    def _answer(self, channel: Channel, answerer: Answerer, ids: Ids, request: Any, at: Moment) -> Message:
+    def _answer(self, channel: Channel, query_handler: QueryHandler, ids: Ids, request: Any, at: Moment) -> Message:
         logged = self._without_secret(request) if channel is ch.ROBOT_COMMAND else request
         self._write(QueryReceived(channel=channel.name, ids=dict(ids), request=logged, now=at.now, stamp=at.stamp))
-        reply = answerer(ids, request, at)
+        reply = query_handler(ids, request, at)
         self._write(Answered(reply=reply))
         return reply
 

@@ -158,7 +158,7 @@ class _Run:
             self._agent.handlers()[channel](entry.ids, msgspec.convert(entry.message, channel.message), at)
         else:
             request = None if channel.message is None else msgspec.convert(entry.request, channel.message)
-            self._agent.answerers()[channel](entry.ids, request, at)
+            self._agent.query_handlers()[channel](entry.ids, request, at)
 
     def _load(self, entry: log.SnapshotLoaded | log.PoseRestored) -> None:
         if isinstance(entry, log.PoseRestored):

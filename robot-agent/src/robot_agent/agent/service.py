@@ -155,11 +155,11 @@ class Service:
     def subscribe(self) -> None:
         """Register subscriptions and queries."""
         self._edges.subscribe(self._core.handlers(), self._publish, only={"robot": self._robot})
-        commands = {**self._core.answerers(), ch.ROBOT_COMMAND: self._on_command}
+        commands = {**self._core.query_handlers(), ch.ROBOT_COMMAND: self._on_command}
         self._edges.serve(commands, robot=self._robot)
 
     def _on_command(self, ids: Ids, command: RobotCommand, at: Moment) -> CommandReply:
-        reply = self._core.answerers()[ch.ROBOT_COMMAND](ids, command, at)
+        reply = self._core.query_handlers()[ch.ROBOT_COMMAND](ids, command, at)
         assert isinstance(reply, CommandReply)
         _log.info("command", kind=command.kind, operator=command.operator, accepted=reply.accepted, reason=reply.reason)
         return reply
@@ -177,7 +177,7 @@ class Service:
     async def _fetch(self) -> bool:
         """Ask for a snapshot and load it; False when there was none, or no good one."""
         try:
-            snapshot = await self._zenoh.ask(ch.MAP_SNAPSHOT, None, MapSnapshot, SNAPSHOT_TIMEOUT_S)
+            snapshot = await self._zenoh.query(ch.MAP_SNAPSHOT, None, MapSnapshot, SNAPSHOT_TIMEOUT_S)
             if snapshot is None:
                 return False
             self._core.load(snapshot, self._clock.now())

@@ -47,7 +47,7 @@ async def main() -> None:
             if was_read:
                 service.store_was_read()
             service.subscribe()
-            zenoh.alive("hazard-aggregator", site)
+            zenoh.declare_liveliness("hazard-aggregator", site)
             app = make_api(service, loaded.map.geometry, clock, health, load_tokens(settings.tokens_file))
             async with asyncio.TaskGroup() as tasks:
                 tasks.create_task(mqtt.run(), name="mqtt")

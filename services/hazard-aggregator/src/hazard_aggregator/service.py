@@ -143,8 +143,8 @@ class Service:
     async def write_loop(self) -> None:
         """Store hazards, again and again until Redis took them; what was withheld for it is then announced."""
         await self._store_read.wait()
-        if weakness := await self._store.weakness():
-            _log.warning("store_is_weak", remedy=weakness)
+        if warning := await self._store.durability_warning():
+            _log.warning("store_is_weak", remedy=warning)
         while True:
             await self._write.wait()
             self._write.clear()

@@ -48,7 +48,7 @@ async def main() -> None:
         ) as zenoh:
             service = Service(core, store, mqtt, zenoh, clock, health)
             service.subscribe()
-            zenoh.alive("map-service", site)
+            zenoh.declare_liveliness("map-service", site)
             app = make_api(service, loaded.site, clock, health, load_tokens(settings.tokens_file))
             async with asyncio.TaskGroup() as tasks:
                 tasks.create_task(mqtt.run(), name="mqtt")

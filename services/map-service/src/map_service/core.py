@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from fog_contracts.channels import Channel
     from fog_contracts.costs import Inflation
-    from fog_contracts.handlers import Answerer, Handler, Ids, Moment
+    from fog_contracts.handlers import Handler, Ids, Moment, QueryHandler
     from fog_contracts.messages import AreaDefinition, MapSnapshot, Zone
     from map_service.costmap import StaticMap
     from map_service.layers.base import CostLayer
@@ -113,7 +113,7 @@ class MapCore:
                 listening.setdefault(channel, []).append(handler)
         return {channel: self._input(handlers) for channel, handlers in listening.items()}
 
-    def answerers(self) -> Mapping[Channel, Answerer]:
+    def query_handlers(self) -> Mapping[Channel, QueryHandler]:
         """Return who answers queries, once the map is served."""
         return {ch.MAP_SNAPSHOT: self._snapshot, ch.ZONES: self._zone_set, ch.HAZARD: self._hazard}
 

@@ -72,7 +72,7 @@ class Service:
     def subscribe(self) -> None:
         """Register the core's handlers; call before the connections run."""
         self._edges.subscribe(self.core.handlers(), self._publish)
-        self._zenoh.watch_live(self._on_live)
+        self._zenoh.subscribe_liveliness(self._on_live)
 
     def _on_live(self, role: str, name: str, alive: bool) -> None:  # noqa: FBT001  # the edge's callback
         if role == AGGREGATOR:
@@ -86,8 +86,8 @@ class Service:
             self._publish(self.core.tick(at))
             if self.core.serving and not self._answering:
                 self._answering = True
-                answerers = self.core.answerers()
-                self._edges.serve({channel: answerers[channel] for channel in (ch.MAP_SNAPSHOT, ch.ZONES)})
+                query_handlers = self.core.query_handlers()
+                self._edges.serve({channel: query_handlers[channel] for channel in (ch.MAP_SNAPSHOT, ch.ZONES)})
             self._health.set("map", ok=self.core.serving, detail=self.core.missing())
             self._health.set("mqtt", ok=connected, detail="" if connected else "no broker")
 
@@ -163,8 +163,8 @@ class Service:
             try:
                 if self._in_doubt or not self.core.zones_are_read:
                     await self.read_zones()
-                    if weakness := await self._store.weakness():
-                        _log.warning("store_is_weak", remedy=weakness)
+                    if warning := await self._store.durability_warning():
+                        _log.warning("store_is_weak", remedy=warning)
                 else:
                     await self._store.ping()
                     self._health.set("store", ok=True)
@@ -186,7 +186,7 @@ class Service:
             self._edges.publish(publication)
             if publication.channel is ch.HAZARD and publication.ids["area"] not in self._answered_areas:
                 self._answered_areas.add(publication.ids["area"])
-                self._edges.serve({ch.HAZARD: self.core.answerers()[ch.HAZARD]}, **publication.ids)
+                self._edges.serve({ch.HAZARD: self.core.query_handlers()[ch.HAZARD]}, **publication.ids)
 
     def _count_delta(self, delta: MapDelta) -> None:
         DELTA_BYTES.observe(len(delta.cells))

@@ -41,7 +41,7 @@ async def main() -> None:
     ):
         service = Service(PlannerCore(await store.begin_epoch("planner"), config), store, zenoh, clock, health)
         service.subscribe()
-        zenoh.alive("planner", site)
+        zenoh.declare_liveliness("planner", site)
         app = make_api(service, loaded.site, health, load_tokens(settings.tokens_file))
         try:
             async with asyncio.TaskGroup() as tasks:

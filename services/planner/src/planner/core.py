@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from fog_contracts.grid import GridGeometry
-    from fog_contracts.handlers import Answerer, Handler, Ids, Moment
+    from fog_contracts.handlers import Handler, Ids, Moment, QueryHandler
     from fog_contracts.messages import (
         EgressRequest,
         MapDelta,
@@ -247,7 +247,7 @@ class PlannerCore:
 
     # --- Questions: answered without side effects -------------------------------------------------------------------
 
-    def answerers(self) -> Mapping[ch.Channel, Answerer]:
+    def query_handlers(self) -> Mapping[ch.Channel, QueryHandler]:
         """Return what answers every query that the planner serves."""
         return {ch.PLANNER_PLAN: self._answer_plan, ch.PLANNER_EGRESS: self._answer_egress}
 

@@ -37,7 +37,7 @@ from planner.store import StoredGoal, StoreError
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Sequence
 
-    from fog_contracts.handlers import Answerer, Handler, Ids, Moment, Publication
+    from fog_contracts.handlers import Handler, Ids, Moment, Publication, QueryHandler
     from fog_contracts.messages import Message
     from fog_runtime.clock import Clock
     from fog_runtime.health import Health
@@ -113,8 +113,8 @@ class Service:
         """Register subscriptions and queries."""
         handlers = {channel: self._dated(channel, handler) for channel, handler in self._core.handlers().items()}
         self._edges.subscribe(handlers, self._publish)
-        for channel, answerer in self._core.answerers().items():
-            self._zenoh.serve(channel, partial(self._answer, answerer))
+        for channel, query_handler in self._core.query_handlers().items():
+            self._zenoh.serve(channel, partial(self._answer, query_handler))
 
     def _dated(self, channel: ch.Channel, handler: Handler) -> Handler:
         """Return a handler that leaves its message, dated now, for the core's next turn, in order of arrival."""
@@ -140,12 +140,12 @@ class Service:
     async def _in_core(self, function: Callable[[], T]) -> T:
         return await asyncio.get_running_loop().run_in_executor(self._thread, function)
 
-    async def _answer(self, answerer: Answerer, ids: Ids, request: Any) -> Message:
-        return await self._in_core(partial(answerer, ids, request, self._edges.now()))
+    async def _answer(self, query_handler: QueryHandler, ids: Ids, request: Any) -> Message:
+        return await self._in_core(partial(query_handler, ids, request, self._edges.now()))
 
     async def preview(self, request: PlanRequest) -> PlanReply:
         """Plan without side effects."""
-        reply = await self._answer(self._core.answerers()[ch.PLANNER_PLAN], {}, request)
+        reply = await self._answer(self._core.query_handlers()[ch.PLANNER_PLAN], {}, request)
         assert isinstance(reply, PlanReply)
         return reply
 
@@ -229,7 +229,7 @@ class Service:
                 self._wants_map.clear()
                 continue
             try:
-                snapshot = await self._zenoh.ask(ch.MAP_SNAPSHOT, None, MapSnapshot, SNAPSHOT_TIMEOUT_S)
+                snapshot = await self._zenoh.query(ch.MAP_SNAPSHOT, None, MapSnapshot, SNAPSHOT_TIMEOUT_S)
                 if snapshot is not None:
                     await self._in_core(partial(self._core.load, snapshot, self._clock.now()))
                     self._wants_map.clear()

@@ -21,7 +21,7 @@ SOLID = (STATIC == 254).astype(np.uint8)
 PLACES = [Pose2(5.0, 2.0, 1.0), Pose2(12.0, 8.0, -2.0), Pose2(3.5, 3.5, 0.3), Pose2(9.0, 1.5, 3.0)]
 
 
-def look(pose_at, begin, end, *, solid=SOLID, noise=0.0, seed=0, repeats=1):
+def look(pose_at, begin, end, *, solid=SOLID, noise=0.0, seed=0, repeats=1):  # noqa: PLR0913  # each has a default
     """One turn, clockwise, each beam cast from where the robot is at its own time."""
     rng = np.random.default_rng(seed)
     times = np.linspace(begin, end, 360)

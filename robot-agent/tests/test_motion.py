@@ -20,7 +20,7 @@ CONFIG = MotionConfig()
 EIGHT = np.array([(1.0, 1.0), (4.0, 4.0), (4.0, 1.0), (1.0, 4.0)])
 
 
-def job(follower, pose, *, cost=None, speed=None, seen=(), cap=0.3, speeds=(0.2, 0.0), theta=None):
+def job(follower, pose, *, cost=None, speed=None, seen=(), cap=0.3, speeds=(0.2, 0.0), theta=None):  # noqa: PLR0913  # each has a default
     return make_job(
         follower,
         plan_id=1,

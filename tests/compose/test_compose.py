@@ -359,7 +359,7 @@ def test_a_fog_node_needs_less_than_a_gigabyte(sim: Project, record_property: Ca
         used[services[found[1]]] = float(found[2]) * unit[found[3]]
     for name, mebibytes in used.items():
         record_property(f"{name} MiB", round(mebibytes))
-    print({name: f"{mebibytes:.0f} MiB" for name, mebibytes in sorted(used.items())})  # noqa: T201
+    print({name: f"{mebibytes:.0f} MiB" for name, mebibytes in sorted(used.items())})  # noqa: T201  # what `pytest -s` is asked for
     assert set(used) == {*FOG, "sim-robot"}
     assert sum(used[name] for name in FOG) < 1024
 

@@ -132,7 +132,7 @@ def check_command(*, json: Json = False) -> None:
 
 
 @app.command("demo", epilog="Example: fognav demo --headless --report report.json --seed 7")
-def demo_command(
+def demo_command(  # noqa: PLR0913  # each option is an argument
     *,
     headless: Annotated[bool, typer.Option("--headless", help="No terminal view and no page: for machines.")] = False,
     report: Annotated[Path | None, typer.Option("--report", metavar="F", help="Write the report (JSON) here.")] = None,

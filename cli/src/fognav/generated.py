@@ -5,7 +5,7 @@ The services' apps are built over no service at all: describing their routes cal
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 from fog_contracts.generate.header import firmware_header
 from fog_contracts.generate.markdown import OpenApi, channels_markdown
@@ -24,9 +24,9 @@ WRITE: Final = "./fognav channels --write"
 def rest_routes() -> dict[str, OpenApi]:
     """Return each service's OpenAPI description by the service's name."""
     # The services bring kernels and web frameworks with them: only who asks for the routes waits for these.
-    from hazard_aggregator.api import make_api as make_aggregator  # noqa: PLC0415
-    from map_service.api import make_api as make_map  # noqa: PLC0415
-    from planner.api import make_api as make_planner  # noqa: PLC0415
+    from hazard_aggregator.api import make_api as make_aggregator  # noqa: PLC0415  # see above
+    from map_service.api import make_api as make_map  # noqa: PLC0415  # same
+    from planner.api import make_api as make_planner  # noqa: PLC0415  # same
 
     loaded = load_site(checkout.site_folder(None))
     clock, health, tokens = SystemClock(), Health(), Tokens()
@@ -41,7 +41,7 @@ def rest_routes() -> dict[str, OpenApi]:
 class _NoService:
     """Stands where a service would: an app may look into it when it is built, but nothing is ever called."""
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> Self:
         return self
 
 

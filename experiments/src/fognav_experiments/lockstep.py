@@ -90,7 +90,7 @@ class LockstepResult(msgspec.Struct, frozen=True, kw_only=True):
 class _Drive:
     """One run: rigs, scenario and what is written down about it."""
 
-    def __init__(
+    def __init__(  # noqa: PLR0913  # each is a part that it is put together from
         self,
         site: LoadedSite,
         start: Pose,
@@ -286,7 +286,7 @@ class _Drive:
         )
 
 
-def run_lockstep(
+def run_lockstep(  # noqa: PLR0913  # the options of a run
     site: LoadedSite,
     start: Pose,
     goal: Place,

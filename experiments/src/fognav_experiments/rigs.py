@@ -61,7 +61,7 @@ def moment(now: float) -> Moment:
 class RobotRig:
     """Simulated hardware, guardian and agent of one robot, as its three processes connect them."""
 
-    def __init__(
+    def __init__(  # noqa: PLR0913  # each is a part that it is put together from
         self,
         site: LoadedSite,
         robot: RobotSite,
@@ -197,7 +197,7 @@ class FogRig(Fog):
 class System:
     """A site with its fog, its nodes and one robot, from time zero on."""
 
-    def __init__(
+    def __init__(  # noqa: PLR0913  # each is a part that it is put together from
         self,
         site: LoadedSite,
         robot: RobotSite,

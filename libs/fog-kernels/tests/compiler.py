@@ -28,7 +28,7 @@ def examples(count: int) -> int:
     return count if COMPILED else max(count // 20, 5)
 
 
-class Guarded(np.ndarray):  # type: ignore[type-arg]  # of any shape and type
+class Guarded(np.ndarray):
     """An array that refuses negative indices: kernels compute theirs, so that a negative one is a mistake."""
 
     def __getitem__(self, index: Any) -> Any:

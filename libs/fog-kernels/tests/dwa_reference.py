@@ -116,7 +116,7 @@ def highest_cost(scene: Scene, v: float, w: float, times: NDArray[np.float64], *
     return max(costs[outside:], default=INSCRIBED)
 
 
-def decide(scene: Scene, limits: DwaLimits, settings: DwaSettings) -> list[Arc] | None:
+def decide(scene: Scene, limits: DwaLimits, settings: DwaSettings) -> list[Arc] | None:  # noqa: C901, PLR0912  # it reads as the method is described, in one piece
     """Return all admissible arcs, the best one anywhere among them; None when the goal is reached, heading and all."""
     x, y, theta = scene.pose
     here = scene.cost_at(x, y)

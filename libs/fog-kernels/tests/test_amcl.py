@@ -222,7 +222,7 @@ def track(seed: int, steps: int) -> tuple[list[NDArray[np.float32]], tuple[float
             pose[2] += turn
             pose[0] += 0.2 * math.cos(pose[2])
             pose[1] += 0.2 * math.sin(pose[2])
-        motion_update(x, y, theta, *odometry_delta(before, tuple(odometry)), ALPHAS, state)  # type: ignore[arg-type]  # tuples of three
+        motion_update(x, y, theta, *odometry_delta(before, tuple(odometry)), ALPHAS, state)
         ranges = scan(*truth) + rng.normal(0, 0.02, BEAMS.size)
         weights *= 1.0 + BEAMS.size * score_poses(x, y, theta, FIELD, RESOLUTION, 0.0, 0.0, BEAMS, ranges)
         weights /= weights.sum()
@@ -271,7 +271,7 @@ def test_wrong_arrays_and_states_are_refused_by_name() -> None:
     x, y, theta = cloud(3, 0.0, 0.0, 0.0)
     weights = np.full(3, 1 / 3)
     with pytest.raises(TypeError, match="theta must be float32"):
-        motion_update(x, y, theta.astype(np.float64), 0, 0, 0, ALPHAS, rng_state(1))  # type: ignore[arg-type]  # tested
+        motion_update(x, y, theta.astype(np.float64), 0, 0, 0, ALPHAS, rng_state(1))
     with pytest.raises(ValueError, match="rng_state"):
         motion_update(x, y, theta, 0, 0, 0, ALPHAS, np.zeros(4, np.uint64))
     with pytest.raises(ValueError, match="weights"):

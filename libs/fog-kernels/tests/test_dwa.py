@@ -45,7 +45,7 @@ class Drive:
         return math.hypot(self.log[-1, 1] - goal[0], self.log[-1, 2] - goal[1])
 
 
-def decide(
+def decide(  # noqa: PLR0913  # the kernel's inputs
     costmap: NDArray[np.uint8],
     pose: tuple[float, float, float],
     speeds: tuple[float, float],
@@ -65,7 +65,7 @@ def decide(
     )  # fmt: skip
 
 
-def drive(
+def drive(  # noqa: PLR0913  # the kernel's inputs, and how long
     costmap: NDArray[np.uint8],
     pose: tuple[float, float, float],
     path: list[Point],

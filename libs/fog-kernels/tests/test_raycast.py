@@ -53,7 +53,7 @@ def box_distance(x: float, y: float, angle: float, column: int, row: int) -> flo
     st.floats(-10, 10),
     st.sampled_from([0.02, 0.2, 0.6]),
 )
-def test_ranges_are_the_entry_into_the_first_occupied_cell(
+def test_ranges_are_the_entry_into_the_first_occupied_cell(  # noqa: PLR0913  # one argument per drawn value
     seed: int, height: int, width: int, x: float, y: float, angle: float, density: float
 ) -> None:
     occupied = np.random.default_rng(seed).random((height, width)) < density
@@ -96,4 +96,4 @@ def test_a_lost_pose_is_refused() -> None:
     with pytest.raises(ValueError, match="finite"):
         cast(np.zeros((2, 2), bool), 0.1, 0.0, 0.0, math.nan, 0.0, [0.0], 1.0)
     with pytest.raises(TypeError, match="occupied"):
-        cast(np.zeros((2, 2), np.float64), 0.1, 0.0, 0.0, 0.0, 0.0, [0.0], 1.0)  # type: ignore[arg-type]  # tested
+        cast(np.zeros((2, 2), np.float64), 0.1, 0.0, 0.0, 0.0, 0.0, [0.0], 1.0)

@@ -207,7 +207,7 @@ def test_failed_atomic_write_leaves_the_old_file(tmp_path):
     path = tmp_path / "f"
     atomic_write(path, b"old")
     with pytest.raises(TypeError):
-        atomic_write(path, "no bytes")  # type: ignore[arg-type]
+        atomic_write(path, "no bytes")
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
 

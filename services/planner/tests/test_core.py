@@ -173,7 +173,7 @@ def test_the_plan_is_repeated_twice_a_second_and_more_of_it_released_as_the_robo
     drive.step(2.0)
     assert len(drive.paths) in (4, 5)
     ahead = Route(np.array(first.points), 0.1)
-    drive.at = tuple(float(v) for v in ahead.rest(3.0)[0])  # type: ignore[assignment]
+    drive.at = tuple(float(v) for v in ahead.rest(3.0)[0])
     drive.step(0.6)
     assert drive.paths[-1].plan_id == first.plan_id
     assert drive.paths[-1].released_length == pytest.approx(18.0, abs=0.15)
@@ -506,5 +506,5 @@ def test_whatever_changes_the_path_is_passable_and_no_much_better_one_is_missed(
         # Kept within the share that a clearing must save; 2 % more for what shortcuts and the robot's place differ.
         assert route.cost(cost, geometry, at) <= best / 0.9 * 1.02 + 100.0
         if math.hypot(19.0 - drive.at[0], 7.0 - drive.at[1]) > 4.0:
-            drive.at = tuple(float(v) for v in route.rest(at + ahead)[0])  # type: ignore[assignment]
+            drive.at = tuple(float(v) for v in route.rest(at + ahead)[0])
             drive.step(0.2)

@@ -117,7 +117,7 @@ def test_loading_tells_a_restart_and_a_damaged_snapshot_changes_nothing() -> Non
 
 
 @pytest.mark.parametrize(("side", "touched"), [(0.6, True), (1.0, False)])
-def test_change_beside_the_path_touches_it_within_the_corridor(side: float, touched: bool) -> None:  # noqa: FBT001
+def test_change_beside_the_path_touches_it_within_the_corridor(side: float, touched: bool) -> None:  # noqa: FBT001  # a parameter of pytest
     along = plan((1.0, 1.0), (9.0, 1.0))
     planning_map = current(tracker(Map()))
     beside = change((4.0, 1.0 + side, 4.2, 1.2 + side))
@@ -187,7 +187,7 @@ def test_path_is_kept_unless_another_saves_the_share_that_its_reason_asks() -> N
     cost = straight(kept).cost(planning_map.cost, planning_map.geometry)
 
     def keeps(share: float, reason: str) -> bool:
-        return is_kept(kept, found(cost * share), reason, planning_map, CONFIG)  # type: ignore[arg-type]
+        return is_kept(kept, found(cost * share), reason, planning_map, CONFIG)
 
     assert keeps(0.98, "map")
     assert not keeps(0.96, "map")

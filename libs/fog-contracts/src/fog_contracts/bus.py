@@ -127,7 +127,7 @@ def roundtrip(channel: Channel, message: M, *, reply: bool = False) -> M:
     return decode(channel, encode(channel, message, reply=reply), type(message), reply=reply)
 
 
-def _decoded(channel: Channel, data: bytes) -> Any:
+def _decoded(channel: Channel, data: bytes) -> Any:  # noqa: ANN401  # of the channel's type, which a table of channels can't say
     """Return what a channel's bytes hold, a message or text; raises `ContractError`."""
     return decode_text(channel, data) if channel.message is None else decode(channel, data, channel.message)
 

@@ -8,7 +8,7 @@ import numpy as np
 from numba import types
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike, NDArray
 
 # Inputs are declared read-only, so that arrays made by np.frombuffer fit as well as writable ones.
 U8_GRID = types.Array(types.uint8, 2, "C", readonly=True)
@@ -52,7 +52,7 @@ def exact(array: NDArray[Any], dtype: type[np.generic], ndim: int, name: str) ->
         raise ValueError(f"{name} must be C-ordered: pass np.ascontiguousarray of the view")
 
 
-def vector(values: Any, name: str) -> NDArray[np.float64]:
+def vector(values: ArrayLike, name: str) -> NDArray[np.float64]:
     """Return values as a C-ordered float64 vector; raise ValueError if it has other than one axis."""
     array = np.ascontiguousarray(values, dtype=np.float64)
     if array.ndim != 1:

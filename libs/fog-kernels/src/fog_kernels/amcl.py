@@ -8,6 +8,10 @@ Methods: odometry motion model (Thrun, Burgard and Fox 2005, table 5.6); likelih
 (chapter 6.4); sample size by Kullback-Leibler distance (Fox 2001), drawn with low variance (chapter 4.3).
 """
 
+# Kernels take arrays and scalars, typed by their compiled signatures, and are one piece where a call per cell would
+# cost more than the work that it does.
+# ruff: noqa: ANN401, C901, PLR0912, PLR0913, PLR0915
+
 from __future__ import annotations
 
 import math

@@ -10,6 +10,10 @@ cell is expanded again when a cheaper way to it appears; the search ends only wh
 path. Shortcuts integrate the cost along lines of sight cell by cell (Amanatides and Woo 1987).
 """
 
+# Kernels take arrays and scalars, typed by their compiled signatures, and are one piece where a call per cell would
+# cost more than the work that it does.
+# ruff: noqa: ANN401, C901, PLR0912, PLR0913, PLR0915
+
 from __future__ import annotations
 
 import math

@@ -4,6 +4,10 @@ Method: separable transform, columns first, then the minimum over a window of ea
 cap bounds the window, which makes a plain vectorized minimum faster than lower envelopes.
 """
 
+# Kernels take arrays and scalars, typed by their compiled signatures, and are one piece where a call per cell would
+# cost more than the work that it does.
+# ruff: noqa: ANN401, C901
+
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any

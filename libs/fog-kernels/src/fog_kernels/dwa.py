@@ -8,6 +8,10 @@ so that a path that starts behind the robot isn't reached by a wide arc.
 The tests hold a plain reimplementation of this definition, which a property test compares with the kernel.
 """
 
+# Kernels take arrays and scalars, typed by their compiled signatures, and are one piece where a call per cell would
+# cost more than the work that it does.
+# ruff: noqa: ANN401, C901, PLR0912, PLR0913, PLR0915
+
 from __future__ import annotations
 
 import math
@@ -169,8 +173,8 @@ class _Window(NamedTuple):
     w_high: float
 
 
-_PARAMETERS: Any = types.NamedTuple((*(float64,) * 20, int64, int64), DwaParameters)  # type: ignore[no-untyped-call]  # numba's
-_RESULT: Any = types.NamedTuple((float64, float64, float64, int64), DwaResult)  # type: ignore[no-untyped-call]  # numba's
+_PARAMETERS: Any = types.NamedTuple((*(float64,) * 20, int64, int64), DwaParameters)  # type: ignore[no-untyped-call]  # numba has no types
+_RESULT: Any = types.NamedTuple((float64, float64, float64, int64), DwaResult)  # type: ignore[no-untyped-call]  # numba has no types
 
 # Inlined before compilation: an array that is passed to a compiled function has its references counted at each call,
 # which makes the loop over the arcs twice as slow and more.

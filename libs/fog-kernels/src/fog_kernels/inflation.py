@@ -4,6 +4,10 @@ Costs follow Nav2's inflation layer: 254 on a lethal cell, 253 within the inscri
 Unknown cells (255) stay unknown and are not inflated.
 """
 
+# Kernels take arrays and scalars, typed by their compiled signatures, and are one piece where a call per cell would
+# cost more than the work that it does.
+# ruff: noqa: ANN401, C901, PLR0912, PLR0913, PLR0915
+
 from __future__ import annotations
 
 import math

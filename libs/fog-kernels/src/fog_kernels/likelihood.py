@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-def likelihood_field(
+def likelihood_field(  # noqa: PLR0913  # the field's grid and the sensor's model, as plain numbers
     occupied: NDArray[np.bool_ | np.uint8],
     resolution: float,
     sigma_hit: float = 0.2,

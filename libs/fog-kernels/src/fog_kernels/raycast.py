@@ -1,5 +1,9 @@
 """Ranges to the nearest occupied cell along rays, by exact grid traversal (Amanatides and Woo 1987)."""
 
+# Kernels take arrays and scalars, typed by their compiled signatures, and are one piece where a call per cell would
+# cost more than the work that it does.
+# ruff: noqa: ANN401, C901, PLR0913
+
 from __future__ import annotations
 
 import math

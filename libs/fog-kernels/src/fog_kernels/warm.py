@@ -95,7 +95,7 @@ def warm(profile: str = "all", on_progress: Callable[[int, int, str], None] = la
     ready = 0
     for module, own in names.items():
         before = ready
-        listener = _Compiled(own, lambda done, name: on_progress(before + done, total, f"{module}.{name}"))  # noqa: B023
+        listener = _Compiled(own, lambda done, name: on_progress(before + done, total, f"{module}.{name}"))  # noqa: B023  # called in this pass only
         with event.install_listener("numba:compile", listener):
             importlib.import_module(f"fog_kernels.{module}")
         ready += len(own)

@@ -68,13 +68,13 @@ class Edges:
     def _delivery(
         self, handler: Handler, publish: Callable[[Sequence[Publication]], object]
     ) -> Callable[[dict[str, str], Any], None]:
-        def deliver(ids: dict[str, str], message: Any) -> None:
+        def deliver(ids: dict[str, str], message: object) -> None:
             publish(handler(ids, message, self.now()))
 
         return deliver
 
     def _reply(self, query_handler: QueryHandler) -> Callable[[dict[str, str], Any], Message]:
-        def reply(ids: dict[str, str], request: Any) -> Message:
+        def reply(ids: dict[str, str], request: object) -> Message:
             return query_handler(ids, request, self.now())
 
         return reply

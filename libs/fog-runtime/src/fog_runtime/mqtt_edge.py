@@ -212,7 +212,7 @@ class MqttEdge:
                 self._limited.warning("broker_lost", "broker_lost", self._clock.now(), broker=where, reason=reason)
             finally:
                 self._lost()
-            delay = random.uniform(BACKOFF_S[0], min(BACKOFF_S[1], BACKOFF_S[0] * 2 ** min(failures + 1, 10)))
+            delay = random.uniform(BACKOFF_S[0], min(BACKOFF_S[1], BACKOFF_S[0] * 2 ** min(failures + 1, 10)))  # noqa: S311  # spreads attempts in time, no secret
             failures += 1
             await asyncio.sleep(delay)
 

@@ -57,8 +57,8 @@ def _schema(kind: type[msgspec.Struct]) -> bytes:
     return msgspec.json.encode({**root, "$defs": components})
 
 
-def _finish(writer: Any) -> None:
-    """Write the index and the end of the file (mcap leaves this method untyped)."""
+def _finish(writer: Any) -> None:  # noqa: ANN401  # mcap leaves the method untyped
+    """Write the index and the end of the file."""
     writer.finish()
 
 

@@ -196,7 +196,7 @@ class RedisStore:
         return f"fog:{self._site}:{name}"
 
     @staticmethod
-    async def _ask(command: Awaitable[Any]) -> Any:
+    async def _ask(command: Awaitable[Any]) -> Any:  # noqa: ANN401  # redis does not say what its commands answer
         try:
             return await command
         except (RedisError, OSError) as error:
@@ -207,5 +207,5 @@ def _now_ms() -> int:
     return int(time.time() * 1000)
 
 
-def _text(value: Any) -> str:
+def _text(value: object) -> str:
     return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)

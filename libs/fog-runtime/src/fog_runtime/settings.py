@@ -93,13 +93,13 @@ class InflationSettings(CommonSettings, frozen=True, kw_only=True):
         )
 
 
-def _hook(kind: type, value: Any) -> Any:
+def _hook(kind: type, value: object) -> object:
     if kind in (Path, Secret) and isinstance(value, str):
         return kind(value)
     raise TypeError(f"expected text, not {type(value).__name__}")
 
 
-def _converted(value: object, kind: Any, *, strict: bool, where: str, remedy: str) -> Any:
+def _converted(value: object, kind: Any, *, strict: bool, where: str, remedy: str) -> Any:  # noqa: ANN401  # `int | None` is no `type` to mypy
     try:
         return msgspec.convert(value, kind, strict=strict, dec_hook=_hook)
     except msgspec.ValidationError as error:
@@ -157,7 +157,7 @@ def load_options(cls: type[S], text: str, *, variable: str) -> S:
         raise SettingsError(f"{variable}: {error}. Give a JSON object with any of: {known}") from error
 
 
-def _shown(kind: Any, text: str) -> str:
+def _shown(kind: object, text: str) -> str:
     return "***" if kind is Secret or kind == Secret | None else repr(_PASSWORD.sub(r"\1:***@", text))
 
 

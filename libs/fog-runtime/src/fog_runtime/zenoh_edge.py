@@ -11,7 +11,7 @@ import json
 import random
 import threading
 from collections import deque
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from functools import partial
@@ -65,8 +65,8 @@ def session_config(
     return config
 
 
-def _finish(query: Any) -> None:
-    """Let the asker know that no answer of ours will come any more (`drop` has no types in zenoh's stubs)."""
+def _finish(query: Any) -> None:  # noqa: ANN401  # `drop` has no types in zenoh's stubs
+    """Let the asker know that no answer of ours will come any more."""
     query.drop()
 
 
@@ -428,7 +428,7 @@ class ZenohEdge:
         """Run a call that may block on a thread of the edge's own."""
         await self._loop.run_in_executor(self._threads, function)
 
-    def spawn(self, work: Any) -> None:
+    def spawn(self, work: Coroutine[Any, Any, None]) -> None:
         """Run a coroutine as a task of the edge; it is cancelled when the edge is closed."""
         task: asyncio.Task[None] = self._loop.create_task(work)
         self._tasks.add(task)
@@ -483,7 +483,7 @@ class ZenohEdge:
 
     async def _keep_trying(self, connect: Sequence[str]) -> None:
         while True:
-            await asyncio.sleep(random.uniform(*_RETRY_S))
+            await asyncio.sleep(random.uniform(*_RETRY_S))  # noqa: S311  # spreads attempts in time, no secret
             if await self._attempt(connect):
                 return
 

@@ -255,7 +255,7 @@ class LoggedAgent(AgentCore):
         self._write(MessageReceived(channel=channel.name, ids=dict(ids), message=message, now=at.now, stamp=at.stamp))
         return self._log_publications(handler(ids, message, at))
 
-    def _answer(self, channel: Channel, query_handler: QueryHandler, ids: Ids, request: Any, at: Moment) -> Message:
+    def _answer(self, channel: Channel, query_handler: QueryHandler, ids: Ids, request: Any, at: Moment) -> Message:  # noqa: ANN401  # of the channel's type
         logged = self._without_secret(request) if channel is ch.ROBOT_COMMAND else request
         self._write(QueryReceived(channel=channel.name, ids=dict(ids), request=logged, now=at.now, stamp=at.stamp))
         reply = query_handler(ids, request, at)

@@ -45,7 +45,7 @@ def robot_pose(localizer: Localizer, config: AgentConfig, at: Moment) -> RobotPo
     )
 
 
-def robot_state(
+def robot_state(  # noqa: PLR0913  # a message gathers from all parts of the agent
     safety: SafetyState,
     mission: Mission,
     version: Version | None,

@@ -168,7 +168,8 @@ class Service:
         """Ask for a snapshot whenever the core wants one, less and less often while nobody answers."""
         failures = 0
         while True:
-            await self._clock.sleep(STREAM_S if not failures else random.uniform(0.5, 1.0) * min(2.0**failures / 5, 3))
+            spread = random.uniform(0.5, 1.0)  # noqa: S311  # spreads attempts in time, no secret
+            await self._clock.sleep(STREAM_S if not failures else spread * min(2.0**failures / 5, 3))
             if not self._core.wants_snapshot(self._clock.now()) or await self._fetch():
                 failures = 0
             else:

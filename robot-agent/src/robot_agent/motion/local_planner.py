@@ -193,7 +193,7 @@ def detour(
     return np.vstack((window.centres(way), path[route.along > ahead[clear[0]]]))
 
 
-def make_job(
+def make_job(  # noqa: PLR0913  # a job holds all that a decision rests on
     follower: PathFollower,
     *,
     plan_id: int,

@@ -377,7 +377,7 @@ def _outputs(state: SafetyState, before: Mode, refusal: str | None, config: Safe
     )
 
 
-def limit_wheels(
+def limit_wheels(  # noqa: PLR0913  # the gate knows nothing of the motion's settings
     requested: tuple[float, float],
     last: tuple[float, float],
     outputs: SafetyOutputs,

@@ -18,7 +18,7 @@ from map_service.layers.zones import ZonesLayer
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
-    from typing import Any, Final
+    from typing import Final
 
     from fog_contracts.channels import Channel
     from fog_contracts.costs import Inflation
@@ -41,7 +41,7 @@ class MapCore:
     `hazards_wait_s` is how long the first tick's map waits for the hazards of all areas.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913  # what the map is made of, each with its name
         self,
         site: str,
         static: StaticMap,
@@ -163,7 +163,7 @@ class MapCore:
     # --- Inside -----------------------------------------------------------------------------------------------------
 
     def _input(self, handlers: Sequence[Handler]) -> Handler:
-        def handle(ids: Ids, message: Any, at: Moment) -> list[Publication]:
+        def handle(ids: Ids, message: object, at: Moment) -> list[Publication]:
             return self._commit([p for handler in handlers for p in handler(ids, message, at)], at)
 
         return handle

@@ -47,7 +47,7 @@ class PathSearch:
         self._fields = fields
         self._planner = Planner(geometry.width, geometry.height)
 
-    def find(
+    def find(  # noqa: PLR0911  # one return per reason for a refusal
         self, planning_map: PlanningMap, blocking: Sequence[Region], start: PointXY, goal: PointXY
     ) -> SearchResult:
         """Return the cheapest path between two points (m, frame `map`), or why there is none."""

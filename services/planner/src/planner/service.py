@@ -12,7 +12,7 @@ from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from prometheus_client import Counter, Gauge, Histogram
 
@@ -119,7 +119,7 @@ class Service:
     def _dated(self, channel: ch.Channel, handler: Handler) -> Handler:
         """Return a handler that leaves its message, dated now, for the core's next turn, in order of arrival."""
 
-        def leave(ids: Ids, message: Any, at: Moment) -> Sequence[Publication]:
+        def leave(ids: Ids, message: object, at: Moment) -> Sequence[Publication]:
             self._note(ids, message)
             self._inputs.append(partial(handler, ids, message, at))
             if channel in self._core.URGENT:
@@ -128,7 +128,7 @@ class Service:
 
         return leave
 
-    def _note(self, ids: Ids, message: Message) -> None:
+    def _note(self, ids: Ids, message: object) -> None:
         """Keep what the API shows."""
         if isinstance(message, RobotPose):
             self.poses[ids["robot"]] = message
@@ -140,7 +140,7 @@ class Service:
     async def _in_core(self, function: Callable[[], T]) -> T:
         return await asyncio.get_running_loop().run_in_executor(self._thread, function)
 
-    async def _answer(self, query_handler: QueryHandler, ids: Ids, request: Any) -> Message:
+    async def _answer(self, query_handler: QueryHandler, ids: Ids, request: object) -> Message:
         return await self._in_core(partial(query_handler, ids, request, self._edges.now()))
 
     async def preview(self, request: PlanRequest) -> PlanReply:

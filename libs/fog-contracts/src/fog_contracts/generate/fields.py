@@ -57,7 +57,7 @@ def parts(kind: type[Message]) -> list[type[Message]]:
     return found
 
 
-def type_text(kind: inspect.Type) -> str:
+def type_text(kind: inspect.Type) -> str:  # noqa: C901, PLR0911  # one case per kind of type
     """Return a readable name of a type: `number`, `list (1 to 8) of number or null`, a message's own name."""
     match kind:
         case inspect.Metadata():

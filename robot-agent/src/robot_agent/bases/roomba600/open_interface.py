@@ -489,7 +489,7 @@ class StreamParser:
         self._events.clear()
         self._synced = False
 
-    def _judge(self, at: int) -> _Verdict:
+    def _judge(self, at: int) -> _Verdict:  # noqa: PLR0911  # each way in which bytes are no frame ends it at once
         buffer = self._buffer
         if buffer[at] != STREAM_HEADER:
             return _Verdict.NO_FRAME

@@ -19,7 +19,7 @@ SOURCES = sorted({path.parent for path in ROOT.glob("*/src/*/__init__.py")} | {
 })  # fmt: skip
 
 EDGES = {
-    "fog_runtime", "fog_supervisor", "fognav", "fognav_experiments",
+    "fog_runtime", "fog_supervisor", "fognav", "fognav_experiments.lockstep", "fognav_experiments.rigs",
     "fog_kernels.warm",
     "hazard_aggregator.__main__", "hazard_aggregator.api", "hazard_aggregator.registry", "hazard_aggregator.service",
     "hazard_aggregator.settings", "hazard_aggregator.store",

@@ -20,7 +20,7 @@ from robot_agent.guardian.link import WheelCommand, decode_feedback, encode
 if TYPE_CHECKING:
     import signal
 
-DEADLINE_S = 20.0
+DEADLINE_S = 45.0
 STOP_S = 0.3
 """The limit that the robot's design sets to everything that must stop the wheels."""
 

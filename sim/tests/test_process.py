@@ -43,7 +43,7 @@ start = { x = 1.0, y = 1.5, theta = 0.0 }
 BOX = SimObstacle(id="box", polygon=[(3.5, 1.0), (4.5, 1.0), (4.5, 1.4), (3.5, 1.4)], height=1.0)
 
 
-async def until(condition, what, seconds=20.0):
+async def until(condition, what, seconds=45.0):
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline, what

@@ -1,4 +1,4 @@
-"""Following the map over a network that loses, doubles, delays, reorders and damages, from a writer that restarts.
+"""Following the map over a network that loses, duplicates, delays, reorders and damages, from a writer that restarts.
 
 `FOGNAV_HISTORIES` sets how many random histories are tried.
 """
@@ -20,7 +20,7 @@ from fog_contracts.replica import MapError, MasterMap, TileHashes
 
 HISTORIES = int(os.environ.get("FOGNAV_HISTORIES", "200"))
 WIDTH, HEIGHT = 70, 12  # two tiles
-BEAT_S = 0.1
+HEARTBEAT_S = 0.1
 
 
 def master(epoch=10, seed=0):
@@ -45,47 +45,46 @@ def cells(writer):
     return {layer: grid.copy() for layer, grid in writer.layers.items()}
 
 
-def copied(follower):
+def replica_cells(follower):
     return {"cost": follower.replica.cost, "speed": follower.replica.speed}
 
 
 class Network:
-    """A writer, a follower, and everything that is under way between them."""
+    """A writer, a follower, and the messages in transit between them."""
 
     def __init__(self):
         self.now = 50.0
         self.writer = master(epoch=1000)
         self.follower = MapFollower()
         self.history = {self.writer.version: cells(self.writer)}
-        self.deltas, self.beats, self.snapshots = [], [], []
-        self.asked = 0
+        self.deltas, self.heartbeats, self.snapshots = [], [], []
 
     def write(self, seed, layers):
         self.deltas += write(self.writer, seed, layers)
         self.history[self.writer.version] = cells(self.writer)
 
     def restart(self, epochs, seed):
-        """Start another writer; a lower epoch comes with an empty network, for nothing tells late from new then."""
+        """Start another writer; a lower epoch clears the network, because late messages would look like new ones."""
         used = [version.epoch for version in self.history]
         if epochs > 0:
             epoch = max(used) + epochs
         else:
             epoch = min(used) + epochs
-            self.deltas, self.beats, self.snapshots = [], [], []
+            self.deltas, self.heartbeats, self.snapshots = [], [], []
         self.writer = master(epoch, seed)
         self.history[self.writer.version] = cells(self.writer)
 
-    def beat(self):
-        self.beats.append((self.now, self.writer.heartbeat(self.now)))
+    def send_heartbeat(self):
+        self.heartbeats.append((self.now, self.writer.heartbeat(self.now)))
 
-    def hear(self, n):
-        """Deliver any of the heartbeats under way; none is under way for as long as the grace."""
-        self.beats = [(sent, beat) for sent, beat in self.beats if self.now - sent < GRACE_S]
-        if self.beats:
-            _, beat = self.beats.pop(n % len(self.beats))
-            self.follower.on_heartbeat(beat, self.now)
+    def deliver_heartbeat(self, n):
+        """Deliver any of the heartbeats in transit; none is in transit for as long as the grace."""
+        self.heartbeats = [(sent, heartbeat) for sent, heartbeat in self.heartbeats if self.now - sent < GRACE_S]
+        if self.heartbeats:
+            _, heartbeat = self.heartbeats.pop(n % len(self.heartbeats))
+            self.follower.on_heartbeat(heartbeat, self.now)
 
-    def answer(self, n):
+    def deliver_snapshot(self, n):
         snapshot = self.snapshots.pop(n % len(self.snapshots))
         before = self.follower.version
         try:
@@ -93,31 +92,31 @@ class Network:
         except MapError:
             assert self.follower.version == before
 
-    def play(self, step):
+    def run_step(self, step):
         match step:
             case ("write", seed, layers):
                 self.write(seed, layers)
             case ("restart", epochs, seed):
                 self.restart(epochs, seed)
-            case ("beat",):
-                self.beat()
-            case ("hear", n):
-                self.hear(n)
-            case ("deliver" | "double" | "lose" | "damage" as fate, n, *position) if self.deltas:
-                self.let_arrive(fate, n % len(self.deltas), *position)
-            case ("ask",) if self.follower.wants_snapshot(self.now):
+            case ("send heartbeat",):
+                self.send_heartbeat()
+            case ("deliver heartbeat", n):
+                self.deliver_heartbeat(n)
+            case ("deliver" | "duplicate" | "lose" | "damage" as fate, n, *position) if self.deltas:
+                self.transmit_delta(fate, n % len(self.deltas), *position)
+            case ("query snapshot",) if self.follower.wants_snapshot(self.now):
                 self.snapshots.append(self.writer.snapshot())
-            case ("answer", n) if self.snapshots:
-                self.answer(n)
-            case ("fetch",) if self.follower.wants_snapshot(self.now):
+            case ("deliver snapshot", n) if self.snapshots:
+                self.deliver_snapshot(n)
+            case ("fetch snapshot",) if self.follower.wants_snapshot(self.now):
                 self.snapshots.append(self.writer.snapshot())
-                self.answer(len(self.snapshots) - 1)
+                self.deliver_snapshot(len(self.snapshots) - 1)
             case ("wait", seconds):
                 self.wait(seconds)
 
-    def let_arrive(self, fate, index, position=0):
-        """Decide what becomes of a delta that is under way."""
-        delta = self.deltas[index] if fate == "double" else self.deltas.pop(index)
+    def transmit_delta(self, fate, index, position=0):
+        """Deliver, duplicate, lose or damage a delta in transit."""
+        delta = self.deltas[index] if fate == "duplicate" else self.deltas.pop(index)
         if fate == "damage":
             raw = bytearray(delta.cells)
             raw[position % len(raw)] ^= 0x55
@@ -126,13 +125,13 @@ class Network:
             self.follower.on_delta(delta, self.now)
 
     def wait(self, seconds):
-        """Let time pass, in which age and gap only grow and no wish for a snapshot vanishes."""
-        before = self.reading()
+        """Advance the time; age and gap may only grow, and the need for a snapshot may not vanish."""
+        before = self.status()
         self.now += seconds
-        after = self.reading()
+        after = self.status()
         assert all(early <= late for early, late in zip(before, after, strict=True))
 
-    def reading(self):
+    def status(self):
         follower, now = self.follower, self.now
         return follower.age(now), follower.gap(now), follower.wants_snapshot(now)
 
@@ -143,25 +142,26 @@ class Network:
             return
         assert follower.version in self.history
         assert all(
-            np.array_equal(copied(follower)[layer], grid) for layer, grid in self.history[follower.version].items()
+            np.array_equal(replica_cells(follower)[layer], grid)
+            for layer, grid in self.history[follower.version].items()
         )
         if follower.up_to_date:
-            assert TileHashes(copied(follower)).value == follower.version.hash
+            assert TileHashes(replica_cells(follower)).value == follower.version.hash
             assert follower.gap(now) == 0.0
         if follower.version == self.writer.version:
             assert not follower.wants_snapshot(now), "nothing is missing"
 
     def recover(self):
-        """Let everything arrive from now on; the messages under way still come, late and in any order."""
+        """Deliver every new message from now on; messages in transit still arrive, late and in any order."""
         for _ in range(20):
-            self.wait(BEAT_S)
+            self.wait(HEARTBEAT_S)
             self.follower.on_heartbeat(self.writer.heartbeat(self.now), self.now)
             self.check()
             if self.follower.up_to_date and self.follower.age(self.now) == 0.0:
                 assert self.follower.version == self.writer.version
             if self.follower.wants_snapshot(self.now):
                 self.snapshots.append(self.writer.snapshot())
-                self.answer(len(self.snapshots) - 1)
+                self.deliver_snapshot(len(self.snapshots) - 1)
                 self.check()
         assert self.follower.up_to_date
         assert self.follower.version == self.writer.version
@@ -177,16 +177,16 @@ STEPS = st.lists(
             st.sampled_from([("cost",), ("speed",), ("cost", "speed"), ("cost", "cost", "cost")]),
         ),
         st.tuples(st.just("restart"), st.sampled_from([1, 1, 3, -1]), st.integers(0, 2**32)),
-        st.tuples(st.just("beat")),
-        st.tuples(st.just("hear"), POSITIONS),
+        st.tuples(st.just("send heartbeat")),
+        st.tuples(st.just("deliver heartbeat"), POSITIONS),
         st.tuples(st.just("deliver"), POSITIONS),
         st.tuples(st.just("deliver"), st.just(0)),
-        st.tuples(st.just("double"), POSITIONS),
+        st.tuples(st.just("duplicate"), POSITIONS),
         st.tuples(st.just("lose"), POSITIONS),
         st.tuples(st.just("damage"), POSITIONS, st.integers(0, 10_000)),
-        st.tuples(st.just("ask")),
-        st.tuples(st.just("fetch")),
-        st.tuples(st.just("answer"), POSITIONS),
+        st.tuples(st.just("query snapshot")),
+        st.tuples(st.just("fetch snapshot")),
+        st.tuples(st.just("deliver snapshot"), POSITIONS),
         st.tuples(st.just("wait"), st.floats(0.0, 0.8)),
     ),
     min_size=10,
@@ -196,46 +196,46 @@ STEPS = st.lists(
 
 @settings(max_examples=HISTORIES, deadline=None)
 @given(loaded=st.booleans(), steps=STEPS)
-def test_copy_is_one_version_of_the_writers_and_recovers_whatever_the_network_did(loaded, steps):
+def test_replica_is_always_one_of_the_writers_versions_and_recovers(loaded, steps):
     network = Network()
     if loaded:
-        network.play(("fetch",))
+        network.run_step(("fetch snapshot",))
     for step in steps:
-        network.play(step)
+        network.run_step(step)
         network.check()
     network.recover()
 
 
 @settings(max_examples=max(20, HISTORIES // 10), deadline=None)
 @given(writes=st.lists(st.tuples(st.integers(0, 2**32), st.booleans(), st.booleans()), max_size=20))
-def test_copy_that_gets_every_delta_never_asks_again(writes):
+def test_follower_that_receives_every_delta_never_wants_another_snapshot(writes):
     network = Network()
     follower = network.follower
     follower.on_snapshot(network.writer.snapshot(), network.now)
-    for seed, overtaken, beating in writes:
+    for seed, overtaken, with_heartbeat in writes:
         network.write(seed, ("cost", "speed"))
-        network.wait(BEAT_S)
+        network.wait(HEARTBEAT_S)
         if overtaken:
             follower.on_heartbeat(network.writer.heartbeat(network.now), network.now)
         deltas, network.deltas = network.deltas, []
         for delta in deltas:
             assert not follower.wants_snapshot(network.now)
             follower.on_delta(delta, network.now)
-        if beating:
+        if with_heartbeat:
             follower.on_heartbeat(network.writer.heartbeat(network.now), network.now)
         assert follower.up_to_date
         assert follower.version == network.writer.version
-        if beating or deltas:
+        if with_heartbeat or deltas:
             assert follower.age(network.now) == 0.0
 
 
-def loaded(writer, now=0.0, **options):
+def loaded_follower(writer, now=0.0, **options):
     follower = MapFollower(**options)
     follower.on_snapshot(writer.snapshot(), now)
     return follower
 
 
-def test_new_follower_wants_a_snapshot_and_knows_no_age():
+def test_new_follower_wants_a_snapshot_and_has_infinite_age():
     follower = MapFollower()
     assert follower.wants_snapshot(0.0)
     assert not follower.up_to_date
@@ -244,9 +244,9 @@ def test_new_follower_wants_a_snapshot_and_knows_no_age():
     assert (follower.version, follower.replica.geometry, follower.replica.site) == (None, None, "")
 
 
-def test_snapshot_alone_does_not_confirm_the_map_and_a_heartbeat_does():
+def test_heartbeat_confirms_a_snapshot():
     writer = master()
-    follower = loaded(writer)
+    follower = loaded_follower(writer)
     assert follower.up_to_date
     assert follower.age(5.0) == math.inf
     follower.on_heartbeat(writer.heartbeat(0.0), 5.0)
@@ -255,9 +255,9 @@ def test_snapshot_alone_does_not_confirm_the_map_and_a_heartbeat_does():
     assert np.array_equal(follower.replica.static, writer.static)
 
 
-def test_delta_does_not_confirm_the_map_when_a_heartbeat_named_a_newer_version():
+def test_delta_does_not_confirm_the_map_while_a_newer_version_is_announced():
     writer = master()
-    follower = loaded(writer)
+    follower = loaded_follower(writer)
     follower.on_heartbeat(writer.heartbeat(0.0), 1.0)
     (first,), (second,) = write(writer, 1), write(writer, 2)
     follower.on_heartbeat(writer.heartbeat(0.0), 2.0)
@@ -269,9 +269,9 @@ def test_delta_does_not_confirm_the_map_when_a_heartbeat_named_a_newer_version()
     assert (follower.up_to_date, follower.age(2.2), follower.gap(2.2)) == (True, 0.0, 0.0)
 
 
-def test_announced_delta_may_be_under_way_for_the_grace():
+def test_snapshot_is_wanted_when_an_announced_delta_is_missing_after_the_grace():
     writer = master()
-    follower = loaded(writer, grace_s=0.5)
+    follower = loaded_follower(writer, grace_s=0.5)
     write(writer, 1)
     for now in (1.0, 1.2, 1.4):
         follower.on_heartbeat(writer.heartbeat(0.0), now)
@@ -280,9 +280,9 @@ def test_announced_delta_may_be_under_way_for_the_grace():
     assert follower.gap(1.6) == pytest.approx(0.6)
 
 
-def test_skipped_delta_wants_a_snapshot_at_once_and_none_if_it_comes_after_all():
+def test_skipped_delta_wants_a_snapshot_until_it_arrives():
     writer = master()
-    follower = loaded(writer)
+    follower = loaded_follower(writer)
     (first,), (second,), (third,) = (write(writer, seed, name=f"z{seed}") for seed in (1, 2, 3))
     assert follower.on_delta(third, 1.0) is None
     assert follower.wants_snapshot(1.0)
@@ -295,7 +295,7 @@ def test_skipped_delta_wants_a_snapshot_at_once_and_none_if_it_comes_after_all()
     assert not follower.wants_snapshot(1.2)
 
 
-def test_deltas_that_come_before_an_older_snapshot_are_applied_after_it():
+def test_deltas_received_before_an_older_snapshot_are_applied_after_it():
     writer = master()
     follower = MapFollower()
     old = writer.snapshot()
@@ -308,7 +308,7 @@ def test_deltas_that_come_before_an_older_snapshot_are_applied_after_it():
     assert follower.up_to_date
 
 
-def test_snapshot_that_lacks_a_lost_delta_is_taken_and_another_wanted():
+def test_snapshot_without_a_lost_delta_is_loaded_and_another_wanted():
     writer = master()
     follower = MapFollower()
     write(writer, 1)
@@ -322,7 +322,7 @@ def test_snapshot_that_lacks_a_lost_delta_is_taken_and_another_wanted():
     assert follower.up_to_date
 
 
-def test_held_deltas_are_bounded_and_the_latest_are_kept():
+def test_number_of_held_deltas_is_limited_to_the_latest():
     writer = master()
     follower = MapFollower(max_held=3)
     snapshots = {}
@@ -331,16 +331,16 @@ def test_held_deltas_are_bounded_and_the_latest_are_kept():
             follower.on_delta(delta, 1.0)
         snapshots[writer.version.seq] = writer.snapshot()
     follower.on_snapshot(snapshots[2], 1.0)
-    assert follower.version.seq == 2, "delta 3 had to make room"
+    assert follower.version.seq == 2, "delta 3 was dropped"
     follower.on_snapshot(snapshots[3], 1.0)
     assert follower.version.seq == 6
 
 
-def test_older_and_damaged_snapshots_are_refused_and_change_nothing():
+def test_older_or_damaged_snapshot_is_refused_and_changes_nothing():
     writer = master()
     older = writer.snapshot()
     write(writer, 1)
-    follower = loaded(writer)
+    follower = loaded_follower(writer)
     follower.on_heartbeat(writer.heartbeat(0.0), 1.0)
     with pytest.raises(MapError, match="older"):
         follower.on_snapshot(older, 1.0)
@@ -351,11 +351,11 @@ def test_older_and_damaged_snapshots_are_refused_and_change_nothing():
         follower.on_snapshot(master(epoch=9).snapshot(), 1.0)
 
 
-def test_broken_copy_does_not_go_back_to_an_older_snapshot():
+def test_older_snapshot_is_refused_after_a_rejected_delta():
     writer = master()
     older = writer.snapshot()
     write(writer, 1)
-    follower = loaded(writer)
+    follower = loaded_follower(writer)
     (delta,) = write(writer, 2)
     follower.on_delta(replace(delta, hash=delta.hash ^ 1), 1.0)
     assert follower.wants_snapshot(1.0)
@@ -364,7 +364,7 @@ def test_broken_copy_does_not_go_back_to_an_older_snapshot():
 
 
 def test_writer_with_a_higher_epoch_is_followed_at_once():
-    follower = loaded(master(epoch=10))
+    follower = loaded_follower(master(epoch=10))
     restarted = master(epoch=11, seed=5)
     follower.on_heartbeat(restarted.heartbeat(0.0), 1.0)
     assert follower.wants_snapshot(1.0)
@@ -373,9 +373,9 @@ def test_writer_with_a_higher_epoch_is_followed_at_once():
     assert follower.age(1.2) == 0.0
 
 
-def test_late_heartbeat_of_a_writer_that_was_replaced_asks_for_nothing():
+def test_late_heartbeat_of_a_replaced_writer_is_ignored():
     old, new = master(epoch=10), master(epoch=11)
-    follower = loaded(new)
+    follower = loaded_follower(new)
     for now in (1.0, 1.1, 1.2):
         follower.on_heartbeat(old.heartbeat(0.0), now)
         assert not follower.wants_snapshot(now)
@@ -385,7 +385,7 @@ def test_late_heartbeat_of_a_writer_that_was_replaced_asks_for_nothing():
 
 def test_late_heartbeat_long_ago_does_not_turn_the_next_late_one_into_a_restart():
     writer = master()
-    follower = loaded(writer)
+    follower = loaded_follower(writer)
     for now in (1.0, 2.0):
         late = writer.heartbeat(0.0)
         write(writer, int(now))
@@ -395,17 +395,17 @@ def test_late_heartbeat_long_ago_does_not_turn_the_next_late_one_into_a_restart(
 
 
 @pytest.mark.parametrize("epoch", [3, 10])
-def test_writer_that_starts_again_with_lower_numbers_is_followed_after_the_grace(epoch):
+def test_writer_that_restarts_with_lower_numbers_is_followed_after_the_grace(epoch):
     writer = master(epoch=10)
     for seed in range(5):
         write(writer, seed)
-    follower = loaded(writer)
+    follower = loaded_follower(writer)
     follower.on_heartbeat(writer.heartbeat(0.0), 0.0)
     restarted = master(epoch=epoch, seed=5)
     write(restarted, 7)
     for now in itertools.takewhile(lambda now: now < 1.0 + GRACE_S, itertools.count(1.0, 0.1)):
         follower.on_heartbeat(restarted.heartbeat(0.0), now)
-        assert follower.age(now) == pytest.approx(now), "the copy is not the newest any more"
+        assert follower.age(now) == pytest.approx(now), "the copy is no longer the newest version"
     follower.on_heartbeat(restarted.heartbeat(0.0), 2.0)
     assert follower.wants_snapshot(2.0)
     before = restarted.snapshot()
@@ -417,21 +417,21 @@ def test_writer_that_starts_again_with_lower_numbers_is_followed_after_the_grace
     assert (follower.age(2.3), follower.gap(2.3)) == (0.0, 0.0)
 
 
-def test_deltas_that_keep_overtaking_heartbeats_are_no_sign_of_a_restart():
+def test_heartbeats_overtaken_by_deltas_do_not_mean_a_restart():
     writer = master()
-    follower = loaded(writer)
+    follower = loaded_follower(writer)
     for step in range(20):
         late = writer.heartbeat(0.0)
         for delta in write(writer, step):
-            follower.on_delta(delta, step * BEAT_S)
-        follower.on_heartbeat(late, step * BEAT_S)
+            follower.on_delta(delta, step * HEARTBEAT_S)
+        follower.on_heartbeat(late, step * HEARTBEAT_S)
         assert follower.up_to_date
-        assert follower.age(step * BEAT_S) == 0.0
+        assert follower.age(step * HEARTBEAT_S) == 0.0
 
 
-def test_another_hash_for_the_same_version_wants_a_snapshot():
+def test_different_hash_for_the_same_version_wants_a_snapshot():
     writer = master()
-    follower = loaded(writer)
+    follower = loaded_follower(writer)
     follower.on_heartbeat(replace(writer.heartbeat(0.0), hash=1), 1.0)
     assert follower.wants_snapshot(1.0)
     assert not follower.up_to_date

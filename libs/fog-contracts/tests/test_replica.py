@@ -19,7 +19,7 @@ def master(epoch=1, width=WIDTH, height=HEIGHT, seed=0):
     return MasterMap("lab", geometry, static, static, epoch)
 
 
-def loaded(writer):
+def loaded_replica(writer):
     replica = Replica()
     replica.load(writer.snapshot())
     return replica
@@ -38,7 +38,7 @@ def state(writer):
     return {layer: grid.copy() for layer, grid in writer.layers.items()}
 
 
-def same(replica, layers):
+def has_cells(replica, layers):
     return all(np.array_equal(replica.layers[name], grid) for name, grid in layers.items())
 
 
@@ -48,26 +48,26 @@ def damaged(delta, position):
     return replace(delta, cells=bytes(raw))
 
 
-links = st.lists(
+network_steps = st.lists(
     st.one_of(
         st.tuples(st.just("write"), st.integers(0, 2**32), st.sampled_from(["cost", "speed", "both"])),
         st.tuples(st.just("restart"), st.integers(0, 2**32)),
-        st.tuples(st.just("deliver"), st.integers(0, 50)),  # which of those under way: any order
+        st.tuples(st.just("deliver"), st.integers(0, 50)),  # any of those in transit: any order
         st.tuples(st.just("lose"), st.integers(0, 50)),
-        st.tuples(st.just("double"), st.integers(0, 50)),
+        st.tuples(st.just("duplicate"), st.integers(0, 50)),
         st.tuples(st.just("damage"), st.integers(0, 50), st.integers(0, 10_000)),
-        st.tuples(st.just("ask")),
-        st.tuples(st.just("answer"), st.integers(0, 50)),
+        st.tuples(st.just("query")),
+        st.tuples(st.just("reply"), st.integers(0, 50)),
     ),
     max_size=60,
 )
 
 
 @settings(max_examples=150, deadline=None)
-@given(steps=links)
-def test_replica_is_always_exactly_one_version_of_the_writers_whatever_the_network_does(steps):
+@given(steps=network_steps)
+def test_replica_is_always_exactly_one_of_the_writers_versions(steps):
     writer = master()
-    replica = loaded(writer)
+    replica = loaded_replica(writer)
     history = {writer.version: state(writer)}
     deltas, snapshots = [], []
     for step in steps:
@@ -83,46 +83,46 @@ def test_replica_is_always_exactly_one_version_of_the_writers_whatever_the_netwo
                 replica.apply(deltas.pop(n % len(deltas)))
             case ("lose", n) if deltas:
                 deltas.pop(n % len(deltas))
-            case ("double", n) if deltas:
+            case ("duplicate", n) if deltas:
                 replica.apply(deltas[n % len(deltas)])
             case ("damage", n, position) if deltas:
                 replica.apply(damaged(deltas.pop(n % len(deltas)), position))
-            case ("ask",):
+            case ("query",):
                 snapshots.append(writer.snapshot())
-            case ("answer", n) if snapshots:
+            case ("reply", n) if snapshots:
                 replica.load(snapshots.pop(n % len(snapshots)))
-        assert same(replica, history[replica.version])
+        assert has_cells(replica, history[replica.version])
     replica.load(writer.snapshot())
     assert not replica.needs_snapshot
-    assert same(replica, state(writer))
+    assert has_cells(replica, state(writer))
 
 
 @given(seeds=st.lists(st.integers(0, 2**32), min_size=1, max_size=8))
 @settings(deadline=None)
-def test_deltas_in_order_keep_the_replica_current_over_the_wire(seeds):
+def test_encoded_deltas_in_order_keep_the_replica_current(seeds):
     writer = master()
-    replica = loaded(decode_snapshot(writer))
+    replica = loaded_replica(decode_snapshot(writer))
     for seed in seeds:
         for delta in writer.write([change(seed)], [], []):
             replica.apply(decode(ch.MAP_DELTA, encode(ch.MAP_DELTA, delta), MapDelta))
         assert replica.version == writer.version
-        assert same(replica, state(writer))
+        assert has_cells(replica, state(writer))
 
 
 def decode_snapshot(writer):
     data = encode(ch.MAP_SNAPSHOT, writer.snapshot(), reply=True)
     snapshot = decode(ch.MAP_SNAPSHOT, data, MapSnapshot, reply=True)
 
-    class Sent:
+    class DecodedSnapshot:
         def snapshot(self):
             return snapshot
 
-    return Sent()
+    return DecodedSnapshot()
 
 
-def test_large_change_travels_in_parts_under_the_limit_in_any_order():
+def test_large_change_is_split_into_parts_that_arrive_in_any_order():
     writer = master(width=1200, height=700)
-    replica = loaded(writer)
+    replica = loaded_replica(writer)
     cause, trace = Cause(kind="zone", id="z", state="set"), Trace(area="a", epoch=1, seq=1)
     cells = np.random.default_rng(1).integers(0, 256, (700, 1200), dtype=np.uint8)
     deltas = writer.write([("cost", Window(0, 0, 1200, 700), cells)], [cause] * 30, [trace] * 10)
@@ -132,10 +132,10 @@ def test_large_change_travels_in_parts_under_the_limit_in_any_order():
     assert others == ["waiting"] * (len(deltas) - 1)
     assert isinstance(last, Applied)
     assert last.causes[0] == cause
-    assert same(replica, state(writer))
+    assert has_cells(replica, state(writer))
 
 
-def test_unchanged_cells_make_no_version_and_changes_are_cut_to_what_differs():
+def test_delta_holds_only_the_changed_cells_and_none_is_made_without_any():
     writer = master()
     before = writer.version
     assert writer.write([("speed", Window(0, 0, 50, 50), np.zeros((50, 50), dtype=np.uint8))], [], []) == []
@@ -146,16 +146,16 @@ def test_unchanged_cells_make_no_version_and_changes_are_cut_to_what_differs():
     assert (delta.x, delta.y, delta.w, delta.h) == (40, 25, 1, 1)
 
 
-def test_wrong_hash_breaks_the_replica_and_leaves_the_old_cells():
+def test_delta_with_wrong_hash_is_rejected_and_leaves_the_old_cells():
     writer = master()
-    replica = loaded(writer)
+    replica = loaded_replica(writer)
     old, version = state(writer), replica.version
     (delta,) = writer.write([change(7)], [], [])
     assert replica.apply(replace(delta, hash=delta.hash ^ 1)) == "gap"
     assert replica.needs_snapshot
-    assert same(replica, old)
+    assert has_cells(replica, old)
     assert replica.version == version
-    assert replica.apply(delta) == "gap", "a broken copy takes a snapshot only"
+    assert replica.apply(delta) == "gap", "only a snapshot is accepted now"
 
 
 @pytest.mark.parametrize(
@@ -169,18 +169,18 @@ def test_wrong_hash_breaks_the_replica_and_leaves_the_old_cells():
         {"epoch": 2},
     ],
 )
-def test_impossible_delta_breaks_the_replica_without_touching_it(wrong):
+def test_invalid_delta_is_rejected_and_leaves_the_old_cells(wrong):
     writer = master()
-    replica, old = loaded(writer), state(writer)
+    replica, old = loaded_replica(writer), state(writer)
     (delta,) = writer.write([change(3, value=77)], [], [])
     assert replica.apply(replace(delta, **wrong)) == "gap"
     assert replica.needs_snapshot
-    assert same(replica, old)
+    assert has_cells(replica, old)
 
 
-def test_gap_and_duplicate_are_told_apart():
+def test_gap_and_duplicate_are_distinguished():
     writer = master()
-    replica = loaded(writer)
+    replica = loaded_replica(writer)
     (first,) = writer.write([change(1)], [], [])
     (second,) = writer.write([change(2)], [], [])
     assert isinstance(replica.apply(first), Applied)
@@ -192,7 +192,7 @@ def test_gap_and_duplicate_are_told_apart():
     assert replica.apply(second) == "old"
     replica.invalidate()
     assert replica.needs_snapshot
-    assert same(replica, state(writer))
+    assert has_cells(replica, state(writer))
 
 
 def test_damaged_snapshot_is_refused_and_changes_nothing():
@@ -210,21 +210,21 @@ def test_damaged_snapshot_is_refused_and_changes_nothing():
             replica.load(wrong)
         assert replica.version is None
     replica.load(newer)
-    assert same(replica, state(writer))
+    assert has_cells(replica, state(writer))
     assert np.array_equal(replica.static, writer.static)
 
 
-def test_snapshot_is_made_once_per_version():
+def test_snapshot_is_encoded_once_per_version():
     writer = master()
     assert writer.snapshot() is writer.snapshot()
-    kept = writer.snapshot()
+    earlier = writer.snapshot()
     writer.write([change(1)], [], [])
-    assert writer.snapshot() is not kept
+    assert writer.snapshot() is not earlier
 
 
-@given(seed=st.integers(0, 2**32), at=st.tuples(st.integers(0, HEIGHT - 1), st.integers(0, WIDTH - 1)))
+@given(seed=st.integers(0, 2**32), cell=st.tuples(st.integers(0, HEIGHT - 1), st.integers(0, WIDTH - 1)))
 @settings(deadline=None, max_examples=50)
-def test_incremental_hash_equals_the_one_from_scratch_and_sees_single_cells(seed, at):
+def test_incremental_hash_equals_the_full_one_and_changes_with_every_cell(seed, cell):
     writer = master()
     layer, window, cells = change(seed)
     layers = state(writer)
@@ -232,7 +232,7 @@ def test_incremental_hash_equals_the_one_from_scratch_and_sees_single_cells(seed
     layers[layer][window.rows, window.columns] = cells
     hashes.update(layer, layers[layer], window)
     assert hashes.value == TileHashes(layers).value
-    layers["speed"][at] ^= 1
+    layers["speed"][cell] ^= 1
     assert TileHashes(layers).value != hashes.value
 
 

@@ -1,6 +1,6 @@
-"""The channels inside one process: cores exchange messages as bytes, in one order, for lockstep, replays and tests.
+"""The channels inside one process: cores exchange encoded messages in a fixed order, for lockstep, replays and tests.
 
-It takes the tables that a process's edges take, so whoever connects cores by it names no handler of theirs.
+It takes the same tables of handlers as a process's edges, so code that connects cores names no single handler.
 """
 
 from __future__ import annotations
@@ -52,30 +52,30 @@ class Bus:
         self._services: list[_Service] = []
         self._in_flight: deque[_InFlight] = deque()
         self.refused: list[str] = []
-        """What subscribers refused (`RefusedMessageError`): the topic or key, and their reason."""
+        """Messages that subscribers refused (`RefusedMessageError`): topic or key, and reason."""
 
     def subscribe(self, handlers: Mapping[Channel, Handler], *, only: Ids | None = None) -> None:
-        """Have each channel's messages go to its handler, and what the handler returns be published.
+        """Subscribe each handler to its channel; what it returns is published.
 
-        `only` narrows channels with such ids to these values, as a robot hears its own.
+        `only` restricts channels with these ids to these values: a robot subscribes to its own.
         """
         self._subscriptions += [_Subscription(c, handler, _fitting(c, only)) for c, handler in handlers.items()]
 
     def serve(self, query_handlers: Mapping[Channel, QueryHandler], *, only: Ids | None = None) -> None:
-        """Have each queryable's requests go to its query_handler; `only` as for `subscribe`."""
+        """Answer each channel's queries with its handler; `only` as for `subscribe`."""
         self._services += [_Service(c, query_handler, _fitting(c, only)) for c, query_handler in query_handlers.items()]
 
     def publish(self, publications: Iterable[Publication]) -> None:
-        """Put messages on their way; raises `ContractError` for one that breaks its channel's contract."""
+        """Queue messages for delivery; raises `ContractError` for one that violates its channel's contract."""
         for publication in publications:
             channel, message = publication.channel, publication.message
             data = encode(channel, message) if isinstance(message, Message) else encode_text(channel, message)
             self._in_flight.append(_InFlight(channel, self._key(channel, publication.ids), data))
 
     def deliver(self, at: Moment) -> int:
-        """Deliver what is on its way, and all that is published in return, until nothing is; return how much it was.
+        """Deliver all queued messages and those published in response; return how many were delivered.
 
-        Every message is handled at `at`. What a subscriber refuses is noted in `refused`; other errors pass through.
+        Every message is handled at `at`. What a subscriber refuses is added to `refused`; other errors propagate.
         """
         count = 0
         while self._in_flight:
@@ -83,27 +83,27 @@ class Bus:
             ids = self._ids(message.channel, message.key)
             for subscription in self._subscriptions:
                 if subscription.channel is message.channel and _matches(subscription.only, ids):
-                    self._hand(message, ids, subscription.handler, at)
+                    self._call(message, ids, subscription.handler, at)
             count += 1
         return count
 
     def query(self, channel: Channel, request: Message | None, kind: type[M], at: Moment, **ids: str) -> M | None:
-        """Ask a queryable; return its answer, or None when nobody serves it.
+        """Send a query; return the reply, or None when nobody serves the channel.
 
-        Raises `ContractError` when request or answer break the channel's contract.
+        Raises `ContractError` when the request or the reply violates the channel's contract.
         """
-        asked = self._ids(channel, self._key(channel, ids))
+        requested = self._ids(channel, self._key(channel, ids))
         for service in self._services:
-            if service.channel is channel and _matches(service.only, asked):
-                taken = None if request is None else roundtrip(channel, request)
-                reply = service.query_handler(asked, taken, at)
+            if service.channel is channel and _matches(service.only, requested):
+                received = None if request is None else roundtrip(channel, request)
+                reply = service.query_handler(requested, received, at)
                 if not isinstance(reply, kind):
-                    raise ContractError(channel.name, f"was answered by {type(reply).__name__}, not {kind.__name__}")
+                    raise ContractError(channel.name, f"was answered with {type(reply).__name__}, not {kind.__name__}")
                 return roundtrip(channel, reply, reply=channel.kind == "query")
         return None
 
-    def _hand(self, message: _InFlight, ids: dict[str, str], handler: Handler, at: Moment) -> None:
-        # Decoded anew for each: nobody can change what another one gets.
+    def _call(self, message: _InFlight, ids: dict[str, str], handler: Handler, at: Moment) -> None:
+        # Each subscriber gets its own copy.
         content = _decoded(message.channel, message.data)
         try:
             publications: Sequence[Publication] = handler(ids, content, at)
@@ -123,17 +123,17 @@ class Bus:
 
 
 def roundtrip(channel: Channel, message: M, *, reply: bool = False) -> M:
-    """Return a message as its receiver gets it: encoded and decoded, with every limit enforced."""
+    """Return a message as its receiver gets it: encoded and decoded, with all limits enforced."""
     return decode(channel, encode(channel, message, reply=reply), type(message), reply=reply)
 
 
 def _decoded(channel: Channel, data: bytes) -> Any:  # noqa: ANN401  # of the channel's type, which a table of channels can't say
-    """Return what a channel's bytes hold, a message or text; raises `ContractError`."""
+    """Decode a channel's bytes to a message or text; raises `ContractError`."""
     return decode_text(channel, data) if channel.message is None else decode(channel, data, channel.message)
 
 
 def _fitting(channel: Channel, ids: Ids | None) -> Ids:
-    """Return the ids that the channel has a place for."""
+    """Return those of the ids that the channel's key contains."""
     return {name: value for name, value in (ids or {}).items() if name in channel.fields}
 
 

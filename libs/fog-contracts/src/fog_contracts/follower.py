@@ -1,7 +1,7 @@
-"""Following the master costmap: a replica kept up to date from deltas, heartbeats and snapshots, whatever gets lost.
+"""Following the master costmap: a replica kept up to date from deltas, heartbeats and snapshots, despite message loss.
 
-Pure: messages and times go in; applied changes, the wish for a snapshot, and the copy's age and gap come out. Times are
-seconds of the reader's monotonic clock.
+Pure: messages and times go in; applied changes, the need for a snapshot, and the copy's age and gap come out. Times are
+in seconds of the reader's monotonic clock.
 """
 
 import math
@@ -12,16 +12,16 @@ from fog_contracts.messages import MapDelta, MapHeartbeat, MapSnapshot
 from fog_contracts.replica import Applied, MapError, Replica, Version
 
 GRACE_S: Final = 0.5
-"""How long a delta that a heartbeat announced may be under way before it is taken for lost (5 heartbeats)."""
+"""How long an announced delta may be in transit before it is considered lost (5 heartbeats)."""
 MAX_HELD: Final = 256
 
 
 class MapFollower:
-    """Keeps a replica at the newest version of the map that its writer is known to have.
+    """Keeps a replica at the newest known version of the map.
 
-    The newest version is the highest one that a heartbeat, a delta or a snapshot named: later epoch first, then higher
-    seq. Heartbeats that keep naming an older one for longer than `grace_s` mean that the writer started again with
-    lower numbers (its clock or its store was reset); the version that they name is then the newest.
+    The newest version is the highest that a heartbeat, a delta or a snapshot announced: higher epoch first, then higher
+    seq. Heartbeats that announce an older one for longer than `grace_s` mean that the writer restarted with lower
+    numbers (its clock or its store was reset); the version that they announce is then the newest.
 
     Deltas that can't be applied yet are held, the latest `max_held` of them, and applied as soon as the missing ones
     or a snapshot arrive.
@@ -35,62 +35,62 @@ class MapFollower:
         """Deltas by epoch, seq and part, oldest arrival first."""
         self._newest: Version | None = None
         self._contradicted_since: float | None = None
-        """Since when heartbeats have named only versions older than `_newest`."""
+        """Since when heartbeats have announced only versions older than `_newest`."""
         self._behind_since: float | None = None
         self._confirmed_at = -math.inf
 
     # --- Messages in ------------------------------------------------------------------------------------------------
 
     def on_delta(self, delta: MapDelta, now: float) -> Applied | None:
-        """Take a delta; return what changed, with all held deltas that it completes, or None if nothing did."""
+        """Apply a delta and all held deltas that it completes; return what changed, or None if nothing did."""
         announced = Version(delta.epoch, delta.seq, delta.hash)
         if self._newest is None or _order(announced) > _order(self._newest):
             self._newest, self._contradicted_since = announced, None
         self._hold(delta, self._newest)
-        applied = _joined(self._apply_held())
-        self._assess(now, confirmed=applied is not None)
+        applied = _merged(self._apply_held())
+        self._update_freshness(now, confirmed=applied is not None)
         return applied
 
     def on_heartbeat(self, heartbeat: MapHeartbeat, now: float) -> None:
-        """Take the writer's word on which version it has."""
-        named = Version(heartbeat.epoch, heartbeat.seq, heartbeat.hash)
-        if self._newest is None or _order(named) >= _order(self._newest):
-            self._newest, self._contradicted_since = named, None
+        """Record which version the writer has."""
+        announced = Version(heartbeat.epoch, heartbeat.seq, heartbeat.hash)
+        if self._newest is None or _order(announced) >= _order(self._newest):
+            self._newest, self._contradicted_since = announced, None
         elif self._contradicted_since is None:
-            self._contradicted_since = now  # perhaps only late
+            self._contradicted_since = now  # it may only be late
         elif now - self._contradicted_since > self._grace_s:
-            self._newest, self._contradicted_since = named, None
+            self._newest, self._contradicted_since = announced, None
             self._held.clear()
-            if named != self._replica.version:
+            if announced != self._replica.version:
                 self._replica.invalidate()
-        self._assess(now, confirmed=named == self._newest)
+        self._update_freshness(now, confirmed=announced == self._newest)
 
     def on_snapshot(self, snapshot: MapSnapshot, now: float) -> Applied:
-        """Take a snapshot and the deltas held since it was asked for; return all that changed.
+        """Load a snapshot and apply the deltas held since it was requested; return all that changed.
 
-        It does not make the copy fresh, for it may come from a disk: the next heartbeat does. Raises `MapError` and
-        changes nothing when it is damaged, or older than the copy, or of a writer that another has replaced.
+        It does not make the copy fresh, because it may come from a disk: the next heartbeat does. Raises `MapError` and
+        changes nothing when it is damaged, older than the copy, or from a writer that was replaced.
         """
-        self._refuse_outdated(snapshot)
+        self._check_not_outdated(snapshot)
         loaded = self._replica.load(snapshot)
         if self._newest is None or _order(loaded.version) > _order(self._newest):
             self._newest, self._contradicted_since = loaded.version, None
         self._held = {key: delta for key, delta in self._held.items() if delta.epoch == snapshot.epoch}
-        applied = _joined([loaded, *self._apply_held()])
+        applied = _merged([loaded, *self._apply_held()])
         assert applied is not None
-        self._assess(now, confirmed=False)
+        self._update_freshness(now, confirmed=False)
         return applied
 
     # --- State out --------------------------------------------------------------------------------------------------
 
     @property
     def up_to_date(self) -> bool:
-        """Whether there is a whole copy, and no newer version is known than the copy's."""
+        """Whether the copy is intact and no newer version is known."""
         intact = self._replica.version is not None and not self._replica.needs_snapshot
         return intact and self._newest in (None, self._replica.version)
 
     def wants_snapshot(self, now: float) -> bool:
-        """Whether only a snapshot helps: no copy yet, a broken one, one of another history, or a delta that is lost."""
+        """Whether a snapshot is needed: no copy yet, an invalid one, one of another history, or a lost delta."""
         version, newest = self._replica.version, self._newest
         if version is None or self._replica.needs_snapshot:
             return True
@@ -99,20 +99,20 @@ class MapFollower:
         if newest.epoch != version.epoch or newest.seq <= version.seq:
             return True
         if any(epoch == version.epoch and seq > version.seq + 1 for epoch, seq, _ in self._held):
-            return True  # deltas are delivered in order: the one before was lost
+            return True  # deltas are delivered in order: an earlier one was lost
         return self.gap(now) > self._grace_s
 
     def age(self, now: float) -> float:
-        """Return the seconds since a message last showed the copy to be the newest version; inf before the first."""
+        """Return the seconds since a message last confirmed the copy as the newest version; inf before the first."""
         return max(0.0, now - self._confirmed_at)
 
     def gap(self, now: float) -> float:
-        """Return for how long (s) the copy has lacked a version that is known to exist; 0 when it lacks none."""
+        """Return for how long (s) a version newer than the copy's has been known; 0 when the copy is the newest."""
         return 0.0 if self._behind_since is None else max(0.0, now - self._behind_since)
 
     @property
     def replica(self) -> Replica:
-        """The copy, for reading: of one version, even while it is behind or broken."""
+        """The copy, for reading: exactly one version, even while it is behind or waits for a snapshot."""
         return self._replica
 
     @property
@@ -120,7 +120,7 @@ class MapFollower:
         """The copy's version; None before the first snapshot."""
         return self._replica.version
 
-    # --- Inside -----------------------------------------------------------------------------------------------------
+    # --- Internals --------------------------------------------------------------------------------------------------
 
     def _hold(self, delta: MapDelta, newest: Version) -> None:
         version = self._replica.version
@@ -128,7 +128,7 @@ class MapFollower:
             if delta.seq <= version.seq:
                 return
         elif delta.epoch != newest.epoch:
-            return  # a late message of a writer that was replaced
+            return  # a late message from a writer that was replaced
         self._held[delta.epoch, delta.seq, delta.part] = delta
         if len(self._held) > self._max_held:
             del self._held[next(iter(self._held))]
@@ -143,23 +143,23 @@ class MapFollower:
             outcomes = [self._replica.apply(self._held.pop(key)) for key in next_parts]
             changes += [outcome for outcome in outcomes if isinstance(outcome, Applied)]
         if version is not None and not self._replica.needs_snapshot:
-            at = _order(version)
-            self._held = {key: delta for key, delta in self._held.items() if key[:2] > at}
+            applied_up_to = _order(version)
+            self._held = {key: delta for key, delta in self._held.items() if key[:2] > applied_up_to}
         return changes
 
-    def _refuse_outdated(self, snapshot: MapSnapshot) -> None:
+    def _check_not_outdated(self, snapshot: MapSnapshot) -> None:
         version, newest = self._replica.version, self._newest
         if newest is None:
             return
         if snapshot.epoch < newest.epoch:
-            raise MapError(f"the snapshot is of epoch {snapshot.epoch}, but the map-service is at epoch {newest.epoch}")
-        started_again = version is not None and _order(newest) < _order(version)
-        if version is None or started_again or snapshot.epoch != version.epoch:
+            raise MapError(f"the snapshot has epoch {snapshot.epoch}, but the map-service is at epoch {newest.epoch}")
+        restarted = version is not None and _order(newest) < _order(version)
+        if version is None or restarted or snapshot.epoch != version.epoch:
             return
         if snapshot.seq < version.seq:
-            raise MapError(f"the snapshot is of version {snapshot.seq}, older than the copy's {version.seq}")
+            raise MapError(f"the snapshot has version {snapshot.seq}, older than the copy's {version.seq}")
 
-    def _assess(self, now: float, *, confirmed: bool) -> None:
+    def _update_freshness(self, now: float, *, confirmed: bool) -> None:
         if self.up_to_date:
             self._behind_since = None
             if confirmed:
@@ -172,8 +172,8 @@ def _order(version: Version) -> tuple[int, int]:
     return version.epoch, version.seq
 
 
-def _joined(changes: Sequence[Applied]) -> Applied | None:
-    """Return changes that followed one another as one, None when there are none."""
+def _merged(changes: Sequence[Applied]) -> Applied | None:
+    """Merge consecutive changes into one; None when there are none."""
     if len(changes) < 2:
         return changes[0] if changes else None
     return Applied(

@@ -1,8 +1,8 @@
-"""Versioned copies of the master costmap: one writer, many replicas, and a hash that tells them apart.
+"""Versioned copies of the master costmap: one writer, many replicas, and a hash that proves them equal.
 
 Every version is named by `epoch, seq, hash`. The epoch changes when the writer starts, the seq grows by one with each
-change, and the hash is over both layers. It combines the hashes of 64 x 64 tiles by XOR, so that a change costs only
-its touched tiles; each tile's hash is keyed by layer and tile number, so that equal tiles don't cancel out.
+change, and the hash is over both layers. It combines the hashes of 64 x 64 tiles by XOR, so that a change needs only
+the hashes of its tiles; each tile's hash is keyed by layer and tile number, so that equal tiles don't cancel out.
 """
 
 import hashlib
@@ -30,7 +30,7 @@ from fog_contracts.messages import (
 TILE: Final = 64
 LAYERS: Final[tuple[Layer, ...]] = get_args(Layer)
 _HEADROOM: Final = 8 * 1024
-"""Bytes of a delta kept for everything but its cells: causes and traces are cut to fit."""
+"""Bytes of a delta reserved for everything but its cells; causes and traces are limited to fit."""
 _MAX_CAUSES: Final = 24
 _MAX_TRACES: Final = 8
 
@@ -38,7 +38,7 @@ Grid = NDArray[np.uint8]
 
 
 class MapError(ValueError):
-    """Bytes that can't be a map of this geometry; the message says what does not fit."""
+    """Cells or a version that do not fit the map; the message says what does not fit."""
 
 
 def _pack(cells: Grid) -> tuple[Packing, bytes]:
@@ -47,21 +47,21 @@ def _pack(cells: Grid) -> tuple[Packing, bytes]:
     return ("zlib", packed) if len(packed) < len(raw) else ("raw", raw)
 
 
-def _unpack(packing: Packing, data: bytes, shape: tuple[int, int], what: str) -> Grid:
+def _unpack(packing: Packing, data: bytes, shape: tuple[int, int], subject: str) -> Grid:
     size = shape[0] * shape[1]
     if packing == "zlib":
         unpacker = zlib.decompressobj()
         try:
             data = unpacker.decompress(data, size + 1)
         except zlib.error as error:
-            raise MapError(f"{what} does not unpack: {error}") from error
+            raise MapError(f"{subject} can't be decompressed: {error}") from error
     if len(data) != size:
-        raise MapError(f"{what} has {len(data)} cells or more where {shape[1]} x {shape[0]} = {size} are due")
+        raise MapError(f"{subject} has {len(data)} cells or more instead of {shape[1]} x {shape[0]} = {size}")
     return np.frombuffer(data, dtype=np.uint8).reshape(shape)
 
 
 class TileHashes:
-    """The hash of a map, kept up to date by recomputing touched tiles only."""
+    """The hash of a map, updated by recomputing changed tiles only."""
 
     def __init__(self, layers: Mapping[Layer, Grid]) -> None:
         height, width = layers[LAYERS[0]].shape
@@ -73,7 +73,7 @@ class TileHashes:
             self.update(layer, layers[layer], Window(0, 0, width, height))
 
     def update(self, layer: Layer, grid: Grid, window: Window) -> None:
-        """Take in that cells of `grid` inside `window` changed."""
+        """Recompute the tiles of `grid` that `window`, in which cells changed, overlaps."""
         if window.empty:
             return
         tiles = self._tiles[layer]
@@ -83,14 +83,14 @@ class TileHashes:
                 tile = grid[row * TILE : (row + 1) * TILE, column * TILE : (column + 1) * TILE]
                 salt = (row * self._columns + column).to_bytes(8, "little")
                 digest = hashlib.blake2b(tile.tobytes(), digest_size=8, key=key, salt=salt).digest()
-                fresh = int.from_bytes(digest, "little") >> 1  # 63 bits: what every msgpack decoder can bound
-                self.value ^= int(tiles[row, column]) ^ fresh
-                tiles[row, column] = fresh
+                tile_hash = int.from_bytes(digest, "little") >> 1  # 63 bits, which every msgpack decoder can represent
+                self.value ^= int(tiles[row, column]) ^ tile_hash
+                tiles[row, column] = tile_hash
 
 
 @dataclass(frozen=True)
 class Version:
-    """Name of one state of the map."""
+    """Identifies one state of the map."""
 
     epoch: int
     seq: int
@@ -98,7 +98,7 @@ class Version:
 
 
 class MasterMap:
-    """The writer's side: holds both layers, turns changed windows into deltas, the whole into a snapshot."""
+    """The writer's side: holds both layers and makes deltas of changed windows and snapshots of the whole map."""
 
     def __init__(self, site: str, geometry: GridGeometry, static: Grid, cost: Grid, epoch: int) -> None:
         if static.shape != geometry.shape or cost.shape != geometry.shape:
@@ -113,11 +113,11 @@ class MasterMap:
 
     @property
     def version(self) -> Version:
-        """The version that holds now."""
+        """The current version."""
         return self._version
 
     def heartbeat(self, stamp: float) -> MapHeartbeat:
-        """Return the message that carries the version."""
+        """Return the message that announces the current version."""
         return MapHeartbeat(epoch=self._version.epoch, seq=self._version.seq, hash=self._version.hash, stamp=stamp)
 
     def write(
@@ -128,18 +128,18 @@ class MasterMap:
     ) -> list[MapDelta]:
         """Write windows of new cells; return the deltas of the new version, or none when no cell differs.
 
-        Each window is first cut down to the cells that differ; a window too large for one message travels in parts.
+        Each window is first reduced to the cells that differ; a window too large for one message is split into parts.
         """
         pieces: list[tuple[Layer, Window, Packing, bytes]] = []
         for layer, window, cells in changes:
             grid = self.layers[layer]
-            tight = self._differing(grid, window, cells)
-            if tight.empty:
+            changed = self._changed_window(grid, window, cells)
+            if changed.empty:
                 continue
-            x, y = tight.x - window.x, tight.y - window.y
-            grid[tight.rows, tight.columns] = cells[y : y + tight.height, x : x + tight.width]
-            self._hashes.update(layer, grid, tight)
-            pieces.extend(self._cut(layer, grid, tight))
+            x, y = changed.x - window.x, changed.y - window.y
+            grid[changed.rows, changed.columns] = cells[y : y + changed.height, x : x + changed.width]
+            self._hashes.update(layer, grid, changed)
+            pieces.extend(self._split(layer, grid, changed))
         if not pieces:
             return []
         self._version = Version(self._version.epoch, self._version.seq + 1, self._hashes.value)
@@ -165,7 +165,7 @@ class MasterMap:
         ]
 
     def snapshot(self) -> MapSnapshot:
-        """Return the whole map; encoded once per version and shared by all who ask."""
+        """Return the whole map; it is encoded once per version."""
         if self._snapshot is None:
             g = self.geometry
             self._snapshot = MapSnapshot(
@@ -187,12 +187,12 @@ class MasterMap:
         return self._snapshot
 
     @staticmethod
-    def _differing(grid: Grid, window: Window, cells: Grid) -> Window:
+    def _changed_window(grid: Grid, window: Window, cells: Grid) -> Window:
         if cells.shape != (window.height, window.width):
             raise MapError(f"cells of shape {cells.shape} don't fill a window of {window.width} x {window.height}")
-        differs = grid[window.rows, window.columns] != cells
-        rows = np.flatnonzero(differs.any(axis=1))
-        columns = np.flatnonzero(differs.any(axis=0))
+        changed = grid[window.rows, window.columns] != cells
+        rows = np.flatnonzero(changed.any(axis=1))
+        columns = np.flatnonzero(changed.any(axis=0))
         if rows.size == 0:
             return Window(window.x, window.y, 0, 0)
         return Window(
@@ -202,7 +202,7 @@ class MasterMap:
             int(rows[-1] - rows[0]) + 1,
         )
 
-    def _cut(self, layer: Layer, grid: Grid, window: Window) -> list[tuple[Layer, Window, Packing, bytes]]:
+    def _split(self, layer: Layer, grid: Grid, window: Window) -> list[tuple[Layer, Window, Packing, bytes]]:
         packing, data = _pack(grid[window.rows, window.columns])
         if len(data) <= DELTA_LIMIT - _HEADROOM:
             return [(layer, window, packing, data)]
@@ -214,12 +214,12 @@ class MasterMap:
             half = window.width // 2
             first = Window(window.x, window.y, half, window.height)
             second = Window(window.x + half, window.y, window.width - half, window.height)
-        return [*self._cut(layer, grid, first), *self._cut(layer, grid, second)]
+        return [*self._split(layer, grid, first), *self._split(layer, grid, second)]
 
 
 @dataclass(frozen=True)
 class Applied:
-    """A new version is in place: the windows that changed, and why."""
+    """A new version was applied: the windows that changed, and why."""
 
     version: Version
     windows: list[tuple[Layer, Window]]
@@ -228,14 +228,14 @@ class Applied:
 
 
 Outcome = Applied | Literal["waiting", "old", "gap"]
-"""`waiting`: parts of the version are missing; `old`: known already; `gap`: only a snapshot helps."""
+"""`waiting`: parts of the version are missing; `old`: applied before; `gap`: a snapshot is needed."""
 
 
 class Replica:
-    """The reader's side: a copy of the map that is either exactly one version of the writer's or known to be broken.
+    """The reader's side: a copy of the map that is always exactly one of the writer's versions.
 
-    A gap, an unknown epoch or a wrong hash makes it broken (`needs_snapshot`); a snapshot mends it. `MapFollower`
-    decides which version is the newest and when to ask for a snapshot.
+    After a gap, an unknown epoch or a wrong hash it accepts no more deltas (`needs_snapshot`) until a snapshot replaces
+    it. `MapFollower` decides which version is the newest and when to request a snapshot.
     """
 
     def __init__(self) -> None:
@@ -259,7 +259,7 @@ class Replica:
         return self.layers["speed"]
 
     def load(self, snapshot: MapSnapshot) -> Applied:
-        """Take a snapshot, whatever was there before; raises `MapError` and changes nothing when it is no map."""
+        """Replace the copy by a snapshot; raises `MapError` and changes nothing when the snapshot is damaged."""
         g = snapshot.geometry
         geometry = GridGeometry(g.width, g.height, g.resolution, g.origin_x, g.origin_y)
         layers: dict[Layer, Grid] = {
@@ -269,7 +269,7 @@ class Replica:
         static = _unpack("zlib", snapshot.static, geometry.shape, "the static layer")
         hashes = TileHashes(layers)
         if hashes.value != snapshot.hash:
-            raise MapError("the snapshot's cells don't have its hash: it was damaged on the way")
+            raise MapError("the snapshot's cells don't have its hash: it was damaged in transit")
         self.site, self.geometry, self.layers, self.static = snapshot.site, geometry, layers, static
         self._hashes = hashes
         self._parts = {}
@@ -279,20 +279,20 @@ class Replica:
         return Applied(self.version, [(layer, whole) for layer in LAYERS], [], [])
 
     def apply(self, delta: MapDelta) -> Outcome:
-        """Take one delta; the copy changes only when a version is complete and its hash fits."""
+        """Apply one delta; the copy changes only when a version is complete and its hash matches."""
         if self.version is None or self._hashes is None or self.needs_snapshot:
             return "gap"
         if delta.epoch == self.version.epoch and delta.seq <= self.version.seq:
             return "old"
         if not self._follows(delta, self.version):
-            return self._broken()
+            return self._reject()
         self._parts[delta.part] = delta
         if len(self._parts) < delta.parts:
             return "waiting"
         return self._complete(delta)
 
     def invalidate(self) -> None:
-        """Take that the copy is of another history than the writer's: only a snapshot helps from now on."""
+        """Accept no more deltas until a snapshot arrives: the copy is not of the writer's history."""
         self.needs_snapshot = True
         self._parts = {}
 
@@ -312,25 +312,25 @@ class Replica:
         for part in parts:
             window = Window(part.x, part.y, part.w, part.h)
             if self.geometry.clip(window) != window:
-                return self._broken()
+                return self._reject()
             try:
                 cells = _unpack(part.packing, part.cells, (part.h, part.w), "a delta")
             except MapError:
-                # Damaged cells are the same to a replica as lost ones: only a snapshot helps.
-                return self._broken()
+                # Damaged cells are handled like lost ones.
+                return self._reject()
             pieces.append((part.layer, window, cells))
-        before = [(layer, window, self._write(layer, window, cells)) for layer, window, cells in pieces]
+        previous = [(layer, window, self._write(layer, window, cells)) for layer, window, cells in pieces]
         if self._hashes.value != delta.hash:
-            # Whoever goes on with the copy while it waits for a snapshot must see the old version, not a mixture.
-            for layer, window, cells in reversed(before):
+            # Readers that use the copy until a snapshot arrives must see the old version, not a mixture.
+            for layer, window, cells in reversed(previous):
                 self._write(layer, window, cells)
-            return self._broken()
+            return self._reject()
         self.version = Version(delta.epoch, delta.seq, delta.hash)
         windows = [(layer, window) for layer, window, _ in pieces]
         return Applied(self.version, windows, list(parts[0].causes), list(parts[0].traces))
 
     def _write(self, layer: Layer, window: Window, cells: Grid) -> Grid:
-        """Write cells and return those that were there."""
+        """Write cells and return the previous ones."""
         assert self._hashes is not None
         grid = self.layers[layer]
         old = grid[window.rows, window.columns].copy()
@@ -338,6 +338,6 @@ class Replica:
         self._hashes.update(layer, grid, window)
         return old
 
-    def _broken(self) -> Literal["gap"]:
+    def _reject(self) -> Literal["gap"]:
         self.invalidate()
         return "gap"

@@ -55,7 +55,7 @@ AXLE = 0.235
 
 
 class Body(Base):
-    """The base and the lidar of a robot that stands in the L of corridors."""
+    """Base and lidar of a robot in the L-shaped corridors."""
 
     def __init__(self, folder: Path, pose=(2.0, 2.0, 0.0)) -> None:
         super().__init__(folder / "roomba")
@@ -66,7 +66,7 @@ class Body(Base):
         self.lidar_link = folder / "lidar"
         self.lidar_port = PtyPort(self.lidar_link)
         self._rng = np.random.default_rng(3)
-        self._world = threading.Thread(target=self._turn, daemon=True)
+        self._world = threading.Thread(target=self._simulate, daemon=True)
 
     def __enter__(self):
         super().__enter__()
@@ -83,15 +83,15 @@ class Body(Base):
         ranges = cast(self.solid, g.resolution, g.origin_x, g.origin_y, x, y, angles + theta, 12.0)
         return ranges + 0.01 * self._rng.standard_normal(len(ranges))
 
-    def _turn(self) -> None:
+    def _simulate(self) -> None:
         before = time.monotonic()
         while not self._ends.wait(0.01):
             now = time.monotonic()
             left, right = self.speeds
             x, y, theta = self.pose
-            way, turned = (left + right) / 2 * (now - before), (right - left) / AXLE * (now - before)
+            distance, turned = (left + right) / 2 * (now - before), (right - left) / AXLE * (now - before)
             middle = theta + turned / 2
-            self.pose = (x + way * math.cos(middle), y + way * math.sin(middle), theta + turned)
+            self.pose = (x + distance * math.cos(middle), y + distance * math.sin(middle), theta + turned)
             if data := self.lidar_port.read():
                 self.scanner.receive(data, now)
             self.lidar_port.write(self.scanner.outgoing(now))
@@ -99,7 +99,7 @@ class Body(Base):
 
 
 class Fog:
-    """What the robot hears of the fog: a map with its heartbeat, and a planner that knows one path."""
+    """The fog as the robot sees it: a map with its heartbeat, and a planner with one path."""
 
     def __init__(self, edge: ZenohEdge, clock: SystemClock, body: Body) -> None:
         self.edge = edge
@@ -126,12 +126,12 @@ class Fog:
         return self.states[-1] if self.states else None
 
     async def run(self) -> None:
-        beats = 0
+        cycles = 0
         while True:
-            beats += 1
+            cycles += 1
             if self.serves:
                 self.edge.publish(ch.MAP_HEARTBEAT, self.master.heartbeat(self.clock.stamp()))
-                if self.goal is not None and beats % 5 == 0:
+                if self.goal is not None and cycles % 5 == 0:
                     self.plan()
             await asyncio.sleep(0.1)
 
@@ -229,17 +229,17 @@ class AgentProcess:
         return [json.loads(line) for line in self.log_file.read_text().splitlines() if line.startswith("{")]
 
 
-async def until(condition, what: str, deadline_s: float = DEADLINE_S):
+async def until(condition, expected: str, deadline_s: float = DEADLINE_S):
     end = time.monotonic() + deadline_s
     while time.monotonic() < end:
         if value := condition():
             return value
         await asyncio.sleep(0.01)
-    raise AssertionError(f"not within {deadline_s} s: {what}")
+    raise AssertionError(f"not within {deadline_s} s: {expected}")
 
 
 class Robot:
-    """All of it, started; `fog` is None until `async with`."""
+    """The whole robot, started; `fog` is None until `async with`."""
 
     def __init__(self, folder: Path, router: str) -> None:
         self.body = Body(folder)
@@ -256,21 +256,21 @@ class Robot:
         self._open = ZenohEdge.open(connect=[self._router], clock=clock, role="fog", id="test", site=SITE)
         edge = await self._open.__aenter__()
         self.fog = Fog(edge, clock, self.body)
-        self._beats = asyncio.create_task(self.fog.run())
+        self._fog_task = asyncio.create_task(self.fog.run())
         return self
 
     async def __aexit__(self, *details):
-        self._beats.cancel()
-        await asyncio.gather(self._beats, return_exceptions=True)
+        self._fog_task.cancel()
+        await asyncio.gather(self._fog_task, return_exceptions=True)
         await self._open.__aexit__(*details)
         await asyncio.to_thread(self._parts.close)
 
     async def localized(self) -> None:
-        """Wait until the only thing missing is an operator."""
+        """Wait until the robot is localized and needs only an operator's enable."""
         waits = ["waiting for an operator to enable"]
         await until(lambda: self.fog.state and self.fog.state.reasons == waits, "the robot waits for its enable")
 
     def error(self) -> float:
-        """Metres between where the robot believes to be and where it is."""
-        told, (x, y, _) = self.fog.poses.get(), self.body.pose
-        return math.hypot(told.x - x, told.y - y)
+        """Distance (m) between the robot's estimated and true position."""
+        estimate, (x, y, _) = self.fog.poses.get(), self.body.pose
+        return math.hypot(estimate.x - x, estimate.y - y)

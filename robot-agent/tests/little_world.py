@@ -1,6 +1,6 @@
 """A world that is just large enough to close the loop: a grid, a unicycle with encoders, a lidar by ray casting.
 
-It feeds an `AgentCore` as its edge would: feedback at 22 Hz, lidar turns at 5.5 Hz whose beams are taken one after
+It feeds an `AgentCore` as its edge would: feedback at 22 Hz, lidar scans at 5.5 Hz whose beams are taken one after
 another while the robot moves, decisions at 5 Hz, wheel commands at 20 Hz. Everything runs on emulated time.
 """
 
@@ -32,7 +32,7 @@ DRIVE_TRAIN = DriveTrain(axle_m=AXLE, travel_wrap_m=65_536 * TICK_M)
 AGENT = AgentConfig(robot="r1", operator_key=KEY, drive_train=DRIVE_TRAIN)
 DT = 0.01
 BEAMS = 360
-TURN_S = 0.18
+SCAN_S = 0.18
 START = 1_000.0
 STAMP = 1_700_000_000.0
 
@@ -75,20 +75,19 @@ class LittleWorld:
         self.wheels = (0.0, 0.0)
         self.ticks = [60_000.0, 10.0]
         self.beams = []
-        self.turn_started = self.now
+        self.scan_started = self.now
         self.lidar_on = self.heartbeats_on = self.base_on = True
         self.bumper = False
         self.fault = None
         self.path = None
         self.path_on = True
         self.goal = None
-        self.touched = False
+        self.collided = False
         self.travelled = 0.0
         self.commands = []
         self.nonce = 0
         self.repeats = RepeatCounter()
-        self.frozen_turn = None
-        self.turns = []
+        self.frozen_scan = None
         self.decide_on = True
         self.resets = 0
         self.published = []
@@ -103,20 +102,20 @@ class LittleWorld:
         return Moment(self.now, self.stamp)
 
     def send(self, channel, message):
-        """Hand the agent a message of the fog."""
+        """Pass a message of the fog to the agent."""
         assert self.agent.handlers()[channel]({"robot": "r1"}, message, self.moment) == ()
 
     def ask(self, command):
-        """Hand the agent an operator's command as it is; return its reply."""
+        """Pass an operator's command to the agent as it is; return the reply."""
         return self.agent.query_handlers()[ch.ROBOT_COMMAND]({"robot": "r1"}, command, self.moment)
 
     def obstacles(self):
-        """Let time pass until the agent next reports obstacles; return the report."""
+        """Run until the agent next reports obstacles; return the report."""
         self.published.clear()
-        assert self.run(1.1, lambda w: w.said(ch.ROBOT_OBSTACLES)), "no report of obstacles within a second"
-        return self.said(ch.ROBOT_OBSTACLES)[0]
+        assert self.run(1.1, lambda w: w.published_on(ch.ROBOT_OBSTACLES)), "no report of obstacles within a second"
+        return self.published_on(ch.ROBOT_OBSTACLES)[0]
 
-    def said(self, channel):
+    def published_on(self, channel):
         """Return what the agent has published on a channel."""
         return [publication.message for publication in self.published if publication.channel is channel]
 
@@ -157,8 +156,8 @@ class LittleWorld:
         self.send(ch.ROBOT_GOAL, self.goal)
         self.send(ch.ROBOT_PATH, self.path)
 
-    def block(self, left, bottom, right, top, *, solid=False, tell=True):
-        """Make a rectangle lethal in the master costmap and, if solid, stand something there."""
+    def block(self, left, bottom, right, top, *, solid=False, publish=True):
+        """Make a rectangle lethal in the master costmap and, if solid, put an obstacle there."""
         g = self.geometry
         window = g.window_around(left, bottom, right - 1e-6, top - 1e-6)
         if solid:
@@ -166,13 +165,13 @@ class LittleWorld:
         self.raw[window.rows, window.columns] = 254
         whole = Window(0, 0, g.width, g.height)
         deltas = self.master.write([("cost", whole, inflate(self.raw, self.table))], [], [])
-        if tell:
+        if publish:
             for delta in deltas:
                 self.send(ch.MAP_DELTA, delta)
         return deltas
 
     def restart(self):
-        """Kill the agent and start another one with what it had saved."""
+        """Kill the agent and start another one with the pose that it had saved."""
         saved = self.agent.pose_to_store(self.now)
         self.wheels = (0.0, 0.0)
         self.agent = self.start_agent(AGENT, self.seed + 1)
@@ -242,7 +241,7 @@ class LittleWorld:
         xs = g.origin_x + (columns + near.x + 0.5) * g.resolution
         ys = g.origin_y + (rows + near.y + 0.5) * g.resolution
         if len(xs) and np.hypot(xs - nx, ys - ny).min() < 0.16:
-            self.touched = True
+            self.collided = True
             return
         self.travelled += math.hypot(nx - self.x, ny - self.y)
         self.x, self.y = nx, ny
@@ -250,35 +249,35 @@ class LittleWorld:
             self.ticks[wheel] += speed * DT * (1 + 0.02 * self.rng.standard_normal()) / TICK_M
 
     def _scan(self):
-        """Cast the beams that the head passes during this step."""
+        """Cast the beams that the head measures during this step."""
         if not self.lidar_on:
             self.beams = []
-            self.turn_started = self.now
+            self.scan_started = self.now
             return
-        share = (self.now - self.turn_started) / TURN_S
+        share = (self.now - self.scan_started) / SCAN_S
         due = min(BEAMS, round(share * BEAMS))
-        fresh = np.arange(len(self.beams), due)
-        if len(fresh):
-            angles = -(fresh + 0.5) * 2 * math.pi / BEAMS  # clockwise, as the real head turns
+        new = np.arange(len(self.beams), due)
+        if len(new):
+            angles = -(new + 0.5) * 2 * math.pi / BEAMS  # clockwise, as the real head rotates
             g = self.geometry
             ranges = cast(self.solid, g.resolution, g.origin_x, g.origin_y, self.x, self.y, angles + self.theta, 12.0)
             ranges += self.lidar_noise * self.rng.standard_normal(len(ranges))
             ranges[~np.isfinite(ranges) | (self.rng.random(len(ranges)) < 0.02)] = math.nan
             self.beams.extend(zip(angles, ranges, strict=True))
-            self.agent.on_lidar_nodes(self.now)
+            self.agent.on_lidar_samples(self.now)
         if len(self.beams) == BEAMS:
-            data = self.frozen_turn if self.frozen_turn is not None else np.array(self.beams)
+            data = self.frozen_scan if self.frozen_scan is not None else np.array(self.beams)
             scan = LaserScan(
                 angles_rad=np.array([math.remainder(a, 2 * math.pi) for a in data[:, 0]]),
                 ranges_m=data[:, 1].copy(),
                 quality=np.full(BEAMS, 40, np.uint8),
-                started_at=self.turn_started,
+                started_at=self.scan_started,
                 ended_at=self.now,
                 repeats=self.repeats.count(np.round(data, 4)),
             )
             self.agent.on_scan(scan, self.now)
             self.beams = []
-            self.turn_started = self.now
+            self.scan_started = self.now
 
 
 def trace(area="z4"):

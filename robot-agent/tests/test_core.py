@@ -1,4 +1,4 @@
-"""The agent's core in a closed loop with a little world: it drives, and above all it stops."""
+"""The agent's core in a closed loop with a little world: driving, and above all stopping."""
 
 from __future__ import annotations
 
@@ -50,12 +50,12 @@ def seconds_to_rest(world, limit=3.0):
     return world.now - begin
 
 
-def test_it_drives_along_the_corridors_to_the_goal_and_says_so(world):
+def test_robot_drives_along_the_corridors_and_reports_the_goal_as_reached(world):
     world.drive_to(L_PATH, theta=math.pi)
     assert world.run(100, lambda w: w.state().goal_reached)
     assert math.hypot(world.x - 12.0, world.y - 10.0) < 0.15
     assert abs(math.remainder(world.theta - math.pi, 2 * math.pi)) < 0.25
-    assert not world.touched
+    assert not world.collided
     assert world.worst_error[0] < 0.10
     assert world.worst_error[1] < 0.06
     assert world.travelled < 19.5
@@ -67,7 +67,7 @@ def test_it_drives_along_the_corridors_to_the_goal_and_says_so(world):
     assert np.abs(speeds.mean(axis=1)).max() <= 0.3 + 1e-9
 
 
-def test_the_same_seed_gives_the_same_drive_to_the_last_bit():
+def test_same_seed_gives_the_same_drive_to_the_last_bit():
     drives = []
     for _ in range(2):
         world = LittleWorld(seed=5).ready()
@@ -85,7 +85,7 @@ def test_a_path_that_starts_behind_the_robot_is_begun_by_turning_on_the_spot():
     assert world.run(30.0, lambda w: w.state().goal_reached)
 
 
-def test_it_stops_at_the_end_of_the_released_part_and_goes_on_when_more_is_released(world):
+def test_robot_stops_at_the_released_end_and_continues_when_more_is_released(world):
     world.drive_to(L_PATH, released=2.0)
     world.run(20.0)
     assert 3.7 < world.x < 4.05
@@ -97,22 +97,22 @@ def test_it_stops_at_the_end_of_the_released_part_and_goes_on_when_more_is_relea
 
 
 @pytest.mark.parametrize("box", [(6.0, 1.5, 6.29, 1.94), (6.0, 1.8, 6.29, 2.3)])
-def test_a_thing_beside_or_on_the_path_that_only_the_lidar_knows_is_driven_around(world, box):
+def test_obstacle_beside_or_on_the_path_that_only_the_lidar_sees_is_avoided(world, box):
     window = world.geometry.window_around(*box)
     world.solid[window.rows, window.columns] = 1
     world.drive_to(L_PATH)
     assert world.run(30, lambda w: w.x > 7.5), world.state().reasons
-    assert not world.touched
+    assert not world.collided
     assert abs(world.y - 2.0) < 0.15
 
 
-def test_a_wall_across_the_corridor_stops_it_without_touching(world):
+def test_wall_across_the_corridor_stops_the_robot_without_contact(world):
     g = world.geometry
     window = g.window_around(6.0, 1.0, 6.2, 3.0)
     world.solid[window.rows, window.columns] = 1
     world.drive_to(L_PATH)
     world.run(40.0)
-    assert not world.touched
+    assert not world.collided
     assert not world.state().goal_reached
     assert world.wheels[0] + world.wheels[1] == pytest.approx(0.0, abs=0.05)
     assert any("no progress" in reason or "near" in reason for reason in world.state().reasons)
@@ -130,7 +130,7 @@ def test_a_lethal_change_on_the_path_nearby_holds_it_until_a_new_plan(driving):
     back = [(driving.x, driving.y), (3.5, 2.0), (3.5, 3.8)]
     driving.drive_to(back, plan_id=2)
     assert driving.run(40.0, lambda w: w.state().goal_reached)
-    assert not driving.touched
+    assert not driving.collided
 
 
 def test_a_lethal_change_far_ahead_leaves_the_planner_a_second(driving):
@@ -148,7 +148,7 @@ def test_a_blocked_goal_is_named_as_such(driving):
     assert any("goal is blocked" in reason for reason in driving.state().reasons)
 
 
-def test_a_refusal_holds_with_the_planners_sentence(driving):
+def test_refusal_holds_the_robot_with_the_planners_reason(driving):
     sentence = "area Z4 cuts the only way"
     refused = msgspec.structs.replace(
         driving.path, plan_id=2, points=[], refusal=Refusal(code=208, reason=sentence, causes=[])
@@ -160,7 +160,7 @@ def test_a_refusal_holds_with_the_planners_sentence(driving):
     assert sentence in " ".join(driving.state().reasons)
 
 
-def test_heartbeats_that_stop_slow_the_robot_then_hold_it_and_it_recovers_by_itself(driving):
+def test_missing_heartbeats_slow_then_hold_the_robot_until_they_return(driving):
     driving.heartbeats_on = False
     driving.run(1.3)
     assert driving.state().mode == "DEGRADED"
@@ -179,8 +179,8 @@ def test_heartbeats_that_stop_slow_the_robot_then_hold_it_and_it_recovers_by_its
     assert driving.x > stood + 0.3
 
 
-def test_a_missed_delta_that_nobody_heals_holds_the_robot_and_a_snapshot_mends_it(driving):
-    driving.block(3.0, 3.9, 3.2, 4.1, tell=False)
+def test_missed_delta_holds_the_robot_until_a_snapshot_is_loaded(driving):
+    driving.block(3.0, 3.9, 3.2, 4.1, publish=False)
     driving.run(0.9)
     assert driving.state().mode == "NORMAL"
     driving.run(0.5)
@@ -189,9 +189,9 @@ def test_a_missed_delta_that_nobody_heals_holds_the_robot_and_a_snapshot_mends_i
     assert driving.run(4.0, lambda w: w.state().mode == "NORMAL")
 
 
-def test_old_changes_that_trickle_in_do_not_make_the_map_fresh_while_newer_ones_are_told_of(driving):
+def test_late_deltas_do_not_make_the_map_fresh_while_newer_ones_are_missing(driving):
     boxes = [(3.0 + 0.2 * i, 3.9, 3.1 + 0.2 * i, 4.0) for i in range(4)]
-    late = [delta for box in boxes for delta in driving.block(*box, tell=False)]
+    late = [delta for box in boxes for delta in driving.block(*box, publish=False)]
     for delta in late[:-1]:
         driving.run(0.5)
         driving.send(ch.MAP_DELTA, delta)
@@ -201,16 +201,16 @@ def test_old_changes_that_trickle_in_do_not_make_the_map_fresh_while_newer_ones_
     assert driving.run(4.0, lambda w: w.state().mode == "NORMAL")
 
 
-def test_a_snapshot_older_than_what_heartbeats_tell_of_does_not_make_the_map_fresh(driving):
+def test_snapshot_older_than_the_heartbeat_version_does_not_make_the_map_fresh(driving):
     old = driving.master.snapshot()
-    driving.block(3.0, 3.9, 3.2, 4.1, tell=False)
+    driving.block(3.0, 3.9, 3.2, 4.1, publish=False)
     driving.run(0.9)
     driving.agent.load(old, driving.now)
     driving.run(0.3)
     assert driving.state().mode == "HOLD"
 
 
-def test_a_path_through_a_wall_that_its_planner_should_have_known_holds_it(world):
+def test_path_through_a_known_wall_holds_the_robot(world):
     world.drive_to([(2.0, 2.0), (3.5, 3.8)])
     world.run(1.5)
     assert world.path.map_seq == world.state().map_seq
@@ -218,7 +218,7 @@ def test_a_path_through_a_wall_that_its_planner_should_have_known_holds_it(world
     assert any("the path is blocked" in reason for reason in world.state().reasons)
 
 
-def test_a_silent_lidar_stops_the_wheels_at_once(driving):
+def test_silent_lidar_stops_the_wheels_immediately(driving):
     driving.lidar_on = False
     begin = driving.now
     assert driving.run(1.0, lambda w: w.state().mode == "PROTECTIVE_STOP")
@@ -230,13 +230,13 @@ def test_a_silent_lidar_stops_the_wheels_at_once(driving):
     assert driving.run(3.0, lambda w: w.state().mode == "NORMAL")
 
 
-def test_a_lidar_that_repeats_itself_stops_the_wheels(driving):
-    driving.frozen_turn = np.column_stack((-(np.arange(360) + 0.5) * math.pi / 180, np.full(360, 3.0)))
+def test_identical_scans_stop_the_wheels(driving):
+    driving.frozen_scan = np.column_stack((-(np.arange(360) + 0.5) * math.pi / 180, np.full(360, 3.0)))
     assert driving.run(0.8, lambda w: w.state().mode == "PROTECTIVE_STOP")
-    assert any("identical turns" in reason for reason in driving.state().reasons)
+    assert any("identical scans" in reason for reason in driving.state().reasons)
 
 
-def test_a_guardian_that_falls_silent_stops_the_wheels(driving):
+def test_silent_guardian_stops_the_wheels(driving):
     driving.base_on = False
     driving.run(0.4)
     assert driving.state().mode == "PROTECTIVE_STOP"
@@ -267,7 +267,7 @@ def test_a_pressed_bumper_is_a_fault_until_an_operator_resets_it(driving):
     assert driving.state().mode == "NORMAL"
 
 
-def test_a_fault_that_the_guardian_latched_is_cleared_by_passing_the_reset_on(driving):
+def test_reset_is_passed_on_to_the_guardian_and_clears_its_fault(driving):
     driving.fault = "the base left Safe mode by itself (now PASSIVE)"
     driving.run(0.1)
     assert driving.state().mode == "FAULT"
@@ -277,7 +277,7 @@ def test_a_fault_that_the_guardian_latched_is_cleared_by_passing_the_reset_on(dr
     assert driving.command("enable").accepted
 
 
-def test_a_restarted_agent_finds_itself_and_waits_for_an_enable(driving):
+def test_restarted_agent_localizes_and_waits_for_an_enable(driving):
     assert driving.restart() is not None
     driving.agent.load(driving.master.snapshot(), driving.now)
     driving.run(2.0)
@@ -290,7 +290,7 @@ def test_a_restarted_agent_finds_itself_and_waits_for_an_enable(driving):
     assert driving.run(80, lambda w: w.state().goal_reached)
 
 
-def test_a_restarted_agent_that_was_carried_away_does_not_trust_what_it_saved(driving):
+def test_restarted_agent_that_was_carried_away_does_not_trust_its_saved_pose(driving):
     driving.restart()
     driving.x, driving.y, driving.theta = 12.0, 8.0, 2.0
     driving.agent.load(driving.master.snapshot(), driving.now)
@@ -300,7 +300,7 @@ def test_a_restarted_agent_that_was_carried_away_does_not_trust_what_it_saved(dr
     assert driving.error()[0] < 0.1
 
 
-def test_being_carried_away_is_noticed_and_only_an_operator_lets_the_robot_go_on(world):
+def test_carried_robot_stops_until_an_operator_enables_it(world):
     world.x, world.y, world.theta = 12.0, 7.0, 1.0
     assert world.run(3.0, lambda w: w.state().mode == "PROTECTIVE_STOP")
     assert world.run(8.0, lambda w: w.agent.localizer.status == "good")
@@ -346,7 +346,7 @@ def test_a_no_go_zone_over_the_robot_is_named_with_its_reason(driving):
     assert any("wet-floor (being mopped)" in reason for reason in driving.state().reasons)
 
 
-def test_in_an_area_that_nobody_can_tell_it_drives_slowly(driving):
+def test_robot_drives_slowly_in_an_unknown_area(driving):
     driving.send(ch.HAZARD, hazard("unknown", [(1, 1), (9, 1), (9, 3), (1, 3)]))
     driving.run(0.5)
     assert driving.state().mode == "DEGRADED"
@@ -367,8 +367,8 @@ def test_a_path_of_another_goal_or_an_older_plan_is_not_followed(world):
     world.drive_to(L_PATH, plan_id=5)
     followed = world.state().plan_id
     older = msgspec.structs.replace(world.path, plan_id=4)
-    foreign = msgspec.structs.replace(world.path, plan_id=9, goal_id="g0")
-    for path in (older, foreign, msgspec.structs.replace(world.path, planner_epoch=2, plan_id=99)):
+    other_goal = msgspec.structs.replace(world.path, plan_id=9, goal_id="g0")
+    for path in (older, other_goal, msgspec.structs.replace(world.path, planner_epoch=2, plan_id=99)):
         world.send(ch.ROBOT_PATH, path)
     assert world.state().plan_id == followed == 5
     restarted = msgspec.structs.replace(world.path, planner_epoch=4, plan_id=1)
@@ -376,7 +376,7 @@ def test_a_path_of_another_goal_or_an_older_plan_is_not_followed(world):
     assert world.state().plan_id == 1
 
 
-def test_a_planner_that_falls_silent_lets_it_drive_slowly_to_the_end_of_the_released_part(world):
+def test_silent_planner_lets_the_robot_drive_slowly_to_the_released_end(world):
     world.drive_to(L_PATH, released=3.0)
     world.path_on = False
     world.run(4.0)
@@ -397,7 +397,7 @@ def test_a_decision_for_a_path_that_was_replaced_is_dropped(driving):
     driving.path = back
     driving.send(ch.ROBOT_PATH, back)
     driving.agent.accept(late)
-    assert driving.agent._wheels.decision.plan_id == 1  # the old one runs out, the late one did not renew it
+    assert driving.agent._wheels.decision.plan_id == 1  # the old decision expires, the late one did not renew it
     assert driving.agent._wheels.decision is not late
     assert seconds_to_rest(driving) <= 1.2
 
@@ -422,22 +422,22 @@ def test_the_first_command_on_a_new_path_closes_its_trace_once(driving):
     assert driving.state().traces == [closed]
 
 
-def test_obstacles_are_what_the_lidar_sees_and_the_map_does_not_know(world):
+def test_lidar_points_that_the_map_does_not_explain_are_reported_as_obstacles(world):
     assert world.obstacles().points == []
     g = world.geometry
     window = g.window_around(5.0, 1.8, 5.3, 2.2)
     world.solid[window.rows, window.columns] = 1
     world.run(0.5)
-    seen = np.array(world.obstacles().points)
-    assert len(seen) >= 3
-    assert np.abs(seen - (5.0, 2.0)).max() < 0.35
-    # once the map shows it because this robot said so, it is still reported: else it would expire while in sight
+    points = np.array(world.obstacles().points)
+    assert len(points) >= 3
+    assert np.abs(points - (5.0, 2.0)).max() < 0.35
+    # once the map shows it because this robot reported it, it is still reported: else it would expire while in sight
     world.block(5.0, 1.8, 5.3, 2.2)
     world.run(0.5)
     assert len(world.obstacles().points) >= 2
 
 
-def test_its_view_reaches_to_the_walls_of_the_corridor_and_to_what_stands_before_them(world):
+def test_view_reaches_to_the_walls_and_to_obstacles_before_them(world):
     def reach(x, y):
         view = world.obstacles().view
         dx, dy = x - view.x, y - view.y
@@ -451,7 +451,7 @@ def test_its_view_reaches_to_the_walls_of_the_corridor_and_to_what_stands_before
     assert reach(3.0, 1.45) == pytest.approx(0.0, abs=0.15)
 
 
-def test_what_others_call_blocked_is_no_news(world):
+def test_obstacle_that_others_put_on_the_map_is_not_reported(world):
     world.block(5.0, 1.5, 5.4, 2.5, solid=True)
     world.run(0.5)
     assert world.obstacles().points == []
@@ -464,7 +464,7 @@ def test_what_others_call_blocked_is_no_news(world):
         ({"robot": "r2"}, "robot"),
     ],
 )
-def test_a_command_that_is_not_an_operators_changes_nothing(world, change, word):
+def test_command_with_wrong_signature_or_robot_changes_nothing(world, change, word):
     command = RobotCommand(kind="disable", robot="r1", operator="ann", nonce="n" * 16, issued_at=world.stamp)
     bad = msgspec.structs.replace(sign(command, KEY), **change)
     reply = world.ask(bad)
@@ -473,7 +473,7 @@ def test_a_command_that_is_not_an_operators_changes_nothing(world, change, word)
     assert world.state().mode == "NORMAL"
 
 
-def test_a_command_that_is_too_old_changes_nothing(world):
+def test_too_old_command_changes_nothing(world):
     command = RobotCommand(kind="disable", robot="r1", operator="ann", nonce="n" * 16, issued_at=world.stamp - 6.0)
     reply = world.ask(sign(command, KEY))
     assert not reply.accepted
@@ -481,7 +481,7 @@ def test_a_command_that_is_too_old_changes_nothing(world):
     assert world.state().mode == "NORMAL"
 
 
-def test_a_command_counts_once(world):
+def test_command_is_executed_once(world):
     command = sign(RobotCommand(kind="disable", robot="r1", operator="ann", nonce="n" * 16, issued_at=world.stamp), KEY)
     assert world.ask(command).accepted
     assert "already" in world.ask(command).reason
@@ -497,7 +497,7 @@ def test_egress_is_refused_with_a_plain_reason(world):
     ("pose", "word"),
     [(None, "no pose"), (Pose(x=99.0, y=0.0, theta=0.0), "off the map"), (Pose(x=0.2, y=0.2, theta=0.0), "wall")],
 )
-def test_an_initial_pose_that_can_not_be_is_refused(world, pose, word):
+def test_impossible_initial_pose_is_refused(world, pose, word):
     reply = world.command("initial_pose", pose=pose)
     assert not reply.accepted
     assert word in reply.reason
@@ -507,7 +507,7 @@ def test_an_initial_pose_is_refused_while_the_robot_drives(driving):
     assert "disable it first" in driving.command("initial_pose", pose=Pose(x=2.0, y=2.0, theta=0.0)).reason
 
 
-def test_without_a_snapshot_there_is_no_enable_and_a_damaged_snapshot_is_refused():
+def test_enable_needs_a_snapshot_and_a_damaged_snapshot_is_refused():
     world = LittleWorld()
     world.run(1.0)
     assert "map" in world.command("enable").reason
@@ -517,14 +517,18 @@ def test_without_a_snapshot_there_is_no_enable_and_a_damaged_snapshot_is_refused
     assert world.agent.wants_snapshot(world.now)
 
 
-def test_what_others_hear_can_be_sent_and_read_again(driving):
+def test_published_messages_survive_encoding_and_decoding(driving):
     g = driving.geometry
     window = g.window_around(driving.x + 1.5, 2.3, driving.x + 1.8, 2.6)
     driving.solid[window.rows, window.columns] = 1
     driving.run(1.0)
-    seen = driving.obstacles()
-    said = [publication.message for publication in driving.published]
-    assert {type(message) for message in said} == {RobotPose, RobotState, RobotObstacles}
-    for message in [*said, driving.agent.stream(driving.now, driving.stamp), driving.agent.pose_to_store(driving.now)]:
+    report = driving.obstacles()
+    messages = [publication.message for publication in driving.published]
+    assert {type(message) for message in messages} == {RobotPose, RobotState, RobotObstacles}
+    for message in [
+        *messages,
+        driving.agent.stream(driving.now, driving.stamp),
+        driving.agent.pose_to_store(driving.now),
+    ]:
         assert msgspec.msgpack.decode(msgspec.msgpack.encode(message), type=type(message)) == message
-    assert seen.points
+    assert report.points

@@ -1,4 +1,4 @@
-"""Following a path: progress, what is handed to a decision, ways around things."""
+"""Following a path: progress, the inputs of a decision, detours around obstacles."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ CONFIG = MotionConfig()
 EIGHT = np.array([(1.0, 1.0), (4.0, 4.0), (4.0, 1.0), (1.0, 4.0)])
 
 
-def job(follower, pose, *, cost=None, speed=None, seen=(), cap=0.3, speeds=(0.2, 0.0), theta=None):  # noqa: PLR0913  # each has a default
+def job(follower, pose, *, cost=None, speed=None, lidar_points=(), cap=0.3, speeds=(0.2, 0.0), theta=None):  # noqa: PLR0913  # each has a default
     return make_job(
         follower,
         plan_id=1,
@@ -33,7 +33,7 @@ def job(follower, pose, *, cost=None, speed=None, seen=(), cap=0.3, speeds=(0.2,
         cost=np.zeros(GRID.shape, np.uint8) if cost is None else cost,
         speed_limits=np.zeros(GRID.shape, np.uint8) if speed is None else speed,
         geometry=GRID,
-        seen=np.array(seen, dtype=np.float64).reshape(-1, 2),
+        lidar_points=np.array(lidar_points, dtype=np.float64).reshape(-1, 2),
         config=CONFIG,
     )
 
@@ -43,45 +43,45 @@ def test_wheels_and_twist_are_each_others_inverse(v, w):
     assert twist(*wheels(v, w, 0.235), 0.235) == pytest.approx((v, w), abs=1e-12)
 
 
-def test_where_a_path_crosses_itself_progress_does_not_jump():
+def test_progress_does_not_jump_where_a_path_crosses_itself():
     follower = PathFollower(EIGHT, math.inf)
-    seen = []
+    progress = []
     for along in np.linspace(0.0, follower.length, 200):
         x, y = (np.interp(along, follower.along, EIGHT[:, i]) for i in (0, 1))
         follower.advance(x, y, 0.0)
-        seen.append(follower.progress)
-    assert np.diff(seen).min() > -1e-9
-    assert np.abs(np.array(seen) - np.linspace(0.0, follower.length, 200)).max() < 0.01
+        progress.append(follower.progress)
+    assert np.diff(progress).min() > -1e-9
+    assert np.abs(np.array(progress) - np.linspace(0.0, follower.length, 200)).max() < 0.01
 
 
-def test_only_the_released_part_is_handed_out_and_the_rest_follows_when_released():
+def test_only_the_released_part_of_the_path_is_returned():
     follower = PathFollower(np.array([(1.0, 1.0), (9.0, 1.0)]), 3.0)
     follower.advance(3.5, 1.0, 0.0)
-    points, ends = follower.rest(2.5)
+    points, ends = follower.released_ahead(2.5)
     assert points[-1] == pytest.approx((4.0, 1.0))
     assert not ends
     assert follower.released_remaining == pytest.approx(0.5)
     follower.release(100.0)
-    points, ends = follower.rest(2.5)
+    points, ends = follower.released_ahead(2.5)
     assert points[-1] == pytest.approx((6.0, 1.0))
-    assert follower.rest(50.0)[1]
+    assert follower.released_ahead(50.0)[1]
 
 
-def test_driving_past_the_released_end_hands_out_no_way_back():
+def test_released_path_does_not_lead_back_after_overshooting_its_end():
     follower = PathFollower(np.array([(1.0, 1.0), (9.0, 1.0)]), 2.0)
     follower.advance(3.3, 1.0, 0.0)
-    points, _ = follower.rest(2.5)
+    points, _ = follower.released_ahead(2.5)
     assert np.ptp(points[:, 0]) == pytest.approx(0.0)
     assert follower.released_remaining == 0.0
 
 
-def test_being_stuck_is_counted_from_the_last_progress():
+def test_stuck_time_is_counted_from_the_last_progress():
     follower = PathFollower(np.array([(1.0, 1.0), (9.0, 1.0)]), math.inf)
     follower.advance(1.0, 1.0, 0.0)
     follower.advance(2.0, 1.0, 5.0)
     follower.advance(2.05, 1.0, 9.0)
     assert follower.stuck_for(15.0) == 10.0
-    follower.rest_clock(15.0)
+    follower.restart_progress_timer(15.0)
     assert follower.stuck_for(16.0) == 1.0
 
 
@@ -96,18 +96,18 @@ def test_a_decision_never_exceeds_the_cap_nor_the_speed_layer():
     assert decide(job(follower, pose, speed=limited, speeds=(0.05, 0.0))).v <= 0.08 + 1e-9
 
 
-def test_off_the_map_there_is_nothing_to_decide():
+def test_no_job_off_the_map():
     follower = PathFollower(np.array([(2.0, 3.0), (9.0, 3.0)]), math.inf)
     assert job(follower, Pose2(-1.0, 3.0, 0.0)) is None
 
 
 @given(st.floats(-math.pi, math.pi), st.floats(0.16, 0.5), st.floats(0.0, 0.3))
-def test_no_decision_drives_into_what_the_lidar_sees(bearing, distance, v):
+def test_no_decision_drives_into_a_lidar_point(bearing, distance, v):
     follower = PathFollower(np.array([(2.0, 3.0), (9.0, 3.0)]), math.inf)
     pose = Pose2(4.0, 3.0, 0.0)
     follower.advance(pose.x, pose.y, 0.0)
-    thing = np.array([(pose.x + distance * math.cos(bearing), pose.y + distance * math.sin(bearing))])
-    decision = decide(job(follower, pose, seen=thing, speeds=(v, 0.0)))
+    obstacle = np.array([(pose.x + distance * math.cos(bearing), pose.y + distance * math.sin(bearing))])
+    decision = decide(job(follower, pose, lidar_points=obstacle, speeds=(v, 0.0)))
     ahead = abs(bearing) < math.radians(20) and distance < 0.2
     if ahead:
         assert decision.v <= 0.11
@@ -117,14 +117,14 @@ def test_no_decision_drives_into_what_the_lidar_sees(bearing, distance, v):
     for _ in range(20):
         turned += decision.w * 0.01
         x, y = x + decision.v * 0.01 * math.cos(turned), y + decision.v * 0.01 * math.sin(turned)
-        nearest = min(nearest, math.hypot(x - thing[0, 0], y - thing[0, 1]))
+        nearest = min(nearest, math.hypot(x - obstacle[0, 0], y - obstacle[0, 1]))
     assert nearest >= min(distance, 0.12) - 0.045
 
 
-def test_a_detour_leads_around_and_back_and_where_there_is_none_the_path_stays():
+def test_detour_leads_around_and_back_and_without_one_the_path_stays():
     follower = PathFollower(np.array([(2.0, 3.0), (9.0, 3.0)]), math.inf)
     follower.advance(2.5, 3.0, 0.0)
-    path, _ = follower.rest(2.5)
+    path, _ = follower.released_ahead(2.5)
     costs = np.zeros(GRID.shape, np.uint8)
     costs[50:70, 70:76] = 254
     around = detour(path, costs, GRID, Pose2(2.5, 3.0, 0.0))
@@ -134,7 +134,7 @@ def test_a_detour_leads_around_and_back_and_where_there_is_none_the_path_stays()
     assert detour(path, costs, GRID, Pose2(2.5, 3.0, 0.0)) is path
 
 
-def test_the_first_blocked_cell_is_found_and_an_inscribed_start_is_forgiven():
+def test_first_blocked_cell_is_found_and_an_inscribed_start_is_tolerated():
     follower = PathFollower(np.array([(2.0, 3.0), (9.0, 3.0)]), math.inf)
     follower.advance(2.0, 3.0, 0.0)
     costs = np.zeros(GRID.shape, np.uint8)
@@ -147,7 +147,7 @@ def test_the_first_blocked_cell_is_found_and_an_inscribed_start_is_forgiven():
     assert first_blocked(costs, GRID, follower) == pytest.approx(0.25, abs=0.05)
 
 
-def test_at_the_goal_the_heading_is_turned_to_before_it_counts_as_reached():
+def test_goal_counts_as_reached_only_at_its_heading():
     follower = PathFollower(np.array([(2.0, 3.0), (5.0, 3.0)]), math.inf)
     follower.advance(4.97, 3.0, 0.0)
     pose = Pose2(4.97, 3.0, 0.0)
@@ -158,10 +158,10 @@ def test_at_the_goal_the_heading_is_turned_to_before_it_counts_as_reached():
     assert turning.w > 0.0
 
 
-def test_a_path_released_whole_ends_at_its_goal_although_its_points_were_rounded():
+def test_wholly_released_path_ends_at_its_goal_despite_rounded_points():
     points = np.array([(0.0, 0.0), (3.0, 0.0), (3.0, 2.0)])
     follower = PathFollower(points, released_length=4.9996)
     follower.advance(3.0, 1.9, 0.0)
-    assert follower.rest(2.5)[1]
+    assert follower.released_ahead(2.5)[1]
     follower.release(4.5)
-    assert not follower.rest(2.5)[1]
+    assert not follower.released_ahead(2.5)[1]

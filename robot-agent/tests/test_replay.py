@@ -1,4 +1,4 @@
-"""What an agent logs is enough to repeat all that it decided, to the last bit."""
+"""An agent's input log is enough to repeat all of its decisions, to the last bit."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ def entries_of(path):
     return [msgspec.json.decode(data, type=log.ENTRY_OF_TOPIC[topic]) for _, topic, data in read_entries(path)]
 
 
-def live_a_little(world):
-    """Let the robot meet most of what its core can tell apart."""
+def drive_through_most_situations(world):
+    """Drive the robot through most of the situations that its core distinguishes."""
     with pytest.raises(MapError):
         world.agent.load(msgspec.structs.replace(world.master.snapshot(), hash=1), world.now)
     world.ready()
@@ -75,7 +75,7 @@ def drive(tmp_path_factory):
     path = tmp_path_factory.mktemp("log") / "drive.mcap"
     entries = []
     world = LittleWorld(seed=4, start_agent=lambda config, seed: log.LoggedAgent(config, seed, entries.append))
-    live_a_little(world)
+    drive_through_most_situations(world)
     write(path, entries)
     return path, world
 
@@ -113,7 +113,7 @@ def test_replays_in_other_processes_with_other_hash_seeds_give_the_same_outputs(
 
 def test_logging_changes_no_decision(drive):
     plain = LittleWorld(seed=4)
-    live_a_little(plain)
+    drive_through_most_situations(plain)
     assert plain.commands == drive[1].commands
     assert plain.published == drive[1].published
 
@@ -132,7 +132,7 @@ def test_a_restarted_agent_is_replayed_from_its_restored_pose(tmp_path):
     assert result.inputs["PoseRestored"] == 1
 
 
-def test_an_agent_that_decides_otherwise_is_found_out(drive, tmp_path, capsys):
+def test_an_agent_that_decides_differently_is_detected(drive, tmp_path, capsys):
     path, _ = drive
     started, *rest = entries_of(path)
     other = tmp_path / "other.mcap"
@@ -147,7 +147,7 @@ def test_an_agent_that_decides_otherwise_is_found_out(drive, tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["different"] == result.different
 
 
-def test_a_missing_and_an_additional_output_are_found_out(drive, tmp_path):
+def test_a_missing_and_an_additional_output_are_detected(drive, tmp_path):
     path, _ = drive
     entries = entries_of(path)
     published = [index for index, entry in enumerate(entries) if isinstance(entry, log.Published)]
@@ -177,10 +177,10 @@ def test_a_log_holds_no_operators_key_and_none_of_its_signatures(drive):
         (lambda entries: entries[1:], "no start"),
         (lambda _: [], "no start"),
         (lambda entries: [*entries[:50], log.EntriesLost(count=7), *entries[50:]], "7 entries are missing"),
-        (lambda entries: [*entries[:50], entries[0]], "can't go on with Started"),
+        (lambda entries: [*entries[:50], entries[0]], "can't continue with Started"),
     ],
 )
-def test_what_can_not_be_replayed_is_refused_in_words(drive, tmp_path, change, word, capsys):
+def test_log_that_can_not_be_replayed_is_refused_with_the_reason(drive, tmp_path, change, word, capsys):
     path = tmp_path / "bad.mcap"
     write(path, change(entries_of(drive[0])))
     with pytest.raises(ReplayError, match=word):
@@ -189,7 +189,7 @@ def test_what_can_not_be_replayed_is_refused_in_words(drive, tmp_path, change, w
     assert word in capsys.readouterr().err
 
 
-def test_a_log_that_a_crash_cut_short_is_replayed_as_far_as_it_goes(drive, tmp_path):
+def test_truncated_log_is_replayed_up_to_its_end(drive, tmp_path):
     data = drive[0].read_bytes()
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(data[: len(data) // 2])

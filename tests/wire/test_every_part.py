@@ -235,7 +235,7 @@ def test_scans_show_the_room_as_it_is(name):
         assert scan.ended_at - scan.started_at == pytest.approx(traits.scan_period_s, abs=0.02)
         assert scan.angles_rad.size > 300
         assert (scan.quality[seen] > 0).all()
-    assert driver.trouble == ""
+    assert driver.problem == ""
 
 
 @every_lidar
@@ -286,7 +286,7 @@ def test_a_silent_lidar_is_trouble_and_the_trouble_ends(name):
         now = number * STEP
         events = driver.receive(lidar.outgoing(now), now)
         lidar.receive(events.data + driver.tick(now), now)
-        troubles.append(driver.trouble)
+        troubles.append(driver.problem)
     assert troubles[100] == ""
     assert "the lidar" in troubles[300]
     assert troubles[-1] == ""

@@ -134,7 +134,7 @@ class RobotRig:
         received = self._scan.receive(self._from_lidar, now)
         self._from_lidar = b""
         if received.samples:
-            self.agent.on_lidar_nodes(now)
+            self.agent.on_lidar_samples(now)
         for scan in received.scans:
             self.agent.on_scan(scan, now)
         self._to_lidar += received.data + self._scan.tick(now)

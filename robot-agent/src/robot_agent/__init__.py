@@ -1,1 +1,1 @@
-"""Localizes, follows and drives; owns the safety gate and the serial port."""
+"""The robot's agent and guardian: localization, path following, the safety gate, and the base's serial port."""

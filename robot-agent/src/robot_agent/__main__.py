@@ -1,6 +1,7 @@
-"""The robot's agent: `python -m robot_agent`, told by FOGNAV_* in the environment. Safe to kill and start at any time.
+"""The robot's agent: `python -m robot_agent`, configured by FOGNAV_* variables. Safe to kill and start at any time.
 
-It drives through the guardian, which stops the wheels without it; `robot_agent.guardian.watchdog` starts the guardian.
+It drives through the guardian, which stops the wheels when the agent is gone. The watchdog
+(`robot_agent.guardian.watchdog`) starts the guardian.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ _log = logs.get("agent")
 
 
 async def main() -> None:
-    """Connect, restore what was stored, then localize, follow and judge until cancelled."""
+    """Connect, restore the stored state, then localize, follow paths and gate the wheels until cancelled."""
     settings = load(Settings, environ=os.environ)
     logs.configure("robot-agent", settings.log_level, settings.log_format)
     _log.info("settings", **describe(settings))
@@ -35,8 +36,8 @@ async def main() -> None:
         settings.robot, read_operator_key(settings.operator_key_file), body, obstacle_ttl=settings.obstacle_memory_s
     )
     base = make_base(settings.base, settings.base_options)
-    scanner = make_lidar(settings.lidar, settings.lidar_options)
-    config = config.with_hardware(base.drive_train, scanner.traits)
+    lidar_driver = make_lidar(settings.lidar, settings.lidar_options)
+    config = config.with_hardware(base.drive_train, lidar_driver.traits)
     clock = SystemClock(settings.speed)
     health = Health("map", "pose", "lidar", "base")
     async with ZenohEdge.open(
@@ -47,17 +48,17 @@ async def main() -> None:
             serve_plain(health, settings.http_host, settings.http_port, settings.port_file),
         ):
             agent = Service(core, zenoh, Store(settings.data_dir), clock, health, site=site)
-            link = GuardianClient(settings.guardian_socket, clock, agent.on_feedback, agent.on_base_lost)
-            lidar = LidarEdge(settings.lidar_port, scanner, clock, core.on_lidar_nodes, agent.on_scan)
+            guardian = GuardianClient(settings.guardian_socket, clock, agent.on_feedback, agent.on_base_lost)
+            lidar = LidarEdge(settings.lidar_port, lidar_driver, clock, core.on_lidar_samples, agent.on_scan)
             agent.restore(body)
             agent.subscribe()
             zenoh.declare_liveliness("robot-agent", settings.robot)
             async with asyncio.TaskGroup() as tasks:
-                tasks.create_task(link.run(), name="base")
+                tasks.create_task(guardian.run(), name="base")
                 tasks.create_task(lidar.run(), name="lidar")
-                tasks.create_task(agent.stream_loop(link), name="stream")
+                tasks.create_task(agent.stream_loop(guardian), name="stream")
                 tasks.create_task(agent.control_loop(), name="control")
-                tasks.create_task(agent.map_loop(), name="map")
+                tasks.create_task(agent.snapshot_loop(), name="snapshot")
                 tasks.create_task(agent.publish_loop(), name="publish")
                 tasks.create_task(agent.housekeeping_loop(lidar), name="housekeeping")
 

@@ -226,7 +226,7 @@ class LidarDriver(Protocol):
         """What this lidar can do."""
 
     @property
-    def trouble(self) -> str:
+    def problem(self) -> str:
         """Why there is no scan, in words; empty while there is one."""
 
     @property

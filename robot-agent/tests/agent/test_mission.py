@@ -27,18 +27,18 @@ def mission():
 
 def test_a_new_robot_has_no_mission():
     mission = Mission()
-    assert (mission.active, mission.goal_id, mission.reached, mission.path_name) == (False, None, False, None)
+    assert (mission.active, mission.goal_id, mission.reached, mission.path_id) == (False, None, False, None)
     assert mission.planner_age(10.0) == float("inf")
     assert mission.cancel() is None
     assert not mission.on_path(PATH, 1.0)
     assert mission.path is None
 
 
-def test_the_planner_is_as_old_as_its_last_goal_or_path(mission):
+def test_planner_age_counts_from_its_last_new_goal_or_path(mission):
     assert mission.planner_age(3.0) == 1.0
     mission.on_path(PATH, 3.5)
     assert mission.planner_age(4.0) == 0.5
-    mission.on_goal(GOAL, 9.0)  # the same one again tells nothing of the path
+    mission.on_goal(GOAL, 9.0)  # the same goal again says nothing about the path
     assert mission.planner_age(10.0) == 6.5
 
 
@@ -66,7 +66,7 @@ def test_only_a_newer_path_of_the_same_goal_replaces_the_one_followed(mission, c
     assert (mission.path is other) == followed
 
 
-def test_a_refusal_leaves_nothing_to_follow_and_the_next_path_is_a_new_one(mission):
+def test_refusal_drops_the_path_and_the_next_path_is_a_new_one(mission):
     refusal = changed(PATH, points=[], refusal=Refusal(code=208, reason="cut off", causes=[]))
     assert not mission.on_path(refusal, 3.0)
     assert mission.follower is None
@@ -80,7 +80,7 @@ def test_the_same_goal_at_another_place_keeps_the_path_until_the_planner_sends_a
 
 
 @pytest.mark.parametrize("end", [Mission.reach, Mission.cancel])
-def test_a_mission_that_ended_begins_again_only_with_another_goal(mission, end):
+def test_ended_mission_starts_again_only_with_another_goal(mission, end):
     end(mission)
     assert not mission.active
     assert mission.path is None
@@ -93,6 +93,6 @@ def test_a_mission_that_ended_begins_again_only_with_another_goal(mission, end):
     assert not mission.reached
 
 
-def test_a_goal_that_was_withdrawn_is_no_mission(mission):
+def test_withdrawn_goal_ends_the_mission(mission):
     mission.on_goal(changed(GOAL, pose=None), 3.0)
     assert (mission.active, mission.goal_id, mission.cancel()) == (False, None, None)

@@ -59,9 +59,9 @@ TWO = [(6.03, 5.02), (6.06, 5.04)]
 
 
 def test_cells_with_two_points_or_more_are_reported_once_each():
-    seen = report([*TWO, (7.05, 5.05)])
-    assert seen.points == [pytest.approx((6.05, 5.05))]
-    assert (seen.stamp, seen.ttl) == (1_000.0, 600.0)
+    reported = report([*TWO, (7.05, 5.05)])
+    assert reported.points == [pytest.approx((6.05, 5.05))]
+    assert (reported.stamp, reported.ttl) == (1_000.0, 600.0)
 
 
 @pytest.mark.parametrize(
@@ -77,12 +77,12 @@ def test_only_the_nearest_cells_are_reported():
 
 
 @pytest.mark.parametrize("change", [{"status": "weak"}, {"turning": 0.6}, {"scan_age": 0.6}, {"scan": None}])
-def test_nothing_is_told_when_the_points_can_not_be_placed(change):
+def test_no_report_while_the_pose_or_scan_is_not_good_enough(change):
     assert report(TWO) is not None
     assert report(TWO, **change) is None
 
 
-def test_what_others_blocked_is_no_news_and_what_it_reported_itself_is_until_its_memory_ends():
+def test_obstacles_of_others_are_left_out_and_own_ones_repeated_until_forgotten():
     reporter, blocked = ObstacleReporter(10.0, 3), replica()
     blocked.cost[45:56, 55:66] = 254
     assert report(TWO, copy=blocked).points == []
@@ -91,7 +91,7 @@ def test_what_others_blocked_is_no_news_and_what_it_reported_itself_is_until_its
     assert report(TWO, copy=blocked, reporter=reporter, now=24.0).points == []
 
 
-def test_its_view_gives_the_nearest_echo_of_each_sector_and_zero_without_one():
+def test_view_gives_the_nearest_return_of_each_sector_and_zero_without_one():
     points = np.array([(7.0, 5.01), (6.0, 5.01), (5.01, 8.0)])
     seen = view(HERE, points, GEOMETRY)
     assert (seen.x, seen.y) == (5.0, 5.0)
@@ -139,38 +139,42 @@ SQUARE = [(4.0, 4.0), (6.0, 4.0), (6.0, 6.0), (4.0, 6.0)]
 )
 def test_a_zone_of_any_shape_is_named_only_by_a_robot_inside_it(shape, inside):
     zone = Zone(id="wet", kind="BLOCKED", shape=shape, reason="mopped")
-    words = places(zones=[zone]).around(HERE, lethal(), ObstacleReporter(10.0, 3), 0.0)
-    assert words == ("the no-go zone wet (mopped)" if inside else "a blocked part of the map")
+    description = places(zones=[zone]).containing(HERE, lethal(), ObstacleReporter(10.0, 3), 0.0)
+    assert description == ("the no-go zone wet (mopped)" if inside else "a blocked part of the map")
 
 
 @pytest.mark.parametrize("changes", [{"enabled": False}, {"kind": "PENALTY", "factor": 2.0}])
 def test_only_zones_that_block_are_named(changes):
     zone = Zone(**{"id": "wet", "kind": "BLOCKED", "shape": CircleShape(centre=(5.0, 5.0), radius=1.0), **changes})
-    assert places(zones=[zone]).around(HERE, lethal(), ObstacleReporter(10.0, 3), 0.0) == "a blocked part of the map"
+    assert (
+        places(zones=[zone]).containing(HERE, lethal(), ObstacleReporter(10.0, 3), 0.0) == "a blocked part of the map"
+    )
 
 
 @pytest.mark.parametrize(
-    ("state", "words", "caution"),
+    ("state", "description", "caution"),
     [("blocked", "the blocked area Z4", False), ("unknown", "the unknown area Z4", True), ("clear", None, False)],
 )
-def test_an_area_is_named_by_its_label_unless_it_is_clear(state, words, caution):
+def test_an_area_is_named_by_its_label_unless_it_is_clear(state, description, caution):
     found = places(hazards=[(state, SQUARE)])
-    assert found.around(HERE, lethal(), ObstacleReporter(10.0, 3), 0.0) == (words or "a blocked part of the map")
+    assert found.containing(HERE, lethal(), ObstacleReporter(10.0, 3), 0.0) == (
+        description or "a blocked part of the map"
+    )
     assert (found.caution(HERE) is not None) == caution
     assert found.caution(Pose2(1.0, 1.0, 0.0)) is None
 
 
-def test_the_map_alone_decides_whether_a_place_is_blocked():
+def test_only_the_map_decides_whether_a_place_is_blocked():
     found, reporter = places(hazards=[("blocked", SQUARE)]), ObstacleReporter(10.0, 3)
-    assert found.around(HERE, replica(), reporter, 0.0) is None
+    assert found.containing(HERE, replica(), reporter, 0.0) is None
     beside_a_wall = lethal()
     beside_a_wall.static[50, 50] = 254
-    assert found.around(HERE, beside_a_wall, reporter, 0.0) is None
-    assert found.around(Pose2(-5.0, math.pi, 0.0), lethal(), reporter, 0.0) is None
+    assert found.containing(HERE, beside_a_wall, reporter, 0.0) is None
+    assert found.containing(Pose2(-5.0, math.pi, 0.0), lethal(), reporter, 0.0) is None
 
 
-def test_a_robot_does_not_stop_for_what_its_own_lidar_reported_under_it():
+def test_robot_does_not_stop_for_an_obstacle_that_it_reported_under_itself():
     reporter = ObstacleReporter(10.0, 3)
     assert report([(5.02, 5.02), (5.04, 5.04)], reporter=reporter).points
-    assert places().around(HERE, lethal(), reporter, 0.0) is None
-    assert places().around(HERE, lethal(), reporter, 13.0) == "a blocked part of the map"
+    assert places().containing(HERE, lethal(), reporter, 0.0) is None
+    assert places().containing(HERE, lethal(), reporter, 13.0) == "a blocked part of the map"

@@ -16,23 +16,23 @@ AT = Moment(10.0, 1_000.0)
 
 
 class FakeRobot:
-    """Takes note of what it is commanded."""
+    """Records its commands."""
 
     def __init__(self, refusal=None, goal=None):
         self.refusal = refusal
         self.goal = goal
-        self.done = []
+        self.commands = []
 
     def request(self, request, now):
-        self.done.append((request, now))
+        self.commands.append((request, now))
         return SimpleNamespace(refusal=self.refusal, mode="NORMAL")
 
     def cancel_goal(self):
-        self.done.append("cancel")
+        self.commands.append("cancel")
         return self.goal
 
-    def take_initial_pose(self, pose):
-        self.done.append(pose)
+    def set_initial_pose(self, pose):
+        self.commands.append(pose)
         return self.refusal
 
 
@@ -45,14 +45,14 @@ def answer(robot, kind, *, key=KEY, at=AT, **more):
 def test_requests_go_to_the_safety_gate_whose_refusal_is_the_reply(kind):
     robot = FakeRobot()
     assert answer(robot, kind).accepted
-    assert robot.done == [(kind, 10.0)]
+    assert robot.commands == [(kind, 10.0)]
     reply = answer(FakeRobot(refusal="the cause is still there: " + "x" * 600), kind)
     assert not reply.accepted
     assert reply.reason.startswith("the cause is still there")
     assert len(reply.reason) == 500
 
 
-def test_cancel_names_the_goal_or_says_that_there_is_none():
+def test_cancel_replies_with_the_goal_or_refuses_without_one():
     assert "g7" in answer(FakeRobot(goal="g7"), "cancel").reason
     assert not answer(FakeRobot(), "cancel").accepted
 
@@ -61,15 +61,15 @@ def test_an_initial_pose_is_passed_on_with_its_refusal():
     pose = Pose(x=1.0, y=2.0, theta=0.5)
     robot = FakeRobot()
     assert answer(robot, "initial_pose", pose=pose).accepted
-    assert robot.done == [pose]
+    assert robot.commands == [pose]
     assert answer(FakeRobot(refusal="off the map"), "initial_pose", pose=pose).reason == "off the map"
 
 
 @pytest.mark.parametrize("more", [{"key": b"x" * 32}, {"at": Moment(10.0, 1_005.1)}])
-def test_a_command_that_does_not_pass_the_gate_reaches_nothing(more):
+def test_command_with_wrong_key_or_age_is_not_executed(more):
     robot = FakeRobot()
     assert not answer(robot, "enable", **more).accepted
-    assert robot.done == []
+    assert robot.commands == []
 
 
 @pytest.mark.parametrize(
@@ -83,7 +83,7 @@ def test_a_command_that_does_not_pass_the_gate_reaches_nothing(more):
         (Pose(x=0.5, y=0.5, theta=0.0), True, True, None),
     ],
 )
-def test_where_a_robot_can_not_be_is_no_initial_pose(pose, geometry, at_rest, word):
+def test_impossible_initial_pose_is_refused_with_the_reason(pose, geometry, at_rest, word):
     static = np.zeros((10, 10), np.uint8)
     static[:, 0] = 254
     replica = SimpleNamespace(geometry=GridGeometry(10, 10, 0.1, 0.0, 0.0) if geometry else None, static=static)

@@ -33,11 +33,11 @@ class Rig:
         self.mission.follower.advance(1.05, 1.05, now)
         self.monitor.begin()
 
-    def set(self, x, cost, *, tell=True):
+    def set(self, x, cost, *, publish=True):
         """Give all cells at x (m) a cost."""
         window = Window(round(x / 0.1), 0, 1, 20)
         deltas = self.master.write([("cost", window, np.full((20, 1), cost, np.uint8))], [], [])
-        for delta in deltas if tell else ():
+        for delta in deltas if publish else ():
             self.replica.apply(delta)
 
     def problem(self, now):
@@ -55,28 +55,28 @@ def test_a_free_path_has_no_problem(rig):
     assert rig.problem(99.0) is None
 
 
-def test_a_block_nearby_is_a_problem_at_once_and_over_when_it_is_cleared(rig):
+def test_near_blockage_is_a_problem_immediately_and_until_it_is_cleared(rig):
     rig.set(1.0 + BLOCK_NEAR_M - 0.2, 254)
     assert "the path is blocked 2.8 m ahead" in rig.problem(1.0)
     rig.set(1.0 + BLOCK_NEAR_M - 0.2, 0)
     assert rig.problem(1.1) is None
 
 
-def test_a_block_far_ahead_leaves_the_planner_its_grace(rig):
+def test_distant_blockage_is_a_problem_after_the_planners_grace_period(rig):
     rig.set(8.0, 254)
     assert rig.problem(1.0) is None
     assert rig.problem(1.0 + PLANNER_GRACE_S) is None
     assert rig.problem(1.1 + PLANNER_GRACE_S) is not None
 
 
-def test_driving_up_to_a_block_makes_it_near(rig):
+def test_blockage_becomes_near_as_the_robot_approaches(rig):
     rig.set(5.0, 254)
     assert rig.problem(1.0) is None
     rig.mission.follower.advance(2.5, 1.05, 1.1)
     assert rig.problem(1.1) is not None
 
 
-def test_a_new_path_that_is_blocked_too_gets_no_second_grace(rig):
+def test_new_path_that_is_blocked_too_gets_no_new_grace_period(rig):
     rig.set(8.0, 254)
     assert rig.problem(1.0) is None
     rig.follow(msgspec.structs.replace(PATH, plan_id=2), 1.8)
@@ -84,7 +84,7 @@ def test_a_new_path_that_is_blocked_too_gets_no_second_grace(rig):
     assert rig.problem(1.1 + PLANNER_GRACE_S) is not None
 
 
-def test_a_blocked_goal_is_called_so(rig):
+def test_blocked_goal_is_named_in_the_problem(rig):
     rig.set(15.0, 253)
     assert rig.problem(1.0) is None
     assert "the goal is blocked" in rig.problem(1.1 + PLANNER_GRACE_S)
@@ -97,16 +97,16 @@ def test_a_planner_that_knew_the_map_may_lead_the_robot_out_of_a_lethal_cell(rig
     assert rig.problem(1.1) is None
 
 
-def test_a_path_of_a_newer_map_is_checked_when_the_robots_has_caught_up(rig):
-    rig.set(2.0, 254, tell=False)
+def test_path_of_a_newer_map_is_checked_when_the_replica_has_caught_up(rig):
+    rig.set(2.0, 254, publish=False)
     rig.follow(msgspec.structs.replace(PATH, plan_id=2, map_seq=2), 1.0)
     assert rig.problem(1.0) is None
-    rig.set(9.0, 254, tell=False)
+    rig.set(9.0, 254, publish=False)
     rig.replica.load(rig.master.snapshot())
     assert rig.problem(1.1) is not None
 
 
-def test_a_path_of_another_map_is_a_problem_after_a_grace(rig):
+def test_path_of_another_map_is_a_problem_after_a_grace_period(rig):
     other = Version(8, 0, 0)
     assert rig.monitor.problem(rig.mission, other, 1.0) is None
     assert rig.monitor.problem(rig.mission, other, 1.0 + PLANNER_GRACE_S) is None
@@ -115,13 +115,13 @@ def test_a_path_of_another_map_is_a_problem_after_a_grace(rig):
     assert rig.monitor.problem(rig.mission, other, 3.1) is None
 
 
-def test_a_refusal_is_a_problem_in_the_planners_words(rig):
+def test_refusal_is_a_problem_with_the_planners_reason(rig):
     refusal = Refusal(code=208, reason="Z4 cuts the only way", causes=[])
     rig.mission.on_path(msgspec.structs.replace(PATH, plan_id=2, points=[], refusal=refusal), 1.0)
     assert "Z4 cuts the only way" in rig.problem(1.0)
 
 
-def test_a_mission_that_ended_has_no_problem(rig):
+def test_ended_mission_has_no_problem(rig):
     rig.set(2.0, 254)
     assert rig.problem(1.0) is not None
     rig.mission.cancel()

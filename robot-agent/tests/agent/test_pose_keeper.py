@@ -55,14 +55,14 @@ def replica(site):
     return SimpleNamespace(site=site, static=np.zeros((2, 2), np.uint8), geometry=GridGeometry(2, 2, 0.1, 0.0, 0.0))
 
 
-def test_a_search_begins_when_nobody_gave_a_pose_and_not_again_for_a_while(keeper, localizer):
+def test_search_begins_without_a_pose_and_not_again_before_the_interval(keeper, localizer):
     assert keeper.search("INIT", 0.0, at_rest=True)
     assert not keeper.search("INIT", SEARCH_AGAIN_S, at_rest=True)
     assert keeper.search("INIT", SEARCH_AGAIN_S + 0.1, at_rest=True)
     assert localizer.searches == 2
 
 
-def test_a_search_that_could_not_begin_is_tried_again_at_once(keeper, localizer):
+def test_search_that_could_not_begin_is_retried_immediately(keeper, localizer):
     localizer.can_search = False
     assert not keeper.search("INIT", 0.0, at_rest=True)
     localizer.can_search = True
@@ -77,7 +77,7 @@ def test_no_search_begins_while_there_is_a_pose_or_a_search(keeper, localizer, c
 
 
 @pytest.mark.parametrize(("mode", "at_rest"), [("NORMAL", True), ("HOLD", True), ("INIT", False)])
-def test_no_search_begins_in_a_robot_that_is_enabled_or_moves(keeper, mode, at_rest):
+def test_no_search_begins_while_the_robot_is_enabled_or_moves(keeper, mode, at_rest):
     assert not keeper.search(mode, 0.0, at_rest=at_rest)
 
 
@@ -90,13 +90,13 @@ def test_a_stored_pose_waits_for_the_map_of_its_site(keeper, localizer, site, re
     assert localizer.restored == restored
 
 
-def test_a_stored_pose_counts_at_once_on_the_map_of_its_site(keeper, localizer):
+def test_stored_pose_is_restored_immediately_on_the_map_of_its_site(keeper, localizer):
     keeper.restore(POSE, "lab")
     assert localizer.restored == [POSE]
 
 
 @pytest.mark.parametrize(
-    ("change", "worth"),
+    ("change", "stored"),
     [
         ({"x": 1.01}, False),
         ({"x": 1.02, "y": 2.01}, True),
@@ -107,11 +107,11 @@ def test_a_stored_pose_counts_at_once_on_the_map_of_its_site(keeper, localizer):
         ({"sigma_theta": 0.04}, True),
     ],
 )
-def test_only_a_pose_that_differs_is_worth_a_write(keeper, localizer, change, worth):
+def test_only_a_pose_that_differs_is_stored(keeper, localizer, change, stored):
     assert keeper.to_store("lab", 0.0) == POSE
     assert keeper.to_store("lab", 1.0) is None
     localizer.trusted = msgspec.structs.replace(POSE, **change)
-    assert (keeper.to_store("lab", 2.0) is not None) == worth
+    assert (keeper.to_store("lab", 2.0) is not None) == stored
 
 
 def test_a_pose_that_is_not_trusted_or_of_no_site_is_not_stored(keeper, localizer):

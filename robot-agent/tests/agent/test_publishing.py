@@ -20,14 +20,14 @@ def run(seconds, *, step=0.1, state=lambda _now: STATE, pose=POSE, report=REPORT
     times = {ch.ROBOT_POSE: [], ch.ROBOT_STATE: [], ch.ROBOT_OBSTACLES: []}
     for number in range(round(seconds / step)):
         now = 100.0 + number * step
-        for publication in policy.choose(pose, state(now), lambda: report, now):
+        for publication in policy.due(pose, state(now), lambda: report, now):
             assert publication.ids == {"robot": "r1"}
             times[publication.channel].append(round(now - 100.0, 3))
     return times
 
 
 @pytest.mark.parametrize("step", [0.1, 0.05, 0.025])
-def test_pose_goes_out_ten_times_a_second_state_and_obstacles_once(step):
+def test_pose_is_published_at_10_hz_and_state_and_obstacles_at_1_hz(step):
     times = run(3.0, step=step)
     assert len(times[ch.ROBOT_POSE]) == pytest.approx(30, abs=1)
     assert len(times[ch.ROBOT_STATE]) == len(times[ch.ROBOT_OBSTACLES]) == pytest.approx(3, abs=1)
@@ -44,25 +44,25 @@ def test_pose_goes_out_ten_times_a_second_state_and_obstacles_once(step):
         ({"goal_distance": 3.0, "battery": 0.7, "stamp": 5.0}, [0.0, 1.0]),
     ],
 )
-def test_a_state_that_says_something_new_goes_out_at_once(change, times):
+def test_changed_state_is_published_immediately(change, times):
     other = msgspec.structs.replace(STATE, **change)
     assert run(1.6, state=lambda now: other if now >= 100.49 else STATE)[ch.ROBOT_STATE] == times
 
 
-def test_without_pose_and_report_the_state_goes_out_alone():
+def test_state_is_published_without_pose_and_obstacles():
     times = run(1.0, pose=None, report=None)
     assert times == {ch.ROBOT_POSE: [], ch.ROBOT_STATE: [0.0], ch.ROBOT_OBSTACLES: []}
 
 
-def test_obstacles_are_looked_for_only_when_a_report_is_due():
+def test_obstacles_are_computed_only_when_a_report_is_due():
     calls = []
     policy = PublishingPolicy("r1")
     for number in range(20):
-        policy.choose(None, STATE, lambda at=number: calls.append(at), 100.0 + number * 0.1)
+        policy.due(None, STATE, lambda at=number: calls.append(at), 100.0 + number * 0.1)
     assert calls == [0, 10]
 
 
-def test_traces_of_a_path_that_was_replaced_before_its_first_command_are_void():
+def test_traces_of_a_path_that_was_replaced_before_its_first_command_are_dropped():
     traces = PathTraces()
     for area in ("z1", "z2"):
         traces.begin([Trace(area=area, epoch=1, seq=1, first_reading=1.0, confirmed=2.0)], 3.0)

@@ -38,7 +38,7 @@ async def enabled(robot) -> None:
     await until(lambda: robot.fog.state.mode == "NORMAL", "the robot is in NORMAL")
 
 
-async def test_the_agent_localizes_obeys_the_right_key_only_and_drives_a_path(robot):
+async def test_agent_localizes_refuses_a_wrong_key_and_drives_a_path(robot):
     await robot.localized()
     assert robot.fog.state.mode == "INIT"
     assert robot.error() < 0.15
@@ -52,11 +52,11 @@ async def test_the_agent_localizes_obeys_the_right_key_only_and_drives_a_path(ro
     await until(lambda: robot.body.pose[0] > 2.6, "it follows the path")
     assert abs(robot.body.pose[1] - 2.0) < 0.3
     assert robot.error() < 0.2
-    told = robot.fog.state
-    assert (told.goal_id, told.plan_id, told.map_epoch, told.mode) == ("g1", 1, 7, "NORMAL")
+    state = robot.fog.state
+    assert (state.goal_id, state.plan_id, state.map_epoch, state.mode) == ("g1", 1, 7, "NORMAL")
     status, text = robot.agent.get("/metrics")
     assert status == 200
-    assert "fognav_lidar_turns_total" in text
+    assert "fognav_lidar_scans_total" in text
     assert 'fognav_robot_mode{mode="NORMAL"} 1.0' in text
     status, text = robot.agent.get("/readyz")
     assert (status, json.loads(text)["missing"]) == (200, [])
@@ -70,19 +70,19 @@ async def test_wheels_stop_when_the_agent_is_killed_and_the_next_one_asks_for_an
     robot.agent.process.kill()
     assert robot.body.stopped_within(time.monotonic()) < STOP_S
     robot.agent.process.wait()
-    stood_at = robot.body.pose
+    stopped_at = robot.body.pose
     assert robot.agent.data.joinpath("pose.json").exists()
     robot.fog.states.clear()
     robot.agent.start()
     await robot.localized()
     assert robot.fog.state.mode == "INIT"
     assert robot.error() < 0.15
-    assert robot.body.pose == stood_at
+    assert robot.body.pose == stopped_at
     await enabled(robot)
-    await until(lambda: robot.body.pose[0] > stood_at[0] + 0.3, "it drives on")
+    await until(lambda: robot.body.pose[0] > stopped_at[0] + 0.3, "it drives on")
 
 
-async def test_wheels_stop_when_the_agent_hangs_or_the_lidar_is_silent_and_go_on_afterwards(robot):
+async def test_wheels_stop_when_the_agent_hangs_or_the_lidar_is_silent_and_continue_afterwards(robot):
     await enabled(robot)
     robot.fog.send_robot_to_the_corner()
     await until(lambda: robot.body.moving, "it drives")
@@ -92,11 +92,11 @@ async def test_wheels_stop_when_the_agent_hangs_or_the_lidar_is_silent_and_go_on
     robot.fog.states.clear()
     await until(lambda: time.monotonic() - begun > 1.0, "the hang lasts")
     robot.agent.process.send_signal(signal.SIGCONT)
-    await until(lambda: any(s.mode == "PROTECTIVE_STOP" for s in robot.fog.states), "the stop is told")
+    await until(lambda: any(s.mode == "PROTECTIVE_STOP" for s in robot.fog.states), "the stop is reported")
     await until(lambda: robot.body.moving, "it drives on after two healthy seconds")
     robot.body.scanner.stalled = True
     assert robot.body.stopped_within(time.monotonic()) < 0.3 + STOP_S
-    await until(lambda: any(e["event"] == "lidar_trouble" for e in robot.agent.events), "the silence is noticed")
+    await until(lambda: any(e["event"] == "lidar_problem" for e in robot.agent.events), "the silence is logged")
     robot.body.scanner.stalled = False
     await until(lambda: robot.body.moving, "it drives on")
 
@@ -107,13 +107,13 @@ async def test_a_bumper_needs_an_authenticated_reset_that_reaches_the_guardian(r
     await until(lambda: robot.body.moving, "it drives")
     robot.body.robot.world.bump_right = True
     assert robot.body.stopped_within(time.monotonic()) < STOP_S
-    await until(lambda: robot.fog.state.mode == "FAULT", "the fault is told")
+    await until(lambda: robot.fog.state.mode == "FAULT", "the fault is reported")
     refused = await robot.fog.command("enable")
     assert not refused.accepted
     refused = await robot.fog.command("reset")
     assert "the cause is still there" in refused.reason
     robot.body.robot.world.bump_right = False
-    for _ in range(100):  # until the core has heard that the bumper is free
+    for _ in range(100):  # until the core has received that the bumper is free
         reply = await robot.fog.command("reset")
         if reply.accepted:
             break
@@ -129,12 +129,12 @@ async def test_changes_of_the_map_are_applied_and_lost_ones_are_fetched(robot):
     master, before = robot.fog.master, robot.fog.snapshots
     cells = master.layers["cost"][30:34, 60:70].copy()
     cells[:] = 200
-    master.write([("cost", Window(60, 30, 10, 4), cells)], [], [])  # published by nobody
+    master.write([("cost", Window(60, 30, 10, 4), cells)], [], [])  # not published
     await until(lambda: robot.fog.state.map_seq == 1, "the lost change is fetched")
     assert robot.fog.snapshots == before + 1
 
 
-async def test_a_robot_without_a_fog_starts_from_its_files_and_waits(robot):
+async def test_robot_without_a_fog_starts_from_its_files_and_holds(robot):
     await robot.localized()
     await until(lambda: robot.agent.data.joinpath("snapshot.msgpack").exists(), "the map is kept")
     await until(lambda: robot.agent.data.joinpath("pose.json").exists(), "the pose is kept")
@@ -142,12 +142,12 @@ async def test_a_robot_without_a_fog_starts_from_its_files_and_waits(robot):
     assert (kept.site, kept.x) == ("lab", pytest.approx(2.0, abs=0.15))
     os.kill(robot.agent.process.pid, signal.SIGTERM)
     assert robot.agent.process.wait(10.0) == 0
-    robot.fog.serves, asked = False, robot.fog.snapshots
+    robot.fog.serves, requested = False, robot.fog.snapshots
     robot.fog.states.clear()
     robot.agent.start()
     await until(lambda: robot.fog.state and robot.fog.state.map_epoch == 7, "the map from disk is in use")
-    await until(lambda: robot.agent.get("/readyz")[0] == 200, "it knows where it is")
-    assert robot.fog.snapshots == asked
+    await until(lambda: robot.agent.get("/readyz")[0] == 200, "it is localized")
+    assert robot.fog.snapshots == requested
     reply = await robot.fog.command("enable")
     assert reply.accepted, reply
     robot.fog.send_robot_to_the_corner()
@@ -155,7 +155,7 @@ async def test_a_robot_without_a_fog_starts_from_its_files_and_waits(robot):
     assert not robot.body.moving
 
 
-async def test_what_a_live_agent_logged_is_replayed_to_the_same_commands_and_publications(robot):
+async def test_log_of_a_live_agent_replays_to_the_same_commands_and_publications(robot):
     await enabled(robot)
     robot.fog.send_robot_to_the_corner()
     await until(lambda: robot.body.pose[0] > 2.6, "it follows the path")

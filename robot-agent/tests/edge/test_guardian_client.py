@@ -8,7 +8,7 @@ import pytest
 from guardian_rig import DEADLINE_S
 
 from fog_runtime.clock import SystemClock
-from robot_agent.agent.guardian_client import QUIET_S, RESET_VALID_S, GuardianClient
+from robot_agent.agent.guardian_client import FEEDBACK_TIMEOUT_S, RESET_VALID_S, GuardianClient
 from robot_agent.guardian.link import BaseFeedback, WheelCommand, decode_command, encode
 from robot_agent.hardware import BaseStatus, WheelOdometry
 
@@ -60,8 +60,11 @@ class Rig:
         self.clock = SkippingClock()
         self.feedback = []
         self.losses = []
-        self.link = GuardianClient(
-            path, self.clock, lambda feedback, _: self.feedback.append(feedback), lambda _, why: self.losses.append(why)
+        self.client = GuardianClient(
+            path,
+            self.clock,
+            lambda feedback, _: self.feedback.append(feedback),
+            lambda _, reason: self.losses.append(reason),
         )
 
     async def until(self, condition):
@@ -78,19 +81,19 @@ def command(seq=1, **more):
 @pytest.fixture
 async def rig(tmp_path):
     made = Rig(tmp_path / "guardian.sock")
-    task = asyncio.create_task(made.link.run())
+    task = asyncio.create_task(made.client.run())
     yield made
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)
 
 
-async def test_a_missing_guardian_is_told_and_found_when_it_comes(rig):
+async def test_missing_guardian_is_reported_and_connected_when_it_starts(rig):
     await rig.until(lambda: rig.losses)
     assert "does the watchdog run?" in rig.losses[0]
-    assert not rig.link.send(command())
+    assert not rig.client.send(command())
     guardian = Guardian(rig.path)
     await guardian.accept()
-    await rig.until(lambda: rig.link.send(command(seq=7)))
+    await rig.until(lambda: rig.client.send(command(seq=7)))
     assert (await guardian.receive()).seq == 7
     guardian.link.send(encode(FEEDBACK))
     await rig.until(lambda: rig.feedback == [FEEDBACK])
@@ -98,41 +101,41 @@ async def test_a_missing_guardian_is_told_and_found_when_it_comes(rig):
     await rig.until(lambda: "the guardian closed the link" in rig.losses)
 
 
-async def test_bad_feedback_is_left_out_and_a_quiet_base_is_told(rig):
+async def test_bad_feedback_is_ignored_and_a_silent_base_is_reported(rig):
     guardian = Guardian(rig.path)
     await guardian.accept()
     guardian.link.send(b"\xc1 nonsense")
     guardian.link.send(encode(FEEDBACK))
     await rig.until(lambda: rig.feedback == [FEEDBACK])
     rig.losses.clear()
-    rig.link.send(command())
+    rig.client.send(command())
     assert not rig.losses
-    rig.clock.skipped = QUIET_S + 0.01
-    rig.link.send(command())
-    assert "hears nothing from the base" in rig.losses[0]
+    rig.clock.skipped = FEEDBACK_TIMEOUT_S + 0.01
+    rig.client.send(command())
+    assert "receives nothing from the base" in rig.losses[0]
     guardian.link.send(encode(FEEDBACK))
     await rig.until(lambda: len(rig.feedback) == 2)
     rig.losses.clear()
-    rig.link.send(command())
+    rig.client.send(command())
     assert not rig.losses
     guardian.close()
 
 
-async def test_a_reset_that_met_no_guardian_is_passed_on_soon_after_or_never(rig):
-    rig.link.send(command(reset=True))
+async def test_reset_without_a_guardian_is_passed_on_soon_after_or_expires(rig):
+    rig.client.send(command(reset=True))
     guardian = Guardian(rig.path)
     await guardian.accept()
-    await rig.until(lambda: rig.link.send(command()))
+    await rig.until(lambda: rig.client.send(command()))
     assert (await guardian.receive()).reset
-    rig.link.send(command())
+    rig.client.send(command())
     assert not (await guardian.receive()).reset
     guardian.close()
-    await rig.until(lambda: not rig.link.send(command()))
-    rig.link.send(command(reset=True))
+    await rig.until(lambda: not rig.client.send(command()))
+    rig.client.send(command(reset=True))
     rig.clock.skipped = RESET_VALID_S + 0.1
     guardian = Guardian(rig.path)
     await guardian.accept()
-    await rig.until(lambda: rig.link.send(command()))
+    await rig.until(lambda: rig.client.send(command()))
     assert not (await guardian.receive()).reset
     guardian.close()
 
@@ -140,9 +143,9 @@ async def test_a_reset_that_met_no_guardian_is_passed_on_soon_after_or_never(rig
 async def test_a_guardian_that_does_not_read_never_blocks_the_agent(rig):
     guardian = Guardian(rig.path)
     await guardian.accept()
-    await rig.until(lambda: rig.link.send(command()))
+    await rig.until(lambda: rig.client.send(command()))
     sent = 0
-    while rig.link.send(command()):
+    while rig.client.send(command()):
         sent += 1
         assert sent < 100_000
     guardian.close()

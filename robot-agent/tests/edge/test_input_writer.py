@@ -22,7 +22,7 @@ def topics(path):
     return [topic for _, topic, _ in read_entries(path)]
 
 
-def test_what_an_agent_logs_is_on_disk_when_it_ends_and_can_be_replayed(tmp_path):
+def test_input_log_is_complete_at_the_end_and_can_be_replayed(tmp_path):
     path = tmp_path / "logs" / "inputs.mcap"
     with open_core(AGENT, 4, path) as core:
         assert isinstance(core, LoggedAgent)
@@ -39,7 +39,7 @@ def test_an_agent_without_a_log_is_a_plain_core():
         assert type(core) is AgentCore
 
 
-def test_the_log_of_the_run_before_is_kept(tmp_path):
+def test_log_of_the_previous_run_is_kept(tmp_path):
     path = tmp_path / "inputs.mcap"
     for reason in ("first", "second", "third"):
         with InputWriter(path) as writer:
@@ -48,7 +48,7 @@ def test_the_log_of_the_run_before_is_kept(tmp_path):
     assert [b"second" in data for _, _, data in read_entries(tmp_path / "inputs.previous.mcap")] == [True]
 
 
-def test_a_full_disk_is_counted_and_stops_nobody(caplog):
+def test_full_disk_is_counted_and_does_not_stop_the_agent(caplog):
     before = lost()
     with open_core(AGENT, 4, Path("/dev/full")) as core:
         world = LittleWorld(seed=4, start_agent=lambda _config, _seed: core)
@@ -59,14 +59,14 @@ def test_a_full_disk_is_counted_and_stops_nobody(caplog):
     assert caplog.messages.count("input_log_ended") == 1
 
 
-def test_a_log_that_can_not_be_begun_leaves_the_agent_without_one(tmp_path, caplog):
+def test_agent_runs_without_a_log_that_can_not_be_opened(tmp_path, caplog):
     (tmp_path / "file").write_text("no folder")
     with open_core(AGENT, 4, tmp_path / "file" / "inputs.mcap") as core:
         assert type(core) is AgentCore
-    assert "input_log_not_begun" in caplog.messages
+    assert "input_log_not_opened" in caplog.messages
 
 
-def test_a_disk_that_is_too_slow_leaves_a_mark_where_entries_are_missing(tmp_path, monkeypatch):
+def test_slow_disk_leaves_an_entry_where_entries_are_missing(tmp_path, monkeypatch):
     begun, release, written = threading.Event(), threading.Event(), threading.Semaphore(0)
 
     class SlowRecorder(Recorder):
@@ -78,7 +78,7 @@ def test_a_disk_that_is_too_slow_leaves_a_mark_where_entries_are_missing(tmp_pat
 
     monkeypatch.setattr(input_writer, "Recorder", SlowRecorder)
     path, entry, before = tmp_path / "inputs.mcap", BaseLost(reason="x", now=1.0), lost()
-    with InputWriter(path, waiting_most=2) as writer:
+    with InputWriter(path, queue_limit=2) as writer:
         writer.write(entry)
         assert begun.wait(DEADLINE_S)
         for _ in range(5):

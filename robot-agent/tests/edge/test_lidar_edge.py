@@ -17,21 +17,21 @@ from robot_agent.lidars.rplidar_a1.emulator import RplidarEmulator
 STEP = 0.02
 
 
-def round_room(angles, _at):
+def wavy_room(angles, _at):
     return 2.0 + 0.5 * np.cos(3 * np.asarray(angles))
 
 
 class Line:
-    """A session and an emulated lidar on one line, in emulated time."""
+    """A driver and an emulated lidar on one serial line, in emulated time."""
 
     def __init__(self):
-        self.device = RplidarEmulator(round_room)
-        self.session = RplidarA1Driver()
+        self.device = RplidarEmulator(wavy_room)
+        self.driver = RplidarA1Driver()
         self.now = 50.0
         self.scans = []
         self.sent = b""
         self.cut = False
-        self.write(self.session.begin(self.now))
+        self.write(self.driver.begin(self.now))
 
     def write(self, data):
         self.sent += data
@@ -42,66 +42,66 @@ class Line:
         for _ in range(round(seconds / STEP)):
             self.now += STEP
             data = self.device.outgoing(self.now)
-            received = self.session.receive(b"" if self.cut else data, self.now)
+            received = self.driver.receive(b"" if self.cut else data, self.now)
             self.scans += received.scans
-            self.write(received.data + self.session.tick(self.now))
+            self.write(received.data + self.driver.tick(self.now))
 
 
-def test_stop_then_health_then_scan_and_scans_come():
+def test_driver_sends_stop_health_request_and_scan_request_then_scans_arrive():
     line = Line()
     line.run(2.0)
     assert line.sent == rplidar.stop() + rplidar.get_health() + rplidar.scan()
     assert 8 <= len(line.scans) <= 10
     assert np.nanmax(line.scans[0].ranges_m) == pytest.approx(2.5, abs=0.01)
-    assert line.session.trouble == ""
+    assert line.driver.problem == ""
 
 
-def test_a_lidar_that_scans_already_is_stopped_first_and_its_old_nodes_make_no_turn():
+def test_lidar_that_scans_already_is_stopped_first_and_its_old_nodes_are_discarded():
     line = Line()
     line.device.receive(rplidar.scan(), line.now)
     line.run(1.0)
     assert line.scans
-    assert line.session.incomplete == 0
+    assert line.driver.incomplete == 0
     assert all(scan.started_at > 50.0 + STOP_S for scan in line.scans)
 
 
-def test_silence_leads_to_a_new_scan():
+def test_silence_restarts_the_scan():
     line = Line()
     line.run(1.0)
     line.device.stalled = True
     line.run(SILENT_S + 0.1)
-    assert "no measurement" in line.session.trouble
+    assert "no measurement" in line.driver.problem
     line.device.stalled = False
     before = len(line.scans)
     line.run(1.0)
     assert len(line.scans) > before
-    assert line.session.trouble == ""
+    assert line.driver.problem == ""
 
 
-def test_a_lidar_that_does_not_answer_is_asked_again_and_again():
+def test_lidar_that_does_not_answer_is_asked_repeatedly():
     line = Line()
     line.cut = True
     line.run(3 * (ANSWER_S + STOP_S) + 0.2)
     assert line.sent.count(rplidar.get_health()) >= 3
-    assert "does not answer" in line.session.trouble
+    assert "does not answer" in line.driver.problem
     line.cut = False
     line.run(3.0)
     assert line.scans
 
 
-def test_a_lidar_in_error_is_reset_and_tried_again():
+def test_lidar_in_error_is_reset_and_restarted():
     line = Line()
     line.device.health, line.device.error_code = 2, 7
     line.run(0.5)
     assert line.sent.endswith(rplidar.reset())
-    assert "error 7" in line.session.trouble
+    assert "error 7" in line.driver.problem
     line.device.health = 0
     line.run(RESET_S + 1.0)
     assert line.scans
 
 
 @pytest.mark.live
-async def test_the_edge_waits_for_its_port_and_opens_it_again(tmp_path):
+async def test_edge_waits_for_its_port_and_reopens_it(tmp_path):
     link = tmp_path / "lidar"
     scans = []
     edge = LidarEdge(str(link), RplidarA1Driver(), SystemClock(), lambda _: None, lambda scan, _: scans.append(scan))
@@ -117,13 +117,13 @@ async def test_the_edge_waits_for_its_port_and_opens_it_again(tmp_path):
                 port.write(device.outgoing(time.monotonic()))
 
     try:
-        await until(lambda: "lidar" in edge.trouble and "No such file" in edge.trouble)
+        await until(lambda: "lidar" in edge.problem and "No such file" in edge.problem)
         for _ in range(2):
             scans.clear()
             with PtyPort(link) as port:
-                await until(lambda: len(scans) >= 2, port, RplidarEmulator(round_room))
-                assert edge.trouble == ""
-            await until(lambda: edge.trouble)
+                await until(lambda: len(scans) >= 2, port, RplidarEmulator(wavy_room))
+                assert edge.problem == ""
+            await until(lambda: edge.problem)
     finally:
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)

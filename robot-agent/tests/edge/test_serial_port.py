@@ -38,10 +38,10 @@ def test_every_byte_value_passes_both_ways(line):
     with open_port(path, 115200) as port:
         assert port.read_available() == b""
         os.write(master, every)
-        got = b""
-        while len(got) < 256:
-            got += read_some(port)
-        assert got == every
+        received = b""
+        while len(received) < 256:
+            received += read_some(port)
+        assert received == every
         port.write(every)
         assert os.read(master, 4096) == every
 
@@ -56,13 +56,13 @@ def test_the_line_is_115200_8n1_and_raw(line):
     assert (ispeed, ospeed) == (termios.B115200, termios.B115200)
 
 
-def test_a_pty_has_no_dtr_and_that_is_no_error(line):
+def test_set_dtr_returns_false_on_a_pty(line):
     _, path = line
     with open_port(path, 115200) as port:
         assert port.set_dtr(on=False) is False
 
 
-def test_losing_the_device_is_one_error_that_says_what_to_check(line):
+def test_lost_device_raises_port_lost_with_a_remedy(line):
     ends, path = line
     with open_port(path, 115200) as port:
         os.close(ends.pop())
@@ -73,7 +73,7 @@ def test_losing_the_device_is_one_error_that_says_what_to_check(line):
             port.write(b"\x80")
 
 
-def test_a_missing_device_and_a_file_that_is_none_are_refused(tmp_path):
+def test_missing_device_and_plain_file_are_refused(tmp_path):
     with pytest.raises(PortLost, match="No such file"):
         open_port(str(tmp_path / "none"), 115200)
     plain = tmp_path / "plain"
@@ -89,7 +89,7 @@ def test_a_port_in_use_is_refused_and_free_after_close(line):
     open_port(path, 115200).close()
 
 
-def test_a_device_that_takes_nothing_is_lost_and_does_not_hang(line):
+def test_write_to_a_device_that_accepts_nothing_raises_port_lost(line):
     _, path = line
     with open_port(path, 115200) as port, pytest.raises(PortLost, match="no byte"):
         port.write(bytes(1_000_000))

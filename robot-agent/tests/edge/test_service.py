@@ -27,7 +27,7 @@ class Fog:
 
     def __init__(self):
         self.answers = asyncio.Queue()
-        self.asked = 0
+        self.requests = 0
         self.handlers = {}
 
     def subscribe(self, channel, _kind, handler, **_ids):
@@ -38,11 +38,11 @@ class Fog:
 
     async def query(self, _channel, _request, kind, _timeout):
         assert kind is MapSnapshot
-        self.asked += 1
+        self.requests += 1
         return await self.answers.get()
 
 
-class Link:
+class FakeGuardian:
     def __init__(self):
         self.sent = []
 
@@ -68,7 +68,7 @@ class Rig:
         for delta in deltas:
             self.fog.handlers[ch.MAP_DELTA]({}, delta)
 
-    def beat(self):
+    def send_heartbeat(self):
         self.fog.handlers[ch.MAP_HEARTBEAT]({}, self.master.heartbeat(1.0))
 
     async def until(self, condition):
@@ -85,25 +85,25 @@ def rig(tmp_path):
 
 @pytest.fixture
 async def mapping(rig):
-    task = asyncio.create_task(rig.service.map_loop())
+    task = asyncio.create_task(rig.service.snapshot_loop())
     yield rig
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)
 
 
 async def test_changes_during_the_fetch_of_a_snapshot_are_applied_after_it(mapping):
-    await mapping.until(lambda: mapping.fog.asked == 1)
+    await mapping.until(lambda: mapping.fog.requests == 1)
     old = mapping.master.snapshot()
     mapping.deliver(mapping.change())
     mapping.deliver(mapping.change())
     mapping.fog.answers.put_nowait(old)
     await mapping.until(lambda: mapping.core.replica.version == mapping.master.version)
-    assert mapping.fog.asked == 1
+    assert mapping.fog.requests == 1
     assert not mapping.core.wants_snapshot(time.monotonic())
 
 
-async def test_changes_of_a_map_service_that_is_gone_do_not_spoil_the_new_map(mapping):
-    await mapping.until(lambda: mapping.fog.asked == 1)
+async def test_deltas_of_an_older_map_service_do_not_affect_the_new_map(mapping):
+    await mapping.until(lambda: mapping.fog.requests == 1)
     mapping.deliver(mapping.change())
     fresh = LittleWorld()
     fresh.master._version = type(fresh.master.version)(8, 0, fresh.master.version.hash)
@@ -112,7 +112,7 @@ async def test_changes_of_a_map_service_that_is_gone_do_not_spoil_the_new_map(ma
     assert not mapping.core.wants_snapshot(time.monotonic())
 
 
-async def test_a_last_change_that_got_lost_is_noticed_by_the_heartbeat_after_a_grace(mapping):
+async def test_lost_last_delta_is_detected_by_the_heartbeat_after_a_grace_period(mapping):
     mapping.fog.answers.put_nowait(mapping.master.snapshot())
     await mapping.until(lambda: mapping.core.replica.version == mapping.master.version)
     mapping.change()
@@ -120,40 +120,40 @@ async def test_a_last_change_that_got_lost_is_noticed_by_the_heartbeat_after_a_g
     begun = time.monotonic()
 
     def caught_up():
-        mapping.beat()
+        mapping.send_heartbeat()
         return mapping.core.replica.version == mapping.master.version
 
     await mapping.until(caught_up)
     assert time.monotonic() - begun >= GRACE_S
-    assert mapping.fog.asked == 2
+    assert mapping.fog.requests == 2
 
 
-async def test_unanswered_and_damaged_snapshots_are_asked_for_again(mapping):
+async def test_unanswered_and_damaged_snapshots_are_requested_again(mapping):
     good = mapping.master.snapshot()
     mapping.fog.answers.put_nowait(None)
     mapping.fog.answers.put_nowait(msgspec.structs.replace(good, hash=1))
     mapping.fog.answers.put_nowait(good)
     await mapping.until(lambda: mapping.core.replica.version is not None)
-    assert mapping.fog.asked == 3
+    assert mapping.fog.requests == 3
 
 
-async def test_a_decision_that_hangs_leaves_the_stream_alive(rig, monkeypatch):
+async def test_hanging_decision_does_not_block_the_stream(rig, monkeypatch):
     release, begun = threading.Event(), threading.Event()
 
     def hang(_job):
         begun.set()
         release.wait(DEADLINE_S)
-        raise AssertionError("nobody asked for the rest")
+        raise AssertionError("the released decision must not run")
 
     monkeypatch.setattr(service_module, "decide", hang)
     monkeypatch.setattr(rig.core, "control_job", lambda _now: object())
-    link = Link()
-    tasks = [asyncio.create_task(rig.service.control_loop()), asyncio.create_task(rig.service.stream_loop(link))]
+    guardian = FakeGuardian()
+    tasks = [asyncio.create_task(rig.service.control_loop()), asyncio.create_task(rig.service.stream_loop(guardian))]
     try:
         await rig.until(begun.is_set)
-        before = len(link.sent)
-        await rig.until(lambda: len(link.sent) >= before + 20)
-        assert [command.seq for _, command in link.sent] == list(range(1, len(link.sent) + 1))
+        before = len(guardian.sent)
+        await rig.until(lambda: len(guardian.sent) >= before + 20)
+        assert [command.seq for _, command in guardian.sent] == list(range(1, len(guardian.sent) + 1))
     finally:
         for task in tasks:
             task.cancel()

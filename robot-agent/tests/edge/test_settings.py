@@ -25,7 +25,7 @@ def settings(tmp_path, **more):
     return load(Settings, environ=environ)
 
 
-def test_the_site_folder_tells_id_start_and_body(tmp_path):
+def test_site_folder_gives_id_start_pose_and_radius(tmp_path):
     (tmp_path / "site.toml").write_text(SITE)
     site, body = read_site(settings(tmp_path, site_dir=tmp_path))
     assert (site, body.start.x, body.radius) == ("lab", 1.0, 0.2)
@@ -33,7 +33,7 @@ def test_the_site_folder_tells_id_start_and_body(tmp_path):
     assert site == "other"
 
 
-def test_a_robot_without_the_folder_needs_the_id_alone(tmp_path):
+def test_robot_without_the_folder_needs_only_the_site_id(tmp_path):
     assert read_site(settings(tmp_path, site="lab")) == ("lab", None)
     with pytest.raises(SettingsError, match="FOGNAV_SITE "):
         read_site(settings(tmp_path))

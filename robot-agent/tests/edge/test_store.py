@@ -10,7 +10,7 @@ from robot_agent.localization.localizer import SavedPose
 POSE = SavedPose(site="lab", x=1.0, y=2.0, theta=0.5, sigma_xy=0.1, sigma_theta=0.05)
 
 
-def test_what_is_stored_comes_back_on_its_own_site_only(tmp_path):
+def test_stored_pose_and_map_are_returned_for_their_own_site_only(tmp_path):
     store, snapshot = Store(tmp_path / "data"), LittleWorld().master.snapshot()
     assert store.pose("lab") is None
     assert store.snapshot("lab") is None
@@ -23,7 +23,7 @@ def test_what_is_stored_comes_back_on_its_own_site_only(tmp_path):
 
 
 @pytest.mark.parametrize("damage", [b"", b"\xff\xfe", b"{}", b"[" * 10])
-def test_damaged_files_are_as_good_as_none(tmp_path, damage):
+def test_damaged_files_count_as_missing(tmp_path, damage):
     store = Store(tmp_path)
     store.put_pose(POSE)
     store.put_snapshot(LittleWorld().master.snapshot())

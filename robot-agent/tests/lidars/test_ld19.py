@@ -197,13 +197,13 @@ def test_a_silent_lidar_is_trouble_until_it_speaks():
     driver = Ld19Driver()
     assert driver.begin(5.0) == b""
     assert driver.tick(5.0 + SILENT_S) == b""
-    assert driver.trouble == ""
+    assert driver.problem == ""
     driver.tick(5.1 + SILENT_S)
-    assert "check its cable" in driver.trouble
+    assert "check its cable" in driver.problem
     assert not driver.receive(b"\x54\x2c nothing that counts", 7.0).samples
-    assert driver.trouble
+    assert driver.problem
     assert driver.receive(packet(0, [1] * 12), 7.1).samples
-    assert driver.trouble == ""
+    assert driver.problem == ""
 
 
 def test_its_line_is_fast_and_takes_no_commands():

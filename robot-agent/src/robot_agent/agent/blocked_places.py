@@ -1,4 +1,4 @@
-"""The reasons behind blocked cells: watched areas and operators' no-go zones, and whether the robot stands in one."""
+"""The reasons for blocked cells: watched areas and no-go zones, and whether the robot is in one of them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class BlockedPlaces:
         self._zones: list[Zone] = []
 
     def handlers(self) -> Mapping[ch.Channel, Handler]:
-        """Return the handlers of the channels that tell the reasons behind cells."""
+        """Return the handlers of the channels that carry areas and zones."""
         return {ch.HAZARD: self._on_hazard, ch.ZONES: self._on_zones}
 
     def _on_hazard(self, _ids: Ids, hazard: HazardArea, _at: Moment) -> Sequence[Publication]:
@@ -40,11 +40,11 @@ class BlockedPlaces:
         self._zones = [zone for zone in zones.zones if zone.enabled and zone.kind == "BLOCKED"]
         return ()
 
-    def around(self, pose: Pose2, replica: Replica, reporter: ObstacleReporter, now: float) -> str | None:
-        """Return which blocked place the robot's centre (m, frame `map`) stands in, in words; None for no such place.
+    def containing(self, pose: Pose2, replica: Replica, reporter: ObstacleReporter, now: float) -> str | None:
+        """Return the name of the blocked place that contains the robot's centre (m, frame `map`), None without one.
 
-        The map decides whether it is blocked, the areas and zones only name the reason. What the robot's own lidar
-        reported does not count: it would be the robot's own side, or a thing that it stands beside.
+        The map decides whether it is blocked, the areas and zones only give the reason. Cells that the robot reported
+        itself do not count: they would be its own body, or an obstacle beside it.
         """
         if not _is_blocked(replica, pose):
             return None
@@ -63,10 +63,10 @@ class BlockedPlaces:
         return None
 
     def caution(self, pose: Pose2) -> str | None:
-        """Return why the robot must be slow where it is (m, frame `map`), in words; None when it need not be."""
+        """Return why the robot must drive slowly where it is (m, frame `map`); None when it need not."""
         for hazard in self._hazards.values():
             if hazard.hazard.state == "unknown" and contains_point(hazard.polygon, pose.x, pose.y):
-                return f"nobody can tell whether the area {hazard.label or hazard.hazard.area} is clear"
+                return f"the state of the area {hazard.label or hazard.hazard.area} is unknown"
         return None
 
 

@@ -1,12 +1,12 @@
-"""What the robot decides, without touching the world; reading this file from the top explains the robot.
+"""The agent's decisions, without I/O; reading this file from the top explains the robot.
 
-Values and times go in, values come out. `now` is the robot's own monotonic clock (s), by which every age is judged;
-`stamp` is the wall clock (s) and only names moments for people and traces. Whoever runs the core
-- hands it every message of `handlers()` and every query of `query_handlers()`, and what base and lidar send;
+Values and times go in, values come out. `now` is the robot's own monotonic clock (s), by which every age is measured;
+`stamp` is the wall clock (s) and only dates messages and traces. Whoever runs the core
+- passes it every message of `handlers()`, every query of `query_handlers()`, and the input from base and lidar;
 - calls `stream` 20 times a second and sends the wheel command to the guardian;
-- runs `decide(control_job(now))` 5 times a second, on a thread if it likes, and hands the decision to `accept`;
+- runs `decide(control_job(now))` 5 times a second, on any thread, and passes the decision to `accept`;
 - calls `tick` 10 times a second and publishes what it returns;
-- asks for a snapshot of the map while `wants_snapshot`, and stores what `pose_to_store` returns.
+- requests a snapshot of the map while `wants_snapshot`, and stores what `pose_to_store` returns.
 """
 
 from __future__ import annotations
@@ -89,10 +89,10 @@ class AgentCore:
         """The robot's id."""
         return self._config.robot
 
-    # --- what the fog says ---
+    # --- messages from the fog ---
 
     def handlers(self) -> Mapping[ch.Channel, Handler]:
-        """Return the handler of every channel that the robot listens to; of `{robot}` channels its own only."""
+        """Return the handlers of all subscribed channels; of channels with `{robot}` the robot's own only."""
         return {
             ch.MAP_DELTA: self._on_delta,
             ch.MAP_HEARTBEAT: self._on_heartbeat,
@@ -102,7 +102,7 @@ class AgentCore:
         }
 
     def query_handlers(self) -> Mapping[ch.Channel, QueryHandler]:
-        """Return what answers every query that the robot serves."""
+        """Return the handlers of all served queries."""
         return {ch.ROBOT_COMMAND: self._on_command}
 
     def _on_delta(self, _ids: Ids, delta: MapDelta, at: Moment) -> Sequence[Publication]:
@@ -136,41 +136,41 @@ class AgentCore:
     # --- the map ---
 
     def wants_snapshot(self, now: float) -> bool:
-        """Return whether only a snapshot of the map-service can mend the copy of the map."""
+        """Return whether the replica of the map needs a snapshot from the map-service."""
         return self._map.wants_snapshot(now)
 
     def load(self, snapshot: MapSnapshot, now: float) -> None:
-        """Take a snapshot, from the map-service or from disk; raises `MapError` when it is none."""
+        """Load a snapshot, from the map-service or from disk; raises `MapError` when it is invalid."""
         self._map.on_snapshot(snapshot, now)
         self._pose_keeper.load_map(self.replica)
         self._path_monitor.check(self._mission, self.replica, now)
 
-    # --- the robot's own parts ---
+    # --- base and lidar ---
 
     def on_base(self, feedback: BaseFeedback, now: float) -> None:
-        """Take what the guardian read from the base."""
+        """Handle feedback of the base."""
         self._base.on_feedback(feedback, now)
         motion = self._odometry.update(feedback.odometry, now)
         if not isinstance(motion, EncoderFault):
             self._localizer.on_odometry(now, motion.x, motion.y, motion.theta)
 
     def on_base_lost(self, now: float, reason: str) -> None:
-        """Take that the link to the guardian broke."""
+        """Record that the link to the guardian broke."""
         del now
         self._base.on_lost(reason)
 
-    def on_lidar_nodes(self, now: float) -> None:
-        """Take that the lidar sent anything."""
-        self._lidar.on_nodes(now)
+    def on_lidar_samples(self, now: float) -> None:
+        """Record that lidar samples arrived."""
+        self._lidar.on_samples(now)
 
     def on_scan(self, scan: LaserScan, now: float) -> None:
-        """Take a whole scan of the lidar that arrived at `now`; a repeated one tells nothing of the world."""
+        """Handle a whole scan that arrived at `now`; repeated identical scans don't correct the pose."""
         self._lidar.on_scan(scan.repeats, now)
         if scan.repeats < self._config.safety.identical_scans:
             self._localizer.on_scan(scan, now)
 
     def on_loop_health(self, health: LoopHealth) -> None:
-        """Take how punctual the process's loops are."""
+        """Record how punctual the process's loops are."""
         self._loop_health = health
 
     # --- driving ---
@@ -183,16 +183,16 @@ class AgentCore:
         return command
 
     def control_job(self, now: float) -> Job | None:
-        """Return what the next decision needs; None while there is nothing to drive to or no right to drive."""
+        """Return the inputs of the next decision; None while there is no goal or the robot must not drive."""
         pose, mission, replica = self._localizer.pose(now), self._mission, self.replica
         follower, path = mission.follower, mission.path
         if follower is None or path is None or pose is None or replica.geometry is None or not mission.active:
             return None
         follower.advance(pose.x, pose.y, now)
         if self.safety.stop != "none":
-            follower.rest_clock(now)
+            follower.restart_progress_timer(now)
             return None
-        seen = self._localizer.points_in_map()
+        points = self._localizer.points_in_map()
         return make_job(
             follower,
             plan_id=path.plan_id,
@@ -205,13 +205,13 @@ class AgentCore:
             cost=replica.cost,
             speed_limits=replica.speed,
             geometry=replica.geometry,
-            seen=np.zeros((0, 2)) if seen is None else seen,
+            lidar_points=np.zeros((0, 2)) if points is None else points,
             config=self._config.motion,
         )
 
     def accept(self, decision: Decision) -> None:
-        """Take a decision; one for a path that is no longer followed is dropped."""
-        if self._mission.path_name != (decision.planner_epoch, decision.plan_id) or not self._mission.active:
+        """Drive by a decision; one for a path that is no longer followed is dropped."""
+        if self._mission.path_id != (decision.planner_epoch, decision.plan_id) or not self._mission.active:
             return
         self._wheels.decision = decision
         if decision.at_goal:
@@ -228,7 +228,9 @@ class AgentCore:
             self._localizer,
             self._mission,
             path_problem=self._path_monitor.problem(self._mission, self.replica.version, now),
-            inside_blocked=self._places.around(pose, self.replica, self._reporter, now) if pose and localized else None,
+            inside_blocked=self._places.containing(pose, self.replica, self._reporter, now)
+            if pose and localized
+            else None,
             caution=self._places.caution(pose) if pose else None,
             now=now,
         )
@@ -238,49 +240,49 @@ class AgentCore:
         return outputs
 
     def _stop_following(self) -> None:
-        """Forget what belonged to the path that the mission dropped."""
+        """Forget decision and blockage of the path that the mission dropped."""
         self._wheels.decision = None
         self._path_monitor.reset()
 
-    # --- what operators may have done: `OperatorCommands` calls these ---
+    # --- operators' commands: `OperatorCommands` calls these ---
 
     def request(self, request: Request, now: float) -> SafetyOutputs:
-        """Hand an operator's request to the safety gate; its refusal stands in the outputs."""
+        """Pass an operator's request to the safety gate; the outputs carry its refusal."""
         outputs = self._evaluate_safety(now, request)
         if request == "reset" and outputs.refusal is None:
             self._wheels.pass_reset()
         return outputs
 
     def cancel_goal(self) -> str | None:
-        """Give the goal up; return which it was, None when there is none."""
+        """Cancel the goal; return its id, None without one."""
         cancelled = self._mission.cancel()
         if cancelled is not None:
             self._stop_following()
         return cancelled
 
-    def take_initial_pose(self, pose: Pose | None) -> str | None:
-        """Start localization at a pose in `map`; return why not, None when it is taken."""
+    def set_initial_pose(self, pose: Pose | None) -> str | None:
+        """Start localization at a pose in `map`; return why the pose is refused, None when it is accepted."""
         refusal = initial_pose_refusal(pose, self.replica, at_rest=self._wheels.at_rest)
         if refusal is None and pose is not None:
             self._localizer.initial_pose(pose.x, pose.y, pose.theta)
         return refusal
 
-    # --- what the robot tells ---
+    # --- publications ---
 
     def tick(self, at: Moment) -> Sequence[Publication]:
-        """Let time pass, at least ten times a second; return what is to be published now."""
+        """Advance time, at least ten times a second; return what to publish now."""
         self._pose_keeper.search(self.safety.mode, at.now, at_rest=self._wheels.at_rest)
-        return self._publishing.choose(self.pose(at), self.state(at), partial(self._report_obstacles, at), at.now)
+        return self._publishing.due(self.pose(at), self.state(at), partial(self._report_obstacles, at), at.now)
 
     def _report_obstacles(self, at: Moment) -> RobotObstacles | None:
         return self._reporter.report(self._localizer, self.replica, self._lidar.scan_age(at.now), at)
 
     def pose(self, at: Moment) -> RobotPose | None:
-        """Return the pose, None while none is known."""
+        """Return the pose; None while it is unknown."""
         return robot_pose(self._localizer, self._config, at)
 
     def state(self, at: Moment) -> RobotState:
-        """Return what the robot is doing and why."""
+        """Return mode, reasons, goal, path and map version as a message."""
         may_drive = self._mission.active and self.safety.stop == "none"
         stuck_after = self._config.motion.stuck_after
         return robot_state(
@@ -295,7 +297,7 @@ class AgentCore:
         )
 
     def finished_traces(self) -> list[Trace]:
-        """Return the traces that came to their end since the last call, each once: for histograms."""
+        """Return the traces that were completed since the last call, each once: for histograms."""
         return self._traces.take_finished()
 
     # --- restart ---
@@ -308,7 +310,7 @@ class AgentCore:
         """Return the pose if it is trusted and differs from the last one returned, so that it is worth a write."""
         return self._pose_keeper.to_store(self.replica.site, now)
 
-    # --- for reading ---
+    # --- read-only views ---
 
     @property
     def localizer(self) -> Localizer:
@@ -317,7 +319,7 @@ class AgentCore:
 
     @property
     def replica(self) -> Replica:
-        """The copy of the master costmap."""
+        """The replica of the master costmap."""
         return self._map.replica
 
     @property

@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     from fog_runtime.clock import Clock
 
 RETRY_S: Final = 0.2
-QUIET_S: Final = 1.0
-"""A guardian that says nothing for so long has heard nothing from its base."""
+FEEDBACK_TIMEOUT_S: Final = 1.0
+"""Without feedback for this long the guardian receives nothing from its base."""
 RESET_VALID_S: Final = 1.0
-"""An operator's reset that could not be passed on within this time is void: it must not clear a later fault."""
+"""An operator's reset that could not be passed on within this time expires: it must not clear a later fault."""
 
 _log = logs.get("base")
 
@@ -43,27 +43,27 @@ class GuardianClient:
         self._on_lost = on_lost
         self._socket: socket.socket | None = None
         self._reset_until = -math.inf
-        self._heard_at = -math.inf
-        self._told = ""
+        self._feedback_at = -math.inf
+        self._last_logged = ""
         self._limited = logs.RateLimited(_log)
 
     def send(self, command: WheelCommand) -> bool:
-        """Send a command without waiting; False when there is no guardian, or one that does not read.
+        """Send a command without waiting; False when there is no guardian, or it does not read.
 
-        Called at a steady rate, it also notices a guardian that has nothing to say.
+        Called at a steady rate, it also detects a guardian that sends no feedback.
         """
         now = self._clock.now()
         if command.reset:
             self._reset_until = now + RESET_VALID_S
         if self._socket is None:
             return False
-        if now - self._heard_at > QUIET_S:
-            self._lost("the guardian hears nothing from the base; check its cable and power")
+        if now - self._feedback_at > FEEDBACK_TIMEOUT_S:
+            self._lost("the guardian receives nothing from the base; check its cable and power")
         reset = now <= self._reset_until
         try:
             self._socket.send(encode(msgspec.structs.replace(command, reset=reset)))
         except (BlockingIOError, ConnectionError):
-            # Full: the guardian hangs, and its watchdog ends it. Broken: whoever reads notices and connects again.
+            # A full socket: the guardian hangs, and its watchdog kills it. A broken one: `run` connects again.
             return False
         self._reset_until = -math.inf
         return True
@@ -75,8 +75,8 @@ class GuardianClient:
                 with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as link:
                     link.settimeout(0)
                     await asyncio.get_running_loop().sock_connect(link, str(self._path))
-                    self._socket, self._heard_at, self._told = link, self._clock.now(), ""
-                    _log.info("guardian_found", socket=str(self._path))
+                    self._socket, self._feedback_at, self._last_logged = link, self._clock.now(), ""
+                    _log.info("guardian_connected", socket=str(self._path))
                     reason = await self._read(link)
             except OSError as error:
                 reason = f"{self._path}: {error.strerror or error}; does the watchdog run?"
@@ -86,7 +86,7 @@ class GuardianClient:
             await self._clock.sleep(RETRY_S)
 
     async def _read(self, link: socket.socket) -> str:
-        """Pass feedback on until the link breaks; return why it did."""
+        """Pass feedback on until the link breaks; return the reason."""
         loop = asyncio.get_running_loop()
         while True:
             data = await loop.sock_recv(link, PACKET_LIMIT + 1)
@@ -96,13 +96,13 @@ class GuardianClient:
             try:
                 feedback = decode_feedback(data)
             except (msgspec.DecodeError, UnicodeDecodeError) as error:
-                self._limited.warning("bad_feedback", "bad_feedback", now, reason=str(error))
+                self._limited.warning("feedback_refused", "feedback_refused", now, reason=str(error))
                 continue
-            self._heard_at, self._told = now, ""
+            self._feedback_at, self._last_logged = now, ""
             self._on_feedback(feedback, now)
 
     def _lost(self, reason: str) -> None:
-        if reason != self._told:
-            self._told = reason
+        if reason != self._last_logged:
+            self._last_logged = reason
             _log.warning("base_lost", reason=reason)
         self._on_lost(self._clock.now(), reason)

@@ -1,8 +1,8 @@
-"""Everything that reaches the agent's core, in order and with its exact times, and what the core answers.
+"""Log of the inputs of the agent's core, in order and with their exact times, and of its outputs.
 
-`LoggedAgent` is an `AgentCore` that hands an entry to `write` before every input and after every output. A fresh core
-that is fed the inputs again gives the same outputs to the last bit (`robot_agent.agent.replay`). An agent that logs
-nothing is a plain `AgentCore` and pays nothing.
+`LoggedAgent` is an `AgentCore` that passes an entry to `write` before every input and after every output. A new core
+that gets the same inputs gives the same outputs to the last bit (`robot_agent.agent.replay`). An agent without a log
+is a plain `AgentCore` and has no overhead.
 
 No secret enters the log: its configuration holds `LOG_KEY` in place of the operators' key, and commands that were
 signed with theirs are signed anew with it.
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from robot_agent.motion.local_planner import Job
 
 LOG_KEY: Final = b"known to all: signs commands in logs only"
-"""Stands in a log for the operators' key."""
+"""Replaces the operators' key in a log."""
 
 
 class Entry(msgspec.Struct, frozen=True, kw_only=True):
@@ -45,11 +45,11 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Input(Entry, frozen=True, kw_only=True):
-    """Something that reached the core, written before the core took it."""
+    """An input of the core, written before the core handles it."""
 
 
 class Output(Entry, frozen=True, kw_only=True):
-    """Something that the core answered to the input before it."""
+    """An output of the core, caused by the input before it."""
 
 
 class Started(Input, frozen=True, kw_only=True):
@@ -93,7 +93,7 @@ class QueryReceived(Input, frozen=True, kw_only=True):
 
 
 class BaseReceived(Input, frozen=True, kw_only=True):
-    """What the guardian read from the base."""
+    """Feedback of the base, from the guardian."""
 
     feedback: BaseFeedback
     now: float
@@ -106,8 +106,8 @@ class BaseLost(Input, frozen=True, kw_only=True):
     now: float
 
 
-class LidarNodesReceived(Input, frozen=True, kw_only=True):
-    """The lidar sent anything."""
+class LidarSamplesReceived(Input, frozen=True, kw_only=True):
+    """Lidar samples arrived."""
 
     now: float
 
@@ -155,33 +155,33 @@ class LoopHealthReceived(Input, frozen=True, kw_only=True):
 
 
 class ControlCycle(Input, frozen=True, kw_only=True):
-    """The control loop asked for a job."""
+    """The control loop requested a job."""
 
     now: float
 
 
 class DecisionMade(Input, frozen=True, kw_only=True):
-    """What came of the last job. A function of that alone, so a replay computes it again."""
+    """The decision for the last job. It depends on that job alone, so a replay computes it again."""
 
     decision: Decision
 
 
 class StreamCycle(Input, frozen=True, kw_only=True):
-    """The stream loop asked for a wheel command."""
+    """The stream loop requested a wheel command."""
 
     now: float
     stamp: float
 
 
 class Tick(Input, frozen=True, kw_only=True):
-    """The publish loop let time pass."""
+    """The publish loop advanced time."""
 
     now: float
     stamp: float
 
 
 class StorageCheck(Input, frozen=True, kw_only=True):
-    """The housekeeping loop asked for a pose to store."""
+    """The housekeeping loop requested a pose to store."""
 
     now: float
 
@@ -208,29 +208,29 @@ class Answered(Output, frozen=True, kw_only=True):
 
 
 class PoseStored(Output, frozen=True, kw_only=True):
-    """A pose that is worth storing."""
+    """A pose to store."""
 
     pose: SavedPose
 
 
 class EntriesLost(Entry, frozen=True, kw_only=True):
-    """So many entries are missing here: the disk was too slow. Nothing after them can be replayed."""
+    """`count` entries are missing here because the disk was too slow. Nothing after them can be replayed."""
 
     count: int
 
 
 _KINDS: Final[tuple[type[Entry], ...]] = (
-    Started, PoseRestored, SnapshotLoaded, MessageReceived, QueryReceived, BaseReceived, BaseLost, LidarNodesReceived,
+    Started, PoseRestored, SnapshotLoaded, MessageReceived, QueryReceived, BaseReceived, BaseLost, LidarSamplesReceived,
     ScanReceived, LoopHealthReceived, ControlCycle, DecisionMade, StreamCycle, Tick, StorageCheck,
     WheelsCommanded, Published, Answered, PoseStored, EntriesLost,
 )  # fmt: skip
 ENTRY_OF_TOPIC: Final[Mapping[str, type[Entry]]] = {f"agent/{kind.__name__}": kind for kind in _KINDS}
 TOPIC_OF_ENTRY: Final[Mapping[type[Entry], str]] = {kind: topic for topic, kind in ENTRY_OF_TOPIC.items()}
-"""Under which topic of a recording each type of entry is written."""
+"""Topic of the recording under which each type of entry is written."""
 
 
 class LoggedAgent(AgentCore):
-    """An `AgentCore` all of whose inputs and outputs are handed to `write`, which must not block."""
+    """An `AgentCore` that passes all of its inputs and outputs to `write`, which must not block."""
 
     def __init__(self, config: AgentConfig, seed: int, write: Callable[[Entry], object]) -> None:
         self._write = write
@@ -239,11 +239,11 @@ class LoggedAgent(AgentCore):
         super().__init__(config, seed)
 
     def handlers(self) -> Mapping[Channel, Handler]:
-        """Return the core's handlers, each of which logs what it takes and returns."""
+        """Return the core's handlers, each of which logs its message and publications."""
         return {channel: partial(self._handle, channel, handler) for channel, handler in super().handlers().items()}
 
     def query_handlers(self) -> Mapping[Channel, QueryHandler]:
-        """Return the core's query_handlers, each of which logs what it is asked and answers."""
+        """Return the core's query handlers, each of which logs its request and reply."""
         return {
             channel: partial(self._answer, channel, query_handler)
             for channel, query_handler in super().query_handlers().items()
@@ -256,14 +256,14 @@ class LoggedAgent(AgentCore):
         return self._log_publications(handler(ids, message, at))
 
     def _answer(self, channel: Channel, query_handler: QueryHandler, ids: Ids, request: Any, at: Moment) -> Message:  # noqa: ANN401  # of the channel's type
-        logged = self._without_secret(request) if channel is ch.ROBOT_COMMAND else request
+        logged = self._re_signed(request) if channel is ch.ROBOT_COMMAND else request
         self._write(QueryReceived(channel=channel.name, ids=dict(ids), request=logged, now=at.now, stamp=at.stamp))
         reply = query_handler(ids, request, at)
         self._write(Answered(reply=reply))
         return reply
 
-    def _without_secret(self, command: RobotCommand) -> RobotCommand:
-        """Return the command as valid or invalid under `LOG_KEY` as it is under the operators' key."""
+    def _re_signed(self, command: RobotCommand) -> RobotCommand:
+        """Return the command signed with `LOG_KEY` if it was signed with the operators' key, else without signature."""
         if hmac.compare_digest(sign(command, self._key).signature, command.signature):
             return sign(command, LOG_KEY)
         return msgspec.structs.replace(command, signature=b"")
@@ -279,27 +279,27 @@ class LoggedAgent(AgentCore):
         super().restore(saved)
 
     def on_base(self, feedback: BaseFeedback, now: float) -> None:
-        """Log the feedback and take it."""
+        """Log the feedback and handle it."""
         self._write(BaseReceived(feedback=feedback, now=now))
         super().on_base(feedback, now)
 
     def on_base_lost(self, now: float, reason: str) -> None:
-        """Log that the link broke, and take it."""
+        """Log that the link broke, and record it."""
         self._write(BaseLost(reason=reason, now=now))
         super().on_base_lost(now, reason)
 
-    def on_lidar_nodes(self, now: float) -> None:
-        """Log that the lidar sent anything, and take it."""
-        self._write(LidarNodesReceived(now=now))
-        super().on_lidar_nodes(now)
+    def on_lidar_samples(self, now: float) -> None:
+        """Log that lidar samples arrived, and record it."""
+        self._write(LidarSamplesReceived(now=now))
+        super().on_lidar_samples(now)
 
     def on_scan(self, scan: LaserScan, now: float) -> None:
-        """Log the scan and take it."""
+        """Log the scan and handle it."""
         self._write(ScanReceived.of(scan, now))
         super().on_scan(scan, now)
 
     def on_loop_health(self, health: LoopHealth) -> None:
-        """Log the loops' health and take it."""
+        """Log the loops' health and record it."""
         self._write(LoopHealthReceived(health=health))
         super().on_loop_health(health)
 
@@ -309,7 +309,7 @@ class LoggedAgent(AgentCore):
         return super().control_job(now)
 
     def accept(self, decision: Decision) -> None:
-        """Log the decision and take it."""
+        """Log the decision and drive by it."""
         self._write(DecisionMade(decision=decision))
         super().accept(decision)
 
@@ -321,12 +321,12 @@ class LoggedAgent(AgentCore):
         return command
 
     def tick(self, at: Moment) -> Sequence[Publication]:
-        """Log that time passes, and what is published."""
+        """Log the tick and its publications."""
         self._write(Tick(now=at.now, stamp=at.stamp))
         return self._log_publications(super().tick(at))
 
     def pose_to_store(self, now: float) -> SavedPose | None:
-        """Log the question, and the pose if there is one to store."""
+        """Log the request, and the pose if there is one to store."""
         self._write(StorageCheck(now=now))
         pose = super().pose_to_store(now)
         if pose is not None:

@@ -1,4 +1,4 @@
-"""Writes the agent's input log on a thread of its own: a slow or full disk costs entries, never the robot's time."""
+"""Writes the agent's input log on its own thread: a slow or full disk loses entries, but never delays the robot."""
 
 from __future__ import annotations
 
@@ -22,33 +22,35 @@ if TYPE_CHECKING:
     from robot_agent.agent.input_log import Entry
     from robot_agent.config import AgentConfig
 
-_WAITING_MOST: Final = 20_000
-"""Entries that may wait for the disk: about a minute's."""
+_QUEUE_LIMIT: Final = 20_000
+"""Entries that may wait for the disk: about those of a minute."""
 _CLOSE_S: Final = 5.0
 
-LOST = Counter("fognav_input_log_lost_total", "Inputs and outputs of the agent that its input log could not take")
+LOST = Counter(
+    "fognav_input_log_lost_entries_total", "Inputs and outputs of the agent that were not written to its input log"
+)
 
 _log = logs.get("input_log")
 
 
 class InputWriter:
-    """Takes entries on the loop's thread, and writes them on another; a context manager."""
+    """Queues entries on the loop's thread and writes them on its own; a context manager."""
 
-    def __init__(self, path: Path, *, waiting_most: int = _WAITING_MOST) -> None:
+    def __init__(self, path: Path, *, queue_limit: int = _QUEUE_LIMIT) -> None:
         """Begin a new log at `path`; one of an earlier run is kept as `NAME.previous.SUFFIX`. Raises `OSError`."""
         if path.is_file():
             path.replace(path.with_suffix(f".previous{path.suffix}"))
         self._path = path
         self._recorder: Recorder | None = Recorder(path)
-        self._waiting_most = waiting_most
+        self._waiting_most = queue_limit
         self._queue: SimpleQueue[tuple[Entry, int] | None] = SimpleQueue()
         self._missing = 0
         self._thread = threading.Thread(target=self._run, name="input log", daemon=True)
         self._thread.start()
-        _log.info("input_log", path=str(path))
+        _log.info("input_log_opened", path=str(path))
 
     def write(self, entry: Entry) -> None:
-        """Have an entry written; never blocks. What finds the queue full is counted and lost."""
+        """Queue an entry for writing; never blocks. With a full queue the entry is lost and counted."""
         now_ns = time.time_ns()
         if self._queue.qsize() >= self._waiting_most:
             if self._missing == 0:
@@ -62,20 +64,20 @@ class InputWriter:
         self._queue.put((entry, now_ns))
 
     def close(self) -> None:
-        """Write what waits, and end the file."""
+        """Write the queued entries, and close the file."""
         self._queue.put(None)
         self._thread.join(_CLOSE_S)
         if self._thread.is_alive():
-            _log.error("input_log_unfinished", path=str(self._path), waiting=self._queue.qsize())
+            _log.error("input_log_unfinished", path=str(self._path), queued=self._queue.qsize())
 
     def _run(self) -> None:
         while (item := self._queue.get()) is not None:
-            entry, at_ns = item
+            entry, log_time_ns = item
             if self._recorder is None:
                 LOST.inc()
                 continue
             try:
-                self._recorder.write_entry(TOPIC_OF_ENTRY[type(entry)], entry, at_ns)
+                self._recorder.write_entry(TOPIC_OF_ENTRY[type(entry)], entry, log_time_ns)
             except OSError as error:
                 LOST.inc()
                 self._give_up(error)
@@ -86,11 +88,11 @@ class InputWriter:
                 self._report(error)
 
     def _give_up(self, error: OSError) -> None:
-        """Write nothing more: what follows a hole can't be replayed."""
+        """Write nothing more: entries after a gap can't be replayed."""
         self._report(error)
         recorder, self._recorder = self._recorder, None
         if recorder is not None:
-            with suppress(OSError):  # the same again: it has been reported
+            with suppress(OSError):  # the same error again, already reported
                 recorder.close()
 
     def _report(self, error: OSError) -> None:
@@ -106,16 +108,16 @@ class InputWriter:
 
 @contextmanager
 def open_core(config: AgentConfig, seed: int, input_log: Path | None) -> Iterator[AgentCore]:
-    """Yield the agent's core, one that logs its inputs to a file if there is one; the file ends with the context.
+    """Yield the agent's core, which logs its inputs if a file is given; the file is closed with the context.
 
-    A log that can't be begun is reported, and the robot does without.
+    If the file can't be opened, that is logged and the robot runs without an input log.
     """
     writer = None
     if input_log is not None:
         try:
             writer = InputWriter(input_log)
         except OSError as error:
-            _log.error("input_log_not_begun", path=str(input_log), reason=error.strerror or str(error))
+            _log.error("input_log_not_opened", path=str(input_log), reason=error.strerror or str(error))
     if writer is None:
         yield AgentCore(config, seed)
         return

@@ -1,4 +1,4 @@
-"""The lidar edge: owns the port, lets the lidar's driver talk over it, and opens it anew whenever it is lost."""
+"""The lidar edge: owns the port, runs the lidar's driver on it, and reopens it whenever it is lost."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from robot_agent.hardware import LaserScan, LidarDriver
 
 POLL_S: Final = 0.02
-"""The port is read this often: some 40 samples at a time cost a small computer far less than each alone."""
+"""Period of reading the port: some 40 samples at a time cost a small computer far less than each alone."""
 REOPEN_S: Final = 1.0
 
 _log = logs.get("lidar")
@@ -38,8 +38,8 @@ class LidarEdge:
         self._clock = clock
         self._on_samples = on_samples
         self._on_scan = on_scan
-        self._told = ""
-        self.trouble = "the lidar's port was not opened yet"
+        self._last_logged = ""
+        self.problem = "the lidar's port was not opened yet"
 
     async def run(self) -> None:
         """Open the port, scan, and start over when it is lost, until cancelled."""
@@ -49,7 +49,7 @@ class LidarEdge:
                     _log.info("port_open", path=self._path)
                     await self._scan(port)
             except PortLost as error:
-                self._tell(str(error))
+                self._report(str(error))
             await self._clock.sleep(REOPEN_S)
 
     async def _scan(self, port: Port) -> None:
@@ -66,14 +66,14 @@ class LidarEdge:
                 for scan in events.scans:
                     self._on_scan(scan, now)
                 port.write(events.data + driver.tick(now))
-                self._tell(driver.trouble)
+                self._report(driver.problem)
         finally:
-            # Whoever ends in good order leaves no lidar scanning for nobody; a lost port takes nothing any more.
+            # The lidar must not go on scanning after an orderly end; a lost port can't be written to.
             with suppress(PortLost):
                 port.write(driver.stop_command)
 
-    def _tell(self, trouble: str) -> None:
-        self.trouble = trouble
-        if trouble and trouble != self._told:
-            _log.warning("lidar_trouble", reason=trouble)
-        self._told = trouble
+    def _report(self, problem: str) -> None:
+        self.problem = problem
+        if problem and problem != self._last_logged:
+            _log.warning("lidar_problem", reason=problem)
+        self._last_logged = problem

@@ -1,4 +1,4 @@
-"""What the robot was sent to do: its goal, the path that the planner leads it along, and how far it has come on it."""
+"""The robot's mission: its goal, the planner's path to it, and the progress along the path."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 
 _NEVER: Final = -math.inf
 
-PathName = tuple[int, int]
-"""Which path it is: the planner's epoch and its number of the plan."""
+PathId = tuple[int, int]
+"""Identity of a path: the planner's epoch and the plan's number."""
 
 
 class Mission:
@@ -39,67 +39,67 @@ class Mission:
 
     @property
     def has_goal(self) -> bool:
-        """Whether the planner names a goal at all, be it reached or cancelled."""
+        """Whether the planner has set a goal, be it reached or cancelled."""
         return self.goal is not None and self.goal.pose is not None
 
     @property
     def goal_id(self) -> str | None:
-        """Name of the goal, None without one."""
+        """Id of the goal; None without one."""
         return self.goal.goal_id if self.goal is not None and self.goal.pose is not None else None
 
     @property
     def reached(self) -> bool:
-        """Whether the robot stands at its goal."""
+        """Whether the robot has reached its goal."""
         return self.goal_id is not None and self.goal_id == self._reached
 
     @property
-    def path_name(self) -> PathName | None:
-        """Which path it is, None without one."""
+    def path_id(self) -> PathId | None:
+        """Identity of the path; None without one."""
         return None if self.path is None else (self.path.planner_epoch, self.path.plan_id)
 
     def planner_age(self, now: float) -> float:
-        """Return how long ago (s) the planner last spoke of this goal; infinite when it never did."""
+        """Return the age (s) of the planner's last message about this goal; infinite without one."""
         return now - max(self._path_at, self._goal_at)
 
     def on_goal(self, goal: RobotGoal, now: float) -> bool:
-        """Take the goal; return whether it is another one, to which the path so far does not lead."""
-        known = self.goal
-        if known is not None and known.goal_id == goal.goal_id and known.pose == goal.pose:
+        """Set the goal; return whether it is a new one, to which the current path does not lead."""
+        current = self.goal
+        if current is not None and current.goal_id == goal.goal_id and current.pose == goal.pose:
             return False
         self.goal, self._goal_at = goal, now
-        if known is not None and known.goal_id == goal.goal_id:
+        if current is not None and current.goal_id == goal.goal_id:
             return False
         self._reached = self._cancelled = None
         self.drop_path()
         return True
 
     def on_path(self, path: RobotPath, now: float) -> bool:
-        """Take a path, its extension or a refusal; return whether a new path is to be followed from now on.
+        """Handle a path, its extension or a refusal; return whether a new path is followed from now on.
 
-        One of another goal, or older than the one known, is ignored.
+        A path for another goal, or older than the current one, is ignored.
         """
         if self.goal is None or path.goal_id != self.goal.goal_id:
             return False
-        name, known = (path.planner_epoch, path.plan_id), self.path_name
-        if known is not None and name < known:
+        new, current = (path.planner_epoch, path.plan_id), self.path_id
+        if current is not None and new < current:
             return False
         self.path, self._path_at = path, now
         if path.refusal is not None or not path.points:
             self.follower = None
             return False
-        if name == known and self.follower is not None:
+        if new == current and self.follower is not None:
             self.follower.release(path.released_length)
             return False
         self.follower = PathFollower(np.array(path.points, dtype=np.float64), path.released_length)
         return True
 
     def reach(self) -> None:
-        """Note that the robot stands at its goal."""
+        """Record that the robot has reached its goal."""
         self._reached = self.goal_id
         self.drop_path()
 
     def cancel(self) -> str | None:
-        """Give the goal up until the planner names another; return which it was, None when there is none."""
+        """Cancel the goal until the planner sets another; return its id, None without one."""
         if self.goal_id is None:
             return None
         self._cancelled = self.goal_id
@@ -107,6 +107,6 @@ class Mission:
         return self._cancelled
 
     def drop_path(self) -> None:
-        """Follow nothing until the planner sends a path again."""
+        """Follow no path until the planner sends one again."""
         self.path = self.follower = None
         self._path_at = _NEVER

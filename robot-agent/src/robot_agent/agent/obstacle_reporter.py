@@ -1,4 +1,4 @@
-"""What the robot tells of the things around it: lidar points that the map does not explain, and how far it sees."""
+"""Reports of obstacles: lidar points that the map does not explain, and how far the lidar sees."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ if TYPE_CHECKING:
     from robot_agent.localization.pose import Pose2
 
 _EXPLAINED_M: Final = 0.25
-"""A lidar point this near to a wall of the map is that wall."""
+"""A lidar point this near to a wall of the map is explained by it."""
 _CELL_M: Final = 0.1
 _RANGE_M: Final = 6.0
 _TURN_RATE: Final = 0.5
-"""Above this turning rate (rad/s) no obstacle is reported: what is left of the skew smears it."""
+"""Above this turning rate (rad/s) no obstacle is reported: the residual skew would smear it."""
 _SCAN_AGE_S: Final = 0.5
-_REMEMBERED_S: Final = 2.0
-"""A cell counts as reported by this robot for so much longer than its report holds: map and message take their time."""
-_POINTS_LEAST: Final = 2
-"""One beam alone may be a mixed echo off an edge."""
+_MEMORY_MARGIN_S: Final = 2.0
+"""A cell counts as reported by this robot for this much longer than its report is valid: messages take time."""
+_POINTS_MIN: Final = 2
+"""Fewest points in a reported cell: a single beam may be a mixed echo off an edge."""
 
 Cell = tuple[int, int]
 
@@ -37,7 +37,7 @@ Cell = tuple[int, int]
 class ObstacleReporter:
     """Turns scans into reports, and remembers which cells it reported itself.
 
-    ttl: how long (s) a report holds. limit: points in a report, the nearest ones.
+    ttl: how long (s) a report is valid. limit: most points in a report; the nearest are kept.
     """
 
     def __init__(self, ttl: float, limit: int) -> None:
@@ -47,9 +47,9 @@ class ObstacleReporter:
         """Until when each cell counts as reported by this robot."""
 
     def report(self, localizer: Localizer, replica: Replica, scan_age: float, at: Moment) -> RobotObstacles | None:
-        """Return points that the lidar sees and the map does not explain; None when that can't be told now.
+        """Return lidar points that the map does not explain; None while pose or scan is not good enough.
 
-        What others put on the map is no news, what this robot did is reported for as long as it is in sight.
+        Obstacles that others put on the map are left out; this robot's own are reported for as long as it sees them.
         """
         points, scan, pose = localizer.points_in_map(), localizer.scan, localizer.pose(at.now)
         if localizer.status != "good" or replica.geometry is None or points is None or scan is None or pose is None:
@@ -58,7 +58,7 @@ class ObstacleReporter:
             return None
         near = np.hypot(*scan.points.T) <= _RANGE_M
         unexplained = points[near & (localizer.wall_distance(points) > _EXPLAINED_M)]
-        unexplained = unexplained[self._is_news(unexplained, replica, replica.geometry, at.now)]
+        unexplained = unexplained[self._is_reportable(unexplained, replica, replica.geometry, at.now)]
         cells = self._choose(unexplained, pose)
         self._remember(cells, at.now)
         return RobotObstacles(
@@ -69,16 +69,16 @@ class ObstacleReporter:
         )
 
     def is_self_reported(self, points: NDArray[np.float64], now: float) -> NDArray[np.bool_]:
-        """Tell which points (n, 2; m, frame `map`) lie at a cell that this robot reported, or beside one."""
-        known = {cell for cell, until in self._reported.items() if until >= now}
+        """Return which points (n, 2; m, frame `map`) lie in a cell that this robot reported, or beside one."""
+        reported = {cell for cell, until in self._reported.items() if until >= now}
         around = [(dx, dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1)]
         cells = np.floor(points / _CELL_M).astype(np.int64).tolist()
-        return np.array([any((cx + dx, cy + dy) in known for dx, dy in around) for cx, cy in cells], dtype=np.bool_)
+        return np.array([any((cx + dx, cy + dy) in reported for dx, dy in around) for cx, cy in cells], dtype=np.bool_)
 
     def _choose(self, points: NDArray[np.float64], pose: Pose2) -> list[Cell]:
-        """Return the cells that hold enough of the points (n, 2), the nearest ones to the robot if they are many."""
+        """Return the cells with enough of the points (n, 2); beyond the limit, those nearest to the robot."""
         cells, counts = np.unique(np.floor(points / _CELL_M).astype(np.int64), axis=0, return_counts=True)
-        chosen = cells[counts >= _POINTS_LEAST]
+        chosen = cells[counts >= _POINTS_MIN]
         if len(chosen) > self._limit:
             offset = (chosen + 0.5) * _CELL_M - (pose.x, pose.y)
             chosen = chosen[np.argsort(np.hypot(*offset.T), kind="stable")[: self._limit]]
@@ -86,26 +86,26 @@ class ObstacleReporter:
 
     def _remember(self, cells: list[Cell], now: float) -> None:
         self._reported = {cell: until for cell, until in self._reported.items() if until >= now}
-        self._reported.update(dict.fromkeys(cells, now + self._ttl + _REMEMBERED_S))
+        self._reported.update(dict.fromkeys(cells, now + self._ttl + _MEMORY_MARGIN_S))
 
-    def _is_news(
+    def _is_reportable(
         self, points: NDArray[np.float64], replica: Replica, geometry: GridGeometry, now: float
     ) -> NDArray[np.bool_]:
-        """Tell which points (n, 2) lie where nobody but this robot itself called something lethal or close to it."""
+        """Return which points (n, 2) lie on floor that is free but for this robot's own reports."""
         _, inside = geometry.cells(points)
         known_floor = geometry.sample(replica.static, points, UNKNOWN) == FREE
         free = known_floor & (geometry.sample(replica.cost, points, UNKNOWN) < INSCRIBED)
-        news: NDArray[np.bool_] = free | (self.is_self_reported(points, now) & inside)
-        return news
+        reportable: NDArray[np.bool_] = free | (self.is_self_reported(points, now) & inside)
+        return reportable
 
 
-def view(at: Pose2 | None, points: NDArray[np.float64], geometry: GridGeometry) -> View | None:
-    """Return how far the points (n, 2; m, frame `map`) let the lidar see from where it was, None off the map."""
-    if at is None or not geometry.contains_cell(*geometry.cell(at.x, at.y)):
+def view(pose: Pose2 | None, points: NDArray[np.float64], geometry: GridGeometry) -> View | None:
+    """Return how far the lidar saw from its pose, by the points (n, 2; m, frame `map`); None off the map."""
+    if pose is None or not geometry.contains_cell(*geometry.cell(pose.x, pose.y)):
         return None
-    dx, dy = points[:, 0] - at.x, points[:, 1] - at.y
+    dx, dy = points[:, 0] - pose.x, points[:, 1] - pose.y
     sectors = np.floor(np.arctan2(dy, dx) % math.tau * (VIEW_SECTORS / math.tau)).astype(np.int64) % VIEW_SECTORS
     reach = np.full(VIEW_SECTORS, np.inf)
     np.minimum.at(reach, sectors, np.hypot(dx, dy))
     reach_cm = np.where(np.isfinite(reach), np.clip(np.floor(100.0 * reach), 0, 65_535), 0).astype(np.int64)
-    return View(x=at.x, y=at.y, reach_cm=reach_cm.tolist())
+    return View(x=pose.x, y=pose.y, reach_cm=reach_cm.tolist())

@@ -1,4 +1,4 @@
-"""Operators' commands: each is carried out once, if it is signed, fresh and fits the robot's state; else refused."""
+"""Operators' commands: each is executed once if it is signed, fresh and possible in the robot's state, else refused."""
 
 from __future__ import annotations
 
@@ -17,28 +17,28 @@ if TYPE_CHECKING:
 _REASON_LIMIT: Final = 500
 
 
-class Commanded(Protocol):
-    """What an operator may have done to the robot."""
+class CommandTarget(Protocol):
+    """The actions that an operator may request from a robot."""
 
     def request(self, request: Request, now: float) -> SafetyOutputs:
-        """Hand a request to the safety gate; its refusal stands in the outputs."""
+        """Pass a request to the safety gate; the outputs carry its refusal."""
 
     def cancel_goal(self) -> str | None:
-        """Give the goal up; return which it was, None when there is none."""
+        """Cancel the goal; return its id, None without one."""
 
-    def take_initial_pose(self, pose: Pose | None) -> str | None:
-        """Start localization at a pose in `map`; return why not, None when it is taken."""
+    def set_initial_pose(self, pose: Pose | None) -> str | None:
+        """Start localization at a pose in `map`; return why the pose is refused, None when it is accepted."""
 
 
 class OperatorCommands:
-    """Checks commands and carries them out on one robot."""
+    """Checks commands and executes them on one robot."""
 
-    def __init__(self, robot: str, key: bytes, commanded: Commanded) -> None:
+    def __init__(self, robot: str, key: bytes, robot_actions: CommandTarget) -> None:
         self._gate = CommandGate(robot, key)
-        self._robot = commanded
+        self._robot = robot_actions
 
     def answer(self, command: RobotCommand, at: Moment) -> CommandReply:
-        """Carry a command out, or say why not."""
+        """Execute a command, or refuse it with a reason."""
         refusal = self._gate.refusal(command, at.stamp)
         if refusal is not None:
             return _refused(refusal)
@@ -59,10 +59,10 @@ class OperatorCommands:
         return CommandReply(accepted=True, reason=f"the goal {goal} is cancelled on the robot")
 
     def _start_localization(self, pose: Pose | None) -> CommandReply:
-        refusal = self._robot.take_initial_pose(pose)
+        refusal = self._robot.set_initial_pose(pose)
         if refusal is not None:
             return _refused(refusal)
-        return CommandReply(accepted=True, reason="taken; the next turns of the lidar check it")
+        return CommandReply(accepted=True, reason="accepted; the next lidar scans verify it")
 
     def _request(self, request: Request, now: float) -> CommandReply:
         outputs = self._robot.request(request, now)
@@ -74,7 +74,7 @@ class OperatorCommands:
 
 
 def initial_pose_refusal(pose: Pose | None, replica: Replica, *, at_rest: bool) -> str | None:
-    """Return why a robot can't be at an initial pose that an operator gives; None when it can."""
+    """Return why an operator's initial pose is impossible; None when it is possible."""
     geometry = replica.geometry
     if pose is None:
         return "the command carries no pose: give x, y and theta"
@@ -84,9 +84,9 @@ def initial_pose_refusal(pose: Pose | None, replica: Replica, *, at_rest: bool) 
         return "the robot is driving: disable it first"
     column, row = geometry.cell(pose.x, pose.y)
     if not geometry.contains_cell(column, row):
-        return f"({pose.x:.2f}, {pose.y:.2f}) lies off the map"
+        return f"({pose.x:.2f}, {pose.y:.2f}) is off the map"
     if replica.static[row, column] == LETHAL:
-        return f"({pose.x:.2f}, {pose.y:.2f}) lies in a wall of the map"
+        return f"({pose.x:.2f}, {pose.y:.2f}) is in a wall of the map"
     return None
 
 

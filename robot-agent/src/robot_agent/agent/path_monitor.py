@@ -1,6 +1,6 @@
-"""Whether the path may still be driven: the fog's plan may be older than the robot's copy of the map.
+"""Whether the path may still be driven: the fog's plan may be older than the robot's replica of the map.
 
-A path that is blocked near the robot, or for longer than the planner needs to replan, is a problem; so is one that
+A path must not be driven when it is blocked near the robot, or for longer than the planner needs to replan, or when it
 was planned on another map.
 """
 
@@ -14,7 +14,7 @@ from robot_agent.motion.path_follower import first_blocked
 if TYPE_CHECKING:
     from fog_contracts.messages import RobotPath
     from fog_contracts.replica import Replica, Version
-    from robot_agent.agent.mission import Mission, PathName
+    from robot_agent.agent.mission import Mission, PathId
     from robot_agent.motion.path_follower import PathFollower
 
 BLOCK_NEAR_M: Final = 3.0
@@ -23,62 +23,62 @@ PLANNER_GRACE_S: Final = 1.0
 """How long the planner may take for a path on the newest map."""
 
 
-class _Block(NamedTuple):
-    """Where along the path (m from its start) it is blocked, and what to say of it."""
+class _Blockage(NamedTuple):
+    """Where along the path (m from its start) it is blocked, and the reason to report."""
 
-    at: float
+    position: float
     reason: str
 
 
 class PathMonitor:
-    """Compares the path that is followed with the robot's copy of the map."""
+    """Compares the path that is followed with the robot's replica of the map."""
 
     def __init__(self) -> None:
-        self._checked: tuple[Version, PathName] | None = None
-        self._block: _Block | None = None
+        self._checked: tuple[Version, PathId] | None = None
+        self._blockage: _Blockage | None = None
         self._blocked_since: float | None = None
         self._other_map_since: float | None = None
 
     def begin(self) -> None:
-        """Begin to watch another path. One that replaces a blocked path inherits no grace."""
-        self._block = self._checked = None
+        """Begin to monitor a new path. One that replaces a blocked path gets no new grace period."""
+        self._blockage = self._checked = None
 
     def reset(self) -> None:
-        """Forget the path: there is none to watch."""
-        self._block = self._blocked_since = self._other_map_since = None
+        """Forget the path: there is none to monitor."""
+        self._blockage = self._blocked_since = self._other_map_since = None
 
     def check(self, mission: Mission, replica: Replica, now: float) -> None:
-        """Look along the path, whenever path or map may have changed; costs nothing when neither did."""
-        name, follower, path = mission.path_name, mission.follower, mission.path
-        if name is None or path is None or follower is None or replica.version is None:
+        """Look for a blockage along the path whenever path or map may have changed; cheap when neither did."""
+        path_id, follower, path = mission.path_id, mission.follower, mission.path
+        if path_id is None or path is None or follower is None or replica.version is None:
             self._clear()
             return
-        if self._checked == (replica.version, name):
+        if self._checked == (replica.version, path_id):
             return
-        self._checked = (replica.version, name)
-        self._block = _find_block(path, follower, replica, replica.version)
-        if self._block is None:
+        self._checked = (replica.version, path_id)
+        self._blockage = _find_blockage(path, follower, replica, replica.version)
+        if self._blockage is None:
             self._clear()
         elif self._blocked_since is None:
             self._blocked_since = now
 
     def problem(self, mission: Mission, version: Version | None, now: float) -> str | None:
-        """Return why the path must not be driven, in words; None when it may. Call it steadily: it keeps time."""
+        """Return why the path must not be driven; None when it may. Call it steadily: it measures durations."""
         path = mission.path
         if path is None or not mission.active:
             return None
         if path.refusal is not None:
-            return f"the planner finds no way: {path.refusal.reason}"
+            return f"the planner finds no path: {path.refusal.reason}"
         if self._is_of_other_map(path, version, now):
             return "the path was planned on another map than the robot's"
-        if self._block is None or self._blocked_since is None:
+        if self._blockage is None or self._blocked_since is None:
             return None
         progress = mission.follower.progress if mission.follower else 0.0
-        near = self._block.at - progress <= BLOCK_NEAR_M
-        return self._block.reason if near or now - self._blocked_since > PLANNER_GRACE_S else None
+        near = self._blockage.position - progress <= BLOCK_NEAR_M
+        return self._blockage.reason if near or now - self._blocked_since > PLANNER_GRACE_S else None
 
     def _clear(self) -> None:
-        self._block = self._blocked_since = None
+        self._blockage = self._blocked_since = None
 
     def _is_of_other_map(self, path: RobotPath, version: Version | None, now: float) -> bool:
         if version is None or path.map_epoch == version.epoch:
@@ -89,19 +89,19 @@ class PathMonitor:
         return now - self._other_map_since > PLANNER_GRACE_S
 
 
-def _find_block(path: RobotPath, follower: PathFollower, replica: Replica, version: Version) -> _Block | None:
+def _find_blockage(path: RobotPath, follower: PathFollower, replica: Replica, version: Version) -> _Blockage | None:
     """Return what first blocks the rest of the path on the robot's map; None when nothing does."""
     assert replica.geometry is not None
     same_map = path.map_epoch == version.epoch
     if same_map and path.map_seq > version.seq:
-        # Checked as soon as the robot's map has caught up; how long it may lag is the safety gate's matter.
+        # Checked as soon as the robot's map has caught up; the safety gate limits how long it may lag.
         return None
-    # A planner that knew all of this map may lead the robot out over what its lidar took for an obstacle.
+    # A planner that knew this map may lead the robot out through what its lidar took for an obstacle.
     known = same_map and path.map_seq == version.seq
-    ahead = first_blocked(replica.cost, replica.geometry, follower, led_out=known)
+    ahead = first_blocked(replica.cost, replica.geometry, follower, known_to_planner=known)
     if ahead is None:
         return None
     column, row = replica.geometry.cell(*follower.points[-1])
     goal_blocked = replica.geometry.contains_cell(column, row) and replica.cost[row, column] >= INSCRIBED
-    what = "the goal is blocked" if goal_blocked else f"the path is blocked {ahead:.1f} m ahead"
-    return _Block(follower.progress + ahead, f"{what} on the newest map; waiting for a new plan")
+    subject = "the goal is blocked" if goal_blocked else f"the path is blocked {ahead:.1f} m ahead"
+    return _Blockage(follower.progress + ahead, f"{subject} on the newest map; waiting for a new plan")

@@ -1,4 +1,4 @@
-"""Traces of hazards: from a path that came because of one, until its first wheel command."""
+"""Traces of hazards: from the path that a hazard caused to the first wheel command on it."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ if TYPE_CHECKING:
 
     from fog_contracts.messages import Trace
 
-_KEPT: Final = 16
+_RECENT_MAX: Final = 16
 
 
 class PathTraces:
-    """Traces of the path that is followed, open until a wheel command follows it. Stamps are seconds since the epoch.
+    """Traces of the followed path, open until its first wheel command. Stamps are seconds since the epoch.
 
-    `recent` are the last closed ones, for the state message.
+    `recent`: the last closed traces, for the state message.
     """
 
     def __init__(self) -> None:
@@ -26,17 +26,17 @@ class PathTraces:
         self._finished: list[Trace] = []
 
     def begin(self, traces: Iterable[Trace], stamp: float) -> None:
-        """Take the traces of a new path; those of the path before it are void."""
+        """Open the traces of a new path; those of the path before it are dropped."""
         self._open = [msgspec.structs.replace(trace, path_received=stamp) for trace in traces]
 
     def close(self, stamp: float) -> None:
-        """Note that a wheel command follows the new path."""
+        """Close the open traces: a wheel command follows the new path."""
         if not self._open:
             return
         closed = [msgspec.structs.replace(trace, first_command=stamp) for trace in self._open]
         self._open = []
         self._finished.extend(closed)
-        self.recent = [*self.recent, *closed][-_KEPT:]
+        self.recent = [*self.recent, *closed][-_RECENT_MAX:]
 
     def take_finished(self) -> list[Trace]:
         """Return the traces that were closed since the last call, each once."""

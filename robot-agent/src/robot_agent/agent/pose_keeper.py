@@ -1,4 +1,4 @@
-"""How the robot comes to a pose after a start, and which poses it keeps for the next one."""
+"""How the robot gets its pose after a start, and which poses it stores for the next start."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from robot_agent.localization.localizer import Localizer
 
 SEARCH_AGAIN_S: Final = 15.0
-"""A global search is not begun again before this time has passed."""
+"""Least time between the beginnings of two global searches."""
 _MOVED_M: Final = 0.02
 _TURNED_RAD: Final = 0.03
 _SIGMA_CHANGED: Final = 0.05
@@ -24,32 +24,32 @@ _START_SIGMA_RAD: Final = 0.15
 
 
 class PoseKeeper:
-    """Starts the localizer from a stored pose or by a global search, and picks the poses that are worth storing."""
+    """Starts the localizer from a stored pose or by a global search, and selects the poses to store."""
 
     def __init__(self, localizer: Localizer) -> None:
         self._localizer = localizer
-        self._waiting: SavedPose | None = None
-        """A stored pose to start at as soon as the map of its site is there."""
+        self._pending: SavedPose | None = None
+        """A stored pose to start at as soon as the map of its site is loaded."""
         self._searched_at = -math.inf
         self._stored: SavedPose | None = None
 
     def restore(self, saved: SavedPose, site: str) -> None:
-        """Start at a stored pose, at once if the map of its site is loaded already; the lidar verifies it."""
+        """Start at a stored pose, at once if the map of its site is loaded already; the next scans verify it."""
         if site == saved.site:
             self._localizer.restore(saved)
         else:
-            self._waiting = saved
+            self._pending = saved
 
     def load_map(self, replica: Replica) -> None:
-        """Take the static map of a snapshot that was loaded."""
+        """Load the static map of a snapshot into the localizer."""
         assert replica.geometry is not None
         self._localizer.load_map(replica.static, replica.geometry)
-        waiting, self._waiting = self._waiting, None
-        if waiting is not None and waiting.site == replica.site:
-            self._localizer.restore(waiting)
+        pending, self._pending = self._pending, None
+        if pending is not None and pending.site == replica.site:
+            self._localizer.restore(pending)
 
     def search(self, mode: Mode, now: float, *, at_rest: bool) -> bool:
-        """Begin to search the whole map when nobody gave a pose: at rest and in INIT only; return whether one began."""
+        """Begin a global search when there is no pose, at rest and in INIT only; return whether one began."""
         localizer = self._localizer
         if localizer.status != "none" or localizer.searching or localizer.pose(now) is not None:
             return False
@@ -63,7 +63,7 @@ class PoseKeeper:
     def to_store(self, site: str, now: float) -> SavedPose | None:
         """Return the pose if it is trusted and differs from the one returned last, which counts as stored.
 
-        Storage of a small computer wears out, so only what moved is worth a write.
+        Storage of a small computer wears out, so a pose that hardly differs is not written.
         """
         pose = self._localizer.save(site, now) if site else None
         if pose is None or (self._stored is not None and not _differs(pose, self._stored)):

@@ -1,4 +1,4 @@
-"""When the robot tells what of itself: its pose at 10 Hz, its state on change and at 1 Hz, obstacles at 1 Hz."""
+"""When the robot publishes: its pose at 10 Hz, its state on change and at 1 Hz, obstacles at 1 Hz."""
 
 from __future__ import annotations
 
@@ -18,41 +18,41 @@ POSE_S: Final = ch.ROBOT_POSE.period_s
 STATE_S: Final = ch.ROBOT_STATE.period_s
 OBSTACLES_S: Final = ch.ROBOT_OBSTACLES.period_s
 _SLACK_S: Final = 0.05
-"""A tick that comes early by so much is due already: ticks are 0.1 s apart, and not exactly."""
+"""A message is published up to this much before it is due: ticks are not exactly 0.1 s apart."""
 _NUMBER: Final = re.compile(r"[\d.]+")
 
 
 class PublishingPolicy:
-    """Chooses at each tick (s, monotonic) what is published."""
+    """Selects at each tick (s, monotonic) what is published."""
 
     def __init__(self, robot: str) -> None:
         self._ids = {"robot": robot}
         self._pose_due = self._state_at = self._obstacles_at = -math.inf
         self._content: object = None
 
-    def choose(
+    def due(
         self, pose: RobotPose | None, state: RobotState, obstacles: Callable[[], RobotObstacles | None], now: float
     ) -> list[Publication]:
-        """Return what is due; `obstacles` is called only when a report of them is."""
-        due: list[tuple[ch.Channel, Message]] = []
+        """Return the publications that are due; `obstacles` is called only when its report is due."""
+        messages: list[tuple[ch.Channel, Message]] = []
         if pose is not None and now >= self._pose_due - _SLACK_S:
             # Counted from when it was due, so that uneven ticks keep the rate.
             self._pose_due = max(self._pose_due, now - _SLACK_S) + POSE_S
-            due.append((ch.ROBOT_POSE, pose))
+            messages.append((ch.ROBOT_POSE, pose))
         content = _content(state)
         if content != self._content or now - self._state_at >= STATE_S - _SLACK_S:
             self._content, self._state_at = content, now
-            due.append((ch.ROBOT_STATE, state))
+            messages.append((ch.ROBOT_STATE, state))
         if now - self._obstacles_at >= OBSTACLES_S - _SLACK_S:
             self._obstacles_at = now
             report = obstacles()
             if report is not None:
-                due.append((ch.ROBOT_OBSTACLES, report))
-        return [Publication(channel, message, self._ids) for channel, message in due]
+                messages.append((ch.ROBOT_OBSTACLES, report))
+        return [Publication(channel, message, self._ids) for channel, message in messages]
 
 
 def _content(state: RobotState) -> object:
-    """Return what makes a state worth publishing at once: all but figures that change all the time."""
+    """Return the part of a state whose change is published at once: all but continuously changing numbers."""
     return (
         state.mode,
         state.enabled,

@@ -1,6 +1,6 @@
-"""Replay what an agent logged: a fresh core is fed the same inputs and must answer the same to the last bit.
+"""Replay an agent's input log: a new core gets the same inputs and must give the same outputs to the last bit.
 
-`python -m robot_agent.agent.replay FILE` prints what came of it as JSON and ends with 1 if anything differs.
+`python -m robot_agent.agent.replay FILE` prints the result as JSON and exits with 1 if any output differs.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ if TYPE_CHECKING:
 
     from robot_agent.motion.local_planner import Job
 
-_SHOWN: Final = 20
-"""Differences that are kept; further ones are counted."""
+_LISTED_MAX: Final = 20
+"""Differences that are listed; further ones are only counted."""
 _TEXT_LIMIT: Final = 500
 
 
 class ReplayError(ValueError):
-    """A log that can't be replayed; the message names it and says why."""
+    """A log can't be replayed; the message names the file and the reason."""
 
 
 class Difference(msgspec.Struct, frozen=True, kw_only=True):
-    """An output that is not the recorded one: after which input (counted from 1), and both as JSON."""
+    """A replayed output that differs from the recorded one, both as JSON; `after_input` counts from 1."""
 
     after_input: int
     recorded: str
@@ -46,7 +46,7 @@ class Difference(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(kw_only=True)
 class Replayed:
-    """What came of a replay: counts by type of entry, modes in order, a digest of all outputs, and differences."""
+    """Result of a replay: counts by type of entry, modes in order, a digest of all outputs, and differences."""
 
     inputs: Counter[str] = field(default_factory=Counter)
     outputs: Counter[str] = field(default_factory=Counter)
@@ -57,20 +57,22 @@ class Replayed:
 
 
 def replay(path: Path) -> Replayed:
-    """Feed a log to a fresh core; raises `ReplayError` or `RecordError` for one that can't be replayed.
+    """Replay a log with a new core; raises `ReplayError` or `RecordError` when it can't be replayed.
 
-    A log that a crash cut short is replayed as far as it goes.
+    A log that a crash truncated is replayed up to its end.
     """
     entries = _entries(path)
     first = next(entries, None)
     if first is None or not isinstance(first[0], log.Started):
-        raise ReplayError(f"{path}: begins with no start of an agent: it is no input log, or its begin is lost")
+        raise ReplayError(
+            f"{path}: the first entry is no start of an agent: this is no input log, or its beginning is missing"
+        )
     run = _Run(first[0])
     recorded: list[bytes] = []
     for entry, data in entries:
         if isinstance(entry, log.EntriesLost):
             raise ReplayError(
-                f"{path}: {entry.count} entries are missing after input {run.count}: its disk was too slow"
+                f"{path}: {entry.count} entries are missing after input {run.count}: the disk was too slow"
             )
         if isinstance(entry, log.Output):
             recorded.append(data)
@@ -78,7 +80,7 @@ def replay(path: Path) -> Replayed:
         run.compare(recorded)
         recorded = []
         run.feed(entry)
-    # The last input may have been cut off from its outputs.
+    # The outputs of the last input may have been truncated.
     run.compare(recorded, whole=False)
     return run.finish()
 
@@ -91,11 +93,13 @@ def _entries(path: Path) -> Iterator[tuple[log.Entry, bytes]]:
         try:
             yield msgspec.json.decode(data, type=kind), data
         except msgspec.DecodeError as error:
-            raise ReplayError(f"{path}: an entry of {topic} is of another version of the agent: {error}") from error
+            raise ReplayError(
+                f"{path}: an entry of {topic} was written by another version of the agent: {error}"
+            ) from error
 
 
 class _Run:
-    """A core under replay, and what it has produced since the last input."""
+    """A core under replay, and its outputs since the last input."""
 
     def __init__(self, started: log.Started) -> None:
         self.count = 0
@@ -103,9 +107,9 @@ class _Run:
         self._digest = hashlib.blake2b(digest_size=16)
         self._produced: list[bytes] = []
         self._job: Job | None = None
-        self._agent = log.LoggedAgent(started.config, started.seed, self._take)
+        self._agent = log.LoggedAgent(started.config, started.seed, self._on_entry)
 
-    def _take(self, entry: log.Entry) -> None:
+    def _on_entry(self, entry: log.Entry) -> None:
         if not isinstance(entry, log.Output):
             return
         data = msgspec.json.encode(entry)
@@ -116,7 +120,7 @@ class _Run:
             self._result.modes.append(entry.mode)
 
     def compare(self, recorded: Sequence[bytes], *, whole: bool = True) -> None:
-        """Compare what was produced since the last input with what was recorded."""
+        """Compare the outputs since the last input with the recorded ones."""
         produced, self._produced = self._produced, []
         if not whole:
             produced = produced[: len(recorded)]
@@ -130,12 +134,12 @@ class _Run:
         if recorded == replayed:
             return
         self._result.different += 1
-        if len(self._result.differences) < _SHOWN:
+        if len(self._result.differences) < _LISTED_MAX:
             before, after = (data[:_TEXT_LIMIT].decode(errors="replace") for data in (recorded, replayed))
             self._result.differences.append(Difference(after_input=self.count, recorded=before, replayed=after))
 
     def feed(self, entry: log.Entry) -> None:
-        """Hand an input to the core."""
+        """Pass an input to the core."""
         self.count += 1
         self._result.inputs[type(entry).__name__] += 1
         match entry:
@@ -143,14 +147,14 @@ class _Run:
                 self._from_channel(entry)
             case log.SnapshotLoaded() | log.PoseRestored():
                 self._load(entry)
-            case log.BaseReceived() | log.BaseLost() | log.LidarNodesReceived() | log.ScanReceived():
+            case log.BaseReceived() | log.BaseLost() | log.LidarSamplesReceived() | log.ScanReceived():
                 self._from_hardware(entry)
             case log.LoopHealthReceived():
                 self._agent.on_loop_health(entry.health)
             case log.ControlCycle() | log.DecisionMade() | log.StreamCycle() | log.Tick() | log.StorageCheck():
                 self._cycle(entry)
             case _:
-                raise ReplayError(f"input {self.count}: a log can't go on with {type(entry).__name__}")
+                raise ReplayError(f"input {self.count}: a log can't continue with {type(entry).__name__}")
 
     def _from_channel(self, entry: log.MessageReceived | log.QueryReceived) -> None:
         channel, at = CHANNELS[entry.channel], Moment(entry.now, entry.stamp)
@@ -167,18 +171,18 @@ class _Run:
         try:
             self._agent.load(entry.snapshot, entry.now)
         except MapError:
-            return  # as it was refused then: what follows would differ otherwise
+            return  # it was refused in the recorded run too, or later outputs will differ
 
     def _from_hardware(
-        self, entry: log.BaseReceived | log.BaseLost | log.LidarNodesReceived | log.ScanReceived
+        self, entry: log.BaseReceived | log.BaseLost | log.LidarSamplesReceived | log.ScanReceived
     ) -> None:
         match entry:
             case log.BaseReceived():
                 self._agent.on_base(entry.feedback, entry.now)
             case log.BaseLost():
                 self._agent.on_base_lost(entry.now, entry.reason)
-            case log.LidarNodesReceived():
-                self._agent.on_lidar_nodes(entry.now)
+            case log.LidarSamplesReceived():
+                self._agent.on_lidar_samples(entry.now)
             case log.ScanReceived():
                 self._agent.on_scan(entry.scan(), entry.now)
 
@@ -204,7 +208,7 @@ class _Run:
         self._agent.accept(entry.decision)
 
     def finish(self) -> Replayed:
-        """Return what came of the run."""
+        """Return the result."""
         self._result.digest = self._digest.hexdigest()
         return self._result
 
@@ -212,7 +216,7 @@ class _Run:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Replay the log named on the command line."""
     parser = argparse.ArgumentParser(prog="python -m robot_agent.agent.replay", description=__doc__)
-    parser.add_argument("file", type=Path, help="what an agent wrote with FOGNAV_INPUT_LOG")
+    parser.add_argument("file", type=Path, help="input log that an agent wrote (FOGNAV_INPUT_LOG)")
     path: Path = parser.parse_args(arguments).file
     try:
         result = replay(path)

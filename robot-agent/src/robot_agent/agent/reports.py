@@ -1,4 +1,4 @@
-"""What the robot tells of itself, as messages."""
+"""The robot's pose and state as messages."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ if TYPE_CHECKING:
     from robot_agent.motion.local_planner import Decision
     from robot_agent.safety.gate import SafetyState
 
-_VARIANCE_LEAST: Final = (1e-4, 1e-4, 1e-4)
+_VARIANCE_MIN: Final = (1e-4, 1e-4, 1e-4)
 _SPEED_LIMIT: Final = 10.0
 _REASON_LIMIT: Final = 500
 
 
 def robot_pose(localizer: Localizer, config: AgentConfig, at: Moment) -> RobotPose | None:
-    """Return the pose at a moment with its covariance and the measured twist; None while none is known."""
+    """Return the pose at a moment with its covariance and the measured twist; None while it is unknown."""
     pose = localizer.pose(at.now)
     if pose is None:
         return None
     v, w = localizer.twist()
-    covariance = localizer.covariance() + np.diag(_VARIANCE_LEAST)
+    covariance = localizer.covariance() + np.diag(_VARIANCE_MIN)
     return RobotPose(
         x=pose.x,
         y=pose.y,
@@ -56,7 +56,7 @@ def robot_state(  # noqa: PLR0913  # a message gathers from all parts of the age
     loop: LoopHealth,
     stamp: float,
 ) -> RobotState:
-    """Return what the robot is doing and why; `hindrances` are reasons that are not the safety gate's."""
+    """Return mode, reasons, goal, path and map version; `hindrances` are reasons besides the safety gate's."""
     path = mission.path
     return RobotState(
         mode=safety.mode,
@@ -69,7 +69,7 @@ def robot_state(  # noqa: PLR0913  # a message gathers from all parts of the age
         plan_id=path.plan_id if path else None,
         planner_epoch=path.planner_epoch if path else None,
         goal_reached=mission.reached,
-        goal_distance=mission.follower.left if mission.follower else None,
+        goal_distance=mission.follower.remaining if mission.follower else None,
         loop=loop,
         traces=list(traces),
         stamp=stamp,
@@ -77,7 +77,7 @@ def robot_state(  # noqa: PLR0913  # a message gathers from all parts of the age
 
 
 def hindrances(mission: Mission, decision: Decision | None, stuck_after: float, now: float) -> list[str]:
-    """Return, in words, what keeps a robot that may drive from its goal."""
+    """Return why a robot that may drive makes no progress to its goal."""
     found: list[str] = []
     if decision is not None and decision.blocked:
         found.append(decision.blocked)

@@ -33,7 +33,7 @@ class SafetySupervisor:
 def safety_inputs(  # noqa: PLR0913  # the gate weighs every source of the agent
     base: BaseSource,
     lidar: LidarSource,
-    map_copy: MapFollower,
+    map_follower: MapFollower,
     localizer: Localizer,
     mission: Mission,
     *,
@@ -45,12 +45,12 @@ def safety_inputs(  # noqa: PLR0913  # the gate weighs every source of the agent
     """Gather age, value and fault of every source at `now` (s, monotonic)."""
     feedback, follower = base.feedback, mission.follower
     return SafetyInputs(
-        map_loaded=map_copy.version is not None,
-        map_age=map_copy.age(now),
-        map_gap=map_copy.gap(now),
+        map_loaded=map_follower.version is not None,
+        map_age=map_follower.age(now),
+        map_gap=map_follower.gap(now),
         localization=localizer.status,
         localization_detail=localizer.detail,
-        lidar_age=lidar.node_age(now),
+        lidar_age=lidar.samples_age(now),
         scan_age=lidar.scan_age(now),
         identical_scans=lidar.identical_scans,
         base_age=base.age(now),

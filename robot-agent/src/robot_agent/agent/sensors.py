@@ -1,4 +1,4 @@
-"""What the robot's own parts last told: the base through the guardian, and the lidar."""
+"""The newest input from base (through the guardian) and lidar, and its age."""
 
 from __future__ import annotations
 
@@ -12,49 +12,49 @@ _NEVER: Final = -math.inf
 
 
 class BaseSource:
-    """The newest feedback, and since when (s, monotonic) there is none."""
+    """The newest feedback and its age (s, monotonic)."""
 
     def __init__(self) -> None:
         self.feedback: BaseFeedback | None = None
         self.lost: str | None = None
-        """Why the link to the guardian is broken, in words; None while it holds."""
-        self._at = _NEVER
+        """Why the link to the guardian is broken; None while it is connected."""
+        self._feedback_at = _NEVER
 
     def on_feedback(self, feedback: BaseFeedback, now: float) -> None:
-        """Take feedback that arrived at `now`."""
-        self.feedback, self._at, self.lost = feedback, now, None
+        """Store feedback that arrived at `now`."""
+        self.feedback, self._feedback_at, self.lost = feedback, now, None
 
     def on_lost(self, reason: str) -> None:
-        """Take that the link broke."""
+        """Record that the link broke."""
         self.lost = reason
 
     def age(self, now: float) -> float:
-        """Return how old (s) the feedback is; infinite when there never was any."""
-        return now - self._at
+        """Return the age (s) of the feedback; infinite without any."""
+        return now - self._feedback_at
 
 
 class LidarSource:
-    """When (s, monotonic) the lidar last sent anything, and a whole scan."""
+    """When (s, monotonic) the last samples and the last whole scan arrived."""
 
     def __init__(self) -> None:
         self.identical_scans = 1
-        """How many scans in a row are the same to the last bit: a live head never gives two equal ones."""
-        self._node_at = _NEVER
+        """Number of identical scans in a row: a working lidar never gives two equal ones."""
+        self._samples_at = _NEVER
         self._scan_at = _NEVER
 
-    def on_nodes(self, now: float) -> None:
-        """Take that anything arrived."""
-        self._node_at = now
+    def on_samples(self, now: float) -> None:
+        """Record that samples arrived."""
+        self._samples_at = now
 
     def on_scan(self, repeats: int, now: float) -> None:
-        """Take that a whole scan arrived, as the `repeats`-th equal one in a row."""
-        self._scan_at = self._node_at = now
+        """Record that a whole scan arrived, the `repeats`-th equal one in a row."""
+        self._scan_at = self._samples_at = now
         self.identical_scans = repeats
 
-    def node_age(self, now: float) -> float:
-        """Return for how long (s) nothing has arrived."""
-        return now - self._node_at
+    def samples_age(self, now: float) -> float:
+        """Return the time (s) since samples last arrived."""
+        return now - self._samples_at
 
     def scan_age(self, now: float) -> float:
-        """Return for how long (s) no whole scan has arrived."""
+        """Return the time (s) since a whole scan last arrived."""
         return now - self._scan_at

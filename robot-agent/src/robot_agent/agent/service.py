@@ -1,4 +1,4 @@
-"""Between the agent's core and the world: the loops that ask it at its rates and carry its answers away."""
+"""The agent's edge: the loops that run its core at its rates, and pass messages between core and network."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ CONTROL_S: Final = 0.2
 PUBLISH_S: Final = 0.1
 HOUSEKEEPING_S: Final = 1.0
 SNAPSHOT_TIMEOUT_S: Final = 3.0
-"""How long the map-service may take for a snapshot."""
+"""Timeout of a snapshot request."""
 
-SCANS = Counter("fognav_lidar_turns_total", "Whole turns of the lidar")
+SCANS = Counter("fognav_lidar_scans_total", "Whole scans of the lidar")
 LATENESS = Gauge("fognav_loop_lateness_p99_seconds", "99th percentile of a loop's lateness", ["loop"])
 MODE = Gauge("fognav_robot_mode", "1 for the mode that the robot is in", ["mode"])
 
@@ -51,7 +51,7 @@ _log = logs.get("agent")
 
 
 class Service:
-    """The running agent; its loops are tasks of the process. The core is touched on the loop's thread only."""
+    """The running agent; its loops are tasks of the process. The core is used on the loop's thread only."""
 
     def __init__(
         self, core: AgentCore, zenoh: ZenohEdge, store: Store, clock: Clock, health: Health, *, site: str
@@ -68,14 +68,14 @@ class Service:
         self._control = Ticker(clock, CONTROL_S)
         self._mode = ""
         self._searching = False
-        self._base_at = -math.inf
-        self._scan_at = -math.inf
-        self._base_reason = "the guardian was not found yet"
+        self._last_feedback_at = -math.inf
+        self._last_scan_at = -math.inf
+        self._base_reason = "the guardian is not connected yet"
 
-    # --- What the robot keeps over a restart ------------------------------------------------------------------------
+    # --- State that survives a restart ------------------------------------------------------------------------------
 
     def restore(self, body: RobotSite | None) -> None:
-        """Start from what was stored: the map until a newer one comes, the pose, else the site's start pose."""
+        """Load the stored map and pose; without a stored pose, start at the site's start pose."""
         snapshot = self._store.snapshot(self._site)
         if snapshot is not None:
             try:
@@ -87,10 +87,10 @@ class Service:
             saved = start_pose(self._site, body)
         if saved is not None:
             self._core.restore(saved)
-        _log.info("restored", map=snapshot is not None, x=saved and saved.x, y=saved and saved.y)
+        _log.info("state_restored", map=snapshot is not None, x=saved and saved.x, y=saved and saved.y)
 
     async def housekeeping_loop(self, lidar: LidarEdge) -> None:
-        """Once a second: store the pose if it is worth it, and report what is missing."""
+        """Once a second: store the pose if it changed, and report the health."""
         async for now in Ticker(self._clock, HOUSEKEEPING_S):
             pose = self._core.pose_to_store(now)
             if pose is not None:
@@ -103,43 +103,43 @@ class Service:
     def _report_health(self, now: float, lidar: LidarEdge) -> None:
         core, health = self._core, self._health
         loaded = core.replica.version is not None
-        health.set("map", loaded, "" if loaded else "no snapshot of the map was received yet")
+        health.set("map", loaded, "" if loaded else "no snapshot of the map has been received yet")
         status = core.localizer.status
         health.set("pose", status in {"good", "weak"}, f"{status}: {core.localizer.detail}".rstrip(": "))
-        health.set("lidar", now - self._scan_at < HOUSEKEEPING_S, lidar.trouble)
-        base_ok = now - self._base_at < HOUSEKEEPING_S
+        health.set("lidar", now - self._last_scan_at < HOUSEKEEPING_S, lidar.problem)
+        base_ok = now - self._last_feedback_at < HOUSEKEEPING_S
         health.set("base", base_ok, "" if base_ok else self._base_reason)
         LATENESS.labels("stream").set(self._stream.p99_s)
         LATENESS.labels("control").set(self._control.p99_s)
         if core.localizer.searching and not self._searching:
-            _log.info("searching_pose", reason=core.localizer.detail)
+            _log.info("global_search_started", reason=core.localizer.detail)
         self._searching = core.localizer.searching
 
-    # --- The robot's own parts --------------------------------------------------------------------------------------
+    # --- Base and lidar ---------------------------------------------------------------------------------------------
 
     def on_feedback(self, feedback: BaseFeedback, now: float) -> None:
-        """Pass the guardian's feedback on."""
-        self._base_at = now
+        """Pass the guardian's feedback to the core."""
+        self._last_feedback_at = now
         self._core.on_base(feedback, now)
 
     def on_base_lost(self, now: float, reason: str) -> None:
-        """Pass on that the guardian, or its base, is gone."""
+        """Pass the loss of the guardian, or of its base, to the core."""
         self._base_reason = reason
         self._core.on_base_lost(now, reason)
 
     def on_scan(self, scan: LaserScan, now: float) -> None:
-        """Pass a whole scan of the lidar on."""
-        self._scan_at = now
+        """Pass a whole scan of the lidar to the core."""
+        self._last_scan_at = now
         SCANS.inc()
         self._core.on_scan(scan, now)
 
-    async def stream_loop(self, link: GuardianClient) -> None:
+    async def stream_loop(self, guardian: GuardianClient) -> None:
         """Stream wheel commands at 20 Hz."""
         async for now in self._stream:
-            link.send(self._core.stream(now, self._clock.stamp()))
+            guardian.send(self._core.stream(now, self._clock.stamp()))
 
     async def control_loop(self) -> None:
-        """Decide at 5 Hz on a thread of its own, so that a decision that hangs can't hold up the stream."""
+        """Decide at 5 Hz on a separate thread, so that a decision that hangs can't block the stream."""
         loop = asyncio.get_running_loop()
         thread = ThreadPoolExecutor(1, thread_name_prefix="decide")
         try:
@@ -150,7 +150,7 @@ class Service:
         finally:
             thread.shutdown(wait=False, cancel_futures=True)
 
-    # --- What the fog says ------------------------------------------------------------------------------------------
+    # --- Subscriptions ----------------------------------------------------------------------------------------------
 
     def subscribe(self) -> None:
         """Register subscriptions and queries."""
@@ -164,19 +164,19 @@ class Service:
         _log.info("command", kind=command.kind, operator=command.operator, accepted=reply.accepted, reason=reply.reason)
         return reply
 
-    async def map_loop(self) -> None:
-        """Ask for a snapshot whenever the core wants one, less and less often while nobody answers."""
+    async def snapshot_loop(self) -> None:
+        """Request a snapshot whenever the core wants one, with a growing delay after each failure."""
         failures = 0
         while True:
             spread = random.uniform(0.5, 1.0)  # noqa: S311  # spreads attempts in time, no secret
             await self._clock.sleep(STREAM_S if not failures else spread * min(2.0**failures / 5, 3))
-            if not self._core.wants_snapshot(self._clock.now()) or await self._fetch():
+            if not self._core.wants_snapshot(self._clock.now()) or await self._fetch_snapshot():
                 failures = 0
             else:
                 failures += 1
 
-    async def _fetch(self) -> bool:
-        """Ask for a snapshot and load it; False when there was none, or no good one."""
+    async def _fetch_snapshot(self) -> bool:
+        """Request a snapshot and load it; False without a valid one."""
         try:
             snapshot = await self._zenoh.query(ch.MAP_SNAPSHOT, None, MapSnapshot, SNAPSHOT_TIMEOUT_S)
             if snapshot is None:
@@ -193,10 +193,10 @@ class Service:
             _log.error("map_not_stored", reason=str(error))
         return True
 
-    # --- What the fog hears -----------------------------------------------------------------------------------------
+    # --- Publications -----------------------------------------------------------------------------------------------
 
     async def publish_loop(self) -> None:
-        """Let time pass in the core at 10 Hz, publish what it returns, and observe traces."""
+        """Tick the core at 10 Hz, publish what it returns, and observe traces."""
         async for _ in Ticker(self._clock, PUBLISH_S):
             self._core.on_loop_health(self._loop_health())
             self._publish(self._core.tick(self._edges.now()))
@@ -206,7 +206,7 @@ class Service:
     def _publish(self, publications: Sequence[Publication]) -> None:
         for publication in publications:
             if isinstance(state := publication.message, RobotState):
-                self._show_mode(state)
+                self._report_mode(state)
             self._edges.publish(publication)
 
     def _loop_health(self) -> LoopHealth:
@@ -216,10 +216,10 @@ class Service:
             late=self._control.late + self._stream.late,
         )
 
-    def _show_mode(self, state: RobotState) -> None:
+    def _report_mode(self, state: RobotState) -> None:
         if state.mode == self._mode:
             return
-        _log.info("mode", mode=state.mode, before=self._mode, reasons=state.reasons)
+        _log.info("mode_changed", mode=state.mode, before=self._mode, reasons=state.reasons)
         if self._mode:
             MODE.labels(self._mode).set(0)
         MODE.labels(state.mode).set(1)

@@ -1,4 +1,4 @@
-"""What the agent can be told (environment FOGNAV_*), beside what all processes can, and what it reads from files."""
+"""Settings of the agent (environment FOGNAV_*) besides the common ones, and the files that they name."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ SITE_FILE: Final = "site.toml"
 
 
 class Settings(CommonSettings, frozen=True, kw_only=True):
-    """The robot's id, its base and lidar with their wires, the seed of its particle filter, and its memory.
+    """The robot's id, its base and lidar with their ports, the seed of its particle filter, and its memory.
 
     `base`, `lidar`: names in the entry points `fognav.bases` and `fognav.lidars`; the base must be the guardian's.
-    `base_options`, `lidar_options`: a JSON object with the part's own options; empty for its defaults.
+    `base_options`, `lidar_options`: a JSON object with the driver's own options; empty for its defaults.
 
-    `input_log`: where to log all that reaches the agent's core, for `python -m robot_agent.agent.replay`; some 1.5 MB
-    a minute. The log of the run before is kept beside it.
+    `input_log`: file for the log of the core's inputs, for `python -m robot_agent.agent.replay`; some 1.5 MB a minute.
+    The log of the previous run is kept beside it.
 
-    `obstacle_memory_s`: how long (s) a thing that its lidar saw counts while no lidar looks there again.
+    `obstacle_memory_s`: how long (s) a reported obstacle counts while no lidar looks there again.
 
-    `site_dir` is optional here: a robot without the site's folder is told its `site` and asks for a pose or searches.
+    `site_dir` is optional here: a robot without the site's folder needs `site`, and an initial pose or a global search.
     """
 
     robot: Id
@@ -49,9 +49,9 @@ class Settings(CommonSettings, frozen=True, kw_only=True):
 
 
 def read_site(settings: Settings) -> tuple[str, RobotSite | None]:
-    """Return the site's id and, if the site's folder is there, what it says of this robot; raises `SettingsError`.
+    """Return the site's id and, if the site's folder exists, its entry of this robot; raises `SettingsError`.
 
-    The map itself comes from the map-service: no robot drives by a copy of its own.
+    The map itself comes from the map-service, not from the site's folder.
     """
     file = settings.site_dir / SITE_FILE
     if settings.site_dir == Path() and not file.is_file():
@@ -63,7 +63,7 @@ def read_site(settings: Settings) -> tuple[str, RobotSite | None]:
     except OSError as error:
         raise SettingsError(f"{file} can't be read: {error.strerror}. Correct FOGNAV_SITE_DIR") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, msgspec.ValidationError) as error:
-        raise SettingsError(f"{file}: {error}. Correct the place it names") from error
+        raise SettingsError(f"{file}: {error}. Correct the field that it names") from error
     for robot in site.robots:
         if robot.id == settings.robot:
             return settings.site or site.id, robot

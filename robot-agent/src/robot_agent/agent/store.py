@@ -1,4 +1,4 @@
-"""What the robot keeps over a restart: its last trusted pose, and the last snapshot of the map for offline starts."""
+"""Files that survive a restart: the last trusted pose, and the last snapshot of the map for offline starts."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Store:
         self._snapshot = folder / "snapshot.msgpack"
 
     def pose(self, site: str) -> SavedPose | None:
-        """Return the stored pose on this site, None when there is none that can be used."""
+        """Return the stored pose on this site, None without a valid one."""
         data = _read(self._pose)
         if data is None:
             return None
@@ -43,7 +43,7 @@ class Store:
         atomic_write(self._pose, msgspec.json.encode(saved))
 
     def snapshot(self, site: str) -> MapSnapshot | None:
-        """Return the stored map of this site, None when there is none that can be read (its hash is not checked)."""
+        """Return the stored map of this site, None without a readable one (its hash is not checked)."""
         data = _read(self._snapshot)
         if data is None:
             return None
@@ -65,5 +65,5 @@ def _read(file: Path) -> bytes | None:
     except FileNotFoundError:
         return None
     except OSError as error:
-        _log.warning("not_readable", file=str(file), reason=str(error))
+        _log.warning("file_not_readable", file=str(file), reason=str(error))
         return None

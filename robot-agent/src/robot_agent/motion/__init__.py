@@ -1,1 +1,1 @@
-"""How it follows its path: path follower, and local planner with the dynamic window."""
+"""Path following: path follower, and local planner with the dynamic window."""

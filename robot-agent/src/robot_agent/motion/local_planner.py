@@ -26,19 +26,19 @@ if TYPE_CHECKING:
     from robot_agent.config import MotionConfig
 
 _AHEAD_M: Final = 2.5
-"""Path handed to a decision: more than an arc can reach, so that the way around something can be seen."""
+"""Length of the path in a decision: more than an arc can reach, so that a detour can be found."""
 _REJOIN_M: Final = 0.2
-"""A detour ends this far behind the last blocked piece of the path."""
+"""A detour rejoins the path this far behind its last blocked point."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Job:
-    """Everything that one decision needs; nothing in it changes afterwards.
+    """The inputs of one decision; immutable.
 
     pose, v, w: where the robot is and how fast (m, rad, m/s, rad/s). path: (n, 2) m, the released rest of the path,
     starting beside the robot. ends_here: whether its last point is the goal; goal_theta: heading wanted there.
     cap: the gate's limit on speed (m/s). cost: uint8 (h, w), the master costmap around the robot, geometry `window`.
-    seen: (m, 2) m, what the lidar sees.
+    lidar_points: (m, 2) m, points of the newest scan.
     """
 
     plan_id: int
@@ -53,15 +53,15 @@ class Job:
     cap: float
     cost: NDArray[np.uint8]
     window: GridGeometry
-    seen: NDArray[np.float64]
+    lidar_points: NDArray[np.float64]
     config: MotionConfig
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Decision:
-    """Speeds (m/s, rad/s) and the wheels' (m/s) for the next period; `at_goal` when position and heading are reached.
+    """Speeds v, w (m/s, rad/s) and the wheels' speeds (m/s) for the next period.
 
-    `blocked` says, in words, why the robot can't move although it should.
+    `at_goal`: position and heading of the goal are reached. `blocked`: why the robot can't move although it should.
     """
 
     plan_id: int
@@ -86,27 +86,27 @@ def twist(left: float, right: float, axle: float) -> tuple[float, float]:
 
 
 def local_costs(
-    cost: NDArray[np.uint8], window: GridGeometry, seen: NDArray[np.float64], table: InflationTable
+    cost: NDArray[np.uint8], window: GridGeometry, lidar_points: NDArray[np.float64], table: InflationTable
 ) -> NDArray[np.uint8]:
-    """Raise the cells of the points that the lidar sees to lethal, inflate them, and keep the higher cost.
+    """Make the cells of the lidar points lethal, inflate them, and combine them with the map by the higher cost.
 
-    The master costmap is inflated already: only the lidar's own points are inflated here. Unknown cells stay so.
+    The master costmap is inflated already: only the lidar points are inflated here. Unknown cells stay unknown.
     """
     marks = np.zeros(cost.shape, np.uint8)
-    cells, inside = window.cells(seen)
+    cells, inside = window.cells(lidar_points)
     marks[cells[inside, 1], cells[inside, 0]] = LETHAL
     return np.maximum(cost, inflate(marks, table))
 
 
 def decide(job: Job) -> Decision:
     """Choose the speeds for the next period; pure, some milliseconds of work, releases the GIL inside its kernels."""
-    c = job.config
+    config = job.config
     resolution = job.window.resolution
-    table = inflation_table(resolution, c.inflation)
-    costs = local_costs(job.cost, job.window, job.seen, table)
+    table = inflation_table(resolution, config.inflation)
+    costs = local_costs(job.cost, job.window, job.lidar_points, table)
     path = detour(job.path, costs, job.window, job.pose)
     end = job.path[-1]
-    wants_theta = job.goal_theta if job.ends_here else None
+    goal_theta = job.goal_theta if job.ends_here else None
     chosen = dwa(
         job.v,
         job.w,
@@ -118,16 +118,16 @@ def decide(job: Job) -> Decision:
         path,
         float(end[0]),
         float(end[1]),
-        wants_theta,
-        _limits(c, job.cap),
-        _settings(c),
+        goal_theta,
+        _limits(config, job.cap),
+        _settings(config),
     )
-    near = math.hypot(end[0] - job.pose.x, end[1] - job.pose.y) <= c.tolerance_xy
-    turned = wants_theta is None or abs(wrap(wants_theta - job.pose.theta)) <= c.tolerance_theta
+    at_position = math.hypot(end[0] - job.pose.x, end[1] - job.pose.y) <= config.tolerance_xy
+    at_heading = goal_theta is None or abs(wrap(goal_theta - job.pose.theta)) <= config.tolerance_theta
     blocked = None
-    if chosen.n_admissible == 0 and not near:
-        blocked = "something stands so near that no arc is free"
-    left, right = wheels(chosen.v, chosen.w, c.axle)
+    if chosen.n_admissible == 0 and not at_position:
+        blocked = "an obstacle is so near that no arc is free"
+    left, right = wheels(chosen.v, chosen.w, config.axle)
     return Decision(
         plan_id=job.plan_id,
         planner_epoch=job.planner_epoch,
@@ -136,13 +136,13 @@ def decide(job: Job) -> Decision:
         w=chosen.w,
         left=left,
         right=right,
-        at_goal=job.ends_here and near and turned,
+        at_goal=job.ends_here and at_position and at_heading,
         blocked=blocked,
     )
 
 
 def _limits(config: MotionConfig, cap: float) -> DwaLimits:
-    """Return what the base can do, no faster than `cap` (m/s)."""
+    """Return the limits of the base, no faster than `cap` (m/s)."""
     return DwaLimits(
         v_max=max(0.0, min(cap, config.speed)),
         w_max=config.angular_speed,
@@ -169,10 +169,10 @@ def _settings(config: MotionConfig) -> DwaSettings:
 def detour(
     path: NDArray[np.float64], costs: NDArray[np.uint8], window: GridGeometry, pose: Pose2
 ) -> NDArray[np.float64]:
-    """Lead a path (n, 2; m) around what blocks it inside the local window, if there is a way around in it.
+    """Return the path (n, 2; m) with a detour around what blocks it, if one exists inside the local window.
 
-    `costs`: uint8 (h, w) over `window`. The dynamic window alone is greedy and stops in front of whatever stands on
-    its path; the exact search of the few metres at hand is the robot's own, all that lies beyond is the planner's.
+    `costs`: uint8 (h, w) over `window`. The dynamic window alone is greedy and stops in front of an obstacle on its
+    path. The robot itself searches only these few metres; everything beyond is planned by the fog.
     """
     route = PathFollower(path, math.inf)
     points, ahead = route.ahead(0.5 * window.resolution)
@@ -189,8 +189,8 @@ def detour(
     found = search.plan(costs, start, window.cell(float(rejoin[0]), float(rejoin[1])))
     if not found.found:
         return path
-    way = search.shortcut(costs, found.cells) if len(found.cells) > 1 else found.cells.astype(np.float64)
-    return np.vstack((window.centres(way), path[route.along > ahead[clear[0]]]))
+    detour_cells = search.shortcut(costs, found.cells) if len(found.cells) > 1 else found.cells.astype(np.float64)
+    return np.vstack((window.centres(detour_cells), path[route.along > ahead[clear[0]]]))
 
 
 def make_job(  # noqa: PLR0913  # a job holds all that a decision rests on
@@ -206,21 +206,21 @@ def make_job(  # noqa: PLR0913  # a job holds all that a decision rests on
     cost: NDArray[np.uint8],
     speed_limits: NDArray[np.uint8],
     geometry: GridGeometry,
-    seen: NDArray[np.float64],
+    lidar_points: NDArray[np.float64],
     config: MotionConfig,
 ) -> Job | None:
-    """Gather what a decision needs; None when the robot is off the map. `seen` are points (m, 2) in `map`.
+    """Gather the inputs of a decision; None when the robot is off the map. `lidar_points`: (m, 2) m.
 
-    The speed layer counts where the robot's body is and a little ahead of its centre.
+    The lowest speed limit under the robot's body applies.
     """
     half = config.window
     window = geometry.window_around(pose.x - half, pose.y - half, pose.x + half, pose.y + half)
     if window.empty or not geometry.contains(pose.x, pose.y):
         return None
-    path, ends_here = follower.rest(_AHEAD_M)
+    path, ends_here = follower.released_ahead(_AHEAD_M)
     limit = _speed_limit(speed_limits, geometry, pose, config)
     part = geometry.part(window)
-    near = np.abs(seen - (pose.x, pose.y)).max(axis=1, initial=0.0) <= half + config.inflation.inflation_radius
+    near = np.abs(lidar_points - (pose.x, pose.y)).max(axis=1, initial=0.0) <= half + config.inflation.inflation_radius
     return Job(
         plan_id=plan_id,
         planner_epoch=planner_epoch,
@@ -234,7 +234,7 @@ def make_job(  # noqa: PLR0913  # a job holds all that a decision rests on
         cap=min(cap, limit),
         cost=np.ascontiguousarray(cost[window.rows, window.columns]),
         window=part,
-        seen=seen[near],
+        lidar_points=lidar_points[near],
         config=config,
     )
 

@@ -19,11 +19,11 @@ _SEARCH_AHEAD_M: Final = 2.5
 _OFF_PATH_M: Final = 1.0
 _PROGRESS_M: Final = 0.1
 _END_M: Final = 0.05
-"""A path released to within this of its end is released whole: rounded points make another length."""
+"""A path released to within this of its end counts as released whole: rounded points change its length."""
 
 
 class PathFollower:
-    """Where on its path the robot is: progress only ever looks near the last one, so a path may cross itself."""
+    """Progress of the robot along a path. It is searched near the last progress only, so a path may cross itself."""
 
     def __init__(self, points: NDArray[np.float64], released_length: float) -> None:
         self.points = points
@@ -50,7 +50,7 @@ class PathFollower:
         return max(0.0, self.released - self.progress)
 
     @property
-    def left(self) -> float:
+    def remaining(self) -> float:
         """Metres of path ahead of the robot."""
         return max(0.0, self.length - self.progress)
 
@@ -59,7 +59,7 @@ class PathFollower:
         self.released = length if length < self.length - _END_M else self.length
 
     def advance(self, x: float, y: float, now: float) -> None:
-        """Note where the robot is (m)."""
+        """Update the progress from the robot's position (m)."""
         low, high = 0.0, math.inf
         if self._started:
             low, high = self.progress - _SEARCH_BACK_M, self.progress + _SEARCH_AHEAD_M
@@ -71,30 +71,30 @@ class PathFollower:
         if self._best_at is None or self.progress > self._best_progress + _PROGRESS_M:
             self._best_progress, self._best_at = self.progress, now
 
-    def rest_clock(self, now: float) -> None:
-        """Restart the clock of `stuck_for`: the robot stands because it must, that is no being stuck."""
+    def restart_progress_timer(self, now: float) -> None:
+        """Restart the timer of `stuck_for`: a robot that must not drive is not stuck."""
         self._best_at = now
 
     def stuck_for(self, now: float) -> float:
         """Seconds without progress while driving was allowed."""
         return 0.0 if self._best_at is None else now - self._best_at
 
-    def rest(self, limit: float) -> tuple[NDArray[np.float64], bool]:
+    def released_ahead(self, limit: float) -> tuple[NDArray[np.float64], bool]:
         """Return the next `limit` metres of the released path (n, 2), and whether its last point is the path's end."""
         end = min(self.progress + limit, self.released)
         end = max(end, self.progress)
         inner = self.points[(self.along > self.progress) & (self.along < end)]
-        points = np.vstack((self._at(self.progress), inner, self._at(end)))
+        points = np.vstack((self._point(self.progress), inner, self._point(end)))
         return points, end >= self.length - 1e-6
 
     def ahead(self, spacing: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return points (n, 2) every `spacing` metres of the rest of the path, and their distances ahead (m)."""
-        count = max(2, math.ceil(self.left / spacing) + 1)
-        at = np.linspace(self.progress, self.length, count)
-        xs, ys = (np.interp(at, self.along, self.points[:, i]) for i in (0, 1))
-        return np.column_stack((xs, ys)), at - self.progress
+        count = max(2, math.ceil(self.remaining / spacing) + 1)
+        distances = np.linspace(self.progress, self.length, count)
+        xs, ys = (np.interp(distances, self.along, self.points[:, i]) for i in (0, 1))
+        return np.column_stack((xs, ys)), distances - self.progress
 
-    def _at(self, along: float) -> NDArray[np.float64]:
+    def _point(self, along: float) -> NDArray[np.float64]:
         return np.array([np.interp(along, self.along, self.points[:, i]) for i in (0, 1)])
 
     def _nearest(self, x: float, y: float, low: float, high: float) -> tuple[float, float]:
@@ -107,9 +107,9 @@ class PathFollower:
             return self.progress, math.inf
         start, delta, length = self.points[:-1][usable], np.diff(self.points, axis=0)[usable], steps[usable]
         part = np.clip(((here - start) * delta).sum(axis=1) / length**2, 0.0, 1.0)
-        away = np.hypot(*(start + part[:, None] * delta - here).T)
-        best = int(away.argmin())
-        return float(self.along[:-1][usable][best] + part[best] * length[best]), float(away[best])
+        offsets = np.hypot(*(start + part[:, None] * delta - here).T)
+        best = int(offsets.argmin())
+        return float(self.along[:-1][usable][best] + part[best] * length[best]), float(offsets[best])
 
 
 def first_blocked(
@@ -118,16 +118,16 @@ def first_blocked(
     follower: PathFollower,
     skip: float = 0.5,
     *,
-    led_out: bool = False,
+    known_to_planner: bool = False,
 ) -> float | None:
     """Return how far ahead (m) the rest of the path first meets a cell that the robot must not enter, or None.
 
-    Inscribed and unknown cells count beyond the first `skip` metres, where the planner may have led the robot out of a
-    tight place. Lethal ones count everywhere, unless the planner knew of them too (`led_out`).
+    Inscribed and unknown cells count beyond the first `skip` metres, where the planner may lead the robot out of a
+    tight place. Lethal ones count everywhere, unless the planner knew of them (`known_to_planner`).
     """
     points, ahead = follower.ahead(0.5 * geometry.resolution)
     cells = geometry.sample(cost, points, UNKNOWN)
     bad = (cells >= INSCRIBED) & (ahead > skip)
-    if not led_out:
+    if not known_to_planner:
         bad |= cells == LETHAL
     return float(ahead[int(bad.argmax())]) if bad.any() else None

@@ -32,7 +32,7 @@ class Ld19Driver:
         self._parser = protocol.Parser()
         self._assembler = protocol.ScanAssembler(chosen.intensity_min)
         self._heard_at = 0.0
-        self.trouble = ""
+        self.problem = ""
 
     @property
     def corrupted(self) -> int:
@@ -43,7 +43,7 @@ class Ld19Driver:
         """Begin (again), after the port was opened; there is nothing to send."""
         self._parser.reset()
         self._assembler.reset()
-        self._heard_at, self.trouble = now, ""
+        self._heard_at, self.problem = now, ""
         return b""
 
     def receive(self, data: bytes, now: float) -> LidarEvents:
@@ -52,14 +52,14 @@ class Ld19Driver:
         scans: list[LaserScan] = []
         samples = False
         while (packets := self._parser.next_event()) is not None:
-            samples, self._heard_at, self.trouble = True, now, ""
+            samples, self._heard_at, self.problem = True, now, ""
             scans.extend(self._assembler.feed(packets, now))
         return LidarEvents(samples, tuple(scans))
 
     def tick(self, now: float) -> bytes:
-        """Let time pass: a silent lidar is trouble, and nothing can be sent to mend it."""
+        """Let time pass: a silent lidar is problem, and nothing can be sent to mend it."""
         if now - self._heard_at > SILENT_S:
-            self.trouble = f"the lidar has sent no good packet for {SILENT_S:.0f} s; check its cable and power"
+            self.problem = f"the lidar has sent no good packet for {SILENT_S:.0f} s; check its cable and power"
         return b""
 
 

@@ -37,7 +37,7 @@ class RplidarA1Driver:
         self._assembler = rplidar.ScanAssembler()
         self._phase: Literal["closed", "stopping", "asking", "scanning", "resetting"] = "closed"
         self._since = 0.0
-        self.trouble = ""
+        self.problem = ""
 
     @property
     def incomplete(self) -> int:
@@ -48,7 +48,7 @@ class RplidarA1Driver:
         """Begin (again), after the port was opened; return what to send."""
         self._parser.reset()
         self._assembler.reset()
-        self.trouble = ""
+        self.problem = ""
         return self._enter("stopping", now, rplidar.stop())
 
     def receive(self, data: bytes, now: float) -> LidarEvents:
@@ -63,7 +63,7 @@ class RplidarA1Driver:
             elif isinstance(event, rplidar.Health) and self._phase == "asking":
                 answer = self._on_health(event, now)
             elif isinstance(event, rplidar.Nodes) and self._phase == "scanning":
-                nodes, self._since, self.trouble = True, now, ""
+                nodes, self._since, self.problem = True, now, ""
                 scans.extend(self._assembler.feed(event, now))
         return LidarEvents(nodes, tuple(scans), answer)
 
@@ -73,10 +73,10 @@ class RplidarA1Driver:
         if self._phase == "stopping" and waited >= STOP_S:
             return self._enter("asking", now, rplidar.get_health())
         if self._phase == "asking" and waited > ANSWER_S:
-            self.trouble = "the lidar does not answer; check its cable and power"
+            self.problem = "the lidar does not answer; check its cable and power"
             return self._enter("stopping", now, rplidar.stop())
         if self._phase == "scanning" and waited > SILENT_S:
-            self.trouble = f"the lidar has sent no measurement for {SILENT_S:.0f} s; it is asked again"
+            self.problem = f"the lidar has sent no measurement for {SILENT_S:.0f} s; it is asked again"
             return self._enter("stopping", now, rplidar.stop())
         if self._phase == "resetting" and waited > RESET_S:
             return self._enter("stopping", now, rplidar.stop())
@@ -84,7 +84,7 @@ class RplidarA1Driver:
 
     def _on_health(self, health: rplidar.Health, now: float) -> bytes:
         if health.status == rplidar.HealthStatus.ERROR:
-            self.trouble = f"the lidar reports error {health.error_code}; it is reset"
+            self.problem = f"the lidar reports error {health.error_code}; it is reset"
             return self._enter("resetting", now, rplidar.reset())
         return self._enter("scanning", now, rplidar.scan())
 

@@ -405,7 +405,7 @@ def _route_cost(
     )
 
 
-@njit(
+@njit(  # type: ignore[untyped-decorator]  # numba has no types for named tuples
     _RESULT(
         float64,
         float64,

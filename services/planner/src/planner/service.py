@@ -18,6 +18,7 @@ from prometheus_client import Counter, Gauge, Histogram
 
 from fog_contracts import channels as ch
 from fog_contracts.codec import ContractError
+from fog_contracts.handlers import RefusedMessageError
 from fog_contracts.messages import (
     MapSnapshot,
     PlanReply,
@@ -87,7 +88,7 @@ class Service:
         self._health = health
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="planner")
         self._field_thread = ThreadPoolExecutor(1, thread_name_prefix="field")
-        self._inputs: deque[Callable[[], object]] = deque()
+        self._inputs: deque[Callable[[], Sequence[Publication]]] = deque()
         self._goal_changes: deque[Callable[[], object]] = deque()
         self._wake = asyncio.Event()
         self._wants_map = asyncio.Event()
@@ -121,12 +122,22 @@ class Service:
 
         def leave(ids: Ids, message: object, at: Moment) -> Sequence[Publication]:
             self._note(ids, message)
-            self._inputs.append(partial(handler, ids, message, at))
+            self._inputs.append(partial(self._handle, channel, handler, ids, message, at))
             if channel in self._core.URGENT:
                 self._wake.set()
             return ()
 
         return leave
+
+    def _handle(
+        self, channel: ch.Channel, handler: Handler, ids: Ids, message: object, at: Moment
+    ) -> Sequence[Publication]:
+        """Run a handler on the core's thread; what it refuses is counted and logged, as by the edge itself."""
+        try:
+            return handler(ids, message, at)
+        except RefusedMessageError as error:
+            self._zenoh.refuse(channel, channel.pattern(**ids), str(error))
+            return ()
 
     def _note(self, ids: Ids, message: object) -> None:
         """Keep what the API shows."""
@@ -274,21 +285,25 @@ class Service:
     def _turn(self) -> _TurnResult:
         """Run one turn on the core's thread; goals that change while it searches count before it publishes."""
         core = self._core
-        _run_all(self._inputs)
+        answers = [publication for answer in _run_all(self._inputs) for publication in answer]
         _run_all(self._goal_changes)
         core.plan(self._edges.now())
         _run_all(self._goal_changes)
-        publications = core.publish(self._edges.now())
+        publications = [*answers, *core.publish(self._edges.now())]
         return _TurnResult(publications, core.take_reached(), core.field_jobs(), self._wants_snapshot())
 
     def _compute(self, job: FieldJob) -> None:
         async def work() -> None:
             await asyncio.get_running_loop().run_in_executor(self._field_thread, job.run)
-            self._inputs.append(partial(self._core.take_field, job))
+            self._inputs.append(partial(self._take_field, job))
 
         task = asyncio.get_running_loop().create_task(work(), name="field")
         self._fields.add(task)
         task.add_done_callback(self._fields.discard)
+
+    def _take_field(self, job: FieldJob) -> Sequence[Publication]:
+        self._core.take_field(job)
+        return ()
 
     def _publish(self, publications: Sequence[Publication]) -> None:
         for publication in publications:
@@ -332,7 +347,9 @@ class Service:
             thread.shutdown(wait=False, cancel_futures=True)
 
 
-def _run_all(waiting: deque[Callable[[], object]]) -> None:
-    """Run what waits, oldest first; the event loop may append meanwhile, for a deque's ends are safe to share."""
+def _run_all(waiting: deque[Callable[[], T]]) -> list[T]:
+    """Run what waits, oldest first, and return its results; the event loop may append meanwhile: a deque allows it."""
+    results: list[T] = []
     while waiting:
-        waiting.popleft()()
+        results.append(waiting.popleft()())
+    return results

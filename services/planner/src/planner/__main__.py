@@ -47,6 +47,7 @@ async def main() -> None:
             async with asyncio.TaskGroup() as tasks:
                 tasks.create_task(service.store_loop(), name="store")
                 tasks.create_task(service.map_loop(), name="map")
+                tasks.create_task(service.tick_loop(), name="tick")
                 tasks.create_task(service.plan_loop(), name="plan")
                 tasks.create_task(serve(app, settings.http_host, settings.http_port, settings.port_file), name="http")
         finally:

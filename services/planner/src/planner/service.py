@@ -32,6 +32,7 @@ from fog_contracts.messages import (
 )
 from fog_contracts.replica import MapError
 from fog_runtime import logs, metrics
+from fog_runtime.clock import ticker
 from fog_runtime.edges import Edges
 from planner.store import StoredGoal, StoreError
 
@@ -261,14 +262,15 @@ class Service:
 
     # --- What goes out ----------------------------------------------------------------------------------------------
 
+    async def tick_loop(self) -> None:
+        """Have the core take a turn ten times a second."""
+        async for _ in ticker(self._clock, TICK_S):
+            self._wake.set()
+
     async def plan_loop(self) -> None:
-        """Run the core's turns and publish what they return: at 10 Hz, and at once after an urgent message."""
+        """Run the core's turns and publish what they return: at every tick, and at once after an urgent message."""
         while True:
-            try:
-                async with asyncio.timeout(self._clock.real(TICK_S)):
-                    await self._wake.wait()
-            except TimeoutError:
-                pass
+            await self._wake.wait()
             self._wake.clear()
             with TURN_SECONDS.time():
                 result = await self._in_core(self._turn)

@@ -1,0 +1,313 @@
+"""The services' own `Service` classes with all their loops in one process: edges over a bus, a clock that tests move.
+
+Everything between a service's loops and its core is the real code; brokers, databases, threads and ports are not there.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any, Final
+
+from fog_contracts.bus import Bus, roundtrip
+from fog_contracts.handlers import Moment, Publication
+from fog_runtime.health import Health
+from fognav_experiments.rigs import STAMP
+from hazard_aggregator.core import Aggregator
+from hazard_aggregator.registry import find_rule
+from hazard_aggregator.service import Service as AggregatorService
+from map_service.core import MapCore
+from map_service.registry import make_layers
+from map_service.service import Service as MapService
+from planner.core import PlannerCore
+from planner.service import Service as PlannerService
+from robot_agent.agent.core import AgentCore
+from robot_agent.agent.service import Service as AgentService
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Coroutine, Sequence
+
+    from fog_contracts.channels import Channel, Role
+    from fog_contracts.messages import Message
+    from fog_runtime.site import LoadedSite
+    from robot_agent.config import AgentConfig
+    from robot_agent.guardian.link import WheelCommand
+
+AGENT_LOOPS: Final = ("agent map", "agent control", "agent stream")
+TICKS: Final = ("aggregator tick", "map tick", "planner tick", "agent publish")
+OTHERS: Final = ("planner map", "agent housekeeping")
+_EARLY_S: Final = 1e-6
+"""Sums of periods are no exact multiples of a step: who is due within this is due now."""
+
+
+class InlineExecutor(ThreadPoolExecutor):
+    """Runs everything at once, on the thread that submits it."""
+
+    def submit(self, fn, /, *args, **kwargs):  # type: ignore[override]
+        future: Future[Any] = Future()
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except BaseException as error:  # noqa: BLE001  # it belongs to whoever waits for the future
+            future.set_exception(error)
+        return future
+
+
+class SteppedClock:
+    """A clock that stands still while woken tasks run, and wakes them one after another, by the names of the tasks."""
+
+    speed = 1.0
+
+    def __init__(self, order: Sequence[str]) -> None:
+        self.time = 0.0
+        self._order = order
+        self._sleepers: list[tuple[float, str, asyncio.Future[None]]] = []
+
+    def now(self) -> float:
+        return self.time
+
+    def stamp(self) -> float:
+        return STAMP + self.time
+
+    def real(self, seconds: float) -> float:
+        return seconds
+
+    async def sleep(self, seconds: float) -> None:
+        task = asyncio.current_task()
+        assert task is not None
+        woken: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._sleepers.append((self.time + seconds, task.get_name(), woken))
+        await woken
+
+    async def wake(self, settle: Callable[[], Awaitable[None]]) -> None:
+        """Wake all whose time has come, in order; each one's doings are settled before the next."""
+        due = [sleeper for sleeper in self._sleepers if sleeper[0] <= self.time + _EARLY_S]
+        self._sleepers = [sleeper for sleeper in self._sleepers if sleeper not in due]
+        for _, _, woken in sorted(due, key=lambda sleeper: self._order.index(sleeper[1])):
+            woken.set_result(None)
+            await settle()
+
+
+class BusEdge:
+    """What `MqttEdge` and `ZenohEdge` offer to a service, over a bus; it lets a role do what the channel table says."""
+
+    connected = True
+
+    def __init__(self, live: LiveServices, role: Role) -> None:
+        self._live = live
+        self._role = role
+        self._on_connect: list[Callable[[], Awaitable[None]]] = []
+
+    def on(self, channel: Channel, handler: Any, kind: Any = None, *, numbers: Sequence[Any] = ()) -> None:
+        assert channel.transport == "mqtt"
+        assert channel.message is kind
+        wanted = {str(number) for number in numbers}
+
+        def only_numbers(ids: dict[str, str], message: Any) -> None:
+            if "number" not in ids or ids["number"] in wanted:
+                handler(ids, message)
+
+        self._subscribe(channel, only_numbers, {})
+
+    def subscribe(self, channel: Channel, kind: type[Message], handler: Any, **ids: str) -> None:
+        assert channel.transport == "zenoh"
+        assert channel.message is kind
+        self._subscribe(channel, handler, ids)
+
+    def _subscribe(self, channel: Channel, handler: Any, ids: dict[str, str]) -> None:
+        assert self._role in channel.subscribers, channel.name
+        self._live.subscribed.add((self._role, channel))
+
+        def handle(ids: Any, message: Any, _at: Moment) -> Sequence[Publication]:
+            handler(dict(ids), message)
+            return ()
+
+        self._live.bus.subscribe({channel: handle}, only=ids)
+
+    def publish(self, channel: Channel, message: Message | str, **ids: str) -> None:
+        assert self._role in channel.publishers, channel.name
+        self._live.published.add((self._role, channel))
+        self._live.bus.publish([Publication(channel, message, ids)])
+
+    publish_nowait = publish
+
+    def serve(self, channel: Channel, handler: Any, **ids: str) -> None:
+        assert self._role in channel.publishers, channel.name
+        self._live.served.add((self._role, channel))
+        self._live.answering[channel.key(site=self._live.site, **ids)] = handler, ids
+
+    async def ask(self, channel: Channel, request: Any, kind: type[Message], _timeout_s: float, **ids: str) -> Any:
+        assert self._role in channel.subscribers, channel.name
+        handler, served = self._live.answering.get(channel.key(site=self._live.site, **ids), (None, {}))
+        if handler is None:
+            return None
+        reply = handler(served, None if request is None else roundtrip(channel, request))
+        reply = await reply if inspect.isawaitable(reply) else reply
+        assert isinstance(reply, kind)
+        return roundtrip(channel, reply, reply=channel.kind == "query")
+
+    def watch_live(self, handler: Any) -> None:
+        self._live.watching.append(handler)
+
+    def on_connect(self, callback: Callable[[], Awaitable[None]]) -> None:
+        self._on_connect.append(callback)
+
+    async def connect(self) -> None:
+        for callback in self._on_connect:
+            await callback()
+
+
+class MemoryStore:
+    """Takes whatever a service stores, at once; nothing was stored before."""
+
+    def __init__(self) -> None:
+        self.writes: list[tuple[Any, ...]] = []
+
+    async def ping(self) -> None: ...
+
+    async def weakness(self) -> str:
+        return ""
+
+    async def zones(self) -> list[Any]:
+        return []
+
+    async def goals(self) -> dict[str, Any]:
+        return {}
+
+    async def save_hazards(self, hazards: Any) -> None:
+        self.writes.append(tuple(hazards))
+
+    async def put(self, *args: Any, **_: Any) -> str:
+        self.writes.append(args)
+        return "ok"
+
+    async def delete(self, *args: Any, **_: Any) -> str:
+        self.writes.append(args)
+        return "ok"
+
+    # The agent's store is a folder.
+    def snapshot(self, _site: str) -> None:
+        return None
+
+    def pose(self, _site: str) -> None:
+        return None
+
+    def put_snapshot(self, snapshot: Any) -> None:
+        self.writes.append((snapshot,))
+
+    def put_pose(self, pose: Any) -> None:
+        self.writes.append((pose,))
+
+
+class Link:
+    """Stands for the guardian and the lidar's port."""
+
+    trouble = ""
+
+    def __init__(self) -> None:
+        self.sent: list[WheelCommand] = []
+
+    def send(self, command: WheelCommand) -> None:
+        self.sent.append(command)
+
+
+class LiveServices:
+    """Aggregator, map-service, planner and one robot's agent, as their `__main__` put them together."""
+
+    def __init__(self, loaded: LoadedSite, config: AgentConfig, seed: int, bus: Bus) -> None:
+        self.bus = bus
+        self.site = loaded.site.id
+        self.clock = SteppedClock((*AGENT_LOOPS, *TICKS, *OTHERS))
+        self.answering: dict[str, tuple[Any, dict[str, str]]] = {}
+        self.watching: list[Any] = []
+        self.subscribed: set[tuple[Role, Channel]] = set()
+        self.published: set[tuple[Role, Channel]] = set()
+        self.served: set[tuple[Role, Channel]] = set()
+        self.link = Link()
+        self._tasks: list[asyncio.Task[None]] = []
+        definitions, clock = loaded.site.definitions(), self.clock
+        self._loaded, self._robot = loaded, config.robot
+        self.edges = edges = {
+            role: BusEdge(self, role)
+            for role in ("hazard-aggregator", "map-service", "planner", "robot-agent", "console")
+        }
+        self.aggregator = AggregatorService(
+            Aggregator(definitions, loaded.site.nodes, 1, registry=find_rule),
+            MemoryStore(), edges["hazard-aggregator"], edges["hazard-aggregator"], clock, Health(),
+        )  # fmt: skip
+        self.map = MapService(
+            MapCore(
+                self.site, loaded.map, 1,
+                layers=make_layers(loaded.map, loaded.site.layers), definitions=definitions,
+            ),
+            MemoryStore(), edges["map-service"], edges["map-service"], clock, Health(),
+        )  # fmt: skip
+        self.planner = PlannerService(PlannerCore(1), MemoryStore(), edges["planner"], clock, Health())
+        self.agent_core = AgentCore(config, seed)
+        self.agent = AgentService(
+            self.agent_core, edges["robot-agent"], MemoryStore(), clock, Health(), robot=self._robot, site=self.site
+        )
+
+    async def start(self) -> None:
+        """Subscribe, read what is stored and connect, at time 0; no loop of the clock runs yet."""
+        body = next(robot for robot in self._loaded.site.robots if robot.id == self._robot)
+        self.agent.restore(body)
+        for service in (self.aggregator, self.map, self.planner, self.agent):
+            service.subscribe()
+        self.aggregator.store_was_read()
+        for name, loop in (
+            ("aggregator write", self.aggregator.write_loop()),
+            ("map store", self.map.store_loop()),
+            ("planner store", self.planner.store_loop()),
+            ("planner plan", self.planner.plan_loop()),
+        ):
+            await self._begin(name, loop)
+        for watching in self.watching:
+            watching("hazard-aggregator", "live", True)  # noqa: FBT003  # as the edge calls it
+        await self.edges["hazard-aggregator"].connect()
+        await self.settle()
+
+    async def begin_loops(self) -> None:
+        """Start all loops that the clock paces; each ticks at once."""
+        loops = {
+            "agent map": self.agent.map_loop(),
+            "agent control": self.agent.control_loop(),
+            "agent stream": self.agent.stream_loop(self.link),
+            "aggregator tick": self.aggregator.tick_loop(),
+            "map tick": self.map.tick_loop(),
+            "planner tick": self.planner.tick_loop(),
+            "agent publish": self.agent.publish_loop(),
+            "planner map": self.planner.map_loop(),
+            "agent housekeeping": self.agent.housekeeping_loop(self.link),
+        }
+        for name, loop in loops.items():
+            await self._begin(name, loop)
+
+    async def stop(self) -> None:
+        """End everything; raises what a loop has died of."""
+        for task in self._tasks:
+            task.cancel()
+        ends = await asyncio.gather(*self._tasks, return_exceptions=True)
+        self.planner.close()
+        for end in ends:
+            assert isinstance(end, asyncio.CancelledError), end
+
+    async def settle(self) -> None:
+        """Run until every task waits for the clock, and no message is on its way."""
+        loop: Any = asyncio.get_running_loop()
+        while True:
+            await asyncio.sleep(0)
+            while loop._ready:  # noqa: ASYNC110  # no event tells that nothing is left to do
+                await asyncio.sleep(0)
+            if not self.bus.deliver(Moment(self.clock.now(), self.clock.stamp())):
+                return
+
+    async def run(self, work: Coroutine[Any, Any, Any]) -> Any:
+        """Run what somebody asks of a service to its end; return its result."""
+        task = asyncio.create_task(work)
+        await self.settle()
+        return task.result()
+
+    async def _begin(self, name: str, loop: Coroutine[Any, Any, None]) -> None:
+        self._tasks.append(asyncio.create_task(loop, name=name))
+        await self.settle()

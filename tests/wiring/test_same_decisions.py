@@ -1,0 +1,422 @@
+"""Lockstep and the live services decide the same: one recorded drive goes through both wirings.
+
+Lockstep drives a robot around a barrier; what came from outside (nodes, other robots, operators, base and lidar) is
+recorded and given to the services' own `Service` classes. All that is decided in between must come out again: every
+publication of every channel, every answer and every wheel command.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import importlib.util
+import inspect
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+import pytest
+
+from fog_contracts import channels as ch
+from fog_contracts.bus import Bus
+from fog_contracts.commands import sign
+from fog_contracts.handlers import Publication
+from fog_contracts.messages import (
+    CircleShape,
+    CommandReply,
+    EgressRequest,
+    LoopHealth,
+    MapDelta,
+    PlanReply,
+    PlanRequest,
+    Pose,
+    RectangleShape,
+    RobotCommand,
+    RobotGoal,
+    RobotObstacles,
+    RobotPose,
+    RobotState,
+    Zone,
+    ZoneSet,
+)
+from fog_contracts.site import AreaSite
+from fognav_experiments.rigs import OPERATOR_KEY, System, moment
+from fognav_sim.scenario import barrier_across
+from hazard_aggregator.core import Aggregator
+from hazard_aggregator.registry import find_rule
+from map_service.core import MapCore
+from map_service.registry import make_layers
+from planner.core import PlannerCore
+from robot_agent.agent import input_log as log
+from robot_agent.agent.core import AgentCore
+
+if TYPE_CHECKING:
+    from robot_agent.config import AgentConfig
+
+HERE = Path(__file__).parent
+
+
+def module(path: Path) -> Any:
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None
+    assert spec.loader is not None
+    made = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(made)
+    return made
+
+
+live_services = module(HERE / "live_services.py")
+little = module(HERE.parents[1] / "experiments" / "tests" / "little_site.py")
+
+SEED = 3
+STEPS = 1500
+ENABLE, GOAL, BARRIER, STRANGERS = 350, 400, 500, 620
+ZONES, QUESTIONS, ARRIVAL, CLOSED_IN = 900, 1000, 1100, 1250
+GOAL_ID = "goal-of-the-drive"
+OUTSIDE = {ch.NODE_READING, ch.NODE_AVAILABILITY, ch.THESIS_AREA}
+OF_ROBOTS = {ch.ROBOT_POSE, ch.ROBOT_STATE, ch.ROBOT_OBSTACLES}
+STRANGER = "r2"
+HARDWARE = (log.BaseReceived, log.LidarNodesReceived, log.ScanReceived)
+ZONE_SLOW = Zone(
+    id="slow",
+    kind="SPEED_LIMIT",
+    speed=0.1,
+    shape=RectangleShape(corner=(5.0, 5.5), opposite=(9.0, 7.5)),
+    reason="visitors",
+    version=1,
+)
+ZONE_WET = Zone(id="wet", kind="BLOCKED", shape=CircleShape(centre=(10.0, 6.4), radius=0.4), reason="mopped", version=1)
+PLAN = PlanRequest(start=Pose(x=1.5, y=1.5, theta=0.0), goal=Pose(x=13.5, y=6.5, theta=0.0))
+EGRESS = EgressRequest(robot="r1", pose=Pose(x=7.5, y=1.5, theta=0.0))
+
+
+class RecordingBus(Bus):
+    """Keeps every publication with its step, and loses the first version of the map in which an area is blocked."""
+
+    def __init__(self, site: str) -> None:
+        super().__init__(site)
+        self.step = 0
+        self.published: list[tuple[int, Publication]] = []
+        self.lost: int | None = None
+
+    def publish(self, publications: Any) -> None:
+        for publication in publications:
+            self.published.append((self.step, publication))
+            if not self._loses(publication.message):
+                super().publish([publication])
+
+    def _loses(self, message: Any) -> bool:
+        if not isinstance(message, MapDelta):
+            return False
+        if self.lost is None and any(cause.state == "blocked" for cause in message.causes):
+            self.lost = message.seq
+        return message.seq == self.lost
+
+
+@dataclass
+class Run:
+    """A drive: what came from outside in each step, and what was decided."""
+
+    bus: RecordingBus
+    config: AgentConfig
+    times: list[float] = field(default_factory=list)
+    hardware: list[list[log.Entry]] = field(default_factory=list)
+    answers: list[Any] = field(default_factory=list)
+    wheels: list[Any] = field(default_factory=list)
+    last_zone: Zone = ZONE_WET
+
+    def outside(self, step: int) -> list[Publication]:
+        return [p for at, p in self.bus.published if at == step and from_outside(p)]
+
+    def decisions(self) -> dict[str, list[Any]]:
+        """Return what was published inside, by channel: step, ids and content."""
+        found: dict[str, list[Any]] = {}
+        for step, publication in self.bus.published:
+            if not from_outside(publication):
+                entry = step, dict(publication.ids), comparable(publication.message)
+                found.setdefault(publication.channel.name, []).append(entry)
+        return found
+
+
+def from_outside(publication: Publication) -> bool:
+    return publication.channel in OUTSIDE or (publication.channel in OF_ROBOTS and publication.ids["robot"] == STRANGER)
+
+
+def comparable(message: Any) -> Any:
+    # How punctual its loops are is no decision.
+    return msgspec.structs.replace(message, loop=LoopHealth()) if isinstance(message, RobotState) else message
+
+
+def enable(now: float) -> RobotCommand:
+    unsigned = RobotCommand(kind="enable", robot="r1", operator="test", nonce="n" * 16, issued_at=moment(now).stamp)
+    return sign(unsigned, OPERATOR_KEY)
+
+
+def strangers(step: int, readings: list[Any]) -> list[Publication]:
+    """Return what another robot, old and broken nodes send in a step, and a reading that is delivered twice."""
+    at = moment(step * 0.01)
+    robot = {"robot": STRANGER}
+    found: list[Publication] = []
+    if step % 100 == 50 and readings:
+        found.append(Publication(ch.NODE_READING, readings[-1], {"node": "n1"}))
+    if step == STRANGERS:
+        seen = RobotObstacles(points=[(4.0, 7.0), (4.05, 7.0)], stamp=at.stamp, ttl=3.0)
+        found += [
+            Publication(ch.NODE_AVAILABILITY, "online", {"node": "n1"}),
+            Publication(ch.NODE_AVAILABILITY, "perhaps", {"node": "n1"}),
+            Publication(ch.THESIS_AREA, "blocked", {"number": "7"}),
+            Publication(ch.ROBOT_OBSTACLES, seen, robot),
+        ]
+    if STRANGERS <= step < STRANGERS + 400 and step % 20 == 0:
+        found.append(Publication(ch.THESIS_AREA, "clear", {"number": "2"}))
+    if step >= STRANGERS and step % 20 == 0:
+        pose = RobotPose(
+            x=7.5, y=0.85, theta=0.0, covariance=[0.0] * 9, v=0.0, w=0.0, radius=0.17, height=0.5, stamp=at.stamp
+        )
+        found.append(Publication(ch.ROBOT_POSE, pose, robot))
+    if step == ARRIVAL:
+        state = RobotState(
+            mode="NORMAL", reasons=[], enabled=True, battery=0.5, goal_id=GOAL_ID, map_epoch=1, map_seq=1, plan_id=1,
+            goal_reached=True, stamp=at.stamp,
+        )  # fmt: skip
+        found.append(Publication(ch.ROBOT_STATE, state, robot))
+    return found
+
+
+def site_with_two_areas() -> Any:
+    """Return the little site with one more area, which only a node of the thesis watches."""
+    loaded = little.little_site()
+    around_start = AreaSite(id="z2", label="West", polygon=[(0.5, 2.6), (2.5, 2.6), (2.5, 5.0), (0.5, 5.0)], number=2)
+    return replace(loaded, site=msgspec.structs.replace(loaded.site, areas=[*loaded.site.areas, around_start]))
+
+
+def drive_in_lockstep() -> Run:
+    site = site_with_two_areas()
+    entries: list[log.Entry] = []
+    bus = RecordingBus(site.site.id)
+    system = System(
+        site, site.site.robots[0], SEED, bus=bus, make_agent=lambda c, s: log.LoggedAgent(c, s, entries.append)
+    )
+    started = entries[0]
+    assert isinstance(started, log.Started)
+    run = Run(bus, replace(started.config, operator_key=OPERATOR_KEY))
+    readings: list[Any] = []
+    bus.subscribe({ch.NODE_READING: lambda _ids, reading, _at: readings.append(reading) or ()})
+    fog = system.fog
+    for step in range(1, STEPS + 1):
+        bus.step = step
+        entries.clear()
+        system.step(strangers(step, readings))
+        run.hardware.append([e for e in entries if isinstance(e, HARDWARE)])
+        run.wheels += [entry.command for entry in entries if isinstance(entry, log.WheelsCommanded)]
+        run.times.append(system.now)
+        at = moment(system.now)
+        if step == ENABLE:
+            asked = enable(at.now)
+            run.answers.append(bus.ask(ch.ROBOT_COMMAND, asked, CommandReply, at, robot="r1"))
+        if step == BARRIER:
+            system.world.place(barrier_across(site.site.areas[0], site.site, site.map, SEED))
+        if step == GOAL:
+            for robot in ("r1", STRANGER):
+                fog.planner.set_goal(robot, goal(at.stamp), any_heading=True)
+                fog.deliver(at)
+        if step == ZONES:
+            fog.map.put_zone(ZONE_SLOW, at)
+            fog.map.put_zone(ZONE_WET, at)
+        if step == CLOSED_IN:
+            run.last_zone = zone_around(*system.world.pose[:2])
+            fog.map.put_zone(run.last_zone, at)
+        if step == QUESTIONS:
+            run.answers.append(bus.ask(ch.PLANNER_PLAN, PLAN, PlanReply, at))
+            run.answers.append(bus.ask(ch.PLANNER_EGRESS, EGRESS, PlanReply, at))
+            run.answers.append(bus.ask(ch.ZONES, None, ZoneSet, at))
+        fog.deliver(at)
+    return run
+
+
+def zone_around(x: float, y: float) -> Zone:
+    """Return a no-go zone that a robot at (x, y) finds itself in."""
+    shape = CircleShape(centre=(round(float(x), 2), round(float(y), 2)), radius=0.5)
+    return Zone(id="here", kind="BLOCKED", shape=shape, reason="gas", version=1)
+
+
+def goal(stamp: float) -> RobotGoal:
+    pose = Pose(x=little.GOAL.x, y=little.GOAL.y, theta=0.0)
+    return RobotGoal(goal_id=GOAL_ID, pose=pose, place=None, stamp=stamp)
+
+
+def feed(live: Any, entries: list[log.Entry]) -> None:
+    """Hand the agent's service what base and lidar sent in a step."""
+    for entry in entries:
+        match entry:
+            case log.BaseReceived():
+                live.agent.on_feedback(entry.feedback, entry.now)
+            case log.LidarNodesReceived():
+                live.agent_core.on_lidar_nodes(entry.now)
+            case log.ScanReceived():
+                live.agent.on_scan(entry.scan(), entry.now)
+
+
+async def drive_live(recorded: Run) -> tuple[Run, Any]:
+    asyncio.get_running_loop().set_default_executor(live_services.InlineExecutor())
+    site = site_with_two_areas()
+    bus = RecordingBus(site.site.id)
+    run = Run(bus, recorded.config)
+    live = live_services.LiveServices(site, recorded.config, SEED, bus)
+    console = live.edges["console"]
+    await live.start()
+    for step, now in enumerate(recorded.times, 1):
+        bus.step = step
+        live.clock.time = now
+        feed(live, recorded.hardware[step - 1])
+        bus.publish(recorded.outside(step))
+        await live.settle()
+        if step == 1:
+            await live.begin_loops()
+        else:
+            await live.clock.wake(live.settle)
+        if step == ENABLE:
+            asked = enable(now)
+            run.answers.append(await live.run(console.ask(ch.ROBOT_COMMAND, asked, CommandReply, 1.0, robot="r1")))
+        if step == GOAL:
+            pose = goal(0.0).pose
+            assert pose is not None
+            for robot in ("r1", STRANGER):
+                await live.run(live.planner.send(robot, pose, "tester", place=None, any_heading=True))
+        if step == ZONES:
+            for zone in (ZONE_SLOW, ZONE_WET):
+                await live.run(live.map.create(zone, "tester"))
+        if step == CLOSED_IN:
+            await live.run(live.map.create(recorded.last_zone, "tester"))
+        if step == QUESTIONS:
+            run.answers.append(await live.run(console.ask(ch.PLANNER_PLAN, PLAN, PlanReply, 1.0)))
+            egress = live.edges["robot-agent"].ask(ch.PLANNER_EGRESS, EGRESS, PlanReply, 1.0)
+            run.answers.append(await live.run(egress))
+            run.answers.append(await live.run(console.ask(ch.ZONES, None, ZoneSet, 1.0)))
+        await live.settle()
+    run.wheels = live.link.sent
+    await live.stop()
+    return run, live
+
+
+@pytest.fixture(scope="module")
+def lockstep() -> Run:
+    return drive_in_lockstep()
+
+
+@pytest.fixture(scope="module")
+def live(lockstep: Run) -> tuple[Run, Any]:
+    with pytest.MonkeyPatch.context() as patch:
+        for service in ("planner.service", "robot_agent.agent.service"):
+            patch.setattr(f"{service}.ThreadPoolExecutor", live_services.InlineExecutor)
+        patch.setattr("planner.service.secrets.token_hex", lambda _: GOAL_ID)
+        return asyncio.run(drive_live(lockstep))
+
+
+def test_the_recorded_drive_is_worth_comparing(lockstep):
+    decisions = lockstep.decisions()
+    modes = {state.mode for _, _, state in decisions["robot_state"]}
+    assert {"INIT", "NORMAL", "DEGRADED", "PROTECTIVE_STOP"} <= modes
+    assert {"clear", "blocked", "unknown"} <= {hazard.state for _, _, hazard in decisions["area_hazard"]}
+    assert STRANGER in {hazard.explained_by for _, _, hazard in decisions["area_hazard"]}
+    assert len({path.plan_id for _, _, path in decisions["robot_path"]}) >= 3
+    assert {delta.layer for _, _, delta in decisions["map_delta"]} == {"cost", "speed"}
+    assert lockstep.bus.lost is not None
+    assert [accepted.accepted for accepted in lockstep.answers[:1]] == [True]
+
+
+def test_live_services_publish_what_lockstep_publishes(lockstep, live):
+    run, _ = live
+    expected, found = lockstep.decisions(), run.decisions()
+    assert found.keys() == expected.keys()
+    for channel, decisions in expected.items():
+        for theirs, ours in zip(found[channel], decisions, strict=False):
+            assert theirs == ours, channel
+        assert len(found[channel]) == len(decisions), channel
+
+
+def test_live_services_answer_refuse_and_drive_as_in_lockstep(lockstep, live):
+    run, _ = live
+    assert run.answers == lockstep.answers
+    assert run.bus.refused == lockstep.bus.refused
+    assert len(run.bus.refused) == 1
+    assert run.wheels == lockstep.wheels
+    assert any(command.left and command.right for command in run.wheels)
+
+
+# --- The channel table is the source of who publishes and who subscribes ---
+
+NOT_YET = {
+    ("hazard-aggregator", ch.NODE_VALUE),
+    ("hazard-aggregator", ch.HOME_ASSISTANT),
+}
+"""What the table allows and no service does so far; whoever makes it true takes it out of here."""
+
+
+def of_table(live: Any, kind: str, side: str) -> set[Any]:
+    """Return the pairs of role and channel that the table has on one side, for the roles that run here."""
+    roles = set(live.edges) - {"console"}
+    pairs = {(role, c) for c in ch.CHANNELS.values() if c.kind == kind for role in getattr(c, side) if role in roles}
+    return pairs - NOT_YET
+
+
+def named(pairs: set[Any]) -> list[str]:
+    return sorted(f"{role}: {channel.name}" for role, channel in pairs)
+
+
+def test_services_subscribe_to_exactly_the_channels_that_the_table_gives_them(live):
+    _, services = live
+    assert named(services.subscribed) == named(of_table(services, "pub", "subscribers"))
+
+
+def test_services_publish_exactly_the_channels_that_the_table_gives_them(live):
+    _, services = live
+    assert named(services.published) == named(of_table(services, "pub", "publishers"))
+
+
+def test_services_answer_exactly_the_queries_that_the_table_gives_them(live):
+    _, services = live
+    served = {(role, channel) for role, channel in services.served if channel.kind == "query"}
+    assert named(served) == named(of_table(services, "query", "publishers"))
+    # Of published channels only those may be asked that have a latest message.
+    assert all(c.durability == "latest" for _, c in services.served if c.kind == "pub")
+
+
+def cores(loaded: Any, config: AgentConfig) -> dict[str, Any]:
+    """Return what offers tables of handlers or answerers, by name."""
+    definitions, layers = loaded.site.definitions(), make_layers(loaded.map, loaded.site.layers)
+    return {
+        "aggregator": Aggregator(definitions, loaded.site.nodes, 1, registry=find_rule),
+        "map": MapCore(loaded.site.id, loaded.map, 1, layers=layers, definitions=definitions),
+        # The map's handlers join those of its layers, and take whatever these take.
+        **{f"map layer {type(layer).__name__}": layer for layer in layers},
+        "planner": PlannerCore(1),
+        "agent": AgentCore(config),
+    }
+
+
+def annotations(function: Any) -> list[str]:
+    return [parameter.annotation for parameter in inspect.signature(function).parameters.values()]
+
+
+def test_every_handler_takes_the_message_type_of_its_channel(lockstep):
+    checked = 0
+    for name, core in cores(site_with_two_areas(), lockstep.config).items():
+        for channel, handler in core.handlers().items() if name != "map" else ():
+            expected = "str" if channel.message is None else channel.message.__name__
+            assert annotations(handler) == ["Ids", expected, "Moment"], f"{name}: {channel.name}"
+            checked += 1
+    assert checked > 20
+
+
+def test_every_answerer_takes_the_request_type_of_its_channel_and_gives_its_reply(lockstep):
+    checked = 0
+    for name, core in cores(site_with_two_areas(), lockstep.config).items():
+        for channel, answerer in core.answerers().items() if hasattr(core, "answerers") else ():
+            asked, reply = (channel.message, channel.reply) if channel.kind == "query" else (None, channel.message)
+            expected = "None" if asked is None else asked.__name__
+            assert annotations(answerer) == ["Ids", expected, "Moment"], f"{name}: {channel.name}"
+            assert reply is not None
+            assert inspect.signature(answerer).return_annotation == reply.__name__, f"{name}: {channel.name}"
+            checked += 1
+    assert checked == 6

@@ -15,6 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from fognav.output import console
 
 _WARM_TIMEOUT_S: Final = 900.0
+_COMPILES: Final = re.compile(r"^(@|\w+ = )njit\(", re.MULTILINE)
 _PROGRESS: Final = re.compile(r"(\d+) of (\d+) kernels ready: (.*)")
 
 
@@ -24,7 +25,7 @@ class KernelsError(RuntimeError):
 
 def _stale(folder: Path) -> list[str]:
     """Return the kernel modules that have no cache index as young as their source, in the folder of the package."""
-    sources = [path for path in folder.glob("*.py") if "njit" in path.read_text("utf-8")]
+    sources = [path for path in folder.glob("*.py") if _COMPILES.search(path.read_text("utf-8"))]
     indices = list((folder / "__pycache__").glob("*.nbi"))
     return sorted(
         source.stem

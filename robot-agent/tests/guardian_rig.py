@@ -1,4 +1,4 @@
-"""An emulated base on a real pty, the watchdog with its guardian as real processes, and an agent to talk to them."""
+"""An emulated base on a real pty, the watchdog with its guardian as real processes, and an agent connected to them."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ if TYPE_CHECKING:
 
 DEADLINE_S = 45.0
 STOP_S = 0.3
-"""The limit that the robot's design sets to everything that must stop the wheels."""
+"""Longest time that the robot's design allows for stopping the wheels."""
 
 
-def wait_for(condition, what: str, deadline_s: float = DEADLINE_S):
+def wait_for(condition, expected: str, deadline_s: float = DEADLINE_S):
     until = time.monotonic() + deadline_s
     while time.monotonic() < until:
         if value := condition():
             return value
         time.sleep(0.005)
-    raise AssertionError(f"not within {deadline_s} s: {what}")
+    raise AssertionError(f"not within {deadline_s} s: {expected}")
 
 
 class Base:
-    """A base behind a pty, run by a thread; it remembers since when its wheels have been at rest."""
+    """A base behind a pty, run by a thread; it records since when its wheels have been at rest."""
 
     def __init__(self, link: Path, robot=None) -> None:
         self.link = link
@@ -79,8 +79,8 @@ class Base:
         return self.robot.wheel_speeds_m_s
 
     def stopped_within(self, begun: float) -> float:
-        """Seconds from `begun` until the wheels stood; they still stand."""
-        stopped = wait_for(lambda: self.stopped_at, "the wheels stand", 5.0)
+        """Seconds from `begun` until the wheels were at rest; they still are."""
+        stopped = wait_for(lambda: self.stopped_at, "the wheels stop", 5.0)
         return stopped - begun
 
     def _run(self) -> None:
@@ -103,7 +103,7 @@ class Base:
 
 
 class Watchdog:
-    """`python -m robot_agent.guardian.watchdog` and what it says."""
+    """`python -m robot_agent.guardian.watchdog` and its log."""
 
     def __init__(self, folder: Path, base_port: Path) -> None:
         self.log_file = folder / "watchdog.log"
@@ -148,7 +148,7 @@ class Watchdog:
 
 
 class Agent:
-    """What the real agent does on the guardian's socket: a stream of commands at 20 Hz, feedback read back."""
+    """The real agent's behaviour on the guardian's socket: commands at 20 Hz, feedback received."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -212,7 +212,7 @@ class Rig:
         self._stack.__exit__(*details)
 
     def drive(self) -> None:
-        """Drive at 0.3 m/s, however the guardian has to be found first."""
+        """Drive at 0.3 m/s, once the guardian is connected."""
         self.agent.wheels = (0.3, 0.3)
         wait_for(lambda: self.base.speeds == (0.3, 0.3), "the base drives")
 

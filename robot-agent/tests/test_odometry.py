@@ -24,12 +24,12 @@ ROOMBA = DriveTrain(axle_m=0.235, wheel_speed_max_m_s=0.5, travel_wrap_m=65_536 
 
 
 def wheels(left: int, right: int) -> WheelOdometry:
-    """What counters of 16 bits that stand at these ticks say."""
+    """Return the reading of 16-bit counters at these ticks."""
     return WheelOdometry(left_m=(left & 0xFFFF) * TICK_M, right_m=(right & 0xFFFF) * TICK_M)
 
 
 @given(st.integers(0, 0xFFFF), st.integers(-0x7FFF, 0x7FFF))
-def test_the_travel_between_two_readings_undoes_any_wrap(old, step):
+def test_travel_between_two_readings_is_right_over_any_wrap(old, step):
     new = (old + step) & 0xFFFF
     assert wheel_travel(new * TICK_M, old * TICK_M, ROOMBA.travel_wrap_m) == pytest.approx(step * TICK_M, abs=1e-9)
 
@@ -80,7 +80,7 @@ def test_known_arcs_end_where_geometry_says():
     st.floats(-3, 3), st.floats(-3, 3), st.floats(-3.1, 3.1), st.floats(-0.5, 0.5), st.floats(-0.5, 0.5),
     st.integers(1, 20),
 )  # fmt: skip
-def test_one_arc_is_the_same_in_any_number_of_pieces(x, y, theta, left, right, pieces):
+def test_arc_is_the_same_in_any_number_of_pieces(x, y, theta, left, right, pieces):
     whole = integrate(x, y, theta, left, right, 0.235)
     pose = (x, y, theta)
     for _ in range(pieces):
@@ -100,7 +100,7 @@ def test_an_impossible_jump_is_a_fault_and_moves_nothing():
     assert odometry.faults == 1
 
 
-def test_one_wild_reading_costs_no_motion():
+def test_one_wild_reading_loses_no_motion():
     odometry = Odometry(ROOMBA)
     odometry.update(wheels(100, 100), 0.0)
     odometry.update(wheels(30000, 500), 0.015)
@@ -109,7 +109,7 @@ def test_one_wild_reading_costs_no_motion():
     assert odometry.pose[0] == pytest.approx(20 * TICK_M)
 
 
-def test_a_restarted_robot_is_believed_from_its_second_reading_on_without_the_jump():
+def test_restarted_base_is_trusted_from_its_second_reading_without_the_jump():
     odometry = Odometry(ROOMBA)
     odometry.update(wheels(20000, 20000), 0.0)
     assert isinstance(odometry.update(wheels(0, 0), 3.0), EncoderFault)
@@ -117,7 +117,7 @@ def test_a_restarted_robot_is_believed_from_its_second_reading_on_without_the_ju
     assert odometry.pose[0] == pytest.approx(10 * TICK_M)
 
 
-def test_a_gap_in_which_the_counter_could_go_around_is_a_fault():
+def test_gap_in_which_the_counter_could_wrap_is_a_fault():
     odometry = Odometry(ROOMBA)
     odometry.update(wheels(0, 0), 0.0)
     assert isinstance(odometry.update(wheels(0, 0), 60.0), EncoderFault)
@@ -142,7 +142,7 @@ def test_top_speed_with_late_frames_is_no_fault():
         ("2019_Fall_Corner_finding_data.txt", (0, 1, 2, 3, 4, 5), 1.0),
     ],
 )
-def test_recorded_drives_end_where_their_owner_found_them(data_dir, name, columns, unit):
+def test_recorded_drives_end_at_their_recorded_pose(data_dir, name, columns, unit):
     lines = Path(data_dir / "roomba" / name).read_text().splitlines()
     rows = [[float(line.split(",")[c]) for c in columns] for line in lines if line[:1].isdigit()]
     assert len(rows) > 1000

@@ -1,4 +1,4 @@
-"""What every base and every lidar that is installed has to do, ours or anybody's: driver and emulator face to face."""
+"""Requirements on every installed base and lidar, from any package: driver and emulator on one line."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ every_base = pytest.mark.parametrize("name", BASES)
 every_lidar = pytest.mark.parametrize("name", LIDARS)
 
 
-def test_ours_are_there_and_each_has_its_stop_command_and_its_emulator():
+def test_every_base_and_lidar_has_its_stop_command_and_emulator():
     assert {"roomba600", "diffdrive"} <= set(BASES)
     assert {"rplidar-a1", "ld19"} <= set(LIDARS)
     assert parts.names(STOPS) == parts.names(devices.BASES) == BASES
@@ -58,7 +58,7 @@ class Wire:
         self.feedback = []
         self.seq = 0
 
-    def take(self, output) -> None:
+    def handle(self, output) -> None:
         self.feedback += output.feedback
         if output.data:
             self.base.receive(output.data, self.now)
@@ -68,13 +68,13 @@ class Wire:
             if wheels is not None and number % 5 == 0:
                 self.seq += 1
                 command = WheelCommand(seq=self.seq, left=wheels[0], right=wheels[1])
-                self.take(self.core.on_command(command, self.now))
+                self.handle(self.core.on_command(command, self.now))
             self.now += STEP
             left, right = self.base.wheel_speeds_m_s
             self.base.add_wheel_travel(left * STEP, right * STEP)
             self.base.tick(self.now, STEP)
-            self.take(self.core.on_bytes(self.base.outgoing(self.now), self.now))
-            self.take(self.core.tick(self.now))
+            self.handle(self.core.on_bytes(self.base.outgoing(self.now), self.now))
+            self.handle(self.core.tick(self.now))
 
     def ready(self) -> Wire:
         self.run(0.5)
@@ -103,9 +103,9 @@ def test_driver_and_emulator_agree_on_the_geometry(name):
     wire.run(0.5, (0.25, 0.2))
     left = right = 0.0
     for _ in range(100):
-        moved = odometry.update(wire.feedback[-1].odometry, wire.now)
-        assert isinstance(moved, Motion)
-        left, right = left + moved.left_m, right + moved.right_m
+        motion = odometry.update(wire.feedback[-1].odometry, wire.now)
+        assert isinstance(motion, Motion)
+        left, right = left + motion.left_m, right + motion.right_m
         wire.run(0.05, (0.25, 0.2))
     # The first reading is the zero; feedback comes every few frames.
     assert (left, right) == pytest.approx((0.25 * 4.95, 0.2 * 4.95), abs=0.02)
@@ -113,39 +113,39 @@ def test_driver_and_emulator_agree_on_the_geometry(name):
 
 
 @every_base
-@pytest.mark.parametrize("felt", [{"bump_left": True}, {"bump_right": True}, {"cliff": True}])
-def test_what_a_base_feels_stops_it_and_latches(name, felt):
+@pytest.mark.parametrize("sensors", [{"bump_left": True}, {"bump_right": True}, {"cliff": True}])
+def test_bumper_and_cliff_stop_the_base_and_latch(name, sensors):
     wire = Wire(name).ready()
     wire.run(0.5, (0.3, 0.3))
-    wire.base.feel(**{"bump_left": False, "bump_right": False, "cliff": False, **felt})
+    wire.base.set_sensors(**{"bump_left": False, "bump_right": False, "cliff": False, **sensors})
     wire.run(0.05, (0.3, 0.3))
     assert wire.base.wheel_speeds_m_s == (0.0, 0.0)
     status = wire.feedback[-1].status
-    assert {key: getattr(status, key.replace("bump", "bumper")) for key in felt} == felt
+    assert {key: getattr(status, key.replace("bump", "bumper")) for key in sensors} == sensors
     assert wire.core.latched is not None
 
 
 @every_base
 def test_a_silent_base_is_a_fault(name):
     wire = Wire(name).ready()
-    for _ in range(round(wire.driver.timing.silence / STEP) + 2):
+    for _ in range(round(wire.driver.timing.frame_timeout / STEP) + 2):
         wire.now += STEP
-        wire.take(wire.core.tick(wire.now))
+        wire.handle(wire.core.tick(wire.now))
     assert "no valid frame" in wire.core.latched
 
 
 @every_base
 @pytest.mark.parametrize("command", ["stop", "hold", "wake", "zero"])
-def test_every_stop_works_after_a_command_that_was_cut_off_anywhere(name, command):
-    cut_off = Wire(name).driver.drive(0.31, 0.29)
-    for cut in range(len(cut_off)):
+def test_every_stop_works_after_a_command_truncated_anywhere(name, command):
+    truncated = Wire(name).driver.drive(0.31, 0.29)
+    for cut in range(len(truncated)):
         wire = Wire(name).ready()
         wire.run(0.5, (0.3, 0.3))
         assert wire.base.wheel_speeds_m_s == (0.3, 0.3)
-        wire.base.receive(cut_off[:cut], wire.now)
+        wire.base.receive(truncated[:cut], wire.now)
         data = {
             "stop": wire.stop.stop,
-            # Repeated until somebody drives again: the first may end what was cut off.
+            # It is repeated until a guardian drives again: the first may complete the truncated command.
             "hold": wire.stop.hold * 2,
             "wake": wire.driver.wake(),
             "zero": wire.core.stop_command() * 2,
@@ -168,9 +168,9 @@ def test_a_base_that_was_stopped_by_the_watchdog_is_woken_by_the_next_guardian(n
 @every_base
 @given(st.integers(0, 2**32), st.lists(st.integers(1, 80), min_size=1, max_size=20))
 @settings(max_examples=20, deadline=None)
-def test_a_base_is_understood_in_pieces_of_any_size_and_damage_is_counted_and_never_believed(name, seed, sizes):
+def test_base_frames_parse_in_pieces_of_any_size_and_damaged_ones_are_counted(name, seed, sizes):
     rng = np.random.default_rng(seed)
-    base, whole, cut, spoilt = devices.make_base(name), *(registry.make_base(name) for _ in range(3))
+    base, whole, cut, damaged = devices.make_base(name), *(registry.make_base(name) for _ in range(3))
     base.receive(whole.wake(), 0.0)
     base.add_wheel_travel(3.0, 2.0)
     clean, dirty, now = b"", b"", 0.0
@@ -179,20 +179,20 @@ def test_a_base_is_understood_in_pieces_of_any_size_and_damage_is_counted_and_ne
         base.tick(now, STEP)
         piece = base.outgoing(now)
         clean += piece
-        damaged = bytearray(piece)
-        if damaged and len(dirty) > 200 and rng.random() < 0.3:
-            damaged[rng.integers(len(damaged))] ^= 1 << int(rng.integers(8))
-        dirty += damaged
+        corrupted = bytearray(piece)
+        if corrupted and len(dirty) > 200 and rng.random() < 0.3:
+            corrupted[rng.integers(len(corrupted))] ^= 1 << int(rng.integers(8))
+        dirty += corrupted
     whole.receive_data(clean, now)
     for begin, end in itertools.pairwise([0, *np.minimum(np.cumsum(sizes), len(clean)), len(clean)]):
         cut.receive_data(clean[begin:end], now)
-    spoilt.receive_data(dirty, now)
+    damaged.receive_data(dirty, now)
     expected = list(iter(whole.next_event, None))
     assert len(expected) >= 15
     assert list(iter(cut.next_event, None)) == expected
-    survived = list(iter(spoilt.next_event, None))
+    survived = list(iter(damaged.next_event, None))
     assert all(reading in expected for reading in survived)
-    assert (spoilt.corrupted > 0) == (dirty != clean) or len(survived) == len(expected)
+    assert (damaged.corrupted > 0) == (dirty != clean) or len(survived) == len(expected)
     assert whole.corrupted == cut.corrupted == 0
 
 
@@ -229,17 +229,17 @@ def test_scans_show_the_room_as_it_is(name):
         # Angles come in small steps: at the edges of the door a sample may fall to either side.
         edge = np.abs(np.abs(scan.angles_rad) - 0.1) < 0.005
         assert (np.isnan(scan.ranges_m) == np.isnan(truth))[~edge].all()
-        seen = ~np.isnan(scan.ranges_m) & ~edge
-        np.testing.assert_allclose(scan.ranges_m[seen], truth[seen], atol=0.003)
+        returned = ~np.isnan(scan.ranges_m) & ~edge
+        np.testing.assert_allclose(scan.ranges_m[returned], truth[returned], atol=0.003)
         assert scan.repeats == 1
         assert scan.ended_at - scan.started_at == pytest.approx(traits.scan_period_s, abs=0.02)
         assert scan.angles_rad.size > 300
-        assert (scan.quality[seen] > 0).all()
+        assert (scan.quality[returned] > 0).all()
     assert driver.problem == ""
 
 
 @every_lidar
-def test_a_lidar_is_understood_one_byte_at_a_time(name):
+def test_lidar_scans_parse_one_byte_at_a_time(name):
     whole, _ = scans_of(name, devices.make_lidar(name, box), 1.0)
     single, _ = scans_of(
         name, devices.make_lidar(name, box), 1.0, pieces=lambda data: [bytes((byte,)) for byte in data]
@@ -251,7 +251,7 @@ def test_a_lidar_is_understood_one_byte_at_a_time(name):
 
 
 @every_lidar
-def test_a_lidar_that_runs_already_gives_whole_scans(name):
+def test_lidar_that_already_scans_gives_whole_scans(name):
     lidar = devices.make_lidar(name, box)
     scans_of(name, lidar, 0.77)
     scans, _ = scans_of(name, lidar, 1.0, begin=0.77)
@@ -260,7 +260,7 @@ def test_a_lidar_that_runs_already_gives_whole_scans(name):
 
 
 @every_lidar
-def test_a_stuck_link_shows_as_equal_scans(name):
+def test_stuck_link_gives_identical_scans(name):
     lidar = devices.make_lidar(name, box)
     driver = registry.make_lidar(name)
     lidar.receive(driver.begin(0.0), 0.0)
@@ -276,37 +276,37 @@ def test_a_stuck_link_shows_as_equal_scans(name):
 
 
 @every_lidar
-def test_a_silent_lidar_is_trouble_and_the_trouble_ends(name):
+def test_silent_lidar_is_a_problem_until_it_sends_again(name):
     lidar = devices.make_lidar(name, box)
     driver = registry.make_lidar(name)
     lidar.receive(driver.begin(0.0), 0.0)
-    troubles = []
+    problems = []
     for number in range(500):
         lidar.stalled = 100 < number <= 300
         now = number * STEP
         events = driver.receive(lidar.outgoing(now), now)
         lidar.receive(events.data + driver.tick(now), now)
-        troubles.append(driver.problem)
-    assert troubles[100] == ""
-    assert "the lidar" in troubles[300]
-    assert troubles[-1] == ""
+        problems.append(driver.problem)
+    assert problems[100] == ""
+    assert "the lidar" in problems[300]
+    assert problems[-1] == ""
 
 
 @every_lidar
 @given(st.binary(max_size=400), st.integers(0, 2**32))
 @settings(max_examples=20, deadline=None)
-def test_no_bytes_raise_and_a_damaged_scan_never_shows_a_wall_that_is_not_there(name, garbage, seed):
+def test_no_bytes_raise_and_damaged_scans_stay_finite(name, garbage, seed):
     rng = np.random.default_rng(seed)
 
-    def spoil(data):
-        spoilt = bytearray(data)
-        if spoilt and rng.random() < 0.05:
-            spoilt[rng.integers(len(spoilt))] ^= int(rng.integers(1, 256))
-        return [bytes(spoilt)]
+    def damage(data):
+        damaged = bytearray(data)
+        if damaged and rng.random() < 0.05:
+            damaged[rng.integers(len(damaged))] ^= int(rng.integers(1, 256))
+        return [bytes(damaged)]
 
     lidar, driver = devices.make_lidar(name, box), registry.make_lidar(name)
     driver.begin(0.0)
     driver.receive(garbage, 0.0)
     driver.tick(0.1)
-    scans, _ = scans_of(name, lidar, 1.0, pieces=spoil)
+    scans, _ = scans_of(name, lidar, 1.0, pieces=damage)
     assert all(np.isfinite(scan.angles_rad).all() and np.ptp(scan.angles_rad) <= 2 * np.pi for scan in scans)

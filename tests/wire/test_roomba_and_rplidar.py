@@ -1,4 +1,4 @@
-"""The robot's drivers and the simulator's emulators know nothing of one another; here they have to agree."""
+"""Drivers and emulators share no code; here they must agree."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ def events(parser):
 
 
 @pytest.mark.parametrize("packet_id", [*range(7, 59), *oi.GROUPS])
-def test_both_agree_on_the_size_of_every_packet_and_group(packet_id):
+def test_driver_and_emulator_agree_on_the_size_of_every_packet_and_group(packet_id):
     roomba = RoombaEmulator()
     roomba.receive(oi.start() + oi.sensors(packet_id), 0.0)
     oi.decode_packets([packet_id], roomba.outgoing(0.0))
 
 
-def test_the_stream_carries_what_the_world_shows():
+def test_stream_carries_the_state_of_the_world():
     roomba = RoombaEmulator(left_encoder=65530, right_encoder=3)
     parser = oi.StreamParser(oi.GUARDIAN_STREAM)
     roomba.receive(oi.start() + oi.safe() + oi.stream(oi.GUARDIAN_STREAM) + oi.drive_wheels(0.3, -0.2), 0.0)
@@ -66,7 +66,7 @@ def test_the_stream_carries_what_the_world_shows():
 
 
 @pytest.mark.parametrize(
-    ("field", "seen"),
+    ("field", "flag"),
     [
         ("bump_left", "bump_left"),
         ("bump_right", "bump_right"),
@@ -80,7 +80,7 @@ def test_the_stream_carries_what_the_world_shows():
         ("charger", "on_charger"),
     ],
 )
-def test_each_danger_arrives_as_itself_and_all_but_the_bumper_end_safe_mode(field, seen):
+def test_each_safety_sensor_sets_its_flag_and_all_but_the_bumper_end_safe_mode(field, flag):
     roomba = RoombaEmulator()
     parser = oi.StreamParser(oi.GUARDIAN_STREAM)
     roomba.receive(oi.start() + oi.safe() + oi.stream(oi.GUARDIAN_STREAM) + oi.drive_wheels(0.2, 0.2), 0.0)
@@ -91,8 +91,8 @@ def test_each_danger_arrives_as_itself_and_all_but_the_bumper_end_safe_mode(fiel
     flags = {"bump_left", "bump_right", "wheel_drop_left", "wheel_drop_right", "on_charger"} | {
         f"cliff_{side}" for side in ("left", "front_left", "front_right", "right")
     }
-    assert {flag for flag in flags if getattr(frame, flag)} == {seen}
-    bumper = seen.startswith("bump")
+    assert {name for name in flags if getattr(frame, name)} == {flag}
+    bumper = flag.startswith("bump")
     assert frame.mode is (oi.Mode.SAFE if bumper else oi.Mode.PASSIVE)
     assert frame.requested_wheels_m_s == ((0.2, 0.2) if bumper else (0.0, 0.0))
 
@@ -132,7 +132,7 @@ def test_odometry_follows_any_drive_through_any_encoder_wrap(legs, left, right):
     assert math.dist(odometry.pose[:2], pose[:2]) < 0.002 + 0.006 * len(legs)
 
 
-def test_a_reset_robot_is_noticed_by_text_mode_and_encoders():
+def test_reset_of_the_robot_is_detected_as_an_encoder_fault():
     roomba = RoombaEmulator(left_encoder=30000, right_encoder=30000)
     driver = Roomba600Driver(Roomba600Options())
     odometry = Odometry(driver.drive_train)
@@ -152,7 +152,7 @@ def test_a_reset_robot_is_noticed_by_text_mode_and_encoders():
 # --- RPLidar ---
 
 
-def test_identity_and_health_arrive():
+def test_device_info_and_health_are_received():
     lidar, parser = RplidarEmulator(box, serial_number=bytes(range(16, 32))), rplidar.Parser()
     lidar.health, lidar.error_code = 1, 7
     lidar.receive(rplidar.get_info() + rplidar.get_health() + rplidar.get_sample_rate(), 0.0)
@@ -165,38 +165,38 @@ def test_identity_and_health_arrive():
     ]
 
 
-def turns_of(lidar, request, seconds, step=0.013):
+def scans_of(lidar, request, seconds, step=0.013):
     parser, assembler = rplidar.Parser(), rplidar.ScanAssembler()
     lidar.receive(request, 0.0)
-    turns = []
+    scans = []
     for number in range(round(seconds / step)):
         parser.receive_data(lidar.outgoing(number * step))
         for event in events(parser):
             if isinstance(event, rplidar.Nodes):
-                turns.extend(assembler.feed(event, number * step))
+                scans.extend(assembler.feed(event, number * step))
     assert (parser.skipped_bytes, parser.resyncs, parser.corrupted, assembler.incomplete) == (0, 0, 0, 0)
-    return turns
+    return scans
 
 
 @pytest.mark.parametrize(
     ("request_bytes", "nodes"), [(rplidar.scan(), 363.6), (rplidar.express_scan(), 727.3)], ids=["standard", "express"]
 )
-def test_turns_show_the_room_as_it_is(request_bytes, nodes):
-    turns = turns_of(RplidarEmulator(box), request_bytes, 2.0)
-    assert 9 <= len(turns) <= 11
-    for turn in turns:
-        assert abs(turn.angles_rad.size - nodes) < 2
-        truth = box(turn.angles_rad, 0.0)
+def test_rplidar_scans_show_the_room(request_bytes, nodes):
+    scans = scans_of(RplidarEmulator(box), request_bytes, 2.0)
+    assert 9 <= len(scans) <= 11
+    for scan in scans:
+        assert abs(scan.angles_rad.size - nodes) < 2
+        truth = box(scan.angles_rad, 0.0)
         # Angles come in 1/64 degree: at the edges of the door one node may fall to either side.
-        edge = np.abs(np.abs(turn.angles_rad) - 0.1) < 0.001
-        assert (np.isnan(turn.ranges_m) == np.isnan(truth))[~edge].all()
-        seen = ~np.isnan(turn.ranges_m) & ~edge
-        np.testing.assert_allclose(turn.ranges_m[seen], truth[seen], atol=0.003)
-        assert turn.repeats == 1
-        assert turn.ended_at - turn.started_at == pytest.approx(1 / 5.5, abs=0.02)
+        edge = np.abs(np.abs(scan.angles_rad) - 0.1) < 0.001
+        assert (np.isnan(scan.ranges_m) == np.isnan(truth))[~edge].all()
+        returned = ~np.isnan(scan.ranges_m) & ~edge
+        np.testing.assert_allclose(scan.ranges_m[returned], truth[returned], atol=0.003)
+        assert scan.repeats == 1
+        assert scan.ended_at - scan.started_at == pytest.approx(1 / 5.5, abs=0.02)
 
 
-def test_a_frozen_link_shows_as_equal_turns():
+def test_frozen_link_gives_identical_scans():
     lidar = RplidarEmulator(box)
     parser, assembler = rplidar.Parser(), rplidar.ScanAssembler()
     lidar.receive(rplidar.scan(), 0.0)
@@ -206,15 +206,15 @@ def test_a_frozen_link_shows_as_equal_turns():
         parser.receive_data(lidar.outgoing(number * 0.01))
         for event in events(parser):
             if isinstance(event, rplidar.Nodes):
-                repeats += [turn.repeats for turn in assembler.feed(event, number * 0.01)]
+                repeats += [scan.repeats for scan in assembler.feed(event, number * 0.01)]
     assert max(repeats[:2]) == 1
     assert repeats[-1] >= 3
 
 
-def test_a_scan_begun_anew_in_mid_stream_gives_whole_turns_again():
+def test_scan_restarted_in_mid_stream_gives_whole_scans():
     lidar = RplidarEmulator(box)
     parser, assembler = rplidar.Parser(), rplidar.ScanAssembler()
-    turns = []
+    scans = []
     for number in range(150):
         if number in {0, 75}:
             lidar.receive(rplidar.stop() + rplidar.get_health() + rplidar.scan(), number * 0.01)
@@ -223,17 +223,17 @@ def test_a_scan_begun_anew_in_mid_stream_gives_whole_turns_again():
             if isinstance(event, rplidar.Descriptor):
                 assembler.reset()
             elif isinstance(event, rplidar.Nodes):
-                turns += assembler.feed(event, number * 0.01)
+                scans += assembler.feed(event, number * 0.01)
     assert parser.resyncs == 0
-    assert all(362 <= turn.angles_rad.size <= 365 for turn in turns)
-    assert turns[-1].ended_at > 1.2
+    assert all(362 <= scan.angles_rad.size <= 365 for scan in scans)
+    assert scans[-1].ended_at > 1.2
 
 
 # --- over real ptys ---
 
 
 @pytest.mark.live
-def test_a_robot_is_driven_over_a_pty_and_survives_a_host_that_crashes(tmp_path):
+def test_base_is_driven_over_a_pty_and_stopped_after_a_crash_of_its_host(tmp_path):
     roomba = RoombaEmulator(left_encoder=65000, right_encoder=65000)
     link = tmp_path / "roomba"
     begin = time.monotonic()
@@ -262,7 +262,7 @@ def test_a_robot_is_driven_over_a_pty_and_survives_a_host_that_crashes(tmp_path)
                 for reading in events(driver):
                     odometry.update(reading.odometry, time.monotonic())
         assert (driver.corrupted, odometry.faults) == (0, 0)
-        # The host is gone without a word: the wheels keep turning. The next one stops them.
+        # The host ended without a stop: the wheels keep turning. The next host stops them.
         simulate()
         assert roomba.wheel_speeds_m_s == (0.2, 0.2)
         with open_port(str(link), 115200) as port:
@@ -274,15 +274,15 @@ def test_a_robot_is_driven_over_a_pty_and_survives_a_host_that_crashes(tmp_path)
 
 
 @pytest.mark.live
-def test_whole_turns_arrive_over_a_pty():
+def test_whole_scans_are_received_over_a_pty():
     lidar = RplidarEmulator(box)
     parser, assembler = rplidar.Parser(), rplidar.ScanAssembler()
-    turns = []
+    scans = []
     deadline = time.monotonic() + 20.0
     with PtyPort() as line, open_port(str(line.path), 115200) as port:
         port.set_dtr(on=False)
         port.write(rplidar.stop() + rplidar.get_health() + rplidar.scan())
-        while len(turns) < 3:
+        while len(scans) < 3:
             assert time.monotonic() < deadline
             select.select([line], [], [], 0.005)
             now = time.monotonic()
@@ -291,7 +291,7 @@ def test_whole_turns_arrive_over_a_pty():
             parser.receive_data(port.read_available())
             for event in events(parser):
                 if isinstance(event, rplidar.Nodes):
-                    turns.extend(assembler.feed(event, now))
+                    scans.extend(assembler.feed(event, now))
     assert parser.resyncs == 0
-    for turn in turns:
-        assert turn.angles_rad.size > 300
+    for scan in scans:
+        assert scan.angles_rad.size > 300

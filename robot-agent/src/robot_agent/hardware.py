@@ -1,7 +1,7 @@
-"""What bases and lidars are to the rest of the robot, whatever their make: neutral values and the protocols of drivers.
+"""Neutral values of bases and lidars, and the interfaces of their drivers.
 
 A driver is a protocol without I/O (as in h11): bytes and arrival times in, events out, commands out as bytes. It knows
-no port and no clock, so it can be fed one byte at a time, damaged, recorded and replayed.
+no port and no clock, so tests can feed it single bytes, damaged bytes and recordings.
 
 Units are m, rad, s; `now` is the caller's monotonic clock.
 """
@@ -41,10 +41,10 @@ class Twist(NamedTuple):
 
 
 class WheelOdometry(msgspec.Struct, frozen=True, kw_only=True):
-    """How far each wheel has rolled forward by its encoder (m), counted from anywhere.
+    """Travel of each wheel by its encoder (m, forward positive), from an arbitrary origin.
 
     The counters wrap at the drive train's `travel_wrap_m` and start anywhere when the base restarts: only differences
-    mean anything, and `robot_agent.odometry` tells the plausible ones from the others.
+    are meaningful, and `robot_agent.odometry` rejects the implausible ones.
     """
 
     left_m: Finite
@@ -52,10 +52,10 @@ class WheelOdometry(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class BaseStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """What a base says of itself. A sensor that it does not have is False, or None where there is a number.
+    """State that a base reports. A missing sensor is False, a missing number None.
 
-    `overcurrent`: a wheel motor draws more than it should. `battery`: charged fraction. `charging`: it has contact to a
-    charger. `mode_problem`: why the base does not obey wheel commands (None: it is in its driving mode).
+    `overcurrent`: a wheel motor draws too much current. `battery`: charged fraction. `charging`: a charger is
+    connected. `mode_problem`: why the base does not obey wheel commands (None: it is in its driving mode).
     """
 
     bumper_left: bool = False
@@ -82,10 +82,10 @@ class BaseReading(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DriveTrain:
-    """Two driven wheels on one axle: what turns wheel speeds and travels into motion of the body.
+    """A differential drive: two driven wheels on one axle.
 
-    `wheel_speed_max_m_s`: the fastest that a wheel can be told to turn. `travel_wrap_m`: the travel after which the
-    encoders' counters begin anew (infinite: never).
+    `axle_m`: distance between the wheels. `wheel_speed_max_m_s`: top speed of a wheel. `travel_wrap_m`: the travel at
+    which the encoders' counters wrap (infinite: never).
     """
 
     axle_m: float = 0.235
@@ -99,15 +99,15 @@ class DriveTrain:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BaseTiming:
-    """What the guardian waits for, s.
+    """Timeouts of the guardian for this base, s.
 
-    `silence`: no valid frame for this long is a fault. `wake`: the base may take this long to report its driving mode
-    before it is woken again. `settle`: frames that come sooner after waking may stem from before it.
+    `frame_timeout`: no valid frame for this long is a fault. `wake_timeout`: the base may take this long to report its
+    driving mode before it is woken again. `ignored_after_wake`: frames that arrive sooner after waking may be older.
     """
 
-    silence: float = 0.3
-    wake: float = 1.0
-    settle: float = 0.1
+    frame_timeout: float = 0.3
+    wake_timeout: float = 1.0
+    ignored_after_wake: float = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,11 +115,11 @@ class LaserScan:
     """One whole revolution of a lidar: n samples in order of arrival.
 
     angles_rad: float64[n], counter-clockwise in the lidar's frame, 0 straight ahead, in (-pi, pi].
-    ranges_m: float64[n], nan where nothing came back; not clipped to the rated range, because a too-near obstacle is an
+    ranges_m: float64[n], nan without a return; not clipped to the rated range, because a too-near obstacle is an
     obstacle. quality: uint8[n], strength of the return on the device's own scale, 0 for none.
     started_at, ended_at: arrival of the first and last sample (s of the caller's clock), interpolated in a batch.
-    repeats: how many scans in a row were identical in every decoded bit, this one included; a live lidar never gives
-    two equal ones, a stuck link does.
+    repeats: how many scans in a row were identical in every decoded bit, this one included; a working lidar never
+    gives two equal ones, a stuck link does.
     """
 
     angles_rad: NDArray[np.float64]
@@ -151,7 +151,7 @@ class RepeatCounter:
 
 
 class BaseDriver(Protocol):
-    """The conversation with one base. The guardian owns it and decides; the driver only translates."""
+    """Protocol of one base: bytes to readings, commands to bytes. The guardian owns it and makes the decisions."""
 
     @property
     def drive_train(self) -> DriveTrain:
@@ -159,22 +159,22 @@ class BaseDriver(Protocol):
 
     @property
     def timing(self) -> BaseTiming:
-        """What the guardian waits for with this base."""
+        """Timeouts of the guardian for this base."""
 
     @property
     def corrupted(self) -> int:
-        """How many frames came damaged, since the driver was made."""
+        """Number of damaged frames since the driver was made."""
 
     def receive_data(self, data: bytes, now: float) -> None:
-        """Take what the port gave at `now`, in pieces of any size; never raises on what it is fed."""
+        """Parse bytes received at `now`, in pieces of any size; never raises, whatever the bytes are."""
 
     def next_event(self) -> BaseReading | None:
-        """Return the oldest valid frame not yet taken, or None: feed more bytes."""
+        """Return the oldest valid frame not yet returned; None until more bytes are received."""
 
     def wake(self) -> bytes:
-        """Return what brings the base into its driving mode with its wheels at rest, and makes it send frames.
+        """Return the bytes that bring the base into its driving mode, wheels at rest, and make it send frames.
 
-        It works whatever the base was doing, also when its receiver stands in the middle of a command.
+        They work in any state of the base, also when its receiver is in the middle of a command.
         """
 
     def drive(self, left_m_s: float, right_m_s: float) -> bytes:
@@ -183,7 +183,7 @@ class BaseDriver(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BaseFactory(Generic[Options]):
-    """What a base registers under its name in the entry points `fognav.bases`."""
+    """The object that a base registers under its name in the entry points `fognav.bases`."""
 
     options: type[Options]
     make: Callable[[Options], BaseDriver]
@@ -191,7 +191,7 @@ class BaseFactory(Generic[Options]):
 
 
 class SerialSettings(NamedTuple):
-    """A serial line, always 8N1. `dtr`: the state of the DTR line in which the device runs; None: it does not care."""
+    """A serial line, always 8N1. `dtr`: the state of the DTR line in which the device runs; None: either."""
 
     baud: int
     dtr: bool | None = None
@@ -207,7 +207,7 @@ class LidarTraits:
 
 
 class LidarEvents(NamedTuple):
-    """What came of some bytes: whether there were samples at all, the whole scans, and what to send."""
+    """Result of received bytes: whether there were any samples, the whole scans, and bytes to send."""
 
     samples: bool = False
     scans: tuple[LaserScan, ...] = ()
@@ -215,37 +215,37 @@ class LidarEvents(NamedTuple):
 
 
 class LidarDriver(Protocol):
-    """The conversation with one lidar: talks it into scanning, and begins again after silence or a bad answer."""
+    """Protocol of one lidar: starts its scan, and restarts it after silence or a bad answer."""
 
     @property
     def serial(self) -> SerialSettings:
-        """How its port is set up."""
+        """Settings of its serial port."""
 
     @property
     def traits(self) -> LidarTraits:
-        """What this lidar can do."""
+        """Rated ranges and scan period of this lidar."""
 
     @property
     def problem(self) -> str:
-        """Why there is no scan, in words; empty while there is one."""
+        """Why there is no scan; empty while scans arrive."""
 
     @property
     def stop_command(self) -> bytes:
-        """What ends the scan; empty for a lidar that takes no commands."""
+        """Bytes that end the scan; empty for a lidar that takes no commands."""
 
     def begin(self, now: float) -> bytes:
-        """Begin (again), after the port was opened; return what to send."""
+        """Begin (again), after the port was opened; return the bytes to send."""
 
     def receive(self, data: bytes, now: float) -> LidarEvents:
-        """Take what the port gave at `now`, in pieces of any size; never raises on what it is fed."""
+        """Parse bytes received at `now`, in pieces of any size; never raises, whatever the bytes are."""
 
     def tick(self, now: float) -> bytes:
-        """Let time pass (20 Hz or more); return what to send."""
+        """Advance time (20 Hz or more); return the bytes to send."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LidarFactory(Generic[Options]):
-    """What a lidar registers under its name in the entry points `fognav.lidars`."""
+    """The object that a lidar registers under its name in the entry points `fognav.lidars`."""
 
     options: type[Options]
     make: Callable[[Options], LidarDriver]

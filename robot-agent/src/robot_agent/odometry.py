@@ -1,4 +1,4 @@
-"""From how far the wheels rolled to where the robot is: pure functions, and one class that keeps their state."""
+"""From travel of the wheels to the robot's pose: pure functions, and one class that keeps their state."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """Travel of both wheels as their counters say it (m), and its arrival, seconds on the caller's monotonic clock."""
+    """Counters of both wheels (m), and their time of arrival (s, the caller's monotonic clock)."""
 
     left_m: float
     right_m: float
-    at: float
+    timestamp: float
 
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """A plausible step: ways of the wheels in metres, and the pose (x, y in metres, theta in radians) after it."""
+    """A plausible step: travel of the wheels in metres, and the pose (x, y in metres, theta in radians) after it."""
 
     left_m: float
     right_m: float
@@ -34,7 +34,7 @@ class Motion:
 
 @dataclass(frozen=True, slots=True)
 class EncoderFault:
-    """A step that no wheel can make. It moved nothing; the pose is the one before it."""
+    """A step that no wheel can make. It does not change the pose."""
 
     left_m: float
     right_m: float
@@ -50,7 +50,7 @@ class EncoderFault:
 
 @dataclass(frozen=True, slots=True)
 class OdometryState:
-    """Pose in the odometry frame (metres, radians, theta not wrapped) and the readings that it rests on."""
+    """Pose in the odometry frame (metres, radians, theta not wrapped) and the readings that it is based on."""
 
     x: float = 0.0
     y: float = 0.0
@@ -60,42 +60,42 @@ class OdometryState:
 
 
 def wheel_travel(new_m: float, old_m: float, wrap_m: float) -> float:
-    """Travel from one reading of a counter to the next (m), whichever way it wrapped: at most half of `wrap_m`."""
+    """Return the travel (m) from one reading of a counter to the next, at most half of `wrap_m` either way."""
     return math.remainder(new_m - old_m, wrap_m)
 
 
 def integrate(
     x: float, y: float, theta: float, left_m: float, right_m: float, axle_m: float
 ) -> tuple[float, float, float]:
-    """Pose after both wheels rolled along one arc of a circle, exact for constant speeds.
+    """Return the pose after both wheels rolled along one arc of a circle, exact for constant speeds.
 
     The chord of an arc of length s and angle a is s sin(a/2)/(a/2), at the mean heading (Siegwart and Nourbakhsh,
     Introduction to Autonomous Mobile Robots, section 5.2.4, with the chord in place of the arc). Metres and radians.
     """
-    turn = (right_m - left_m) / axle_m
-    half = 0.5 * turn
+    rotation = (right_m - left_m) / axle_m
+    half = 0.5 * rotation
     chord = 0.5 * (left_m + right_m) * (math.sin(half) / half if half else 1.0)
-    return x + chord * math.cos(theta + half), y + chord * math.sin(theta + half), theta + turn
+    return x + chord * math.cos(theta + half), y + chord * math.sin(theta + half), theta + rotation
 
 
-# Frames that the host reads late arrive together, some milliseconds of motion with no time between them.
+# Frames that the host reads late arrive together: some milliseconds of motion with no time between them.
 _ARRIVAL_SLACK_S: Final = 0.1
 _SPEED_MARGIN: Final = 1.2
 
 
 def advance(state: OdometryState, reading: Reading, drive: DriveTrain) -> tuple[OdometryState, Motion | EncoderFault]:
-    """Take one reading: the new state, and the motion or why it is none.
+    """Apply one reading; return the new state, and the motion or the fault.
 
     The first reading only sets the zero. A step beyond what the wheels can do (top speed and a fifth, over the time
-    since the last trusted reading and 0.1 s) is an EncoderFault. One wild reading costs nothing, the next good one
-    connects to the trusted one; if the readings after it agree with it instead (the base restarted), they become
+    since the last trusted reading and 0.1 s) is an EncoderFault. After one wild reading the next good one
+    continues from the trusted one; if the readings after it agree with it instead (the base restarted), they become
     trusted, and the jump itself never counts as motion.
     """
     if state.trusted is None:
         return replace(state, trusted=reading), Motion(0.0, 0.0, state.x, state.y, state.theta)
     left_m, right_m, possible_m = _step(state.trusted, reading, drive)
     if max(abs(left_m), abs(right_m)) > possible_m:
-        fault = EncoderFault(left_m, right_m, possible_m, reading.at - state.trusted.at)
+        fault = EncoderFault(left_m, right_m, possible_m, reading.timestamp - state.trusted.timestamp)
         if state.suspect is None:
             return replace(state, suspect=reading), fault
         left_m, right_m, possible_m = _step(state.suspect, reading, drive)
@@ -106,10 +106,10 @@ def advance(state: OdometryState, reading: Reading, drive: DriveTrain) -> tuple[
 
 
 def _step(old: Reading, new: Reading, drive: DriveTrain) -> tuple[float, float, float]:
-    span = max(0.0, new.at - old.at) + _ARRIVAL_SLACK_S
+    span = max(0.0, new.timestamp - old.timestamp) + _ARRIVAL_SLACK_S
     possible = _SPEED_MARGIN * drive.wheel_speed_max_m_s * span
     if possible > drive.travel_wrap_m / 4:
-        # The counter may have gone around unseen: no step over such a gap can be told from another.
+        # The counter may have wrapped during the gap: the step is ambiguous.
         possible = -1.0
     wrap = drive.travel_wrap_m
     return wheel_travel(new.left_m, old.left_m, wrap), wheel_travel(new.right_m, old.right_m, wrap), possible
@@ -129,7 +129,7 @@ class Odometry:
         return self._state.x, self._state.y, self._state.theta
 
     def update(self, wheels: WheelOdometry, now: float) -> Motion | EncoderFault:
-        """Take the travel of a frame that arrived at `now` (seconds, monotonic)."""
+        """Apply the counters of a frame that arrived at `now` (s, monotonic)."""
         self._state, outcome = advance(self._state, Reading(wheels.left_m, wheels.right_m, now), self._drive)
         if isinstance(outcome, EncoderFault):
             self.faults += 1

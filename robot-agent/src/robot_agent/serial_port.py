@@ -1,7 +1,7 @@
 """The edge: a serial device as a file descriptor. 8N1, raw, never blocking.
 
-Plain termios, because the protocols above need nothing more and because an inherited descriptor (the watchdog of the
-guardian) has to be a port as well.
+Plain termios, because the protocols need nothing more and because an inherited descriptor (the guardian's) must work as
+a port too.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ _READ_BYTES: Final = 65536
 _WRITE_WAIT_S: Final = 0.1
 
 
-class PortLost(Exception):  # noqa: N818  # named for what happened; it is an end of the link, not a mistake
-    """The serial device is not there, not ours, or not answering any more."""
+class PortLost(Exception):  # noqa: N818  # named after the event
+    """The serial device is missing, in use, or no longer responds."""
 
     def __init__(self, path: str, reason: str) -> None:
-        """Name the port, what happened to it and what to check."""
+        """Name the port, the reason and the remedy."""
         super().__init__(
-            f"{path}: {reason}; check that the device is plugged in and powered, that the cable sits, that this user "
-            "may use it (group dialout) and that no other process has it open"
+            f"{path}: {reason}; check that the device is plugged in and powered, that this user may use it (group "
+            "dialout) and that no other process has it open"
         )
         self.path = path
         self.reason = reason
@@ -35,14 +35,14 @@ class Port:
     """An open serial port. Close it yourself or use it in a `with` statement; nothing happens on garbage collection."""
 
     def __init__(self, fd: int, path: str, *, owned: bool) -> None:
-        """Take a descriptor that is already set up; `open_port` and `from_fd` are the usual ways."""
+        """Wrap a descriptor that is already set up; normally use `open_port` or `from_fd`."""
         self._fd = fd
         self._owned = owned
         self.path = path
 
     @classmethod
     def from_fd(cls, fd: int, path: str | None = None) -> Self:
-        """Use a descriptor that another process opened and set up; `close` leaves it open for them.
+        """Use a descriptor that another process opened and set up; `close` leaves it open.
 
         Raises:
             PortLost: if the descriptor is not open.
@@ -60,10 +60,10 @@ class Port:
         return self._fd
 
     def read_available(self) -> bytes:
-        """Return what has arrived, at once; b"" if nothing has.
+        """Return the bytes that have arrived, without waiting; b"" if none have.
 
         Raises:
-            PortLost: when the device is gone.
+            PortLost: when the device is lost.
 
         """
         try:
@@ -77,10 +77,10 @@ class Port:
         return data
 
     def write(self, data: bytes) -> None:
-        """Send all of it, so that no command is ever cut. A full buffer is waited for, 0.1 s at most.
+        """Send all bytes, so that no command is ever truncated; wait for a full buffer, 0.1 s at most.
 
         Raises:
-            PortLost: when the device is gone or takes nothing.
+            PortLost: when the device is lost or accepts nothing.
 
         """
         rest = memoryview(data)
@@ -97,7 +97,7 @@ class Port:
         """Set or clear the DTR line. False where there is none, as on a pty.
 
         Raises:
-            PortLost: when the device is gone.
+            PortLost: when the device is lost.
 
         """
         request = termios.TIOCMBIS if on else termios.TIOCMBIC
@@ -110,14 +110,14 @@ class Port:
         return True
 
     def discard_input(self) -> None:
-        """Throw away what has arrived and was not read. Raises PortLost when the device is gone."""
+        """Discard bytes that have arrived and were not read. Raises PortLost when the device is lost."""
         try:
             termios.tcflush(self._fd, termios.TCIFLUSH)
         except termios.error as error:
             raise PortLost(self.path, str(error.args[-1])) from error
 
     def close(self) -> None:
-        """Give the port back; harmless when done twice."""
+        """Close the port; harmless when done twice."""
         fd, self._fd = self._fd, -1
         if fd >= 0 and self._owned:
             os.close(fd)
@@ -133,7 +133,7 @@ def open_port(path: str, baud: int) -> Port:
     """Open a serial device (or pty) for this process alone: 8N1 at `baud`, raw, non-blocking.
 
     Raises:
-        PortLost: if it is missing, forbidden, in use by another Port, no terminal, or can't be so fast.
+        PortLost: if it is missing, forbidden, in use by another Port, no terminal, or does not support the rate.
 
     """
     try:
@@ -153,7 +153,7 @@ def _set_up(fd: int, path: str, baud: int) -> None:
     if speed is None:
         raise PortLost(path, f"this system has no rate of {baud} baud")
     try:
-        # Advisory, and shared by those who inherit the descriptor.
+        # Advisory, and shared with processes that inherit the descriptor.
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
         raise PortLost(path, "another process has locked it") from error

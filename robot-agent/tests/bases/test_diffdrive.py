@@ -24,7 +24,7 @@ statuses = st.builds(
 
 
 def crc(body: bytes) -> int:
-    """CRC-16 by polynomial division of the whole message: another way than the driver's and the emulator's."""
+    """CRC-16 by polynomial division of the whole message: by another method than driver and emulator."""
     message = int.from_bytes(body + b"\0\0", "big") ^ 0xFFFF << 8 * len(body)
     for place in range(8 * len(body) - 1, -1, -1):
         if message >> (place + 16) & 1:
@@ -71,7 +71,7 @@ def test_commands_are_the_lines_of_the_specification():
     assert STOP.baud == protocol.BAUD
 
 
-def test_the_example_of_the_specification_is_understood():
+def test_example_of_the_specification_is_decoded():
     assert parse(EXAMPLE) == [Status(17, 1024, -5, Flag.ENABLED, 11_870)]
 
 
@@ -93,7 +93,7 @@ def test_scaled_wheel_speeds_fit_and_keep_the_curve(left, right, fastest_m_s):
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_a_speed_that_is_no_number_is_refused(bad):
+def test_speed_that_is_not_finite_is_refused(bad):
     with pytest.raises(ValueError, match="finite"):
         protocol.wheels(0.0, bad, 0.5)
 
@@ -103,7 +103,7 @@ def test_a_speed_that_is_no_number_is_refused(bad):
 
 @settings(deadline=None)
 @given(statuses)
-def test_every_status_arrives_as_it_was_sent(status):
+def test_every_status_is_decoded_as_sent(status):
     assert parse(line_of(status)) == [status]
 
 
@@ -158,9 +158,9 @@ def test_no_damaged_byte_passes_and_each_one_is_counted():
 @given(statuses, st.integers(0, 200), st.integers(1, 0xFFFF))
 def test_no_burst_of_sixteen_bits_passes(status, place, pattern):
     good = line_of(status)
-    at = 1 + place % (len(good) - 8)  # within the body, where the checksum promises it
-    spoilt = (int.from_bytes(good[at : at + 2], "big") ^ pattern).to_bytes(2, "big")
-    assert parse(good[:at] + spoilt + good[at + 2 :]) == []
+    at = 1 + place % (len(good) - 8)  # within the body, which the checksum protects
+    damaged = (int.from_bytes(good[at : at + 2], "big") ^ pattern).to_bytes(2, "big")
+    assert parse(good[:at] + damaged + good[at + 2 :]) == []
 
 
 @settings(derandomize=True, deadline=None)  # a checksum of 16 bits may let one in 65,536 such lines pass
@@ -172,7 +172,7 @@ def test_a_line_that_lost_bytes_does_not_pass(status, data):
     assert parse(good[:begin] + good[end:]) == []
 
 
-def test_a_lost_line_feed_costs_one_line_and_is_counted():
+def test_lost_line_feed_loses_one_line_and_is_counted():
     first, second, third = numbered(3)
     parser = StatusParser()
     parser.receive_data(line_of(first) + line_of(second)[:-1] + line_of(third))
@@ -180,14 +180,14 @@ def test_a_lost_line_feed_costs_one_line_and_is_counted():
     assert parser.corrupted == 1
 
 
-def test_the_same_line_again_is_a_stuck_link_and_no_news():
+def test_repeated_line_is_counted_as_corrupted():
     parser = StatusParser()
     parser.receive_data(EXAMPLE * 5)
     assert len(drain(parser)) == 1
     assert parser.corrupted == 4
 
 
-def test_what_was_sent_before_anybody_listened_is_not_counted():
+def test_partial_line_before_the_first_good_one_is_not_counted():
     parser = StatusParser()
     parser.receive_data(b"24,-5,0001,11870*71FE\n" + EXAMPLE)
     assert len(drain(parser)) == 1
@@ -198,7 +198,7 @@ def test_what_was_sent_before_anybody_listened_is_not_counted():
     "body",
     [b"S,256,0,0,0001,0", b"S,1,2147483648,0,0001,0", b"S,1,0,0,01,0", b"S,1,0,0,0001,65536", b"S,1,+1,0,0001,0"],
 )
-def test_a_right_checksum_does_not_excuse_a_wrong_status(body):
+def test_invalid_status_with_a_right_checksum_is_dropped(body):
     assert parse(protocol.line(body)) == []
 
 
@@ -211,7 +211,7 @@ def reading(status: Status, **options):
     return driver.next_event()
 
 
-def test_every_flag_arrives_as_itself():
+def test_every_flag_is_decoded():
     names = {
         Flag.BUMPER_LEFT: "bumper_left",
         Flag.BUMPER_RIGHT: "bumper_right",
@@ -229,13 +229,13 @@ def test_every_flag_arrives_as_itself():
 @pytest.mark.parametrize(
     ("flags", "words"), [(Flag(0), "switched off"), (Flag.EMERGENCY_STOP, "emergency button"), (Flag.ENABLED, None)]
 )
-def test_a_base_without_power_says_why(flags, words):
+def test_mode_problem_names_the_reason(flags, words):
     problem = reading(Status(0, 0, 0, flags, 0)).status.mode_problem
     assert problem is None if words is None else words in problem
 
 
 @pytest.mark.parametrize(("millivolts", "charge"), [(0, None), (9_000, 0.0), (11_550, 0.5), (13_000, 1.0)])
-def test_the_charge_follows_the_voltage(millivolts, charge):
+def test_charge_is_computed_from_the_voltage(millivolts, charge):
     assert reading(Status(0, 0, 0, Flag.ENABLED, millivolts)).status.battery == (
         None if charge is None else pytest.approx(charge)
     )
@@ -253,6 +253,6 @@ def test_travel_is_in_metres_by_the_options_and_survives_the_wrap():
     assert (motion.left_m, motion.right_m) == pytest.approx((0.1 * math.pi * 0.1, 0.1 * math.pi * 0.1), abs=1e-6)
 
 
-def test_a_battery_that_is_full_when_it_is_empty_is_refused():
+def test_battery_full_v_below_battery_empty_v_is_refused():
     with pytest.raises(ValueError, match="battery_full_v"):
         DiffDriveOptions(battery_full_v=9.0)

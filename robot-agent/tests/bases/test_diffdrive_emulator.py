@@ -29,7 +29,7 @@ def test_the_checksum_is_the_one_of_the_specification():
     assert crc16(b"123456789") == 0x29B1
 
 
-def test_nothing_drives_before_it_is_switched_on():
+def test_board_does_not_drive_before_it_is_enabled():
     board = DiffDriveEmulator()
     board.receive(line("V,300,300"), 0.0)
     assert board.wheel_speeds_m_s == (0.0, 0.0)
@@ -39,7 +39,7 @@ def test_nothing_drives_before_it_is_switched_on():
     assert (board.enabled, board.wheel_speeds_m_s) == (False, (0.0, 0.0))
 
 
-def test_switching_on_puts_the_wheels_at_rest():
+def test_enable_sets_zero_speed():
     board = awake()
     board.receive(line("V,300,300") + line("E"), 0.0)
     assert board.wheel_speeds_m_s == (0.0, 0.0)
@@ -48,7 +48,7 @@ def test_switching_on_puts_the_wheels_at_rest():
 @pytest.mark.parametrize(
     "wrong", [b"$V,300,300*0000\n", line("V,2001,0"), line("V,1"), line("V,+1,0"), line("Z"), b"V,300,300\n"]
 )
-def test_what_is_no_command_is_refused_and_counted(wrong):
+def test_invalid_command_is_refused_and_counted(wrong):
     board = awake()
     board.receive(wrong, 0.0)
     assert (board.refused, board.wheel_speeds_m_s) == (1, (0.0, 0.0))
@@ -69,7 +69,7 @@ def test_a_status_comes_every_20_ms_with_a_number_of_its_own():
     assert len(board.outgoing(100.0201).splitlines()) == 1, "a pause gives no burst"
 
 
-def test_silence_stops_the_wheels_and_shows_until_the_next_command():
+def test_timeout_stops_the_wheels_and_is_reported_until_the_next_command():
     board = awake()
     board.receive(line("V,300,300"), 0.0)
     board.tick(0.29, 0.29)
@@ -126,7 +126,7 @@ def test_counters_wrap_at_32_bits():
 
 @settings(deadline=None)
 @given(st.binary(max_size=200), st.lists(st.integers(1, 30), max_size=8))
-def test_any_bytes_in_any_pieces_do_the_same_and_never_raise(data, sizes):
+def test_any_bytes_in_any_pieces_have_the_same_effect_and_never_raise(data, sizes):
     data = line("V,100,200") + data
     whole, cut = awake(), awake()
     whole.receive(data, 0.0)

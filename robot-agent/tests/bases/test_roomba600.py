@@ -57,7 +57,7 @@ def test_commands_have_the_bytes_of_the_specification():
 
 
 @pytest.mark.parametrize("speeds", [(501, 0), (0, -501), (-32768, 0), (70000, 0)])
-def test_speeds_beyond_the_robot_are_refused(speeds):
+def test_speeds_above_500_mm_s_are_refused(speeds):
     with pytest.raises(ValueError, match="500"):
         oi.drive_direct(*speeds)
 
@@ -74,7 +74,7 @@ def test_scaled_wheel_speeds_fit_and_keep_the_curvature(left, right):
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_a_speed_that_is_no_number_is_refused(bad):
+def test_speed_that_is_not_finite_is_refused(bad):
     with pytest.raises(ValueError, match="finite"):
         oi.drive_wheels(bad, 0.0)
 
@@ -126,8 +126,8 @@ def test_recorded_sensor_values_decode(data_dir):
         assert build() == commands[name]
 
 
-def test_a_cut_answer_is_refused():
-    with pytest.raises(ValueError, match="cut"):
+def test_truncated_answer_is_refused():
+    with pytest.raises(ValueError, match="truncated"):
         oi.decode_packets([43, 44], b"\x01\x02\x03")
 
 
@@ -169,11 +169,11 @@ def test_values_come_in_si_units():
     assert math.isnan(oi.Frame({25: 0, 26: 0}).charge_fraction)
 
 
-def test_a_mode_that_the_specification_does_not_name_stays_readable():
+def test_unknown_mode_is_returned_as_an_int():
     assert oi.Frame({35: 32}).mode == 32
 
 
-def test_asking_for_a_packet_that_is_not_streamed_says_which():
+def test_access_to_a_packet_that_is_not_streamed_names_it():
     with pytest.raises(oi.MissingPacketError, match="oi_mode"):
         _ = oi.Frame({7: 0}).mode
 
@@ -215,25 +215,25 @@ def test_garbage_never_raises_and_the_next_frames_come_through(garbage, cuts):
     parse(garbage, cuts)
 
 
-def test_garbage_does_not_hide_the_first_frame_when_the_ids_are_known():
+def test_garbage_does_not_hide_the_first_frame_with_known_ids():
     good = frame_bytes([(7, b"\x00"), (35, b"\x02")])
     assert parse(b"\x13\xff\x13" + good, ids=(7, 35)) == [{7: 0, 35: 2}]
 
 
 def test_only_frames_with_the_expected_packets_pass():
     other = frame_bytes([(7, b"\x00"), (35, b"\x03")])
-    wanted = frame_bytes([(35, b"\x02"), (7, b"\x00")])
-    assert parse(other + wanted + other, ids=(35, 7)) == [{35: 2, 7: 0}]
+    expected = frame_bytes([(35, b"\x02"), (7, b"\x00")])
+    assert parse(other + expected + other, ids=(35, 7)) == [{35: 2, 7: 0}]
 
 
-def test_a_group_in_the_stream_is_taken_apart():
+def test_group_in_the_stream_is_split_into_its_packets():
     raw = bytes(range(28))
     frame = parse(frame_bytes([(101, raw)]))[0]
     assert frame == oi.decode_packets([101], raw)
     assert frame[43] == 0x0001
 
 
-def test_each_damaged_frame_is_counted_and_the_good_ones_between_arrive():
+def test_each_damaged_frame_is_counted_and_the_good_ones_between_are_received():
     rng = random.Random(3)
     stream, sent = bytearray(), []
     for index in range(200):
@@ -250,7 +250,7 @@ def test_each_damaged_frame_is_counted_and_the_good_ones_between_arrive():
     assert parser.corrupted in {99, 100}
 
 
-def test_a_hundred_thousand_damaged_frames_let_no_more_through_than_the_checksum_allows():
+def test_a_hundred_thousand_damaged_frames_pass_no_more_often_than_the_checksum_allows():
     rng = random.Random(20)
     ids = (7, 35, 43, 44)
     damaged, harmless = 100_000, 0

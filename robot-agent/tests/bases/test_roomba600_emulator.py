@@ -23,7 +23,7 @@ def ask(roomba: RoombaEmulator, packet_id: int) -> bytes:
     return roomba.outgoing(0.0)
 
 
-def test_off_hears_nothing_but_start_and_reset():
+def test_off_mode_accepts_only_start_and_reset():
     roomba = RoombaEmulator()
     roomba.receive(bytes((131, 132, 142, 7, 148, 1, 7)) + DRIVE_300, 0.0)
     assert (roomba.mode, roomba.outgoing(1.0), roomba.wheel_speeds_m_s) == (OFF, b"", (0.0, 0.0))
@@ -56,7 +56,7 @@ def test_passive_does_not_drive():
     ("command", "speeds"),
     [
         (bytes((145, 255, 56, 1, 244)), (0.5, -0.2)),
-        (bytes((145, 3, 232, 252, 24)), (-0.5, 0.5)),  # +-1000 mm/s asked
+        (bytes((145, 3, 232, 252, 24)), (-0.5, 0.5)),  # +-1000 mm/s requested
         (bytes((137, 0, 200, 128, 0)), (0.2, 0.2)),
         (bytes((137, 0, 200, 127, 255)), (0.2, 0.2)),
         (bytes((137, 0, 200, 0, 1)), (-0.2, 0.2)),
@@ -129,12 +129,12 @@ def test_encoders_add_up_fractions_and_wrap(steps, left, right):
     for step in steps:
         roomba.add_wheel_travel(*step)
     per_metre = 508.8 / (math.pi * 0.072)
-    for at, begin, way in zip(
+    for reading, begin, travel in zip(
         roomba.encoders, (left, right), (sum(s[0] for s in steps), sum(s[1] for s in steps)), strict=True
     ):
-        assert 0 <= at <= 0xFFFF
-        off = (at - begin - way * per_metre + 0x8000) % 0x10000 - 0x8000
-        assert -1.001 <= off <= 0.001
+        assert 0 <= reading <= 0xFFFF
+        error = (reading - begin - travel * per_metre + 0x8000) % 0x10000 - 0x8000
+        assert -1.001 <= error <= 0.001
 
 
 def test_sensor_answers_are_big_endian_and_of_the_right_size():
@@ -193,13 +193,13 @@ def test_the_stream_comes_every_15_ms_with_a_sum_of_zero():
     assert len(roomba.outgoing(0.5301)) == 2 * 8
 
 
-def test_a_pause_of_the_simulator_gives_no_burst():
+def test_no_burst_after_a_pause_of_the_simulation():
     roomba = awake()
     roomba.receive(bytes((148, 1, 35)), 0.0)
     assert len(roomba.outgoing(100.0)) == 5
 
 
-def test_the_stream_shows_the_fall_to_passive():
+def test_stream_reports_the_change_to_passive():
     roomba = awake()
     roomba.receive(bytes((148, 1, 35)), 0.0)
     roomba.receive(DRIVE_300, 0.0)
@@ -240,7 +240,7 @@ def test_an_empty_battery_switches_the_robot_off():
 
 
 @given(st.binary(max_size=300), st.lists(st.integers(1, 40), max_size=12))
-def test_any_bytes_in_any_pieces_do_the_same_and_never_raise(data, sizes):
+def test_any_bytes_in_any_pieces_have_the_same_effect_and_never_raise(data, sizes):
     whole, cut = awake(), awake()
     whole.receive(data, 0.0)
     at = 0

@@ -118,7 +118,7 @@ async def test_a_bumper_needs_an_authenticated_reset_that_reaches_the_guardian(r
         if reply.accepted:
             break
     assert reply.accepted, reply
-    await until(lambda: robot.watchdog.count("reset") == 1, "the guardian is reset")
+    await until(lambda: robot.watchdog.count("fault_reset") == 1, "the guardian is reset")
     assert not robot.body.moving
     await enabled(robot)
     await until(lambda: robot.body.moving, "it drives again")

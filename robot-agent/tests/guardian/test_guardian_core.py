@@ -14,8 +14,8 @@ from robot_agent.guardian.core import COMMAND_FRESH_S, GuardianCore
 from robot_agent.guardian.link import WheelCommand
 
 STEP = 0.01
-BASE_SILENT_S = Roomba600Driver.timing.silence
-SETTLE_S = Roomba600Driver.timing.settle
+BASE_SILENT_S = Roomba600Driver.timing.frame_timeout
+IGNORED_AFTER_WAKE_S = Roomba600Driver.timing.ignored_after_wake
 
 
 def commands(data: bytes) -> list[tuple[int, bytes]]:
@@ -44,26 +44,26 @@ class Rig:
     latched: str | None = None
     damage: int | None = None
     silent: bool = False
-    deaf: bool = False
+    not_receiving: bool = False
     feedback: list = field(default_factory=list)
 
-    def take(self, output) -> None:
+    def handle(self, output) -> None:
         self.feedback.extend(output.feedback)
         for opcode, argument in commands(output.data):
             if opcode == 131:
-                assert self.resetting or self.latched is None, "woken again although a fault is latched"
+                assert self.resetting or self.latched is None, "woken although a fault is latched"
             if opcode in {128, 131}:
                 self.wheels, self.wheels_at = (0.0, 0.0), self.now
             if opcode == 145:
                 right, left = (speed / 1000 for speed in struct.unpack(">hh", argument))
-                self.judge_speeds(left, right)
+                self.check_speeds(left, right)
                 self.wheels, self.wheels_at = (left, right), self.now
-        if output.data and not self.deaf:
+        if output.data and not self.not_receiving:
             self.base.receive(output.data, self.now)
         self.latched = self.core.latched
         self.resetting = False
 
-    def judge_speeds(self, left: float, right: float) -> None:
+    def check_speeds(self, left: float, right: float) -> None:
         assert max(abs(left), abs(right)) <= 0.5
         assert abs(left + right) / 2 <= 0.3115
         if (left, right) != (0.0, 0.0):
@@ -72,29 +72,29 @@ class Rig:
             assert self.now - self.command_at <= COMMAND_FRESH_S
         gain = 3.0 * (self.now - self.wheels_at) + 0.002
         for new, old in ((left, self.wheels[0]), (right, self.wheels[1])):
-            grown = abs(new) - abs(old) if new * old >= 0 else abs(new)
-            assert grown <= gain, f"a wheel went from {old} to {new} m/s in {self.now - self.wheels_at:.3f} s"
+            increase = abs(new) - abs(old) if new * old >= 0 else abs(new)
+            assert increase <= gain, f"a wheel went from {old} to {new} m/s in {self.now - self.wheels_at:.3f} s"
 
     def command(self, left: float, right: float, *, reset: bool = False) -> None:
         self.seq += 1
         self.command_at, self.resetting = self.now, reset
-        self.take(self.core.on_command(WheelCommand(seq=self.seq, left=left, right=right, reset=reset), self.now))
+        self.handle(self.core.on_command(WheelCommand(seq=self.seq, left=left, right=right, reset=reset), self.now))
 
     def lose_agent(self) -> None:
         self.command_at = -1e9
-        self.take(self.core.on_agent_lost(self.now))
+        self.handle(self.core.on_agent_lost(self.now))
 
     def step(self) -> None:
         self.now += STEP
         self.base.tick(self.now, STEP)
         data = self.base.outgoing(self.now)
         if self.damage is not None and data:
-            spoilt = bytearray(data)
-            spoilt[self.damage % len(spoilt)] ^= 0x10 | (self.damage & 0xFF)
-            data, self.damage = bytes(spoilt), None
+            corrupted = bytearray(data)
+            corrupted[self.damage % len(corrupted)] ^= 0x10 | (self.damage & 0xFF)
+            data, self.damage = bytes(corrupted), None
         if data and not self.silent:
-            self.take(self.core.on_bytes(data, self.now))
-        self.take(self.core.tick(self.now))
+            self.handle(self.core.on_bytes(data, self.now))
+        self.handle(self.core.tick(self.now))
         if self.now - self.command_at > COMMAND_FRESH_S or self.core.latched is not None:
             assert self.wheels == (0.0, 0.0)
 
@@ -139,14 +139,14 @@ events = st.one_of(
     st.tuples(st.just("mode"), st.sampled_from([OFF, PASSIVE, FULL])),
     st.tuples(st.just("damage"), st.integers(0, 10_000)),
     st.tuples(st.just("silent"), st.booleans()),
-    st.tuples(st.just("deaf"), st.booleans()),
+    st.tuples(st.just("not_receiving"), st.booleans()),
     st.tuples(st.just("garbage"), st.binary(max_size=200)),
 )
 
 
 @settings(max_examples=300, deadline=None)
 @given(st.lists(events, max_size=30))
-def test_no_order_of_events_moves_a_wheel_without_right(order):  # noqa: C901  # one case per kind of event
+def test_no_sequence_of_events_moves_a_wheel_without_a_fresh_command(order):  # noqa: C901  # one case per kind of event
     rig = Rig()
     for name, *arguments in order:
         match name:
@@ -168,11 +168,11 @@ def test_no_order_of_events_moves_a_wheel_without_right(order):  # noqa: C901  #
             case "mode":
                 change_mode(rig.base, arguments[0])
             case "garbage":
-                rig.take(rig.core.on_bytes(arguments[0], rig.now))
+                rig.handle(rig.core.on_bytes(arguments[0], rig.now))
             case _:
                 setattr(rig, name, arguments[0])
         rig.step()
-    rig.deaf = False
+    rig.not_receiving = False
     rig.run(COMMAND_FRESH_S + 0.1)
     assert rig.base.wheel_speeds_m_s == (0.0, 0.0)
 
@@ -185,7 +185,7 @@ def test_a_streamed_command_drives_and_a_pause_stops():
     assert rig.base.wheel_speeds_m_s == (0.0, 0.0)
 
 
-def test_one_factor_for_both_wheels_keeps_the_curve():
+def test_speed_limit_scales_both_wheels_alike():
     rig = ready_rig()
     rig.drive(0.6, 0.5, 0.25)
     left, right = rig.base.wheel_speeds_m_s
@@ -194,7 +194,7 @@ def test_one_factor_for_both_wheels_keeps_the_curve():
 
 
 @pytest.mark.parametrize(
-    ("felt", "words"),
+    ("sensors", "reason"),
     [
         ({"bump_left": True}, "bumper"),
         ({"bump_right": True}, "bumper"),
@@ -202,16 +202,16 @@ def test_one_factor_for_both_wheels_keeps_the_curve():
         ({"wheel_drop_right": True}, "dropped"),
     ],
 )
-def test_the_frame_that_tells_of_danger_yields_the_stop_in_the_same_call(felt, words):
+def test_frame_with_a_safety_sensor_set_returns_the_stop_in_the_same_call(sensors, reason):
     rig = ready_rig()
     rig.drive(0.5)
-    for name, value in felt.items():
+    for name, value in sensors.items():
         setattr(rig.base.world, name, value)
     rig.now += 0.015
     rig.base.tick(rig.now, 0.015)
     output = rig.core.on_bytes(rig.base.outgoing(rig.now), rig.now)
     assert (145, bytes(4)) in commands(output.data)
-    assert words in rig.core.latched
+    assert reason in rig.core.latched
     assert output.feedback[-1].fault == rig.core.latched
 
 
@@ -242,7 +242,7 @@ def test_a_reset_while_the_cause_persists_latches_again_before_a_wheel_turns():
 
 
 @pytest.mark.parametrize("mode", [OFF, PASSIVE, FULL])
-def test_a_base_that_leaves_safe_mode_stays_so_until_a_reset(mode):
+def test_base_that_leaves_safe_mode_is_not_woken_before_a_reset(mode):
     rig = ready_rig()
     rig.drive(0.3)
     change_mode(rig.base, mode)
@@ -256,7 +256,7 @@ def test_a_base_that_leaves_safe_mode_stays_so_until_a_reset(mode):
     assert rig.core.latched is None
 
 
-def test_frames_from_before_a_handshake_do_not_count_as_its_answer():
+def test_frames_from_before_waking_do_not_make_the_base_awake():
     rig = ready_rig()
     rig.base.world.bump_left = True
     rig.run(0.1)
@@ -264,24 +264,24 @@ def test_frames_from_before_a_handshake_do_not_count_as_its_answer():
     rig.run(0.2)
     old = rig.base.outgoing(rig.now + 0.015)
     assert old
-    rig.deaf = True
+    rig.not_receiving = True
     rig.command(0.3, 0.3, reset=True)
-    rig.now += 0.5 * SETTLE_S
-    rig.take(rig.core.on_bytes(old, rig.now))
+    rig.now += 0.5 * IGNORED_AFTER_WAKE_S
+    rig.handle(rig.core.on_bytes(old, rig.now))
     assert rig.feedback[-1].stopped == "the base is not ready to drive yet"
     rig.command(0.3, 0.3)
     assert rig.wheels == (0.0, 0.0)
 
 
-def test_a_silent_base_is_a_fault_that_the_agent_hears_of_again_and_again():
+def test_silent_base_is_a_fault_that_is_reported_repeatedly():
     rig = ready_rig()
     rig.drive(0.3)
     rig.silent = True
     rig.drive(BASE_SILENT_S + 0.1)
     assert "no valid frame" in rig.core.latched
-    told = len(rig.feedback)
+    before = len(rig.feedback)
     rig.run(1.0)
-    assert len(rig.feedback) - told >= 15
+    assert len(rig.feedback) - before >= 15
     rig.silent = False
     rig.command(0.0, 0.0, reset=True)
     rig.run(0.3)
@@ -289,7 +289,7 @@ def test_a_silent_base_is_a_fault_that_the_agent_hears_of_again_and_again():
     assert rig.base.wheel_speeds_m_s == (0.3, 0.3)
 
 
-def test_a_line_that_damages_every_frame_never_drives():
+def test_base_whose_frames_are_all_damaged_never_drives():
     rig = ready_rig()
     for number in range(200):
         rig.damage = 3 + 256 * number
@@ -300,22 +300,22 @@ def test_a_line_that_damages_every_frame_never_drives():
 
 
 def test_a_base_that_is_switched_on_late_is_woken_and_drives():
-    rig = Rig(silent=True, deaf=True)
+    rig = Rig(silent=True, not_receiving=True)
     rig.drive(4.0)
     assert rig.wheels == (0.0, 0.0)
-    rig.silent = rig.deaf = False
+    rig.silent = rig.not_receiving = False
     rig.run(1.5)
     rig.drive(0.5)
     assert rig.base.wheel_speeds_m_s == (0.3, 0.3)
 
 
-def test_a_base_on_its_charger_is_left_alone_until_it_is_taken_off():
+def test_charging_base_is_not_woken_until_it_leaves_the_charger():
     rig = Rig()
     rig.base.world.charger = True
     rig.run(1.0)
     later = b"".join(rig.core.tick(rig.now + 0.02 * n).data for n in range(12))
     assert {opcode for opcode, _ in commands(later)} <= {145}
-    assert rig.feedback[-1].stopped == "the base stands on its charger"
+    assert rig.feedback[-1].stopped == "the base is on its charger"
     assert rig.feedback[-1].status.charging
     rig.base.world.charger = False
     rig.run(1.5)
@@ -334,16 +334,16 @@ def test_a_short_surge_of_current_is_no_fault_and_a_blocked_motor_is():
     assert "current" in rig.core.latched
 
 
-def test_feedback_carries_encoders_battery_and_news_at_once():
+def test_feedback_carries_encoders_battery_and_the_reason_of_the_stop():
     rig = ready_rig(base=RoombaEmulator(left_encoder=65_530, right_encoder=7))
     rig.base.add_wheel_travel(0.1, 0.2)
     rig.run(0.1)
-    told = rig.feedback[-1]
-    travel = (told.odometry.left_m, told.odometry.right_m)
+    feedback = rig.feedback[-1]
+    travel = (feedback.odometry.left_m, feedback.odometry.right_m)
     assert travel == pytest.approx([ticks * math.pi * 0.072 / 508.8 for ticks in rig.base.encoders], abs=1e-9)
-    assert told.status.battery == pytest.approx(2400 / 2600, abs=0.01)
-    assert told.status.mode_problem is None
-    assert told.stopped == "no fresh command of the agent"
+    assert feedback.status.battery == pytest.approx(2400 / 2600, abs=0.01)
+    assert feedback.status.mode_problem is None
+    assert feedback.stopped == "no fresh command from the agent"
     assert [feedback.seq for feedback in rig.feedback] == list(range(1, len(rig.feedback) + 1))
 
 

@@ -41,9 +41,9 @@ def test_wheels_stop_each_time_the_guardian_is_killed_and_drive_again(rig):
         wait_for(lambda dead=dead: rig.watchdog.guardian() not in {None, dead}, "another guardian runs")
 
 
-def test_another_base_is_guarded_and_watched_just_as_well(tmp_path):
+def test_diffdrive_base_is_guarded_like_the_roomba(tmp_path):
     board = DiffDriveEmulator()
-    board.timeout_s = 1e9  # what stops it here must not be the board itself
+    board.timeout_s = 1e9  # the board itself must not stop here
     with rigs.Rig(tmp_path, "diffdrive", board) as rig:
         rig.drive()
         begun = rig.end_guardian(signal.SIGKILL)
@@ -54,7 +54,7 @@ def test_another_base_is_guarded_and_watched_just_as_well(tmp_path):
         rig.drive()
         board.bump_left = True
         assert rig.base.stopped_within(time.monotonic()) < STOP_S
-        wait_for(lambda: "bumper" in (rig.agent.feedback.fault or ""), "the fault is told")
+        wait_for(lambda: "bumper" in (rig.agent.feedback.fault or ""), "the fault is reported")
 
 
 def test_wheels_stop_when_the_guardian_hangs_and_drive_again(rig):
@@ -71,7 +71,7 @@ def test_wheels_stop_when_the_agent_falls_silent(rig):
     rig.drive()
     rig.agent.wheels = None
     assert rig.base.stopped_within(time.monotonic()) < STOP_S
-    wait_for(lambda: rig.agent.feedback.stopped == "no fresh command of the agent", "the agent is told")
+    wait_for(lambda: rig.agent.feedback.stopped == "no fresh command from the agent", "the agent is informed")
     rig.drive()
 
 
@@ -122,11 +122,11 @@ def test_a_signal_ends_both_processes_cleanly_with_the_wheels_at_rest(rig, numbe
     assert rig.watchdog.events[-1]["event"] == "ended"
 
 
-def test_a_port_that_comes_back_is_opened_again(rig):
+def test_lost_port_is_reopened(rig):
     rig.drive()
     rig.base.unplug()
-    wait_for(lambda: rig.watchdog.count("port_lost"), "the loss is noticed")
-    # The cable cut the robot off while it was driving: it rolls on until somebody reaches it again.
+    wait_for(lambda: rig.watchdog.count("port_lost"), "the loss is logged")
+    # The cable was unplugged while the robot was driving: it rolls on until the port is open again.
     assert rig.base.moving
     rig.base.plug_in()
     rig.agent.wheels = (0.0, 0.0)
@@ -134,7 +134,7 @@ def test_a_port_that_comes_back_is_opened_again(rig):
     rig.drive()
 
 
-def test_garbage_on_the_line_neither_drives_nor_ends_anything(rig):
+def test_garbage_on_the_line_neither_moves_the_base_nor_ends_the_guardian(rig):
     rig.drive()
     rig.agent.wheels = (0.0, 0.0)
     wait_for(lambda: not rig.base.moving, "the base stands")
@@ -145,12 +145,12 @@ def test_garbage_on_the_line_neither_drives_nor_ends_anything(rig):
         assert not rig.base.moving
     assert rig.watchdog.guardian() == guardian
     travel = rig.base.robot.encoders[0] * math.pi * 0.072 / 508.8
-    wait_for(lambda: abs(rig.agent.feedback.odometry.left_m - travel) < 1e-9, "frames are understood again")
+    wait_for(lambda: abs(rig.agent.feedback.odometry.left_m - travel) < 1e-9, "frames are parsed again")
     rig.agent.reset = True
     rig.drive()
 
 
-def test_a_bumper_latches_until_a_reset_even_over_a_new_agent(rig):
+def test_bumper_fault_survives_a_new_agent_until_a_reset(rig):
     rig.drive()
     rig.base.robot.world.bump_left = True
     assert rig.base.stopped_within(time.monotonic()) < STOP_S
@@ -159,7 +159,7 @@ def test_a_bumper_latches_until_a_reset_even_over_a_new_agent(rig):
     rig.agent = rigs.Agent(rig.watchdog.socket)
     with rig.agent:
         rig.agent.wheels = (0.3, 0.3)
-        wait_for(lambda: rig.agent.feedback and "bumper" in (rig.agent.feedback.fault or ""), "the fault is told")
+        wait_for(lambda: rig.agent.feedback and "bumper" in (rig.agent.feedback.fault or ""), "the fault is reported")
         assert not rig.base.moving
         rig.agent.reset = True
         wait_for(lambda: rig.base.moving, "the reset lets it drive")
@@ -176,16 +176,16 @@ def test_the_newest_agent_drives_and_bad_packets_are_refused(rig):
             old.settimeout(5.0)
             while old.recv(4096):
                 pass
-    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as strange:
-        strange.connect(str(rig.watchdog.socket))
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as bad_client:
+        bad_client.connect(str(rig.watchdog.socket))
         for packet in (b"\xff", os.urandom(4000), b"\x80", b"\x00" * 5000):
-            strange.send(packet)
-        assert strange.recv(4096)
-    wait_for(lambda: rig.watchdog.count("bad_command"), "the refusal is logged")
+            bad_client.send(packet)
+        assert bad_client.recv(4096)
+    wait_for(lambda: rig.watchdog.count("command_refused"), "the refusal is logged")
     assert rig.watchdog.count("guardian_lost") == 0
 
 
-def test_a_second_watchdog_keeps_off_a_port_in_use(rig, tmp_path):
+def test_second_watchdog_does_not_open_a_port_in_use(rig, tmp_path):
     rig.drive()
     folder = tmp_path / "second"
     folder.mkdir()
@@ -196,7 +196,7 @@ def test_a_second_watchdog_keeps_off_a_port_in_use(rig, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("setting", "value", "words"),
+    ("setting", "value", "reason"),
     [
         ("BASE_PORT", "", "FOGNAV_BASE_PORT is not set"),
         ("SPEED", "fast", "positive number"),
@@ -207,11 +207,11 @@ def test_a_second_watchdog_keeps_off_a_port_in_use(rig, tmp_path):
         ("LOG_LEVEL", "loud", "FOGNAV_LOG_LEVEL"),
     ],
 )
-def test_wrong_settings_end_the_watchdog_with_words_instead_of_a_loop(tmp_path, setting, value, words):
+def test_wrong_settings_end_the_watchdog_with_the_reason(tmp_path, setting, value, reason):
     with rigs.Base(tmp_path / "roomba") as base, rigs.Watchdog(tmp_path, base.link) as watchdog:
         watchdog.__exit__()
         watchdog.log_file.unlink()
         watchdog.environment[f"FOGNAV_{setting}"] = value
         watchdog.start()
         assert watchdog.process.wait(15.0) == 78
-        assert any(line["event"] == "bad_settings" and words in line["reason"] for line in watchdog.events)
+        assert any(line["event"] == "bad_settings" and reason in line["reason"] for line in watchdog.events)

@@ -4,7 +4,7 @@ from robot_agent.guardian.watchdog import refuse_speed
 
 
 @pytest.mark.parametrize("speed", [0.1, 0.99, 1.01, 5.0])
-def test_a_real_base_is_never_guarded_on_another_clock_than_the_real_one(speed: float) -> None:
+def test_real_base_is_refused_on_a_scaled_clock(speed: float) -> None:
     refusal = refuse_speed(speed, "/dev/ttyUSB0")
     assert refusal is not None
     assert "/dev/ttyUSB0" in refusal
@@ -12,5 +12,5 @@ def test_a_real_base_is_never_guarded_on_another_clock_than_the_real_one(speed: 
 
 
 @pytest.mark.parametrize(("speed", "device"), [(1.0, "/dev/ttyUSB0"), (1.0, "/dev/pts/3"), (5.0, "/dev/pts/3")])
-def test_real_time_on_any_device_and_any_time_on_a_simulated_one_are_fine(speed: float, device: str) -> None:
+def test_real_time_and_simulated_devices_are_accepted(speed: float, device: str) -> None:
     assert refuse_speed(speed, device) is None

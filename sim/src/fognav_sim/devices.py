@@ -56,8 +56,8 @@ class BaseEmulator(SerialEmulator, Protocol):
     def add_wheel_travel(self, left_m: float, right_m: float) -> None:
         """Let the wheels roll this far, m: the encoders count it."""
 
-    def feel(self, *, bump_left: bool, bump_right: bool, cliff: bool) -> None:
-        """Set what its sensors feel from now on."""
+    def set_sensors(self, *, bump_left: bool, bump_right: bool, cliff: bool) -> None:
+        """Set the state of its contact sensors."""
 
     def tick(self, now: float, dt: float) -> None:
         """Let dt seconds pass up to `now`."""

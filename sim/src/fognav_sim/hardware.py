@@ -79,7 +79,7 @@ class Hardware:
         base.add_wheel_travel(*world.step(dt))
         self.now += dt
         bump_left, bump_right = world.bumpers
-        base.feel(bump_left=bump_left, bump_right=bump_right, cliff=False)
+        base.set_sensors(bump_left=bump_left, bump_right=bump_right, cliff=False)
         base.tick(self.now, dt)
         return (
             self._base_line.send(base.outgoing(self.now), dt),

@@ -1,1 +1,1 @@
-"""The process that owns the wheels, the watchdog that outlives it, and what they tell the agent."""
+"""The guardian that owns the base, the watchdog that monitors it, and their messages to the agent."""

@@ -1,11 +1,12 @@
-"""What the guardian decides: which bytes go to the base, and when the wheels must stand. Pure; time is an argument.
+"""The guardian's decisions: which bytes go to the base, and when the wheels must stop. Pure; time is an argument.
 
-The guardian trusts nobody. A command of the agent moves the wheels only while it is fresh; bumper, cliff, wheel drop,
-a base that leaves its driving mode or falls silent stop them within one sensor frame, latched until the agent passes on
-an operator's reset. A base may keep its last velocity when the host is silent, so "stop" is always a command, repeated.
+The guardian trusts no other process. A command of the agent moves the wheels only while it is fresh; bumper, cliff,
+wheel drop, a base that leaves its driving mode or falls silent stop them within one sensor frame, latched until the
+agent passes on an operator's reset. A base may keep its last velocity when the host is silent, so "stop" is always a
+command, repeated.
 
-The agent keeps a fault of its own as soon as it hears of the latch, so either of the two may die without the fault
-being forgotten. When both die, the robot starts in INIT, and an operator must enable it as after any boot.
+The agent latches a fault too as soon as it receives the guardian's, so the fault survives the end of either process.
+When both end, the robot starts in INIT, and an operator must enable it as after any boot.
 """
 
 from __future__ import annotations
@@ -23,18 +24,18 @@ if TYPE_CHECKING:
 COMMAND_FRESH_S: Final = 0.2
 """A command older than this does not move a wheel."""
 OVERCURRENT_S: Final = 0.3
-"""A wheel motor that starts on a carpet draws much for a moment; one that is blocked keeps drawing."""
+"""A motor that starts on a carpet draws a high current for a moment; a blocked one keeps drawing it."""
 REPEAT_S: Final = 0.05
-"""The wheel command is repeated this often even when it does not change: a byte may have been lost."""
+"""Period of repeating an unchanged wheel command: a byte may have been lost."""
 FEEDBACK_S: Final = 0.045
-"""The agent gets every third sensor frame, and at once whatever is news."""
+"""The agent gets every third sensor frame, and every change immediately."""
 STEP_S: Final = 0.06
-"""A wheel gains speed for at most this long at once: a guardian that was away must not make up for it in one leap."""
+"""Longest time step of acceleration: after a pause the guardian must not catch up in one step."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What the guardian lets through: wheel speed and mean speed in m/s, gain of a wheel's speed in m/s2."""
+    """Limits of a command: wheel speed and mean speed in m/s, acceleration of a wheel in m/s2."""
 
     wheel: float = WHEEL_SPEED_MAX_M_S
     linear: float = 0.31
@@ -43,7 +44,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class Output:
-    """What follows from an input: bytes for the base and news for the agent."""
+    """Result of an input: bytes for the base and feedback for the agent."""
 
     data: bytes = b""
     feedback: tuple[BaseFeedback, ...] = ()
@@ -51,7 +52,7 @@ class Output:
 
 @dataclass
 class _Base:
-    """What is known of the base."""
+    """State of the base."""
 
     reading: BaseReading | None = None
     reading_at: float = -1.0e9
@@ -62,7 +63,7 @@ class _Base:
 
 @dataclass
 class GuardianCore:
-    """One base, one agent. Feed it bytes, commands and time; write what it returns."""
+    """One base, one agent. Pass it bytes, commands and time; write the bytes that it returns."""
 
     driver: BaseDriver
     limits: Limits = field(default_factory=Limits)
@@ -83,29 +84,29 @@ class GuardianCore:
 
     @property
     def latched(self) -> str | None:
-        """The fault that keeps the wheels still until a reset, in words."""
+        """The fault that stops the wheels until a reset; None without one."""
         return self._latched
 
     @property
     def corrupted(self) -> int:
-        """Sensor frames that came damaged."""
+        """Number of damaged sensor frames."""
         return self.driver.corrupted
 
     def on_bytes(self, data: bytes, now: float) -> Output:
-        """Take what the base sent; a frame that calls for a stop yields the stop at once."""
+        """Handle bytes of the base; a frame that demands a stop returns the stop immediately."""
         self.driver.receive_data(data, now)
-        news: list[BaseFeedback] = []
-        urgent = b""
+        feedbacks: list[BaseFeedback] = []
+        stop = b""
         while (reading := self.driver.next_event()) is not None:
             self._base.reading, self._base.reading_at = reading, now
-            urgent += self._check(reading.status, now)
+            stop += self._check(reading.status, now)
             feedback = self._feedback(reading, now)
             if feedback is not None:
-                news.append(feedback)
-        return Output(urgent, tuple(news))
+                feedbacks.append(feedback)
+        return Output(stop, tuple(feedbacks))
 
     def on_command(self, command: WheelCommand, now: float) -> Output:
-        """Take the agent's command; with `reset` it also clears a latched fault and wakes the base again."""
+        """Handle the agent's command; with `reset` also clear a latched fault and wake the base again."""
         self._command, self._command_at = command, now
         if command.reset and self._latched is not None:
             self._latched = None
@@ -114,34 +115,34 @@ class GuardianCore:
         return self._drive(now)
 
     def on_agent_lost(self, now: float) -> Output:
-        """Forget the agent's last word: its link is gone."""
+        """Discard the agent's last command: its link is lost."""
         self._command = None
         return self._drive(now)
 
     def tick(self, now: float) -> Output:
-        """Let time pass (50 Hz or more): stale commands, a silent base, repeated stops."""
+        """Advance time (50 Hz or more): stale commands, a silent base, repeated stops."""
         base, timing = self._base, self.driver.timing
         if not base.awake:
-            due = base.woken_at is None or now - base.woken_at > timing.wake
+            due = base.woken_at is None or now - base.woken_at > timing.wake_timeout
             # A base that does not drive on its charger is left alone there: waking it would only disturb the charging.
             if due and not self._charging(now):
                 return Output(self._wake(now), self._reminder(now))
-            # What should wake it may have got lost, and the base may still roll as somebody else left it.
-            again = now - self._sent_at >= REPEAT_S
-            return Output(self._send((0.0, 0.0), now) if again else b"", self._reminder(now))
+            # The wake command may have been lost, and the base may still roll at an old speed.
+            repeat = now - self._sent_at >= REPEAT_S
+            return Output(self._send((0.0, 0.0), now) if repeat else b"", self._reminder(now))
         silent = now - base.reading_at
-        if silent > timing.silence:
+        if silent > timing.frame_timeout:
             data = self._latch(f"the base has sent no valid frame for {silent:.1f} s: check cable and power", now)
             return Output(data, self._reminder(now))
         return self._drive(now)
 
     def stop_command(self) -> bytes:
-        """Return the bytes that stop the wheels when the guardian ends in good order; the base stays awake."""
+        """Return the bytes that stop the wheels at an orderly end of the guardian; the base stays awake."""
         return self.driver.drive(0.0, 0.0)
 
     def _charging(self, now: float) -> bool:
         base = self._base
-        fresh = now - base.reading_at <= self.driver.timing.silence
+        fresh = now - base.reading_at <= self.driver.timing.frame_timeout
         return base.reading is not None and fresh and base.reading.status.charging
 
     def _wake(self, now: float) -> bytes:
@@ -152,8 +153,8 @@ class GuardianCore:
     def _check(self, status: BaseStatus, now: float) -> bytes:
         base = self._base
         if not base.awake:
-            settled = base.woken_at is not None and now - base.woken_at >= self.driver.timing.settle
-            if not settled or status.mode_problem is not None:
+            current = base.woken_at is not None and now - base.woken_at >= self.driver.timing.ignored_after_wake
+            if not current or status.mode_problem is not None:
                 return b""
             base.awake, base.overcurrent_since, self._stepped_at = True, None, now
         if self._latched is not None:
@@ -166,8 +167,8 @@ class GuardianCore:
         return b"" if fault is None else self._latch(fault, now)
 
     def _fault(self, status: BaseStatus, now: float) -> str | None:
-        """Return what a base that is awake reports and wheels must not turn with, in words; None for no such thing."""
-        # A base may leave its driving mode by itself on cliff or wheel drop: those say more than the mode does.
+        """Return the fault that an awake base reports and that must stop the wheels; None without one."""
+        # A base may leave its driving mode by itself on cliff or wheel drop, which are the more precise reason.
         if status.cliff:
             return "a cliff sensor sees no floor"
         if status.wheel_drop:
@@ -184,11 +185,11 @@ class GuardianCore:
         return None
 
     def _latch(self, reason: str, now: float) -> bytes:
-        news = self._latched is None
-        if news:
+        first = self._latched is None
+        if first:
             self._latched = reason
         self._wheels, self._stepped_at = (0.0, 0.0), now
-        if not news and self._sent == self._wheels and now - self._sent_at < REPEAT_S:
+        if not first and self._sent == self._wheels and now - self._sent_at < REPEAT_S:
             return b""
         return self._send(self._wheels, now)
 
@@ -197,23 +198,23 @@ class GuardianCore:
             return Output()
         elapsed = 0.0 if self._stepped_at is None else max(0.0, min(now - self._stepped_at, STEP_S))
         self._stepped_at = now
-        wanted = self._wanted(now)
+        target = self._target(now)
         gain = self.limits.acceleration * elapsed
-        left = _slew(self._wheels[0], wanted[0], gain)
-        right = _slew(self._wheels[1], wanted[1], gain)
+        left = _slew(self._wheels[0], target[0], gain)
+        right = _slew(self._wheels[1], target[1], gain)
         self._wheels = (left, right)
         if self._wheels == self._sent and now - self._sent_at < REPEAT_S:
             return Output()
         return Output(self._send(self._wheels, now))
 
-    def _wanted(self, now: float) -> tuple[float, float]:
+    def _target(self, now: float) -> tuple[float, float]:
         command = self._command
         if self._latched is not None or command is None or now - self._command_at > COMMAND_FRESH_S:
             return 0.0, 0.0
         left, right = command.left, command.right
         mean = abs(left + right) / 2
         fastest = max(abs(left), abs(right))
-        # One factor for both wheels keeps the curve that the agent meant.
+        # One factor for both wheels keeps the curve of the command.
         scale = min(
             1.0,
             self.limits.linear / mean if mean > self.limits.linear else 1.0,
@@ -226,7 +227,7 @@ class GuardianCore:
         return self.driver.drive(*wheels)
 
     def _feedback(self, reading: BaseReading, now: float) -> BaseFeedback | None:
-        # All that is news but the battery, which changes all the time.
+        # Any change counts but that of the battery, which changes all the time.
         key = (msgspec.structs.replace(reading.status, battery=None), self._latched, self._base.awake)
         if key == self._feedback_key and now - self._feedback_at < FEEDBACK_S:
             return None
@@ -234,7 +235,7 @@ class GuardianCore:
         return self._report(reading, now)
 
     def _reminder(self, now: float) -> tuple[BaseFeedback, ...]:
-        """Repeat the last frame while the base says nothing new, so that the agent knows what it waits for."""
+        """Repeat the last frame while the base is silent, so that the agent gets the reason."""
         reading = self._base.reading
         return () if reading is None or now - self._feedback_at < FEEDBACK_S else (self._report(reading, now),)
 
@@ -243,18 +244,18 @@ class GuardianCore:
         self._feedback_at = now
         stopped = None
         if not self._base.awake:
-            stopped = "the base stands on its charger" if self._charging(now) else "the base is not ready to drive yet"
+            stopped = "the base is on its charger" if self._charging(now) else "the base is not ready to drive yet"
         elif self._command is None or now - self._command_at > COMMAND_FRESH_S:
-            stopped = "no fresh command of the agent"
+            stopped = "no fresh command from the agent"
         return BaseFeedback(
             seq=self._seq, status=reading.status, odometry=reading.odometry, fault=self._latched, stopped=stopped
         )
 
 
-def _slew(current: float, wanted: float, gain: float) -> float:
-    """Limit the growth of a wheel's speed; slowing down is never held back, reversing passes through zero."""
-    if current * wanted < 0:
+def _slew(current: float, target: float, gain: float) -> float:
+    """Limit the growth of a wheel's speed; slowing down is not limited, reversing passes through zero."""
+    if current * target < 0:
         current = 0.0
-    if abs(wanted) <= abs(current):
-        return wanted
-    return min(wanted, current + gain) if wanted > 0 else max(wanted, current - gain)
+    if abs(target) <= abs(current):
+        return target
+    return min(target, current + gain) if target > 0 else max(target, current - gain)

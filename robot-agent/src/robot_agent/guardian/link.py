@@ -1,4 +1,4 @@
-"""What agent and guardian tell each other over their Unix socket (SOCK_SEQPACKET, msgpack, one message a packet)."""
+"""Messages between agent and guardian on their Unix socket (SOCK_SEQPACKET, msgpack, one message a packet)."""
 
 from typing import Annotated, Final
 
@@ -12,13 +12,13 @@ PACKET_LIMIT = 4096
 """Bytes of the largest packet that either side accepts."""
 
 WHEEL_SPEED_MAX_M_S: Final = 0.5
-"""No base of this system is asked to turn a wheel faster, whatever it could do."""
+"""No base of this system turns a wheel faster, whatever its own limit."""
 
 WheelSpeed = Annotated[float, Meta(ge=-WHEEL_SPEED_MAX_M_S, le=WHEEL_SPEED_MAX_M_S)]
 
 
 class WheelCommand(Struct, frozen=True, kw_only=True):
-    """Wheel speeds that the agent asks for (m/s), 20 times a second; `seq` grows by one with each.
+    """Wheel speeds that the agent requests (m/s), 20 times a second; `seq` grows by one with each.
 
     `reset` passes on an operator's authenticated reset: the guardian clears a latched fault and wakes the base again.
     """
@@ -30,10 +30,10 @@ class WheelCommand(Struct, frozen=True, kw_only=True):
 
 
 class BaseFeedback(Struct, frozen=True, kw_only=True):
-    """What the guardian last read from the base.
+    """The newest reading of the base.
 
-    `fault` is what the guardian has latched (None: nothing), `stopped` why it holds the wheels at zero whatever the
-    agent asks (None: it doesn't).
+    `fault`: the guardian's latched fault (None: none). `stopped`: why the guardian keeps the wheels at zero
+    whatever the agent requests (None: it does not).
     """
 
     seq: Count

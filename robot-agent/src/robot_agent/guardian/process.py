@@ -1,7 +1,7 @@
-"""The guardian process: owns the wheels, lets fresh commands of the agent through and stops for everything else.
+"""The guardian process: owns the base, passes on fresh commands of the agent and stops the wheels otherwise.
 
-Started by the watchdog, which passes the open serial port (FOGNAV_BASE_FD), the pipe for the guardian's beat
-(FOGNAV_BEAT_FD) and one whose end means that the watchdog is gone (FOGNAV_WATCHDOG_FD). The agent connects to the Unix
+Started by the watchdog, which passes the open serial port (FOGNAV_BASE_FD), the pipe for the guardian's heartbeats
+(FOGNAV_HEARTBEAT_FD) and a pipe that closes when the watchdog ends (FOGNAV_WATCHDOG_FD). The agent connects to the Unix
 socket FOGNAV_GUARDIAN_SOCKET; the newest connection is the agent, an older one is dropped.
 """
 
@@ -33,16 +33,16 @@ if TYPE_CHECKING:
     from robot_agent.hardware import BaseDriver
 
 TICK_S: Final = 0.02
-BEAT_S: Final = 0.05
-PACKETS_A_ROUND: Final = 64
-"""A flood of packets must not keep the guardian from its sensors."""
+HEARTBEAT_S: Final = 0.05
+PACKETS_PER_CYCLE: Final = 64
+"""Limit per cycle: a flood of packets must not block the sensors."""
 
 
 class GuardianSettings(msgspec.Struct, frozen=True, kw_only=True):
-    """Environment of the guardian; the watchdog fills in the descriptors."""
+    """Settings of the guardian (environment); the watchdog sets the descriptors."""
 
     base_fd: int
-    beat_fd: int
+    heartbeat_fd: int
     watchdog_fd: int
     base: str = DEFAULT_BASE
     base_options: str = ""
@@ -65,11 +65,11 @@ class Guardian:
         self._port = Port.from_fd(settings.base_fd, settings.base_port or None)
         self._selector = selectors.DefaultSelector()
         self._agent: socket.socket | None = None
-        self._beat_at = -1.0
+        self._heartbeat_at = -1.0
         self._latched: str | None = None
         self._corrupted = 0
         self._log = logs.get("guardian")
-        self._seldom = logs.RateLimited(self._log)
+        self._limited_log = logs.RateLimited(self._log)
         self._signal: int | None = None
         self._ended = False
 
@@ -77,16 +77,16 @@ class Guardian:
         """Guard until the watchdog or a signal ends it; returns the exit code."""
         listener = self._listener
         self._selector.register(self._port, selectors.EVENT_READ, self._read_base)
-        self._selector.register(self._settings.watchdog_fd, selectors.EVENT_READ, self._watchdog_gone)
+        self._selector.register(self._settings.watchdog_fd, selectors.EVENT_READ, self._on_watchdog_lost)
         self._selector.register(listener, selectors.EVENT_READ, lambda: self._accept(listener))
         try:
-            # What arrived while nobody read is of another time.
+            # Bytes that arrived before this process started are stale.
             self._port.discard_input()
             while not self._ended and self._signal is None:
                 for key, _ in self._selector.select(self._clock.real(TICK_S)):
                     key.data()
-                self._do(self._core.tick(self._clock.now()))
-                self._beat()
+                self._apply(self._core.tick(self._clock.now()))
+                self._send_heartbeat()
             self._port.write(self._core.stop_command())
         except PortLost as error:
             self._log.error("port_lost", reason=str(error))
@@ -95,38 +95,38 @@ class Guardian:
         return 0
 
     def end(self, signum: int, _frame: FrameType | None) -> None:
-        """Finish the current round, stop the wheels, and end (signal handler: it may interrupt anything)."""
+        """Finish the current cycle, stop the wheels, and end (signal handler: it may interrupt anything)."""
         self._signal = signum
 
     def _read_base(self) -> None:
         now = self._clock.now()
-        self._do(self._core.on_bytes(self._port.read_available(), now))
+        self._apply(self._core.on_bytes(self._port.read_available(), now))
         if self._core.corrupted != self._corrupted:
             self._corrupted = self._core.corrupted
-            self._seldom.warning("damaged_frames", "damaged_frames", now, total=self._corrupted)
+            self._limited_log.warning("frames_corrupted", "frames_corrupted", now, total=self._corrupted)
 
-    def _watchdog_gone(self) -> None:
+    def _on_watchdog_lost(self) -> None:
         if self._signal is None:
-            self._log.error("watchdog_gone", remedy="the watchdog ended; it must run whenever the guardian does")
+            self._log.error("watchdog_lost", remedy="the watchdog ended: start it again, it starts the guardian")
         self._ended = True
 
     def _accept(self, listener: socket.socket) -> None:
         try:
-            fresh, _ = listener.accept()
+            agent, _ = listener.accept()
         except (BlockingIOError, ConnectionError):
-            return  # it went away again
-        fresh.settimeout(0)
-        self._drop_agent("another one connected")
-        self._agent = fresh
-        self._selector.register(fresh, selectors.EVENT_READ, lambda: self._read_agent(fresh))
+            return  # it disconnected already
+        agent.settimeout(0)
+        self._drop_agent("another agent connected")
+        self._agent = agent
+        self._selector.register(agent, selectors.EVENT_READ, lambda: self._read_agent(agent))
         self._log.info("agent_connected")
 
     def _read_agent(self, agent: socket.socket) -> None:
         if agent is not self._agent:
-            return  # dropped earlier in this round
+            return  # dropped earlier in this cycle
         newest: WheelCommand | None = None
         reset = False
-        for _ in range(PACKETS_A_ROUND):
+        for _ in range(PACKETS_PER_CYCLE):
             try:
                 data = agent.recv(PACKET_LIMIT + 1)
             except BlockingIOError:
@@ -135,17 +135,17 @@ class Guardian:
                 self._drop_agent(str(error))
                 return
             if not data:
-                self._drop_agent("it closed the link")
+                self._drop_agent("the agent closed the link")
                 return
             try:
                 newest = decode_command(data)
             except (msgspec.DecodeError, UnicodeDecodeError) as error:
-                self._seldom.warning("bad_command", "bad_command", self._clock.now(), reason=str(error))
+                self._limited_log.warning("command_refused", "command_refused", self._clock.now(), reason=str(error))
                 continue
             reset = reset or newest.reset
         if newest is not None:
             command = msgspec.structs.replace(newest, reset=reset)
-            self._do(self._core.on_command(command, self._clock.now()))
+            self._apply(self._core.on_command(command, self._clock.now()))
 
     def _drop_agent(self, reason: str) -> None:
         if self._agent is None:
@@ -154,41 +154,40 @@ class Guardian:
         self._agent.close()
         self._agent = None
         self._log.warning("agent_lost", reason=reason)
-        self._do(self._core.on_agent_lost(self._clock.now()))
+        self._apply(self._core.on_agent_lost(self._clock.now()))
 
-    def _do(self, output: Output) -> None:
+    def _apply(self, output: Output) -> None:
         if output.data:
             self._port.write(output.data)
         if self._core.latched != self._latched:
             self._latched = self._core.latched
-            self._log.warning("latched" if self._latched else "reset", reason=self._latched)
+            self._log.warning("fault_latched" if self._latched else "fault_reset", reason=self._latched)
         if self._agent is None:
             return
         for feedback in output.feedback:
             try:
                 self._agent.send(encode(feedback))
             except BlockingIOError:
-                # The agent does not read: it hangs, and its commands will go stale. News are worth nothing to it.
+                # The agent does not read: it hangs, and its commands will become stale.
                 break
             except ConnectionError as error:
                 self._drop_agent(str(error))
                 break
 
-    def _beat(self) -> None:
+    def _send_heartbeat(self) -> None:
         now = self._clock.now()
-        if now - self._beat_at < BEAT_S:
+        if now - self._heartbeat_at < HEARTBEAT_S:
             return
-        self._beat_at = now
-        # A full pipe means that the watchdog hangs; it is no reason to drive any less safely. A broken one means that
-        # it is gone, which the other pipe tells too.
+        self._heartbeat_at = now
+        # A full pipe means that the watchdog hangs, a broken one that it ended; the other pipe reports the latter too.
         with suppress(BlockingIOError, BrokenPipeError):
-            os.write(self._settings.beat_fd, b".")
+            os.write(self._settings.heartbeat_fd, b".")
 
 
 def _listen(path: str) -> socket.socket:
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     try:
-        # A guardian that is gone leaves its socket behind.
+        # A guardian that was killed leaves its socket behind.
         Path(path).unlink(missing_ok=True)
         listener.bind(path)
         Path(path).chmod(0o660)
@@ -203,10 +202,10 @@ def _listen(path: str) -> socket.socket:
     return listener
 
 
-def _be_prompt(priority: int) -> str:
-    """Ask for a real-time priority, so that a busy machine can't delay a stop; say what came of it."""
+def set_realtime_priority(priority: int) -> str:
+    """Set a real-time priority, so that a busy machine can't delay a stop; return the result as text."""
     if priority <= 0:
-        return "not asked for"
+        return "not requested"
     try:
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(priority))
     except PermissionError:
@@ -228,6 +227,6 @@ def main() -> int:
     guardian = Guardian(settings, driver, listener)
     signal.signal(signal.SIGTERM, guardian.end)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    priority = _be_prompt(settings.realtime_priority)
+    priority = set_realtime_priority(settings.realtime_priority)
     logs.get("guardian").info("started", base=settings.base, port=settings.base_port, priority=priority)
     return guardian.run()

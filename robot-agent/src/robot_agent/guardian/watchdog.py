@@ -1,8 +1,8 @@
 """The watchdog: opens the base's serial port, starts the guardian, stops the wheels when the guardian dies or hangs.
 
-A base may keep its last velocity when its host falls silent, so somebody has to outlive the guardian. This process
-does nothing else and imports next to nothing, so that next to nothing can end it. Run it as a service; it starts the
-guardian again after each end. Settings (environment): FOGNAV_BASE, FOGNAV_BASE_PORT, FOGNAV_SPEED, and those of the
+A base may keep its last velocity when its host falls silent, so this process must outlive the guardian. It does
+nothing else and imports almost nothing, so that almost nothing can end it. Run it as a service; it restarts the
+guardian whenever that ends. Settings (environment): FOGNAV_BASE, FOGNAV_BASE_PORT, FOGNAV_SPEED, and those of the
 guardian.
 """
 
@@ -27,22 +27,22 @@ if TYPE_CHECKING:
     from types import FrameType
 
 PORT_LOST: Final = 3
-"""Exit code of the guardian when the port is gone: open it anew."""
+"""Exit code of the guardian when the port is lost: reopen it."""
 BAD_SETTINGS: Final = 78
-"""Exit code of the guardian (EX_CONFIG of sysexits.h) when another start would fail just the same."""
+"""Exit code of the guardian (EX_CONFIG of sysexits.h) when a restart would fail again."""
 SILENCE_S: Final = 0.15
-"""The guardian beats every 0.05 s; after this long without a beat it is taken for hung and killed."""
-SILENCE_LEAST_S: Final = 0.05
-"""Real seconds: a simulation that runs faster than time must not take the scheduler's delays for a hang."""
+"""The guardian sends a heartbeat every 0.05 s; without one for this long it is killed as hung."""
+SILENCE_MIN_S: Final = 0.05
+"""Real seconds: in a simulation faster than real time, delays of the scheduler must not count as a hang."""
 STARTUP_S: Final = 15.0
-"""Real seconds until a guardian that has never beaten is taken for hung; the wheels stand meanwhile."""
+"""Real seconds until a guardian without any heartbeat is killed as hung; the wheels are at rest meanwhile."""
 REPEAT_S: Final = 0.1
 RESTART_S: Final = 0.3
 REOPEN_S: Final = 1.0
 TERMINATE_S: Final = 1.0
 
 STOPS: Final = "fognav.base_stops"
-"""Entry points with the stop command of each base, apart from its driver: plain bytes in a module of its own."""
+"""Entry points of the stop command of each base: plain bytes in a module separate from its driver."""
 DEFAULT_BASE: Final = "roomba600"
 
 
@@ -51,26 +51,26 @@ class _Terminated(Exception):  # noqa: N818  # an end, not an error
 
 
 class _BadSettings(Exception):  # noqa: N818  # an end, too
-    """The settings can't be used: the process ends, and is not to be started again as it is."""
+    """The settings are invalid: the process ends, and a restart would fail again."""
 
 
 def _log(event: str, **fields: object) -> None:
     line = {"ts": time.time(), "process": "watchdog", "event": event, **fields}
-    # Nobody may be left who reads the log; that must not end the one who stops the wheels.
+    # A log without a reader must not end the process that stops the wheels.
     with suppress(OSError):
         sys.stderr.write(json.dumps(line) + "\n")
         sys.stderr.flush()
 
 
 def _terminate(signum: int, _frame: FrameType | None) -> None:
-    # Once is enough: a second signal must not interrupt the stop that the first one asked for.
+    # A second signal must not interrupt the stop that the first one requested.
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, signal.SIG_IGN)
     raise _Terminated(signal.Signals(signum).name)
 
 
 def stop_wheels(port: Port, command: bytes) -> bool:
-    """Write the stop; False (and logged) when the port takes nothing."""
+    """Write the stop command; log and return False when the port is lost."""
     try:
         port.write(command)
     except PortLost as error:
@@ -80,10 +80,10 @@ def stop_wheels(port: Port, command: bytes) -> bool:
 
 
 def hold(port: Port, command: bytes, seconds: float) -> None:
-    """Wait with the wheels held at zero: a stop may get lost on the line, and nobody else repeats it now.
+    """Wait with the wheels held at zero: a stop may get lost on the line, and no guardian repeats it.
 
     Raises:
-        PortLost: when the port is gone.
+        PortLost: when the port is lost.
 
     """
     until = time.monotonic() + seconds
@@ -92,23 +92,25 @@ def hold(port: Port, command: bytes, seconds: float) -> None:
         time.sleep(min(left, REPEAT_S))
 
 
-def _start_guardian(port: Port, beat_write: int, alive_read: int) -> subprocess.Popen[bytes]:
+def _start_guardian(port: Port, heartbeat_write: int, alive_read: int) -> subprocess.Popen[bytes]:
     environment = {
         **os.environ,
         "FOGNAV_BASE_FD": str(port.fileno()),
         "FOGNAV_BASE_PORT": port.path,
-        "FOGNAV_BEAT_FD": str(beat_write),
+        "FOGNAV_HEARTBEAT_FD": str(heartbeat_write),
         "FOGNAV_WATCHDOG_FD": str(alive_read),
     }
     return subprocess.Popen(
         [sys.executable, "-m", "robot_agent.guardian"],
         env=environment,
-        pass_fds=(port.fileno(), beat_write, alive_read),
+        pass_fds=(port.fileno(), heartbeat_write, alive_read),
     )
 
 
-def _watch(guardian: subprocess.Popen[bytes], beat_read: int, port: Port, hold_command: bytes, silence_s: float) -> str:
-    """Return why the guardian can't be trusted any more. Until its first beat the wheels are held at zero from here."""
+def _monitor(
+    guardian: subprocess.Popen[bytes], heartbeat_read: int, port: Port, hold_command: bytes, silence_s: float
+) -> str:
+    """Return when the guardian has ended or hangs, with the reason; hold the wheels until its first heartbeat."""
     starts_until: float | None = time.monotonic() + STARTUP_S
     while True:
         if starts_until is None:
@@ -116,46 +118,46 @@ def _watch(guardian: subprocess.Popen[bytes], beat_read: int, port: Port, hold_c
         else:
             port.write(hold_command)
             timeout = REPEAT_S
-        if select.select((beat_read,), (), (), timeout)[0]:
-            if not os.read(beat_read, 4096):
+        if select.select((heartbeat_read,), (), (), timeout)[0]:
+            if not os.read(heartbeat_read, 4096):
                 return "ended"
             starts_until = None
         elif starts_until is None or time.monotonic() > starts_until:
             guardian.kill()
-            return f"hung: no beat for {silence_s if starts_until is None else STARTUP_S:.3f} s, killed"
+            return f"hung: no heartbeat for {silence_s if starts_until is None else STARTUP_S:.3f} s, killed"
 
 
 def guard_once(port: Port, base: StopCommand, silence_s: float) -> int:
     """Run the guardian until it ends or hangs; the wheels are stopped when this returns. Returns its exit code.
 
     Raises:
-        PortLost: when the port is gone before the guardian's first beat.
+        PortLost: when the port is lost before the guardian's first heartbeat.
 
     """
-    beat_read, beat_write = os.pipe()
+    heartbeat_read, heartbeat_write = os.pipe()
     alive_read, alive_write = os.pipe()
-    os.set_blocking(beat_write, False)
-    guardian = _start_guardian(port, beat_write, alive_read)
-    os.close(beat_write)
+    os.set_blocking(heartbeat_write, False)
+    guardian = _start_guardian(port, heartbeat_write, alive_read)
+    os.close(heartbeat_write)
     os.close(alive_read)
     try:
-        reason = _watch(guardian, beat_read, port, base.hold, silence_s)
+        reason = _monitor(guardian, heartbeat_read, port, base.hold, silence_s)
         stopped = stop_wheels(port, base.stop)
         code = _end(guardian)
         _log("guardian_lost", reason=reason, exit_code=code, wheels_stopped=stopped)
         return code
     finally:
-        # We were told to end, and so is a guardian that still lives: it stops the wheels first.
+        # On a signal, end a guardian that still runs: it stops the wheels first.
         if guardian.poll() is None:
             guardian.terminate()
         os.close(alive_write)
-        os.close(beat_read)
+        os.close(heartbeat_read)
         _end(guardian)
         stop_wheels(port, base.stop)
 
 
 def _end(guardian: subprocess.Popen[bytes]) -> int:
-    """Wait for the end of the guardian, which knows of it; kill it when it does not end."""
+    """Wait for the guardian to end; kill it after a timeout."""
     try:
         return guardian.wait(TERMINATE_S)
     except subprocess.TimeoutExpired:
@@ -164,19 +166,19 @@ def _end(guardian: subprocess.Popen[bytes]) -> int:
 
 
 def refuse_speed(speed: float, device: str) -> str | None:
-    """Return why this device must not be guarded on a clock of this speed, or None.
+    """Return why this device must not be guarded on a clock of this speed; None when it may.
 
     All limits are in seconds of the clock. On a simulated base, a pty, the clock may be faster or slower; on a real
-    one a slow clock would let the wheels turn longer than any limit says.
+    one a slow clock would let the wheels turn longer than the limits allow.
     """
     if speed == 1.0 or device.startswith("/dev/pts/"):
         return None
-    return f"FOGNAV_SPEED is {speed:g}, but {device} is no simulated device: unset it, real wheels need real seconds"
+    return f"FOGNAV_SPEED is {speed:g}, but {device} is no simulated device: unset it, a real base needs real time"
 
 
 @dataclass(frozen=True, slots=True)
 class _Settings:
-    """What the environment says: the base's port, what stops it, and simulated over wall time."""
+    """Settings from the environment: the base's port, its stop command, and the ratio of simulated to wall time."""
 
     path: str
     base: StopCommand
@@ -187,7 +189,7 @@ def _settings() -> _Settings:
     """Read the environment.
 
     Raises:
-        _BadSettings: when a variable is missing or means nothing.
+        _BadSettings: when a variable is missing or invalid.
 
     """
     path = os.environ.get("FOGNAV_BASE_PORT", "")
@@ -207,27 +209,27 @@ def _settings() -> _Settings:
 
 
 def _guard(port: Port, settings: _Settings) -> int:
-    """Run one guardian after the other on an open port; returns PORT_LOST, or BAD_SETTINGS of the guardian.
+    """Run the guardian on an open port, again after each end; returns PORT_LOST, or BAD_SETTINGS of the guardian.
 
     Raises:
-        PortLost: when the port is gone before a guardian's first beat.
+        PortLost: when the port is lost before a guardian's first heartbeat.
         _BadSettings: when this port must not be guarded at this speed.
 
     """
     base, speed = settings.base, settings.speed
-    # First of all: a log that nobody reads must not keep the wheels turning.
+    # Before anything else: a blocked log must not keep the wheels turning.
     stop_wheels(port, base.stop)
     if (refusal := refuse_speed(speed, os.ttyname(port.fileno()))) is not None:
         raise _BadSettings(refusal)
     _log("port_open", path=settings.path)
-    silence_s = max(SILENCE_S / speed, SILENCE_LEAST_S)
+    silence_s = max(SILENCE_S / speed, SILENCE_MIN_S)
     while (code := guard_once(port, base, silence_s)) not in {PORT_LOST, BAD_SETTINGS}:
         hold(port, base.hold, RESTART_S / speed)
     return code
 
 
 def _guard_always(settings: _Settings) -> int:
-    """Open the port and guard it, again whenever it is lost; returns BAD_SETTINGS of the guardian."""
+    """Open the port and guard it, and reopen it whenever it is lost; returns BAD_SETTINGS of the guardian."""
     last_logged = ""
     while True:
         try:
@@ -243,7 +245,7 @@ def _guard_always(settings: _Settings) -> int:
 
 
 def main() -> int:
-    """Guard until told to end."""
+    """Guard until a signal ends the process."""
     try:
         settings = _settings()
         signal.signal(signal.SIGTERM, _terminate)

@@ -1,4 +1,4 @@
-"""A diffdrive board as a base: it reports by itself every 20 ms, and drives while its motors are on."""
+"""Driver of a diffdrive board: it sends its status every 20 ms, and drives while its motors are on."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from robot_agent.hardware import BaseFactory, BaseReading, BaseStatus, BaseTimin
 
 
 class DiffDriveOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The machine around the board; README.md beside this file lists the options."""
+    """Geometry and battery of the robot around the board; README.md beside this file lists the options."""
 
     counts_per_turn: Annotated[float, Meta(gt=0.0, le=1e6)] = 1440.0
     wheel_diameter_m: Annotated[float, Meta(ge=0.02, le=0.5)] = 0.09
@@ -32,9 +32,9 @@ class DiffDriveOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
 
 
 class DiffDriveDriver:
-    """One board's conversation; see `robot_agent.hardware.BaseDriver`."""
+    """One board's protocol; see `robot_agent.hardware.BaseDriver`."""
 
-    timing = BaseTiming(silence=0.3, wake=1.0, settle=0.1)
+    timing = BaseTiming(frame_timeout=0.3, wake_timeout=1.0, ignored_after_wake=0.1)
 
     def __init__(self, options: DiffDriveOptions) -> None:
         self._options = options
@@ -48,16 +48,16 @@ class DiffDriveDriver:
 
     @property
     def corrupted(self) -> int:
-        """Status lines that came damaged, or again."""
+        """Number of damaged or repeated status lines."""
         return self._parser.corrupted
 
     def receive_data(self, data: bytes, now: float) -> None:
-        """Take what the port gave."""
+        """Parse received bytes."""
         del now
         self._parser.receive_data(data)
 
     def next_event(self) -> BaseReading | None:
-        """Return the oldest status not yet taken."""
+        """Return the oldest status not yet returned."""
         status = self._parser.next_event()
         if status is None:
             return None
@@ -67,11 +67,11 @@ class DiffDriveDriver:
         return BaseReading(self._base_status(status), travel)
 
     def wake(self) -> bytes:
-        """Return zero speeds and the command that switches the motors on, after an end to whatever was cut off."""
+        """Return a line feed that ends a truncated line, zero speeds, and the command that switches the motors on."""
         return b"\n" + protocol.velocity(0, 0) + protocol.enable()
 
     def drive(self, left_m_s: float, right_m_s: float) -> bytes:
-        """Return the wheels' speeds; beyond what the base can do both are scaled, which keeps the curve."""
+        """Return the command for these wheel speeds; beyond the top speed both are scaled, which keeps the curve."""
         return protocol.wheels(left_m_s, right_m_s, self._options.wheel_speed_max_m_s)
 
     def _base_status(self, status: protocol.Status) -> BaseStatus:

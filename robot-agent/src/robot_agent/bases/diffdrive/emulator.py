@@ -1,7 +1,7 @@
-"""A diffdrive board as its serial port shows it.
+"""Emulator of a diffdrive board at its serial port.
 
-Pure: bytes, times and the state of the world go in, bytes and wheel speeds come out. Written from README.md beside this
-file alone, with a checksum of its own.
+Pure: bytes, times and the state of the world go in, bytes and wheel speeds come out. It is written from README.md
+beside this file and shares no code with the driver.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ SPEED_LIMIT_MM_S: Final = 2000
 STATUS_S: Final = 0.02
 TIMEOUT_S: Final = 0.3
 _LINE_LIMIT: Final = 64
-# A host that was away, or a simulation that paused, gets no burst of all that it missed.
+# After a pause of the host or the simulation, missed status lines are not sent in a burst.
 _CATCH_UP_LINES: Final = 20
 _IDLE_A: Final = 0.3
 _WHEEL_A_PER_M_S: Final = 1.5
 
 
 class DiffDriveEmulator:
-    """The board's end of the serial line, as `fognav_sim.devices.BaseEmulator` asks for it.
+    """The board's end of the serial line; implements `fognav_sim.devices.BaseEmulator`.
 
-    Whoever simulates the world sets the public attributes at any time. `refused` counts lines that were no command.
+    The simulation sets the public attributes at any time. `refused` counts lines that were no valid command.
     """
 
     def __init__(self) -> None:
@@ -70,17 +70,17 @@ class DiffDriveEmulator:
         return left, right
 
     def add_wheel_travel(self, left_m: float, right_m: float) -> None:
-        """Let the wheels roll this far, m; fractions of a count add up."""
+        """Roll the wheels this far (m); fractions of a count accumulate."""
         per_metre = COUNTS_PER_TURN / (math.pi * WHEEL_DIAMETER_M)
         self._counts[0] += left_m * per_metre
         self._counts[1] += right_m * per_metre
 
-    def feel(self, *, bump_left: bool, bump_right: bool, cliff: bool) -> None:
+    def set_sensors(self, *, bump_left: bool, bump_right: bool, cliff: bool) -> None:
         """Set bumper and cliff sensors."""
         self.bump_left, self.bump_right, self.cliff = bump_left, bump_right, cliff
 
     def tick(self, now: float, dt: float) -> None:
-        """Let dt seconds pass up to `now`: emergency button, the board's own watchdog, battery, status lines."""
+        """Advance time by dt (s) to `now`: emergency button, the board's own timeout, battery, status lines."""
         if self.emergency_button:
             self._switch_off()
         if self.enabled and now - self._commanded_at > self.timeout_s:
@@ -92,10 +92,10 @@ class DiffDriveEmulator:
         self._report_until(now)
 
     def receive(self, data: bytes, now: float) -> None:
-        """Take bytes from the host; whole lines act at once."""
+        """Receive bytes from the host; whole lines take effect immediately."""
         for byte in data:
             if byte == 0x0A:
-                self._take_line(self._incoming, now)
+                self._handle_line(self._incoming, now)
                 self._incoming = b""
             elif byte == 0x24:
                 self._incoming = b"$"
@@ -108,7 +108,7 @@ class DiffDriveEmulator:
         sent, self._outgoing = self._outgoing, b""
         return sent
 
-    def _take_line(self, text: bytes, now: float) -> None:
+    def _handle_line(self, text: bytes, now: float) -> None:
         if not text:
             return
         body, star, check = text[1:].partition(b"*")

@@ -1,6 +1,6 @@
-"""The diffdrive text protocol: commands as bytes, status lines as typed values. README.md beside this is its text.
+"""The diffdrive text protocol: commands as bytes, status lines as typed values.
 
-Nothing here touches a port or a clock.
+README.md beside this file is the specification. Nothing here touches a port or a clock.
 """
 
 from __future__ import annotations
@@ -70,8 +70,8 @@ def velocity(left_mm_s: int, right_mm_s: int) -> bytes:
     return line(b"V,%d,%d" % (left_mm_s, right_mm_s))
 
 
-def wheels(left_m_s: float, right_m_s: float, fastest_m_s: float) -> bytes:
-    """Build `velocity` from m/s; beyond `fastest_m_s` both wheels are scaled alike, which keeps the curve.
+def wheels(left_m_s: float, right_m_s: float, speed_max_m_s: float) -> bytes:
+    """Build `velocity` from m/s; beyond `speed_max_m_s` both wheels are scaled alike, which keeps the curve.
 
     Raises:
         ValueError: if a speed is not finite.
@@ -79,16 +79,16 @@ def wheels(left_m_s: float, right_m_s: float, fastest_m_s: float) -> bytes:
     """
     if not (math.isfinite(left_m_s) and math.isfinite(right_m_s)):
         raise ValueError(f"wheel speeds must be finite: left {left_m_s}, right {right_m_s} m/s")
-    faster = max(abs(left_m_s), abs(right_m_s))
-    scale = 1000.0 * min(1.0, fastest_m_s / faster) if faster else 0.0
+    fastest = max(abs(left_m_s), abs(right_m_s))
+    scale = 1000.0 * min(1.0, speed_max_m_s / fastest) if fastest else 0.0
     return velocity(round(left_m_s * scale), round(right_m_s * scale))
 
 
 class StatusParser:
-    """Bytes of the board -> status lines. Never raises on what it is fed; goes on with the next line after damage.
+    """Bytes of the board -> status lines. Never raises, whatever the bytes are; damage affects single lines only.
 
-    `corrupted` counts pieces between two line feeds that were more or less than one whole, right and new status line,
-    except what came before the first good one: its beginning was sent before anybody listened.
+    `corrupted` counts lines that were not exactly one whole, correct and new status line, except before the first good
+    one: reception may start in the middle of a line.
     """
 
     def __init__(self) -> None:
@@ -98,12 +98,12 @@ class StatusParser:
         self.corrupted = 0
 
     def receive_data(self, data: bytes) -> None:
-        """Take what a port gave, in pieces of any size."""
+        """Parse received bytes, in pieces of any size."""
         *lines, rest = (self._buffer + data).split(b"\n")
-        # No line is longer; the byte more tells that there was something before it.
+        # No line is longer; one byte more shows that something precedes it.
         self._buffer = rest[-LINE_BYTES_MAX:]
         for piece in lines:
-            # A dollar sign begins a line, whatever came before: the rest of a line whose end got lost.
+            # A dollar sign begins a line, even after the rest of a line whose end got lost.
             begin = max(0, piece.rfind(b"$"))
             status = _decode(piece[begin:])
             fresh = status is not None and status.number != self._number
@@ -114,7 +114,7 @@ class StatusParser:
                 self._events.append(status)
 
     def next_event(self) -> Status | None:
-        """Oldest status not yet taken, or None: feed more bytes."""
+        """Return the oldest status not yet returned; None until more bytes are received."""
         return self._events.popleft() if self._events else None
 
 

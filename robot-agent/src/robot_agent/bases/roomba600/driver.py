@@ -1,4 +1,4 @@
-"""The Roomba 600 as a base: Open Interface in Safe mode, all that can stop it streamed every 15 ms.
+"""Driver of the Roomba 600: Open Interface in Safe mode, with its safety sensors streamed every 15 ms.
 
 A Roomba keeps its last velocity while the host is silent. Safe mode falls back to Passive by itself on cliff, wheel
 drop and charger, and stops the wheels then; the bumper is left to the host.
@@ -20,7 +20,7 @@ _COUNTS: Final = 1 << 16
 
 
 class Roomba600Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What turns encoder ticks into motion. Defaults: Open Interface specification, packets 43 and 44.
+    """Geometry that converts encoder ticks to motion. Defaults: Open Interface specification, packets 43 and 44.
 
     Calibrate them: out of the box a turn may be off by a tenth, because the wheels are soft and the axle's effective
     length depends on the floor.
@@ -32,9 +32,9 @@ class Roomba600Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
 
 
 class Roomba600Driver:
-    """One Roomba's conversation; see `robot_agent.hardware.BaseDriver`."""
+    """One Roomba's protocol; see `robot_agent.hardware.BaseDriver`."""
 
-    timing = BaseTiming(silence=0.3, wake=1.0, settle=0.1)
+    timing = BaseTiming(frame_timeout=0.3, wake_timeout=1.0, ignored_after_wake=0.1)
 
     def __init__(self, options: Roomba600Options) -> None:
         self._parser = oi.StreamParser(oi.GUARDIAN_STREAM)
@@ -47,28 +47,28 @@ class Roomba600Driver:
 
     @property
     def corrupted(self) -> int:
-        """Stream frames that came damaged."""
+        """Number of damaged stream frames."""
         return self._parser.corrupted
 
     def receive_data(self, data: bytes, now: float) -> None:
-        """Take what the port gave."""
+        """Parse received bytes."""
         del now
         self._parser.receive_data(data)
 
     def next_event(self) -> BaseReading | None:
-        """Return the oldest frame not yet taken."""
+        """Return the oldest frame not yet returned."""
         frame = self._parser.next_event()
         return None if frame is None else BaseReading(_status(frame), self._odometry(frame))
 
     def wake(self) -> bytes:
         """Return Start, Safe, zero speed and the request for the stream."""
         # Start puts the OI into Passive mode, which stops the wheels by itself. The zeros after Safe are for a base
-        # whose receiver was in the middle of a command: that takes Start, Safe and the beginning of the first zero for
-        # its missing bytes, and what speed they make ends with the second.
+        # whose receiver was in the middle of a command: it takes Start, Safe and the beginning of the first zero speed
+        # as the missing bytes, and the second zero speed ends whatever speed they make.
         return oi.start() + oi.safe() + 2 * oi.drive_direct(0, 0) + oi.stream(oi.GUARDIAN_STREAM)
 
     def drive(self, left_m_s: float, right_m_s: float) -> bytes:
-        """Return Drive Direct; speeds beyond what the base can do are scaled, which keeps the curve."""
+        """Return Drive Direct; speeds beyond the top speed are scaled, which keeps the curve."""
         return oi.drive_wheels(left_m_s, right_m_s)
 
     def _odometry(self, frame: oi.Frame) -> WheelOdometry:
@@ -94,8 +94,8 @@ def _mode_problem(frame: oi.Frame) -> str | None:
     if frame.mode == oi.Mode.SAFE:
         return None
     name = frame.mode.name.capitalize() if isinstance(frame.mode, oi.Mode) else f"number {frame.mode}"
-    why = ", because it has contact to a charger" if frame.on_charger else ""
-    return f"its Open Interface is in mode {name} instead of Safe{why}"
+    reason = ", because a charger is connected" if frame.on_charger else ""
+    return f"its Open Interface is in mode {name} instead of Safe{reason}"
 
 
 FACTORY: Final = BaseFactory(options=Roomba600Options, make=Roomba600Driver, stop=STOP)

@@ -1,11 +1,11 @@
-"""A Roomba 600 as its serial port shows it: the Open Interface's modes, commands, sensors and stream.
+"""Emulator of a Roomba 600 at its serial port: the Open Interface's modes, commands, sensors and stream.
 
 Pure: bytes, times and the state of the world go in, bytes and wheel speeds come out.
 Source: iRobot Create 2 Open Interface specification based on the Roomba 600 (2018). Where it is silent:
 a byte that is no opcode is ignored; speeds and radii out of range are clamped; Spot, Clean, Max and Seek Dock end in
-Passive mode with the wheels at rest (what the firmware would drive then is the world's business, see `seeking_dock`);
+Passive mode with the wheels at rest (the simulation may drive it to the dock, see `seeking_dock`);
 Power puts the robot to sleep in Passive mode with its stream off; the encoders survive everything but Reset.
-Not shown: the five minutes after which Passive mode sleeps, songs, LEDs, brushes, schedules, other baud rates (their
+Not emulated: the five minutes after which Passive mode sleeps, songs, LEDs, brushes, schedules, other baud rates (their
 commands are accepted and have no effect).
 """
 
@@ -24,10 +24,10 @@ AXLE_MM: Final = 235.0
 SPEED_MAX_MM_S: Final = 500
 RADIUS_MAX_MM: Final = 2000
 STREAM_PERIOD_S: Final = 0.015
-# A host that was away, or a simulation that paused, gets no burst of all that it missed.
+# After a pause of the host or the simulation, missed frames are not sent in a burst.
 _CATCH_UP_FRAMES: Final = 20
 
-# Bytes of data after each opcode. 140, 148 and 149 say in their data how many follow.
+# Bytes of data after each opcode. The data of 140, 148 and 149 begin with the number of bytes that follow.
 _ARGUMENTS: Final = {
     7: 0, 128: 0, 129: 1, 130: 0, 131: 0, 132: 0, 133: 0, 134: 0, 135: 0, 136: 0, 137: 4, 138: 1, 139: 3, 140: 2,
     141: 1, 142: 1, 143: 0, 144: 3, 145: 4, 146: 4, 148: 1, 149: 1, 150: 1, 162: 2, 163: 4, 164: 4, 165: 1, 167: 15,
@@ -41,12 +41,12 @@ _GROUPS: Final = {
 }  # fmt: skip
 
 BOOT_TEXT: Final = b"bl-start\r\nSTR730\r\nbootloader id: #x47186549 82ECCFFF\r\nbootloader info rev: #xF000\r\n"
-"""What a robot of the 600 series prints when it resets; hosts have to live through it."""
+"""Text that a robot of the 600 series prints when it resets."""
 
 
 @dataclass(slots=True)
 class World:
-    """What the robot feels; whoever simulates the world sets it at any time."""
+    """State of the robot's sensors; the simulation sets it at any time."""
 
     bump_left: bool = False
     bump_right: bool = False
@@ -82,7 +82,7 @@ class World:
 
 @dataclass(slots=True)
 class Battery:
-    """A NiMH pack of twelve cells: an open-circuit voltage over the charge, less what the inner resistance takes.
+    """A NiMH pack of twelve cells: an open-circuit voltage over the charge, minus the drop over the inner resistance.
 
     The constants are round figures for a 14.4 V pack; they bring a robot from full to empty in three to six hours.
     """
@@ -93,7 +93,7 @@ class Battery:
     resistance_ohm: float = 0.25
 
     def use(self, current_ma: float, dt: float) -> None:
-        """Let a current flow, mA, positive into the pack, for dt seconds."""
+        """Charge or discharge with a current (mA, positive into the pack) for dt seconds."""
         self.current_ma = current_ma
         self.charge_mah = min(self.capacity_mah, max(0.0, self.charge_mah + current_ma * dt / 3600.0))
 
@@ -112,11 +112,11 @@ _TRICKLE_MA: Final = 60.0
 
 
 class RoombaEmulator:
-    """The robot's end of the serial line, as `fognav_sim.devices.BaseEmulator` asks for it.
+    """The robot's end of the serial line; implements `fognav_sim.devices.BaseEmulator`.
 
-    The world calls `tick(now, dt)`, reads `wheel_speeds_m_s`, moves its robot, tells how far the wheels really rolled
-    by `add_wheel_travel`, and sets `world`. The port calls `receive` and `outgoing`. `now` is any monotonic clock,
-    seconds. As the real one, it keeps its last speeds for ever while the host is silent.
+    The simulation calls `tick(now, dt)`, reads `wheel_speeds_m_s`, moves its robot, reports the true travel of the
+    wheels by `add_wheel_travel`, and sets `world`. The port calls `receive` and `outgoing`. `now` is any monotonic
+    clock (s). Like the real robot, it keeps its last speeds for ever while the host is silent.
     """
 
     def __init__(self, *, left_encoder: int = 0, right_encoder: int = 0, battery: Battery | None = None) -> None:
@@ -146,7 +146,7 @@ class RoombaEmulator:
         """Distance between the wheels, m."""
         return AXLE_MM / 1000.0
 
-    def feel(self, *, bump_left: bool, bump_right: bool, cliff: bool) -> None:
+    def set_sensors(self, *, bump_left: bool, bump_right: bool, cliff: bool) -> None:
         """Set bumper and cliff sensors at once; everything else is in `world`."""
         self.world.bump_left, self.world.bump_right = bump_left, bump_right
         self.world.cliff_left = self.world.cliff_right = cliff
@@ -165,7 +165,7 @@ class RoombaEmulator:
         return left, right
 
     def add_wheel_travel(self, left_m: float, right_m: float) -> None:
-        """Let the wheels roll this far, metres; fractions of a tick add up."""
+        """Roll the wheels this far (m); fractions of a tick accumulate."""
         per_metre = TICKS_PER_TURN / (math.pi * WHEEL_DIAMETER_M)
         self._ticks[0] += left_m * per_metre
         self._ticks[1] += right_m * per_metre
@@ -173,7 +173,7 @@ class RoombaEmulator:
         self._angle_deg += math.degrees((right_m - left_m) * 1000.0 / AXLE_MM)
 
     def tick(self, now: float, dt: float) -> None:
-        """Let dt seconds pass up to `now`: protection, battery and the stream."""
+        """Advance time by dt (s) to `now`: protection, battery and the stream."""
         self._protect()
         moving = sum(abs(speed) for speed in self.wheel_speeds_m_s)
         if self.world.powered:
@@ -186,7 +186,7 @@ class RoombaEmulator:
         self._stream_until(now)
 
     def receive(self, data: bytes, now: float) -> None:
-        """Take bytes from the host; whole commands act at once."""
+        """Receive bytes from the host; whole commands take effect immediately."""
         self._incoming += data
         while self._incoming:
             opcode = self._incoming[0]
@@ -268,7 +268,7 @@ class RoombaEmulator:
         self._wheels_mm_s = (left, right)
 
     def _leave(self, mode: int, *, keep_stream: bool = False) -> None:
-        """Stop the motors and fall to a mode in which the host does not drive."""
+        """Stop the motors and enter a mode in which the host does not drive."""
         self.mode = mode
         self._wheels_mm_s = (0, 0)
         self._requested = (0, 0)
@@ -276,10 +276,10 @@ class RoombaEmulator:
         self._streaming = self._streaming and keep_stream
 
     def _protect(self) -> None:
-        """Safe mode's own protection: cliff while moving forward, wheel drop, charger. The bumper is the host's."""
+        """Safe mode's own protection: cliff while moving forward, wheel drop, charger; not bumper."""
         if self.mode != SAFE:
             return
-        # Backwards the specification lets a cliff pass, unless the robot turns within its own radius.
+        # Backwards the specification ignores a cliff, unless the robot turns within its own radius.
         left, right = self._wheels_mm_s
         forward_or_turning = left > 0 or right > 0 or left == right == 0
         if self.world.wheel_drop or self.world.powered or (self.world.cliff and forward_or_turning):
@@ -391,6 +391,6 @@ def _bits(*flags: bool) -> int:
 
 
 def _whole(amount: float) -> tuple[int, float]:
-    """Cut an amount that has gathered into whole units, which are handed out and forgotten, and the rest."""
+    """Split an accumulated amount into whole units, which are reported once, and the rest."""
     whole = max(-0x8000, min(0x7FFF, math.trunc(amount)))
     return whole, amount - math.trunc(amount)

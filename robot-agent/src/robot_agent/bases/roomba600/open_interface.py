@@ -132,12 +132,12 @@ GROUPS: Final[Mapping[int, tuple[int, int]]] = {
 """Group id -> first and last packet in it, both included."""
 
 GUARDIAN_STREAM: Final = (7, 9, 10, 11, 12, 13, 14, 21, 22, 23, 25, 26, 34, 35, 41, 42, 43, 44)
-"""What the guardian streams: all that can stop the robot, the battery, the wheel speeds that the robot believes were
-asked of it, and the encoders. 47 bytes a frame, of 172 possible."""
+"""Packets that the guardian streams: all safety sensors, the battery, the wheel speeds that the robot was last
+commanded, and the encoders. 47 bytes a frame, of 172 possible."""
 
 
 def expand(ids: Iterable[int]) -> tuple[int, ...]:
-    """Single packet ids that a list of packet and group ids stands for, in wire order.
+    """Return the single packet ids of a list of packet and group ids, in wire order.
 
     Raises:
         ValueError: for an id that the Open Interface does not have.
@@ -156,7 +156,7 @@ def expand(ids: Iterable[int]) -> tuple[int, ...]:
 
 
 def data_size(packet_id: int) -> int:
-    """Bytes of data that a packet or group id brings. Raises ValueError for an unknown id."""
+    """Return the size (bytes) of the data of a packet or group id. Raises ValueError for an unknown id."""
     return sum(PACKETS[single].size for single in expand((packet_id,)))
 
 
@@ -175,7 +175,7 @@ def decode_packets(ids: Iterable[int], data: bytes) -> dict[int, int]:
     single = expand(ids)
     layout = struct.Struct(">" + "".join(_format(PACKETS[packet_id]) for packet_id in single))
     if layout.size != len(data):
-        raise ValueError(f"packets {single} need {layout.size} bytes of data, got {len(data)}: the answer is cut")
+        raise ValueError(f"packets {single} need {layout.size} bytes of data, got {len(data)}: the answer is truncated")
     return dict(zip(single, layout.unpack(data), strict=True))
 
 
@@ -275,7 +275,7 @@ def pause_stream() -> bytes:
 
 
 def resume_stream() -> bytes:
-    """Resume the stream with the list that was asked for last (150 1)."""
+    """Resume the stream with the list that was requested last (150 1)."""
     return b"\x96\x01"
 
 
@@ -286,7 +286,7 @@ class MissingPacketError(LookupError):
     """A frame was asked for a packet that the stream does not carry."""
 
     def __init__(self, packet_id: int, present: Iterable[int]) -> None:
-        """Name the packet and what there is."""
+        """Name the missing packet and those present."""
         super().__init__(
             f"packet {packet_id} ({PACKETS[packet_id].name}) is not in this frame: it has {sorted(present)}; "
             "add it to the ids given to stream()"
@@ -376,7 +376,7 @@ class Frame:
 
     @property
     def charging_state(self) -> ChargingState | int:
-        """What the charger does (packet 21); a bare int for a value that the specification does not name."""
+        """State of the charger (packet 21); a bare int for a value that the specification does not name."""
         return _named(ChargingState, self[21])
 
     @property
@@ -407,7 +407,7 @@ class Frame:
 
     @property
     def requested_wheels_m_s(self) -> tuple[float, float]:
-        """(left, right) speeds that the robot was last asked for, m/s (packets 42 and 41)."""
+        """(left, right) speeds that the robot was last commanded, m/s (packets 42 and 41)."""
         return self[42] / 1000.0, self[41] / 1000.0
 
     @property
@@ -423,8 +423,8 @@ def _named(kind: type[_Enum], value: int) -> _Enum | int:
         return value
 
 
-class _Verdict(IntEnum):
-    MORE = 0
+class _FrameCheck(IntEnum):
+    INCOMPLETE = 0
     VALID = 1
     NO_FRAME = 2
     BAD_CHECKSUM = 3
@@ -434,10 +434,10 @@ _SIZES: Final = {packet_id: data_size(packet_id) for packet_id in (*PACKETS, *GR
 
 
 class StreamParser:
-    """Bytes of the sensor stream -> frames. Never raises on what it is fed; finds the next frame after garbage.
+    """Bytes of the sensor stream -> frames. Never raises, whatever the bytes are; resynchronizes after garbage.
 
-    With `ids`, only frames that carry exactly these packets pass: the eight-bit checksum alone would let one in 256
-    damaged frames through, and the ids are further bytes that have to be right.
+    With `ids`, only frames with exactly these packets are accepted: the eight-bit checksum alone would accept one
+    in 256 damaged frames, and the ids are further bytes to check.
 
     `corrupted` counts damaged frames (once per loss of the frame boundary, and every frame whose checksum is wrong);
     `skipped_bytes` counts every byte that belonged to no valid frame.
@@ -456,63 +456,63 @@ class StreamParser:
         self.skipped_bytes = 0
 
     def receive_data(self, data: bytes) -> None:
-        """Take what a port gave, in pieces of any size."""
+        """Parse received bytes, in pieces of any size."""
         self._buffer += data
-        at = 0
-        while at < len(self._buffer):
-            verdict = self._judge(at)
-            if verdict is _Verdict.MORE:
+        position = 0
+        while position < len(self._buffer):
+            check = self._check_frame(position)
+            if check is _FrameCheck.INCOMPLETE:
                 break
-            if verdict is _Verdict.VALID:
-                end = at + 2 + self._buffer[at + 1]
-                self._events.append(Frame(self._decode(at + 2, end)))
+            if check is _FrameCheck.VALID:
+                end = position + 2 + self._buffer[position + 1]
+                self._events.append(Frame(self._decode(position + 2, end)))
                 self.frames += 1
                 self._synced = True
-                at = end + 1
+                position = end + 1
                 continue
-            if self._synced or verdict is _Verdict.BAD_CHECKSUM:
+            if self._synced or check is _FrameCheck.BAD_CHECKSUM:
                 self.corrupted += 1
             self._synced = False
-            found = self._buffer.find(STREAM_HEADER, at + 1)
+            found = self._buffer.find(STREAM_HEADER, position + 1)
             following = len(self._buffer) if found < 0 else found
-            self.skipped_bytes += following - at
-            at = following
-        del self._buffer[:at]
+            self.skipped_bytes += following - position
+            position = following
+        del self._buffer[:position]
 
     def next_event(self) -> Frame | None:
-        """Oldest frame not yet taken, or None: feed more bytes."""
+        """Return the oldest frame not yet returned; None until more bytes are received."""
         return self._events.popleft() if self._events else None
 
     def reset(self) -> None:
-        """Forget half a frame, after the port was reopened; counters stay."""
+        """Discard an incomplete frame, after the port was reopened; counters are kept."""
         self._buffer.clear()
         self._events.clear()
         self._synced = False
 
-    def _judge(self, at: int) -> _Verdict:  # noqa: PLR0911  # each way in which bytes are no frame ends it at once
+    def _check_frame(self, begin: int) -> _FrameCheck:  # noqa: PLR0911  # each way in which bytes are no frame ends it at once
         buffer = self._buffer
-        if buffer[at] != STREAM_HEADER:
-            return _Verdict.NO_FRAME
-        if at + 1 == len(buffer):
-            return _Verdict.MORE
-        length = buffer[at + 1]
+        if buffer[begin] != STREAM_HEADER:
+            return _FrameCheck.NO_FRAME
+        if begin + 1 == len(buffer):
+            return _FrameCheck.INCOMPLETE
+        length = buffer[begin + 1]
         if not length or (self._length is not None and length != self._length):
-            return _Verdict.NO_FRAME
-        # The ids must lead exactly to the checksum; a false header shows as soon as one does not.
-        cursor, end, index = at + 2, at + 2 + length, 0
+            return _FrameCheck.NO_FRAME
+        # The ids must lead exactly to the checksum; otherwise this was no header.
+        cursor, end, index = begin + 2, begin + 2 + length, 0
         while cursor < end:
             if cursor >= len(buffer):
-                return _Verdict.MORE
+                return _FrameCheck.INCOMPLETE
             size = _SIZES.get(buffer[cursor])
             if size is None or (self._ids is not None and buffer[cursor] != self._ids[index]):
-                return _Verdict.NO_FRAME
+                return _FrameCheck.NO_FRAME
             cursor += 1 + size
             index += 1
         if cursor != end:
-            return _Verdict.NO_FRAME
+            return _FrameCheck.NO_FRAME
         if end >= len(buffer):
-            return _Verdict.MORE
-        return _Verdict.BAD_CHECKSUM if sum(buffer[at : end + 1]) & 0xFF else _Verdict.VALID
+            return _FrameCheck.INCOMPLETE
+        return _FrameCheck.BAD_CHECKSUM if sum(buffer[begin : end + 1]) & 0xFF else _FrameCheck.VALID
 
     def _decode(self, cursor: int, end: int) -> dict[int, int]:
         packets: dict[int, int] = {}

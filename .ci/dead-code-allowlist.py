@@ -84,7 +84,7 @@ _.start_router
 _.save_map
 _.find_channel
 _.person_at
-_.beats  # counters and views that tests assert on
+_.ticks  # counters and views that tests assert on
 _.frames
 _.lost_bytes
 _.particles

@@ -112,15 +112,15 @@ def copy_of_estig(folder: Path) -> Path:
 @pytest.mark.parametrize(
     ("file", "content", "words"),
     [
-        ("map.pgm", b"P5\n10 x\n255\n", ["map.yaml: image:", "map.pgm can't be decoded", "Save it anew, as PGM"]),
+        ("map.pgm", b"P5\n10 x\n255\n", ["map.yaml: image:", "map.pgm can't be decoded", "Save it again as PGM"]),
         ("map.pgm", b"P5\n2040 1140\n255\n" + bytes(5000), ["map.pgm can't be decoded", "truncated"]),
-        ("map.pgm", None, ["map.yaml: image:", "map.pgm is no file", "Put the image there"]),
+        ("map.pgm", None, ["map.yaml: image:", "map.pgm is not a file", "Put the image there"]),
         ("map.yaml", b"resolution: 0.05\n", ["map.yaml: image: missing", "Name the image file"]),
-        ("map.yaml", b"image: [\n:::", ["map.yaml is no valid YAML (line 2, column 1: ", "Correct that place"]),
-        ("map.yaml", b"\x89PNG\xff", ["map.yaml is no text", "not the image"]),
+        ("map.yaml", b"image: [\n:::", ["map.yaml is not valid YAML (line 2, column 1: ", "Correct that line"]),
+        ("map.yaml", b"\x89PNG\xff", ["map.yaml is not a text file", "not the image"]),
         ("map.yaml", None, ["map.yaml can't be read (Is a directory)", "check the path"]),
-        ("site.toml", b"id = = 3", ["site.toml is no valid TOML (Invalid value (at line 1, column 6))"]),
-        ("site.toml", b'nmae = "x"\nid = "estig"', ["site.toml: nmae: is no field", "Correct its spelling"]),
+        ("site.toml", b"id = = 3", ["site.toml is not valid TOML (Invalid value (at line 1, column 6))"]),
+        ("site.toml", b'nmae = "x"\nid = "estig"', ["site.toml: nmae: is not a field", "Correct its spelling"]),
     ],
 )
 def test_a_demo_refuses_a_broken_site_by_file_field_and_remedy(
@@ -151,7 +151,9 @@ def test_a_site_is_checked_by_its_name_as_well() -> None:
 def test_an_image_in_place_of_a_map_file_is_told_so(tmp_path: Path) -> None:
     image = copy_of_estig(tmp_path) / "map.pgm"
     told = said("site", "new", "--map", image, "--out", tmp_path / "new")
-    assert told.endswith("map.pgm is no text. A map is a YAML file that names an image: name that file, not the image")
+    assert told.endswith(
+        "map.pgm is not a text file. A map is a YAML file that names an image: name that file, not the image"
+    )
     assert not (tmp_path / "new").exists()
 
 

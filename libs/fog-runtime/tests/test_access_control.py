@@ -1,4 +1,4 @@
-"""The generated access control lists on a real Mosquitto and a real zenoh router: what is allowed works, no more."""
+"""The generated access control lists in a real Mosquitto and zenoh router: they allow what they should and no more."""
 
 import asyncio
 import contextlib
@@ -32,36 +32,36 @@ WAIT_S = 15.0
 def broker(tmp_path_factory):
     folder = tmp_path_factory.mktemp("broker")
     (folder / "acl").write_text(mqtt_acl("lab"))
-    # Names without passwords: this is about what a name is allowed.
+    # User names without passwords: only authorization is tested here.
     with start_mosquitto(folder, extra=f"acl_file {folder}/acl") as server:
         yield server
 
 
 @contextlib.contextmanager
 def mqtt_client(broker, user):
-    """Give a connected client of this name; what it is sent goes into `received`."""
+    """Yield a connected client with this user name; the messages that it receives go into `received`."""
     client = paho.Client(CallbackAPIVersion.VERSION2, protocol=paho.MQTTv5)
     if user is not None:
         client.username_pw_set(user)
-    client.received, client.done = queue.Queue(), queue.Queue()
-    client.on_connect = lambda *_: client.done.put("connected")
-    client.on_subscribe = lambda *_: client.done.put("subscribed")
-    client.on_publish = lambda _client, _data, _mid, code, _properties: client.done.put(code.getName())
+    client.received, client.acknowledged = queue.Queue(), queue.Queue()
+    client.on_connect = lambda *_: client.acknowledged.put("connected")
+    client.on_subscribe = lambda *_: client.acknowledged.put("subscribed")
+    client.on_publish = lambda _client, _data, _mid, code, _properties: client.acknowledged.put(code.getName())
     client.on_message = lambda _client, _data, message: client.received.put((message.topic, message.payload))
     client.connect("127.0.0.1", broker.port)
     client.loop_start()
     try:
-        assert client.done.get(timeout=WAIT_S) == "connected"
+        assert client.acknowledged.get(timeout=WAIT_S) == "connected"
         yield client
     finally:
         client.disconnect()
         client.loop_stop()
 
 
-def published(client, topic, payload=b"x", *, retain=False):
-    """Publish with QoS 1 and return what the broker answers: of QoS 0 a refusal can't be seen."""
+def publish_result(client, topic, payload=b"x", *, retain=False):
+    """Publish with QoS 1 and return the broker's reason code: with QoS 0 a refusal is not reported."""
     client.publish(topic, payload, qos=1, retain=retain)
-    return client.done.get(timeout=WAIT_S)
+    return client.acknowledged.get(timeout=WAIT_S)
 
 
 def lab(channel, **ids):
@@ -81,9 +81,9 @@ HAZARD = lab(ch.AREA_HAZARD, area="hall")
         ("hazard-aggregator", lab(ch.NODE_CONFIG, node="n1")), ("thesis-node", ch.THESIS_AREA.key(number="3")),
     ],
 )  # fmt: skip
-def test_the_broker_takes_what_a_role_may_publish(broker, user, topic):
+def test_broker_accepts_topics_that_a_role_may_publish(broker, user, topic):
     with mqtt_client(broker, user) as client:
-        assert published(client, topic) in {"Success", "No matching subscribers"}
+        assert publish_result(client, topic) in {"Success", "No matching subscribers"}
 
 
 @pytest.mark.parametrize(
@@ -96,29 +96,29 @@ def test_the_broker_takes_what_a_role_may_publish(broker, user, topic):
         ("map-service", HAZARD), ("recorder", READING), ("hazard-aggregator", READING),
     ],
 )  # fmt: skip
-def test_the_broker_refuses_what_a_role_may_not_publish(broker, user, topic):
+def test_broker_refuses_topics_that_a_role_may_not_publish(broker, user, topic):
     with mqtt_client(broker, user) as client:
-        assert published(client, topic) == "Not authorized"
+        assert publish_result(client, topic) == "Not authorized"
 
 
-def test_the_broker_gives_each_role_its_own_messages_only(broker):
+def test_broker_delivers_to_each_role_only_what_it_may_receive(broker):
     with contextlib.ExitStack() as stack:
         users = ("hazard-aggregator", "map-service", "n1", "n2", "recorder", None)
         clients = {user: stack.enter_context(mqtt_client(broker, user)) for user in users}
         for client in clients.values():
             client.subscribe([("fog/#", 1), ("WSN", 1), ("area 3", 1)])
-            assert client.done.get(timeout=WAIT_S) == "subscribed"
+            assert client.acknowledged.get(timeout=WAIT_S) == "subscribed"
         thesis = stack.enter_context(mqtt_client(broker, "thesis-node"))
         aggregator = clients["hazard-aggregator"]
         config = {node: lab(ch.NODE_CONFIG, node=node) for node in ("n1", "n2")}
-        assert published(clients["n1"], READING, b"reading") == "Success"
-        assert published(thesis, "area 3", b"blocked") == "Success"
-        assert published(aggregator, HAZARD, b"hazard") == "Success"
+        assert publish_result(clients["n1"], READING, b"reading") == "Success"
+        assert publish_result(thesis, "area 3", b"blocked") == "Success"
+        assert publish_result(aggregator, HAZARD, b"hazard") == "Success"
         for topic in config.values():
-            assert published(aggregator, topic, b"config") == "Success"
-        # The broker delivers to one client in order: with the last message all that were allowed have come.
-        assert published(aggregator, "WSN", b"end") == "Success"
-        assert published(aggregator, lab(ch.AREA_DEFINITION, area="hall"), b"end") == "Success"
+            assert publish_result(aggregator, topic, b"config") == "Success"
+        # The broker delivers to each client in order: after the last message all allowed ones have arrived.
+        assert publish_result(aggregator, "WSN", b"end") == "Success"
+        assert publish_result(aggregator, lab(ch.AREA_DEFINITION, area="hall"), b"end") == "Success"
         sent = [(READING, b"reading"), ("area 3", b"blocked"), (HAZARD, b"hazard"),
                 *((topic, b"config") for topic in config.values()), ("WSN", b"end")]  # fmt: skip
         end = (lab(ch.AREA_DEFINITION, area="hall"), b"end")
@@ -128,14 +128,16 @@ def test_the_broker_gives_each_role_its_own_messages_only(broker):
             "n1": [(config["n1"], b"config")],
             "n2": [(config["n2"], b"config")],
         }
-        got = {user: [clients[user].received.get(timeout=WAIT_S) for _ in wanted] for user, wanted in expected.items()}
-        assert got == expected
-        heard = [aggregator.received.get(timeout=WAIT_S) for _ in range(3)]
-        assert heard[:2] == [(READING, b"reading"), ("area 3", b"blocked")]
+        received = {
+            user: [clients[user].received.get(timeout=WAIT_S) for _ in messages] for user, messages in expected.items()
+        }
+        assert received == expected
+        first = [aggregator.received.get(timeout=WAIT_S) for _ in range(3)]
+        assert first[:2] == [(READING, b"reading"), ("area 3", b"blocked")]
         for user in ("n1", "n2", "map-service", None):
-            # An answer to a question of its own comes after everything that was sent to it before.
+            # The acknowledgement of a subscription arrives after every message that was sent to the client before.
             clients[user].subscribe("$SYS/none", 1)
-            assert clients[user].done.get(timeout=WAIT_S) == "subscribed"
+            assert clients[user].acknowledged.get(timeout=WAIT_S) == "subscribed"
             assert clients[user].received.empty(), user
 
 
@@ -146,7 +148,7 @@ ROLES = ("hazard-aggregator", "map-service", "planner", "console", "recorder", "
 
 @contextlib.contextmanager
 def zenoh_router(folder, acl):
-    """Run a router with this access control; every user's password is its name."""
+    """Run a router with this access control; each user's password is the user name."""
     (folder / "users").write_text("".join(f"{role}:{role}\n" for role in ROLES))
     (folder / "acl.json5").write_text(acl)
     endpoint = f"tcp/127.0.0.1:{free_port()}"
@@ -166,18 +168,18 @@ def zenoh_router(folder, acl):
 
 @pytest.fixture
 def opened(monkeypatch):
-    """Give what opens an edge under a name, which becomes its user and its password."""
+    """Return a function that opens an edge whose user name and password are its name or role."""
 
     @contextlib.asynccontextmanager
     async def enter(endpoint, role, name=""):
         user = name or role
 
-        def config(*arguments, **keys):
-            made = session_config(*arguments, **keys)
-            made.insert_json5("transport/auth/usrpwd", json.dumps({"user": user, "password": user}))
-            return made
+        def config_with_user(*arguments, **keys):
+            config = session_config(*arguments, **keys)
+            config.insert_json5("transport/auth/usrpwd", json.dumps({"user": user, "password": user}))
+            return config
 
-        monkeypatch.setattr(zenoh_edge, "session_config", config)
+        monkeypatch.setattr(zenoh_edge, "session_config", config_with_user)
         async with ZenohEdge.open(
             connect=[endpoint], clock=SystemClock(), role=role, id=name or "lab", site="lab"
         ) as edge:
@@ -187,18 +189,18 @@ def opened(monkeypatch):
     return enter
 
 
-async def until(condition, what):
+async def until(condition, expected):
     deadline = time.monotonic() + WAIT_S
     while not condition():
-        assert time.monotonic() < deadline, what
+        assert time.monotonic() < deadline, expected
         await asyncio.sleep(0.01)
 
 
-async def repeat(edge, channel, message, condition, what, **ids):
-    """Publish again and again: a subscription takes a moment to reach the publisher."""
+async def publish_until(edge, channel, message, condition, expected, **ids):
+    """Publish repeatedly: a subscription takes a moment to reach the publisher."""
     deadline = time.monotonic() + WAIT_S
     while not condition():
-        assert time.monotonic() < deadline, what
+        assert time.monotonic() < deadline, expected
         edge.publish(channel, message, **ids)
         await asyncio.sleep(0.05)
 
@@ -222,7 +224,7 @@ ZONES = m.ZoneSet(epoch=1, seq=1, zones=[])
 PLAN = m.PlanRequest(start=m.Pose(x=0.0, y=0.0, theta=0.0), goal=m.Pose(x=1.0, y=0.0, theta=0.0))
 
 
-async def test_every_way_of_talking_that_the_table_has_works_under_the_list(tmp_path, opened):
+async def test_acl_allows_publishing_queries_recovery_and_liveliness(tmp_path, opened):
     with zenoh_router(tmp_path, zenoh_acl("lab", ["r1", "r2"])) as endpoint:
         async with (
             opened(endpoint, "map-service") as map_service,
@@ -231,7 +233,7 @@ async def test_every_way_of_talking_that_the_table_has_works_under_the_list(tmp_
             opened(endpoint, "console") as console,
             opened(endpoint, "recorder") as recorder,
         ):
-            deltas, recorded, zones, poses, there = [], [], [], [], set()
+            deltas, recorded, zones, poses, present = [], [], [], [], set()
             map_service.publish(ch.MAP_DELTA, delta(1))
             map_service.publish(ch.ZONES, ZONES)
             map_service.serve(ch.ZONES, lambda *_: ZONES)
@@ -242,19 +244,19 @@ async def test_every_way_of_talking_that_the_table_has_works_under_the_list(tmp_
             robot.subscribe(ch.ZONES, m.ZoneSet, lambda _, message: zones.append(message))
             planner.subscribe(ch.ROBOT_POSE, m.RobotPose, lambda ids, message: poses.append((ids["robot"], message.x)))
             recorder.subscribe(ch.ROBOT_POSE, m.RobotPose, lambda ids, _: recorded.append(ids["robot"]))
-            console.subscribe_liveliness(lambda role, name, alive: there.add((role, name, alive)))
-            await until(lambda: deltas == [1] and zones == [ZONES], "what was published before is given to latecomers")
+            console.subscribe_liveliness(lambda role, name, alive: present.add((role, name, alive)))
+            await until(lambda: deltas == [1] and zones == [ZONES], "late subscribers get earlier messages")
             map_service.publish(ch.MAP_DELTA, delta(2))
             await until(lambda: deltas == [1, 2], "deltas arrive")
-            await repeat(robot, ch.ROBOT_POSE, pose(1.0), lambda: poses and recorded, "poses arrive", robot="r1")
+            await publish_until(robot, ch.ROBOT_POSE, pose(1.0), lambda: poses and recorded, "poses arrive", robot="r1")
             await until(
-                lambda: there == {("map-service", "lab", True), ("robot-agent", "r1", True)}, "presence is seen"
+                lambda: present == {("map-service", "lab", True), ("robot-agent", "r1", True)}, "presence is seen"
             )
             assert await console.query(ch.PLANNER_PLAN, PLAN, m.PlanReply, 5.0) == m.PlanReply(length=1.0)
             assert await robot.query(ch.ZONES, None, m.ZoneSet, 5.0) == ZONES
 
 
-async def test_a_role_without_the_right_reaches_nobody(tmp_path, opened):
+async def test_acl_blocks_messages_and_queries_of_a_role_without_the_right(tmp_path, opened):
     with zenoh_router(tmp_path, zenoh_acl("lab", ["r1", "r2"])) as endpoint:
         async with (
             opened(endpoint, "map-service") as map_service,
@@ -263,33 +265,33 @@ async def test_a_role_without_the_right_reaches_nobody(tmp_path, opened):
             opened(endpoint, "robot-agent", "r2") as r2,
             opened(endpoint, "console") as console,
         ):
-            deltas, goals, poses, there = [], [], [], set()
+            deltas, goals, poses, present = [], [], [], set()
             console.subscribe(ch.MAP_DELTA, m.MapDelta, lambda _, message: deltas.append(message.seq))
             console.subscribe(ch.ROBOT_GOAL, m.RobotGoal, lambda ids, _: goals.append(ids["robot"]))
             console.subscribe(ch.ROBOT_POSE, m.RobotPose, lambda ids, _: poses.append(ids["robot"]))
-            console.subscribe_liveliness(lambda role, name, alive: there.add((role, name, alive)))
+            console.subscribe_liveliness(lambda role, name, alive: present.add((role, name, alive)))
             planner.serve(ch.MAP_SNAPSHOT, lambda *_: None)
             planner.declare_liveliness("map-service", "lab")
             r1.declare_liveliness("robot-agent", "r2")
-            # Everything that one session sends arrives in order: what is forbidden is sent before what is allowed.
+            # One session's messages arrive in order: forbidden ones are sent before allowed ones.
             for _ in range(3):
                 planner.publish(ch.MAP_DELTA, delta(666))
                 r1.publish(ch.ROBOT_POSE, pose(1.0), robot="r2")
                 r2.publish(ch.ROBOT_GOAL, GOAL, robot="r2")
-                await repeat(planner, ch.ROBOT_GOAL, GOAL, lambda: goals, "goals arrive", robot="r1")
-                await repeat(r1, ch.ROBOT_POSE, pose(1.0), lambda: "r1" in poses, "poses arrive", robot="r1")
-                await repeat(r2, ch.ROBOT_POSE, pose(1.0), lambda: "r2" in poses, "poses arrive", robot="r2")
-                await repeat(map_service, ch.MAP_DELTA, delta(1), lambda: deltas, "deltas arrive")
+                await publish_until(planner, ch.ROBOT_GOAL, GOAL, lambda: goals, "goals arrive", robot="r1")
+                await publish_until(r1, ch.ROBOT_POSE, pose(1.0), lambda: "r1" in poses, "poses arrive", robot="r1")
+                await publish_until(r2, ch.ROBOT_POSE, pose(1.0), lambda: "r2" in poses, "poses arrive", robot="r2")
+                await publish_until(map_service, ch.MAP_DELTA, delta(1), lambda: deltas, "deltas arrive")
                 assert set(deltas) == {1}
                 assert set(goals) == {"r1"}
                 goals.clear()
             assert await console.query(ch.MAP_SNAPSHOT, None, m.MapSnapshot, 1.0) is None
             r2.declare_liveliness("robot-agent", "r2")
-            await until(lambda: ("robot-agent", "r2", True) in there, "presence is seen")
-            assert there == {("robot-agent", "r2", True)}
+            await until(lambda: ("robot-agent", "r2", True) in present, "presence is seen")
+            assert present == {("robot-agent", "r2", True)}
 
 
-async def test_a_robot_speaks_for_no_other_where_robots_are_named(tmp_path, opened):
+async def test_acl_with_robot_ids_keeps_a_robot_from_publishing_as_another(tmp_path, opened):
     with zenoh_router(tmp_path, zenoh_acl("lab", ["r1", "r2"])) as endpoint:
         async with (
             opened(endpoint, "robot-agent", "r1") as r1,
@@ -302,13 +304,13 @@ async def test_a_robot_speaks_for_no_other_where_robots_are_named(tmp_path, open
             r1.subscribe(ch.ROBOT_GOAL, m.RobotGoal, lambda ids, _: goals.append(ids["robot"]), robot="r1")
             recorder.subscribe(ch.ROBOT_GOAL, m.RobotGoal, lambda ids, _: recorded.append(ids["robot"]))
 
-            def both():
+            def publish_as_other_robot():
                 r1.publish(ch.ROBOT_POSE, pose(6.0), robot="r2")
                 planner.publish(ch.ROBOT_GOAL, GOAL, robot="r2")
                 return poses and "r1" in goals and {"r1", "r2"} <= set(recorded)
 
             deadline = time.monotonic() + WAIT_S
-            while not both():
+            while not publish_as_other_robot():
                 assert time.monotonic() < deadline, (poses, goals, recorded)
                 r1.publish(ch.ROBOT_POSE, pose(1.0), robot="r1")
                 planner.publish(ch.ROBOT_GOAL, GOAL, robot="r1")
@@ -317,7 +319,7 @@ async def test_a_robot_speaks_for_no_other_where_robots_are_named(tmp_path, open
             assert set(goals) == {"r1"}
 
 
-async def test_the_list_for_any_site_knows_robots_by_their_role(tmp_path, opened):
+async def test_acl_for_all_sites_identifies_robots_by_their_role(tmp_path, opened):
     with zenoh_router(tmp_path, zenoh_acl()) as endpoint:
         async with opened(endpoint, "robot-agent") as robot, opened(endpoint, "planner") as planner:
             poses, heartbeats = [], []
@@ -325,8 +327,8 @@ async def test_the_list_for_any_site_knows_robots_by_their_role(tmp_path, opened
             planner.subscribe(ch.MAP_HEARTBEAT, m.MapHeartbeat, lambda _, message: heartbeats.append(message))
 
             robot.publish(ch.MAP_HEARTBEAT, heartbeat(1))
-            await repeat(robot, ch.ROBOT_POSE, pose(1.0), lambda: poses, "poses arrive", robot="r7")
+            await publish_until(robot, ch.ROBOT_POSE, pose(1.0), lambda: poses, "poses arrive", robot="r7")
             robot.publish(ch.MAP_HEARTBEAT, heartbeat(2))
             poses.clear()
-            await repeat(robot, ch.ROBOT_POSE, pose(1.0), lambda: poses, "poses arrive", robot="r7")
+            await publish_until(robot, ch.ROBOT_POSE, pose(1.0), lambda: poses, "poses arrive", robot="r7")
             assert heartbeats == []

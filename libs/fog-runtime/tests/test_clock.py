@@ -6,18 +6,18 @@ import pytest
 from fog_runtime.clock import ManualClock, SystemClock, ticker
 
 
-async def run_beats(clock: ManualClock, bodies: list[float], period: float = 0.1) -> list[float]:
-    """Beats' times when the n-th body takes bodies[n] seconds of the clock."""
+async def run_ticker(clock: ManualClock, bodies: list[float], period: float = 0.1) -> list[float]:
+    """Return the times of the ticks when the n-th body takes bodies[n] seconds of the clock."""
     times: list[float] = []
 
     async def loop() -> None:
-        async for now in beat:
+        async for now in loop_ticker:
             times.append(now)
             if len(times) > len(bodies):
                 return
             await clock.sleep(bodies[len(times) - 1])
 
-    beat = ticker(clock, period)
+    loop_ticker = ticker(clock, period)
     task = asyncio.create_task(loop())
     while not task.done():
         for _ in range(5):
@@ -28,39 +28,39 @@ async def run_beats(clock: ManualClock, bodies: list[float], period: float = 0.1
     return times
 
 
-async def test_beats_keep_to_multiples_of_the_period_whatever_the_body_takes():
-    times = await run_beats(ManualClock(), [0.03, 0.09, 0.0, 0.05])
+async def test_ticks_lie_at_multiples_of_the_period_whatever_the_body_takes():
+    times = await run_ticker(ManualClock(), [0.03, 0.09, 0.0, 0.05])
     assert times == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4], abs=0.006)
 
 
-async def test_missed_beats_are_skipped_and_counted_not_bunched():
+async def test_missed_ticks_are_skipped_and_counted():
     clock = ManualClock()
-    beat = ticker(clock, 0.25)
+    loop_ticker = ticker(clock, 0.25)
     times = []
-    async for now in beat:
+    async for now in loop_ticker:
         times.append(now)
         if len(times) == 3:
             break
         clock.advance(0.875 if len(times) == 1 else 0.125)
-    # The beats of 0.25 and 0.5 are gone, that of 0.75 comes 0.125 s late, and that of 1 is on time again.
+    # The ticks at 0.25 and 0.5 are skipped, that at 0.75 is 0.125 s late, and that at 1 is on time.
     assert times == [0.0, 0.875, 1.0]
-    assert beat.late == 2
-    assert beat.beats == 3
+    assert loop_ticker.late == 2
+    assert loop_ticker.ticks == 3
 
 
-async def test_p99_is_the_worst_lateness_of_few_beats():
+async def test_p99_of_few_ticks_is_the_largest_lateness():
     clock = ManualClock()
-    beat = ticker(clock, 1.0)
-    assert beat.p99_s == 0.0
-    async for _ in beat:
-        if beat.beats == 3:
+    loop_ticker = ticker(clock, 1.0)
+    assert loop_ticker.p99_s == 0.0
+    async for _ in loop_ticker:
+        if loop_ticker.ticks == 3:
             break
-        clock.advance(1.0 if beat.beats == 1 else 1.25)
-    assert beat.p99_s == pytest.approx(0.25)
-    assert beat.late == 0
+        clock.advance(1.0 if loop_ticker.ticks == 1 else 1.25)
+    assert loop_ticker.p99_s == pytest.approx(0.25)
+    assert loop_ticker.late == 0
 
 
-async def test_sleepers_wake_in_the_order_of_their_times():
+async def test_sleepers_wake_in_the_order_of_their_wake_times():
     clock, woken = ManualClock(10.0), []
 
     async def sleeper(name: str, seconds: float) -> None:
@@ -78,7 +78,7 @@ async def test_sleepers_wake_in_the_order_of_their_times():
     assert clock.now() == clock.stamp() == 15.5
 
 
-def test_manual_time_does_not_run_backwards():
+def test_manual_clock_refuses_to_go_backwards():
     with pytest.raises(ValueError, match="backwards"):
         ManualClock().advance(-0.1)
 
@@ -95,6 +95,6 @@ async def test_fast_clock_scales_time_and_timeouts():
 
 
 @pytest.mark.parametrize("speed", [0.0, -1.0, 1000.0, float("nan")])
-def test_impossible_speed_is_refused(speed):
+def test_speed_out_of_range_is_refused(speed):
     with pytest.raises(ValueError, match="speed"):
         SystemClock(speed)

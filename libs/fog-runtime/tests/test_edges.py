@@ -1,4 +1,4 @@
-"""A table of handlers wired to transports that only take notes."""
+"""A table of handlers wired to transports that only record calls."""
 
 import pytest
 
@@ -39,7 +39,7 @@ class Zenoh:
         self.sent.append((channel, message, ids))
 
 
-def test_each_channel_of_a_table_is_wired_by_its_transport_and_answers_are_published():
+def test_each_channel_is_subscribed_on_its_transport_and_results_are_published():
     clock, mqtt, zenoh = ManualClock(5.0), Mqtt(), Zenoh()
     edges = Edges(clock, mqtt=mqtt, zenoh=zenoh)
     received, published = [], []
@@ -67,7 +67,7 @@ def test_each_channel_of_a_table_is_wired_by_its_transport_and_answers_are_publi
     assert mqtt.numbers[ch.THESIS_AREA] == [7]
 
 
-def test_a_channel_whose_transport_is_missing_is_an_error_at_once():
+def test_channel_without_a_connected_transport_raises():
     edges = Edges(ManualClock(), zenoh=Zenoh())
     with pytest.raises(ValueError, match="node_reading"):
         edges.subscribe({ch.NODE_READING: lambda _ids, _message, _at: []}, list)
@@ -77,17 +77,17 @@ def test_a_channel_whose_transport_is_missing_is_an_error_at_once():
         Edges(ManualClock(), mqtt=Mqtt()).publish(Publication(ch.ROBOT_GOAL, GOAL, {"robot": "r1"}))
 
 
-def test_a_robot_hears_and_answers_on_its_own_channels_only():
+def test_robot_subscribes_and_serves_only_its_own_keys():
     clock, zenoh = ManualClock(5.0), Zenoh()
     edges = Edges(clock, zenoh=zenoh)
 
-    def nothing(_ids, _message, _at):
+    def ignore(_ids, _message, _at):
         return []
 
     def answer(ids, command, at):
         return m.CommandReply(accepted=True, reason=f"{ids['robot']} {command.kind} {at.now}")
 
-    edges.subscribe({ch.ROBOT_GOAL: nothing, ch.MAP_HEARTBEAT: nothing}, list, only={"robot": "r1"})
+    edges.subscribe({ch.ROBOT_GOAL: ignore, ch.MAP_HEARTBEAT: ignore}, list, only={"robot": "r1"})
     assert zenoh.only == {ch.ROBOT_GOAL: {"robot": "r1"}, ch.MAP_HEARTBEAT: {}}
     edges.serve({ch.ROBOT_COMMAND: answer}, robot="r1")
     handler, ids = zenoh.served[ch.ROBOT_COMMAND]

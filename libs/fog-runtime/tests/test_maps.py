@@ -33,7 +33,7 @@ def describe(folder, **keys):
 
 @pytest.mark.data
 @pytest.mark.parametrize("image", ["testmap.png", "testmap.bmp"])
-def test_map_servers_own_map_gives_its_expected_cells(maps_dir, tmp_path, image):
+def test_map_servers_test_map_has_its_expected_cells(maps_dir, tmp_path, image):
     expected = json.loads((maps_dir / "map_server" / "expected_cells.json").read_text())["testmap"]
     text = (maps_dir / "map_server" / "testmap.yaml").read_text()
     path = tmp_path / "testmap.yaml"
@@ -42,17 +42,17 @@ def test_map_servers_own_map_gives_its_expected_cells(maps_dir, tmp_path, image)
     assert occupancy.geometry == GridGeometry(expected["width"], expected["height"], 0.1, 2.0, 3.0)
     assert occupancy.yaw == 1.0
     assert occupancy.values.ravel().tolist() == expected["data"]
-    turned = load_map(path)
+    rotated = load_map(path)
     row, column = np.nonzero(occupancy.values == 100)
     for x, y in zip((column + 0.5) * 0.1, (row + 0.5) * 0.1, strict=True):
-        there = turned.geometry.cell(
+        column_row = rotated.geometry.cell(
             2.0 + x * math.cos(1.0) - y * math.sin(1.0), 3.0 + x * math.sin(1.0) + y * math.cos(1.0)
         )
-        assert turned.cells[there[1], there[0]] == 254
+        assert rotated.cells[column_row[1], column_row[0]] == 254
 
 
 @pytest.mark.data
-def test_every_recorded_map_loads_with_floor_and_walls(maps_dir):
+def test_every_recorded_map_has_free_and_occupied_cells(maps_dir):
     files = [path for path in sorted(maps_dir.glob("*/*.yaml")) if "image:" in path.read_text()]
     assert len(files) >= 11
     for path in files:
@@ -65,34 +65,34 @@ def test_every_recorded_map_loads_with_floor_and_walls(maps_dir):
 
 
 @pytest.mark.data
-def test_depots_grey_is_free_under_its_own_threshold(maps_dir):
+def test_grey_of_the_depot_map_is_free_by_its_threshold(maps_dir):
     with Image.open(maps_dir / "nav2" / "depot.pgm") as image:
         grey = np.asarray(image)[::-1] == 205
     assert grey.any()
     assert (load_map(maps_dir / "nav2" / "depot.yaml").cells[grey] == 0).all()
 
 
-def test_first_row_of_cells_is_the_bottom_of_the_image(tmp_path):
+def test_row_0_is_the_bottom_of_the_image(tmp_path):
     static = load_map(write(tmp_path, [[0, 255, 255], [205, 205, 0]]))
     assert static.cells.tolist() == [[255, 255, 254], [254, 0, 0]]
     assert static.geometry == GridGeometry(3, 2, 0.05, 1.0, -2.0)
 
 
-def test_negated_map_is_free_where_it_is_dark(tmp_path):
+def test_dark_pixels_of_a_negated_map_are_free(tmp_path):
     assert load_map(write(tmp_path, [[0, 255, 128]], negate=1)).cells.tolist() == [[0, 254, 255]]
 
 
 @pytest.mark.parametrize("name", ["m.png", "m.pgm", "m.bmp"])
-def test_image_formats_agree(tmp_path, name):
+def test_png_pgm_and_bmp_give_the_same_cells(tmp_path, name):
     assert load_map(write(tmp_path, [[0, 205, 254]], name)).cells.tolist() == [[254, 255, 0]]
 
 
-def test_ascii_pgm_with_comment_and_small_maximum(tmp_path):
+def test_ascii_pgm_with_comment_and_small_maximum_is_read(tmp_path):
     (tmp_path / "m.pgm").write_text("P2\n# drawn by hand\n3 1\n15\n0 15 12\n")
     assert load_map(describe(tmp_path, image="m.pgm")).cells.tolist() == [[254, 0, 255]]
 
 
-def test_colour_palette_and_16_bit_images(tmp_path):
+def test_colour_palette_and_16_bit_images_are_read(tmp_path):
     assert load_map(write(tmp_path, [[[0, 0, 0], [255, 255, 255], [255, 0, 0]]])).cells.tolist() == [[254, 0, 254]]
     Image.fromarray(np.array([[0, 255, 205]], dtype=np.uint8)).convert("P").save(tmp_path / "p.png")
     assert load_map(describe(tmp_path, image="p.png")).cells.tolist() == [[254, 0, 255]]
@@ -108,7 +108,7 @@ def test_alpha_counts_as_one_of_four_channels_in_trinary_mode(tmp_path):
     assert load_occupancy(write(tmp_path, rgba)).values.tolist() == [[100, -1, 100, 0]]
 
 
-def test_scale_mode_grades_between_the_thresholds_and_transparent_is_unknown(tmp_path):
+def test_scale_mode_interpolates_between_thresholds_and_transparent_is_unknown(tmp_path):
     path = write(tmp_path, [[0, 255, 128]], mode_=None, mode=None)
     path = describe(tmp_path, mode="scale", occupied_thresh=0.9, free_thresh=0.1)
     assert load_occupancy(path).values.tolist() == [[100, 0, 50]]
@@ -117,7 +117,7 @@ def test_scale_mode_grades_between_the_thresholds_and_transparent_is_unknown(tmp
     assert load_occupancy(path).values.tolist() == [[100, -1]]
 
 
-def test_raw_mode_takes_pixels_as_percent(tmp_path):
+def test_raw_mode_reads_pixels_as_percent(tmp_path):
     write(tmp_path, [[0, 100, 101, 255, 50, 70, 10]])
     path = describe(tmp_path, mode="raw")
     assert load_occupancy(path).values.tolist() == [[0, 100, -1, -1, 50, 70, 10]]
@@ -125,11 +125,11 @@ def test_raw_mode_takes_pixels_as_percent(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("keys", "words"),
+    ("keys", "texts"),
     [
         ({"image": "gone.png"}, ["image", "gone.png", "does not exist"]),
         ({"image": None}, ["image: missing"]),
-        ({"resolution": 0}, ["resolution", "0 is no number"]),
+        ({"resolution": 0}, ["resolution", "0 is not a number"]),
         ({"resolution": None}, ["resolution: missing"]),
         ({"resolution": ".nan"}, ["resolution", "nan"]),
         ({"origin": "[0, 0]"}, ["origin", "[x, y, yaw]"]),
@@ -141,23 +141,23 @@ def test_raw_mode_takes_pixels_as_percent(tmp_path):
         ({"origin": "[1, 2"}, ["YAML"]),
     ],
 )
-def test_error_names_file_key_and_what_is_wrong(tmp_path, keys, words):
+def test_invalid_map_file_is_refused_by_file_and_key(tmp_path, keys, texts):
     write(tmp_path, [[0]])
     path = describe(tmp_path, **keys)
     with pytest.raises(MapFileError) as refused:
         load_map(path)
-    assert all(word in str(refused.value) for word in [str(path), *words]), refused.value
+    assert all(text in str(refused.value) for text in [str(path), *texts]), refused.value
 
 
-def test_missing_file_and_broken_image_are_refused(tmp_path):
+def test_missing_file_and_damaged_image_are_refused(tmp_path):
     with pytest.raises(MapFileError, match="can't be read"):
         load_map(tmp_path / "none.yaml")
     (tmp_path / "m.png").write_bytes(b"\x89PNG but not really")
     with pytest.raises(MapFileError, match=re.escape("m.png can't be decoded")):
         load_map(describe(tmp_path))
     write(tmp_path, [[0, 255]] * 50)
-    whole = (tmp_path / "m.png").read_bytes()
-    (tmp_path / "m.png").write_bytes(whole[: len(whole) // 2])
+    data = (tmp_path / "m.png").read_bytes()
+    (tmp_path / "m.png").write_bytes(data[: len(data) // 2])
     with pytest.raises(MapFileError, match="can't be decoded"):
         load_map(describe(tmp_path))
 
@@ -169,12 +169,12 @@ cell_grids = hnp.arrays(
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=50)
 @given(cells=cell_grids, x=st.floats(-1e3, 1e3), y=st.floats(-1e3, 1e3))
-def test_saved_map_reads_back_the_same(tmp_path, cells, x, y):
+def test_loading_a_saved_map_returns_the_same_cells(tmp_path, cells, x, y):
     static = StaticMap(GridGeometry(cells.shape[1], cells.shape[0], 0.05, x, y), cells)
     save_map(tmp_path / "saved", static)
-    again = load_map(tmp_path / "saved.yaml")
-    assert again.geometry == static.geometry
-    assert np.array_equal(again.cells, cells)
+    loaded = load_map(tmp_path / "saved.yaml")
+    assert loaded.geometry == static.geometry
+    assert np.array_equal(loaded.cells, cells)
 
 
 def saved_with_yaw(folder, cells, yaw):
@@ -185,27 +185,27 @@ def saved_with_yaw(folder, cells, yaw):
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=30)
-@given(cells=cell_grids, turns=st.integers(-4, 4))
-def test_quarter_turns_move_cells_and_change_none(tmp_path, cells, turns):
-    turned = load_map(saved_with_yaw(tmp_path, cells, turns * math.pi / 2))
-    # numpy turns towards the first axis, which points up here: the other way round.
-    assert np.array_equal(turned.cells, np.rot90(cells, -turns))
-    left = {0: 0.0, 1: -0.1 * cells.shape[0], 2: -0.1 * cells.shape[1], 3: 0.0}[turns % 4]
-    assert turned.geometry.origin_x == pytest.approx(5.0 + left)
+@given(cells=cell_grids, quarter_turns=st.integers(-4, 4))
+def test_rotating_by_quarter_turns_moves_cells_and_changes_none(tmp_path, cells, quarter_turns):
+    rotated = load_map(saved_with_yaw(tmp_path, cells, quarter_turns * math.pi / 2))
+    # numpy rotates towards the first axis, which points up here: in the opposite direction.
+    assert np.array_equal(rotated.cells, np.rot90(cells, -quarter_turns))
+    left = {0: 0.0, 1: -0.1 * cells.shape[0], 2: -0.1 * cells.shape[1], 3: 0.0}[quarter_turns % 4]
+    assert rotated.geometry.origin_x == pytest.approx(5.0 + left)
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=50)
 @given(cells=cell_grids, yaw=st.floats(-7, 7))
-def test_turning_loses_no_obstacle_and_invents_no_floor(tmp_path, cells, yaw):
-    turned = load_map(saved_with_yaw(tmp_path, cells, yaw))
+def test_rotating_loses_no_occupied_cell_and_adds_no_free_area(tmp_path, cells, yaw):
+    rotated = load_map(saved_with_yaw(tmp_path, cells, yaw))
     cos, sin = math.cos(yaw), math.sin(yaw)
     for row, column in zip(*np.nonzero(cells == 254), strict=True):
         x, y = 0.1 * (column + 0.5), 0.1 * (row + 0.5)
-        c, r = turned.geometry.cell(5.0 + x * cos - y * sin, 7.0 + x * sin + y * cos)
-        near = turned.cells[max(r - 1, 0) : r + 2, max(c - 1, 0) : c + 2]
+        c, r = rotated.geometry.cell(5.0 + x * cos - y * sin, 7.0 + x * sin + y * cos)
+        near = rotated.cells[max(r - 1, 0) : r + 2, max(c - 1, 0) : c + 2]
         assert (near == 254).any()
-    for row, column in zip(*np.nonzero(turned.cells == 0), strict=True):
-        x, y = turned.geometry.centre(column, row)
+    for row, column in zip(*np.nonzero(rotated.cells == 0), strict=True):
+        x, y = rotated.geometry.centre(column, row)
         x, y = x - 5.0, y - 7.0
         c, r = round((x * cos + y * sin) / 0.1 - 0.5), round((-x * sin + y * cos) / 0.1 - 0.5)
         near = cells[max(r - 1, 0) : r + 2, max(c - 1, 0) : c + 2]

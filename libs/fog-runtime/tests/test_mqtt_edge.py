@@ -28,7 +28,7 @@ def shared_broker(tmp_path_factory):
 
 @pytest.fixture
 def broker(shared_broker):
-    """Return a running broker, started again in case the last test killed it."""
+    """Return a running broker, restarted if the previous test killed it."""
     shared_broker.start()
     return shared_broker
 
@@ -48,7 +48,7 @@ async def running(*edges):
     assert all(isinstance(end, asyncio.CancelledError) for end in ended), ended
 
 
-def make(broker, name, **keys):
+def make_edge(broker, name, **keys):
     return MqttEdge(broker.url, name, SystemClock(), **{"site": "lab", **keys})
 
 
@@ -62,24 +62,24 @@ def hazard(seq, area="a1"):
     )
 
 
-def raw(broker):
+def raw_client(broker):
     return aiomqtt.Client("127.0.0.1", broker.port)
 
 
-async def until(condition, what, seconds=10.0):
+async def until(condition, failure, seconds=10.0):
     deadline = time.monotonic() + seconds
     while not condition():
-        assert time.monotonic() < deadline, what
+        assert time.monotonic() < deadline, failure
         await asyncio.sleep(0.01)
 
 
-def counted(name, channel):
+def counter(name, channel):
     return REGISTRY.get_sample_value(name, {"channel": channel.name}) or 0.0
 
 
-async def test_messages_and_texts_arrive_with_their_ids_in_order(broker):
+async def test_messages_and_texts_are_delivered_in_order_with_their_ids(broker):
     readings, texts, thesis = [], [], []
-    a, b = make(broker, "a"), make(broker, "b")
+    a, b = make_edge(broker, "a"), make_edge(broker, "b")
     b.on(ch.NODE_READING, lambda ids, message: readings.append((ids["node"], message.seq)), m.NodeReading)
     b.on(ch.NODE_AVAILABILITY, lambda ids, text: texts.append((ids["node"], text)))
     b.on(ch.THESIS_AREA, lambda ids, text: thesis.append((ids["number"], text)), numbers=[1, "3"])
@@ -89,50 +89,50 @@ async def test_messages_and_texts_arrive_with_their_ids_in_order(broker):
         assert await a.publish(ch.NODE_AVAILABILITY, "online", wait=True, node="n2")
         for number in ("1", "2", "3"):
             assert await a.publish(ch.THESIS_AREA, "blocked", number=number)
-        await until(lambda: len(readings) == 50 and texts and len(thesis) == 2, "not all came")
+        await until(lambda: len(readings) == 50 and texts and len(thesis) == 2, "not all messages arrived")
     assert readings == [("n1", n) for n in range(50)]
     assert ("n2", "online") in texts
     assert thesis == [("1", "blocked"), ("3", "blocked")]
     assert not a.connected
 
 
-async def test_an_area_of_the_thesis_that_is_numbered_later_is_heard_now_and_after_a_reconnect(broker):
-    heard = []
-    a, b = make(broker, "a"), make(broker, "b")
-    b.on(ch.THESIS_AREA, lambda ids, text: heard.append((ids["number"], text)), numbers=[])
+async def test_thesis_area_added_later_is_subscribed_at_once_and_after_a_reconnect(broker):
+    received = []
+    a, b = make_edge(broker, "a"), make_edge(broker, "b")
+    b.on(ch.THESIS_AREA, lambda ids, text: received.append((ids["number"], text)), numbers=[])
     async with running(a, b):
         await b.add_number(ch.THESIS_AREA, 9)
         assert await a.publish(ch.THESIS_AREA, "blocked", wait=True, number="9")
         assert await a.publish(ch.THESIS_AREA, "blocked", wait=True, number="8")
-        await until(lambda: heard, "it is not heard")
+        await until(lambda: received, "no message of the added area")
         broker.kill()
-        await until(lambda: not a.connected and not b.connected, "the broker's death goes unseen")
+        await until(lambda: not a.connected and not b.connected, "the lost connection is not noticed")
         broker.start()
         await asyncio.gather(a.wait_connected(), b.wait_connected())
         assert await a.publish(ch.THESIS_AREA, "clear", wait=True, number="9")
-        await until(lambda: len(heard) == 2, "it is not heard after the reconnect")
-    assert heard == [("9", "blocked"), ("9", "clear")]
+        await until(lambda: len(received) == 2, "no message after the reconnect")
+    assert received == [("9", "blocked"), ("9", "clear")]
 
 
 async def test_retained_state_reaches_late_subscribers_until_it_is_cleared(broker):
     first, second, third = [], [], []
-    a = make(broker, "a")
+    a = make_edge(broker, "a")
     async with running(a):
         for n in range(20):
             await a.publish(ch.AREA_HAZARD, hazard(n, "kept"), area="kept")
         assert await a.publish(ch.AREA_HAZARD, hazard(20, "kept"), wait=True, area="kept")
-        b = make(broker, "b")
+        b = make_edge(broker, "b")
         b.on(ch.AREA_HAZARD, lambda ids, message: first.append((ids["area"], message.seq)), m.AreaHazard)
         async with running(b):
-            await until(lambda: ("kept", 20) in first, "the retained hazard did not come")
-        c = make(broker, "c")
+            await until(lambda: ("kept", 20) in first, "no retained hazard")
+        c = make_edge(broker, "c")
         c.on(ch.AREA_HAZARD, lambda ids, message: second.append((ids["area"], message.seq)), m.AreaHazard)
         async with running(c):
             assert await a.clear(ch.AREA_HAZARD, wait=True, area="kept")
             await a.publish(ch.AREA_HAZARD, hazard(1, "last"), wait=True, area="last")
-            await until(lambda: ("last", 1) in second, "nothing after the clearing")
+            await until(lambda: ("last", 1) in second, "no message after the deletion")
             await a.clear(ch.AREA_HAZARD, wait=True, area="last")
-        d = make(broker, "d")
+        d = make_edge(broker, "d")
         d.on(ch.AREA_HAZARD, lambda ids, _: third.append(ids["area"]), m.AreaHazard)
         async with running(d):
             await a.publish(ch.AREA_HAZARD, hazard(1, "mark"), wait=True, area="mark")
@@ -142,33 +142,35 @@ async def test_retained_state_reaches_late_subscribers_until_it_is_cleared(broke
     assert third == ["mark"]
 
 
-async def test_broker_killed_and_restarted_subscriptions_and_publishing_go_on(broker):
-    seen, greetings = [], []
-    a, b = make(broker, "a"), make(broker, "b")
+async def test_subscriptions_and_publishing_resume_after_a_restart_of_the_broker(broker):
+    seen, on_connect_results = [], []
+    a, b = make_edge(broker, "a"), make_edge(broker, "b")
     b.on(ch.NODE_READING, lambda _, message: seen.append(message.seq), m.NodeReading)
 
-    async def greet():
-        greetings.append(await a.publish(ch.AREA_HAZARD, hazard(len(greetings)), wait=True, area="a1"))
+    async def publish_on_connect():
+        on_connect_results.append(
+            await a.publish(ch.AREA_HAZARD, hazard(len(on_connect_results)), wait=True, area="a1")
+        )
 
-    a.on_connect(greet)
+    a.on_connect(publish_on_connect)
     async with running(a, b):
         await a.publish(ch.NODE_READING, reading(1), node="n1")
-        await until(lambda: seen == [1] and greetings == [True], "nothing before the crash")
+        await until(lambda: seen == [1] and on_connect_results == [True], "no message before the crash")
         broker.kill()
         await until(lambda: not a.connected and not b.connected, "the loss was not noticed")
-        before = counted("fognav_dropped_messages_total", ch.NODE_READING)
+        before = counter("fognav_dropped_messages_total", ch.NODE_READING)
         assert not await a.publish(ch.NODE_READING, reading(2), node="n1")
         assert not await a.publish(ch.AREA_HAZARD, hazard(9), wait=True, area="a1")
-        assert counted("fognav_dropped_messages_total", ch.NODE_READING) == before + 1
+        assert counter("fognav_dropped_messages_total", ch.NODE_READING) == before + 1
         broker.start()
-        await until(lambda: a.connected and b.connected and greetings == [True, True], "no reconnection")
+        await until(lambda: a.connected and b.connected and on_connect_results == [True, True], "no reconnection")
         assert await a.publish(ch.NODE_READING, reading(3), node="n1")
-        await until(lambda: seen == [1, 3], f"nothing after the restart: {seen}")
+        await until(lambda: seen == [1, 3], f"no message after the restart: {seen}")
 
 
 async def test_edge_started_before_its_broker_connects_later(broker):
     broker.stop()
-    edge = make(broker, "early")
+    edge = make_edge(broker, "early")
     task = asyncio.create_task(edge.run())
     await asyncio.sleep(0.3)
     assert not task.done()
@@ -179,18 +181,18 @@ async def test_edge_started_before_its_broker_connects_later(broker):
     await asyncio.gather(task, return_exceptions=True)
 
 
-async def test_will_is_published_when_the_process_vanishes(broker):
+async def test_last_will_is_published_when_the_connection_is_lost(broker):
     texts = []
-    watchdog = make(broker, "w")
-    watchdog.on(ch.NODE_AVAILABILITY, lambda ids, text: texts.append((ids["node"], text)))
-    edge = make(broker, "x", will=Will(ch.NODE_AVAILABILITY, "offline", {"node": "gone"}))
-    async with running(watchdog):
+    observer = make_edge(broker, "w")
+    observer.on(ch.NODE_AVAILABILITY, lambda ids, text: texts.append((ids["node"], text)))
+    edge = make_edge(broker, "x", will=Will(ch.NODE_AVAILABILITY, "offline", {"node": "gone"}))
+    async with running(observer):
         async with running(edge):
             await edge.publish(ch.NODE_AVAILABILITY, "online", wait=True, node="gone")
-            # A second client of the same name makes the broker cut the first one off, as a dead link would.
+            # A second client with the same id makes the broker disconnect the first, as a lost link would.
             async with aiomqtt.Client("127.0.0.1", broker.port, identifier="x"):
                 await until(lambda: ("gone", "offline") in texts, "no will")
-        await watchdog.clear(ch.NODE_AVAILABILITY, wait=True, node="gone")
+        await observer.clear(ch.NODE_AVAILABILITY, wait=True, node="gone")
 
 
 @pytest.mark.parametrize(
@@ -206,50 +208,50 @@ async def test_will_is_published_when_the_process_vanishes(broker):
                                                 "status": ["ok"], "state": "clear"}).encode()),
     ],
 )  # fmt: skip
-async def test_broken_message_is_refused_counted_and_the_next_one_heard(broker, topic, payload):
+async def test_invalid_message_is_refused_and_counted_and_the_next_is_delivered(broker, topic, payload):
     seen = []
-    before = counted("fognav_refused_messages_total", ch.NODE_READING)
-    edge = make(broker, "e")
+    before = counter("fognav_refused_messages_total", ch.NODE_READING)
+    edge = make_edge(broker, "e")
     edge.on(ch.NODE_READING, lambda _, message: seen.append(message.seq), m.NodeReading)
-    async with running(edge), raw(broker) as client:
+    async with running(edge), raw_client(broker) as client:
         await client.publish(topic, payload)
         await edge.publish(ch.NODE_READING, reading(5), node="n1")
-        await until(lambda: seen == [5], "deaf after a broken message")
-    assert counted("fognav_refused_messages_total", ch.NODE_READING) == before + 1
+        await until(lambda: seen == [5], "no message after an invalid one")
+    assert counter("fognav_refused_messages_total", ch.NODE_READING) == before + 1
 
 
-async def test_retained_reading_is_never_taken_for_a_fresh_one(broker):
+async def test_retained_reading_is_refused(broker):
     seen = []
-    before = counted("fognav_refused_messages_total", ch.NODE_READING)
-    async with raw(broker) as client:
+    before = counter("fognav_refused_messages_total", ch.NODE_READING)
+    async with raw_client(broker) as client:
         await client.publish("fog/v1/lab/nodes/old/reading", json.dumps({
             "seq": 1, "boot": 1, "uptime_ms": 1, "range_m": [1.0], "status": ["ok"], "state": "clear",
         }), retain=True, qos=1)  # fmt: skip
-        edge = make(broker, "e")
+        edge = make_edge(broker, "e")
         edge.on(ch.NODE_READING, lambda ids, _: seen.append(ids["node"]), m.NodeReading)
         async with running(edge):
-            await until(lambda: counted("fognav_refused_messages_total", ch.NODE_READING) == before + 1, "not refused")
+            await until(lambda: counter("fognav_refused_messages_total", ch.NODE_READING) == before + 1, "not refused")
             await edge.publish(ch.NODE_READING, reading(1), node="new")
-            await until(lambda: seen, "nothing came")
+            await until(lambda: seen, "no message")
         await client.publish("fog/v1/lab/nodes/old/reading", b"", retain=True, qos=1)
     assert seen == ["new"]
 
 
-async def test_handler_that_fails_does_not_silence_the_channel(broker):
+async def test_messages_are_delivered_after_a_handler_raised(broker):
     seen = []
 
     def handler(_, message):
         seen.append(message.seq)
         raise RuntimeError("a bug")
 
-    before = counted("fognav_handler_errors_total", ch.NODE_READING)
-    edge = make(broker, "e")
+    before = counter("fognav_handler_errors_total", ch.NODE_READING)
+    edge = make_edge(broker, "e")
     edge.on(ch.NODE_READING, handler, m.NodeReading)
     async with running(edge):
         await edge.publish(ch.NODE_READING, reading(1), node="n1")
         await edge.publish(ch.NODE_READING, reading(2), node="n1")
-        await until(lambda: seen == [1, 2], "the second did not come")
-    assert counted("fognav_handler_errors_total", ch.NODE_READING) == before + 2
+        await until(lambda: seen == [1, 2], "the second message was not delivered")
+    assert counter("fognav_handler_errors_total", ch.NODE_READING) == before + 2
 
 
 @pytest.fixture
@@ -261,7 +263,7 @@ def passwords(tmp_path):
     return file
 
 
-async def test_password_in_the_address_is_used_and_a_wrong_one_is_tried_again(tmp_path, passwords):
+async def test_edge_connects_with_the_url_s_password_and_retries_with_a_wrong_one(tmp_path, passwords):
     extra = f"allow_anonymous false\npassword_file {passwords}"
     with start_mosquitto(tmp_path / "broker", extra=extra) as broker:
         good = MqttEdge(f"mqtt://fog:p%40ss@127.0.0.1:{broker.port}", "good", SystemClock(), site="lab")
@@ -276,7 +278,7 @@ async def test_password_in_the_address_is_used_and_a_wrong_one_is_tried_again(tm
             await asyncio.gather(task, return_exceptions=True)
 
 
-async def test_wrong_use_is_an_error_at_once():
+async def test_invalid_url_channel_type_or_message_raises():
     with pytest.raises(ValueError, match="mqtt://"):
         MqttEdge("http://broker", "e", SystemClock(), site="lab")
     edge = MqttEdge("mqtt://127.0.0.1", "e", SystemClock(), site="lab")
@@ -291,19 +293,19 @@ async def test_wrong_use_is_an_error_at_once():
 
 
 @pytest.mark.live
-async def test_sites_that_share_a_broker_hear_only_their_own(broker):
-    here, there = [], []
-    ours, theirs = make(broker, "ours"), make(broker, "theirs", site="other")
-    for edge, heard in ((ours, here), (theirs, there)):
-        edge.on(ch.NODE_READING, lambda ids, message, to=heard: to.append((ids, message.seq)), m.NodeReading)
-        edge.on(ch.AREA_HAZARD, lambda ids, message, to=heard: to.append((ids, message.seq)), m.AreaHazard)
+async def test_sites_that_share_a_broker_receive_only_their_own_messages(broker):
+    our_messages, their_messages = [], []
+    ours, theirs = make_edge(broker, "ours"), make_edge(broker, "theirs", site="other")
+    for edge, received in ((ours, our_messages), (theirs, their_messages)):
+        edge.on(ch.NODE_READING, lambda ids, message, to=received: to.append((ids, message.seq)), m.NodeReading)
+        edge.on(ch.AREA_HAZARD, lambda ids, message, to=received: to.append((ids, message.seq)), m.AreaHazard)
     async with running(ours, theirs):
         assert await theirs.publish(ch.AREA_HAZARD, hazard(2), wait=True, area="shared")
         assert await ours.publish(ch.AREA_HAZARD, hazard(1), wait=True, area="shared")
-        await until(lambda: ({"area": "shared"}, 1) in here and there, "nothing came")
+        await until(lambda: ({"area": "shared"}, 1) in our_messages and their_messages, "no message")
         assert await theirs.clear(ch.AREA_HAZARD, wait=True, area="shared")
         assert await ours.clear(ch.AREA_HAZARD, wait=True, area="shared")
-        with pytest.raises(ValueError, match="fills the site in"):
+        with pytest.raises(ValueError, match="fills in the site"):
             await ours.publish(ch.NODE_READING, reading(1), site="other", node="n1")
-    assert [seq for ids, seq in here if ids == {"area": "shared"}] == [1]
-    assert there == [({"area": "shared"}, 2)]
+    assert [seq for ids, seq in our_messages if ids == {"area": "shared"}] == [1]
+    assert their_messages == [({"area": "shared"}, 2)]

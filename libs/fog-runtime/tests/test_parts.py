@@ -11,7 +11,7 @@ GROUP = "fognav.test_parts"
 
 @pytest.fixture
 def install(tmp_path, monkeypatch):
-    """Make entry points as an installed distribution has them."""
+    """Return a function that writes the entry points of a distribution as if it were installed."""
     monkeypatch.syspath_prepend(tmp_path)
 
     def write(distribution: str, *lines: str) -> None:
@@ -23,41 +23,41 @@ def install(tmp_path, monkeypatch):
     return write
 
 
-def test_a_part_is_found_by_its_name(install):
+def test_part_is_found_by_its_name(install):
     install("one", "pi = math:pi")
     install("two", "tau = math:tau")
     assert parts.names(GROUP) == ["pi", "tau"]
     assert parts.load(GROUP, "pi", float) == pytest.approx(3.14159, abs=1e-5)
 
 
-def test_an_unknown_name_is_refused_with_the_known_ones(install):
+def test_unknown_name_is_refused_with_the_known_ones(install):
     install("one", "pi = math:pi", "tau = math:tau")
     with pytest.raises(parts.PartError, match=r"no 'phi' \(known: pi, tau\)"):
         parts.load(GROUP, "phi", float)
 
 
-def test_a_group_without_parts_says_so():
+def test_unknown_name_in_an_empty_group_is_refused():
     with pytest.raises(parts.PartError, match="known: none"):
         parts.load(GROUP, "pi", float)
 
 
-def test_a_name_that_two_packages_claim_is_refused(install):
+def test_name_that_two_packages_register_is_refused(install):
     install("one", "pi = math:pi")
     install("two", "pi = math:e")
     with pytest.raises(parts.PartError, match="math:e of two, math:pi of one"):
         parts.load(GROUP, "pi", float)
 
 
-@pytest.mark.parametrize(("value", "words"), [("nowhere_at_all:x", "imported"), ("math:no_such", "imported")])
-def test_a_part_that_cannot_be_imported_is_named(install, value, words):
+@pytest.mark.parametrize(("value", "text"), [("nowhere_at_all:x", "imported"), ("math:no_such", "imported")])
+def test_part_that_cannot_be_imported_is_named(install, value, text):
     install("one", f"pi = {value}")
-    with pytest.raises(parts.PartError, match=words):
+    with pytest.raises(parts.PartError, match=text):
         parts.load(GROUP, "pi", float)
 
 
-def test_a_part_of_another_kind_is_refused(install):
+def test_part_of_the_wrong_type_is_refused(install):
     install("one", "pi = math:pi")
-    with pytest.raises(parts.PartError, match="is no str"):
+    with pytest.raises(parts.PartError, match="is not a str"):
         parts.load(GROUP, "pi", str)
 
 
@@ -66,7 +66,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     counts: int = 100
 
 
-def test_options_come_from_json_over_their_defaults():
+def test_json_options_override_the_defaults():
     assert load_options(Options, "", variable="X") == Options()
     assert load_options(Options, '{"counts": 7}', variable="X") == Options(counts=7)
 
@@ -79,6 +79,6 @@ def test_options_come_from_json_over_their_defaults():
         ("axle_m=0.3", "FOGNAV_X: JSON is malformed"),
     ],
 )
-def test_wrong_options_are_refused_by_variable_and_field(text, words):
+def test_invalid_options_are_refused_by_variable_and_field(text, words):
     with pytest.raises(SettingsError, match=words):
         load_options(Options, text, variable="FOGNAV_X")

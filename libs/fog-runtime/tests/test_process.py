@@ -1,4 +1,4 @@
-"""A process ends as it is told, and says why when it isn't."""
+"""A process ends cleanly on a signal, and logs the reason when it crashes."""
 
 import json
 import signal
@@ -34,7 +34,7 @@ def start(body="pass", seconds=60.0):
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_signal_cancels_cleans_up_and_exits_zero(number):
+def test_signal_cancels_main_and_exits_with_status_zero(number):
     with start() as child:
         assert child.stdout.readline() == "up\n"
         child.send_signal(number)
@@ -43,7 +43,7 @@ def test_signal_cancels_cleans_up_and_exits_zero(number):
     assert [json.loads(line)["event"] for line in err.splitlines()] == ["stopping", "stopped"]
 
 
-def test_crash_is_one_event_and_status_one():
+def test_crash_is_logged_once_and_exits_with_status_one():
     body = "raise ExceptionGroup('many', [ValueError('the reason')])"
     with start(body, seconds=0.0) as child:
         out, err = child.communicate(timeout=20)

@@ -50,12 +50,12 @@ def record(path, events):
             recorder.write(channel, ids, message, log_time)
 
 
-def test_recording_reads_back_the_same_in_order(tmp_path):
+def test_reading_a_recording_returns_the_same_messages_in_order(tmp_path):
     record(tmp_path / "a" / "r.mcap", EVENTS)
     assert list(read(tmp_path / "a" / "r.mcap")) == EVENTS
 
 
-def test_other_readers_find_topics_schemas_and_json(tmp_path):
+def test_mcap_readers_find_topics_schemas_and_json(tmp_path):
     record(tmp_path / "r.mcap", EVENTS)
     with (tmp_path / "r.mcap").open("rb") as file:
         found = list(make_reader(file).iter_messages())
@@ -71,18 +71,18 @@ def test_other_readers_find_topics_schemas_and_json(tmp_path):
 
 
 @pytest.mark.parametrize("lost", [1, 8, 9, 100, 5_000, 20_000])
-def test_recording_cut_short_by_a_crash_gives_what_is_whole(tmp_path, lost):
+def test_complete_records_of_a_truncated_recording_are_read(tmp_path, lost):
     path = tmp_path / "r.mcap"
     record(path, [(n, ch.NODE_READING, {"node": "n1"}, reading(n)) for n in range(5000)])
-    whole = path.read_bytes()
-    path.write_bytes(whole[:-lost])
+    data = path.read_bytes()
+    path.write_bytes(data[:-lost])
     got = [message.seq for _, _, _, message in read(path)]
     assert 100 < len(got) <= 5000
     assert got == list(range(len(got)))
 
 
 @pytest.mark.parametrize("content", [b"", b"nothing of the kind, but long enough to look at"])
-def test_what_is_no_recording_is_named(tmp_path, content):
+def test_file_that_is_not_a_recording_is_refused_by_name(tmp_path, content):
     path = tmp_path / "x.mcap"
     path.write_bytes(content)
     with pytest.raises(RecordError, match=r"x\.mcap"):
@@ -90,7 +90,7 @@ def test_what_is_no_recording_is_named(tmp_path, content):
 
 
 @pytest.mark.parametrize("share", range(1, 40))
-def test_damage_is_named_and_never_read_as_something_else(tmp_path, share):
+def test_damaged_recording_gives_the_messages_before_the_damage_or_is_refused(tmp_path, share):
     path = tmp_path / "x.mcap"
     events = [(n, ch.NODE_READING, {"node": "n1"}, reading(n)) for n in range(1500)]
     record(path, events)
@@ -101,11 +101,11 @@ def test_damage_is_named_and_never_read_as_something_else(tmp_path, share):
     try:
         got.extend(read(path))
     except RecordError as error:
-        assert "x.mcap" in str(error)  # noqa: PT017  # reading may succeed too: damage in the index loses nothing
+        assert "x.mcap" in str(error)  # noqa: PT017  # reading may also succeed: damage in the index loses no message
     assert got == events[: len(got)]
 
 
-def test_a_hole_between_records_is_no_end(tmp_path):
+def test_zeros_between_records_are_reported_as_damage(tmp_path):
     path = tmp_path / "x.mcap"
     record(path, [(n, ch.NODE_READING, {"node": "n1"}, reading(n)) for n in range(1500)])
     with path.open("rb") as file:
@@ -119,7 +119,7 @@ def test_a_hole_between_records_is_no_end(tmp_path):
         list(read(path))
 
 
-async def test_replay_keeps_the_intervals_of_its_clock(tmp_path):
+async def test_replay_keeps_the_recorded_intervals(tmp_path):
     record(tmp_path / "r.mcap", EVENTS)
     clock, sent = ManualClock(100.0), []
 
@@ -132,14 +132,14 @@ async def test_replay_keeps_the_intervals_of_its_clock(tmp_path):
             await asyncio.sleep(0)
         clock.advance(0.25)
     assert await task == 4
-    assert [at for at, *_ in sent] == [100.0, 100.5, 101.5, 101.5]
+    assert [time_s for time_s, *_ in sent] == [100.0, 100.5, 101.5, 101.5]
     assert [tuple(rest) for _, *rest in sent] == [tuple(rest) for _, *rest in EVENTS]
 
 
 @pytest.mark.live
 @pytest.mark.parametrize("speed", [1.0, 100.0])
-async def test_record_all_takes_both_transports_at_any_speed(tmp_path, speed):
-    clock, begun = SystemClock(speed), time.time()
+async def test_record_all_records_both_transports_at_any_clock_speed(tmp_path, speed):
+    clock, started = SystemClock(speed), time.time()
     with start_mosquitto(tmp_path / "m") as broker, start_router(tmp_path / "z") as router:
         mqtt = MqttEdge(broker.url, "rec", clock, site="lab")
         async with ZenohEdge.open(connect=[router.endpoint], clock=clock, role="test", id="t", site="lab") as zenoh:
@@ -157,8 +157,8 @@ async def test_record_all_takes_both_transports_at_any_speed(tmp_path, speed):
                 task.cancel()
                 await asyncio.gather(task, return_exceptions=True)
     events = list(read(tmp_path / "r.mcap"))
-    # However fast its clock runs, a recording begins when it was made.
-    assert all(begun <= at_ns * 1e-9 <= begun + speed * (time.time() - begun) for at_ns, *_ in events)
+    # A recording begins at the real time, however fast its clock runs.
+    assert all(started <= log_ns * 1e-9 <= started + speed * (time.time() - started) for log_ns, *_ in events)
     got = {channel.name: (ids, message) for _, channel, ids, message in events}
     assert got == {
         "map_delta": ({}, delta(1)),
@@ -172,7 +172,7 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True):
     data: bytes
 
 
-def test_entries_that_cross_no_channel_lie_beside_messages_and_are_read_apart(tmp_path):
+def test_entries_that_belong_to_no_channel_are_read_separately_from_messages(tmp_path):
     path = tmp_path / "both.mcap"
     heartbeat = m.MapHeartbeat(epoch=1, seq=2, hash=3, stamp=4.0)
     with Recorder(path, site="lab") as recorder:
@@ -180,7 +180,7 @@ def test_entries_that_cross_no_channel_lie_beside_messages_and_are_read_apart(tm
         recorder.write(ch.MAP_HEARTBEAT, {}, heartbeat, 11)
         recorder.write_entry("own/entry", Entry(number=2, data=b""), 12)
     assert list(read(path)) == [(11, ch.MAP_HEARTBEAT, {}, heartbeat)]
-    entries = [(at, topic, msgspec.json.decode(data, type=Entry)) for at, topic, data in read_entries(path)]
+    entries = [(log_ns, topic, msgspec.json.decode(data, type=Entry)) for log_ns, topic, data in read_entries(path)]
     assert entries == [
         (10, "own/entry", Entry(number=1, data=b"\x00\xff")),
         (12, "own/entry", Entry(number=2, data=b"")),

@@ -32,7 +32,7 @@ def redis(tmp_path: Path):
         yield server
 
 
-async def test_of_eight_writers_that_expect_one_version_one_writes(redis: Server):
+async def test_one_of_eight_concurrent_writers_that_expect_the_same_version_succeeds(redis: Server):
     async with RedisStore(redis.url, "test") as store:
         for expected in (ABSENT, "1"):
             version = int(expected) + 1
@@ -44,7 +44,7 @@ async def test_of_eight_writers_that_expect_one_version_one_writes(redis: Server
         assert len(await store.audit_entries(100)) == 2
 
 
-async def test_a_deletion_needs_the_version_and_a_repeated_one_finds_nothing(redis: Server):
+async def test_deletion_needs_the_stored_version_and_a_repeated_one_is_missing(redis: Server):
     async with RedisStore(redis.url, "test") as store:
         assert await store._swap(THINGS, "a", Thing(label="x"), "7", AUDIT) == "missing"
         assert await store._swap(THINGS, "a", Thing(label="x"), ABSENT, AUDIT) == "ok"
@@ -54,7 +54,7 @@ async def test_a_deletion_needs_the_version_and_a_repeated_one_finds_nothing(red
         assert await store._swap(THINGS, "a", None, ANY, AUDIT) == "missing"
 
 
-async def test_a_version_may_lie_deeper_and_any_version_can_be_written_over(redis: Server):
+async def test_nested_version_is_checked_and_any_version_can_be_overwritten(redis: Server):
     async with RedisStore(redis.url, "test") as store:
         for name in ("first", "second"):
             assert await store._swap(JOBS, "r1", Job(job={"id": name}), ANY, AUDIT) == "ok"
@@ -62,11 +62,11 @@ async def test_a_version_may_lie_deeper_and_any_version_can_be_written_over(redi
         assert await store._swap(JOBS, "r1", None, "second", AUDIT) == "ok"
 
 
-async def test_audit_entries_tell_who_what_before_and_after_newest_first(redis: Server):
+async def test_audit_entries_have_author_action_before_and_after_newest_first(redis: Server):
     async with RedisStore(redis.url, "test") as store:
         site = Thing(label="from the site", version=0)
         await store._swap(THINGS, "a", Thing(label="x"), ABSENT, AUDIT, before=site)
-        await store._swap(THINGS, "a", Thing(label="x"), ABSENT, AUDIT)  # an attempt whose answer was lost
+        await store._swap(THINGS, "a", Thing(label="x"), ABSENT, AUDIT)  # a repeated attempt, after a lost reply
         await store._swap(THINGS, "a", Thing(label="y", version=2), "1", AUDIT)
         assert await store.audit_entries(100) == [
             {"at": "1.500", "who": "anna", "action": "put", "thing": "a",
@@ -77,16 +77,16 @@ async def test_audit_entries_tell_who_what_before_and_after_newest_first(redis: 
         assert len(await store.audit_entries(1)) == 1
 
 
-async def test_an_unreadable_record_is_an_error_or_left_out_as_its_reader_needs(redis: Server):
+async def test_unreadable_record_raises_or_is_left_out(redis: Server):
     async with RedisStore(redis.url, "test") as store, Redis.from_url(redis.url) as raw:
         await store._write_records("things", {"a": Thing(label="x")})
         await raw.hset("fog:test:things", "b", b"nonsense")
         assert await store._readable_records("things", Thing) == {"a": Thing(label="x")}
-        with pytest.raises(StoreError, match=r"fog:test:things holds what is no Thing \(b\)"):
+        with pytest.raises(StoreError, match=r"fog:test:things contains an invalid Thing \(b\)"):
             await store._records("things", Thing)
 
 
-async def test_epochs_grow_also_beyond_a_clock_that_went_back_and_go_on_without_redis(redis: Server):
+async def test_epochs_grow_after_a_clock_reset_and_without_redis(redis: Server):
     async with RedisStore(redis.url, "test") as store, Redis.from_url(redis.url) as raw:
         first = await store.begin_epoch("map")
         assert await store.begin_epoch("map") > first
@@ -102,7 +102,7 @@ async def test_epochs_grow_also_beyond_a_clock_that_went_back_and_go_on_without_
                 await attempt
 
 
-async def test_a_redis_that_may_lose_acknowledged_writes_is_reported(redis: Server):
+async def test_redis_without_durable_writes_is_reported(redis: Server):
     async with RedisStore(redis.url, "test") as store, Redis.from_url(redis.url) as raw:
         await raw.config_set("appendfsync", "everysec")
         assert "appendfsync always" in await store.durability_warning()

@@ -65,7 +65,7 @@ def test_site_loads_with_its_map_and_counter_clockwise_areas(folder):
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "field", "words"),
+    ("old", "new", "field", "remedy"),
     [
         ('id = "lab"', 'id = "The Lab"', "id", "a-z0-9"),
         ("x = 1.0\n", "", "places.door", "`x`"),
@@ -74,7 +74,7 @@ def test_site_loads_with_its_map_and_counter_clockwise_areas(folder):
         ("x = 0.5, y = 0.5", "x = 0.5, y = 1.95", "robots[0].start (r1)", "occupied"),
         ('area = "a1"', 'area = "a2"', "nodes[0].area", "one of: a1"),
         ("y = 1.95", "y = 2.95", "nodes[0] (n1)", "off the map"),
-        ("[2.5, 0.5]", "[2.5, -0.5]", "areas[0].polygon (a1), corner", "off the map"),
+        ("[2.5, 0.5]", "[2.5, -0.5]", "areas[0].polygon (a1), vertex", "off the map"),
         ("[2.5, 0.5], [2.5, 1.5]", "[2.5, 1.5], [2.5, 0.5]", "areas[0].polygon (a1)", "crosses itself"),
         ("number = 1", "nummber = 1", "areas[0].nummber", "spelling"),
         ("angle = 0.2", "angel = 0.2", "nodes[0].sonars[1].angel", "spelling"),
@@ -86,20 +86,20 @@ def test_site_loads_with_its_map_and_counter_clockwise_areas(folder):
         ("range_limit = 1.5 }, {", "range_limit = 9 }, {", "nodes[0].sonars[0].range_limit", "4.0"),
     ],
 )
-def test_error_names_file_field_and_remedy(folder, old, new, field, words):
+def test_invalid_site_is_refused_by_file_and_field_with_a_remedy(folder, old, new, field, remedy):
     assert SITE.count(old) >= 1
     (folder / "site.toml").write_text(SITE.replace(old, new, 1))
     with pytest.raises(SiteError) as refused:
         load_site(folder)
     text = str(refused.value)
     assert text.startswith(f"{folder / 'site.toml'}: {field}"), text
-    assert words in text, text
+    assert remedy in text, text
 
 
-def test_what_is_no_toml_is_named_with_the_place(folder):
+def test_invalid_toml_is_refused_with_its_line(folder):
     (folder / "site.toml").write_text(SITE.replace('name = "A small lab"', "name = A small lab"))
     with pytest.raises(
-        SiteError, match=re.escape(f"{folder / 'site.toml'} is no valid TOML (Invalid value (at line 3")
+        SiteError, match=re.escape(f"{folder / 'site.toml'} is not valid TOML (Invalid value (at line 3")
     ):
         load_site(folder)
 

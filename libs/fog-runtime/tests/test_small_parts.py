@@ -17,12 +17,12 @@ from fog_contracts.messages import Trace
 from fog_contracts.stages import SPANS
 from fog_runtime import logs, metrics
 from fog_runtime.files import atomic_write
-from fog_runtime.health import Health, serve_plain
+from fog_runtime.health import Health, serve_health
 from fog_runtime.settings import CommonSettings, InflationSettings, Secret, SettingsError, describe, load
 from fog_runtime.slots import Slot
 
 
-async def test_slot_keeps_only_the_newest_and_knows_its_age():
+async def test_slot_holds_only_the_newest_value_with_its_age():
     slot: Slot[int] = Slot()
     assert slot.get() is None
     assert slot.age(100.0) == math.inf
@@ -36,7 +36,7 @@ async def test_slot_keeps_only_the_newest_and_knows_its_age():
     assert slot.fresh(1e9, None)
 
 
-async def test_slot_wait_is_woken_by_a_newer_value_only():
+async def test_slot_wait_returns_on_a_newer_value_only():
     slot: Slot[str] = Slot()
     slot.put("old", 0.0)
     waiting = asyncio.create_task(slot.wait())
@@ -54,7 +54,7 @@ class Example(CommonSettings, frozen=True, kw_only=True):
     mode: Annotated[str, msgspec.Meta(pattern="^[ab]$")] = "a"
 
 
-NEEDED = {"FOGNAV_SITE_DIR": "/s", "FOGNAV_DATA_DIR": "/d"}
+REQUIRED = {"FOGNAV_SITE_DIR": "/s", "FOGNAV_DATA_DIR": "/d"}
 
 
 def test_environment_overrides_file_overrides_default(tmp_path):
@@ -66,38 +66,38 @@ def test_environment_overrides_file_overrides_default(tmp_path):
 
 
 def test_empty_variable_counts_as_not_set():
-    assert load(Example, environ={**NEEDED, "FOGNAV_RATE": "", "FOGNAV_PORT_FILE": ""}).rate == 1.0
+    assert load(Example, environ={**REQUIRED, "FOGNAV_RATE": "", "FOGNAV_PORT_FILE": ""}).rate == 1.0
 
 
 @pytest.mark.parametrize(
-    ("environ", "words"),
+    ("environ", "texts"),
     [
         ({}, ["site_dir", "FOGNAV_SITE_DIR"]),
-        ({**NEEDED, "FOGNAV_RATE": "fast"}, ["FOGNAV_RATE", "float", "'fast'"]),
-        ({**NEEDED, "FOGNAV_MODE": "c"}, ["FOGNAV_MODE", "'c'"]),
-        ({**NEEDED, "FOGNAV_LOG_LEVEL": "loud"}, ["FOGNAV_LOG_LEVEL", "'loud'"]),
+        ({**REQUIRED, "FOGNAV_RATE": "fast"}, ["FOGNAV_RATE", "float", "'fast'"]),
+        ({**REQUIRED, "FOGNAV_MODE": "c"}, ["FOGNAV_MODE", "'c'"]),
+        ({**REQUIRED, "FOGNAV_LOG_LEVEL": "loud"}, ["FOGNAV_LOG_LEVEL", "'loud'"]),
     ],
 )
-def test_wrong_variable_is_named(environ, words):
+def test_invalid_environment_variable_is_refused_by_name(environ, texts):
     with pytest.raises(SettingsError) as refused:
         load(Example, environ=environ)
-    assert all(word in str(refused.value) for word in words), refused.value
+    assert all(text in str(refused.value) for text in texts), refused.value
 
 
 @pytest.mark.parametrize(
     ("content", "word"), [("rate = 'x'", "rate"), ("ratte = 1", "'ratte'"), ("rate = ", "TOML"), (None, "read")]
 )
-def test_wrong_file_is_named(tmp_path, content, word):
+def test_invalid_settings_file_is_refused_by_name(tmp_path, content, word):
     file = tmp_path / "x.toml"
     if content is not None:
         file.write_text(content)
     with pytest.raises(SettingsError, match=word) as refused:
-        load(Example, file=file, environ=NEEDED)
+        load(Example, file=file, environ=REQUIRED)
     assert str(file) in str(refused.value)
 
 
-def test_secrets_show_nowhere():
-    environ = {**NEEDED, "FOGNAV_PASSWORD": "hush", "FOGNAV_MQTT_URL": "mqtt://user:hush@broker:1883"}
+def test_secrets_do_not_appear_in_logs_or_errors():
+    environ = {**REQUIRED, "FOGNAV_PASSWORD": "hush", "FOGNAV_MQTT_URL": "mqtt://user:hush@broker:1883"}
     settings = load(Example, environ=environ)
     assert settings.password.reveal() == "hush"
     shown = f"{describe(settings)} {settings.password} {settings.password!r} {settings!r}"
@@ -110,7 +110,7 @@ def test_secrets_show_nowhere():
 
 @pytest.fixture
 def lines(capsys):
-    """Return what was logged so far, line by line; the root logger is put back at the end."""
+    """Return a function that returns the lines logged so far; the root logger is restored at the end."""
     root = logging.getLogger()
     before, level = root.handlers[:], root.level
     seen: list[str] = []
@@ -142,12 +142,12 @@ def test_text_log_names_event_and_fields(lines):
     assert lines()[0].endswith("warning proc part: odd n=3")
 
 
-def test_rate_limited_log_says_the_first_and_counts_the_rest(lines):
+def test_rate_limited_log_logs_the_first_and_counts_the_suppressed(lines):
     logs.configure("proc")
     limited = logs.RateLimited(logs.get("part"), period=10.0, max_keys=2)
     for now in (0.0, 1.0, 9.9, 10.5):
         limited.warning("refused", "a", now)
-    assert [json.loads(line).get("not_logged_since") for line in lines()] == [None, 2]
+    assert [json.loads(line).get("suppressed") for line in lines()] == [None, 2]
     for key in "bcdef":
         limited.warning("refused", key, 11.0)
     assert len(lines()) == 4, "b, and the first of those beyond the bound"
@@ -162,11 +162,11 @@ def get(port, path):
             return error.code, error.read().decode()
 
 
-def test_health_server_names_what_is_missing(tmp_path):
+def test_readyz_names_unmet_conditions(tmp_path):
     health = Health("mqtt", "store")
     health.set("mqtt", ok=True)
     health.set("store", ok=False, detail="redis://x refuses")
-    with serve_plain(health, port_file=tmp_path / "run" / "port") as server:
+    with serve_health(health, port_file=tmp_path / "run" / "port") as server:
         assert int((tmp_path / "run" / "port").read_text()) == server.port
         assert get(server.port, "/healthz")[0] == 200
         status, body = get(server.port, "/readyz")
@@ -183,7 +183,7 @@ def stage_sum(stage):
     return REGISTRY.get_sample_value("fognav_stage_seconds_sum", {"stage": stage}) or 0.0
 
 
-def test_trace_fills_the_finished_stages_only():
+def test_observed_trace_counts_its_finished_stages_only():
     before = {stage: stage_sum(stage) for stage in SPANS}
     trace = Trace(area="a1", epoch=1, seq=1, first_reading=10.0, confirmed=10.5, costmap_published=10.75)
     metrics.observe_trace(trace)
@@ -212,7 +212,7 @@ def test_failed_atomic_write_leaves_the_old_file(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_inflation_that_cannot_be_is_refused_while_the_settings_are_read():
+def test_invalid_inflation_is_refused_when_the_settings_are_read():
     environ = {"FOGNAV_SITE_DIR": "/s", "FOGNAV_DATA_DIR": "/d", "FOGNAV_COST_SCALING": "5"}
     assert load(InflationSettings, environ=environ).inflation.cost_scaling == 5.0
     with pytest.raises(SettingsError, match="inflation_radius"):

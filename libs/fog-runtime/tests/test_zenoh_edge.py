@@ -29,7 +29,7 @@ def shared_router(tmp_path_factory):
 
 @pytest.fixture
 def router(shared_router):
-    """Return a running router, started again in case the last test killed it."""
+    """Return a running router, restarted if the previous test killed it."""
     shared_router.start()
     return shared_router
 
@@ -38,10 +38,10 @@ def edge(endpoint, name="e1", site="lab"):
     return ZenohEdge.open(connect=[endpoint], clock=SystemClock(), role="test", id=name, site=site)
 
 
-async def until(condition, what, seconds=10.0):
+async def until(condition, failure, seconds=10.0):
     deadline = time.monotonic() + seconds
     while not condition():
-        assert time.monotonic() < deadline, what
+        assert time.monotonic() < deadline, failure
         await asyncio.sleep(0.01)
 
 
@@ -59,22 +59,22 @@ def zones(seq):
     return m.ZoneSet(epoch=1, seq=seq, zones=[])
 
 
-def counted(name, channel):
+def counter(name, channel):
     return REGISTRY.get_sample_value(name, {"channel": channel.name}) or 0.0
 
 
-async def publish_until(publisher, channel, make, condition, what, **ids):
-    """Publish again and again (a subscription takes a moment to reach the publisher)."""
+async def publish_until(publisher, channel, make, condition, failure, **ids):
+    """Publish repeatedly: a subscription takes a moment to reach the publisher."""
     deadline = time.monotonic() + 10.0
     n = 0
     while not condition():
-        assert time.monotonic() < deadline, what
+        assert time.monotonic() < deadline, failure
         publisher.publish(channel, make(n), **ids)
         n += 1
         await asyncio.sleep(0.02)
 
 
-async def test_messages_reach_subscribers_of_their_key_with_ids(router):
+async def test_messages_are_delivered_to_subscribers_of_their_key_with_ids(router):
     seen, one = [], []
     async with edge(router.endpoint, "a") as a, edge(router.endpoint, "b") as b:
         assert a.connected
@@ -88,7 +88,7 @@ async def test_messages_reach_subscribers_of_their_key_with_ids(router):
     assert not a.connected
 
 
-async def test_sites_do_not_hear_one_another(router):
+async def test_subscribers_receive_only_their_own_sites_messages(router):
     other, own = [], []
     async with edge(router.endpoint) as a, edge(router.endpoint, site="other") as b:
         b.subscribe(ch.ZONES, m.ZoneSet, lambda _, message: other.append(message))
@@ -97,7 +97,7 @@ async def test_sites_do_not_hear_one_another(router):
     assert other == []
 
 
-async def test_a_busy_loop_gets_the_newest_value_only_and_recovered_ones_complete(router):
+async def test_busy_loop_gets_only_the_newest_pose_but_every_delta(router):
     poses, deltas = [], []
     async with edge(router.endpoint, "a") as a, edge(router.endpoint, "b") as b:
         b.subscribe(ch.ROBOT_POSE, m.RobotPose, lambda _, message: poses.append(message.x))
@@ -110,13 +110,13 @@ async def test_a_busy_loop_gets_the_newest_value_only_and_recovered_ones_complet
         for n in range(1, 101):
             a.publish(ch.ROBOT_POSE, pose(float(n)), robot="r1")
             a.publish(ch.MAP_DELTA, delta(n))
-        time.sleep(0.5)  # noqa: ASYNC251  # the loop is meant to stand still while all arrive
+        time.sleep(0.5)  # noqa: ASYNC251  # blocks the loop on purpose while messages arrive
         await until(lambda: deltas == list(range(101)), "deltas are missing or out of order")
-        await until(lambda: poses and poses[-1] == 100.0, "the newest pose did not come")
+        await until(lambda: poses and poses[-1] == 100.0, "the newest pose was not delivered")
     assert len(poses) < 20
 
 
-async def test_late_subscriber_gets_kept_values_and_recent_deltas(router):
+async def test_late_subscriber_gets_the_latest_zones_and_recent_deltas(router):
     got, deltas = [], []
     async with edge(router.endpoint, "a") as a:
         for n in range(3):
@@ -125,12 +125,12 @@ async def test_late_subscriber_gets_kept_values_and_recent_deltas(router):
         async with edge(router.endpoint, "b") as b:
             b.subscribe(ch.ZONES, m.ZoneSet, lambda _, message: got.append(message.seq))
             b.subscribe(ch.MAP_DELTA, m.MapDelta, lambda _, message: deltas.append(message.seq))
-            await until(lambda: got and len(deltas) >= 3, "history did not come")
+            await until(lambda: got and len(deltas) >= 3, "earlier messages were not delivered")
     assert got == [2]
     assert deltas == [0, 1, 2]
 
 
-async def test_router_killed_and_restarted_all_goes_on_and_no_delta_is_lost(router):
+async def test_everything_resumes_after_a_restart_of_the_router_without_a_lost_delta(router):
     poses, deltas = [], []
     async with edge(router.endpoint, "a") as a, edge(router.endpoint, "b") as b:
         b.subscribe(ch.ROBOT_POSE, m.RobotPose, lambda _, message: poses.append(message.x))
@@ -149,7 +149,7 @@ async def test_router_killed_and_restarted_all_goes_on_and_no_delta_is_lost(rout
         poses.clear()
         await publish_until(a, ch.ROBOT_POSE, lambda _: pose(2.0), lambda: poses, "no pose again", robot="r1")
         await until(lambda: deltas == list(range(21)), f"deltas are missing: {deltas}")
-        await answered(b, 3.0)
+        await query_until_answered(b, 3.0)
 
 
 def plan(x):
@@ -157,11 +157,11 @@ def plan(x):
     return m.PlanRequest(start=at, goal=at)
 
 
-async def answered(asker, x, seconds=10.0):
-    """Ask until somebody answers."""
+async def query_until_answered(querier, x, seconds=10.0):
+    """Query until a reply arrives."""
     deadline = time.monotonic() + seconds
     while True:
-        reply = await asker.query(ch.PLANNER_PLAN, plan(x), m.PlanReply, 1.0)
+        reply = await querier.query(ch.PLANNER_PLAN, plan(x), m.PlanReply, 1.0)
         if reply is not None:
             assert reply.length == x
             return
@@ -169,7 +169,7 @@ async def answered(asker, x, seconds=10.0):
         await asyncio.sleep(0.02)
 
 
-async def test_edge_opened_before_any_router_does_all_once_there_is_one(tmp_path):
+async def test_edge_opened_before_any_router_works_once_there_is_one(tmp_path):
     port = free_port()
     endpoint = f"tcp/127.0.0.1:{port}"
     got, deltas, live = [], [], []
@@ -183,13 +183,13 @@ async def test_edge_opened_before_any_router_does_all_once_there_is_one(tmp_path
         for n in range(3):
             a.publish(ch.ZONES, zones(n))
             a.publish(ch.MAP_DELTA, delta(n))
-        before = counted("fognav_dropped_messages_total", ch.ROBOT_POSE)
+        before = counter("fognav_dropped_messages_total", ch.ROBOT_POSE)
         a.publish(ch.ROBOT_POSE, pose(1.0), robot="r1")
-        assert counted("fognav_dropped_messages_total", ch.ROBOT_POSE) == before + 1
+        assert counter("fognav_dropped_messages_total", ch.ROBOT_POSE) == before + 1
         assert await b.query(ch.PLANNER_PLAN, plan(1.0), m.PlanReply, 0.5) is None
         with start_router(tmp_path, port):
             await until(lambda: a.connected and b.connected, "no connection")
-            await answered(b, 4.0)
+            await query_until_answered(b, 4.0)
             await until(lambda: got == [2] and deltas == [0, 1, 2], f"missing: {got} {deltas}")
             await until(lambda: live == [("planner", "p1", True)], f"live: {live}")
 
@@ -204,16 +204,16 @@ async def test_queries_are_answered_by_plain_and_async_handlers_with_ids(router)
         a.serve(ch.ROBOT_COMMAND, command, robot="r1")
         a.serve(ch.ZONES, lambda *_: snapshot)
         a.serve(ch.PLANNER_PLAN, lambda _, request: m.PlanReply(length=request.goal.x))
-        await answered(b, 5.0)
+        await query_until_answered(b, 5.0)
         order = m.RobotCommand(kind="enable", robot="r1", operator="o", nonce="n" * 16, issued_at=1.0)
         reply = await b.query(ch.ROBOT_COMMAND, order, m.CommandReply, 5.0, robot="r1")
         assert reply == m.CommandReply(accepted=True, reason="r1 enable")
         assert await b.query(ch.ZONES, None, m.ZoneSet, 5.0) == snapshot
-        # Nobody serves r2: none comes, long before the time is over.
+        # r2 is not served: the query ends without a reply, long before its timeout.
         assert await b.query(ch.ROBOT_COMMAND, order, m.CommandReply, 5.0, robot="r2") is None
 
 
-async def test_a_large_reply_arrives_whole(router):
+async def test_large_reply_arrives_complete(router):
     big = m.MapSnapshot(
         site="lab", epoch=1, seq=1, hash=1, cost=bytes(range(256)) * 40_000, speed=b"", static=b"",
         geometry=m.MapGeometry(width=1, height=1, resolution=0.05, origin_x=0.0, origin_y=0.0),
@@ -221,11 +221,11 @@ async def test_a_large_reply_arrives_whole(router):
     async with edge(router.endpoint, "a") as a, edge(router.endpoint, "b") as b:
         a.serve(ch.MAP_SNAPSHOT, lambda *_: big)
         a.serve(ch.PLANNER_PLAN, lambda _, request: m.PlanReply(length=request.goal.x))
-        await answered(b, 1.0)
+        await query_until_answered(b, 1.0)
         assert await b.query(ch.MAP_SNAPSHOT, None, m.MapSnapshot, 20.0) == big
 
 
-async def test_asker_learns_of_failure_silence_and_broken_answers(router):
+async def test_query_reports_a_failing_and_a_silent_handler(router):
     silent = asyncio.Event()
 
     async def never(ids, request):
@@ -238,11 +238,11 @@ async def test_asker_learns_of_failure_silence_and_broken_answers(router):
         a.serve(ch.MAP_SNAPSHOT, never)
         a.serve(ch.PLANNER_EGRESS, fails)
         a.serve(ch.PLANNER_PLAN, lambda _, request: m.PlanReply(length=request.goal.x))
-        await answered(b, 1.0)
+        await query_until_answered(b, 1.0)
         assert await b.query(ch.MAP_SNAPSHOT, None, m.MapSnapshot, 0.2) is None
         with pytest.raises(ContractError, match="failed"):
             await b.query(ch.PLANNER_EGRESS, m.EgressRequest(robot="r1", pose=plan(0.0).start), m.PlanReply, 5.0)
-        await answered(b, 2.0)
+        await query_until_answered(b, 2.0)
 
 
 @contextlib.contextmanager
@@ -254,10 +254,10 @@ def raw_session(endpoint):
         session.close()
 
 
-async def test_broken_messages_are_refused_counted_and_do_no_harm(router):
+async def test_invalid_messages_are_refused_and_counted_and_later_ones_delivered(router):
     seen = []
     channel = ch.ROBOT_POSE
-    before = counted("fognav_refused_messages_total", channel)
+    before = counter("fognav_refused_messages_total", channel)
     async with edge(router.endpoint, "a") as a, edge(router.endpoint, "b") as b:
         b.subscribe(channel, m.RobotPose, lambda ids, _: seen.append(ids["robot"]))
         await publish_until(a, channel, lambda _: pose(1.0), lambda: seen, "no pose", robot="r1")
@@ -266,16 +266,16 @@ async def test_broken_messages_are_refused_counted_and_do_no_harm(router):
             raw.put("fog/lab/robots/r4/pose", b"x" * (channel.limit + 1))
             raw.put("fog/lab/robots/R 5/pose", b"\x80")
             raw.put("fog/lab/robots/r6/pose", b"\x80")
-            await until(lambda: counted("fognav_refused_messages_total", channel) == before + 4, "not all were refused")
+            await until(lambda: counter("fognav_refused_messages_total", channel) == before + 4, "not all were refused")
         seen.clear()
-        await publish_until(a, channel, lambda _: pose(1.0), lambda: seen, "deaf after broken messages", robot="r7")
+        await publish_until(a, channel, lambda _: pose(1.0), lambda: seen, "no message after invalid ones", robot="r7")
     assert set(seen) <= {"r1", "r7"}
 
 
-async def test_broken_and_oversized_requests_are_refused_in_words(router):
+async def test_invalid_and_oversized_requests_are_refused_with_the_reason(router):
     async with edge(router.endpoint, "a") as a, edge(router.endpoint, "b") as b:
         a.serve(ch.PLANNER_PLAN, lambda _, request: m.PlanReply(length=request.goal.x))
-        await answered(b, 1.0)
+        await query_until_answered(b, 1.0)
 
         def ask(payload):
             with raw_session(router.endpoint) as raw:
@@ -285,54 +285,54 @@ async def test_broken_and_oversized_requests_are_refused_in_words(router):
         assert "over the limit" in (await asyncio.to_thread(ask, b"x" * 2000))[0]
 
 
-async def test_a_message_that_its_handler_refuses_is_counted_as_refused(router):
+async def test_message_refused_by_its_handler_is_counted_as_refused(router):
     def handler(ids, message):
         raise RefusedMessageError("it can't be used")
 
-    before = counted("fognav_refused_messages_total", ch.ROBOT_POSE)
-    failed = counted("fognav_handler_errors_total", ch.ROBOT_POSE)
+    before = counter("fognav_refused_messages_total", ch.ROBOT_POSE)
+    failed = counter("fognav_handler_errors_total", ch.ROBOT_POSE)
     async with edge(router.endpoint, "a") as a, edge(router.endpoint, "b") as b:
         b.subscribe(ch.ROBOT_POSE, m.RobotPose, handler)
         await publish_until(
             a,
             ch.ROBOT_POSE,
             lambda _: pose(1.0),
-            lambda: counted("fognav_refused_messages_total", ch.ROBOT_POSE) > before,
+            lambda: counter("fognav_refused_messages_total", ch.ROBOT_POSE) > before,
             "not counted",
             robot="r1",
         )
-    assert counted("fognav_handler_errors_total", ch.ROBOT_POSE) == failed
+    assert counter("fognav_handler_errors_total", ch.ROBOT_POSE) == failed
 
 
-async def test_handler_that_fails_does_not_silence_the_channel(router):
+async def test_messages_are_delivered_after_a_handler_raised(router):
     seen = []
 
     def handler(ids, message):
         seen.append(message.x)
         raise RuntimeError("a bug")
 
-    before = counted("fognav_handler_errors_total", ch.ROBOT_POSE)
+    before = counter("fognav_handler_errors_total", ch.ROBOT_POSE)
     async with edge(router.endpoint, "a") as a, edge(router.endpoint, "b") as b:
         b.subscribe(ch.ROBOT_POSE, m.RobotPose, handler)
         await publish_until(a, ch.ROBOT_POSE, lambda _: pose(1.0), lambda: len(seen) > 2, "no pose", robot="r1")
-    assert counted("fognav_handler_errors_total", ch.ROBOT_POSE) >= before + 3
+    assert counter("fognav_handler_errors_total", ch.ROBOT_POSE) >= before + 3
 
 
-async def test_liveliness_tells_who_comes_and_goes(router):
+async def test_liveliness_reports_appearing_and_disappearing_processes(router):
     seen = []
-    async with edge(router.endpoint, "w") as watchdog:
+    async with edge(router.endpoint, "w") as observer:
         async with edge(router.endpoint, "early") as early:
             early.declare_liveliness("planner", "p1")
-            watchdog.subscribe_liveliness(lambda *event: seen.append(event))
-            await until(lambda: ("planner", "p1", True) in seen, "the early one is not seen")
+            observer.subscribe_liveliness(lambda *event: seen.append(event))
+            await until(lambda: ("planner", "p1", True) in seen, "the early process was not reported")
             async with edge(router.endpoint, "late") as late:
                 late.declare_liveliness("robot-agent", "r1")
-                await until(lambda: ("robot-agent", "r1", True) in seen, "the late one is not seen")
-            await until(lambda: ("robot-agent", "r1", False) in seen, "its end is not seen")
+                await until(lambda: ("robot-agent", "r1", True) in seen, "the late process was not reported")
+            await until(lambda: ("robot-agent", "r1", False) in seen, "its end was not reported")
         assert ("planner", "p1", False) not in seen[:-1]
 
 
-async def test_wrong_use_is_an_error_at_once(router):
+async def test_wrong_channel_ids_or_message_type_raises(router):
     async with edge(router.endpoint) as a:
         with pytest.raises(ValueError, match="mqtt"):
             a.publish(ch.NODE_READING, pose(1.0), node="n1")
@@ -344,7 +344,7 @@ async def test_wrong_use_is_an_error_at_once(router):
             a.publish(ch.ROBOT_POSE, zones(1), robot="r1")
 
 
-async def test_router_logs_that_it_listens_and_ends_on_sigterm(tmp_path):
+async def test_router_logs_its_endpoint_and_ends_on_sigterm(tmp_path):
     router = start_router(tmp_path)
     await until(lambda: "listening" in router.log.read_text(), "no event")
     router.stop()

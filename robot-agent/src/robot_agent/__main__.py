@@ -11,7 +11,7 @@ import os
 
 from fog_runtime import logs, process
 from fog_runtime.clock import SystemClock
-from fog_runtime.health import Health, serve_plain
+from fog_runtime.health import Health, serve_health
 from fog_runtime.settings import describe, load
 from fog_runtime.zenoh_edge import ZenohEdge
 from robot_agent.agent.guardian_client import GuardianClient
@@ -45,7 +45,7 @@ async def main() -> None:
     ) as zenoh:
         with (
             open_core(config, settings.seed, settings.input_log) as core,
-            serve_plain(health, settings.http_host, settings.http_port, settings.port_file),
+            serve_health(health, settings.http_host, settings.http_port, settings.port_file),
         ):
             agent = Service(core, zenoh, Store(settings.data_dir), clock, health, site=site)
             guardian = GuardianClient(settings.guardian_socket, clock, agent.on_feedback, agent.on_base_lost)

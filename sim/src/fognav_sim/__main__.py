@@ -9,7 +9,7 @@ import os
 from fog_contracts.site import RobotSite
 from fog_runtime import logs, process
 from fog_runtime.clock import SystemClock
-from fog_runtime.health import Health, serve_plain
+from fog_runtime.health import Health, serve_health
 from fog_runtime.settings import SettingsError, describe, load
 from fog_runtime.site import LoadedSite, load_site
 from fog_runtime.zenoh_edge import ZenohEdge
@@ -54,7 +54,7 @@ async def main() -> None:
             connect=settings.zenoh_endpoints, clock=clock, role="sim", id=robot.id, site=site
         ) as edge:
             floor.serve(edge, robot.id)
-            with serve_plain(health, settings.http_host, settings.http_port, settings.port_file):
+            with serve_health(health, settings.http_host, settings.http_port, settings.port_file):
                 async with asyncio.TaskGroup() as tasks:
                     tasks.create_task(floor.run(), name="world")
                     tasks.create_task(floor.tell(edge, robot.id), name="truth")

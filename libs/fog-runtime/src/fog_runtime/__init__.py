@@ -1,1 +1,1 @@
-"""Edges of Fognav's processes: settings, MQTT, zenoh, clock, metrics, health, logs, sites, record and replay."""
+"""I/O of Fognav's processes: settings, MQTT, zenoh, clock, metrics, health, logs, sites, recording and replay."""

@@ -1,4 +1,4 @@
-"""Time as something that is handed in: the real clock, a faster one, and one that only tests move."""
+"""Injectable clocks: the system's, the same sped up, and a manual one for tests and lockstep runs."""
 
 import asyncio
 import heapq
@@ -8,28 +8,28 @@ from collections import deque
 from collections.abc import AsyncIterator
 from typing import Final, Protocol
 
-_KEPT_BEATS: Final = 1000
-"""Beats over which a ticker's lateness is judged: 50 s at 20 Hz."""
+_LATENESS_SAMPLES: Final = 1000
+"""Ticks over which a ticker's lateness is measured: 50 s at 20 Hz."""
 
 
 class Clock(Protocol):
-    """What a process knows of time; all but `real` is in the clock's own, possibly faster, seconds."""
+    """A source of time; all but `real` is in the clock's own, possibly faster, seconds."""
 
     @property
     def speed(self) -> float:
         """How many seconds of this clock pass in one real second."""
 
     def now(self) -> float:
-        """Monotonic seconds: for ages, periods and timeouts; the zero means nothing."""
+        """Monotonic seconds, for ages, periods and timeouts; the origin is arbitrary."""
 
     def stamp(self) -> float:
-        """Seconds that all processes of a machine count alike: for messages, traces and people.
+        """Seconds on a scale shared by all processes of a machine, for messages, traces and people.
 
-        At speed 1 they count from the Unix epoch; at another speed they only keep the intervals right.
+        At speed 1 they count from the Unix epoch; at other speeds only differences are meaningful.
         """
 
     def real(self, seconds: float) -> float:
-        """Real seconds that `seconds` of this clock take: for timeouts of APIs that know real time only."""
+        """Real seconds that `seconds` of this clock take, for timeouts of APIs that use real time."""
 
     async def sleep(self, seconds: float) -> None:
         """Wait for `seconds` of this clock."""
@@ -66,7 +66,7 @@ class SystemClock:
 
 
 class ManualClock:
-    """A clock that moves only when told: tests and lockstep runs decide what time it is."""
+    """A clock that moves only by `advance`, for tests and lockstep runs."""
 
     def __init__(self, start: float = 0.0) -> None:
         self._now = start
@@ -79,7 +79,7 @@ class ManualClock:
         return 1.0
 
     def now(self) -> float:
-        """Return the seconds that it was set to."""
+        """Return the seconds to which it was advanced."""
         return self._now
 
     def stamp(self) -> float:
@@ -100,7 +100,7 @@ class ManualClock:
         await woken
 
     def advance(self, dt: float) -> None:
-        """Move the clock on by `dt` >= 0 seconds and wake, in order, all whose time has come."""
+        """Advance the clock by `dt` >= 0 seconds and wake, in order, the sleepers whose time has come."""
         if dt < 0.0:
             raise ValueError(f"time does not run backwards: dt must be >= 0, not {dt}")
         self._now += dt
@@ -113,8 +113,8 @@ class ManualClock:
 class Ticker:
     """A periodic loop without drift: `async for now in Ticker(clock, period): ...`.
 
-    Beats lie at multiples of the period after the first. One that was missed (the body took too long) is skipped,
-    never made up for: a burst of control cycles would act several times on one state of the world.
+    Ticks lie at multiples of the period after the first. A tick that was missed because the body took too long is
+    skipped: a burst of control cycles would act several times on the same state of the world.
     """
 
     def __init__(self, clock: Clock, period: float) -> None:
@@ -122,21 +122,21 @@ class Ticker:
             raise ValueError(f"a period must be positive, not {period} s")
         self.clock = clock
         self.period = period
-        self.beats = 0
+        self.ticks = 0
         self.late = 0
-        """Beats that were skipped, or came more than half a period after they were due."""
-        self._lateness: deque[float] = deque(maxlen=_KEPT_BEATS)
+        """Ticks that were skipped, or came more than half a period after they were due."""
+        self._lateness: deque[float] = deque(maxlen=_LATENESS_SAMPLES)
 
     @property
     def p99_s(self) -> float:
-        """99th percentile of the lateness (s of the clock) of the last 1000 beats; 0 before the first."""
+        """99th percentile of the lateness (s of the clock) of the last 1000 ticks; 0 before the first."""
         if not self._lateness:
             return 0.0
         ordered = sorted(self._lateness)
         return ordered[min(len(ordered) - 1, int(0.99 * len(ordered)))]
 
     async def __aiter__(self) -> AsyncIterator[float]:
-        """Yield `clock.now()` at every beat, the first at once."""
+        """Yield `clock.now()` at every tick, the first at once."""
         due = self.clock.now()
         while True:
             wait = due - self.clock.now()
@@ -147,7 +147,7 @@ class Ticker:
                 await asyncio.sleep(0)
             now = self.clock.now()
             lateness = max(0.0, now - due)
-            self.beats += 1
+            self.ticks += 1
             self._lateness.append(lateness)
             if lateness > self.period / 2:
                 self.late += 1

@@ -1,4 +1,4 @@
-"""A process's transports taken together: a core's table of handlers is subscribed to, and what it returns published."""
+"""Wiring of a core to a process's transports: subscribes its table of handlers and publishes what they return."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class Edges:
-    """The MQTT and zenoh connections of one process, chosen by each channel's transport."""
+    """The MQTT and zenoh connections of one process; each channel uses that of its transport."""
 
     def __init__(self, clock: Clock, *, mqtt: MqttEdge | None = None, zenoh: ZenohEdge | None = None) -> None:
         self._clock = clock
@@ -26,7 +26,7 @@ class Edges:
         self._zenoh = zenoh
 
     def now(self) -> Moment:
-        """Return the present moment by the process's clock."""
+        """Return the current moment by the process's clock."""
         return Moment(self._clock.now(), self._clock.stamp())
 
     def subscribe(
@@ -37,24 +37,24 @@ class Edges:
         numbers: Sequence[str | int] = (),
         only: Ids | None = None,
     ) -> None:
-        """Have each channel's messages go to its handler, and what the handler returns to `publish`.
+        """Subscribe each handler to its channel; what it returns is passed to `publish`.
 
-        Call it before the MQTT connection runs. `numbers` names the areas of the thesis's topics, for which MQTT has
-        no wildcard; `only` narrows zenoh's channels to those of these ids, as a robot hears its own. Raises
-        `ValueError` for a channel whose transport this process does not have.
+        Call it before the MQTT connection runs. `numbers` lists the areas of the thesis's topics, for which MQTT has
+        no wildcard; `only` restricts zenoh channels with these ids to these values: a robot subscribes to its own.
+        Raises `ValueError` for a channel whose transport this process does not have.
         """
         for channel, handler in handlers.items():
             self._subscribe(channel, self._delivery(handler, publish), numbers, only or {})
 
     def serve(self, query_handlers: Mapping[Channel, QueryHandler], **ids: str) -> None:
-        """Have each queryable's requests go to its query_handler; `ids` are the variable parts of the keys served."""
+        """Answer each channel's queries with its handler; `ids` are the variable parts of the keys served."""
         for channel, query_handler in query_handlers.items():
             if self._zenoh is None:
                 raise ValueError(f"channel {channel.name} is carried by zenoh, to which this process is not connected")
-            self._zenoh.serve(channel, self._reply(query_handler), **_fitting(channel, ids))
+            self._zenoh.serve(channel, self._reply(query_handler), **_ids_of(channel, ids))
 
     def publish(self, publication: Publication) -> None:
-        """Publish without waiting; raises `ContractError` when the message breaks the channel's contract."""
+        """Publish without waiting; raises `ContractError` when the message violates the channel's contract."""
         channel, message = publication.channel, publication.message
         if channel.transport == "mqtt":
             if self._mqtt is None:
@@ -92,11 +92,13 @@ class Edges:
             else:
                 self._mqtt.on(channel, deliver, channel.message)
         elif channel.transport == "zenoh" and self._zenoh is not None and channel.message is not None:
-            self._zenoh.subscribe(channel, channel.message, deliver, **_fitting(channel, only))
+            self._zenoh.subscribe(channel, channel.message, deliver, **_ids_of(channel, only))
         else:
-            raise ValueError(f"channel {channel.name} is carried by {channel.transport}: this process can't hear it")
+            raise ValueError(
+                f"channel {channel.name} is carried by {channel.transport}, to which this process is not connected"
+            )
 
 
-def _fitting(channel: Channel, ids: Ids) -> dict[str, str]:
-    """Return the ids that the channel has a place for."""
+def _ids_of(channel: Channel, ids: Ids) -> dict[str, str]:
+    """Return those of the ids that the channel's key contains."""
     return {name: value for name, value in ids.items() if name in channel.fields}

@@ -1,4 +1,4 @@
-"""Files that are either the old or the new one, whatever happens in between."""
+"""Atomic replacement of files."""
 
 import os
 import tempfile
@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 def atomic_write(path: Path, data: bytes) -> None:
-    """Write a file durably: readers, and a restart after a power cut, see the old content or the new, never a part."""
+    """Write a file durably; readers, even after a power cut, see either the old content or the new, never a part."""
     path.parent.mkdir(parents=True, exist_ok=True)
     descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
@@ -26,6 +26,6 @@ def atomic_write(path: Path, data: bytes) -> None:
 
 
 def write_port_file(path: Path | None, port: int) -> None:
-    """Tell others in a file (if one is wanted) which port was chosen."""
+    """Write the chosen port to `path`, if given, for other processes."""
     if path is not None:
         atomic_write(path, f"{port}\n".encode())

@@ -1,4 +1,4 @@
-"""Liveness and readiness: what a process needs, what it has, and a tiny HTTP server that tells."""
+"""Liveness and readiness: named conditions, and a small HTTP server that reports them."""
 
 import json
 import threading
@@ -17,37 +17,37 @@ class Health:
     """Named conditions of readiness; any thread may set and read them."""
 
     def __init__(self, *needed: str) -> None:
-        """Start with the `needed` conditions unmet, so that nothing is ready before it said so."""
+        """Start with the `needed` conditions unmet, so that the process is not ready before all are set."""
         self._lock = threading.Lock()
-        self._parts: dict[str, tuple[bool, str]] = dict.fromkeys(needed, (False, "not started"))
+        self._conditions: dict[str, tuple[bool, str]] = dict.fromkeys(needed, (False, "not started"))
 
     def set(self, name: str, ok: bool, detail: str = "") -> None:  # noqa: FBT001  # set("redis", True) reads well
-        """Say whether a condition is met, and why not."""
+        """Set whether a condition is met, and if not, why."""
         with self._lock:
-            before = self._parts.get(name)
-            self._parts[name] = (ok, detail)
+            before = self._conditions.get(name)
+            self._conditions[name] = (ok, detail)
         if before is None or before[0] != ok:
-            _log.info("health", part=name, ok=ok, detail=detail)
+            _log.info("readiness_changed", condition=name, ok=ok, detail=detail)
 
     @property
     def ready(self) -> bool:
         """Whether every condition is met."""
         with self._lock:
-            return all(ok for ok, _ in self._parts.values())
+            return all(ok for ok, _ in self._conditions.values())
 
     def report(self) -> dict[str, Any]:
-        """Return readiness, the names of what is missing, and every condition with its detail."""
+        """Return readiness, the names of the unmet conditions, and every condition with its detail."""
         with self._lock:
-            parts = dict(self._parts)
-        missing = [name for name, (ok, _) in parts.items() if not ok]
+            conditions = dict(self._conditions)
+        missing = [name for name, (ok, _) in conditions.items() if not ok]
         return {
             "ready": not missing,
             "missing": missing,
-            "parts": {name: {"ok": ok, "detail": detail} for name, (ok, detail) in parts.items()},
+            "parts": {name: {"ok": ok, "detail": detail} for name, (ok, detail) in conditions.items()},
         }
 
 
-class PlainServer:
+class HealthServer:
     """A running health server; close it, or use it as a context manager."""
 
     def __init__(self, server: ThreadingHTTPServer) -> None:
@@ -73,8 +73,8 @@ class PlainServer:
         self.close()
 
 
-def serve_plain(health: Health, host: str = "127.0.0.1", port: int = 0, port_file: Path | None = None) -> PlainServer:
-    """Serve /healthz, /readyz (503 names what is missing) and /metrics from a thread; port 0 takes a free one."""
+def serve_health(health: Health, host: str = "127.0.0.1", port: int = 0, port_file: Path | None = None) -> HealthServer:
+    """Serve /healthz, /readyz (503 names what is missing) and /metrics from a thread; port 0: any free port."""
 
     class Handler(BaseHTTPRequestHandler):
         timeout = 5.0  # seconds until a silent client is dropped
@@ -100,11 +100,11 @@ def serve_plain(health: Health, host: str = "127.0.0.1", port: int = 0, port_fil
             self.wfile.write(body)
 
         def log_message(self, format: str, *args: object) -> None:  # noqa: A002  # the name is http.server's
-            _log.debug("request", line=format % args)
+            _log.debug("request_served", line=format % args)
 
     server = ThreadingHTTPServer((host, port), Handler)
     server.daemon_threads = True
-    running = PlainServer(server)
+    running = HealthServer(server)
     _log.info("listening", url=f"http://{host}:{running.port}", port=running.port)
     write_port_file(port_file, running.port)
     return running

@@ -1,4 +1,4 @@
-"""The secrets of a site: `python -m fog_runtime.keys DIR` makes what is missing in DIR and touches nothing else.
+"""The secrets of a site: `python -m fog_runtime.keys DIR` creates those missing in DIR and keeps the others.
 
 - `admin.token`: a bearer token for REST writes; `tokens.toml`: its hash, for the services (FOGNAV_TOKENS_FILE).
 - `operator.key`: the key that signs commands to robots (FOGNAV_OPERATOR_KEY_FILE), hexadecimal.
@@ -25,40 +25,41 @@ def _write_new(file: Path, text: str, mode: int) -> None:
 
 
 def make_keys(directory: Path, *, mode: int = 0o600) -> list[Path]:
-    """Make the secrets that are missing; return the files that are new.
+    """Create the missing secrets; return the new files.
 
-    A token without its entry in `tokens.toml` would open nothing, so these two are made together: raises
-    `FileExistsError` when only one of them is there.
+    A token is useless without its entry in `tokens.toml`, so these two are created together: raises `FileExistsError`
+    when only one of them exists.
     """
     directory.mkdir(parents=True, exist_ok=True)
-    made: list[Path] = []
+    created: list[Path] = []
     token_file, tokens_file, key_file = (directory / name for name in (ADMIN_TOKEN, TOKENS, OPERATOR_KEY))
     if token_file.exists() != tokens_file.exists():
-        there = token_file if token_file.exists() else tokens_file
-        raise FileExistsError(f"{there} is there without its counterpart: remove it, or bring the other one back")
+        existing = token_file if token_file.exists() else tokens_file
+        missing = tokens_file if token_file.exists() else token_file
+        raise FileExistsError(f"{existing} exists, but {missing} does not: remove the one or restore the other")
     if not token_file.exists():
         token = secrets.token_urlsafe(32)
         _write_new(token_file, token + "\n", mode)
         _write_new(tokens_file, f'[[tokens]]\nname = "admin"\nrole = "admin"\nsha256 = "{token_hash(token)}"\n', mode)
-        made += [token_file, tokens_file]
+        created += [token_file, tokens_file]
     if not key_file.exists():
         _write_new(key_file, secrets.token_hex(KEY_BYTES) + "\n", mode)
-        made.append(key_file)
-    return made
+        created.append(key_file)
+    return created
 
 
 def main() -> int:
-    """Make the missing secrets in the folder that the command line names."""
+    """Create the missing secrets in the folder that the command line names."""
     if len(sys.argv) != 2:
         sys.stderr.write("usage: python -m fog_runtime.keys DIR\n")
         return 2
     try:
-        made = make_keys(Path(sys.argv[1]))
+        created = make_keys(Path(sys.argv[1]))
     except OSError as error:
         sys.stderr.write(f"{error}\n")
         return 1
-    for file in made:
-        sys.stdout.write(f"made {file}\n")
+    for file in created:
+        sys.stdout.write(f"created {file}\n")
     return 0
 
 

@@ -26,24 +26,24 @@ class Log:
         return Log(self._logger.name, {**self._bound, **fields})
 
     def debug(self, event: str, **fields: object) -> None:
-        """Log what only a developer wants to see."""
+        """Log a detail for developers."""
         self._emit(logging.DEBUG, event, fields)
 
     def info(self, event: str, **fields: object) -> None:
-        """Log what happened in the normal course of things."""
+        """Log an event of normal operation."""
         self._emit(logging.INFO, event, fields)
 
     def warning(self, event: str, **fields: object) -> None:
-        """Log what somebody should look at."""
+        """Log an event that needs attention."""
         self._emit(logging.WARNING, event, fields)
 
     def error(self, event: str, *, error: BaseException | None = None, **fields: object) -> None:
-        """Log what failed; `error` adds the exception with its traceback."""
+        """Log a failure; `error` adds the exception with its traceback."""
         self._emit(logging.ERROR, event, fields, error)
 
     def _emit(self, level: int, event: str, fields: Mapping[str, object], error: BaseException | None = None) -> None:
         if self._logger.isEnabledFor(level):
-            # "%s" keeps an event that holds a percent sign from being taken for a format.
+            # "%s", because an event with a percent sign would be taken for a format.
             self._logger.log(level, "%s", event, extra={_FIELDS: {**self._bound, **fields}}, exc_info=error)
 
 
@@ -53,7 +53,7 @@ class _Formatter(logging.Formatter):
         self._process = process
 
     def record(self, record: logging.LogRecord) -> dict[str, object]:
-        """Collect what a line says."""
+        """Return the fields of a line."""
         fields: dict[str, object] = {
             "ts": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
             "level": record.levelname.lower(),
@@ -86,13 +86,13 @@ class _TextFormatter(_Formatter):
 
 
 def configure(process: str, level: Level = "info", fmt: Format = "json") -> None:
-    """Send all logs of this process, those of libraries too, to standard error; call once, first thing."""
+    """Send all logs of this process, including those of libraries, to standard error; call once, at the start."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(_JsonFormatter(process) if fmt == "json" else _TextFormatter(process))
     root = logging.getLogger()
     root.handlers[:] = [handler]
     root.setLevel(level.upper())
-    # Libraries report their successes at info level; only their troubles belong into our events.
+    # Libraries log normal operation at info level; only their warnings and errors belong into our events.
     for name in ("mqtt", "uvicorn", "asyncio", "httpx", "httpcore"):
         logging.getLogger(name).setLevel(max(logging.WARNING, root.level))
 
@@ -103,9 +103,9 @@ def get(name: str) -> Log:
 
 
 class RateLimited:
-    """Logs the first of equal troubles at once, then at most one line per `period` seconds that counts the rest.
+    """Logs the first of equal warnings at once, then at most one per `period` seconds with the number suppressed.
 
-    Keeps at most `max_keys` different troubles apart, so that a sender of ever new ones can't fill the memory.
+    Distinguishes at most `max_keys` keys, so that a sender of ever new ones can't exhaust the memory.
     """
 
     def __init__(self, log: Log, period: float = 10.0, max_keys: int = 1000) -> None:
@@ -126,5 +126,5 @@ class RateLimited:
                 return
             self._state[key] = (now, 0)
         if suppressed:
-            fields["not_logged_since"] = suppressed
+            fields["suppressed"] = suppressed
         self._log.warning(event, **fields)

@@ -1,7 +1,7 @@
-"""Map files of ROS's map_server (a YAML beside an image), read into grids and written.
+"""Reading and writing map files of ROS's map_server (a YAML file beside an image).
 
-The meaning of pixels is that of Nav2's `nav2_map_server/map_io` (and map_server before it): shade is the mean of the
-colour channels, in trinary mode with alpha counted as one more; `occ` is 1 - shade, or shade when negated.
+Pixels are interpreted as by Nav2's `nav2_map_server/map_io`: the shade is the mean of the colour channels, in trinary
+mode with alpha as one more channel; the occupancy is 1 - shade, or the shade when negated.
 """
 
 import io
@@ -25,7 +25,7 @@ Mode = Literal["trinary", "scale", "raw"]
 OCCUPIED_PERCENT: Final = 100
 UNKNOWN_PERCENT: Final = -1
 MAX_PIXELS: Final = 50_000_000
-"""Larger images are refused: 350 m x 350 m at 5 cm, and no decompression bomb."""
+"""Limit of an image (350 m x 350 m at 5 cm), against decompression bombs."""
 
 _EXAMPLES: Final = {"resolution": 0.05, "occupied_thresh": 0.65, "free_thresh": 0.196}
 _WRITTEN_OCCUPIED: Final = 0.65
@@ -34,9 +34,9 @@ _SHADES: Final = {FREE: 254, LETHAL: 0, UNKNOWN: 205}
 
 
 class MapFileError(ValueError):
-    """A map file that can't be used; the message names the file, the key and the remedy.
+    """A map file is missing or invalid; the message names the file, the key and the remedy.
 
-    The key `file` stands for the file as a whole.
+    The key `file` means the file as a whole.
     """
 
     def __init__(self, file: Path, key: str, problem: str, remedy: str) -> None:
@@ -48,9 +48,9 @@ class MapFileError(ValueError):
 
 @dataclass(frozen=True)
 class Occupancy:
-    """What map_server would publish: int8 (height, width), 0..100 percent or -1 unknown, row 0 at the bottom.
+    """The grid that map_server publishes: int8 (height, width), 0..100 percent or -1 unknown, row 0 at the bottom.
 
-    `yaw` (rad) turns the grid about its lower-left corner (`geometry.origin_x`, `origin_y`).
+    `yaw` (rad) rotates the grid about its lower-left corner (`geometry.origin_x`, `origin_y`).
     """
 
     geometry: GridGeometry
@@ -63,14 +63,14 @@ class Occupancy:
 
 @dataclass(frozen=True)
 class StaticMap:
-    """The plain map of a site, aligned with `map`: uint8 (height, width), 0 free, 254 occupied, 255 unknown."""
+    """A site's floor plan, aligned with the frame `map`: uint8 (height, width), 0 free, 254 occupied, 255 unknown."""
 
     geometry: GridGeometry
     cells: NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
-class _Description:
+class _Metadata:
     image: Path
     resolution: float
     origin: tuple[float, float, float]
@@ -81,7 +81,7 @@ class _Description:
 
 
 def _as_number(value: object) -> float:
-    """Return a number as YAML means it, NaN when it is none; `1e-05`, as C++ writes it, is a text in YAML 1.1."""
+    """Return a YAML value as a number, else NaN; YAML 1.1 reads `1e-05`, as C++ writes it, as text."""
     if isinstance(value, bool) or not isinstance(value, int | float | str):
         return math.nan
     try:
@@ -93,40 +93,44 @@ def _as_number(value: object) -> float:
 def _number(file: Path, data: dict[str, Any], key: str, low: float, high: float) -> float:
     value = _as_number(data.get(key))
     if not low <= value <= high:
-        shown = "missing" if key not in data else f"{data[key]!r} is no number from {low:g} to {high:g}"
+        shown = "missing" if key not in data else f"{data[key]!r} is not a number from {low:g} to {high:g}"
         raise MapFileError(file, key, shown, f"Write e.g. `{key}: {_EXAMPLES[key]}`")
     return value
 
 
-def _no_yaml(error: yaml.YAMLError | UnicodeDecodeError) -> tuple[str, str]:
-    """Return what is wrong with a file that can't be read as YAML, in one line, and what to do."""
+def _yaml_problem(error: yaml.YAMLError | UnicodeDecodeError) -> tuple[str, str]:
+    """Return why a file can't be read as YAML, in one line, and the remedy."""
     if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None:
         where = f"line {error.problem_mark.line + 1}, column {error.problem_mark.column + 1}"
-        return f"is no valid YAML ({where}: {error.problem})", "Correct that place"
-    return "is no text", "A map is a YAML file that names an image: name that file, not the image"
+        return f"is not valid YAML ({where}: {error.problem})", "Correct that line"
+    return "is not a text file", "A map is a YAML file that names an image: name that file, not the image"
 
 
-def _describe(file: Path) -> _Description:
+def _read_metadata(file: Path) -> _Metadata:
     try:
         data = yaml.safe_load(file.read_text("utf-8"))
     except OSError as error:
         remedy = "A map is a YAML file that names an image; check the path"
         raise MapFileError(file, "file", f"can't be read ({error.strerror})", remedy) from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise MapFileError(file, "file", *_no_yaml(error)) from error
+        raise MapFileError(file, "file", *_yaml_problem(error)) from error
     if not isinstance(data, dict):
-        raise MapFileError(file, "file", "is no table of keys", "Write `image: ...`, `resolution: ...` and so on")
+        raise MapFileError(
+            file, "file", "is not a mapping of keys to values", "Write `image: ...`, `resolution: ...` and so on"
+        )
     name = data.get("image")
     if not isinstance(name, str) or not name:
         raise MapFileError(file, "image", "missing", "Name the image file, relative to this file")
     image = file.parent / name
     if not image.is_file():
-        problem = f"{image} {'is no file' if image.exists() else 'does not exist'}"
+        problem = f"{image} {'is not a file' if image.exists() else 'does not exist'}"
         raise MapFileError(file, "image", problem, "Put the image there or name another")
-    given = data.get("origin")
-    origin = [_as_number(value) for value in given] if isinstance(given, list) else []
+    origin_value = data.get("origin")
+    origin = [_as_number(value) for value in origin_value] if isinstance(origin_value, list) else []
     if len(origin) != 3 or not all(math.isfinite(value) for value in origin):
-        raise MapFileError(file, "origin", f"{given!r} is no [x, y, yaw]", "Write e.g. `origin: [0.0, 0.0, 0.0]`")
+        raise MapFileError(
+            file, "origin", f"{origin_value!r} is not [x, y, yaw]", "Write e.g. `origin: [0.0, 0.0, 0.0]`"
+        )
     negate = data.get("negate")
     if negate not in (0, 1):
         raise MapFileError(file, "negate", f"{negate!r} is neither 0 nor 1", "Write `negate: 0` when dark is occupied")
@@ -136,7 +140,7 @@ def _describe(file: Path) -> _Description:
     occupied, free = (_number(file, data, key, 0.0, 1.0) for key in ("occupied_thresh", "free_thresh"))
     if free >= occupied:
         raise MapFileError(file, "free_thresh", f"{free} is not below occupied_thresh {occupied}", "Lower it")
-    return _Description(
+    return _Metadata(
         image=image,
         resolution=_number(file, data, "resolution", 1e-3, 10.0),
         origin=(origin[0], origin[1], origin[2]),
@@ -152,17 +156,19 @@ def _channels(file: Path, image: Path) -> tuple[NDArray[np.float64], NDArray[np.
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
-            opened = Image.open(image)
-        with opened:
-            if opened.width * opened.height > MAX_PIXELS:
-                size = f"{image} has {opened.width} x {opened.height} pixels, more than {MAX_PIXELS}"
+            picture = Image.open(image)
+        with picture:
+            if picture.width * picture.height > MAX_PIXELS:
+                size = f"{image} has {picture.width} x {picture.height} pixels, more than {MAX_PIXELS}"
                 raise MapFileError(file, "image", size, "Use a coarser resolution")
-            if opened.mode in {"I", "I;16", "I;16B", "I;16L"}:
-                return (np.asarray(opened, dtype=np.float64) / 65_535.0)[:, :, None], None
-            mode = _plain_mode(opened)
+            if picture.mode in {"I", "I;16", "I;16B", "I;16L"}:
+                return (np.asarray(picture, dtype=np.float64) / 65_535.0)[:, :, None], None
+            mode = _plain_mode(picture)
             if mode is None:
-                raise MapFileError(file, "image", f"{image} has pixels of kind {opened.mode}", "Save it as PNG in grey")
-            pixels = np.asarray(opened.convert(mode), dtype=np.float64) / 255.0
+                raise MapFileError(
+                    file, "image", f"{image} has pixels of mode {picture.mode}", "Save it as a greyscale PNG"
+                )
+            pixels = np.asarray(picture.convert(mode), dtype=np.float64) / 255.0
     except (
         UnidentifiedImageError, OSError, SyntaxError, ValueError, Image.DecompressionBombWarning,
         Image.DecompressionBombError,
@@ -170,13 +176,13 @@ def _channels(file: Path, image: Path) -> tuple[NDArray[np.float64], NDArray[np.
         if isinstance(error, MapFileError):
             raise
         raise MapFileError(
-            file, "image", f"{image} can't be decoded ({error})", "Save it anew, as PGM or PNG"
+            file, "image", f"{image} can't be decoded ({error})", "Save it again as PGM or PNG"
         ) from error
-    return _without_alpha(pixels, mode)
+    return _split_alpha(pixels, mode)
 
 
 def _plain_mode(image: Image.Image) -> str | None:
-    """Return the mode of Pillow (L, LA, RGB or RGBA) that holds all that an image says; None for none of them."""
+    """Return the mode of Pillow (L, LA, RGB or RGBA) to which an image converts without loss; None for none."""
     transparent = "transparency" in image.info
     if image.mode in {"1", "L"}:
         return "LA" if transparent else "L"
@@ -185,10 +191,10 @@ def _plain_mode(image: Image.Image) -> str | None:
     return image.mode if image.mode in {"LA", "RGB", "RGBA"} else None
 
 
-def _without_alpha(pixels: NDArray[np.float64], mode: str) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+def _split_alpha(pixels: NDArray[np.float64], mode: str) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
     """Split the pixels of an image in one of the plain modes into colours (h, w, n) and alpha (h, w) or None."""
     if mode == "LA":
-        # Alpha weighs as one of four channels, as if grey had been spread to red, green and blue.
+        # Alpha must weigh as one of four channels, so grey is repeated as red, green and blue.
         return np.repeat(pixels[:, :, :1], 3, axis=2), pixels[:, :, 1]
     if mode == "RGBA":
         return pixels[:, :, :3], pixels[:, :, 3]
@@ -196,60 +202,62 @@ def _without_alpha(pixels: NDArray[np.float64], mode: str) -> tuple[NDArray[np.f
 
 
 def load_occupancy(yaml_path: Path) -> Occupancy:
-    """Read a map file as map_server would, yaw unresolved; raises `MapFileError`."""
-    about = _describe(yaml_path)
-    colours, alpha = _channels(yaml_path, about.image)
-    if about.mode == "trinary" and alpha is not None:
+    """Read a map file as map_server does, without applying the yaw; raises `MapFileError`."""
+    metadata = _read_metadata(yaml_path)
+    colours, alpha = _channels(yaml_path, metadata.image)
+    if metadata.mode == "trinary" and alpha is not None:
         colours = np.concatenate([colours, alpha[:, :, None]], axis=2)
     shade = colours.mean(axis=2)
-    occ = shade if about.negate else 1.0 - shade
-    if about.mode == "raw":
+    occ = shade if metadata.negate else 1.0 - shade
+    if metadata.mode == "raw":
         percent = np.rint(shade * 255.0)
         values = np.where(percent <= OCCUPIED_PERCENT, percent, UNKNOWN_PERCENT)
     else:
-        if about.mode == "scale":
-            between = np.rint((occ - about.free_thresh) / (about.occupied_thresh - about.free_thresh) * 100.0)
+        if metadata.mode == "scale":
+            between = np.rint((occ - metadata.free_thresh) / (metadata.occupied_thresh - metadata.free_thresh) * 100.0)
         else:
             between = np.full(occ.shape, float(UNKNOWN_PERCENT))
         values = np.where(
-            occ > about.occupied_thresh, OCCUPIED_PERCENT, np.where(occ < about.free_thresh, 0.0, between)
+            occ > metadata.occupied_thresh, OCCUPIED_PERCENT, np.where(occ < metadata.free_thresh, 0.0, between)
         )
-        if about.mode == "scale" and alpha is not None:
+        if metadata.mode == "scale" and alpha is not None:
             values = np.where(alpha < 1.0, UNKNOWN_PERCENT, values)
     height, width = values.shape
-    geometry = GridGeometry(width, height, about.resolution, about.origin[0], about.origin[1])
+    geometry = GridGeometry(width, height, metadata.resolution, metadata.origin[0], metadata.origin[1])
     bottom_up = np.ascontiguousarray(values[::-1].astype(np.int8))
-    return Occupancy(geometry, about.origin[2], bottom_up, about.mode, about.occupied_thresh, about.free_thresh)
+    return Occupancy(
+        geometry, metadata.origin[2], bottom_up, metadata.mode, metadata.occupied_thresh, metadata.free_thresh
+    )
 
 
 def load_map(yaml_path: Path) -> StaticMap:
     """Read a map file into a grid aligned with the frame `map`; raises `MapFileError`.
 
-    Grades between free and occupied (modes scale and raw) are judged by the file's thresholds; what lies between
-    them is unknown, and so impassable: a grade is no promise. A yaw is resolved by turning the grid: no occupied cell
-    is lost, walls may grow by half a cell, and cells off the old grid are unknown. Yaw 0 keeps every cell.
+    Occupancies between free and occupied (modes scale and raw) are classified by the file's thresholds; between them a
+    cell is unknown, and so impassable. A yaw is applied by rotating the grid: no occupied cell is lost, walls may grow
+    by half a cell, and cells outside the original grid are unknown. Yaw 0 keeps every cell.
     """
     occupancy = load_occupancy(yaml_path)
     values = occupancy.values
     cells = np.full(values.shape, UNKNOWN, dtype=np.uint8)
-    # In the modes trinary and scale the thresholds are in the values already: only the ends are certain.
+    # In the modes trinary and scale the thresholds were applied: only the extreme values are free or occupied.
     raw = occupancy.mode == "raw"
     cells[(values >= 0) & (values < max(1.0, 100.0 * occupancy.free_thresh if raw else 1.0))] = FREE
     cells[values > (100.0 * occupancy.occupied_thresh if raw else 99.0)] = LETHAL
     if occupancy.yaw == 0.0:
         return StaticMap(occupancy.geometry, cells)
-    return _turned(StaticMap(occupancy.geometry, cells), occupancy.yaw)
+    return _rotated(StaticMap(occupancy.geometry, cells), occupancy.yaw)
 
 
-def _turned(flat: StaticMap, yaw: float) -> StaticMap:
-    """Turn a grid counter-clockwise about its origin onto the axes of the frame, by nearest neighbour both ways."""
-    old = flat.geometry
+def _rotated(original: StaticMap, yaw: float) -> StaticMap:
+    """Rotate a grid counter-clockwise about its origin and resample it by nearest neighbour on the frame's axes."""
+    old = original.geometry
     cos, sin = math.cos(yaw), math.sin(yaw)
     wide, high = old.width * old.resolution, old.height * old.resolution
     corners = [(x * cos - y * sin, x * sin + y * cos) for x, y in ((0.0, 0.0), (wide, 0.0), (0.0, high), (wide, high))]
     left, bottom = min(x for x, _ in corners), min(y for _, y in corners)
     right, top = max(x for x, _ in corners), max(y for _, y in corners)
-    # The small slack keeps quarter turns exact: rounding must not add an empty row.
+    # The tolerance keeps quarter turns exact: rounding must not add an empty row.
     width = max(1, math.ceil((right - left) / old.resolution - 1e-6))
     height = max(1, math.ceil((top - bottom) / old.resolution - 1e-6))
     new = GridGeometry(width, height, old.resolution, old.origin_x + left, old.origin_y + bottom)
@@ -261,10 +269,10 @@ def _turned(flat: StaticMap, yaw: float) -> StaticMap:
     row = np.floor((-x * sin + y * cos) / old.resolution).astype(np.int64)
     inside = (column >= 0) & (column < old.width) & (row >= 0) & (row < old.height)
     cells = np.full((height, width), UNKNOWN, dtype=np.uint8)
-    cells[inside] = flat.cells[row[inside], column[inside]]
+    cells[inside] = original.cells[row[inside], column[inside]]
 
-    # A single occupied cell may lie between all the new centres: draw each where its centre falls, too.
-    rows, columns = np.nonzero(flat.cells == LETHAL)
+    # An occupied cell may contain none of the new centres: mark also the cell that contains its own centre.
+    rows, columns = np.nonzero(original.cells == LETHAL)
     px, py = (columns + 0.5) * old.resolution, (rows + 0.5) * old.resolution
     new_column = np.floor((px * cos - py * sin - left) / old.resolution).astype(np.int64)
     new_row = np.floor((px * sin + py * cos - bottom) / old.resolution).astype(np.int64)
@@ -273,17 +281,17 @@ def _turned(flat: StaticMap, yaw: float) -> StaticMap:
 
 
 def save_map(path_prefix: Path, static: StaticMap) -> None:
-    """Write PREFIX.pgm and PREFIX.yaml so that `load_map` gives the same cells; each file is replaced as a whole."""
+    """Write PREFIX.pgm and PREFIX.yaml so that `load_map` returns the same cells; each file is replaced atomically."""
     shades = np.full(256, _SHADES[UNKNOWN], dtype=np.uint8)
     for cost, shade in _SHADES.items():
         shades[cost] = shade
     image = io.BytesIO()
     Image.fromarray(np.ascontiguousarray(shades[static.cells][::-1])).save(image, format="PPM")
-    picture = path_prefix.with_name(f"{path_prefix.name}.pgm")
-    atomic_write(picture, image.getvalue())
+    image_file = path_prefix.with_name(f"{path_prefix.name}.pgm")
+    atomic_write(image_file, image.getvalue())
     g = static.geometry
     text = (
-        f"image: {picture.name}\nmode: trinary\nresolution: {g.resolution!r}\n"
+        f"image: {image_file.name}\nmode: trinary\nresolution: {g.resolution!r}\n"
         f"origin: [{g.origin_x!r}, {g.origin_y!r}, 0.0]\nnegate: 0\n"
         f"occupied_thresh: {_WRITTEN_OCCUPIED}\nfree_thresh: {_WRITTEN_FREE}\n"
     )

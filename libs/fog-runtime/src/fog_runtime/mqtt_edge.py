@@ -1,7 +1,7 @@
-"""The sensor side's transport: the table's MQTT channels as typed publishing and subscribing over one connection.
+"""The transport of the sensor side: typed publishing and subscribing on MQTT channels over one connection.
 
-MQTT 5, so that a broker says why it refuses. Each connection starts clean and subscribes anew: what must survive is
-retained or published again by `on_connect`, never left to the broker's memory.
+MQTT 5, because its brokers give the reason of a refusal. Each connection starts a clean session and subscribes again:
+state that must survive is retained, or published again by `on_connect`, never kept in a broker's session.
 """
 
 import asyncio
@@ -28,9 +28,9 @@ T = TypeVar("T")
 Ids = dict[str, str]
 
 BACKOFF_S: Final = (0.2, 2.0)
-"""Real seconds between attempts to connect: at first, and at most."""
+"""Real seconds between attempts to connect: initial and maximum."""
 KEEPALIVE_S: Final = 10
-"""A broker that is silent for 1.5 times as long is taken for dead (and takes us for dead)."""
+"""A connection without traffic for 1.5 times as long is considered lost by both sides."""
 _TIMEOUT_S: Final = 5.0
 _QUEUE: Final = 10_000
 
@@ -39,7 +39,7 @@ _log = logs.get("mqtt_edge")
 
 @dataclass(frozen=True)
 class Will:
-    """What the broker publishes when this process vanishes without a goodbye."""
+    """The last will: what the broker publishes when this process disconnects unexpectedly."""
 
     channel: Channel
     message: Message | str
@@ -81,7 +81,7 @@ def _encoded(channel: Channel, message: Message | str) -> bytes:
     return encode(channel, message) if isinstance(message, Message) else encode_text(channel, message)
 
 
-def _tell_refused(topics: Sequence[str], codes: Sequence[object]) -> None:
+def _log_refused_subscriptions(topics: Sequence[str], codes: Sequence[object]) -> None:
     for topic, code in zip(topics, codes, strict=True):
         if isinstance(code, ReasonCode) and code.is_failure:
             _log.error("subscription_refused", topic=topic, reason=str(code))
@@ -91,9 +91,9 @@ class MqttEdge:
     """One process's connection to the broker. All handlers run on the event loop's thread."""
 
     def __init__(self, url: str, client_id: str, clock: Clock, *, site: str, will: Will | None = None) -> None:
-        """Prepare a connection; nothing happens before `run`. `site` is filled into every topic that has one.
+        """Prepare a connection that `run` opens. `site` is filled into every topic that contains one.
 
-        Raises `ValueError` for an address that is none.
+        Raises `ValueError` for an invalid address.
         """
         self._address = _address(url)
         self._client_id = client_id
@@ -138,10 +138,10 @@ class MqttEdge:
         *,
         numbers: Sequence[str | int] = (),
     ) -> None:
-        """Have `handler(ids, message)` called for each message of the channel; register before `run`.
+        """Call `handler(ids, message)` for each message of the channel; register before `run`.
 
-        Channels without a message type give their text. `numbers` names the areas of the thesis's topics, for which
-        MQTT has no wildcard.
+        Channels without a message type deliver text. `numbers` lists the areas of the thesis's topics, for which MQTT
+        has no wildcard.
         """
         if channel.transport != "mqtt" or channel.message is not kind:
             expected = channel.message.__name__ if channel.message else "text"
@@ -153,72 +153,72 @@ class MqttEdge:
         self._registrations.append(_Registration(channel, handler, kind, topics))
 
     async def add_number(self, channel: Channel, number: str | int) -> None:
-        """Have the handlers of one of the thesis's channels hear one more area, now and after every connection.
+        """Subscribe the handlers of one of the thesis's channels to one more area, now and after every connection.
 
-        A broker that is lost meanwhile is told at the next connection.
+        Without a connection the subscription is made at the next one.
         """
         topic = channel.key(number=str(number))
-        deaf = [r for r in self._registrations if r.channel == channel and topic not in r.topics]
-        for registration in deaf:
+        unsubscribed = [r for r in self._registrations if r.channel == channel and topic not in r.topics]
+        for registration in unsubscribed:
             registration.topics.append(topic)
         client = self._client
-        if not deaf or client is None:
+        if not unsubscribed or client is None:
             return
         try:
             codes = await client.subscribe([(topic, SubscribeOptions(qos=channel.qos))])
         except aiomqtt.MqttError as error:
-            self._limited.warning("unsubscribed", topic, self._clock.now(), topic=topic, reason=str(error))
+            self._limited.warning("subscription_failed", topic, self._clock.now(), topic=topic, reason=str(error))
             return
-        _tell_refused([topic], codes)
+        _log_refused_subscriptions([topic], codes)
 
     def on_connect(self, callback: Callable[[], Awaitable[None]]) -> None:
-        """Have `callback` run after every connection, once all subscriptions are made."""
+        """Run `callback` after every connection, once all subscriptions are made."""
         self._on_connect.append(callback)
 
     async def publish(self, channel: Channel, message: Message | str, *, wait: bool = False, **ids: str) -> bool:
-        """Publish; True when it was given to the connection or, with `wait`, acknowledged by the broker (QoS 1).
+        """Publish; True when it was passed to the connection or, with `wait`, acknowledged by the broker (QoS 1).
 
-        Without a connection nothing is kept: the answer is False, and whoever must not lose it publishes again in
-        `on_connect`. Raises `ContractError` when the message breaks the channel's contract.
+        Without a connection the message is dropped and the result is False; a caller that must not lose it publishes
+        again in `on_connect`. Raises `ContractError` when the message violates the channel's contract.
         """
         return await self._send(channel, self._topic(channel, ids), _encoded(channel, message), wait=wait)
 
     def publish_nowait(self, channel: Channel, message: Message | str, **ids: str) -> None:
-        """Publish in the order of the calls, without waiting; a message that has no connection is dropped and counted.
+        """Publish in the order of the calls, without waiting; without a connection the message is dropped and counted.
 
-        Raises `ContractError` when the message breaks the channel's contract.
+        Raises `ContractError` when the message violates the channel's contract.
         """
         topic, data, client = self._topic(channel, ids), _encoded(channel, message), self._client
         if client is None:
             metrics.DROPPED.labels(channel.name).inc()
         else:
-            self._spawn(self._give(client, channel, topic, data), topic)
+            self._spawn(self._transmit(client, channel, topic, data), topic)
 
     async def clear(self, channel: Channel, *, wait: bool = False, **ids: str) -> bool:
-        """Take a retained message away (MQTT: an empty retained payload)."""
+        """Delete a retained message (in MQTT: by an empty retained payload)."""
         return await self._send(channel, self._topic(channel, ids), b"", wait=wait)
 
     async def run(self) -> None:
-        """Keep the connection until cancelled; a broker that is away, lost or unwilling is tried again."""
+        """Connect and stay connected until cancelled; a failed or lost connection is tried again."""
         failures = 0
         while True:
             try:
-                async with self._make() as client:
+                async with self._create_client() as client:
                     failures = 0
                     await self._serve(client)
             except aiomqtt.MqttError as error:
                 reason = str(error) or type(error).__name__
-                where = f"{self._address.host}:{self._address.port}"
-                self._limited.warning("broker_lost", "broker_lost", self._clock.now(), broker=where, reason=reason)
+                broker = f"{self._address.host}:{self._address.port}"
+                self._limited.warning("broker_disconnected", broker, self._clock.now(), broker=broker, reason=reason)
             finally:
-                self._lost()
+                self._on_disconnected()
             delay = random.uniform(BACKOFF_S[0], min(BACKOFF_S[1], BACKOFF_S[0] * 2 ** min(failures + 1, 10)))  # noqa: S311  # spreads attempts in time, no secret
             failures += 1
             await asyncio.sleep(delay)
 
     def _with_site(self, channel: Channel, ids: Ids) -> Ids:
         if "site" in ids:
-            raise ValueError("the edge fills the site in: leave it out")
+            raise ValueError("the edge fills in the site: leave it out")
         return {**ids, "site": self._site} if "site" in channel.fields else ids
 
     def _topic(self, channel: Channel, ids: Ids) -> str:
@@ -230,7 +230,7 @@ class MqttEdge:
             self._topic(channel, will.ids), _encoded(channel, will.message), channel.qos, channel.retained
         )
 
-    def _make(self) -> aiomqtt.Client:
+    def _create_client(self) -> aiomqtt.Client:
         client = aiomqtt.Client(
             self._address.host,
             self._address.port,
@@ -249,34 +249,34 @@ class MqttEdge:
         return client
 
     async def _serve(self, client: aiomqtt.Client) -> None:
-        wanted = {topic: r.channel.qos for r in self._registrations for topic in r.topics}
-        if wanted:
-            codes = await client.subscribe([(topic, SubscribeOptions(qos=qos)) for topic, qos in wanted.items()])
-            _tell_refused(list(wanted), codes)
+        topics = {topic: r.channel.qos for r in self._registrations for topic in r.topics}
+        if topics:
+            codes = await client.subscribe([(topic, SubscribeOptions(qos=qos)) for topic, qos in topics.items()])
+            _log_refused_subscriptions(list(topics), codes)
         self._client = client
         self._changed.set()
         metrics.CONNECTED.labels("mqtt").set(1)
-        metrics.CONNECTS.labels("mqtt").inc()
+        metrics.CONNECTIONS.labels("mqtt").inc()
         _log.info("broker_connected", broker=f"{self._address.host}:{self._address.port}", client=self._client_id)
         for callback in self._on_connect:
             self._spawn(callback(), "on_connect")
         async for message in client.messages:
             self._deliver(message)
 
-    def _lost(self) -> None:
+    def _on_disconnected(self) -> None:
         self._client = None
         metrics.CONNECTED.labels("mqtt").set(0)
         for task in list(self._tasks):
             task.cancel()
 
-    def _spawn(self, work: Awaitable[T], what: str) -> asyncio.Future[T]:
+    def _spawn(self, work: Awaitable[T], name: str) -> asyncio.Future[T]:
         task = asyncio.ensure_future(work)
         self._tasks.add(task)
 
         def ended(done: asyncio.Future[T]) -> None:
             self._tasks.discard(done)
             if not done.cancelled() and (error := done.exception()) is not None:
-                _log.error("task_failed", error=error, what=what)
+                _log.error("task_failed", error=error, task=name)
 
         task.add_done_callback(ended)
         return task
@@ -287,20 +287,20 @@ class MqttEdge:
             metrics.DROPPED.labels(channel.name).inc()
             return False
         if channel.qos == 0:
-            return await self._give(client, channel, topic, data)
-        # Tasks begin in the order of their making: a message that is waited for must not overtake one that isn't.
-        task = self._spawn(self._give(client, channel, topic, data), topic)
+            return await self._transmit(client, channel, topic, data)
+        # A task in both cases: tasks start in order, so a message that is awaited does not overtake one that is not.
+        task = self._spawn(self._transmit(client, channel, topic, data), topic)
         if not wait:
             return True
         await asyncio.wait([task])
         return not task.cancelled() and task.result()
 
-    async def _give(self, client: aiomqtt.Client, channel: Channel, topic: str, data: bytes) -> bool:
+    async def _transmit(self, client: aiomqtt.Client, channel: Channel, topic: str, data: bytes) -> bool:
         try:
             await client.publish(topic, data, qos=channel.qos, retain=channel.retained)
         except aiomqtt.MqttError as error:
             metrics.DROPPED.labels(channel.name).inc()
-            self._limited.warning("unsent", channel.name, self._clock.now(), topic=topic, reason=str(error))
+            self._limited.warning("message_dropped", channel.name, self._clock.now(), topic=topic, reason=str(error))
             return False
         metrics.PUBLISHED.labels(channel.name).inc()
         return True
@@ -314,14 +314,16 @@ class MqttEdge:
                 if any(message.topic.matches(pattern) for pattern in registration.topics):
                     self._refuse(channel, topic, "the ids in the topic are malformed")
                 continue
-            ids.pop("site", None)  # its own: it subscribes to no other
+            ids.pop("site", None)  # always this process's own site
             data = message.payload
             if message.retain and not channel.retained:
-                # It may be years old; a stale reading must never pass for a fresh one.
-                self._refuse(channel, topic, "retained, which this channel never is: somebody else's leftover")
+                # It may be years old; a stale reading must never be used as a fresh one.
+                self._refuse(
+                    channel, topic, "retained, but this channel's messages never are: delete it from the broker"
+                )
                 continue
             if channel.retained and not data:
-                continue  # a retained message that was taken away
+                continue  # a retained message was deleted
             try:
                 content = (
                     decode_text(channel, data)
@@ -336,10 +338,10 @@ class MqttEdge:
                 registration.handler(ids, content)
             except RefusedMessageError as error:
                 self._refuse(channel, topic, str(error))
-            except Exception as error:  # noqa: BLE001  # one message must not end the process; the event tells of the bug
+            except Exception as error:  # noqa: BLE001  # one message must not end the process; the bug is logged
                 metrics.HANDLER_ERRORS.labels(channel.name).inc()
                 _log.error("handler_failed", error=error, channel=channel.name, topic=topic)
 
     def _refuse(self, channel: Channel, topic: str, reason: str) -> None:
         metrics.REFUSED.labels(channel.name).inc()
-        self._limited.warning("refused", channel.name, self._clock.now(), topic=topic, reason=reason)
+        self._limited.warning("message_refused", channel.name, self._clock.now(), topic=topic, reason=reason)

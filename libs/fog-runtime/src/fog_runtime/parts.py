@@ -1,11 +1,11 @@
-"""Exchangeable parts by name: what installed packages registered in a group of entry points.
+"""Exchangeable parts by name, registered by installed packages in groups of entry points.
 
-A part is chosen by its name in a setting. Ours are registered in the same way as anybody's, in `pyproject.toml`:
+A setting chooses a part by its name. All parts, Fognav's own included, are registered in a `pyproject.toml`:
 
     [project.entry-points."fognav.lidars"]
     my-lidar = "my_package.lidar:FACTORY"
 
-Imports nothing but the standard library: the watchdog uses it too.
+Imports only the standard library, because the watchdog uses it.
 """
 
 from importlib.metadata import entry_points
@@ -15,7 +15,7 @@ T = TypeVar("T")
 
 
 class PartError(ValueError):
-    """A part that is not there or can't be used; the message names it, those that there are, and the remedy."""
+    """A part is unknown or unusable; the message names it, the known ones and the remedy."""
 
 
 def names(group: str) -> list[str]:
@@ -27,22 +27,26 @@ def load(group: str, name: str, kind: type[T]) -> T:
     """Import the part of this name and return it.
 
     Raises:
-        PartError: if no package or more than one registers the name, or if what it registers can't be imported or is
-            of another kind.
+        PartError: if no package or more than one registers the name, or if the part can't be imported or has the wrong
+            type.
 
     """
-    found = entry_points(group=group, name=name)
-    if not found:
+    points = entry_points(group=group, name=name)
+    if not points:
         known = ", ".join(names(group)) or "none"
-        raise PartError(f"{group} has no {name!r} (known: {known}). Use one of these, or install the package with it")
-    if len({point.value for point in found}) > 1:
-        rivals = ", ".join(sorted(f"{point.value} of {point.dist.name if point.dist else '?'}" for point in found))
-        raise PartError(f"{group}: {name!r} is registered more than once ({rivals}). Uninstall all but one")
-    (point, *_) = found
+        raise PartError(
+            f"{group} has no {name!r} (known: {known}). Use one of these, or install the package that provides it"
+        )
+    if len({point.value for point in points}) > 1:
+        providers = ", ".join(sorted(f"{point.value} of {point.dist.name if point.dist else '?'}" for point in points))
+        raise PartError(f"{group}: {name!r} is registered more than once ({providers}). Uninstall all but one")
+    (point, *_) = points
     try:
         part = point.load()
     except (ImportError, AttributeError) as error:
         raise PartError(f"{group}: {name!r} ({point.value}) can't be imported: {error}. Correct its package") from error
     if not isinstance(part, kind):
-        raise PartError(f"{group}: {name!r} ({point.value}) is no {kind.__name__}. Correct its package's entry point")
+        raise PartError(
+            f"{group}: {name!r} ({point.value}) is not a {kind.__name__}. Correct its package's entry point"
+        )
     return part

@@ -1,4 +1,4 @@
-"""The life of a process: start, run until told to stop, end cleanly."""
+"""The main function of a process: run until a signal, then end cleanly."""
 
 import asyncio
 import os
@@ -37,14 +37,14 @@ async def _supervise(main: Callable[[], Awaitable[None]]) -> None:
 
 
 def run(main: Callable[[], Awaitable[None]]) -> None:
-    """Run `main` until it returns or SIGTERM or SIGINT cancels it (a clean end, status 0).
+    """Run `main` until it returns, or until SIGTERM or SIGINT cancels it; both end the process with status 0.
 
-    An exception that `main` lets through is logged as one event, and the process exits with status 1. A second
-    signal ends the process at once.
+    An exception from `main` is logged as one event, and the process exits with status 1. A second signal ends the
+    process at once.
     """
     try:
         asyncio.run(_supervise(main))
-    except Exception as error:  # noqa: BLE001  # the last place that can say why the process ends
+    except Exception as error:  # noqa: BLE001  # the last place that can log why the process ends
         causes = _leaves(error)
         _log.error("crashed", error=error, reason="; ".join(f"{type(c).__name__}: {c}" for c in causes))
         raise SystemExit(1) from None

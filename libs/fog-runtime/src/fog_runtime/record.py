@@ -1,7 +1,7 @@
-"""Record what crosses the channels into MCAP files, which Foxglove opens as they are, and read or replay them.
+"""Recording of all channels into MCAP files, which Foxglove can open, and reading or replaying them.
 
-Messages are stored as JSON with their JSON schema, under their real topic or key. A process may also record entries of
-its own, which cross no channel (`Recorder.write_entry`, `read_entries`); `read` passes over them.
+Messages are stored as JSON with their JSON schema, under their topic or key. A process may also record entries of its
+own that belong to no channel (`Recorder.write_entry`, `read_entries`); `read` skips them.
 """
 
 from __future__ import annotations
@@ -30,29 +30,29 @@ if TYPE_CHECKING:
     from fog_runtime.zenoh_edge import ZenohEdge
 
 _CHUNK: Final = 64 * 1024
-"""Bytes that a crash may cost."""
+"""Bytes that a crash may lose."""
 
-_FRAME: Final = 9
+_RECORD_HEADER: Final = 9
 _NO_OPCODE: Final = 0
 _ENTRY: Final = "entry"
-"""Metadata by which an entry that crosses no channel is known."""
+"""Metadata that marks an entry that belongs to no channel."""
 
 _log = logs.get("record")
 
 
 class RecordError(ValueError):
-    """A file that is no recording of ours; the message names it and what is wrong."""
+    """A file is not a recording, or is damaged; the message names it and what is wrong."""
 
 
 class _Text(Message, frozen=True, kw_only=True):
-    """How a channel of plain text is stored."""
+    """The stored form of a plain text message."""
 
     text: str
 
 
 def _schema(kind: type[msgspec.Struct]) -> bytes:
     (described,), components = msgspec.json.schema_components([kind], ref_template="#/$defs/{name}")
-    # Foxglove wants an object at the top, not a reference to one.
+    # Foxglove needs an object at the top level, not a reference to one.
     root = components.pop(described["$ref"].rsplit("/", 1)[1]) if "$ref" in described else described
     return msgspec.json.encode({**root, "$defs": components})
 
@@ -66,7 +66,7 @@ class Recorder:
     """Writes messages to an MCAP file; close it, or use it as a context manager. For one thread."""
 
     def __init__(self, path: Path, *, site: str = "") -> None:
-        """Begin a new file at `path` (an old one is replaced); `site` is filled in where a key needs it."""
+        """Create the file at `path`, replacing an old one; `site` is filled into keys that contain one."""
         self._site = site
         path.parent.mkdir(parents=True, exist_ok=True)
         self._file = path.open("wb")
@@ -85,7 +85,7 @@ class Recorder:
         self._add(key, content, {"channel": channel.name}, log_time_ns)
 
     def write_entry(self, topic: str, entry: msgspec.Struct, log_time_ns: int) -> None:
-        """Write an entry that crosses no channel, under a topic that is no channel's and holds one type of entry."""
+        """Write an entry that belongs to no channel, under a topic of its own that holds one type of entry."""
         self._add(topic, entry, {_ENTRY: topic}, log_time_ns)
 
     def _add(self, topic: str, content: msgspec.Struct, metadata: dict[str, str], log_time_ns: int) -> None:
@@ -113,7 +113,7 @@ class Recorder:
         )
 
     def close(self) -> None:
-        """Write the index and close the file; it is closed too when there is no room for the index (`OSError`)."""
+        """Write the index and close the file, even when the disk has no room for the index (`OSError`)."""
         try:
             _finish(self._writer)
         finally:
@@ -129,8 +129,8 @@ class Recorder:
 def read(path: Path) -> Iterator[tuple[int, Channel, dict[str, str], Message | str]]:
     """Yield (time in ns, channel, ids without the site, message) in the order of recording.
 
-    A file that a crash cut short gives all that is whole. Raises `RecordError` for what is no recording, or
-    when it comes to bytes that are damaged.
+    Of a file that a crash truncated, all complete records are read. Raises `RecordError` for a file that is not a
+    recording, or on reaching damaged bytes.
     """
     for info, record in _records(path):
         if _ENTRY in info.metadata:
@@ -138,68 +138,68 @@ def read(path: Path) -> Iterator[tuple[int, Channel, dict[str, str], Message | s
         channel = CHANNELS.get(info.metadata.get("channel", ""))
         ids = channel.match(info.topic) if channel else None
         if channel is None or ids is None:
-            raise RecordError(f"{path}: {info.topic!r} belongs to no channel of this version of the contracts")
+            raise RecordError(f"{path}: {info.topic!r} belongs to no channel of this version")
         ids.pop("site", None)
-        yield record.log_time, channel, ids, _decoded(path, channel, record.data)
+        yield record.log_time, channel, ids, _decode(path, channel, record.data)
 
 
 def read_entries(path: Path) -> Iterator[tuple[int, str, bytes]]:
-    """Yield (time in ns, topic, JSON) of the entries that cross no channel, as `read` does with messages."""
+    """Yield (time in ns, topic, JSON) of the entries that belong to no channel; errors as for `read`."""
     for info, record in _records(path):
         if _ENTRY in info.metadata:
             yield record.log_time, info.topic, record.data
 
 
 def _records(path: Path) -> Iterator[tuple[Any, Any]]:
-    """Yield channel and message of all that is whole; raises `RecordError` as `read` does."""
+    """Yield MCAP channel and message of each complete record; raises `RecordError` as `read` does."""
     size = path.stat().st_size
     if size < MAGIC_SIZE:
-        raise RecordError(f"{path}: is no MCAP file ({size} bytes)")
+        raise RecordError(f"{path}: is not an MCAP file ({size} bytes)")
     with path.open("rb") as file:
-        whole = _whole_records(path, file)
-        if whole < size:
-            _log.warning("recording_cut_short", path=str(path), bytes_lost=size - whole)
-        reader = NonSeekingReader(cast("BinaryIO", _Head(file, whole)), validate_crcs=True)
+        complete = _complete_size(path, file)
+        if complete < size:
+            _log.warning("recording_truncated", path=str(path), bytes_lost=size - complete)
+        reader = NonSeekingReader(cast("BinaryIO", _FilePrefix(file, complete)), validate_crcs=True)
         yield from _messages(path, reader)
 
 
 def bytes_lost(path: Path) -> int:
-    """Return how many bytes at a recording's end belong to no whole record: a crash or a copy cut it short.
+    """Return how many bytes at the end of a truncated recording belong to no complete record; 0 if it is complete.
 
     Raises `RecordError` for damage before that.
     """
     with path.open("rb") as file:
-        return max(0, path.stat().st_size - _whole_records(path, file))
+        return max(0, path.stat().st_size - _complete_size(path, file))
 
 
 def _messages(path: Path, reader: NonSeekingReader) -> Iterator[tuple[Any, Any]]:
-    """Yield channel and message of all that is whole; raises `RecordError` for damage."""
+    """Yield MCAP channel and message of each complete record; raises `RecordError` for damage."""
     try:
-        # Not by the index: a file without an end has none.
+        # Not by the index: a truncated file has none.
         for _, info, record in reader.iter_messages(log_time_order=False):
             yield info, record
     except EndOfFile:
-        return  # between two records: all that is whole was read
+        return  # truncated between two records: all complete ones were read
     except InvalidMagic as error:
-        raise RecordError(f"{path}: is no MCAP file") from error
-    except Exception as error:  # its parser has no error of its own for most damage
-        raise RecordError(f"{path}: is damaged, or no MCAP file ({error!r})") from error
+        raise RecordError(f"{path}: is not an MCAP file") from error
+    except Exception as error:  # the parser raises errors of many kinds for damage
+        raise RecordError(f"{path}: is damaged, or not an MCAP file ({error!r})") from error
 
 
-def _whole_records(path: Path, file: BinaryIO) -> int:
-    """Return where the last whole record ends: each is an opcode, a length of 8 bytes and its content.
+def _complete_size(path: Path, file: BinaryIO) -> int:
+    """Return where the last complete record ends; a record is an opcode, a length of 8 bytes and its content.
 
-    Raises `RecordError` where none can begin.
+    Raises `RecordError` where no record can begin.
     """
     size = file.seek(0, os.SEEK_END)
     end = MAGIC_SIZE
-    while end + _FRAME <= size:
+    while end + _RECORD_HEADER <= size:
         file.seek(end)
-        opcode, length = struct.unpack("<BQ", file.read(_FRAME))
+        opcode, length = struct.unpack("<BQ", file.read(_RECORD_HEADER))
         if opcode == _NO_OPCODE and end > MAGIC_SIZE:
             raise RecordError(f"{path}: is damaged before byte {end}: no record begins there")
         footer = opcode == Opcode.FOOTER
-        after = end + _FRAME + length + (MAGIC_SIZE if footer else 0)  # the closing magic belongs to the footer
+        after = end + _RECORD_HEADER + length + (MAGIC_SIZE if footer else 0)  # the closing magic belongs to the footer
         if after > size:
             break
         end = after
@@ -209,26 +209,26 @@ def _whole_records(path: Path, file: BinaryIO) -> int:
     return end
 
 
-class _Head:
+class _FilePrefix:
     """The first `size` bytes of a file."""
 
     def __init__(self, file: BinaryIO, size: int) -> None:
         self._file = file
-        self._left = size
+        self._remaining = size
 
     def read(self, size: int = -1) -> bytes:
-        data = self._file.read(self._left if size < 0 else min(size, self._left))
-        self._left -= len(data)
+        data = self._file.read(self._remaining if size < 0 else min(size, self._remaining))
+        self._remaining -= len(data)
         return data
 
 
-def _decoded(path: Path, channel: Channel, data: bytes) -> Message | str:
+def _decode(path: Path, channel: Channel, data: bytes) -> Message | str:
     try:
         if channel.message is None:
             return msgspec.json.decode(data, type=_Text).text
         return msgspec.json.decode(data, type=channel.message)
     except msgspec.DecodeError as error:
-        raise RecordError(f"{path}: a message of {channel.name} breaks its contract: {error}") from error
+        raise RecordError(f"{path}: a message of {channel.name} violates its contract: {error}") from error
 
 
 def record_all(
@@ -236,16 +236,16 @@ def record_all(
 ) -> None:
     """Record every published channel of both transports; call before `mqtt.run()`.
 
-    The log's times begin at the real time and go on in seconds of `clock`: a fast clock's own stamps lie centuries
-    ahead, and soon beyond what a file can hold. `numbers` names the areas of the thesis's topics.
+    The log's times begin at the real time and continue in seconds of `clock`: a fast clock's own stamps lie centuries
+    ahead, and soon beyond the range of MCAP's times. `numbers` lists the areas of the thesis's topics.
     """
     begin = clock.stamp()
     real_begin = begin / clock.speed
 
     def writer(channel: Channel) -> Callable[[dict[str, str], Any], None]:
         def write(ids: dict[str, str], message: Message | str) -> None:
-            known = {**ids, "site": zenoh.site} if "site" in channel.fields else ids
-            recorder.write(channel, known, message, int((real_begin + clock.stamp() - begin) * 1e9))
+            all_ids = {**ids, "site": zenoh.site} if "site" in channel.fields else ids
+            recorder.write(channel, all_ids, message, int((real_begin + clock.stamp() - begin) * 1e9))
 
         return write
 
@@ -261,7 +261,7 @@ def record_all(
 async def replay(
     path: Path, clock: Clock, send: Callable[[Channel, dict[str, str], Message | str], Awaitable[object]]
 ) -> int:
-    """Hand every recorded message to `send` at its time after the first, by `clock`; return how many there were."""
+    """Pass every recorded message to `send` at its time relative to the first, by `clock`; return their number."""
     count = 0
     begin_ns = 0
     begin = clock.now()

@@ -1,6 +1,6 @@
-"""What every service's record in Redis has in common: one connection, versions, an epoch and the audit stream.
+"""The base of all services' stores in Redis: connection, versioned records, epochs and the audit stream.
 
-A service's store adds its keys and what they hold. All keys of a site begin with `fog:SITE:`.
+A service's store adds its own keys and records. All keys of a site begin with `fog:SITE:`.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ if TYPE_CHECKING:
 M = TypeVar("M", bound=Message)
 
 Outcome = Literal["ok", "exists", "missing", "stale"]
-"""What became of a write: done (or done already), or refused as a record exists, is missing, or has another version."""
+"""Result of a write: done (now or before), or refused because a record exists, is missing, or has another version."""
 
 ANY: Final = "*"
-"""Expect no version: write over whatever is stored."""
+"""Expect no particular version: overwrite what is stored."""
 
-# One step for Redis, so that a crash leaves record and audit entry both or neither, and of two writers that expect the
-# same version one is refused. Repeating it is harmless: a record that is stored already as it should be is left alone.
+# One atomic step of Redis: after a crash either both record and audit entry are stored or neither, and of two writers
+# that expect the same version one is refused. It is idempotent: a record that is already stored is left unchanged.
 _SWAP: Final = """
 local current = redis.call('HGET', KEYS[1], ARGV[1])
 local expected, data = ARGV[2], ARGV[3]
@@ -54,11 +54,11 @@ _log = logs.get("store")
 
 
 class StoreError(Exception):
-    """Redis can't be reached, did not take a write, or holds what can't be read; the message says which."""
+    """Redis can't be reached, refused a write, or contains an unreadable record; the message says which."""
 
 
 class Audit(Message, frozen=True, kw_only=True):
-    """Who does what, when (`at`: seconds since the epoch)."""
+    """An audit entry: who does what, and when (`at`: seconds since the epoch)."""
 
     at: float
     who: str
@@ -66,9 +66,9 @@ class Audit(Message, frozen=True, kw_only=True):
 
 
 class Table(NamedTuple):
-    """A hash of JSON records by id: its key's last part, and how its records are called in audit entries.
+    """A Redis hash of JSON records by id: `name` ends its key, `subject` names its records in audit entries.
 
-    `version` is the path, in a record, of what a writer expects to find unchanged.
+    `version` is the path of a record's version, which a writer expects to be unchanged.
     """
 
     name: str
@@ -79,7 +79,7 @@ class Table(NamedTuple):
 class RedisStore:
     """A connection to the site's keys; every call may raise `StoreError` and may be repeated.
 
-    A command waits `timeout_s` for its answer, and is tried twice: the first one after a restart of Redis meets a dead
+    A command has a timeout of `timeout_s` and is tried twice: the first attempt after a restart of Redis may use a dead
     connection of the pool.
     """
 
@@ -90,7 +90,7 @@ class RedisStore:
         self._site = site
 
     async def __aenter__(self) -> Self:
-        """Connect later, with the first command."""
+        """Return the store; it connects with the first command."""
         return self
 
     async def __aexit__(self, *_: object) -> None:
@@ -98,11 +98,11 @@ class RedisStore:
         await self._redis.aclose()
 
     async def ping(self) -> None:
-        """Return when Redis answers."""
-        await self._ask(cast("Awaitable[Any]", self._redis.ping()))
+        """Check that Redis answers."""
+        await self._execute(cast("Awaitable[Any]", self._redis.ping()))
 
     async def durability_warning(self) -> str:
-        """Return why Redis's acknowledgements can't be trusted, or an empty text (a server may refuse to tell)."""
+        """Return why acknowledged writes are not durable, or an empty text; also empty if Redis hides its settings."""
         try:
             config = await self._redis.config_get("appendonly", "appendfsync")
         except (RedisError, OSError):
@@ -113,50 +113,50 @@ class RedisStore:
         return ""
 
     async def claim_epoch(self, service: str, running: int = 0) -> int:
-        """Record and return an epoch (ms) larger than that of every start before.
+        """Store and return an epoch (ms) larger than that of every earlier start.
 
-        With `running`, the epoch of a start that could not ask before, record that one instead.
+        `running` is the epoch of a process that started without Redis; it is stored instead if it is larger.
         """
         key = self._key(f"{service}:epoch")
-        last = int(await self._ask(self._redis.get(key)) or b"0")
+        last = int(await self._execute(self._redis.get(key)) or b"0")
         epoch = max(last, running) if running else max(last + 1, _now_ms())
-        await self._ask(self._redis.set(key, epoch))
+        await self._execute(self._redis.set(key, epoch))
         return epoch
 
     async def begin_epoch(self, service: str) -> int:
-        """Return an epoch (ms) larger than that of every start before; without Redis the clock alone must do."""
+        """Return an epoch (ms) larger than that of every earlier start; without Redis it is taken from the clock."""
         try:
             return await self.claim_epoch(service)
         except StoreError as error:
             epoch = _now_ms()
-            _log.warning("epoch_by_clock", epoch=epoch, reason=str(error))
+            _log.warning("epoch_from_clock", epoch=epoch, reason=str(error))
             return epoch
 
     async def audit_entries(self, limit: int) -> list[dict[str, str]]:
-        """Return the newest entries of the site's audit stream, of all services, newest first."""
-        entries = await self._ask(self._redis.xrevrange(self._key("audit"), count=limit))
+        """Return the newest entries of the site's audit stream, which all services share, newest first."""
+        entries = await self._execute(self._redis.xrevrange(self._key("audit"), count=limit))
         return [{_text(name): _text(value) for name, value in fields.items()} for _, fields in entries]
 
-    # --- For the stores of services ---------------------------------------------------------------------------------
+    # --- For the services' stores -----------------------------------------------------------------------------------
 
     async def _records(self, table: str, kind: type[M]) -> dict[str, M]:
-        """Return all records of a table; one that can't be read is an error: it must not be missing silently."""
+        """Return all records of a table; raises `StoreError` for an unreadable one, which must not be lost silently."""
         key = self._key(table)
         found: dict[str, M] = {}
-        for name, data in (await self._ask(self._redis.hgetall(key))).items():
+        for name, data in (await self._execute(self._redis.hgetall(key))).items():
             try:
                 found[_text(name)] = msgspec.json.decode(data, type=kind)
             except msgspec.DecodeError as error:
                 raise StoreError(
-                    f"{key} holds what is no {kind.__name__} ({_text(name)}): {error}; repair or delete that field"
+                    f"{key} contains an invalid {kind.__name__} ({_text(name)}): {error}; repair or delete that field"
                 ) from error
         return found
 
     async def _readable_records(self, table: str, kind: type[M]) -> dict[str, M]:
-        """Return the records of a table; one that can't be read is left out and reported."""
+        """Return the readable records of a table; an unreadable one is logged and left out."""
         key = self._key(table)
         found: dict[str, M] = {}
-        for name, data in (await self._ask(self._redis.hgetall(key))).items():
+        for name, data in (await self._execute(self._redis.hgetall(key))).items():
             try:
                 found[_text(name)] = msgspec.json.decode(data, type=kind)
             except msgspec.DecodeError as error:
@@ -164,9 +164,9 @@ class RedisStore:
         return found
 
     async def _write_records(self, table: str, records: dict[str, Message]) -> None:
-        """Write records durably, over what is stored, without audit entries."""
+        """Write records durably, overwriting what is stored, without audit entries."""
         values = {name: msgspec.json.encode(record) for name, record in records.items()}
-        await self._ask(self._redis.hset(self._key(table), mapping=cast("Any", values)))
+        await self._execute(self._redis.hset(self._key(table), mapping=cast("Any", values)))
 
     async def _swap(
         self,
@@ -178,11 +178,11 @@ class RedisStore:
         *,
         before: Message | None = None,
     ) -> Outcome:
-        """Write a record durably, or delete it (None), if the stored version is `expected`, with its audit entry.
+        """Write a record durably, or delete it (None), with an audit entry, if the stored version is `expected`.
 
-        `expected` is the text of the version, `0` where none may be stored yet, or ANY; `before` is what held until now
-        where nothing was stored, for the audit entry. A repeated attempt, whose first answer was lost, is `ok` for a
-        write and `missing` for a deletion.
+        `expected` is the version as text, `0` when none may be stored yet, or ANY; `before` is the previous value for
+        the audit entry when none was stored. A repeated attempt, after the first reply was lost, is `ok` for a write
+        and `missing` for a deletion.
         """
         data = b"" if record is None else msgspec.json.encode(record)
         arguments: list[str | bytes] = [
@@ -190,13 +190,13 @@ class RedisStore:
             b"" if before is None else msgspec.json.encode(before),
         ]  # fmt: skip
         keys = (self._key(table.name), self._key("audit"))
-        return cast("Outcome", _text(await self._ask(self._redis.eval(_SWAP, 2, *keys, *cast("Any", arguments)))))
+        return cast("Outcome", _text(await self._execute(self._redis.eval(_SWAP, 2, *keys, *cast("Any", arguments)))))
 
     def _key(self, name: str) -> str:
         return f"fog:{self._site}:{name}"
 
     @staticmethod
-    async def _ask(command: Awaitable[Any]) -> Any:  # noqa: ANN401  # redis does not say what its commands answer
+    async def _execute(command: Awaitable[Any]) -> Any:  # noqa: ANN401  # redis does not type its replies
         try:
             return await command
         except (RedisError, OSError) as error:

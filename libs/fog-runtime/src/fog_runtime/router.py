@@ -1,4 +1,4 @@
-"""A zenoh router as a process of its own: `python -m fog_runtime.router --listen tcp/127.0.0.1:7447`."""
+"""A zenoh router process: `python -m fog_runtime.router --listen tcp/127.0.0.1:7447`."""
 
 import argparse
 import asyncio
@@ -13,7 +13,7 @@ _log = logs.get("router")
 
 
 async def run_router(*listen: str) -> None:
-    """Route between all who connect to `listen`, until cancelled; raises `zenoh.ZError` if an endpoint is taken."""
+    """Route between the clients of the endpoints `listen`, until cancelled; raises `zenoh.ZError` if one is taken."""
     session = await asyncio.to_thread(zenoh.open, session_config("router", listen=listen))
     try:
         _log.info("listening", endpoints=list(listen), zid=str(session.zid()))
@@ -24,7 +24,7 @@ async def run_router(*listen: str) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run a router until SIGTERM."""
-    parser = argparse.ArgumentParser(prog="fog_runtime.router", description=run_router.__doc__)
+    parser = argparse.ArgumentParser(prog="fog_runtime.router", description="Run a zenoh router until SIGTERM.")
     parser.add_argument("--listen", action="append", required=True, metavar="tcp/ADDRESS:PORT")
     parser.add_argument("--log-level", default="info", choices=["debug", "info", "warning", "error"])
     parser.add_argument("--log-format", default="json", choices=["json", "text"])

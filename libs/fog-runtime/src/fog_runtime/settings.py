@@ -1,4 +1,4 @@
-"""Settings of a process: typed, from environment over TOML file over defaults, with errors that say what to do."""
+"""Typed settings of a process: the environment overrides a TOML file, which overrides defaults."""
 
 import re
 import tomllib
@@ -17,11 +17,11 @@ _PASSWORD: Final = re.compile(r"(?<=://)([^/@:]*):([^/@]*)@")
 
 
 class SettingsError(ValueError):
-    """A setting that is missing or can't be used; the message names the variable or file and field, and the remedy."""
+    """A setting is missing or invalid; the message names the variable or the file and field, and the remedy."""
 
 
 class Secret:
-    """A value that must not reach a log: it prints as `***`, `reveal()` gives it."""
+    """A value that must not be logged: it prints as `***`, `reveal()` returns it."""
 
     __slots__ = ("_value",)
 
@@ -46,12 +46,12 @@ class Secret:
 
 
 class CommonSettings(msgspec.Struct, frozen=True, kw_only=True):
-    """What every process of the fog and the robot understands; each process adds its own by subclassing."""
+    """Settings of every process of the fog and the robot; a process adds its own by subclassing."""
 
     site_dir: Path
     data_dir: Path
     site: str = ""
-    """Id of the site; empty: the one in `site.toml`."""
+    """Id of the site; empty: that of `site.toml`."""
     speed: float = 1.0
     """How many times faster than real time the clock runs (simulation only)."""
     mqtt_url: str = "mqtt://127.0.0.1:1883"
@@ -74,18 +74,18 @@ class CommonSettings(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class InflationSettings(CommonSettings, frozen=True, kw_only=True):
-    """What a process understands that inflates costmaps: radii in m, `cost_scaling` in 1/m."""
+    """Settings of a process that inflates costmaps: radii in m, `cost_scaling` in 1/m."""
 
     inscribed_radius: float = DEFAULT_INFLATION.inscribed_radius
     inflation_radius: float = DEFAULT_INFLATION.inflation_radius
     cost_scaling: float = DEFAULT_INFLATION.cost_scaling
 
     def __post_init__(self) -> None:
-        _ = self.inflation  # refuses what can't be while the settings are read, not when the map arrives
+        _ = self.inflation  # refuses invalid values when the settings are read, not when the map arrives
 
     @property
     def inflation(self) -> Inflation:
-        """The three as one value."""
+        """The inflation of these settings."""
         return Inflation(
             inscribed_radius=self.inscribed_radius,
             inflation_radius=self.inflation_radius,
@@ -114,13 +114,13 @@ def _read(file: Path) -> dict[str, Any]:
             f"settings file {file} can't be read: {error.strerror}. Create it or name another"
         ) from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise SettingsError(f"settings file {file} is no valid TOML: {error}. Correct the place it names") from error
+        raise SettingsError(f"settings file {file} is not valid TOML: {error}. Correct that line") from error
 
 
 def load(cls: type[S], *, prefix: str = "FOGNAV_", file: Path | None = None, environ: Mapping[str, str]) -> S:
-    """Build the settings: the variable FOGNAV_FIELD overrides `field` in the file, which overrides the default.
+    """Read the settings: the variable FOGNAV_FIELD overrides `field` in the file, which overrides the default.
 
-    An empty variable counts as not set (compose files pass those). Raises `SettingsError`.
+    An empty variable counts as unset, because compose files pass empty ones. Raises `SettingsError`.
     """
     in_file = _read(file) if file else {}
     fields = {field.name: field for field in msgspec.structs.fields(cls)}
@@ -131,7 +131,7 @@ def load(cls: type[S], *, prefix: str = "FOGNAV_", file: Path | None = None, env
     for name, field in fields.items():
         variable = prefix + name.upper()
         if text := environ.get(variable):
-            remedy = f"Correct the environment variable {variable} (it holds {_shown(field.type, text)})"
+            remedy = f"Correct the environment variable {variable} (it is {_shown(field.type, text)})"
             values[name] = _converted(text, field.type, strict=False, where=variable, remedy=remedy)
         elif name in in_file:
             where = f"{file}: {name}"
@@ -142,13 +142,13 @@ def load(cls: type[S], *, prefix: str = "FOGNAV_", file: Path | None = None, env
     try:
         return cls(**values)
     except ValueError as error:  # from the class's own __post_init__
-        raise SettingsError(f"the settings don't fit together: {error}") from error
+        raise SettingsError(f"the settings are inconsistent: {error}") from error
 
 
 def load_options(cls: type[S], text: str, *, variable: str) -> S:
-    """Build a part's own options from the JSON object in an environment variable; empty text gives the defaults.
+    """Read the options of a part from the JSON object in an environment variable; empty text means the defaults.
 
-    Raises `SettingsError`, which names the variable and the field.
+    Raises `SettingsError` that names the variable and the field.
     """
     try:
         return msgspec.json.decode(text or "{}", type=cls)
@@ -162,7 +162,7 @@ def _shown(kind: object, text: str) -> str:
 
 
 def describe(settings: msgspec.Struct) -> dict[str, object]:
-    """Return the settings as plain values for the start-up log line, without secrets and passwords in URLs."""
+    """Return the settings as plain values for the log, without secrets and passwords in URLs."""
     shown: dict[str, object] = {}
     for name in settings.__struct_fields__:
         value = getattr(settings, name)

@@ -1,4 +1,4 @@
-"""A site's folder: `site.toml` with the map that it names, checked as a whole before anybody acts on it."""
+"""Loading of a site's folder: `site.toml` and its map, validated as a whole."""
 
 import re
 import tomllib
@@ -17,13 +17,13 @@ from fog_runtime.maps import MapFileError, StaticMap, load_map
 
 SITE_FILE: Final = "site.toml"
 _BORDER: Final = 1e-6
-"""Metres by which a corner may lie off the map: what rounding does to a polygon drawn along its edge."""
+"""Metres by which a vertex may lie off the map: the rounding error of a polygon drawn along the map's edge."""
 
 
 class SiteError(ValueError):
-    """A site that can't be used; the message names the file, the field and the remedy.
+    """A site is invalid; the message names the file, the field and the remedy.
 
-    The field `file` stands for the file as a whole.
+    The field `file` means the file as a whole.
     """
 
     def __init__(self, file: Path, field: str, problem: str, remedy: str) -> None:
@@ -35,7 +35,7 @@ class SiteError(ValueError):
 
 @dataclass(frozen=True)
 class LoadedSite:
-    """A site that was checked: what it says, its map, and the folder that it came from."""
+    """A validated site, its map, and its folder."""
 
     site: Site
     map: StaticMap
@@ -43,10 +43,10 @@ class LoadedSite:
 
 
 def load_site(directory: Path) -> LoadedSite:
-    """Read and check a site's folder; raises `SiteError`.
+    """Read and validate a site's folder; raises `SiteError`.
 
-    Ids are unique and every id that is referred to exists; areas are simple polygons on the map (counter-clockwise in
-    the result), nodes lie on the map, places and starts on free cells of it.
+    Ids are unique and every referenced id exists; areas are simple polygons on the map (counter-clockwise in the
+    result), nodes lie on the map, places and start poses on free cells.
     """
     file = directory / SITE_FILE
     site = _read(file)
@@ -72,7 +72,7 @@ def _read(file: Path) -> Site:
         remedy = "A site is a folder with site.toml and its map; check the path"
         raise SiteError(file, "file", f"can't be read ({error.strerror})", remedy) from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise SiteError(file, "file", f"is no valid TOML ({error})", "Correct the place it names") from error
+        raise SiteError(file, "file", f"is not valid TOML ({error})", "Correct that line") from error
     try:
         site = msgspec.convert(data, Site)
     except msgspec.ValidationError as error:
@@ -83,12 +83,12 @@ def _read(file: Path) -> Site:
         remedy = f"Add `{missing[1]}`" if missing else "Correct the value"
         raise SiteError(file, path.strip("`").removeprefix("$").lstrip(".") or "file", problem, remedy) from error
     if unknown := _unknown_key(data, msgspec.to_builtins(site), ""):
-        raise SiteError(file, unknown, "is no field that a site knows", "Correct its spelling or remove it")
+        raise SiteError(file, unknown, "is not a field of a site", "Correct its spelling or remove it")
     return site
 
 
 def _bad_place(data: dict[str, Any]) -> str:
-    """Return the name of the place that can't be decoded: the decoder's own message leaves keys of tables out."""
+    """Return the name of the invalid place, which the decoder's message does not contain."""
     for name, place in data["places"].items():
         try:
             msgspec.convert(place, Place)
@@ -97,17 +97,17 @@ def _bad_place(data: dict[str, Any]) -> str:
     return "(a name)"
 
 
-def _unknown_key(given: object, known: object, path: str) -> str | None:
-    """Return the path of the first key that decoding ignored: a misspelt optional field would be lost in silence."""
-    if isinstance(given, dict) and isinstance(known, dict):
-        for key, value in given.items():
-            here = f"{path}.{key}" if path else key
-            if key not in known:
-                return here
-            if found := _unknown_key(value, known[key], here):
+def _unknown_key(data: object, decoded: object, path: str) -> str | None:
+    """Return the path of the first key that decoding ignored, because it may be a misspelt optional field."""
+    if isinstance(data, dict) and isinstance(decoded, dict):
+        for key, value in data.items():
+            key_path = f"{path}.{key}" if path else key
+            if key not in decoded:
+                return key_path
+            if found := _unknown_key(value, decoded[key], key_path):
                 return found
-    elif isinstance(given, list) and isinstance(known, list | tuple):
-        for index, (value, other) in enumerate(zip(given, known, strict=True)):
+    elif isinstance(data, list) and isinstance(decoded, list | tuple):
+        for index, (value, other) in enumerate(zip(data, decoded, strict=True)):
             if found := _unknown_key(value, other, f"{path}[{index}]"):
                 return found
     return None
@@ -117,7 +117,7 @@ def _check_unique(file: Path, field: str, names: Iterable[object]) -> None:
     seen = set()
     for name in names:
         if name in seen:
-            raise SiteError(file, field, f"{name!r} stands there twice", "Give each its own")
+            raise SiteError(file, field, f"{name!r} is used twice", "Give each its own")
         seen.add(name)
 
 
@@ -135,7 +135,7 @@ def _check_ids(file: Path, site: Site) -> None:
     for kind, ids in (("nodes", (node.id for node in site.nodes)), ("robots", (robot.id for robot in site.robots))):
         for index, name in enumerate(ids):
             if name in ROLES:
-                remedy = "Rename it: the brokers give whoever has a role's name that role's rights"
+                remedy = "Rename it: the brokers would give it that role's rights"
                 raise SiteError(file, f"{kind}[{index}].id", f"{name!r} is the name of a role", remedy)
     areas = [area.id for area in site.areas]
     for index, node in enumerate(site.nodes):
@@ -153,7 +153,7 @@ def _checked_area(file: Path, area: AreaSite, field: str, static: StaticMap) -> 
     except GeometryError as error:
         raise SiteError(file, f"{field}.polygon ({area.id})", str(error), "Correct the vertices") from error
     for index, (x, y) in enumerate(ring):
-        _check_on_map(file, f"{field}.polygon ({area.id}), corner {index}", x, y, static)
+        _check_on_map(file, f"{field}.polygon ({area.id}), vertex {index}", x, y, static)
     return msgspec.structs.replace(area, polygon=ring)
 
 
@@ -170,4 +170,4 @@ def _check_free(file: Path, field: str, x: float, y: float, static: StaticMap) -
     free = static.geometry.contains_cell(column, row) and is_traversable(int(static.cells[row, column]))
     if not free:
         problem = f"({x:g}, {y:g}) lies on a cell of the map that is occupied or unknown"
-        raise SiteError(file, field, problem, "Move it to where the floor is free")
+        raise SiteError(file, field, problem, "Move it to a free cell")

@@ -1,8 +1,8 @@
-"""The robot side's transport: the table's zenoh channels as typed publishing, subscribing, asking and answering.
+"""The transport of the robot side: typed publishing, subscribing, querying and answering on zenoh channels.
 
-A session is a client of the site's routers. Clients, unlike peers, are served by a router without knowing one another
-(zenoh 1.9 and later never route between peers), and a robot that comes and goes changes nobody else's routes. As a
-client's session can't be opened while no router is up, everything declared before is kept and done then.
+A session is a client of the site's routers. A router serves clients, unlike peers, without their knowing one another
+(zenoh 1.9 and later never route between peers), and a robot that comes or goes changes no other routes. A client's
+session can't be opened while no router is up; what was declared before is declared when it opens.
 """
 
 import asyncio
@@ -32,13 +32,13 @@ M = TypeVar("M", bound=Message)
 Ids = dict[str, str]
 
 RECOVERED_SAMPLES: Final = 256
-"""Messages of a recovered channel that its publisher keeps for those who lost them: 16 MiB of full deltas."""
+"""Messages of a recovered channel that its publisher caches for recovery: 16 MiB of full deltas."""
 HEARTBEAT_S: Final = 0.5
-"""Real seconds between the announcements by which a subscriber notices that the last message was lost."""
-_KEPT: Final[Mapping[Durability, int]] = {"volatile": 0, "latest": 1, "recovered": RECOVERED_SAMPLES}
-"""How many messages of a key its publisher keeps for those who missed them."""
+"""Real seconds between a publisher's heartbeats, by which a subscriber detects that the last message was lost."""
+_CACHE_DEPTH: Final[Mapping[Durability, int]] = {"volatile": 0, "latest": 1, "recovered": RECOVERED_SAMPLES}
+"""How many messages of a key its publisher caches for recovery."""
 _QUEUE: Final = 4096
-"""Messages of a recovered channel that may wait for the loop; more are dropped, which the versions reveal."""
+"""Messages of a recovered channel that may wait for the loop; further ones are dropped, which their versions show."""
 _PENDING_QUERIES: Final = 64
 _RETRY_S: Final = (0.2, 1.0)
 
@@ -48,7 +48,7 @@ _log = logs.get("zenoh")
 def session_config(
     mode: Literal["client", "router", "peer"], *, connect: Sequence[str] = (), listen: Sequence[str] = ()
 ) -> zenoh.Config:
-    """Build a configuration without scouting and shared memory: a session talks to the named endpoints alone."""
+    """Build a configuration without scouting and shared memory: a session connects only to the given endpoints."""
     config = zenoh.Config()
     values: dict[str, object] = {
         "mode": mode,
@@ -66,18 +66,18 @@ def session_config(
 
 
 def _finish(query: Any) -> None:  # noqa: ANN401  # `drop` has no types in zenoh's stubs
-    """Let the asker know that no answer of ours will come any more."""
+    """Tell the querier that no further reply will come."""
     query.drop()
 
 
 class _Publisher:
-    """Publishes on one key; what must not be lost waits for the session to be opened."""
+    """Publishes on one key; messages that must not be lost are queued until the session opens."""
 
     def __init__(self, channel: Channel, key: str) -> None:
         self._channel = channel
         self._key = key
-        self._depth = _KEPT[channel.durability]
-        self._waiting: deque[bytes] = deque(maxlen=self._depth)
+        self._depth = _CACHE_DEPTH[channel.durability]
+        self._pending: deque[bytes] = deque(maxlen=self._depth)
         self._put: Callable[[bytes], object] | None = None
 
     def declare(self, session: zenoh.Session) -> None:
@@ -95,21 +95,21 @@ class _Publisher:
             self._put = advanced.put
         else:
             self._put = session.declare_publisher(self._key, congestion_control=drop).put
-        while self._waiting:
-            self._put(self._waiting.popleft())
+        while self._pending:
+            self._put(self._pending.popleft())
 
     def put(self, data: bytes) -> None:
         if self._put is not None:
             self._put(data)
             metrics.PUBLISHED.labels(self._channel.name).inc()
         elif self._depth:
-            self._waiting.append(data)
+            self._pending.append(data)
         else:
             metrics.DROPPED.labels(self._channel.name).inc()
 
 
-class _Inbox(Generic[M]):
-    """Carries samples from zenoh's threads to the loop: all in order, or of each key the newest only."""
+class _Subscription(Generic[M]):
+    """Passes samples from zenoh's threads to the loop: all in order, or only the newest of each key."""
 
     def __init__(
         self, edge: "ZenohEdge", channel: Channel, kind: type[M], handler: Callable[[Ids, M], object], pattern: str
@@ -122,22 +122,22 @@ class _Inbox(Generic[M]):
         self._lock = threading.Lock()
         self._queue: deque[tuple[str, bytes]] = deque()
         self._newest: dict[str, bytes] = {}
-        self._woken = False
+        self._drain_scheduled = False
 
     def declare(self, session: zenoh.Session) -> object:
-        depth = _KEPT[self._channel.durability]
+        depth = _CACHE_DEPTH[self._channel.durability]
         if not depth:
-            return session.declare_subscriber(self._pattern, self._arrived)
+            return session.declare_subscriber(self._pattern, self._on_sample)
         return ext.declare_advanced_subscriber(
             session,
             self._pattern,
-            self._arrived,
+            self._on_sample,
             history=ext.HistoryConfig(detect_late_publishers=True, max_samples=depth),
             recovery=ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
         )
 
-    def _arrived(self, sample: zenoh.Sample) -> None:
-        """Take a sample in; runs on a thread of zenoh's and must be short."""
+    def _on_sample(self, sample: zenoh.Sample) -> None:
+        """Queue a sample; runs on one of zenoh's threads and must be short."""
         if sample.kind != zenoh.SampleKind.PUT:
             return
         key = str(sample.key_expr)
@@ -156,14 +156,14 @@ class _Inbox(Generic[M]):
                 self._newest[key] = data
             else:
                 metrics.DROPPED.labels(self._channel.name).inc()
-            wake = not self._woken
-            self._woken = True
-        if wake:
+            schedule = not self._drain_scheduled
+            self._drain_scheduled = True
+        if schedule:
             self._edge.call(self._drain)
 
     def _drain(self) -> None:
         with self._lock:
-            self._woken = False
+            self._drain_scheduled = False
             samples = [*self._queue, *self._newest.items()]
             self._queue.clear()
             self._newest.clear()
@@ -185,7 +185,7 @@ class _Inbox(Generic[M]):
             self._handler(ids, message)
         except RefusedMessageError as error:
             self._edge.refuse(self._channel, key, str(error))
-        except Exception as error:  # noqa: BLE001  # one message must not end the process; the event tells of the bug
+        except Exception as error:  # noqa: BLE001  # one message must not end the process; the bug is logged
             metrics.HANDLER_ERRORS.labels(self._channel.name).inc()
             _log.error("handler_failed", error=error, channel=self._channel.name, key=key)
 
@@ -193,7 +193,7 @@ class _Inbox(Generic[M]):
 Answer = Message | Awaitable[Message]
 
 
-class _Answerer:
+class _Queryable:
     """Answers queries on one key, with the handler on the loop's thread."""
 
     def __init__(self, edge: "ZenohEdge", channel: Channel, handler: Callable[[Ids, Any], Answer], key: str) -> None:
@@ -206,10 +206,10 @@ class _Answerer:
         self._last: tuple[Message, bytes] | None = None
 
     def declare(self, session: zenoh.Session) -> object:
-        return session.declare_queryable(self._key, self._arrived)
+        return session.declare_queryable(self._key, self._on_query)
 
-    def _arrived(self, query: zenoh.Query) -> None:
-        """Take a query in; runs on a thread of zenoh's."""
+    def _on_query(self, query: zenoh.Query) -> None:
+        """Pass a query to the loop; runs on one of zenoh's threads."""
         if not self._edge.call(self._begin, query):
             _finish(query)
 
@@ -234,7 +234,7 @@ class _Answerer:
                 answer = self._handler(self._ids, request)
                 message = await answer if inspect.isawaitable(answer) else answer
                 data = self._encoded(message)
-            except Exception as error:  # noqa: BLE001  # as for messages: the asker is told, the event tells of the bug
+            except Exception as error:  # noqa: BLE001  # as for messages: the querier gets an error, the bug is logged
                 metrics.HANDLER_ERRORS.labels(self._channel.name).inc()
                 _log.error("handler_failed", error=error, channel=self._channel.name, key=self._key)
                 await self._edge.in_thread(partial(query.reply_err, b"the answering process failed; see its log"))
@@ -254,20 +254,20 @@ class _Answerer:
         return decode(self._channel, b"" if payload is None else payload.to_bytes(), self._channel.message)
 
     def _encoded(self, message: Message) -> bytes:
-        """Encode an answer; one that is the same object as the last (a snapshot) is not encoded again."""
+        """Encode a reply; the same object as last time (a snapshot) is not encoded again."""
         if self._last is None or self._last[0] is not message:
             self._last = (message, encode(self._channel, message, reply=self._channel.kind == "query"))
         return self._last[1]
 
 
 class ZenohEdge:
-    """One process's session. All handlers run on the thread of the event loop that opened it."""
+    """The zenoh session of a process. All handlers run on the thread of the event loop that opened it."""
 
     def __init__(self, clock: Clock, *, site: str, role: str, name: str) -> None:
         """Prepare a session; use `ZenohEdge.open`."""
         self._clock = clock
         self._site = site
-        self._who = f"{role}/{name}"
+        self._client_name = f"{role}/{name}"
         self._loop = asyncio.get_running_loop()
         self._session: zenoh.Session | None = None
         self._closed = False
@@ -290,15 +290,15 @@ class ZenohEdge:
         id: str,  # noqa: A002  # as in the channel `live`
         site: str,
     ) -> AsyncIterator["ZenohEdge"]:
-        """Open a session as a client of one of the routers `connect`; without any router it keeps trying.
+        """Open a session as a client of one of the routers `connect`; while none is reachable it keeps trying.
 
-        `role` and `id` name the process in logs; `site` is filled into every key.
+        `role` and `id` identify the process in logs; `site` is filled into every key.
         """
         edge = cls(clock, site=site, role=role, name=id)
         connecting: asyncio.Task[None] | None = None
         try:
-            if not await edge._attempt(connect):
-                connecting = asyncio.create_task(edge._keep_trying(connect), name="zenoh connect")
+            if not await edge._try_connect(connect):
+                connecting = asyncio.create_task(edge._connect_when_possible(connect), name="zenoh connect")
             yield edge
         finally:
             if connecting is not None:
@@ -317,10 +317,10 @@ class ZenohEdge:
         return self._session is not None and not self._closed and bool(self._session.info.routers_zid())
 
     def publish(self, channel: Channel, message: Message, **ids: str) -> None:
-        """Publish without waiting; raises `ContractError` when the message breaks the channel's contract.
+        """Publish without waiting; raises `ContractError` when the message violates the channel's contract.
 
-        Without a connection the message is lost, but for channels of durability `recovered`, and the latest of those
-        of durability `latest`: these reach their subscribers as soon as there is one.
+        Without a connection the message is lost, except on channels of durability `recovered` and, for the latest
+        message, `latest`: these messages reach their subscribers as soon as there is a connection.
         """
         key = self._key(channel, ids)
         data = encode(channel, message)
@@ -331,17 +331,17 @@ class ZenohEdge:
         publisher.put(data)
 
     def subscribe(self, channel: Channel, kind: type[M], handler: Callable[[Ids, M], object], **ids: str) -> None:
-        """Have `handler(ids, message)` called for every id that is not given.
+        """Call `handler(ids, message)` for each message, with every value of the ids that are not given.
 
-        Of channels of which the latest value counts, only the newest message of each key is delivered when the loop
-        is behind; recovered channels are delivered completely and in order.
+        When the loop is behind, only the newest message of each key is delivered, except on recovered channels: their
+        messages are all delivered, in order.
         """
         self._check(channel, ids)
         pattern = channel.pattern(**self._with_site(channel, ids))
-        self._declare(_Inbox(self, channel, kind, handler, pattern).declare)
+        self._declare(_Subscription(self, channel, kind, handler, pattern).declare)
 
     def latest(self, channel: Channel, kind: type[M], **ids: str) -> Slot[M]:
-        """Return a slot that always holds the newest message of one key."""
+        """Return a slot that holds the newest message of one key."""
         self._key(channel, ids)
         slot: Slot[M] = Slot()
         self.subscribe(channel, kind, lambda _, message: slot.put(message, self._clock.now()), **ids)
@@ -350,10 +350,10 @@ class ZenohEdge:
     async def query(
         self, channel: Channel, request: Message | None, kind: type[M], timeout_s: float, **ids: str
     ) -> M | None:
-        """Ask a queryable; return its first answer, or None when nobody answers within `timeout_s` of the clock.
+        """Send a query; return the first reply, or None when there is none within `timeout_s` of the clock.
 
-        Channels that are published (hazards, zones) are asked without a request. Raises `ContractError` for an
-        answer that breaks the contract, or when the answering side says that it refuses or has failed.
+        Published channels (hazards, zones) are queried without a request. Raises `ContractError` for a reply that
+        violates the contract, or when the answering side refuses the query or fails.
         """
         key = self._key(channel, ids)
         data = None if request is None else encode(channel, request)
@@ -364,68 +364,68 @@ class ZenohEdge:
         reply = channel.kind == "query"
         limit = channel.reply_limit if reply else channel.limit
 
-        def settle(value: bytes | ContractError | None) -> None:
+        def set_answer(value: bytes | ContractError | None) -> None:
             if not answer.done():
                 answer.set_result(value)
 
-        def arrived(got: zenoh.Reply) -> None:
-            if got.ok is not None:
-                size = len(got.ok.payload)
+        def on_reply(reply_or_error: zenoh.Reply) -> None:
+            if reply_or_error.ok is not None:
+                size = len(reply_or_error.ok.payload)
                 if size > limit:
-                    self.call(settle, ContractError(channel.name, f"{size} bytes are over the limit of {limit}"))
+                    self.call(set_answer, ContractError(channel.name, f"{size} bytes are over the limit of {limit}"))
                 else:
-                    self.call(settle, got.ok.payload.to_bytes())
-            elif got.err is not None and (text := bytes(got.err.payload)[:500]) != b"Timeout":
-                # "Timeout" is zenoh's own word for an answer that never came: the same as none.
-                self.call(settle, ContractError(channel.name, f"refused: {text.decode('utf-8', 'replace')}"))
+                    self.call(set_answer, reply_or_error.ok.payload.to_bytes())
+            elif reply_or_error.err is not None and (text := bytes(reply_or_error.err.payload)[:500]) != b"Timeout":
+                # zenoh reports a missing reply as the error "Timeout": the same as none.
+                self.call(set_answer, ContractError(channel.name, f"refused: {text.decode('utf-8', 'replace')}"))
 
         timeout = max(0.001, self._clock.real(timeout_s))
-        handler = zenoh.handlers.Callback(arrived, lambda: self.call(settle, None))
+        handler = zenoh.handlers.Callback(on_reply, lambda: self.call(set_answer, None))
         get = partial(session.get, key, handler, timeout=timeout, payload=data)
         try:
             async with asyncio.timeout(timeout):
                 await self.in_thread(get)
-                found = await answer
+                result = await answer
         except TimeoutError:
             return None
-        if isinstance(found, ContractError):
-            raise found
-        return None if found is None else decode(channel, found, kind, reply=reply)
+        if isinstance(result, ContractError):
+            raise result
+        return None if result is None else decode(channel, result, kind, reply=reply)
 
     def serve(self, channel: Channel, handler: Callable[[Ids, Any], Answer], **ids: str) -> None:
         """Answer queries with `handler(ids, request)`, plain or async; `request` is None where the channel has none."""
-        self._declare(_Answerer(self, channel, handler, self._key(channel, ids)).declare)
+        self._declare(_Queryable(self, channel, handler, self._key(channel, ids)).declare)
 
     def declare_liveliness(self, role: str, id: str) -> None:  # noqa: A002  # as in the channel `live`
-        """Declare that this process is there, for as long as its session lives."""
+        """Declare that this process is present, for as long as its session is open."""
         key = LIVE.key(site=self._site, role=role, id=id)
         self._declare(lambda session: session.liveliness().declare_token(key))
 
     def subscribe_liveliness(self, handler: Callable[[str, str, bool], object]) -> None:
-        """Have `handler(role, id, alive)` called for all who are there now, and whenever one comes or goes.
+        """Call `handler(role, id, alive)` for each process that is present, and whenever one appears or disappears.
 
-        When this process itself loses its router, all go.
+        When this process loses its own router, all others disappear.
         """
 
-        def arrived(sample: zenoh.Sample) -> None:
+        def on_sample(sample: zenoh.Sample) -> None:
             ids = LIVE.match(str(sample.key_expr))
             if ids is not None:
                 self.call(handler, ids["role"], ids["id"], sample.kind == zenoh.SampleKind.PUT)
 
         pattern = LIVE.pattern(site=self._site)
-        self._declare(lambda session: session.liveliness().declare_subscriber(pattern, arrived, history=True))
+        self._declare(lambda session: session.liveliness().declare_subscriber(pattern, on_sample, history=True))
 
-    # --- for the parts of this module ---------------------------------------------------------------------------
+    # --- For the other classes of this module -----------------------------------------------------------------------
 
     def call(self, function: Callable[..., object], *arguments: object) -> bool:
-        """Call a function on the loop's thread, from any thread; False when the edge is closed already."""
+        """Call a function on the loop's thread, from any thread; False when the edge is closed."""
         if self._closed or self._loop.is_closed():
             return False
         self._loop.call_soon_threadsafe(function, *arguments)
         return True
 
     async def in_thread(self, function: Callable[[], object]) -> None:
-        """Run a call that may block on a thread of the edge's own."""
+        """Run a call that may block on one of the edge's own threads."""
         await self._loop.run_in_executor(self._threads, function)
 
     def spawn(self, work: Coroutine[Any, Any, None]) -> None:
@@ -442,15 +442,17 @@ class ZenohEdge:
         return found
 
     def refuse(self, channel: Channel, key: str, reason: str) -> None:
-        """Count and report (rate-limited) what broke a contract; from any thread."""
+        """Count and log (rate-limited) a message that violates its contract; from any thread."""
         metrics.REFUSED.labels(channel.name).inc()
-        self._limited.warning("refused", channel.name, self._clock.now(), channel=channel.name, key=key, reason=reason)
+        self._limited.warning(
+            "message_refused", channel.name, self._clock.now(), channel=channel.name, key=key, reason=reason
+        )
 
     def _check(self, channel: Channel, ids: Ids) -> None:
         if channel.transport != "zenoh":
             raise ValueError(f"channel {channel.name} is carried by {channel.transport}, not by zenoh")
         if "site" in ids:
-            raise ValueError("the edge fills the site in: leave it out")
+            raise ValueError("the edge fills in the site: leave it out")
 
     def _with_site(self, channel: Channel, ids: Ids) -> Ids:
         return {**ids, "site": self._site} if "site" in channel.fields else ids
@@ -463,28 +465,30 @@ class ZenohEdge:
         if self._session is None:
             self._undeclared.append(declare)
         else:
-            # zenoh undeclares what nobody refers to any more.
+            # zenoh undeclares what is no longer referenced.
             self._declared.append(declare(self._session))
 
-    async def _attempt(self, connect: Sequence[str]) -> bool:
+    async def _try_connect(self, connect: Sequence[str]) -> bool:
         try:
             session = await asyncio.to_thread(zenoh.open, session_config("client", connect=connect))
         except zenoh.ZError as error:
-            self._limited.warning("no_router", "no_router", self._clock.now(), connect=list(connect), reason=str(error))
+            self._limited.warning(
+                "router_unreachable", "router_unreachable", self._clock.now(), connect=list(connect), reason=str(error)
+            )
             return False
         self._session = session
         metrics.CONNECTED.labels("zenoh").set_function(lambda: float(self.connected))
-        metrics.CONNECTS.labels("zenoh").inc()
+        metrics.CONNECTIONS.labels("zenoh").inc()
         pending, self._undeclared = self._undeclared, []
         for declare in pending:
             self._declared.append(declare(session))
-        _log.info("zenoh_open", who=self._who, connect=list(connect), zid=str(session.zid()))
+        _log.info("router_connected", client=self._client_name, connect=list(connect), zid=str(session.zid()))
         return True
 
-    async def _keep_trying(self, connect: Sequence[str]) -> None:
+    async def _connect_when_possible(self, connect: Sequence[str]) -> None:
         while True:
             await asyncio.sleep(random.uniform(*_RETRY_S))  # noqa: S311  # spreads attempts in time, no secret
-            if await self._attempt(connect):
+            if await self._try_connect(connect):
                 return
 
     async def _close(self) -> None:
@@ -493,7 +497,7 @@ class ZenohEdge:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
         if self._session is not None:
-            # Without this, callback subscribers would keep the interpreter from ending.
+            # Without this, callback subscribers would keep the interpreter running.
             await asyncio.to_thread(self._session.close)
             metrics.CONNECTED.labels("zenoh").set_function(lambda: 0.0)
         self._threads.shutdown(wait=False, cancel_futures=True)

@@ -27,6 +27,8 @@ _.path_received
 _.first_command
 _.publishers  # channels: what documents and access lists are made from
 _.subscribers
+NODE_VALUE  # channels: rows of the table for other people's programs, which no service of ours uses yet
+HOME_ASSISTANT
 _.ROLES
 _.DURABILITIES
 

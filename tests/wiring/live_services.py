@@ -136,7 +136,7 @@ class BusEdge:
         self._live.served.add((self._role, channel))
         self._live.answering[channel.key(site=self._live.site, **ids)] = handler, ids
 
-    async def ask(self, channel: Channel, request: Any, kind: type[Message], _timeout_s: float, **ids: str) -> Any:
+    async def query(self, channel: Channel, request: Any, kind: type[Message], _timeout_s: float, **ids: str) -> Any:
         assert self._role in channel.subscribers, channel.name
         handler, served = self._live.answering.get(channel.key(site=self._live.site, **ids), (None, {}))
         if handler is None:
@@ -146,7 +146,10 @@ class BusEdge:
         assert isinstance(reply, kind)
         return roundtrip(channel, reply, reply=channel.kind == "query")
 
-    def watch_live(self, handler: Any) -> None:
+    def refuse(self, _channel: Channel, key: str, reason: str) -> None:
+        self._live.bus.refused.append(f"{key}: {reason}")
+
+    def subscribe_liveliness(self, handler: Any) -> None:
         self._live.watching.append(handler)
 
     def on_connect(self, callback: Callable[[], Awaitable[None]]) -> None:
@@ -165,7 +168,7 @@ class MemoryStore:
 
     async def ping(self) -> None: ...
 
-    async def weakness(self) -> str:
+    async def durability_warning(self) -> str:
         return ""
 
     async def zones(self) -> list[Any]:
@@ -202,7 +205,7 @@ class MemoryStore:
 class Link:
     """Stands for the guardian and the lidar's port."""
 
-    trouble = ""
+    problem = ""
 
     def __init__(self) -> None:
         self.sent: list[WheelCommand] = []
@@ -244,9 +247,7 @@ class LiveServices:
         )  # fmt: skip
         self.planner = PlannerService(PlannerCore(1), MemoryStore(), edges["planner"], clock, Health())
         self.agent_core = AgentCore(config, seed)
-        self.agent = AgentService(
-            self.agent_core, edges["robot-agent"], MemoryStore(), clock, Health(), robot=self._robot, site=self.site
-        )
+        self.agent = AgentService(self.agent_core, edges["robot-agent"], MemoryStore(), clock, Health(), site=self.site)
 
     async def start(self) -> None:
         """Subscribe, read what is stored and connect, at time 0; no loop of the clock runs yet."""
@@ -270,7 +271,7 @@ class LiveServices:
     async def begin_loops(self) -> None:
         """Start all loops that the clock paces; each ticks at once."""
         loops = {
-            "agent map": self.agent.map_loop(),
+            "agent map": self.agent.snapshot_loop(),
             "agent control": self.agent.control_loop(),
             "agent stream": self.agent.stream_loop(self.link),
             "aggregator tick": self.aggregator.tick_loop(),

@@ -76,7 +76,7 @@ GOAL_ID = "goal-of-the-drive"
 OUTSIDE = {ch.NODE_READING, ch.NODE_AVAILABILITY, ch.THESIS_AREA}
 OF_ROBOTS = {ch.ROBOT_POSE, ch.ROBOT_STATE, ch.ROBOT_OBSTACLES}
 STRANGER = "r2"
-HARDWARE = (log.BaseReceived, log.LidarNodesReceived, log.ScanReceived)
+HARDWARE = (log.BaseReceived, log.LidarSamplesReceived, log.ScanReceived)
 ZONE_SLOW = Zone(
     id="slow",
     kind="SPEED_LIMIT",
@@ -213,7 +213,7 @@ def drive_in_lockstep() -> Run:
         at = moment(system.now)
         if step == ENABLE:
             asked = enable(at.now)
-            run.answers.append(bus.ask(ch.ROBOT_COMMAND, asked, CommandReply, at, robot="r1"))
+            run.answers.append(bus.query(ch.ROBOT_COMMAND, asked, CommandReply, at, robot="r1"))
         if step == BARRIER:
             system.world.place(barrier_across(site.site.areas[0], site.site, site.map, SEED))
         if step == GOAL:
@@ -227,9 +227,9 @@ def drive_in_lockstep() -> Run:
             run.last_zone = zone_around(*system.world.pose[:2])
             fog.map.put_zone(run.last_zone, at)
         if step == QUESTIONS:
-            run.answers.append(bus.ask(ch.PLANNER_PLAN, PLAN, PlanReply, at))
-            run.answers.append(bus.ask(ch.PLANNER_EGRESS, EGRESS, PlanReply, at))
-            run.answers.append(bus.ask(ch.ZONES, None, ZoneSet, at))
+            run.answers.append(bus.query(ch.PLANNER_PLAN, PLAN, PlanReply, at))
+            run.answers.append(bus.query(ch.PLANNER_EGRESS, EGRESS, PlanReply, at))
+            run.answers.append(bus.query(ch.ZONES, None, ZoneSet, at))
         fog.deliver(at)
     return run
 
@@ -251,8 +251,8 @@ def feed(live: Any, entries: list[log.Entry]) -> None:
         match entry:
             case log.BaseReceived():
                 live.agent.on_feedback(entry.feedback, entry.now)
-            case log.LidarNodesReceived():
-                live.agent_core.on_lidar_nodes(entry.now)
+            case log.LidarSamplesReceived():
+                live.agent_core.on_lidar_samples(entry.now)
             case log.ScanReceived():
                 live.agent.on_scan(entry.scan(), entry.now)
 
@@ -277,7 +277,7 @@ async def drive_live(recorded: Run) -> tuple[Run, Any]:
             await live.clock.wake(live.settle)
         if step == ENABLE:
             asked = enable(now)
-            run.answers.append(await live.run(console.ask(ch.ROBOT_COMMAND, asked, CommandReply, 1.0, robot="r1")))
+            run.answers.append(await live.run(console.query(ch.ROBOT_COMMAND, asked, CommandReply, 1.0, robot="r1")))
         if step == GOAL:
             pose = goal(0.0).pose
             assert pose is not None
@@ -289,10 +289,10 @@ async def drive_live(recorded: Run) -> tuple[Run, Any]:
         if step == CLOSED_IN:
             await live.run(live.map.create(recorded.last_zone, "tester"))
         if step == QUESTIONS:
-            run.answers.append(await live.run(console.ask(ch.PLANNER_PLAN, PLAN, PlanReply, 1.0)))
-            egress = live.edges["robot-agent"].ask(ch.PLANNER_EGRESS, EGRESS, PlanReply, 1.0)
+            run.answers.append(await live.run(console.query(ch.PLANNER_PLAN, PLAN, PlanReply, 1.0)))
+            egress = live.edges["robot-agent"].query(ch.PLANNER_EGRESS, EGRESS, PlanReply, 1.0)
             run.answers.append(await live.run(egress))
-            run.answers.append(await live.run(console.ask(ch.ZONES, None, ZoneSet, 1.0)))
+            run.answers.append(await live.run(console.query(ch.ZONES, None, ZoneSet, 1.0)))
         await live.settle()
     run.wheels = live.link.sent
     await live.stop()
@@ -383,7 +383,7 @@ def test_services_answer_exactly_the_queries_that_the_table_gives_them(live):
 
 
 def cores(loaded: Any, config: AgentConfig) -> dict[str, Any]:
-    """Return what offers tables of handlers or answerers, by name."""
+    """Return what offers tables of handlers or query handlers, by name."""
     definitions, layers = loaded.site.definitions(), make_layers(loaded.map, loaded.site.layers)
     return {
         "aggregator": Aggregator(definitions, loaded.site.nodes, 1, registry=find_rule),
@@ -409,14 +409,14 @@ def test_every_handler_takes_the_message_type_of_its_channel(lockstep):
     assert checked > 20
 
 
-def test_every_answerer_takes_the_request_type_of_its_channel_and_gives_its_reply(lockstep):
+def test_every_query_handler_takes_the_request_type_of_its_channel_and_gives_its_reply(lockstep):
     checked = 0
     for name, core in cores(site_with_two_areas(), lockstep.config).items():
-        for channel, answerer in core.answerers().items() if hasattr(core, "answerers") else ():
+        for channel, query_handler in core.query_handlers().items() if hasattr(core, "query_handlers") else ():
             asked, reply = (channel.message, channel.reply) if channel.kind == "query" else (None, channel.message)
             expected = "None" if asked is None else asked.__name__
-            assert annotations(answerer) == ["Ids", expected, "Moment"], f"{name}: {channel.name}"
+            assert annotations(query_handler) == ["Ids", expected, "Moment"], f"{name}: {channel.name}"
             assert reply is not None
-            assert inspect.signature(answerer).return_annotation == reply.__name__, f"{name}: {channel.name}"
+            assert inspect.signature(query_handler).return_annotation == reply.__name__, f"{name}: {channel.name}"
             checked += 1
     assert checked == 6

@@ -1,4 +1,4 @@
-"""A fog of its own for each test: broker, Redis and router on free loopback ports, and the processes under test."""
+"""A separate fog for each test: broker, Redis and router on free loopback ports, and the processes under test."""
 
 import asyncio
 import hashlib
@@ -39,8 +39,8 @@ y = 4.5
 theta = -1.5707963
 sonars = [{ range_limit = 1.5, no_echo_is_clear = true }, { angle = 0.2, range_limit = 1.5, no_echo_is_clear = true }]
 """
-TOKEN = "an-operators-token"
-VIEWER = "a-viewers-token"
+OPERATOR_TOKEN = "operator-token"
+VIEWER_TOKEN = "viewer-token"
 
 
 class Fog:
@@ -60,7 +60,7 @@ class Fog:
         save_map(self.site / "map", StaticMap(GridGeometry(160, 120, 0.05, 0.0, 0.0), cells))
         tokens = folder / "tokens.toml"
         lines = []
-        for name, role, token in (("anna", "operator", TOKEN), ("vera", "viewer", VIEWER)):
+        for name, role, token in (("anna", "operator", OPERATOR_TOKEN), ("vera", "viewer", VIEWER_TOKEN)):
             digest = hashlib.sha256(token.encode()).hexdigest()
             lines += ["[[tokens]]", f'name = "{name}"', f'role = "{role}"', f'sha256 = "{digest}"']
         tokens.write_text("\n".join(lines))
@@ -72,13 +72,13 @@ class Fog:
             "FOGNAV_REDIS_URL": self.redis.url,
             "FOGNAV_ZENOH_CONNECT": self.router.endpoint,
             "FOGNAV_TOKENS_FILE": str(tokens),
-            # The map-service need not wait long for an aggregator that a test does not start.
+            # Short, because many tests start no aggregator.
             "FOGNAV_HAZARDS_WAIT_S": "0.3",
         }
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
 
     def start(self, module: str) -> None:
-        """Start `python -m module`, again after a kill."""
+        """Start `python -m module`; may be called again after a kill."""
         port_file = self.folder / f"{module}.port"
         port_file.unlink(missing_ok=True)
         with (self.folder / f"{module}.log").open("ab") as log:
@@ -90,23 +90,23 @@ class Fog:
             )
 
     def kill(self, module: str) -> None:
-        """End a process as a crash would."""
+        """Kill a process, as a crash would."""
         process = self.processes.pop(module)
         process.kill()
         process.wait()
 
     def log(self, module: str) -> str:
-        """Everything that a process printed."""
+        """Return everything that a process printed."""
         return (self.folder / f"{module}.log").read_text()
 
     async def url(self, module: str) -> str:
-        """Return the address of its REST interface, once it listens."""
+        """Return the URL of a process's REST API once it listens."""
         port_file = self.folder / f"{module}.port"
         await until(port_file.exists, f"{module} listens", lambda: self.log(module))
         return f"http://127.0.0.1:{port_file.read_text().strip()}"
 
     async def ready(self, module: str) -> str:
-        """Return its address once it says that it is ready."""
+        """Return the URL of a process's REST API once it is ready."""
         url = await self.url(module)
         async with httpx.AsyncClient() as client:
             deadline = time.monotonic() + 15
@@ -117,7 +117,7 @@ class Fog:
 
     @asynccontextmanager
     async def edges(self) -> AsyncIterator[tuple[MqttEdge, ZenohEdge, Callable[[], None]]]:
-        """Give a connection to each side; register on the broker's before calling the third, which connects it."""
+        """Yield an MQTT edge, a zenoh edge, and a function that connects the former: register MQTT handlers before."""
         clock = SystemClock()
         mqtt = MqttEdge(self.mosquitto.url, "test", clock, site="test")
         tasks: list[asyncio.Task[None]] = []
@@ -144,11 +144,11 @@ class Fog:
             server.stop()
 
 
-async def until(condition: Callable[[], object], what: str, why: Callable[[], str] = str) -> None:
-    """Wait until something is so."""
+async def until(condition: Callable[[], object], expected: str, details: Callable[[], str] = str) -> None:
+    """Wait until a condition is true; after 15 s, fail with what was `expected` and the `details`."""
     deadline = time.monotonic() + 15.0
     while not condition():
-        assert time.monotonic() < deadline, f"not within 15 s: {what}\n{why()}"
+        assert time.monotonic() < deadline, f"not within 15 s: {expected}\n{details()}"
         await asyncio.sleep(0.01)
 
 
@@ -159,7 +159,10 @@ def until_fixture():
 
 @pytest.fixture(name="tokens")
 def tokens_fixture() -> dict[str, dict[str, str]]:
-    return {name: {"Authorization": f"Bearer {token}"} for name, token in (("operator", TOKEN), ("viewer", VIEWER))}
+    return {
+        name: {"Authorization": f"Bearer {token}"}
+        for name, token in (("operator", OPERATOR_TOKEN), ("viewer", VIEWER_TOKEN))
+    }
 
 
 @pytest.fixture
@@ -172,8 +175,8 @@ def fog(tmp_path: Path) -> Iterator[Fog]:
 
 
 @pytest.fixture(scope="module")
-def calm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fog]:
-    """Give a fog with a running map-service to all tests of a module that neither kill nor restart anything."""
+def shared_fog(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fog]:
+    """Yield a fog with a running map-service, shared by the tests of a module that kill and restart nothing."""
     running = Fog(tmp_path_factory.mktemp("fog"))
     try:
         running.start("map_service")

@@ -49,7 +49,7 @@ class AggregatorProcess:
 
     def _store(self, publications: Sequence[Publication]) -> Sequence[Publication]:
         """Return these publications, and those that waited for the store."""
-        return [*publications, *self.core.stored(self.core.to_store())]
+        return [*publications, *self.core.mark_stored(self.core.to_store())]
 
 
 class MapProcess:

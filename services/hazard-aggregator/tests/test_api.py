@@ -37,7 +37,7 @@ async def test_areas_are_changed_by_version_and_survive_a_kill(fog, client, toke
     assert (kept["polygon"], kept["debounce"]["to_blocked"], kept["version"]) == (POLYGON, 3, 1)
 
 
-async def test_of_eight_concurrent_changes_to_one_version_one_is_made(fog, client, tokens):
+async def test_one_of_eight_concurrent_changes_to_a_version_succeeds(fog, client, tokens):
     async def put(number: int) -> httpx.Response:
         body = {"polygon": POLYGON, "nodes": ["n1"], "label": f"by writer {number}"}
         return await client.put("/api/v1/areas/hall", json=body, headers={**tokens["operator"], "If-Match": '"0"'})
@@ -53,7 +53,7 @@ async def test_of_eight_concurrent_changes_to_one_version_one_is_made(fog, clien
     assert json.loads(entry[b"before"])["version"] == 0, "the site's own definition, which was not stored"
 
 
-async def test_a_version_that_somebody_else_stored_is_taken_over_after_the_conflict(fog, client, tokens):
+async def test_version_stored_by_another_writer_is_loaded_after_the_conflict(fog, client, tokens):
     other = AreaDefinition(id="hall", polygon=[(1.0, 1.0), (2.0, 1.0), (2.0, 2.0)], label="elsewhere", version=5)
     async with Redis.from_url(fog.redis.url) as raw:
         await raw.hset("fog:test:areas", "hall", msgspec.json.encode(other))
@@ -69,7 +69,7 @@ async def test_a_version_that_somebody_else_stored_is_taken_over_after_the_confl
     assert (again.status_code, again.headers["etag"]) == (200, '"6"')
 
 
-async def test_bad_areas_are_refused_by_field_and_a_dead_store_is_said(fog, client, tokens):
+async def test_invalid_areas_are_refused_naming_the_field_and_a_dead_store_is_reported(fog, client, tokens):
     for body, field in (
         ({"polygon": [[1, 1], [2, 2], [2, 1], [1, 2]]}, "body.polygon"),
         ({"polygon": [[1, 1], [90, 1], [2, 2]]}, "body.polygon.1"),
@@ -88,7 +88,7 @@ async def test_bad_areas_are_refused_by_field_and_a_dead_store_is_said(fog, clie
     assert (await client.get("/api/v1/areas/hall")).json()["definition"]["version"] == 0
 
 
-async def test_nodes_tell_their_health(client):
+async def test_nodes_report_their_health(client):
     (node,) = (await client.get("/api/v1/nodes")).json()
     assert (node["id"], node["area"], node["state"], node["age_s"]) == ("n1", "hall", "unknown", None)
     described = (await client.get("/openapi.json")).json()

@@ -1,4 +1,4 @@
-"""What the aggregator publishes and when: dangers at once, reliefs once stored, everything again for a new broker."""
+"""When the aggregator publishes: dangers at once, reliefs once stored, everything again for a new broker."""
 
 import pytest
 
@@ -19,7 +19,7 @@ def stored(state: str, penalty: int, epoch: int = 0) -> AreaHazard:
 
 
 class Rig:
-    """A core that is fed through its table of handlers, 0.1 s apart."""
+    """A core that gets messages through its handlers, 0.1 s apart."""
 
     def __init__(self, *restored: AreaHazard) -> None:
         self.core = Aggregator([AREA], [NODE], 5, restored, registry=find_rule)
@@ -32,7 +32,7 @@ class Rig:
     def at(self) -> Moment:
         return Moment(self.now, self.now + 1e6)
 
-    def feed(self, channel: ch.Channel, message: object, **ids: str) -> list[Publication]:
+    def deliver(self, channel: ch.Channel, message: object, **ids: str) -> list[Publication]:
         self.now += 0.1
         publications = list(self.core.handlers()[channel](ids, message, self.at))
         self.published += publications
@@ -43,7 +43,7 @@ class Rig:
             self.seq += 1
             state = "blocked" if distance < 1.2 else "clear"
             reading = NodeReading(seq=self.seq, boot=1, uptime_ms=0, range_m=[distance], status=["ok"], state=state)
-            self.feed(ch.NODE_READING, reading, node="n1")
+            self.deliver(ch.NODE_READING, reading, node="n1")
 
     def states(self) -> list[str]:
         return [p.message.state for p in self.published if p.channel is ch.AREA_HAZARD]
@@ -52,18 +52,18 @@ class Rig:
         return [p.message for p in self.published if p.channel is ch.THESIS_WSN]
 
 
-def test_every_channel_of_the_table_takes_its_message():
+def test_handler_of_every_channel_accepts_its_message():
     rig = Rig()
     pose = RobotPose(x=9.0, y=9.0, theta=0.0, covariance=[0.0] * 9, v=0.0, w=0.0, radius=0.2, height=0.3, stamp=0.0)
     rig.read(3.0, 1)
-    rig.feed(ch.NODE_AVAILABILITY, "online", node="n1")
-    rig.feed(ch.THESIS_AREA, "clear", number="7")
-    rig.feed(ch.AREA_HAZARD, stored("blocked", 254), area="hall")
-    rig.feed(ch.ROBOT_POSE, pose, robot="r1")
+    rig.deliver(ch.NODE_AVAILABILITY, "online", node="n1")
+    rig.deliver(ch.THESIS_AREA, "clear", number="7")
+    rig.deliver(ch.AREA_HAZARD, stored("blocked", 254), area="hall")
+    rig.deliver(ch.ROBOT_POSE, pose, robot="r1")
     assert len(rig.core.handlers()) == 5
 
 
-def test_danger_is_published_at_once_with_the_thesiss_line():
+def test_danger_is_published_at_once_with_its_thesis_line():
     rig = Rig()
     rig.published.clear()
     rig.read(0.8)
@@ -84,7 +84,7 @@ def test_relief_is_published_once_it_is_stored():
     assert rig.states() == []
     assert rig.core.withheld() == ["hall"]
     assert rig.core.announced()["hall"].state == "blocked"
-    rig.published += rig.core.stored(rig.core.to_store())
+    rig.published += rig.core.mark_stored(rig.core.to_store())
     assert (rig.states(), rig.lines()) == (["clear"], ["7,-999,-999"])
     assert (rig.core.to_store(), rig.core.withheld()) == ([], [])
 
@@ -92,47 +92,47 @@ def test_relief_is_published_once_it_is_stored():
 def test_availability_that_is_neither_online_nor_offline_is_refused():
     rig = Rig()
     with pytest.raises(RefusedMessageError, match="maybe"):
-        rig.feed(ch.NODE_AVAILABILITY, "maybe", node="n1")
+        rig.deliver(ch.NODE_AVAILABILITY, "maybe", node="n1")
     rig.read(3.0)
-    rig.core.stored(rig.core.to_store())
+    rig.core.mark_stored(rig.core.to_store())
     rig.published.clear()
-    rig.feed(ch.NODE_AVAILABILITY, "offline", node="n1")
+    rig.deliver(ch.NODE_AVAILABILITY, "offline", node="n1")
     assert rig.states() == ["unknown"]
 
 
-def test_a_retained_hazard_of_an_earlier_run_is_recalled_and_one_of_this_run_is_not():
+def test_retained_hazard_of_an_earlier_run_is_restored_and_one_of_this_run_ignored():
     rig = Rig()
     rig.published.clear()
-    rig.feed(ch.AREA_HAZARD, stored("blocked", 254, epoch=5), area="hall")
+    rig.deliver(ch.AREA_HAZARD, stored("blocked", 254, epoch=5), area="hall")
     assert rig.states() == []
-    rig.feed(ch.AREA_HAZARD, stored("blocked", 254, epoch=4), area="hall")
+    rig.deliver(ch.AREA_HAZARD, stored("blocked", 254, epoch=4), area="hall")
     assert [p.message.penalty for p in rig.published if p.channel is ch.AREA_HAZARD] == [254]
 
 
-def test_a_new_broker_gets_definitions_announced_hazards_and_node_configs():
+def test_reconnected_broker_gets_definitions_announced_hazards_and_node_configs():
     rig = Rig()
     rig.read(0.8)
     rig.read(3.0)
-    again = rig.core.republish_all()
-    assert [p.message for p in again if p.channel is ch.AREA_DEFINITION] == [AREA]
-    assert [p.message.state for p in again if p.channel is ch.AREA_HAZARD] == ["blocked"], "the relief is not stored"
-    (config,) = [p.message for p in again if p.channel is ch.NODE_CONFIG]
+    republished = rig.core.republish_all()
+    assert [p.message for p in republished if p.channel is ch.AREA_DEFINITION] == [AREA]
+    assert [p.message.state for p in republished if p.channel is ch.AREA_HAZARD] == ["blocked"], "relief not stored"
+    (config,) = [p.message for p in republished if p.channel is ch.NODE_CONFIG]
     assert isinstance(config, NodeConfig)
     assert (config.range_limit_m, config.no_echo_is_clear, config.version > 0) == ([1.2], [True], True)
 
 
-def test_what_the_store_held_counts_when_it_is_read_late():
+def test_stored_areas_and_hazards_take_effect_when_they_are_loaded_late():
     rig = Rig()
     rig.published.clear()
-    moved = AreaDefinition(id="gate", polygon=SQUARE, number=8)
-    rig.published += rig.core.restore([moved], [stored("blocked", 254)], rig.at)
+    gate_area = AreaDefinition(id="gate", polygon=SQUARE, number=8)
+    rig.published += rig.core.restore([gate_area], [stored("blocked", 254)], rig.at)
     hall, gate = (rig.core.announced()[name] for name in ("hall", "gate"))
     assert (hall.state, hall.penalty, gate.state) == ("unknown", 254, "unknown")
     assert rig.core.thesis_numbers() == [7, 8]
     assert {p.ids["area"] for p in rig.published if p.channel is ch.AREA_DEFINITION} == {"hall", "gate"}
 
 
-def test_a_removed_area_is_published_as_removed_and_nothing_of_it_waits_for_the_store():
+def test_removed_area_is_published_as_removed_and_leaves_nothing_to_store():
     rig = Rig()
     removed = AreaDefinition(id="hall", polygon=SQUARE, removed=True, version=1)
     publications = rig.core.put_area(removed, rig.at)
@@ -140,7 +140,7 @@ def test_a_removed_area_is_published_as_removed_and_nothing_of_it_waits_for_the_
     assert (rig.core.to_store(), rig.core.announced(), rig.core.thesis_numbers()) == ([], {}, [])
 
 
-def test_the_thesiss_robots_get_their_line():
+def test_thesis_line_has_the_position_of_node_or_area_and_none_when_clear():
     assert wsn_line(AREA, stored("blocked", 254)) == "7,1.000,0.500"
     assert wsn_line(AREA, stored("blocked", 254), NODE) == "7,0.000,0.500"
     assert wsn_line(AREA, stored("clear", 0)) == "7,-999,-999"

@@ -1,4 +1,4 @@
-"""What readings make of areas: debounce, silence, contradiction, robots in the cone, fusion, restarts."""
+"""From readings to area states: debounce, silence, contradictions, robots in the cone, fusion, restarts."""
 
 import itertools
 import math
@@ -50,28 +50,28 @@ class Rig:
         self.core = AreaFusion([area(*(n.id for n in nodes), **fields)], nodes, 1, restored or [], registry=find_rule)
         self.now = 100.0
         self.seq = 0
-        self.seen: list[AreaHazard] = []
+        self.changes: list[AreaHazard] = []
         self.wait(0.0)
 
     def read(self, *ranges: float | None, state: str | None = None, node: str = "n1", times: int = 1) -> None:
         for _ in range(times):
             self.now += PERIOD
             self.seq += 1
-            said = state or ("blocked" if any(r is not None and r < LIMIT for r in ranges) else "clear")
+            reported = state or ("blocked" if any(r is not None and r < LIMIT for r in ranges) else "clear")
             reading = NodeReading(
                 seq=self.seq,
                 boot=1,
                 uptime_ms=0,
                 range_m=list(ranges),
                 status=["no_echo" if r is None else "ok" for r in ranges],
-                state=said,
+                state=reported,
             )
-            self.seen += self.core.on_reading(node, reading, self.now, self.now + 1e6)
+            self.changes += self.core.on_reading(node, reading, self.now, self.now + 1e6)
 
     def wait(self, seconds: float) -> None:
         end = self.now + seconds
         while True:
-            self.seen += self.core.tick(self.now, self.now + 1e6)
+            self.changes += self.core.tick(self.now, self.now + 1e6)
             if self.now >= end:
                 return
             self.now = min(self.now + 0.1, end)
@@ -81,19 +81,19 @@ class Rig:
         return self.core.hazards()[0]
 
 
-def test_an_area_starts_as_unknown_at_the_policys_penalty():
+def test_area_starts_as_unknown_with_the_penalty_of_its_policy():
     rig = Rig(site("n1"))
     assert (rig.hazard.state, rig.hazard.penalty, rig.hazard.seq, rig.hazard.epoch) == ("unknown", 200, 1, 1)
 
 
-def test_the_fifth_blocked_reading_in_a_row_blocks_and_is_traced():
+def test_fifth_consecutive_blocked_reading_blocks_the_area_and_begins_a_trace():
     rig = Rig(site("n1"))
     rig.read(3.0, 3.0, times=5)
-    rig.seen.clear()
+    rig.changes.clear()
     rig.read(0.8, 3.0, times=4)
-    assert rig.seen == []
+    assert rig.changes == []
     rig.read(0.8, 3.0)
-    (hazard,) = rig.seen
+    (hazard,) = rig.changes
     assert (hazard.state, hazard.penalty, hazard.severity) == ("blocked", 254, 3)
     assert hazard.trace is not None
     assert hazard.trace.confirmed - hazard.trace.first_reading == pytest.approx(4 * PERIOD)
@@ -101,17 +101,17 @@ def test_the_fifth_blocked_reading_in_a_row_blocks_and_is_traced():
     assert "n1" in hazard.cause
 
 
-def test_four_blocked_readings_and_one_clear_change_nothing():
+def test_four_blocked_readings_between_clear_ones_change_nothing():
     rig = Rig(site("n1"))
     rig.read(3.0, 3.0, times=5)
-    rig.seen.clear()
+    rig.changes.clear()
     for _ in range(3):
         rig.read(0.8, 3.0, times=4)
         rig.read(3.0, 3.0, times=5)
-    assert rig.seen == []
+    assert rig.changes == []
 
 
-def test_debounce_counts_are_the_areas_own():
+def test_each_area_uses_its_own_debounce_counts():
     rig = Rig(site("n1"), debounce={"to_blocked": 2, "to_clear": 7})
     rig.read(0.8, 3.0, times=2)
     assert rig.hazard.state == "blocked"
@@ -121,7 +121,7 @@ def test_debounce_counts_are_the_areas_own():
     assert rig.hazard.state == "clear"
 
 
-def test_duplicates_and_overtaken_readings_do_not_count():
+def test_duplicate_and_outdated_readings_are_ignored():
     rig = Rig(site("n1"))
     rig.read(3.0, 3.0, times=5)
     rig.seq -= 3
@@ -132,25 +132,25 @@ def test_duplicates_and_overtaken_readings_do_not_count():
     assert rig.hazard.state == "clear"
 
 
-def test_a_reading_of_an_earlier_boot_is_ignored_until_the_node_falls_silent():
+def test_reading_of_an_earlier_boot_is_ignored_until_the_node_is_silent():
     rig = Rig(site("n1"))
     rig.read(3.0, 3.0, times=5)
 
-    def old_boot(seq: int) -> None:
+    def read_from_old_boot(seq: int) -> None:
         late = NodeReading(seq=seq, boot=0, uptime_ms=0, range_m=[0.8, 3.0], status=["ok", "ok"], state="blocked")
         rig.core.on_reading("n1", late, rig.now, rig.now)
 
     for seq in range(10):
-        old_boot(seq)
+        read_from_old_boot(seq)
     assert rig.hazard.state == "clear"
     rig.wait(3.5)
     for seq in range(10, 15):
-        old_boot(seq)
+        read_from_old_boot(seq)
     assert rig.hazard.state == "blocked"
 
 
 @pytest.mark.parametrize(("before", "penalty"), [((3.0, 3.0), 200), ((0.8, 3.0), 254)])
-def test_silence_makes_unknown_and_keeps_what_was_blocked_impassable(before, penalty):
+def test_silent_node_makes_its_area_unknown_and_a_blocked_area_stays_impassable(before, penalty):
     rig = Rig(site("n1"))
     rig.read(*before, times=5)
     rig.wait(2.9)
@@ -162,7 +162,7 @@ def test_silence_makes_unknown_and_keeps_what_was_blocked_impassable(before, pen
     assert rig.hazard.state == "unknown"
 
 
-def test_only_a_row_of_clear_readings_ends_what_silence_kept():
+def test_only_consecutive_clear_readings_clear_an_area_that_silence_kept_impassable():
     rig = Rig(site("n1"))
     rig.read(0.8, 3.0, times=5)
     rig.wait(4.0)
@@ -173,24 +173,24 @@ def test_only_a_row_of_clear_readings_ends_what_silence_kept():
 
 
 @pytest.mark.parametrize(
-    ("ranges", "state", "words"),
+    ("ranges", "state", "cause"),
     [
-        ((0.8, 3.0), "clear", "says clear"),
-        ((3.0, 3.0), "blocked", "says blocked"),
+        ((0.8, 3.0), "clear", "reports clear"),
+        ((3.0, 3.0), "blocked", "reports blocked"),
         ((0.001, 3.0), "blocked", "nearer than a sonar can measure"),
         ((3.0,), "clear", "reports 1 sonars"),
-        ((3.0, 3.0), "unknown", "calls its own reading unknown"),
+        ((3.0, 3.0), "unknown", "the node reports unknown"),
     ],
 )
-def test_a_node_whose_word_contradicts_its_ranges_is_not_believed(ranges, state, words):
+def test_reading_whose_state_contradicts_its_ranges_is_unknown(ranges, state, cause):
     rig = Rig(site("n1"))
     rig.read(3.0, 3.0, times=5)
     rig.read(*ranges, state=state, times=5)
     assert rig.hazard.state == "unknown"
-    assert words in rig.hazard.cause
+    assert cause in rig.hazard.cause
 
 
-def test_at_the_limit_itself_the_nodes_word_holds():
+def test_range_within_rounding_of_the_limit_takes_the_nodes_reported_state():
     rig = Rig(site("n1"))
     rig.read(LIMIT - 0.005, 3.0, state="clear", times=5)
     assert rig.hazard.state == "clear"
@@ -200,7 +200,7 @@ def test_at_the_limit_itself_the_nodes_word_holds():
     assert rig.hazard.state == "unknown"
 
 
-def test_no_echo_clears_only_where_calibration_saw_nothing_in_range():
+def test_no_echo_is_clear_only_where_calibration_found_nothing_in_range():
     free = Rig(site("n1", no_echo_is_clear=True))
     free.read(None, None, state="clear", times=5)
     assert free.hazard.state == "clear"
@@ -210,7 +210,7 @@ def test_no_echo_clears_only_where_calibration_saw_nothing_in_range():
     assert "opposite wall" in walled.hazard.cause
 
 
-def test_flapping_readings_become_unknown_not_clear():
+def test_flapping_readings_make_the_area_unknown():
     rig = Rig(site("n1"))
     rig.read(3.0, 3.0, times=5)
     for _ in range(40):
@@ -220,13 +220,13 @@ def test_flapping_readings_become_unknown_not_clear():
         rig.wait(0.0)
     assert rig.hazard.state == "unknown"
     assert "contradict" in rig.hazard.cause
-    assert len(rig.seen) <= 4
+    assert len(rig.changes) <= 4
 
 
-def test_an_offline_node_is_not_trusted_and_is_again_once_heard():
+def test_offline_node_is_unknown_until_new_readings_arrive():
     rig = Rig(site("n1"))
     rig.read(3.0, 3.0, times=5)
-    rig.seen += rig.core.on_availability("n1", online=False, now=rig.now, stamp=rig.now)
+    rig.changes += rig.core.on_availability("n1", online=False, now=rig.now, stamp=rig.now)
     assert (rig.hazard.state, rig.hazard.penalty) == ("unknown", 200)
     rig.read(3.0, 3.0, times=5)
     assert rig.hazard.state == "clear"
@@ -235,46 +235,46 @@ def test_an_offline_node_is_not_trusted_and_is_again_once_heard():
 # --- Robots in the cone ---------------------------------------------------------------------------------------------
 
 
-def drive_by(rig: Rig, robot: RobotPose, ranges: tuple[float, float], times: int = 20) -> None:
+def read_beside_robot(rig: Rig, robot: RobotPose, ranges: tuple[float, float], times: int = 20) -> None:
     for _ in range(times):
         rig.core.on_pose("r1", robot, rig.now)
         rig.read(*ranges)
         rig.wait(0.0)
 
 
-def test_a_robot_in_the_cone_at_the_measured_range_counts_neither_way():
+def test_echo_of_a_robot_in_the_cone_does_not_block_a_clear_area():
     rig = Rig(site("n1"))
     rig.read(3.0, 3.0, times=5)
-    drive_by(rig, pose(1.0, 0.5), (0.83, 3.0), times=60)
+    read_beside_robot(rig, pose(1.0, 0.5), (0.83, 3.0), times=60)
     assert (rig.hazard.state, rig.hazard.explained_by) == ("clear", "r1")
     rig.read(3.0, 3.0, times=5)
     assert (rig.hazard.state, rig.hazard.explained_by) == ("clear", None)
 
 
-def test_a_robot_does_not_clear_a_blocked_area_either():
+def test_echo_of_a_robot_in_the_cone_does_not_clear_a_blocked_area():
     rig = Rig(site("n1"))
     rig.read(0.8, 3.0, times=5)
-    drive_by(rig, pose(1.0, 0.5), (0.83, 3.0), times=60)
+    read_beside_robot(rig, pose(1.0, 0.5), (0.83, 3.0), times=60)
     assert rig.hazard.state == "blocked"
 
 
 @pytest.mark.parametrize(
     ("robot", "ranges"),
     [
-        (pose(1.0, 0.5), (0.45, 3.0)),  # a person before the robot
+        (pose(1.0, 0.5), (0.45, 3.0)),  # a person in front of the robot
         (pose(1.0, 1.3), (0.83, 3.0)),  # the robot beside the cone
         (pose(1.0, 0.5, height=0.2), (0.83, 3.0)),  # a robot lower than the node
-        (pose(1.0, 0.5, localized=False), (0.83, 3.0)),  # a robot that does not know where it is
+        (pose(1.0, 0.5, localized=False), (0.83, 3.0)),  # a robot that is not localized
         (pose(-1.0, 0.5), (0.83, 3.0)),  # a robot behind the node
     ],
 )
-def test_an_echo_that_no_robot_explains_blocks(robot, ranges):
+def test_echo_that_no_robot_explains_blocks(robot, ranges):
     rig = Rig(site("n1"))
-    drive_by(rig, robot, ranges, times=5)
+    read_beside_robot(rig, robot, ranges, times=5)
     assert rig.hazard.state == "blocked"
 
 
-def test_a_pose_older_than_a_second_explains_nothing():
+def test_pose_older_than_a_second_explains_no_echo():
     rig = Rig(site("n1"))
     rig.core.on_pose("r1", pose(1.0, 0.5), rig.now)
     rig.now += 1.01
@@ -282,15 +282,15 @@ def test_a_pose_older_than_a_second_explains_nothing():
     assert rig.hazard.state == "blocked"
 
 
-def test_a_person_in_the_other_sonar_counts_although_a_robot_explains_the_first():
+def test_unexplained_echo_of_one_sonar_blocks_although_a_robot_explains_the_other():
     rig = Rig(site("n1"))
-    drive_by(rig, pose(1.0, 0.47), (0.83, 0.4), times=5)
+    read_beside_robot(rig, pose(1.0, 0.47), (0.83, 0.4), times=5)
     assert rig.hazard.state == "blocked"
 
 
 @given(st.floats(-math.pi, math.pi), st.floats(0.3, 1.3), st.floats(-0.6, 0.6))
 @settings(max_examples=60, deadline=None)
-def test_explaining_does_not_depend_on_how_the_site_is_turned(turn, distance, bearing):
+def test_explained_echoes_do_not_depend_on_the_sites_rotation(rotation, distance, bearing):
     def outcome(theta: float) -> str:
         x, y = distance * math.cos(theta + bearing), distance * math.sin(theta + bearing)
         node = NodeSite(id="n1", area="hall", x=0.0, y=0.0, theta=theta, sonars=[Sonar(range_limit=1.25)])
@@ -305,13 +305,13 @@ def test_explaining_does_not_depend_on_how_the_site_is_turned(turn, distance, be
 
     edge = abs(abs(bearing) - math.asin(0.17 / distance) - math.radians(7.5))
     if edge > 1e-6:
-        assert outcome(0.0) == outcome(turn)
+        assert outcome(0.0) == outcome(rotation)
 
 
 # --- Several nodes --------------------------------------------------------------------------------------------------
 
 
-def test_one_blocked_node_blocks_and_all_must_agree_to_clear():
+def test_one_blocked_node_blocks_an_area_and_only_all_nodes_clear_it():
     rig = Rig(site("n1"), site("n2"))
     rig.read(3.0, 3.0, node="n1", times=5)
     assert rig.hazard.state == "unknown"
@@ -322,7 +322,7 @@ def test_one_blocked_node_blocks_and_all_must_agree_to_clear():
     assert rig.hazard.nodes == {"n1": "clear", "n2": "blocked"}
 
 
-def test_a_silent_node_beside_a_clear_one_makes_the_area_unknown():
+def test_silent_node_beside_a_clear_one_makes_the_area_unknown():
     rig = Rig(site("n1"), site("n2"))
     for node in ("n1", "n2"):
         rig.read(3.0, 3.0, node=node, times=5)
@@ -333,7 +333,7 @@ def test_a_silent_node_beside_a_clear_one_makes_the_area_unknown():
     assert "n2" in rig.hazard.cause
 
 
-def test_a_blocked_area_stays_impassable_when_its_blocked_node_dies_and_the_other_sees_nothing():
+def test_blocked_area_stays_impassable_when_its_blocked_node_is_silent_and_the_other_clear():
     rig = Rig(site("n1"), site("n2"))
     rig.read(3.0, 3.0, node="n1", times=5)
     rig.read(0.8, 3.0, node="n2", times=5)
@@ -346,7 +346,7 @@ def test_a_blocked_area_stays_impassable_when_its_blocked_node_dies_and_the_othe
 # --- Restart, change of areas, the thesis's nodes -------------------------------------------------------------------
 
 
-def test_an_aggregator_that_was_held_up_hears_what_has_arrived_before_it_calls_a_node_silent():
+def test_stalled_aggregator_handles_waiting_readings_before_it_declares_a_node_silent():
     rig = Rig(site("n1"))
     rig.read(3.0, 3.0, times=5)
     rig.now += 5.0
@@ -356,7 +356,7 @@ def test_an_aggregator_that_was_held_up_hears_what_has_arrived_before_it_calls_a
     assert rig.hazard.state == "clear"
 
 
-def test_an_aggregator_that_is_always_held_up_still_calls_a_silent_node_silent():
+def test_aggregator_that_stalls_at_every_tick_still_detects_a_silent_node():
     rig = Rig(site("n1"))
     rig.read(3.0, 3.0, times=5)
     for _ in range(2):
@@ -369,21 +369,21 @@ def stored(state: str, penalty: int) -> AreaHazard:
     return AreaHazard(area="hall", state=state, severity=3, penalty=penalty, since=1.0, seq=9, epoch=0, cause="")
 
 
-def test_a_restart_keeps_a_blocked_area_blocked_until_silence_makes_it_unknown_and_impassable():
+def test_blocked_area_stays_blocked_after_a_restart_until_silence_makes_it_unknown_and_impassable():
     rig = Rig(site("n1"), restored=[stored("blocked", 254)])
     assert (rig.hazard.state, rig.hazard.penalty, rig.hazard.epoch) == ("blocked", 254, 1)
     rig.wait(3.2)
     assert (rig.hazard.state, rig.hazard.penalty) == ("unknown", 254)
 
 
-def test_no_area_is_clear_after_a_restart_before_readings_say_so():
+def test_clear_area_is_unknown_after_a_restart_until_readings_confirm_clear():
     rig = Rig(site("n1"), restored=[stored("clear", 0)])
     assert (rig.hazard.state, rig.hazard.penalty) == ("unknown", 200)
     rig.read(3.0, 3.0, times=5)
     assert rig.hazard.state == "clear"
 
 
-def test_a_reading_before_the_first_tick_does_not_break_a_restored_state():
+def test_reading_before_the_first_tick_leaves_the_restored_state():
     core = AreaFusion([area("n1")], [site("n1")], 2, [stored("blocked", 254)], registry=find_rule)
     reading = NodeReading(seq=1, boot=1, uptime_ms=0, range_m=[3.0, 3.0], status=["ok", "ok"], state="clear")
     core.on_reading("n1", reading, 1000.0, 0.0)
@@ -391,17 +391,17 @@ def test_a_reading_before_the_first_tick_does_not_break_a_restored_state():
     assert core.hazards()[0].state == "blocked"
 
 
-def test_a_late_memory_makes_an_unjudged_area_impassable_and_leaves_a_judged_one_alone():
+def test_late_restore_makes_an_unconfirmed_area_impassable_and_leaves_a_confirmed_one():
     rig = Rig(site("n1"))
-    rig.seen += rig.core.recall([stored("blocked", 254)], rig.now)
+    rig.changes += rig.core.restore([stored("blocked", 254)], rig.now)
     assert (rig.hazard.state, rig.hazard.penalty) == ("unknown", 254)
-    judged = Rig(site("n1"))
-    judged.read(3.0, 3.0, times=5)
-    assert judged.core.recall([stored("blocked", 254)], judged.now) == []
-    assert judged.hazard.state == "clear"
+    confirmed = Rig(site("n1"))
+    confirmed.read(3.0, 3.0, times=5)
+    assert confirmed.core.restore([stored("blocked", 254)], confirmed.now) == []
+    assert confirmed.hazard.state == "clear"
 
 
-def test_a_changed_policy_changes_the_hazard_at_once_and_removal_leaves_a_tombstone():
+def test_changed_policy_changes_the_hazard_at_once_and_a_removed_area_stays_listed_as_removed():
     rig = Rig(site("n1"))
     definition = rig.core.definitions()[0]
     changed = rig.core.put_area(_with_penalty(definition, 50), rig.now)
@@ -423,7 +423,7 @@ def _with_penalty(definition: AreaDefinition, penalty: int) -> AreaDefinition:
     )
 
 
-def test_the_thesiss_nodes_still_count():
+def test_thesis_nodes_block_their_area():
     core = AreaFusion([area()], [], 1, registry=find_rule)
     core.tick(0.0, 0.0)
     for i in range(5):
@@ -435,7 +435,7 @@ def test_the_thesiss_nodes_still_count():
 
 
 @pytest.mark.parametrize(
-    ("choice", "words"),
+    ("choice", "message"),
     [
         ({"rule": "majority"}, r"area hall: debounce\.rule: .*'majority' \(known: .*consecutive"),
         ({"rule": "consecutive", "to_blocke": 3}, r"area hall: debounce\.to_blocke: .*known: to_blocked, to_clear"),
@@ -444,15 +444,15 @@ def test_the_thesiss_nodes_still_count():
         ({"rule": 7}, r"area hall: debounce\.rule"),
     ],
 )
-def test_a_debounce_rule_that_cannot_be_used_is_refused_by_area_field_and_what_there_is(choice, words):
-    with pytest.raises(DebounceError, match=words):
+def test_invalid_debounce_settings_are_refused_naming_area_field_and_known_values(choice, message):
+    with pytest.raises(DebounceError, match=message):
         Rig(site("n1"), debounce=choice)
-    with pytest.raises(DebounceError, match=words):
+    with pytest.raises(DebounceError, match=message):
         AreaFusion([area(debounce=choice)], [], 1, registry=find_rule)
 
 
-class Patient:
-    """Settles what readings have said for `seconds` on end."""
+class Sustained:
+    """Confirms a state that readings have shown for `seconds` without a break."""
 
     class Options(msgspec.Struct):
         seconds: float
@@ -460,20 +460,20 @@ class Patient:
     def __init__(self, options: Options) -> None:
         self.seconds, self.state, self.since = options.seconds, None, 0.0
 
-    def feed(self, state: str, at: float) -> str | None:
+    def update(self, state: str, now: float) -> str | None:
         if state != self.state:
-            self.state, self.since = state, at
-        return state if at - self.since >= self.seconds else None
+            self.state, self.since = state, now
+        return state if now - self.since >= self.seconds else None
 
     def reset(self) -> None:
         self.state = None
 
 
-def test_a_rule_may_judge_by_time():
+def test_debounce_rule_can_use_the_time_of_readings():
     definition = area("n1", debounce={"seconds": 1.0})
-    factory = RuleFactory(options=Patient.Options, make=Patient)
+    factory = RuleFactory(options=Sustained.Options, make=Sustained)
     fusion = AreaFusion(
-        [definition], [site("n1")], 1, registry={"patient": factory}.__getitem__, default_rule="patient"
+        [definition], [site("n1")], 1, registry={"sustained": factory}.__getitem__, default_rule="sustained"
     )
     for seq, now in enumerate((100.0, 100.5, 100.99, 101.0)):
         assert fusion.hazards() == [] or fusion.hazards()[0].state == "unknown"
@@ -484,39 +484,41 @@ def test_a_rule_may_judge_by_time():
 
 # --- Invariants -----------------------------------------------------------------------------------------------------
 
-EVENT = st.sampled_from(["clear", "blocked", "no_echo", "lie", "wait", "offline", "duplicate"])
+EVENT = st.sampled_from(["clear", "blocked", "no_echo", "contradiction", "wait", "offline", "duplicate"])
 
 
 @given(st.lists(EVENT, max_size=120))
 @settings(max_examples=150, deadline=None)
-def test_nothing_but_a_row_of_clear_readings_ever_clears_a_blocked_area(events):
+def test_only_consecutive_clear_readings_clear_a_blocked_area(events):
     rig = Rig(site("n1", no_echo_is_clear=False))
     rig.read(0.8, 3.0, times=5)
-    row = 0
+    clear_in_a_row = 0
     for event in events:
         if event == "clear":
             rig.read(3.0, 3.0)
-            row += 1
+            clear_in_a_row += 1
         elif event == "blocked":
             rig.read(0.8, 3.0)
-            row = 0
+            clear_in_a_row = 0
         elif event == "no_echo":
             rig.read(None, 3.0, state="unknown")
-            row = 0
-        elif event == "lie":
+            clear_in_a_row = 0
+        elif event == "contradiction":
             rig.read(0.8, 3.0, state="clear")
-            row = 0
+            clear_in_a_row = 0
         elif event == "wait":
             rig.wait(3.5)
-            row = 0
+            clear_in_a_row = 0
         elif event == "offline":
-            rig.seen += rig.core.on_availability("n1", online=False, now=rig.now, stamp=rig.now)
+            rig.changes += rig.core.on_availability("n1", online=False, now=rig.now, stamp=rig.now)
         else:
             rig.seq -= 1
             rig.read(3.0, 3.0)
-        if row >= 5:
+        if clear_in_a_row >= 5:
             break
         assert rig.hazard.penalty == 254
-    seqs = [h.seq for h in rig.seen]
+    seqs = [h.seq for h in rig.changes]
     assert seqs == sorted(set(seqs))
-    assert all((a.state, a.penalty, a.cause) != (b.state, b.penalty, b.cause) for a, b in itertools.pairwise(rig.seen))
+    assert all(
+        (a.state, a.penalty, a.cause) != (b.state, b.penalty, b.cause) for a, b in itertools.pairwise(rig.changes)
+    )

@@ -1,4 +1,4 @@
-"""What may be announced before it is stored, and in what order."""
+"""Which hazards are announced before they are stored, and in what order."""
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -12,35 +12,35 @@ def hazard(state: str, seq: int, penalty: int | None = None, area: str = "hall")
     return AreaHazard(area=area, state=state, severity=0, penalty=cost, since=0.0, seq=seq, epoch=1, cause="")
 
 
-def test_danger_goes_out_at_once_and_relief_once_it_is_stored():
+def test_danger_is_announced_at_once_and_relief_once_it_is_stored():
     outbox = Outbox()
     blocked, clear = hazard("blocked", 1), hazard("clear", 2)
     assert outbox.offer([blocked]) == [blocked]
     assert outbox.offer([clear]) == []
     assert outbox.announced() == [blocked]
     assert outbox.withheld() == ["hall"]
-    assert outbox.stored([clear]) == [clear]
+    assert outbox.mark_stored([clear]) == [clear]
     assert outbox.announced() == [clear]
     assert outbox.unstored() == []
 
 
-def test_a_stored_clear_is_not_announced_after_a_newer_danger():
+def test_stored_clear_is_not_announced_after_a_newer_danger():
     outbox = Outbox()
     outbox.offer([hazard("blocked", 1)])
     clear = hazard("clear", 2)
     outbox.offer([clear])
-    again = hazard("blocked", 3)
-    assert outbox.offer([again]) == [again]
-    assert outbox.stored([clear]) == []
-    assert outbox.announced() == [again]
-    assert outbox.unstored() == [again]
+    newer = hazard("blocked", 3)
+    assert outbox.offer([newer]) == [newer]
+    assert outbox.mark_stored([clear]) == []
+    assert outbox.announced() == [newer]
+    assert outbox.unstored() == [newer]
 
 
 states = st.sampled_from([("blocked", 254), ("unknown", 254), ("unknown", 200), ("clear", 0)])
 
 
 @given(st.lists(st.one_of(states, st.just("store"), st.just("begin")), max_size=60))
-def test_no_relief_is_ever_announced_that_is_not_stored(steps):
+def test_no_relief_is_announced_before_it_is_stored(steps):
     outbox = Outbox()
     on_disk: AreaHazard | None = None
     announced: AreaHazard | None = None
@@ -51,13 +51,13 @@ def test_no_relief_is_ever_announced_that_is_not_stored(steps):
             continue
         if step == "store":
             on_disk = in_flight[0] if in_flight else on_disk
-            said = outbox.stored(in_flight)
+            released = outbox.mark_stored(in_flight)
             in_flight = []
         else:
-            said = outbox.offer([hazard(step[0], seq, step[1])])
-        for word in said:
-            if relieves(word, announced):
-                assert on_disk is word
-            assert announced is None or word.seq > announced.seq
-            announced = word
+            released = outbox.offer([hazard(step[0], seq, step[1])])
+        for newest in released:
+            if relieves(newest, announced):
+                assert on_disk is newest
+            assert announced is None or newest.seq > announced.seq
+            announced = newest
     assert outbox.announced() == ([announced] if announced else [])

@@ -1,4 +1,4 @@
-"""The running aggregator with a real broker, Redis and router: what survives which death."""
+"""The running aggregator with a real broker, Redis and router, each of them killed and restarted."""
 
 import asyncio
 from contextlib import asynccontextmanager
@@ -12,8 +12,8 @@ from fog_contracts.messages import AreaDefinition, AreaHazard, NodeConfig, NodeR
 pytestmark = pytest.mark.live
 
 
-class Watch:
-    """Plays a node, and notes what the aggregator says."""
+class NodeClient:
+    """Publishes the readings of a node, and records what the aggregator publishes."""
 
     def __init__(self, mqtt) -> None:
         self.mqtt = mqtt
@@ -47,149 +47,149 @@ class Watch:
 
 
 @asynccontextmanager
-async def watching(fog):
+async def connected_node(fog):
     async with fog.edges() as (mqtt, zenoh, connect):
-        watch = Watch(mqtt)
+        node = NodeClient(mqtt)
         connect()
         await mqtt.wait_connected()
-        yield watch, zenoh
+        yield node, zenoh
 
 
 async def test_five_readings_block_an_area_and_five_clear_it(fog, until):
     fog.start("hazard_aggregator")
     await fog.ready("hazard_aggregator")
-    async with watching(fog) as (watch, _):
-        await until(lambda: watch.definitions and watch.hazards and watch.configs, "everything is retained")
-        assert watch.hazards[0].state == "unknown"
-        assert watch.configs[0].range_limit_m == [1.5, 1.5]
-        await watch.read(0.8, 5)
-        await until(lambda: watch.state == "blocked", "blocked", lambda: fog.log("hazard_aggregator"))
-        trace = watch.hazards[-1].trace
+    async with connected_node(fog) as (node, _):
+        await until(lambda: node.definitions and node.hazards and node.configs, "retained messages")
+        assert node.hazards[0].state == "unknown"
+        assert node.configs[0].range_limit_m == [1.5, 1.5]
+        await node.read(0.8, 5)
+        await until(lambda: node.state == "blocked", "blocked", lambda: fog.log("hazard_aggregator"))
+        trace = node.hazards[-1].trace
         assert 0 < trace.first_reading <= trace.confirmed
-        await watch.read(3.0, 5)
-        await until(lambda: watch.state == "clear", "clear", lambda: fog.log("hazard_aggregator"))
-        await until(lambda: watch.lines[-2:] == ["7,3.500,4.500", "7,-999,-999"], "the thesis's lines")
+        await node.read(3.0, 5)
+        await until(lambda: node.state == "clear", "clear", lambda: fog.log("hazard_aggregator"))
+        await until(lambda: node.lines[-2:] == ["7,3.500,4.500", "7,-999,-999"], "thesis lines")
 
 
-async def test_a_killed_aggregator_comes_back_with_the_block(fog, until):
+async def test_restarted_aggregator_restores_the_blocked_area(fog, until):
     fog.start("hazard_aggregator")
     await fog.ready("hazard_aggregator")
-    async with watching(fog) as (watch, _):
-        await watch.read(0.8, 5)
-        await until(lambda: watch.state == "blocked", "blocked")
-        epoch = watch.hazards[-1].epoch
+    async with connected_node(fog) as (node, _):
+        await node.read(0.8, 5)
+        await until(lambda: node.state == "blocked", "blocked")
+        epoch = node.hazards[-1].epoch
         fog.kill("hazard_aggregator")
         fog.start("hazard_aggregator")
-        await until(lambda: watch.hazards[-1].epoch > epoch, "it is back", lambda: fog.log("hazard_aggregator"))
-        assert watch.state == "blocked"
-        await until(lambda: watch.state == "unknown", "its node is silent")
-        assert watch.hazards[-1].penalty == 254
+        await until(lambda: node.hazards[-1].epoch > epoch, "restarted", lambda: fog.log("hazard_aggregator"))
+        assert node.state == "blocked"
+        await until(lambda: node.state == "unknown", "unknown because its node is silent")
+        assert node.hazards[-1].penalty == 254
 
 
-async def test_a_broker_that_lost_everything_is_told_everything_again(fog, until):
+async def test_broker_that_lost_its_data_gets_everything_again(fog, until):
     fog.start("hazard_aggregator")
     await fog.ready("hazard_aggregator")
-    async with watching(fog) as (watch, _):
-        await watch.read(0.8, 5)
-        await until(lambda: watch.state == "blocked", "blocked")
+    async with connected_node(fog) as (node, _):
+        await node.read(0.8, 5)
+        await until(lambda: node.state == "blocked", "blocked")
         fog.mosquitto.kill()
         (fog.mosquitto.folder / "mosquitto.db").unlink(missing_ok=True)
-        watch.hazards.clear()
-        watch.definitions.clear()
+        node.hazards.clear()
+        node.definitions.clear()
         fog.mosquitto.start()
-        await until(lambda: watch.hazards and watch.definitions, "said again", lambda: fog.log("hazard_aggregator"))
-        assert watch.hazards[-1].penalty == 254
+        await until(lambda: node.hazards and node.definitions, "republished", lambda: fog.log("hazard_aggregator"))
+        assert node.hazards[-1].penalty == 254
 
 
 async def test_without_redis_danger_is_announced_and_relief_waits(fog, until):
     fog.start("hazard_aggregator")
     url = await fog.ready("hazard_aggregator")
-    async with watching(fog) as (watch, _), httpx.AsyncClient() as client:
-        await until(lambda: watch.hazards, "the first word")
+    async with connected_node(fog) as (node, _), httpx.AsyncClient() as client:
+        await until(lambda: node.hazards, "first hazard")
         fog.redis.kill()
-        await watch.read(0.8, 5)
-        await until(lambda: watch.state == "blocked", "danger needs no store")
-        await watch.read(3.0, 5)
+        await node.read(0.8, 5)
+        await until(lambda: node.state == "blocked", "blocked without the store")
+        await node.read(3.0, 5)
         async with asyncio.timeout(15):
             for _ in iter(int, 1):
                 if "fognav_hazards_withheld 1.0" in (await client.get(f"{url}/metrics")).text:
                     break
                 await asyncio.sleep(0.02)
-        assert watch.state == "blocked"
+        assert node.state == "blocked"
         assert (await client.get(f"{url}/readyz")).json()["missing"] == ["store"]
         fog.redis.start()
-        await watch.read(3.0, 5)
-        await until(lambda: watch.state == "clear", "relief once it is stored", lambda: fog.log("hazard_aggregator"))
+        await node.read(3.0, 5)
+        await until(lambda: node.state == "clear", "clear once it is stored", lambda: fog.log("hazard_aggregator"))
 
 
-async def test_a_start_without_redis_and_broker_recalls_the_block_later(fog, until):
+async def test_aggregator_started_without_redis_restores_the_blocked_area_later(fog, until):
     fog.start("hazard_aggregator")
     await fog.ready("hazard_aggregator")
-    async with watching(fog) as (watch, _):
-        await watch.read(0.8, 5)
-        await until(lambda: watch.state == "blocked", "blocked")
-        await until(lambda: fog_stored(fog), "stored")
+    async with connected_node(fog) as (node, _):
+        await node.read(0.8, 5)
+        await until(lambda: node.state == "blocked", "blocked")
+        await until(lambda: is_blocked_stored(fog), "stored")
         fog.kill("hazard_aggregator")
         fog.redis.kill()
         fog.mosquitto.kill()
         (fog.mosquitto.folder / "mosquitto.db").unlink(missing_ok=True)
-        watch.hazards.clear()
+        node.hazards.clear()
         fog.mosquitto.start()
         fog.start("hazard_aggregator")
-        await until(lambda: watch.state == "unknown", "unknown without memory", lambda: fog.log("hazard_aggregator"))
-        assert watch.hazards[-1].penalty == 200
+        await until(lambda: node.state == "unknown", "unknown without the store", lambda: fog.log("hazard_aggregator"))
+        assert node.hazards[-1].penalty == 200
         fog.redis.start()
-        await until(lambda: watch.hazards[-1].penalty == 254, "recalled", lambda: fog.log("hazard_aggregator"))
+        await until(lambda: node.hazards[-1].penalty == 254, "restored", lambda: fog.log("hazard_aggregator"))
 
 
-def fog_stored(fog) -> bool:
+def is_blocked_stored(fog) -> bool:
     return any(b"blocked" in path.read_bytes() for path in fog.redis.folder.glob("appendonlydir/*.aof"))
 
 
-async def test_a_robot_in_the_cone_blocks_nothing(fog, until):
+async def test_robot_in_the_cone_does_not_block_the_area(fog, until):
     fog.start("hazard_aggregator")
     await fog.ready("hazard_aggregator")
-    async with watching(fog) as (watch, zenoh):
-        await watch.read(3.0, 5)
-        await until(lambda: watch.state == "clear", "clear")
+    async with connected_node(fog) as (node, zenoh):
+        await node.read(3.0, 5)
+        await until(lambda: node.state == "clear", "clear")
         robot = RobotPose(
             x=3.5, y=3.5, theta=0.0, covariance=[0.0] * 9, v=0.0, w=0.0, radius=0.17, height=0.35, stamp=1.0
         )
-        while watch.hazards[-1].explained_by is None:
+        while node.hazards[-1].explained_by is None:
             zenoh.publish(ch.ROBOT_POSE, robot, robot="r1")
-            await watch.read(0.83)
+            await node.read(0.83)
             await asyncio.sleep(0.05)
-            assert watch.state == "clear" or watch.seq < 12  # the pose may come after the first readings
-        assert watch.hazards[-1].explained_by == "r1"
+            assert node.state == "clear" or node.seq < 12  # the pose may come after the first readings
+        assert node.hazards[-1].explained_by == "r1"
 
 
-async def test_a_thesiss_node_of_an_area_that_was_drawn_later_counts_without_a_restart(fog, until, tokens):
+async def test_thesis_node_of_an_area_added_at_run_time_is_subscribed_without_a_restart(fog, until, tokens):
     fog.start("hazard_aggregator")
     url = await fog.ready("hazard_aggregator")
-    async with watching(fog) as (watch, _), httpx.AsyncClient() as client:
+    async with connected_node(fog) as (node, _), httpx.AsyncClient() as client:
         body = {"polygon": [[1.0, 1.0], [2.0, 1.0], [2.0, 2.0]], "number": 8}
         put = await client.put(f"{url}/api/v1/areas/gate", json=body, headers=tokens["operator"])
         assert put.status_code == 200, put.text
         for _ in range(5):
-            assert await watch.mqtt.publish(ch.THESIS_AREA, "blocked", wait=True, number="8")
+            assert await node.mqtt.publish(ch.THESIS_AREA, "blocked", wait=True, number="8")
         await until(
-            lambda: any(h.area == "gate" and h.state == "blocked" for h in watch.hazards),
+            lambda: any(h.area == "gate" and h.state == "blocked" for h in node.hazards),
             "the area is blocked",
             lambda: fog.log("hazard_aggregator"),
         )
 
 
-async def test_garbage_is_refused_and_nothing_stops(fog, until):
+async def test_malformed_messages_are_refused_and_the_aggregator_goes_on(fog, until):
     fog.start("hazard_aggregator")
     url = await fog.ready("hazard_aggregator")
-    async with watching(fog) as (watch, _), httpx.AsyncClient() as client:
-        raw = watch.mqtt._client
+    async with connected_node(fog) as (node, _), httpx.AsyncClient() as client:
+        raw = node.mqtt._client
         topic = ch.NODE_READING.key(site="test", node="n1")
         for payload in (b"x" * 200_000, b"{", b'{"seq":-1}', b"\xff\xfe"):
             await raw.publish(topic, payload, qos=0, timeout=30)
         await raw.publish(ch.NODE_AVAILABILITY.key(site="test", node="n1"), b"maybe", qos=1)
-        await watch.read(0.8, 5)
-        await until(lambda: watch.state == "blocked", "still works", lambda: fog.log("hazard_aggregator"))
+        await node.read(0.8, 5)
+        await until(lambda: node.state == "blocked", "blocked", lambda: fog.log("hazard_aggregator"))
         metrics = (await client.get(f"{url}/metrics")).text
         assert 'fognav_refused_messages_total{channel="node_reading"} 4.0' in metrics
         assert 'fognav_refused_messages_total{channel="node_availability"} 1.0' in metrics

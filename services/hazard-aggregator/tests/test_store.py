@@ -1,4 +1,4 @@
-"""The aggregator's record in a real Redis."""
+"""The aggregator's records in a real Redis."""
 
 import asyncio
 from pathlib import Path
@@ -24,7 +24,7 @@ def hazard(seq: int) -> AreaHazard:
     return AreaHazard(area="hall", state="blocked", severity=3, penalty=254, since=0, seq=seq, epoch=1, cause="")
 
 
-async def test_stored_hazards_and_areas_survive_kills(redis: Server):
+async def test_stored_hazards_and_areas_survive_kills_of_redis(redis: Server):
     area = AreaDefinition(id="hall", polygon=[(0, 0), (1, 0), (1, 1)], version=4)
     async with Store(redis.url, "test", timeout_s=5.0) as store:
         first = await store.load()
@@ -44,7 +44,7 @@ async def test_stored_hazards_and_areas_survive_kills(redis: Server):
             await store.save_hazards([hazard(9)])
 
 
-async def test_a_record_that_cannot_be_read_does_not_hide_the_others(redis: Server):
+async def test_unreadable_record_is_left_out_and_the_others_are_loaded(redis: Server):
     async with Store(redis.url, "test") as store, Redis.from_url(redis.url) as raw:
         await store.save_hazards([hazard(1)])
         await raw.hset("fog:test:hazards", "gate", b"nonsense")

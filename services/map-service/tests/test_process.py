@@ -138,8 +138,8 @@ async def test_a_drawn_zone_reaches_the_robot_and_survives_a_kill(fog, until, to
         assert robot.cost(6.0, 3.0) == LETHAL
 
 
-async def test_zones_are_changed_by_version_and_audited(calm, tokens):
-    async with running(calm) as (client, _, _):
+async def test_zones_are_changed_by_version_and_audited(shared_fog, tokens):
+    async with running(shared_fog) as (client, _, _):
         operator = tokens["operator"]
         body = {**CIRCLE, "id": "wet"}
         assert (await client.post("/api/v1/zones", json=body, headers=operator)).status_code == 201
@@ -193,8 +193,8 @@ async def test_a_zone_that_cannot_be_is_refused_by_field(shared, tokens):
 
 
 @pytest.fixture
-async def shared(calm):
-    url = await calm.ready("map_service")
+async def shared(shared_fog):
+    url = await shared_fog.ready("map_service")
     async with httpx.AsyncClient(base_url=url, timeout=15) as client:
         yield client
 
@@ -268,11 +268,11 @@ async def test_hazards_are_back_after_the_broker_was_killed_and_garbage_stops_no
         assert robot.cost(3.5, 3.0) == LETHAL, fog.log("map_service")
 
 
-async def test_a_robots_obstacles_are_shared_and_vanish(calm, until):
-    async with running(calm) as (_, robot, _):
+async def test_a_robots_obstacles_are_shared_and_vanish(shared_fog, until):
+    async with running(shared_fog) as (_, robot, _):
         seen = RobotObstacles(points=[(1.0, 1.0)], stamp=1.0, ttl=0.5)
         robot.zenoh.publish(ch.ROBOT_OBSTACLES, seen, robot="r1")
-        await until(lambda: robot.cost(1.0, 1.0) == LETHAL, "seen", lambda: calm.log("map_service"))
+        await until(lambda: robot.cost(1.0, 1.0) == LETHAL, "seen", lambda: shared_fog.log("map_service"))
         await until(lambda: robot.cost(1.0, 1.0) == 0, "gone")
 
 

@@ -1,4 +1,4 @@
-"""The hazard aggregator: `python -m hazard_aggregator`, told by FOGNAV_* in the environment. Safe to kill any time."""
+"""The hazard aggregator: `python -m hazard_aggregator`, configured by FOGNAV_* variables. Safe to kill at any time."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from hazard_aggregator.core import Aggregator
 from hazard_aggregator.registry import find_rule
 from hazard_aggregator.service import Service
 from hazard_aggregator.settings import Settings
-from hazard_aggregator.store import Store, load_or_begin
+from hazard_aggregator.store import Store, load_at_start
 
 _log = logs.get("aggregator")
 
 
 async def main() -> None:
-    """Connect, recall what was stored, then turn readings into hazards until cancelled."""
+    """Connect, load the stored areas and hazards, then turn readings into hazards until cancelled."""
     settings = load(Settings, environ=os.environ)
     logs.configure("hazard-aggregator", settings.log_level, settings.log_format)
     _log.info("settings", **describe(settings))
@@ -33,7 +33,7 @@ async def main() -> None:
     clock = SystemClock(settings.speed)
     health = Health("store", "mqtt")
     async with Store(settings.redis_url, site) as store:
-        stored, was_read = await load_or_begin(store)
+        stored, loaded_from_store = await load_at_start(store)
         definitions = {d.id: d for d in [*loaded.site.definitions(), *stored.definitions]}
         core = Aggregator(
             definitions.values(), loaded.site.nodes, stored.epoch, stored.hazards,
@@ -44,8 +44,8 @@ async def main() -> None:
             connect=settings.zenoh_endpoints, clock=clock, role="hazard-aggregator", id=site, site=site
         ) as zenoh:
             service = Service(core, store, mqtt, zenoh, clock, health)
-            if was_read:
-                service.store_was_read()
+            if loaded_from_store:
+                service.mark_store_loaded()
             service.subscribe()
             zenoh.declare_liveliness("hazard-aggregator", site)
             app = make_api(service, loaded.map.geometry, clock, health, load_tokens(settings.tokens_file))

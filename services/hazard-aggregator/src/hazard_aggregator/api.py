@@ -1,4 +1,4 @@
-"""REST under /api/v1: areas with their state, and the health of nodes. Reading needs no token, PUT the operator's."""
+"""REST under /api/v1: areas with their state, and the health of nodes. Reading needs no token, PUT an operator's."""
 
 from typing import Annotated, Any
 
@@ -36,7 +36,7 @@ from hazard_aggregator.store import StoreError
 
 
 class AreaBody(Message, frozen=True, kw_only=True):
-    """What an operator decides about an area; polygon in m, frame `map`."""
+    """The part of an area that an operator sets; polygon in m, frame `map`."""
 
     label: Annotated[str, msgspec.Meta(max_length=100)] = ""
     polygon: Ring
@@ -48,7 +48,7 @@ class AreaBody(Message, frozen=True, kw_only=True):
 
 
 class AreaView(Message, frozen=True, kw_only=True):
-    """An area with the hazard that was announced; `withheld`: a relief is decided but not stored yet."""
+    """An area with its announced hazard; `withheld`: a newer hazard, a relief, is not announced until it is stored."""
 
     definition: AreaDefinition
     hazard: AreaHazard | None
@@ -56,7 +56,7 @@ class AreaView(Message, frozen=True, kw_only=True):
 
 
 class NodeView(Message, frozen=True, kw_only=True):
-    """Health of a node; `age_s` is since its last reading, null when it was never heard."""
+    """Health of a node; `age_s` is the time since its last reading, null before the first one."""
 
     id: str
     area: str
@@ -79,20 +79,20 @@ def make_api(service: Service, geometry: GridGeometry, clock: Clock, health: Hea
 def _add_areas(routes: Routes, service: Service, geometry: GridGeometry) -> None:
     routes.raises(
         StoreError,
-        {503: "The store does not answer, so nothing was changed for certain"},
+        {503: "The store does not answer; the change may not be stored"},
         lambda error: ProblemError(
             503,
-            f"the store does not answer, so nothing was changed for certain: try again ({error})",
+            f"the store does not answer, so the change may not be stored: try again ({error})",
             headers={"Retry-After": "1"},
         ),
     )
     routes.raises(
         ConflictError,
-        {412: "Somebody else changed it"},
-        lambda error: ProblemError(412, f"{error}: read it again and decide"),
+        {412: "Somebody else changed the area"},
+        lambda error: ProblemError(412, f"{error}: read it again, then repeat your change"),
     )
 
-    def views() -> dict[str, AreaView]:
+    def area_views() -> dict[str, AreaView]:
         announced, withheld = service.core.announced(), service.core.withheld()
         return {
             d.id: AreaView(definition=d, hazard=announced.get(d.id), withheld=d.id in withheld)
@@ -103,12 +103,12 @@ def _add_areas(routes: Routes, service: Service, geometry: GridGeometry) -> None
     @routes.get("/api/v1/areas")
     async def list_areas() -> list[AreaView]:
         """List all areas with their state."""
-        return list(views().values())
+        return list(area_views().values())
 
-    @routes.get("/api/v1/areas/{area_id}", problems={404: "There is no such area"})
+    @routes.get("/api/v1/areas/{area_id}", problems={404: "No area has this id"})
     async def get_area(area_id: str) -> Answer[AreaView]:
         """Return one area with its ETag."""
-        view = views().get(area_id)
+        view = area_views().get(area_id)
         if view is None:
             raise ProblemError(404, f"there is no area {area_id}")
         return Answer(view, etag(view.definition.version))
@@ -117,8 +117,8 @@ def _add_areas(routes: Routes, service: Service, geometry: GridGeometry) -> None
     async def put_area(
         area_id: str, body: Body[AreaBody], caller: Operator, if_match: IfMatch = None
     ) -> Answer[AreaDefinition]:
-        """Change or add an area; the answer comes once it is stored for good. With If-Match only if unchanged."""
-        definition = _checked(area_id, body, service, geometry)
+        """Add or replace an area; replies once it is durably stored. With If-Match, only if it is unchanged."""
+        definition = _validated(area_id, body, service, geometry)
         definition = await service.put_area(definition, caller.name, expected=expected_version(if_match))
         return Answer(definition, etag(definition.version))
 
@@ -126,7 +126,7 @@ def _add_areas(routes: Routes, service: Service, geometry: GridGeometry) -> None
 def _add_nodes(routes: Routes, service: Service, clock: Clock) -> None:
     @routes.get("/api/v1/nodes")
     async def nodes() -> list[NodeView]:
-        """Return the health of every node in every area that it watches."""
+        """Return the health of every node in each area that it watches."""
         return [
             NodeView(
                 id=node.id,
@@ -142,24 +142,26 @@ def _add_nodes(routes: Routes, service: Service, clock: Clock) -> None:
         ]
 
 
-def _checked(area_id: str, body: AreaBody, service: Service, geometry: GridGeometry) -> AreaDefinition:
+def _validated(area_id: str, body: AreaBody, service: Service, geometry: GridGeometry) -> AreaDefinition:
     try:
         polygon = normalized_polygon(body.polygon)
     except GeometryError as error:
-        raise ProblemError(422, f"{error}; draw one simple outline", field="body.polygon") from error
+        raise ProblemError(422, f"{error}; draw a simple polygon", field="body.polygon") from error
     for index, (x, y) in enumerate(polygon):
         if not geometry.contains(x, y):
             left, bottom, right, top = geometry.bounds
             reach = f"the map reaches from ({left:.2f}, {bottom:.2f}) to ({right:.2f}, {top:.2f}) m"
-            raise ProblemError(422, f"({x:.2f}, {y:.2f}) is off the map: {reach}", field=f"body.polygon.{index}")
+            raise ProblemError(422, f"({x:.2f}, {y:.2f}) lies off the map: {reach}", field=f"body.polygon.{index}")
     for index, node in enumerate(body.nodes):
         if node not in service.core.nodes:
-            detail = f"the site has no node {node}: add it to site.toml first, with its place and its limits"
+            detail = f"the site has no node {node}: add it to site.toml first, with its position and range limits"
             raise ProblemError(422, detail, field=f"body.nodes.{index}")
     try:
         definition = msgspec.convert({**msgspec.to_builtins(body), "id": area_id, "polygon": polygon}, AreaDefinition)
     except msgspec.ValidationError as error:  # the id comes from the path
-        raise ProblemError(422, f"{area_id!r} is no id: use a to z, 0 to 9 and -, at most 32", field="path") from error
+        raise ProblemError(
+            422, f"{area_id!r} is no valid id: use a to z, 0 to 9 and -, at most 32", field="path"
+        ) from error
     try:
         service.core.check(definition)
     except DebounceError as error:

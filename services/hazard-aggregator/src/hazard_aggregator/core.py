@@ -1,7 +1,7 @@
-"""What the aggregator decides: area states from readings, what may be announced when, and what is published again.
+"""The aggregator's decisions: area states from readings, when a hazard may be announced, and what is republished.
 
-Pure: every input comes with its `Moment`, and everything that is to be published is returned. Readings become states
-in `fusion`; a relief is withheld until it is stored (`outbox`): the process writes `to_store()` and reports `stored`.
+Pure: every input comes with its `Moment`, and everything to be published is returned. `fusion` turns readings into
+states. `outbox` withholds a relief until it is stored: the process writes `to_store()` and then calls `mark_stored`.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 class Aggregator:
-    """The aggregator's core; arguments as `AreaFusion` takes them."""
+    """The aggregator's core; it takes the same arguments as `AreaFusion`."""
 
     def __init__(
         self,
@@ -49,26 +49,26 @@ class Aggregator:
         )
         self._outbox = Outbox()
 
-    # --- What it holds ----------------------------------------------------------------------------------------------
+    # --- State ------------------------------------------------------------------------------------------------------
 
     def definitions(self) -> list[AreaDefinition]:
         """Return all areas, removed ones (`removed`) too, so that they can be taken off the map."""
         return self._fusion.definitions()
 
     def announced(self) -> dict[str, AreaHazard]:
-        """Return the hazard of every area that was announced last."""
+        """Return the last announced hazard of every area."""
         return {hazard.area: hazard for hazard in self._outbox.announced()}
 
     def withheld(self) -> list[str]:
-        """Return the areas whose relief waits for the store."""
+        """Return the areas whose newest hazard is a relief that is not stored yet."""
         return self._outbox.withheld()
 
     def to_store(self) -> list[AreaHazard]:
-        """Return the hazards that have to be stored, the newest of each area."""
+        """Return the hazards that must be stored, the newest of each area."""
         return self._outbox.unstored()
 
     def thesis_numbers(self) -> list[int]:
-        """Return the numbers under which nodes of the thesis may report."""
+        """Return the area numbers under which the thesis's nodes may report."""
         return sorted({d.number for d in self.definitions() if d.number is not None and not d.removed})
 
     def node_reports(self, now: float) -> list[NodeReport]:
@@ -76,13 +76,13 @@ class Aggregator:
         return self._fusion.node_reports(now)
 
     def check(self, definition: AreaDefinition) -> None:
-        """Raise `DebounceError` when an area's debounce rule or its options can't be used."""
+        """Raise `DebounceError` when an area's debounce rule or its options are invalid."""
         self._fusion.new_rule(definition)
 
     # --- Inputs -----------------------------------------------------------------------------------------------------
 
     def handlers(self) -> Mapping[Channel, Handler]:
-        """Return the handler of every channel that the aggregator listens to."""
+        """Return the handler of every channel that the aggregator subscribes to."""
         return {
             ch.NODE_READING: self._on_reading,
             ch.NODE_AVAILABILITY: self._on_availability,
@@ -92,34 +92,34 @@ class Aggregator:
         }
 
     def tick(self, at: Moment) -> list[Publication]:
-        """Notice silence and flapping; call ten times a second."""
+        """Detect silent and flapping nodes; call ten times a second."""
         return self._announce(self._fusion.tick(at.now, at.stamp))
 
-    def stored(self, hazards: Iterable[AreaHazard]) -> list[Publication]:
-        """Take that these of `to_store` are stored: reliefs among them may be announced now."""
-        return self._hazards(self._outbox.stored(hazards))
+    def mark_stored(self, hazards: Iterable[AreaHazard]) -> list[Publication]:
+        """Record that these hazards of `to_store` are stored; return the reliefs among them, announced now."""
+        return self._hazard_publications(self._outbox.mark_stored(hazards))
 
     def put_area(self, definition: AreaDefinition, at: Moment) -> list[Publication]:
-        """Add, change or (with `removed`) drop an area that is stored; its nodes keep what they have settled."""
+        """Add, change or (with `removed`) remove an area that is stored; its nodes keep their confirmed states."""
         changed = self._fusion.put_area(definition, at.stamp)
         if definition.removed:
             self._outbox.forget(definition.id)
-        return [_published_definition(definition), *self._announce(changed)]
+        return [_definition_publication(definition), *self._announce(changed)]
 
     def restore(
         self, definitions: Iterable[AreaDefinition], hazards: Iterable[AreaHazard], at: Moment
     ) -> list[Publication]:
-        """Take what was stored before this run and could not be read at its start; publish everything again."""
+        """Restore areas and hazards that were unreadable at the start of this run; republish everything."""
         for definition in definitions:
             self._outbox.offer(self._fusion.put_area(definition, at.stamp))
-        self._outbox.offer(self._fusion.recall(hazards, at.stamp))
+        self._outbox.offer(self._fusion.restore(hazards, at.stamp))
         return self.republish_all()
 
     def republish_all(self) -> list[Publication]:
-        """Return what a broker that was (re)connected must hear: retained messages are a convenience, no record."""
+        """Return all retained messages, for a broker that has (re)connected and may have lost its own copies."""
         configs = [Publication(ch.NODE_CONFIG, node_config(node), {"node": node.id}) for node in self.nodes.values()]
-        definitions = [_published_definition(definition) for definition in self.definitions()]
-        return [*definitions, *self._hazards(self._outbox.announced()), *configs]
+        definitions = [_definition_publication(definition) for definition in self.definitions()]
+        return [*definitions, *self._hazard_publications(self._outbox.announced()), *configs]
 
     # --- Inside -----------------------------------------------------------------------------------------------------
 
@@ -135,19 +135,19 @@ class Aggregator:
         return self._announce(self._fusion.on_thesis_state(int(ids["number"]), text.strip(), at.now, at.stamp))
 
     def _on_own_hazard(self, _ids: Ids, hazard: AreaHazard, at: Moment) -> list[Publication]:
-        """Take what an earlier run of the aggregator left with the broker: it outlives a restart without Redis."""
+        """Restore a hazard that an earlier run left retained on the broker: it survives a restart without Redis."""
         if hazard.epoch >= self.epoch:
             return []
-        return self._announce(self._fusion.recall([hazard], at.stamp))
+        return self._announce(self._fusion.restore([hazard], at.stamp))
 
     def _on_pose(self, ids: Ids, pose: RobotPose, at: Moment) -> Sequence[Publication]:
         return self._announce(self._fusion.on_pose(ids["robot"], pose, at.now))
 
     def _announce(self, changed: Iterable[AreaHazard]) -> list[Publication]:
-        return self._hazards(self._outbox.offer(changed))
+        return self._hazard_publications(self._outbox.offer(changed))
 
-    def _hazards(self, hazards: Iterable[AreaHazard]) -> list[Publication]:
-        """Return hazards as they are published, each with its line for the thesis's robots."""
+    def _hazard_publications(self, hazards: Iterable[AreaHazard]) -> list[Publication]:
+        """Return the publications of hazards, each with its line for the thesis's robots."""
         publications: list[Publication] = []
         for hazard in hazards:
             publications.append(Publication(ch.AREA_HAZARD, hazard, {"area": hazard.area}))
@@ -158,12 +158,12 @@ class Aggregator:
         return publications
 
 
-def _published_definition(definition: AreaDefinition) -> Publication:
+def _definition_publication(definition: AreaDefinition) -> Publication:
     return Publication(ch.AREA_DEFINITION, definition, {"area": definition.id})
 
 
 def node_config(node: NodeSite) -> NodeConfig:
-    """Return what a node is told about its place; the version tells one content from another."""
+    """Return the configuration of a node; its version is a checksum of its content."""
     config = NodeConfig(
         version=0,
         range_limit_m=[sonar.range_limit for sonar in node.sonars],
@@ -175,8 +175,8 @@ def node_config(node: NodeSite) -> NodeConfig:
 def wsn_line(definition: AreaDefinition, hazard: AreaHazard, node: NodeSite | None = None) -> str | None:
     """Return the line for the thesis's robots: `n,x,y`, or `n,-999,-999` when clear; None for an area without number.
 
-    (x, y) is the node's place (m, frame `map`), or the middle of the area's corners without one. Those robots know no
-    third state: an unknown area is served as blocked (Mendes 2022, section 3.4).
+    (x, y) is the node's position (m, frame `map`), or the mean of the area's corners when it has no node. Those robots
+    have no third state: an unknown area is sent as blocked (Mendes 2022, section 3.4).
     """
     if definition.number is None:
         return None

@@ -1,7 +1,8 @@
-"""What may be said when: dangers at once, relief only once it is stored. Pure; nothing here sends or stores.
+"""Which hazards may be announced: dangers at once, reliefs only once they are stored. Pure; no I/O here.
 
-A slow or dead store must not withhold a danger, and a crash must not bring back a danger's opposite: a `clear` that was
-announced and then forgotten would leave robots in an area that the restarted aggregator calls blocked.
+A relief is a change that allows robots more than before. A slow or dead store must not delay a danger, and a crash must
+not undo an announced relief: a `clear` that was announced but not stored would leave robots in an area that the
+restarted aggregator announces as blocked.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def relieves(hazard: AreaHazard, announced: AreaHazard | None) -> bool:
-    """Whether a hazard allows robots more than what was announced before (nothing announced allows nothing)."""
+    """Whether a hazard allows robots more than the one announced before (an area without one counts as forbidden)."""
     if announced is None:
         return hazard.state == "clear"
     if hazard.penalty < announced.penalty:
@@ -24,47 +25,47 @@ def relieves(hazard: AreaHazard, announced: AreaHazard | None) -> bool:
 
 
 class Outbox:
-    """Per area the newest hazard, whether it is stored, and what was announced last."""
+    """Per area the newest hazard, whether it is stored, and the last announced one."""
 
     def __init__(self) -> None:
         self._announced: dict[str, AreaHazard] = {}
         self._unstored: dict[str, AreaHazard] = {}
 
     def offer(self, hazards: Iterable[AreaHazard]) -> list[AreaHazard]:
-        """Take changed hazards; return those to announce at once. All of them wait to be stored."""
-        now: list[AreaHazard] = []
+        """Add changed hazards, all of which must be stored; return those to announce at once."""
+        to_announce: list[AreaHazard] = []
         for hazard in hazards:
             self._unstored[hazard.area] = hazard
             if not relieves(hazard, self._announced.get(hazard.area)):
                 self._announced[hazard.area] = hazard
-                now.append(hazard)
-        return now
+                to_announce.append(hazard)
+        return to_announce
 
     def unstored(self) -> list[AreaHazard]:
-        """Return what has to be stored, the newest of each area."""
+        """Return the hazards that must be stored, the newest of each area."""
         return list(self._unstored.values())
 
-    def stored(self, hazards: Iterable[AreaHazard]) -> list[AreaHazard]:
-        """Take that these are stored now; return those that may be announced for it, unless a newer one came."""
-        now: list[AreaHazard] = []
+    def mark_stored(self, hazards: Iterable[AreaHazard]) -> list[AreaHazard]:
+        """Record that these hazards are stored; return those to announce now, unless a newer one replaced them."""
+        to_announce: list[AreaHazard] = []
         for hazard in hazards:
             if self._unstored.get(hazard.area) is not hazard:
                 continue
             del self._unstored[hazard.area]
             if self._announced.get(hazard.area) is not hazard:
                 self._announced[hazard.area] = hazard
-                now.append(hazard)
-        return now
+                to_announce.append(hazard)
+        return to_announce
 
     def announced(self) -> list[AreaHazard]:
-        """Return what was announced last of every area: what to say again after a reconnect."""
+        """Return the last announced hazard of every area, to republish after a reconnect."""
         return list(self._announced.values())
 
     def withheld(self) -> list[str]:
-        """Return the areas whose newest hazard waits for the store."""
+        """Return the areas whose newest hazard is announced only once it is stored."""
         return sorted(area for area, hazard in self._unstored.items() if self._announced.get(area) is not hazard)
 
     def forget(self, area: str) -> None:
-        """Drop an area that was removed."""
+        """Forget a removed area."""
         self._announced.pop(area, None)
         self._unstored.pop(area, None)

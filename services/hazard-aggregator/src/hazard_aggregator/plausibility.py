@@ -1,6 +1,6 @@
-"""What one reading of a node says about its area: the sonars against their calibration, the robots that explain them.
+"""Classifies one reading of a node: compares its sonars with their calibration, and echoes with robots in the cone.
 
-Pure: the poses of robots come as arguments, already found fresh by the caller.
+Pure: the caller passes the fresh poses of robots.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ if TYPE_CHECKING:
     from fog_contracts.site import NodeSite, Sonar
 
 CONE_HALF_ANGLE: Final = math.radians(7.5)
-"""Half of the beam's width: the HC-SR04 sees 15 degrees (Mendes 2022, section 3.3)."""
-EXPLAINED_WITHIN: Final = 0.3
-"""How far (m) a measured range may be from where a robot's rim should be and still be that robot."""
-DOUBT_SIGMAS: Final = 2.0
-DOUBT_LIMIT: Final = 0.3
-"""How far (m) off the beam a robot may be believed that is in it: two standard deviations of its pose, this at most."""
-SHORTEST_RANGE: Final = 0.02
-"""Below this (m) an HC-SR04 measures its own ringing (datasheet: 2 cm to 4 m)."""
+"""Half of the beam's width: the HC-SR04's cone is 15 degrees wide (Mendes 2022, section 3.3)."""
+EXPLAIN_TOLERANCE: Final = 0.3
+"""How far (m) a measured range may differ from the expected range of a robot's rim to be explained by that robot."""
+POSE_SIGMAS: Final = 2.0
+MAX_POSE_MARGIN: Final = 0.3
+"""The margin for a robot's pose error across the beam: so many standard deviations, and at most so far (m)."""
+MIN_RANGE: Final = 0.02
+"""Below this range (m) an HC-SR04 measures its own ringing (datasheet: 2 cm to 4 m)."""
 LIMIT_TOLERANCE: Final = 0.01
-"""A range this near (m) to the limit may be called either way: node and fog round differently."""
+"""A range this close (m) to the limit may be classified either way: node and aggregator round differently."""
 
 
 class Classification(NamedTuple):
-    """What a reading says, in words too; `explained_by` names the robot that is all the reading sees."""
+    """The state that a reading shows, and why; `explained_by` is the robot that causes all of its blocking echoes."""
 
     state: AreaState
     reason: str
@@ -37,24 +37,24 @@ class Classification(NamedTuple):
 
 
 def classify_sonar(sonar: Sonar, status: str, measured: float | None, shift: float = 0.0) -> tuple[AreaState, str]:
-    """Return what one sonar says: an echo nearer than its limit is `blocked`; what can't be right is `unknown`.
+    """Return what one sonar shows: an echo nearer than its limit is `blocked`, an implausible value `unknown`.
 
-    `shift` (m) moves the limit, to classify readings that are as near to it as rounding.
+    `shift` (m) moves the limit, for readings that are within rounding of it.
     """
     if status == "stuck":
         return "unknown", "the echo line is stuck"
     if status == "no_echo":
-        return _classify_silence(sonar, measured)
+        return _classify_no_echo(sonar, measured)
     if measured is None:
         return "unknown", "it reports an echo without a range"
-    if measured < SHORTEST_RANGE:
+    if measured < MIN_RANGE:
         return "unknown", f"{measured:.3f} m is nearer than a sonar can measure"
     if measured < sonar.range_limit + shift:
         return "blocked", f"something at {measured:.2f} m, nearer than {sonar.range_limit:.2f} m"
     return "clear", f"nothing nearer than {sonar.range_limit:.2f} m"
 
 
-def _classify_silence(sonar: Sonar, measured: float | None) -> tuple[AreaState, str]:
+def _classify_no_echo(sonar: Sonar, measured: float | None) -> tuple[AreaState, str]:
     if measured is not None:
         return "unknown", f"it reports no echo and yet a range of {measured:.2f} m"
     if sonar.no_echo_is_clear:
@@ -63,11 +63,11 @@ def _classify_silence(sonar: Sonar, measured: float | None) -> tuple[AreaState, 
 
 
 def expected_range(site: NodeSite, sonar: Sonar, pose: RobotPose) -> float | None:
-    """Return where (m) this sonar should see the robot's rim, or None when the robot is not in its cone.
+    """Return the range (m) at which this sonar should measure the robot's rim, or None when it is outside the cone.
 
     The footprint is a circle; it is in the cone when any part of it may be within half the beam's width of the axis,
-    as far as the robot's own doubt about its pose across the beam goes: along a bare corridor that can be decimetres.
-    A robot that is lower than the node hangs is not seen.
+    given the uncertainty of its pose across the beam: along a bare corridor that can be decimetres. A robot that is
+    lower than the node's mounting height is not seen.
     """
     if site.height >= pose.height:
         return None
@@ -76,36 +76,36 @@ def expected_range(site: NodeSite, sonar: Sonar, pose: RobotPose) -> float | Non
     if distance <= pose.radius:
         return 0.0
     off_axis = abs(math.remainder(math.atan2(dy, dx) - site.theta - sonar.angle, math.tau))
-    reach = pose.radius + _doubt_across(pose, -dy / distance, dx / distance)
+    reach = pose.radius + _pose_margin(pose, -dy / distance, dx / distance)
     if off_axis - math.asin(min(1.0, reach / distance)) > CONE_HALF_ANGLE:
         return None
     return distance - pose.radius
 
 
-def _doubt_across(pose: RobotPose, nx: float, ny: float) -> float:
-    """Return how far (m) the robot may be off its pose in the direction (nx, ny) of unit length."""
+def _pose_margin(pose: RobotPose, nx: float, ny: float) -> float:
+    """Return how far (m) the robot may be from its pose in the direction of the unit vector (nx, ny)."""
     xx, xy, yx, yy = pose.covariance[0], pose.covariance[1], pose.covariance[3], pose.covariance[4]
     variance = nx * nx * xx + nx * ny * (xy + yx) + ny * ny * yy
-    return min(DOUBT_LIMIT, DOUBT_SIGMAS * math.sqrt(max(0.0, variance)))
+    return min(MAX_POSE_MARGIN, POSE_SIGMAS * math.sqrt(max(0.0, variance)))
 
 
 def explaining_robot(
     site: NodeSite, sonar: Sonar, measured: float, poses: Iterable[tuple[str, RobotPose]]
 ) -> str | None:
-    """Return the robot whose rim lies in the sonar's cone within 0.3 m of the measured range, or None."""
+    """Return the robot in the sonar's cone whose rim is within 0.3 m of the measured range, or None."""
     for robot, pose in poses:
         expected = expected_range(site, sonar, pose)
-        if expected is not None and abs(expected - measured) <= EXPLAINED_WITHIN:
+        if expected is not None and abs(expected - measured) <= EXPLAIN_TOLERANCE:
             return robot
     return None
 
 
 def classify_reading(site: NodeSite, reading: NodeReading, poses: Iterable[tuple[str, RobotPose]]) -> Classification:
-    """Return what a reading says about the area.
+    """Return what a reading shows about the area.
 
-    The sonars are fused as the node does it: blocked if one says so, clear if all do, unknown otherwise. A node whose
-    own word contradicts its ranges is not believed. Blocking echoes that robots explain make the reading count
-    neither way, as long as no other echo blocks.
+    The sonars are fused as the node does it: blocked if one is, clear if all are, unknown otherwise. A reading whose
+    reported state contradicts its ranges is unknown. A reading counts neither way if robots explain all of its
+    blocking echoes.
     """
     if len(reading.range_m) != len(site.sonars):
         return Classification("unknown", f"it reports {len(reading.range_m)} sonars, the site has {len(site.sonars)}")
@@ -120,8 +120,8 @@ def classify_reading(site: NodeSite, reading: NodeReading, poses: Iterable[tuple
             return _contradiction(reading, classified, fused)
     if fused == "blocked":
         blocking = [i for i, (state, _) in enumerate(classified) if state == "blocked"]
-        fresh = list(poses)
-        robots = [explaining_robot(site, site.sonars[i], reading.range_m[i] or 0.0, fresh) for i in blocking]
+        known = list(poses)
+        robots = [explaining_robot(site, site.sonars[i], reading.range_m[i] or 0.0, known) for i in blocking]
         for index, robot in zip(blocking, robots, strict=True):
             if robot is None:
                 return Classification("blocked", f"sonar {index}: {classified[index][1]}")
@@ -131,7 +131,7 @@ def classify_reading(site: NodeSite, reading: NodeReading, poses: Iterable[tuple
 
 
 def _fuse(site: NodeSite, reading: NodeReading, shift: float) -> tuple[list[tuple[AreaState, str]], AreaState]:
-    """Classify every sonar with its limit shifted (m), and fuse them."""
+    """Classify every sonar with its limit moved by `shift` (m), and fuse the results."""
     classified = [
         classify_sonar(sonar, status, measured, shift)
         for sonar, status, measured in zip(site.sonars, reading.status, reading.range_m, strict=True)
@@ -141,8 +141,10 @@ def _fuse(site: NodeSite, reading: NodeReading, shift: float) -> tuple[list[tupl
 
 
 def _contradiction(reading: NodeReading, classified: list[tuple[AreaState, str]], fused: AreaState) -> Classification:
-    """Say why the node's own word is not believed."""
+    """Return why the node's reported state contradicts its ranges."""
     index = next(i for i, (state, _) in enumerate(classified) if state == fused)
     if reading.state == "unknown":
-        return Classification("unknown", "the node calls its own reading unknown")
-    return Classification("unknown", f"the node says {reading.state}, but of sonar {index}: {classified[index][1]}")
+        return Classification("unknown", "the node reports unknown")
+    return Classification(
+        "unknown", f"the node reports {reading.state}, but sonar {index} shows: {classified[index][1]}"
+    )

@@ -1,4 +1,4 @@
-"""Debounce rules by name, ours like anybody's: what installed packages registered as entry points."""
+"""Debounce rules by name: those that installed packages, this one included, registered as entry points."""
 
 from __future__ import annotations
 
@@ -11,6 +11,6 @@ GROUP: Final = "fognav.debounce_rules"
 
 
 def find_rule(name: str) -> RuleFactory[Any]:
-    """Return the factory of a debounce rule; raises `PartError`, which names the rules that there are."""
+    """Return the factory of a debounce rule; raises `PartError`, which lists the known rules."""
     factory: RuleFactory[Any] = parts.load(GROUP, name, RuleFactory)
     return factory

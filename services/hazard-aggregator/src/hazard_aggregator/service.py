@@ -1,4 +1,4 @@
-"""Between the core and the world: publishes what the core returns, and stores what it wants stored."""
+"""Runs the core: publishes what it returns, stores its hazards, and stores areas before they take effect."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ if TYPE_CHECKING:
     from hazard_aggregator.store import Store
 
 TICK_S = 0.1
-RETRY_S = 0.5
+STORE_RETRY_S = 0.5
 
 HAZARDS = Gauge("fognav_hazards", "Whether an area is announced in this state (1) or not (0)", ["area", "state"])
-WITHHELD = Gauge("fognav_hazards_withheld", "Areas whose relief waits for the store")
+WITHHELD = Gauge("fognav_hazards_withheld", "Areas whose relief is withheld until it is stored")
 
 _log = logs.get("aggregator")
 
 
 class ConflictError(Exception):
-    """An area has another version than its writer expected."""
+    """An area has another version than the writer expected."""
 
     def __init__(self, area: str) -> None:
         super().__init__(f"area {area} was changed by somebody else")
@@ -55,10 +55,10 @@ class Service:
         self._edges = Edges(clock, mqtt=mqtt, zenoh=zenoh)
         self._clock = clock
         self._health = health
-        self._write = asyncio.Event()
-        self._store_read = asyncio.Event()
-        self._writing = asyncio.Lock()
-        self._in_doubt = False
+        self._write_pending = asyncio.Event()
+        self._store_loaded = asyncio.Event()
+        self._area_lock = asyncio.Lock()
+        self._reload_areas = False
 
     def subscribe(self) -> None:
         """Register the core's handlers; call before the connections run."""
@@ -66,11 +66,11 @@ class Service:
         self._mqtt.on_connect(self._republish_all)
 
     async def put_area(self, definition: AreaDefinition, who: str, *, expected: int | None = None) -> AreaDefinition:
-        """Store an area as its next version, then let it count; with `expected`, only if that is its version still.
+        """Store an area as its next version, then put it into force; with `expected`, only if that is its version.
 
-        Raises `ConflictError` when it is not, and `StoreError`; then nothing has changed for certain.
+        Raises `ConflictError` when it is not; raises `StoreError`, after which the area may or may not be stored.
         """
-        async with self._writing:
+        async with self._area_lock:
             old = next((known for known in self.core.definitions() if known.id == definition.id), None)
             if expected is not None and (old is None or old.version != expected):
                 raise ConflictError(definition.id)
@@ -80,39 +80,41 @@ class Service:
             try:
                 outcome = await self._store.put_area(definition, expected=version, audit=audit, before=old)
                 if outcome == "missing":
-                    # Redis lost what it had acknowledged: what is in force is the record now.
+                    # Redis lost an acknowledged write: the definition in force replaces it.
                     outcome = await self._store.put_area(definition, expected=0, audit=audit, before=old)
             except StoreError as error:
-                # It may have been written although the answer was lost: read again before trusting the memory.
-                self._in_doubt = True
+                # It may have been written although the reply was lost: reload the areas.
+                self._reload_areas = True
                 self._health.set("store", ok=False, detail=str(error))
                 raise
             if outcome != "ok":
-                self._in_doubt = True
+                self._reload_areas = True
                 raise ConflictError(definition.id)
             self._announce(self.core.put_area(definition, self._edges.now()))
         await self._subscribe_numbers()
         return definition
 
-    async def _read_areas_again(self) -> None:
-        """Take the stored areas that are newer than those in force; raises `StoreError`."""
-        async with self._writing:
+    async def _load_newer_areas(self) -> None:
+        """Put stored areas into force that are newer than the known ones; raises `StoreError`."""
+        async with self._area_lock:
             known = {definition.id: definition.version for definition in self.core.definitions()}
             for definition in await self._store.areas():
                 if definition.version > known.get(definition.id, -1):
                     self._announce(self.core.put_area(definition, self._edges.now()))
-            self._in_doubt = False
+            self._reload_areas = False
         await self._subscribe_numbers()
 
-    # --- What goes out ----------------------------------------------------------------------------------------------
+    # --- Publishing -------------------------------------------------------------------------------------------------
 
     def _announce(self, publications: Sequence[Publication]) -> None:
-        """Publish what the core has decided just now."""
+        """Log and publish new decisions of the core."""
         for publication in publications:
             if isinstance(hazard := publication.message, AreaHazard):
                 if hazard.trace is not None:
                     metrics.observe_trace(hazard.trace, ["debounce"])
-                _log.info("hazard", area=hazard.area, state=hazard.state, penalty=hazard.penalty, cause=hazard.cause)
+                _log.info(
+                    "hazard_announced", area=hazard.area, state=hazard.state, penalty=hazard.penalty, cause=hazard.cause
+                )
         self._publish(publications)
 
     def _publish(self, publications: Sequence[Publication]) -> None:
@@ -123,7 +125,7 @@ class Service:
             self._edges.publish(publication)
         WITHHELD.set(len(self.core.withheld()))
         if self.core.to_store():
-            self._write.set()
+            self._write_pending.set()
 
     async def _republish_all(self) -> None:
         self._publish(self.core.republish_all())
@@ -133,44 +135,46 @@ class Service:
             await self._mqtt.add_number(ch.THESIS_AREA, number)
 
     async def tick_loop(self) -> None:
-        """Let time pass in the core, and report the connection's health."""
+        """Tick the core, and report the broker connection's health."""
         async for _ in ticker(self._clock, TICK_S):
             self._announce(self.core.tick(self._edges.now()))
-            self._health.set("mqtt", ok=self._mqtt.connected, detail="" if self._mqtt.connected else "no broker")
+            self._health.set(
+                "mqtt", ok=self._mqtt.connected, detail="" if self._mqtt.connected else "not connected to the broker"
+            )
 
     # --- The store --------------------------------------------------------------------------------------------------
 
     async def write_loop(self) -> None:
-        """Store hazards, again and again until Redis took them; what was withheld for it is then announced."""
-        await self._store_read.wait()
+        """Store hazards, retrying until Redis has them; then announce the reliefs that were withheld for it."""
+        await self._store_loaded.wait()
         if warning := await self._store.durability_warning():
-            _log.warning("store_is_weak", remedy=warning)
+            _log.warning("store_not_durable", remedy=warning)
         while True:
-            await self._write.wait()
-            self._write.clear()
-            while waiting := self.core.to_store():
+            await self._write_pending.wait()
+            self._write_pending.clear()
+            while unstored := self.core.to_store():
                 try:
-                    await self._store.save_hazards(waiting)
+                    await self._store.save_hazards(unstored)
                 except StoreError as error:
                     self._health.set("store", ok=False, detail=str(error))
-                    await asyncio.sleep(RETRY_S)
+                    await asyncio.sleep(STORE_RETRY_S)
                     continue
                 self._health.set("store", ok=True)
-                self._announce(self.core.stored(waiting))
+                self._announce(self.core.mark_stored(unstored))
 
-    def store_was_read(self) -> None:
-        """Report that the start found the store: writing may begin."""
-        self._store_read.set()
+    def mark_store_loaded(self) -> None:
+        """Record that the stored state is loaded, which allows writing."""
+        self._store_loaded.set()
         self._health.set("store", ok=True)
 
     async def store_loop(self) -> None:
-        """Watch Redis; after a start without it, read it as soon as it answers, before anything is written over."""
+        """Monitor Redis; after a start without it, load its records as soon as it answers, before any write."""
         while True:
-            await asyncio.sleep(RETRY_S)
+            await asyncio.sleep(STORE_RETRY_S)
             try:
-                if self._store_read.is_set():
-                    if self._in_doubt:
-                        await self._read_areas_again()
+                if self._store_loaded.is_set():
+                    if self._reload_areas:
+                        await self._load_newer_areas()
                     await self._store.ping()
                     self._health.set("store", ok=True)
                     continue
@@ -180,4 +184,4 @@ class Service:
                 continue
             self._publish(self.core.restore(stored.definitions, stored.hazards, self._edges.now()))
             await self._subscribe_numbers()
-            self.store_was_read()
+            self.mark_store_loaded()

@@ -1,4 +1,4 @@
-"""Redis as the record of what was decided: areas that people changed, and the last hazard of every area."""
+"""The aggregator's records in Redis: areas that operators changed, and the last hazard of every area."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from fog_runtime.redis_store import Audit, Outcome, RedisStore, StoreError, Tabl
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-__all__ = ["Audit", "Outcome", "Store", "StoreError", "Stored", "load_or_begin"]
+__all__ = ["Audit", "Outcome", "Store", "StoreError", "Stored", "load_at_start"]
 
 _AREAS: Final = Table("areas", "area")
 _HAZARDS: Final = "hazards"
@@ -22,7 +22,7 @@ _log = logs.get("store")
 
 
 class Stored(NamedTuple):
-    """What an aggregator finds at its start; `epoch` is its own, larger than that of every start before."""
+    """What an aggregator loads at its start; `epoch` is its own, larger than that of every start before."""
 
     epoch: int
     definitions: list[AreaDefinition]
@@ -33,13 +33,13 @@ class Store(RedisStore):
     """The aggregator's keys."""
 
     async def load(self, running: int = 0) -> Stored:
-        """Return what can be read of what is stored, and begin an epoch; with `running`, record that this one runs."""
+        """Claim an epoch and return all readable records; with `running`, claim that epoch instead of a new one."""
         epoch = await self.claim_epoch(_SERVICE, running)
         hazards = await self._readable_records(_HAZARDS, AreaHazard)
         return Stored(epoch, await self.areas(), list(hazards.values()))
 
     async def areas(self) -> list[AreaDefinition]:
-        """Return the stored areas; one that can't be read is left out: the site's definition of it holds."""
+        """Return the stored areas; an unreadable one is left out, so the site's definition of it stays in force."""
         return list((await self._readable_records(_AREAS.name, AreaDefinition)).values())
 
     async def save_hazards(self, hazards: Iterable[AreaHazard]) -> None:
@@ -51,16 +51,16 @@ class Store(RedisStore):
     ) -> Outcome:
         """Write an area durably if the stored version is `expected` (0: none is stored, as for the site's own).
 
-        `before` is the definition that held until now, for the audit entry of an area that was not stored yet.
+        `before` is the definition in force until now, for the audit entry of an area that was not stored yet.
         """
         return await self._swap(_AREAS, definition.id, definition, str(expected), audit, before=before)
 
 
-async def load_or_begin(store: Store) -> tuple[Stored, bool]:
-    """Return what is stored, and whether it could be read; without Redis nothing, and an epoch (ms) by the clock."""
+async def load_at_start(store: Store) -> tuple[Stored, bool]:
+    """Return the stored records, and whether Redis answered; if not, no records and an epoch (ms) from the clock."""
     try:
         return await store.load(), True
     except StoreError as error:
         epoch = int(time.time() * 1000)
-        _log.warning("start_without_store", epoch=epoch, reason=str(error))
+        _log.warning("started_without_store", epoch=epoch, reason=str(error))
         return Stored(epoch, [], []), False

@@ -1,7 +1,8 @@
-"""When the readings of a node are enough to settle its state: one rule per module, ours like anybody's.
+"""Debounce rules: when the readings of a node suffice to confirm its state. One rule per module.
 
-A rule registers a `RuleFactory` under its name in the entry points `fognav.debounce_rules`. An area chooses it by name,
-with the rule's own options beside: `debounce = { rule = "consecutive", to_blocked = 3 }`.
+A rule, in this package or any other, registers a `RuleFactory` under its name in the entry points
+`fognav.debounce_rules`. An area chooses it by name, together with its options:
+`debounce = { rule = "consecutive", to_blocked = 3 }`.
 """
 
 from __future__ import annotations
@@ -24,28 +25,28 @@ _RULE: Final = "rule"
 
 
 class Rule(Protocol):
-    """Watches the classified readings of one node."""
+    """Debounces the classified readings of one node."""
 
-    def feed(self, state: AreaState, at: float) -> AreaState | None:
-        """Take what one reading says, `at` seconds of a monotonic clock.
+    def update(self, state: AreaState, now: float) -> AreaState | None:
+        """Process the state that one reading shows; `now` is in seconds of a monotonic clock.
 
-        Returns the state that is settled now, or None while that is open.
+        Returns the confirmed state, or None while the readings don't confirm one.
         """
 
     def reset(self) -> None:
-        """Forget all readings: the node fell silent or is not trusted any more."""
+        """Forget all readings: the node fell silent, went offline or contradicted itself."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RuleFactory(Generic[Options]):
-    """What a rule registers: the type of its options, and how a rule for one node is made of them."""
+    """What a rule registers: the type of its options, and a function that makes the rule of one node from them."""
 
     options: type[Options]
     make: Callable[[Options], Rule]
 
 
 class DebounceError(ValueError):
-    """An area's choice of a rule that can't be used; the message names the area, the field and what there is."""
+    """An area's debounce settings are invalid; the message names the area, the field and the known values."""
 
     def __init__(self, area: str, field: str, problem: str) -> None:
         super().__init__(f"area {area}: {field}: {problem}")
@@ -54,11 +55,11 @@ class DebounceError(ValueError):
 
 
 Registry = Callable[[str], "RuleFactory[Any]"]
-"""Returns the factory of a name; raises `ValueError`, which says what names there are, for an unknown one."""
+"""Returns the factory of a name; raises `ValueError`, which lists the known names, for an unknown one."""
 
 
 def make_rule(area: str, choice: Mapping[str, Any], registry: Registry, default: str = DEFAULT_RULE) -> Rule:
-    """Return a fresh rule for one node of an area, as the area's `debounce` says; raises `DebounceError`.
+    """Return a new rule for one node of an area from the area's `debounce` settings; raises `DebounceError`.
 
     `default` is the rule of an area that names none.
     """

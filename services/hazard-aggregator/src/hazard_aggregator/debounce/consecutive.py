@@ -1,4 +1,4 @@
-"""N readings in a row that say the same settle a state (Mendes 2022, section 3.4, with N = 5)."""
+"""N consecutive readings of the same state confirm it (Mendes 2022, section 3.4, with N = 5)."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ if TYPE_CHECKING:
 
 
 class Options(Struct, frozen=True, kw_only=True):
-    """How many readings in a row change a node's state (the thesis: five either way)."""
+    """How many consecutive readings change a node's state (the thesis: five either way)."""
 
     to_blocked: Annotated[int, Meta(ge=1, le=1000)] = 5
     to_clear: Annotated[int, Meta(ge=1, le=1000)] = 5
 
 
 class Consecutive:
-    """Counts readings in a row; one that says something else starts the count again.
+    """Counts consecutive readings of the same state; a reading of another state restarts the count.
 
-    A row of implausible readings settles `unknown` after as many as settle `blocked`.
+    Implausible readings confirm `unknown` after as many as confirm `blocked`.
     """
 
     def __init__(self, options: Options) -> None:
@@ -30,14 +30,14 @@ class Consecutive:
         self._last: AreaState | None = None
         self._count = 0
 
-    def feed(self, state: AreaState, at: float) -> AreaState | None:  # noqa: ARG002  # it counts, whatever the time
-        """Take what one reading says; return it once it is the N-th in a row."""
+    def update(self, state: AreaState, now: float) -> AreaState | None:  # noqa: ARG002  # it counts, whatever the time
+        """Count one reading's state; return the state from its N-th consecutive reading on."""
         self._count = self._count + 1 if state == self._last else 1
         self._last = state
         return state if self._count >= self._needed[state] else None
 
     def reset(self) -> None:
-        """Forget the row."""
+        """Restart the count."""
         self._last = None
         self._count = 0
 

@@ -1,7 +1,7 @@
-"""What vulture may take for dead although it is not, with the reason; whatever else nothing uses has to go.
+"""Names that vulture would report as unused although they are needed, each with the reason.
 
-vulture looks at the members' sources without their tests: code that only a test keeps alive is dead too, unless it is
-named here. Run it by `./fognav check`.
+vulture reads the members' sources without their tests: code that only a test uses is dead too, unless it is listed
+here. `./fognav check` runs it.
 """
 
 # --- Fields of messages, reports and API answers: other programs and people read them. ---
@@ -51,7 +51,7 @@ _.RplidarEmulator
 _.DiffDriveEmulator
 _.Ld19Emulator
 
-# --- Protocols that are written down whole, as their data sheets do. ---
+# --- Protocols of devices, complete as in their data sheets. ---
 _.NOT_CHARGING  # Roomba Open Interface
 _.RECONDITIONING
 _.FULL_CHARGING
@@ -78,7 +78,7 @@ _.model
 _.get_info
 _.get_sample_rate
 
-# --- For tests, of this repository and of those who build on it. ---
+# --- For tests, of this repository and of packages that build on it. ---
 _.ManualClock
 _.start_mosquitto  # private servers
 _.start_redis

@@ -1,4 +1,4 @@
-# One image per process, with its own closure only. Build arguments: MEMBER (folder), NAME (distribution), MODULE
+# One image per process, with only its own dependencies. Build arguments: MEMBER (folder), NAME (distribution), MODULE
 # (what `python -m` starts), KERNELS (profile of fog_kernels.warm, or "none").
 #     docker build -f deploy/images/service.Dockerfile --build-arg MEMBER=services/planner ... .
 FROM python:3.11-slim-bookworm AS wheels
@@ -20,7 +20,7 @@ RUN useradd --system --uid 10001 --home-dir /var/lib/fognav --create-home fognav
 COPY requirements/${NAME}.txt /tmp/requirements.txt
 RUN pip install --no-cache-dir --require-hashes -r /tmp/requirements.txt
 COPY --from=wheels /wheels /tmp/wheels
-# Only the workspace libraries that this member declares: kernels (numba) stay out of images that don't compute.
+# Only the workspace libraries that this member declares: kernels (numba) stay out of images that don't need them.
 RUN set -e; pip install --no-cache-dir --no-deps /tmp/wheels/fog_contracts-*.whl /tmp/wheels/fog_runtime-*.whl; \
     if [ "${KERNELS}" != none ]; then pip install --no-cache-dir --no-deps /tmp/wheels/fog_kernels-*.whl; fi; \
     pip install --no-cache-dir --no-deps /tmp/wheels/"$(echo "${NAME}" | tr - _)"-*.whl; \

@@ -1,5 +1,5 @@
-# A simulated robot with its nodes: simulator, watchdog, guardian and agent in one container, because ptys don't cross
-# containers.
+# A simulated robot and its sensor nodes: simulator, watchdog, guardian and agent in one container, because containers
+# can't share ptys.
 FROM python:3.11-slim-bookworm AS wheels
 WORKDIR /src
 COPY requirements/build.txt requirements/

@@ -1,4 +1,4 @@
-"""The localizer on its own: skew, propagation, what may and may not disturb it."""
+"""The localizer alone: deskewing, propagation, and its robustness."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ SOLID = (STATIC == 254).astype(np.uint8)
 PLACES = [Pose2(5.0, 2.0, 1.0), Pose2(12.0, 8.0, -2.0), Pose2(3.5, 3.5, 0.3), Pose2(9.0, 1.5, 3.0)]
 
 
-def look(pose_at, begin, end, *, solid=SOLID, noise=0.0, seed=0, repeats=1):  # noqa: PLR0913  # each has a default
-    """One turn, clockwise, each beam cast from where the robot is at its own time."""
+def measure_scan(pose_at, begin, end, *, solid=SOLID, noise=0.0, seed=0, repeats=1):  # noqa: PLR0913  # each has a default
+    """Return a scan, clockwise, each beam cast from the robot's pose at its own time."""
     rng = np.random.default_rng(seed)
     times = np.linspace(begin, end, 360)
     angles = -np.arange(360) * 2 * math.pi / 360
@@ -43,36 +43,38 @@ def look(pose_at, begin, end, *, solid=SOLID, noise=0.0, seed=0, repeats=1):  # 
     )
 
 
-def standing(pose, *, turns=8, localizer=None, solid=SOLID, start=0.0, prepare=None):
+def standing(pose, *, scans=8, localizer=None, solid=SOLID, start=0.0, prepare=None):
     localizer = localizer or Localizer(seed=3)
     localizer.load_map(STATIC, GEOMETRY)
-    for i in range(turns):
+    for i in range(scans):
         begin = start + 0.18 * i
         for j in range(5):
             localizer.on_odometry(begin + 0.04 * j, 0.0, 0.0, 0.0)
-        localizer.on_scan(look(lambda _: pose, begin, begin + 0.16, solid=solid, noise=0.01, seed=i), begin + 0.17)
+        localizer.on_scan(
+            measure_scan(lambda _: pose, begin, begin + 0.16, solid=solid, noise=0.01, seed=i), begin + 0.17
+        )
         if i == 0 and prepare is not None:
             prepare(localizer)
-    return localizer, start + 0.18 * turns
+    return localizer, start + 0.18 * scans
 
 
-def off(localizer, at, pose):
-    found = localizer.pose(at)
-    return math.hypot(found.x - pose.x, found.y - pose.y), abs(wrap(found.theta - pose.theta))
+def error_of(localizer, at, pose):
+    estimate = localizer.pose(at)
+    return math.hypot(estimate.x - pose.x, estimate.y - pose.y), abs(wrap(estimate.theta - pose.theta))
 
 
 poses = st.builds(Pose2, st.floats(-50, 50), st.floats(-50, 50), st.floats(-3, 3))
 
 
 @given(poses, poses)
-def test_a_pose_seen_from_another_and_put_back_is_the_same(a, b):
+def test_relative_to_and_compose_are_inverse(a, b):
     again = b.compose(a.relative_to(b))
     assert (again.x, again.y) == pytest.approx((a.x, a.y), abs=1e-9)
     assert wrap(again.theta - a.theta) == pytest.approx(0.0, abs=1e-9)
 
 
 @pytest.mark.parametrize(("v", "w"), [(0.3, 0.0), (0.0, 1.5), (0.25, -0.8)])
-def test_a_turn_taken_in_motion_is_straightened(v, w):
+def test_scan_taken_in_motion_is_deskewed(v, w):
     def pose_at(at):
         theta = 0.4 + w * at
         if w == 0.0:
@@ -86,11 +88,11 @@ def test_a_turn_taken_in_motion_is_straightened(v, w):
     origin = pose_at(0.0)
     for i in range(9):
         localizer.on_odometry(0.025 * i, *(pose_at(0.025 * i).relative_to(origin)))
-    localizer.on_scan(look(pose_at, 0.0, 0.18), 0.18)
+    localizer.on_scan(measure_scan(pose_at, 0.0, 0.18), 0.18)
     still = Localizer()
     still.load_map(STATIC, GEOMETRY)
     still.on_odometry(0.0, 0.0, 0.0, 0.0)
-    still.on_scan(look(pose_at, 0.0, 0.18), 0.18)
+    still.on_scan(measure_scan(pose_at, 0.0, 0.18), 0.18)
     end = pose_at(0.18)
     fits = [one.wall_distance(end.transform(one.scan.points)).mean() for one in (localizer, still)]
     assert fits[0] < 0.04
@@ -103,26 +105,26 @@ def test_a_given_pose_is_refined_and_trusted(place):
         place, prepare=lambda one: one.initial_pose(place.x + 0.4, place.y - 0.3, place.theta + 0.25)
     )
     assert localizer.status == "good"
-    xy, theta = off(localizer, now, place)
+    xy, theta = error_of(localizer, now, place)
     assert xy < 0.06
     assert theta < 0.03
 
 
 def test_a_given_pose_that_is_wrong_is_not_trusted():
-    localizer, _ = standing(PLACES[0], prepare=lambda one: one.initial_pose(12.0, 6.0, 0.0), turns=5)
+    localizer, _ = standing(PLACES[0], prepare=lambda one: one.initial_pose(12.0, 6.0, 0.0), scans=5)
     assert localizer.status != "good"
 
 
 @pytest.mark.parametrize("place", PLACES)
 def test_global_localization_finds_the_robot_anywhere(place):
-    localizer, now = standing(place, prepare=lambda one: one.global_localization(), turns=12)
+    localizer, now = standing(place, prepare=lambda one: one.global_localization(), scans=12)
     assert localizer.status == "good"
-    xy, theta = off(localizer, now, place)
+    xy, theta = error_of(localizer, now, place)
     assert xy < 0.08
     assert theta < 0.04
 
 
-def test_global_localization_says_so_when_places_look_alike():
+def test_global_localization_fails_when_places_look_alike():
     static, geometry = grid_of([(1, 1, 4, 4), (6, 1, 9, 4)], 10, 5)
     localizer = Localizer()
     localizer.load_map(static, geometry)
@@ -130,46 +132,46 @@ def test_global_localization_says_so_when_places_look_alike():
     solid = (static == 254).astype(np.uint8)
     angles = np.arange(360) * 2 * math.pi / 360
     ranges = cast(solid, geometry.resolution, 0.0, 0.0, 2.0, 2.2, angles, 12.0)
-    turn = LaserScan(
+    scan = LaserScan(
         angles_rad=angles, ranges_m=ranges, quality=np.zeros(360, np.uint8), started_at=0.0, ended_at=0.0, repeats=1,
     )  # fmt: skip
-    localizer.on_scan(turn, 0.0)
+    localizer.on_scan(scan, 0.0)
     assert localizer.global_localization()
     while localizer.searching:
-        localizer.on_scan(turn, 0.1)
+        localizer.on_scan(scan, 0.1)
     assert localizer.status == "lost"
     assert "look like this one" in localizer.detail
 
 
-def test_people_around_the_robot_do_not_make_it_doubt():
+def test_pose_stays_good_with_people_around_the_robot():
     place = PLACES[1]
     solid = SOLID.copy()
     for angle in (0.3, 1.5, 2.9, 4.4):
         column, row = GEOMETRY.cell(place.x + 0.7 * math.cos(angle), place.y + 0.7 * math.sin(angle))
         solid[row - 3 : row + 4, column - 3 : column + 4] = 1
     localizer, now = standing(place, prepare=lambda one: one.initial_pose(*place))
-    standing(place, localizer=localizer, solid=solid, start=now, turns=30)
+    standing(place, localizer=localizer, solid=solid, start=now, scans=30)
     assert localizer.status == "good"
 
 
-def test_a_saved_pose_that_fits_is_taken_up_and_one_that_does_not_leads_to_a_search():
+def test_saved_pose_is_restored_if_it_fits_else_the_map_is_searched():
     saved = SavedPose(site="s", x=5.2, y=1.9, theta=1.1, sigma_xy=0.1, sigma_theta=0.05)
-    localizer, now = standing(PLACES[0], prepare=lambda one: one.restore(saved), turns=4)
+    localizer, now = standing(PLACES[0], prepare=lambda one: one.restore(saved), scans=4)
     assert localizer.status == "good"
-    assert off(localizer, now, PLACES[0])[0] < 0.06
-    localizer, now = standing(PLACES[1], prepare=lambda one: one.restore(saved), turns=25)
+    assert error_of(localizer, now, PLACES[0])[0] < 0.06
+    localizer, now = standing(PLACES[1], prepare=lambda one: one.restore(saved), scans=25)
     assert localizer.status == "good"
-    assert off(localizer, now, PLACES[1])[0] < 0.08
+    assert error_of(localizer, now, PLACES[1])[0] < 0.08
 
 
-def test_nothing_is_saved_while_the_pose_is_not_trusted():
+def test_pose_is_saved_only_when_it_is_trusted():
     assert Localizer().save("s", 0.0) is None
     localizer, now = standing(PLACES[0], prepare=lambda one: one.initial_pose(*PLACES[0]))
     saved = localizer.save("s", now)
     assert (saved.x, saved.y) == pytest.approx((5.0, 2.0), abs=0.06)
 
 
-def test_between_turns_the_pose_follows_the_odometry():
+def test_between_scans_the_pose_follows_the_odometry():
     localizer, now = standing(PLACES[0], prepare=lambda one: one.initial_pose(*PLACES[0]))
     before = localizer.pose(now)
     localizer.on_odometry(now + 0.05, 0.1, 0.0, 0.2)
@@ -177,7 +179,7 @@ def test_between_turns_the_pose_follows_the_odometry():
     assert after.relative_to(before) == pytest.approx((0.1, 0.0, 0.2), abs=1e-6)
 
 
-def test_the_number_of_particles_stays_within_its_bounds_and_the_seed_decides_everything():
+def test_number_of_particles_stays_within_its_bounds_and_the_seed_repeats_everything():
     def drive(seed):
         localizer = Localizer(LocalizationConfig(), seed)
         localizer.load_map(STATIC, GEOMETRY)
@@ -187,11 +189,11 @@ def test_the_number_of_particles_stays_within_its_bounds_and_the_seed_decides_ev
         for i in range(1, 25):
             at = 0.18 * i
             localizer.on_odometry(at, 0.3 * i, 0.0, 0.0)
-            turn = look(lambda _, i=i: Pose2(2.0 + 0.3 * i, 2.0, 0.0), at, at, seed=i, noise=0.01)
-            localizer.on_scan(turn, at)
+            scan = measure_scan(lambda _, i=i: Pose2(2.0 + 0.3 * i, 2.0, 0.0), at, at, seed=i, noise=0.01)
+            localizer.on_scan(scan, at)
             counts.append(localizer.particles)
             found.append(tuple(localizer.pose(at)))
-        assert off(localizer, at, Pose2(2.0 + 0.3 * 24, 2.0, 0.0))[0] < 0.1
+        assert error_of(localizer, at, Pose2(2.0 + 0.3 * 24, 2.0, 0.0))[0] < 0.1
         return counts, found
 
     counts, found = drive(7)
@@ -201,7 +203,7 @@ def test_the_number_of_particles_stays_within_its_bounds_and_the_seed_decides_ev
     assert drive(8)[1] != found
 
 
-def test_readings_that_were_held_up_and_arrive_together_make_no_speed():
+def test_delayed_readings_that_arrive_together_give_the_true_speed():
     localizer = Localizer(seed=1)
     for i in range(20):
         localizer.on_odometry(0.015 * i, 0.3 * 0.015 * i, 0.0, 0.0)
@@ -214,7 +216,7 @@ def test_readings_that_were_held_up_and_arrive_together_make_no_speed():
     assert late.x == pytest.approx(moved + 0.3 * 0.7, abs=0.02)
 
 
-def test_a_bunch_of_readings_without_a_past_makes_no_speed():
+def test_burst_of_readings_without_history_gives_zero_speed():
     localizer = Localizer(seed=1)
     for i in range(40):
         localizer.on_odometry(0.0001 * i, 0.3 * 0.015 * i, 0.0, 0.0)

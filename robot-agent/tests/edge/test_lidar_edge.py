@@ -11,7 +11,7 @@ from fog_runtime.clock import SystemClock
 from fognav_sim.pty_port import PtyPort
 from robot_agent.agent.lidar_edge import LidarEdge
 from robot_agent.lidars.rplidar_a1 import protocol as rplidar
-from robot_agent.lidars.rplidar_a1.driver import ANSWER_S, RESET_S, SILENT_S, STOP_S, RplidarA1Driver
+from robot_agent.lidars.rplidar_a1.driver import ANSWER_TIMEOUT_S, RESET_S, SAMPLES_TIMEOUT_S, STOP_S, RplidarA1Driver
 from robot_agent.lidars.rplidar_a1.emulator import RplidarEmulator
 
 STEP = 0.02
@@ -69,7 +69,7 @@ def test_silence_restarts_the_scan():
     line = Line()
     line.run(1.0)
     line.device.stalled = True
-    line.run(SILENT_S + 0.1)
+    line.run(SAMPLES_TIMEOUT_S + 0.1)
     assert "no measurement" in line.driver.problem
     line.device.stalled = False
     before = len(line.scans)
@@ -81,7 +81,7 @@ def test_silence_restarts_the_scan():
 def test_lidar_that_does_not_answer_is_asked_repeatedly():
     line = Line()
     line.cut = True
-    line.run(3 * (ANSWER_S + STOP_S) + 0.2)
+    line.run(3 * (ANSWER_TIMEOUT_S + STOP_S) + 0.2)
     assert line.sent.count(rplidar.get_health()) >= 3
     assert "does not answer" in line.driver.problem
     line.cut = False

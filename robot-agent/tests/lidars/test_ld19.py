@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robot_agent.lidars.ld19.driver import SILENT_S, Ld19Driver, Ld19Options
+from robot_agent.lidars.ld19.driver import SAMPLES_TIMEOUT_S, Ld19Driver, Ld19Options
 from robot_agent.lidars.ld19.protocol import Parser, ScanAssembler
 
 # A few values of the checksum's table, as the maker's header file has them.
@@ -13,7 +13,7 @@ KNOWN_CRC = {1: 0x4D, 2: 0x9A, 64: 0x3E, 255: 0xA8}
 
 
 def crc8(data: bytes) -> int:
-    """CRC-8 by polynomial division of the whole message: another way than the driver's and the emulator's."""
+    """CRC-8 by polynomial division of the whole message: by another method than driver and emulator."""
     message = int.from_bytes(data, "big") << 8
     for place in range(8 * len(data) - 1, -1, -1):
         if message >> (place + 8) & 1:
@@ -30,8 +30,8 @@ def packet(start: int, distances, *, speed=3600, span=880, intensity=200, stamp=
     return body + bytes((crc8(body),))
 
 
-def turn(distance=2000, *, begin=0, packets=38) -> bytes:
-    """A whole turn and a little more, 960 hundredths of a degree from packet to packet."""
+def scan_bytes(distance=2000, *, begin=0, packets=38) -> bytes:
+    """A whole scan and a little more, 960 hundredths of a degree from packet to packet."""
     return b"".join(packet(begin + 960 * number, [distance] * 12) for number in range(packets))
 
 
@@ -99,13 +99,13 @@ def test_garbage_never_raises_and_the_packets_after_it_come_through(garbage, cut
 
 
 def test_no_damaged_byte_passes_and_each_one_is_counted():
-    before, damaged, after = (packet(960 * number, [1000 + number] * 12) for number in range(3))
-    for place in range(len(damaged)):
+    before, original, after = (packet(960 * number, [1000 + number] * 12) for number in range(3))
+    for place in range(len(original)):
         for flip in range(1, 256):
-            spoilt = bytearray(damaged)
-            spoilt[place] ^= flip
+            damaged = bytearray(original)
+            damaged[place] ^= flip
             parser = Parser()
-            parser.receive_data(before + bytes(spoilt) + after)
+            parser.receive_data(before + bytes(damaged) + after)
             assert {distance for _, distance, _ in drain(parser)} <= {1000, 1002}, (place, flip)
             assert parser.corrupted >= 1, (place, flip)
 
@@ -136,11 +136,11 @@ def scans_of(data: bytes, **options):
 
 
 def test_a_scan_has_counter_clockwise_angles_and_metres():
-    (scan,), _ = scans_of(turn(2500, begin=35_900, packets=40))
+    (scan,), _ = scans_of(scan_bytes(2500, begin=35_900, packets=40))
     assert (scan.ranges_m == 2.5).all()
     assert (scan.angles_rad.dtype, scan.ranges_m.dtype, scan.quality.dtype) == (np.float64, np.float64, np.uint8)
     assert -np.pi < scan.angles_rad.min() < scan.angles_rad.max() <= np.pi
-    # The head turns clockwise: from straight ahead to the right, which is negative.
+    # The head scans clockwise: from straight ahead to the right, which is negative.
     assert scan.angles_rad[0] == pytest.approx(-np.deg2rad(0.6), abs=0.01)
     assert (np.diff(np.unwrap(scan.angles_rad)) < 0).all()
     assert np.ptp(np.unwrap(scan.angles_rad)) == pytest.approx(2 * np.pi, abs=0.02)
@@ -162,43 +162,43 @@ def test_no_return_is_nan_and_so_is_a_weak_one_where_asked_for():
     assert np.isnan(weak.ranges_m).all()
 
 
-def test_a_turn_with_a_gap_is_thrown_away_and_counted():
-    begin, hole = turn(packets=40), turn(packets=12, begin=960 * 62)
-    found, driver = scans_of(begin + hole + turn(begin=960 * 74, packets=40))
+def test_a_scan_with_a_gap_is_thrown_away_and_counted():
+    begin, hole = scan_bytes(packets=40), scan_bytes(packets=12, begin=960 * 62)
+    found, driver = scans_of(begin + hole + scan_bytes(begin=960 * 74, packets=40))
     assert driver._assembler.incomplete == 1
     assert all(np.ptp(np.unwrap(scan.angles_rad)) > 6.2 for scan in found)
 
 
-def test_equal_turns_are_counted():
+def test_identical_scans_are_counted():
     one = b"".join(packet(1000 * number, [2000] * 12) for number in range(36))
     found, _ = scans_of(one * 4 + one[:47])
     assert [scan.repeats for scan in found] == [1, 2, 3]
 
 
-def test_the_beginning_is_told_in_time_of_arrival():
-    found, _ = scans_of(turn(packets=120))
+def test_start_and_end_of_a_scan_are_times_of_arrival():
+    found, _ = scans_of(scan_bytes(packets=120))
     for scan in found:
         assert scan.ended_at - scan.started_at == pytest.approx(37.5 / 4 * 0.01, abs=0.003)
 
 
-def test_an_assembler_that_was_reset_needs_a_whole_turn_again():
+def test_an_assembler_that_was_reset_needs_a_whole_scan_again():
     assembler, parser = ScanAssembler(), Parser()
-    parser.receive_data(turn(packets=60))
+    parser.receive_data(scan_bytes(packets=60))
     assembler.feed(parser.next_event(), 0.0)
     assembler.reset()
-    parser.receive_data(turn(begin=960 * 60, packets=30))
+    parser.receive_data(scan_bytes(begin=960 * 60, packets=30))
     assert assembler.feed(parser.next_event(), 0.1) == []
 
 
 # --- the driver ---
 
 
-def test_a_silent_lidar_is_trouble_until_it_speaks():
+def test_silent_lidar_is_a_problem_until_it_sends_a_packet():
     driver = Ld19Driver()
     assert driver.begin(5.0) == b""
-    assert driver.tick(5.0 + SILENT_S) == b""
+    assert driver.tick(5.0 + SAMPLES_TIMEOUT_S) == b""
     assert driver.problem == ""
-    driver.tick(5.1 + SILENT_S)
+    driver.tick(5.1 + SAMPLES_TIMEOUT_S)
     assert "check its cable" in driver.problem
     assert not driver.receive(b"\x54\x2c nothing that counts", 7.0).samples
     assert driver.problem
@@ -206,6 +206,6 @@ def test_a_silent_lidar_is_trouble_until_it_speaks():
     assert driver.problem == ""
 
 
-def test_its_line_is_fast_and_takes_no_commands():
+def test_serial_settings_and_empty_stop_command():
     driver = Ld19Driver()
     assert (driver.serial.baud, driver.serial.dtr, driver.stop_command) == (230_400, None, b"")

@@ -26,7 +26,7 @@ def u16(packets: np.ndarray, column: int) -> np.ndarray:
     return packets[:, column] | packets[:, column + 1] << 8
 
 
-def test_it_sends_from_power_on_375_packets_a_second_with_right_checksums():
+def test_lidar_sends_from_power_on_375_packets_a_second_with_right_checksums():
     packets = sent(Ld19Emulator(box), 2.0)
     assert len(packets) == pytest.approx(750, abs=1)
     assert (packets[:, 0] == 0x54).all()
@@ -70,18 +70,18 @@ def test_ranges_outside_the_rated_ones_give_no_return():
         assert (packets[:, 6:42] == 0).all()
 
 
-def test_a_resting_robot_never_sees_two_equal_turns():
+def test_a_resting_robot_never_sees_two_identical_scans():
     packets = sent(Ld19Emulator(box), 2.0)
     begins = np.flatnonzero(np.diff(u16(packets, 4)) < 0) + 1
-    turns = [packets[a:b, :46].tobytes() for a, b in itertools.pairwise(begins)]
-    assert len(turns) > 15
-    assert all(a != b for a, b in itertools.pairwise(turns))
+    scans = [packets[a:b, :46].tobytes() for a, b in itertools.pairwise(begins)]
+    assert len(scans) > 15
+    assert all(a != b for a, b in itertools.pairwise(scans))
 
 
-def test_what_the_host_writes_changes_nothing():
-    lidar, told = Ld19Emulator(box), Ld19Emulator(box)
-    told.receive(b"\xa5\x25 stop!", 0.0)
-    assert (sent(lidar, 0.1) == sent(told, 0.1)).all()
+def test_bytes_from_the_host_have_no_effect():
+    lidar, commanded = Ld19Emulator(box), Ld19Emulator(box)
+    commanded.receive(b"\xa5\x25 stop!", 0.0)
+    assert (sent(lidar, 0.1) == sent(commanded, 0.1)).all()
 
 
 def test_a_stalled_head_is_silent_and_goes_on_without_a_burst():
@@ -94,12 +94,12 @@ def test_a_stalled_head_is_silent_and_goes_on_without_a_burst():
     assert lidar.outgoing(50.0) == b"", "a pause gives no burst"
 
 
-def test_a_frozen_link_repeats_one_turn():
+def test_a_frozen_link_repeats_one_scan():
     lidar = Ld19Emulator(box)
     sent(lidar, 0.5)
     lidar.frozen = True
     packets = sent(lidar, 1.0, begin=0.51)
     begins = np.flatnonzero(np.diff(u16(packets, 4)) < 0) + 1
-    turns = {packets[a:b].tobytes() for a, b in itertools.pairwise(begins)}
+    scans = {packets[a:b].tobytes() for a, b in itertools.pairwise(begins)}
     assert len(begins) > 5
-    assert len(turns) == 1
+    assert len(scans) == 1

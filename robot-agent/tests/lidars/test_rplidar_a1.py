@@ -3,6 +3,7 @@ from __future__ import annotations
 import csv
 import json
 import random
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -10,6 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robot_agent.lidars.rplidar_a1 import protocol as rplidar
+
+if TYPE_CHECKING:
+    from robot_agent.hardware import LaserScan
 
 SCAN = bytes.fromhex("a55a0500004081")
 EXPRESS = bytes.fromhex("a55a5400004082")
@@ -25,7 +29,7 @@ def node(angle_q6: int, distance_q2: int, *, start: bool = False, quality: int =
     )  # fmt: skip
 
 
-def turn_bytes(rng: random.Random, count: int = 360, *, quiet: bool = False) -> bytes:
+def scan_bytes(rng: random.Random, count: int = 360, *, quiet: bool = False) -> bytes:
     shift = rng.randrange(60)
     return b"".join(
         node(i * 23040 // count + shift, 0 if quiet else rng.randrange(600, 40000), start=i == 0) for i in range(count)
@@ -88,7 +92,7 @@ def test_single_answers_decode():
     ]
 
 
-def test_a_health_that_the_protocol_does_not_name_stays_readable():
+def test_unknown_health_status_is_returned_as_an_int():
     assert parse(HEALTH + b"\x09\x00\x00")[-1] == rplidar.Health(9, 0)
 
 
@@ -103,14 +107,14 @@ def test_a_new_answer_ends_the_one_before_in_mid_node():
 
 
 def _with_a_byte_lost(rng):
-    broken = bytearray(turn_bytes(rng, 30))
+    broken = bytearray(scan_bytes(rng, 30))
     del broken[rng.randrange(len(broken))]
     return broken
 
 
 PIECES = {
     "a scan": lambda _: SCAN,
-    "nodes": lambda rng: turn_bytes(rng, rng.randrange(4, 40), quiet=rng.random() < 0.3),
+    "nodes": lambda rng: scan_bytes(rng, rng.randrange(4, 40), quiet=rng.random() < 0.3),
     "broken nodes": _with_a_byte_lost,
     "an express scan": lambda _: EXPRESS,
     "a capsule": lambda rng: capsule(rng.randrange(23040), rng.randbytes(80), new=rng.random() < 0.2),
@@ -142,17 +146,17 @@ def test_any_chunking_gives_the_same_events_and_counts(data):
 
 @given(st.sampled_from([b"", SCAN, EXPRESS, INFO]), st.binary(max_size=600), st.lists(st.integers(1, 50), max_size=8))
 def test_garbage_never_raises_and_the_next_scan_is_complete(answer, garbage, sizes):
-    nodes = turn_bytes(random.Random(2), 50)
+    nodes = scan_bytes(random.Random(2), 50)
     events = parse(answer + garbage + SCAN + nodes, sizes)
     assert events[-50:] == parse(SCAN + nodes)[1:]
 
 
 @pytest.mark.parametrize("quiet", [False, True])
 @pytest.mark.parametrize("lost", [1, 2, 3, 4])
-def test_lost_bytes_cost_a_few_nodes_and_the_boundary_is_found_again(lost, quiet):
+def test_lost_bytes_lose_a_few_nodes_until_the_boundary_is_found_again(lost, quiet):
     rng = random.Random(lost)
     for _ in range(30):
-        good = turn_bytes(rng, 300, quiet=quiet)
+        good = scan_bytes(rng, 300, quiet=quiet)
         at = rng.randrange(5 * 50, 5 * 200)
         received = parse(SCAN + good[:at] + good[at + lost :])[1:]
         sent = parse(SCAN + good)[1:]
@@ -164,12 +168,12 @@ def test_lost_bytes_cost_a_few_nodes_and_the_boundary_is_found_again(lost, quiet
         assert tail == sent[len(sent) - len(tail) :]
 
 
-def test_a_hundred_thousand_damaged_nodes_neither_crash_nor_lose_the_place_for_long():
+def test_a_hundred_thousand_damaged_nodes_neither_raise_nor_lose_the_boundary_for_long():
     rng = np.random.default_rng(8)
     clean = bytearray()
     shifts = random.Random(8)
     while len(clean) < 5 * 400_000:
-        clean += turn_bytes(shifts)
+        clean += scan_bytes(shifts)
     raw = np.frombuffer(bytes(clean), np.uint8).copy()
     hit = rng.choice(raw.size // 5, 100_000, replace=False) * 5 + rng.integers(0, 5, 100_000)
     raw[hit] ^= rng.integers(1, 256, hit.size).astype(np.uint8)
@@ -219,10 +223,10 @@ def test_recorded_text_captures_give_the_nodes_of_a_well_known_decoder(data_dir)
 
 
 @pytest.mark.data
-def test_recorded_living_room_gives_steady_turns(data_dir):
+def test_recorded_living_room_gives_steady_scans(data_dir):
     files = sorted((data_dir / "rplidar" / "living_room_137").glob("*.bin"))
     assert files
-    turns, incomplete, resyncs = [], 0, 0
+    scans, incomplete, resyncs = [], 0, 0
     for path in files:
         parser, assembler = rplidar.Parser(), rplidar.ScanAssembler()
         now = 0.0
@@ -232,17 +236,17 @@ def test_recorded_living_room_gives_steady_turns(data_dir):
             now += 64 / 11520
             while (event := parser.next_event()) is not None:
                 if isinstance(event, rplidar.Nodes):
-                    turns.extend(assembler.feed(event, now))
+                    scans.extend(assembler.feed(event, now))
         incomplete += assembler.incomplete
         resyncs += parser.resyncs
-    assert len(turns) > 5 * len(files)
+    assert len(scans) > 5 * len(files)
     assert resyncs <= 5
     assert incomplete <= 1
-    for turn in turns:
-        assert 280 <= turn.angles_rad.size <= 330
-        assert turn.repeats == 1
-        assert np.nanmax(turn.ranges_m) < 16.4
-        assert 0.1 < turn.ended_at - turn.started_at < 0.2
+    for scan in scans:
+        assert 280 <= scan.angles_rad.size <= 330
+        assert scan.repeats == 1
+        assert np.nanmax(scan.ranges_m) < 16.4
+        assert 0.1 < scan.ended_at - scan.started_at < 0.2
 
 
 @pytest.mark.data
@@ -263,7 +267,7 @@ def test_recorded_express_capsules_decode(data_dir):
 # --- express ---
 
 
-def test_a_turn_begins_where_the_capsules_pass_zero():
+def test_a_scan_begins_where_the_capsules_pass_zero():
     step = 32 * 36
     capsules = b"".join(capsule(i * step % 23040, bytes(80), new=i == 0) for i in range(42))
     starts = [place for place, entry in enumerate(parse(EXPRESS + capsules)[1:]) if entry[0]]
@@ -284,58 +288,58 @@ def test_a_damaged_capsule_is_counted_and_the_stream_goes_on():
     assert received == good[: 3 * 32] + good[5 * 32 :]
 
 
-# --- turns ---
+# --- scans ---
 
 
-def feed(assembler: rplidar.ScanAssembler, data: bytes, now: float = 0.0) -> list[rplidar.Turn]:
+def feed(assembler: rplidar.ScanAssembler, data: bytes, now: float = 0.0) -> list[LaserScan]:
     parser = rplidar.Parser()
     parser.receive_data(SCAN + data)
-    turns = []
+    scans = []
     while (event := parser.next_event()) is not None:
         if isinstance(event, rplidar.Nodes):
-            turns.extend(assembler.feed(event, now))
-    return turns
+            scans.extend(assembler.feed(event, now))
+    return scans
 
 
-def test_a_turn_has_counter_clockwise_angles_and_metres():
+def test_a_scan_has_counter_clockwise_angles_and_metres():
     data = b"".join(node(i * 64, 4000 if i else 0, start=i == 0, quality=15 if i else 0) for i in range(360))
-    (turn,) = feed(rplidar.ScanAssembler(), data + data)
-    assert turn.angles_rad[90] == pytest.approx(-np.pi / 2)
-    assert turn.angles_rad[270] == pytest.approx(np.pi / 2)
-    assert turn.angles_rad[180] == pytest.approx(np.pi)
-    assert turn.angles_rad.min() > -np.pi
-    assert turn.angles_rad.max() <= np.pi
-    assert np.isnan(turn.ranges_m[0])
-    assert (turn.ranges_m[1:] == 1.0).all()
-    assert (turn.angles_rad.dtype, turn.ranges_m.dtype) == (np.float64, np.float64)
+    (scan,) = feed(rplidar.ScanAssembler(), data + data)
+    assert scan.angles_rad[90] == pytest.approx(-np.pi / 2)
+    assert scan.angles_rad[270] == pytest.approx(np.pi / 2)
+    assert scan.angles_rad[180] == pytest.approx(np.pi)
+    assert scan.angles_rad.min() > -np.pi
+    assert scan.angles_rad.max() <= np.pi
+    assert np.isnan(scan.ranges_m[0])
+    assert (scan.ranges_m[1:] == 1.0).all()
+    assert (scan.angles_rad.dtype, scan.ranges_m.dtype) == (np.float64, np.float64)
 
 
-def test_equal_turns_are_counted_and_a_different_one_starts_anew():
-    first, second = turn_bytes(random.Random(1)), turn_bytes(random.Random(2))
-    turns = feed(rplidar.ScanAssembler(), first * 3 + second + first + first[:5])
-    assert [turn.repeats for turn in turns] == [1, 2, 3, 1, 1]
+def test_identical_scans_are_counted_and_a_different_one_starts_anew():
+    first, second = scan_bytes(random.Random(1)), scan_bytes(random.Random(2))
+    scans = feed(rplidar.ScanAssembler(), first * 3 + second + first + first[:5])
+    assert [scan.repeats for scan in scans] == [1, 2, 3, 1, 1]
 
 
-def test_the_piece_before_the_first_start_flag_is_no_turn():
-    turn = turn_bytes(random.Random(1))
-    assert len(feed(rplidar.ScanAssembler(), turn[500:] + turn + turn[:5])) == 1
+def test_the_piece_before_the_first_start_flag_is_no_scan():
+    scan = scan_bytes(random.Random(1))
+    assert len(feed(rplidar.ScanAssembler(), scan[500:] + scan + scan[:5])) == 1
 
 
-def test_a_turn_that_did_not_look_all_around_is_dropped_and_counted():
-    turn = turn_bytes(random.Random(1))
+def test_a_scan_that_does_not_cover_all_directions_is_dropped_and_counted():
+    scan = scan_bytes(random.Random(1))
     assembler = rplidar.ScanAssembler()
-    assert feed(assembler, turn[: 5 * 200] + turn[:5]) == []
+    assert feed(assembler, scan[: 5 * 200] + scan[:5]) == []
     assert assembler.incomplete == 1
 
 
-def test_a_damaged_start_flag_does_not_cut_a_turn():
-    turn = bytearray(turn_bytes(random.Random(1)))
-    turn[5 * 180] ^= 3
-    turns = feed(rplidar.ScanAssembler(), bytes(turn) + bytes(turn[:5]))
-    assert [t.angles_rad.size for t in turns] == [360]
+def test_a_damaged_start_flag_does_not_cut_a_scan():
+    scan = bytearray(scan_bytes(random.Random(1)))
+    scan[5 * 180] ^= 3
+    scans = feed(rplidar.ScanAssembler(), bytes(scan) + bytes(scan[:5]))
+    assert [t.angles_rad.size for t in scans] == [360]
 
 
-def test_nodes_without_end_do_not_fill_the_memory():
+def test_endless_scan_is_discarded_at_a_size_limit():
     assembler = rplidar.ScanAssembler()
     endless = b"".join(node(i * 64 % 23040, 4000, start=i == 0) for i in range(30_000))
     for begin in range(0, len(endless), 5000):
@@ -345,19 +349,19 @@ def test_nodes_without_end_do_not_fill_the_memory():
 
 def test_arrival_times_spread_over_a_batch_and_never_run_backwards():
     assembler = rplidar.ScanAssembler()
-    turn = turn_bytes(random.Random(1))
+    scan = scan_bytes(random.Random(1))
     times = []
     for number in range(40):
-        half = turn[: 5 * 180] if number % 2 == 0 else turn[5 * 180 :]
+        half = scan[: 5 * 180] if number % 2 == 0 else scan[5 * 180 :]
         for done in feed(assembler, half, now=0.09 * (number + 1)):
             times += [done.started_at, done.ended_at]
     assert times == sorted(times)
     assert times[3] - times[2] == pytest.approx(0.18 * 359 / 360, abs=1e-6)
 
 
-def test_a_restart_begins_a_new_turn():
+def test_a_restart_begins_a_new_scan():
     assembler = rplidar.ScanAssembler()
-    turn = turn_bytes(random.Random(1))
-    feed(assembler, turn)
+    scan = scan_bytes(random.Random(1))
+    feed(assembler, scan)
     assembler.reset()
-    assert feed(assembler, turn[500:] + turn + turn[:5])[0].angles_rad.size == 360
+    assert feed(assembler, scan[500:] + scan + scan[:5])[0].angles_rad.size == 360

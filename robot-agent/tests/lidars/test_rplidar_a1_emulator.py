@@ -112,11 +112,11 @@ def test_ranges_outside_the_rated_ones_give_no_return():
         assert (nodes[:, 3:] == 0).all()
 
 
-def test_a_resting_robot_never_sees_two_equal_turns():
+def test_a_resting_robot_never_sees_two_identical_scans():
     nodes = nodes_of(scanned(RplidarEmulator(box), 2.0))
     starts = np.flatnonzero(nodes[:, 0] & 1)
-    turns = [nodes[a:b].tobytes() for a, b in itertools.pairwise(starts)]
-    assert all(a != b for a, b in itertools.pairwise(turns))
+    scans = [nodes[a:b].tobytes() for a, b in itertools.pairwise(starts)]
+    assert all(a != b for a, b in itertools.pairwise(scans))
 
 
 def test_a_stalled_head_is_silent_and_goes_on_without_a_burst():
@@ -128,16 +128,16 @@ def test_a_stalled_head_is_silent_and_goes_on_without_a_burst():
     assert len(lidar.outgoing(0.41)) <= 5 * 21
 
 
-def test_a_frozen_link_repeats_one_turn():
+def test_a_frozen_link_repeats_one_scan():
     lidar = RplidarEmulator(box)
     scanned(lidar, 0.5)
     lidar.frozen = True
     data = b"".join(lidar.outgoing(0.5 + number * 0.01) for number in range(1, 101))
     nodes = nodes_of(data)
     starts = np.flatnonzero(nodes[:, 0] & 1)
-    turns = {nodes[a:b].tobytes() for a, b in itertools.pairwise(starts)}
+    scans = {nodes[a:b].tobytes() for a, b in itertools.pairwise(starts)}
     assert len(starts) > 4
-    assert len(turns) == 1
+    assert len(scans) == 1
 
 
 def test_a_device_in_error_does_not_scan():
@@ -160,7 +160,7 @@ def test_express_capsules_have_sync_nibbles_and_a_right_checksum():
     assert [bool(flag) for flag in capsules[:, 3] & 0x80] == [True] + [False] * 124
 
 
-def test_a_request_with_a_wrong_checksum_is_not_obeyed():
+def test_a_request_with_a_wrong_checksum_is_ignored():
     lidar = RplidarEmulator(box)
     lidar.receive(bytes.fromhex("a58205000000000023") + b"\xa5\x52", 0.0)
     assert lidar.outgoing(0.0)[:7] == bytes.fromhex("a55a0300000006")
@@ -172,7 +172,7 @@ def test_more_nodes_than_the_line_carries_are_refused():
 
 
 @given(st.binary(max_size=200), st.lists(st.integers(1, 30), max_size=8))
-def test_any_bytes_in_any_pieces_do_the_same_and_never_raise(data, sizes):
+def test_any_bytes_in_any_pieces_have_the_same_effect_and_never_raise(data, sizes):
     whole, cut = RplidarEmulator(box), RplidarEmulator(box)
     whole.receive(data, 0.0)
     at = 0

@@ -1,4 +1,4 @@
-"""Deskewing: what the robot's motion did to a scan is undone, whatever the motion."""
+"""Deskewing corrects a scan for any motion of the robot."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from robot_agent.localization.odometry_buffer import OdometryBuffer
 from robot_agent.localization.pose import Pose2
 
 POST = (2.0, 1.0)
-"""Where the only thing in sight stands, in `odom`."""
+"""Position of the only visible object, in `odom`."""
 
 
 def scan_of(ranges, angles=None, begin=0.0, end=0.18) -> LaserScan:
@@ -39,7 +39,7 @@ def at_rest(*, since: float = 0.0) -> OdometryBuffer:
 
 
 @given(v=st.floats(-0.3, 0.3), w=st.floats(-2.5, 2.5), x=st.floats(-0.1, 0.1), yaw=st.floats(-3.0, 3.0))
-def test_every_sample_of_one_post_falls_on_the_post(v, w, x, yaw):
+def test_every_sample_of_a_post_is_moved_to_the_post(v, w, x, yaw):
     config = LocalizationConfig(lidar_x=x, lidar_yaw=yaw)
     odometry = OdometryBuffer()
     pose = Pose2(0.0, 0.0, 0.3)
@@ -48,13 +48,13 @@ def test_every_sample_of_one_post_falls_on_the_post(v, w, x, yaw):
         odometry.add(0.002 * i, *pose)
         if i % 10 == 0:
             lidar = pose.compose(Pose2(config.lidar_x, config.lidar_y, config.lidar_yaw))
-            seen = Pose2(*POST, 0.0).relative_to(lidar)
-            ranges.append(math.hypot(seen.x, seen.y))
-            angles.append(math.atan2(seen.y, seen.x))
-        turned = pose.theta + 0.002 * w  # not wrapped, as odometry is
-        pose = Pose2(pose.x + 0.002 * v * math.cos(turned), pose.y + 0.002 * v * math.sin(turned), turned)
-    straight = deskew(scan_of(ranges, angles, 0.0, 0.18), odometry, config)
-    assert straight.odom.transform(straight.points) == pytest.approx(np.tile(POST, (10, 1)), abs=1e-6)
+            relative = Pose2(*POST, 0.0).relative_to(lidar)
+            ranges.append(math.hypot(relative.x, relative.y))
+            angles.append(math.atan2(relative.y, relative.x))
+        theta = pose.theta + 0.002 * w  # not wrapped, as odometry is
+        pose = Pose2(pose.x + 0.002 * v * math.cos(theta), pose.y + 0.002 * v * math.sin(theta), theta)
+    deskewed = deskew(scan_of(ranges, angles, 0.0, 0.18), odometry, config)
+    assert deskewed.odom.transform(deskewed.points) == pytest.approx(np.tile(POST, (10, 1)), abs=1e-6)
 
 
 def test_samples_without_a_return_or_out_of_range_are_left_out():

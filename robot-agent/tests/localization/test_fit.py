@@ -20,12 +20,12 @@ PLACE = Pose2(5.0, 2.0, 1.0)
 GOOD = Fit(agree=0.95, explained=0.9, contradict=0.02, informative=80)
 FAIR = Fit(agree=0.9, explained=0.8, contradict=0.12, informative=80)
 VAGUE = Fit(agree=0.9, explained=0.1, contradict=0.0, informative=4)
-DOUBTFUL = Fit(agree=0.6, explained=0.5, contradict=0.3, informative=80)
+CONTRADICTED = Fit(agree=0.6, explained=0.5, contradict=0.3, informative=80)
 WRONG = Fit(agree=0.2, explained=0.2, contradict=0.6, informative=80)
 SURE = (0.05, 0.02)
 
 
-def seen_at(pose: Pose2, *, shorten: float = 0.0):
+def points_at(pose: Pose2, *, shorten: float = 0.0):
     angles = np.linspace(-math.pi, math.pi, 120, endpoint=False)
     ranges = FIELDS.ranges(pose.x, pose.y, angles + pose.theta, 12.0) - shorten
     hit = np.isfinite(ranges)
@@ -40,42 +40,42 @@ def monitor_after(*fits: Fit, trial: int = 0) -> FitMonitor:
     return monitor
 
 
-def test_what_the_map_shows_agrees_and_contradicts_nothing():
-    fit = evaluate_fit(FIELDS, PLACE, seen_at(PLACE), 12.0)
+def test_scan_of_the_map_itself_agrees_and_contradicts_nothing():
+    fit = evaluate_fit(FIELDS, PLACE, points_at(PLACE), 12.0)
     assert fit.agree > 0.95
     assert fit.explained > 0.95
     assert fit.contradict < 0.05
 
 
-def test_beams_through_walls_contradict_and_things_before_walls_do_not():
-    through = evaluate_fit(FIELDS, PLACE, seen_at(PLACE, shorten=-0.6), 12.0)
+def test_beams_through_walls_contradict_and_objects_before_walls_do_not():
+    through = evaluate_fit(FIELDS, PLACE, points_at(PLACE, shorten=-0.6), 12.0)
     assert through.contradict > 0.5
-    before = evaluate_fit(FIELDS, PLACE, seen_at(PLACE, shorten=0.45), 12.0)
+    before = evaluate_fit(FIELDS, PLACE, points_at(PLACE, shorten=0.45), 12.0)
     assert before.contradict < 0.2
     assert before.explained < 0.5
 
 
-def test_no_beam_tells_nothing_and_counts_as_contradiction():
+def test_scan_without_beams_counts_as_contradiction():
     fit = evaluate_fit(FIELDS, PLACE, np.zeros((0, 2)), 12.0)
     assert (fit.informative, fit.contradict) == (0, 1.0)
 
 
 @pytest.mark.parametrize(
-    ("fit", "sigmas", "grade", "why"),
+    ("fit", "sigmas", "grade", "reason"),
     [
         (GOOD, SURE, "good", ""),
-        (DOUBTFUL, SURE, "weak", "look through walls"),
-        (WRONG, SURE, "lost", "look through walls"),
+        (CONTRADICTED, SURE, "weak", "pass through walls"),
+        (WRONG, SURE, "lost", "pass through walls"),
         (VAGUE, SURE, "weak", "too few beams"),
         (GOOD, (1.2, 0.1), "lost", "uncertain by 1.2 m"),
         (GOOD, (0.4, 0.1), "weak", "0.40 m"),
         (GOOD, (0.1, 0.4), "weak", "0.40 rad"),
     ],
 )
-def test_grade_and_reason(fit, sigmas, grade, why):
+def test_grade_and_reason(fit, sigmas, grade, reason):
     found = grade_fit(fit, *sigmas)
     assert found[0] == grade
-    assert why in found[1]
+    assert reason in found[1]
 
 
 def test_two_good_scans_make_a_good_pose():
@@ -89,15 +89,15 @@ def test_pose_that_has_not_proved_itself_needs_a_better_fit():
     assert monitor_after(GOOD, GOOD, FAIR, FAIR, FAIR).status == "good"
 
 
-def test_single_bad_scan_is_no_loss_and_five_of_nine_are():
+def test_single_bad_scan_keeps_the_pose_and_five_of_nine_lose_it():
     assert monitor_after(GOOD, GOOD, WRONG).status == "good"
     assert monitor_after(GOOD, GOOD, WRONG, WRONG, WRONG).status == "weak"
     assert monitor_after(GOOD, GOOD, *[WRONG] * 5).status == "lost"
 
 
-def test_lasting_doubt_is_a_loss():
-    assert monitor_after(GOOD, GOOD, *[DOUBTFUL] * 24).status == "weak"
-    assert monitor_after(GOOD, GOOD, *[DOUBTFUL] * 25).status == "lost"
+def test_lasting_contradiction_loses_the_pose():
+    assert monitor_after(GOOD, GOOD, *[CONTRADICTED] * 24).status == "weak"
+    assert monitor_after(GOOD, GOOD, *[CONTRADICTED] * 25).status == "lost"
 
 
 def test_four_weak_scans_make_a_new_pose_weak_but_not_one_on_trial():
@@ -128,7 +128,7 @@ def test_lost_pose_stays_lost_while_the_map_is_searched():
     assert monitor.status == "good"
 
 
-@given(st.lists(st.sampled_from([GOOD, FAIR, VAGUE, DOUBTFUL, WRONG]), max_size=60))
+@given(st.lists(st.sampled_from([GOOD, FAIR, VAGUE, CONTRADICTED, WRONG]), max_size=60))
 def test_any_status_but_good_has_a_reason(fits):
     monitor = FitMonitor()
     for fit in fits:

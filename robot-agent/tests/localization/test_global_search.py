@@ -31,7 +31,7 @@ def search(fields: MapFields, points) -> tuple[SearchResult, int]:
         result = one.advance(fields)
         if result is not None:
             return result, shares
-    raise AssertionError("the search never ends")
+    raise AssertionError("the search does not end")
 
 
 @pytest.mark.parametrize("place", [Pose2(5.0, 2.0, 1.0), Pose2(12.0, 8.0, -2.0)])

@@ -42,9 +42,9 @@ def test_free_places_are_free_and_clear_of_walls():
     assert FIELDS.wall_distances(FIELDS.free_places).min() >= 0.15 - 1e-6
 
 
-def test_only_another_map_asks_for_other_fields():
-    assert FIELDS.shows(STATIC, GEOMETRY)
+def test_fields_match_only_their_own_map():
+    assert FIELDS.matches(STATIC, GEOMETRY)
     other = STATIC.copy()
     other[50, 50] = 254 - other[50, 50]
-    assert not FIELDS.shows(other, GEOMETRY)
-    assert not FIELDS.shows(STATIC, GridGeometry(GEOMETRY.width, GEOMETRY.height, 0.1, 0.0, 0.0))
+    assert not FIELDS.matches(other, GEOMETRY)
+    assert not FIELDS.matches(STATIC, GridGeometry(GEOMETRY.width, GEOMETRY.height, 0.1, 0.0, 0.0))

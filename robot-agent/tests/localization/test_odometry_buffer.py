@@ -22,12 +22,12 @@ def driven(v: float, w: float, *, until: float = 1.0) -> OdometryBuffer:
 
 
 @given(v=st.floats(-0.3, 0.3), w=st.floats(-2.0, 2.0).filter(lambda w: abs(w) > 0.01), at=st.floats(0.0, 1.0))
-def test_pose_between_two_readings_lies_on_the_way(v, w, at):
+def test_pose_between_two_readings_lies_on_the_arc(v, w, at):
     pose = driven(v, w).pose(at)
     assert pose == pytest.approx((v / w * math.sin(w * at), v / w * (1.0 - math.cos(w * at)), w * at), abs=1e-4)
 
 
-def test_speed_is_that_of_the_last_stretch():
+def test_twist_is_that_of_the_last_readings():
     assert driven(0.25, 0.8).twist() == pytest.approx((0.25, 0.8), abs=1e-3)
     assert driven(-0.1, 0.0).twist() == pytest.approx((-0.1, 0.0), abs=1e-6)
 
@@ -53,7 +53,7 @@ def test_reading_that_is_not_newer_is_ignored():
     assert buffer.latest() == before
 
 
-def test_without_readings_nothing_is_known():
+def test_empty_buffer_has_no_pose_and_zero_twist():
     buffer = OdometryBuffer()
     assert buffer.pose(1.0) is None
     assert buffer.latest() is None

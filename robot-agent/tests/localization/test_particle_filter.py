@@ -52,7 +52,7 @@ def test_given_pose_is_refined_by_the_first_scan():
     assert one.sigmas() == pytest.approx((0.08 * math.sqrt(2.0), 0.04))
 
 
-def test_scan_with_next_to_no_points_leaves_the_given_pose():
+def test_scan_with_too_few_points_leaves_the_given_pose():
     one = ParticleFilter(CONFIG, 1)
     one.start(START, ORIGIN, 0.4, 0.3)
     one.add(DeskewedScan(np.ones((3, 2)), ORIGIN, 0.0), FIELDS, recover=False)
@@ -84,7 +84,7 @@ def test_scans_correct_odometry_that_drifts():
     one, true, odom = driven(2, drift=0.02)
     found = one.pose(odom)
     assert math.hypot(found.x - true.x, found.y - true.y) < 0.1
-    assert math.hypot(*np.subtract(START.compose(odom)[:2], true[:2])) > 0.8  # what the odometry alone would say
+    assert math.hypot(*np.subtract(START.compose(odom)[:2], true[:2])) > 0.8  # error of the odometry alone
 
 
 def test_number_of_particles_shrinks_with_their_spread_and_the_seed_repeats_everything():
@@ -96,7 +96,7 @@ def test_number_of_particles_shrinks_with_their_spread_and_the_seed_repeats_ever
     assert other.pose(odom) != one.pose(odom)
 
 
-def test_random_guesses_are_scattered_only_when_allowed_and_scans_fit_less_and_less():
+def test_random_particles_are_added_only_when_allowed_and_the_fit_declines():
     spreads = []
     for recover in (False, True):
         one, _, odom = driven(2, drift=0.0)

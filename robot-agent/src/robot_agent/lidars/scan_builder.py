@@ -1,4 +1,4 @@
-"""From batches of samples to whole scans, for any lidar whose head turns. Pure."""
+"""From batches of samples to whole scans, for any rotating lidar. Pure."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _ARRIVAL_GAP_S: Final = 0.5
 
 
 class Samples(NamedTuple):
-    """A batch of n samples in order of arrival; how they are cut into batches means nothing.
+    """A batch of n samples in order of arrival; the boundaries between batches have no meaning.
 
     clockwise_rad: float64[n], clockwise seen from above, 0 straight ahead, in [0, 2 pi).
     ranges_m: float64[n], nan for no return. quality: uint8[n].
@@ -32,10 +32,10 @@ class Samples(NamedTuple):
 
 
 class ScanBuilder:
-    """Samples -> whole scans. A scan runs from one boundary to the next and must have looked in nearly all directions.
+    """Samples -> whole scans. A scan runs from one boundary to the next and must cover nearly all directions.
 
-    `incomplete` counts scans that were thrown away because samples were missing; the piece before the first boundary
-    does not count.
+    `incomplete` counts scans that were discarded because samples were missing; the samples before the first
+    boundary do not count.
     """
 
     def __init__(self) -> None:
@@ -43,12 +43,12 @@ class ScanBuilder:
         self._times: list[NDArray[np.float64]] = []
         self._count = 0
         self._started = False
-        self._arrived: float | None = None
+        self._last_arrival: float | None = None
         self._repeats = RepeatCounter()
         self.incomplete = 0
 
     def feed(self, samples: Samples, boundaries: Iterable[int], now: float) -> list[LaserScan]:
-        """Take a batch that arrived at `now` (s, monotonic); return the scans that it completes.
+        """Add a batch that arrived at `now` (s, monotonic); return the scans that it completes.
 
         `boundaries` are the indices, in order, of the samples with which a new scan begins.
         """
@@ -65,14 +65,14 @@ class ScanBuilder:
         return scans
 
     def reset(self) -> None:
-        """Forget the scan at hand, after a gap or a new beginning."""
+        """Discard the incomplete scan, after a gap or a restart."""
         self._clear()
         self._started = False
-        self._arrived = None
+        self._last_arrival = None
 
     def _arrival_times(self, count: int, now: float) -> NDArray[np.float64]:
-        before = self._arrived
-        self._arrived = now
+        before = self._last_arrival
+        self._last_arrival = now
         if before is None or not 0.0 <= now - before <= _ARRIVAL_GAP_S:
             return np.full(count, now)
         return before + (now - before) * np.arange(1, count + 1) / max(count, 1)

@@ -1,1 +1,1 @@
-"""Where the robot is: odometry buffer, deskewing, map fields, particle filter, fit monitor, global search."""
+"""Localization: odometry buffer, deskewing, map fields, particle filter, fit monitor, global search."""

@@ -1,4 +1,4 @@
-"""A scan without the skew that the robot's motion gave it: each sample was taken somewhere else."""
+"""Deskewing: correct a scan for the robot's motion during the revolution."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class DeskewedScan:
-    """A scan as if all of it had been taken at its end.
+    """A scan whose samples are moved to the robot's pose at its end.
 
-    points: (n, 2) m, frame `base` at the scan's end, samples without a return or out of the rated range left out.
-    odom: pose of `base` in `odom` at that time. at: that time (s).
+    points: (n, 2) m, frame `base` at the scan's end, without samples that have no return or exceed the rated range.
+    odom: pose of `base` in `odom` at that time. timestamp: that time (s).
     """
 
     points: NDArray[np.float64]
     odom: Pose2
-    at: float
+    timestamp: float
 
     def beams(self, count: int) -> NDArray[np.float64]:
         """Return at most `count` of the points, evenly spread over the revolution."""

@@ -1,7 +1,7 @@
-"""Finding the robot anywhere on the map: candidate poses everywhere, scored coarse to fine.
+"""Global localization: candidate poses all over the map, scored coarse to fine.
 
-Method: in the manner of Olson 2009, over the likelihood field. The work is done in shares, one with each scan, while
-the robot stands.
+Method: after Olson 2009, over the likelihood field. The work is split into shares, one with each scan, while the
+robot is at rest.
 """
 
 from __future__ import annotations
@@ -20,32 +20,32 @@ if TYPE_CHECKING:
     from robot_agent.localization.map_fields import MapFields
 
 _CHUNK: Final = 40_000
-"""Candidate poses that one scan's share of a search scores: some 10 ms."""
+"""Candidate poses scored with each scan: some 10 ms."""
 _SPACING_M: Final = 0.3
 _HEADINGS: Final = 36
 _REFINED: Final = 400
 """Candidates that are refined."""
 _PLACES: Final = 8
-"""Places that are compared in the end, ..."""
+"""Places that are compared at the end, ..."""
 _APART_M: Final = 0.6
 _APART_RAD: Final = 0.5
 """... apart from one another by this distance or this angle."""
 _AMBIGUOUS: Final = 0.85
-"""A second place that fits this well, as a share of the best, makes the search undecided."""
+"""A second place that fits this well, as a share of the best, makes the search ambiguous."""
 
 
 class SearchResult(NamedTuple):
-    """The pose in `map` that was found, or None and why there is none, in words."""
+    """The pose in `map` that was found, or None and the reason."""
 
     pose: Pose2 | None
     detail: str
 
 
 class GlobalSearch:
-    """A search under way, for where the robot stood when it saw `points`."""
+    """A search in progress for the pose at which the robot measured `points`."""
 
     def __init__(self, fields: MapFields, points: NDArray[np.float64], odom: Pose2, range_max: float) -> None:
-        """Begin; points (n, 2; m, frame `base`) were seen at `odom`, by a lidar with a rated range of `range_max` m."""
+        """Begin; points (n, 2; m, frame `base`) were measured at `odom`; `range_max`: the lidar's rated range (m)."""
         places = fields.free_places
         spaced = places[np.unique(np.floor(places / _SPACING_M).astype(np.int64), axis=0, return_index=True)[1]]
         headings = np.arange(_HEADINGS) * (2.0 * math.pi / _HEADINGS)
@@ -58,7 +58,7 @@ class GlobalSearch:
         """Pose in `odom` to which the result belongs."""
 
     def advance(self, fields: MapFields) -> SearchResult | None:
-        """Do a share of the work on a map; return the result once there is one."""
+        """Do one share of the work; return the result once there is one."""
         if self._scored < len(self._candidates):
             part = slice(self._scored, self._scored + _CHUNK)
             self._scores[part] = fields.scores(self._candidates[part], self._points, fields.coarse)
@@ -82,14 +82,14 @@ class GlobalSearch:
         return poses, scores
 
     def _conclude(self, fields: MapFields, poses: NDArray[np.float64], scores: NDArray[np.float64]) -> SearchResult:
-        """Keep the best place unless another one, elsewhere, explains the scan nearly as well."""
+        """Return the best place unless another one explains the scan nearly as well."""
         fitting: list[tuple[float, Pose2]] = []
         for score, pose in _places(poses, scores):
             fit = evaluate_fit(fields, pose, self._points, self._range_max)
             if _fits(fit):
                 fitting.append((score * (1.0 - fit.contradict) * fit.explained, pose))
         if not fitting:
-            return SearchResult(None, "the lidar's view fits no place of the map: give the initial pose")
+            return SearchResult(None, "the scan fits no place of the map: give the initial pose")
         fitting.sort(key=lambda entry: -entry[0])
         if len(fitting) > 1 and fitting[1][0] > _AMBIGUOUS * fitting[0][0]:
             return SearchResult(None, "several places of the map look like this one: give the initial pose")

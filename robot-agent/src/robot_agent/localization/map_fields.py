@@ -1,4 +1,4 @@
-"""What localization needs of the static map, computed once per map: likelihood fields, wall distances, free places.
+"""Fields of the static map for localization, computed once per map: likelihoods, wall distances, free places.
 
 Method: likelihood field of a range scanner (Thrun, Burgard and Fox 2005, chapter 6.4).
 """
@@ -23,10 +23,10 @@ if TYPE_CHECKING:
     from fog_contracts.grid import GridGeometry
     from robot_agent.config import LocalizationConfig
 
-_WALL_REACH_M: Final = 1.0
+_WALL_DISTANCE_MAX_M: Final = 1.0
 """Wall distances are exact up to here."""
 _FREE_CLEARANCE_M: Final = 0.15
-"""A robot may be guessed on free cells at least this far from a wall."""
+"""Candidate poses lie on free cells at least this far from a wall."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,13 +46,13 @@ class MapFields:
     wall_distance: NDArray[np.float32]
     free_places: NDArray[np.float64]
 
-    def shows(self, static: NDArray[np.uint8], geometry: GridGeometry) -> bool:
+    def matches(self, static: NDArray[np.uint8], geometry: GridGeometry) -> bool:
         """Whether these are the fields of a map with the same walls."""
         return self.geometry == geometry and np.array_equal(static == LETHAL, self.occupied)
 
     def wall_distances(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the distances (n; m, at most 1) of points (n, 2; m) in `map` to the nearest wall; 1 off the map."""
-        return self.geometry.sample(self.wall_distance, points, _WALL_REACH_M).astype(np.float64)
+        return self.geometry.sample(self.wall_distance, points, _WALL_DISTANCE_MAX_M).astype(np.float64)
 
     def ranges(self, x: float, y: float, angles: NDArray[np.float64], reach: float) -> NDArray[np.float64]:
         """Return the ranges (n; m) to the first wall from (x, y) in `map` along angles (n; rad), inf beyond `reach`."""
@@ -73,7 +73,7 @@ class MapFields:
 def map_fields(static: NDArray[np.uint8], geometry: GridGeometry, config: LocalizationConfig) -> MapFields:
     """Compute the fields of a static map (height, width; 0 free, 254 occupied, 255 unknown)."""
     occupied = np.ascontiguousarray(static == LETHAL).astype(np.uint8)
-    # A beam ends at the face of a wall; the inside of solid blocks must attract none.
+    # A beam ends at the face of a wall; cells inside solid blocks must not be likely.
     faces = occupied & ~_eroded(occupied)
 
     def field(sigma: float) -> NDArray[np.float32]:
@@ -81,7 +81,7 @@ def map_fields(static: NDArray[np.uint8], geometry: GridGeometry, config: Locali
             faces, geometry.resolution, sigma, config.field_reach, config.z_hit, config.z_rand, config.range_max
         )
 
-    cap = max(1, math.ceil(_WALL_REACH_M / geometry.resolution))
+    cap = max(1, math.ceil(_WALL_DISTANCE_MAX_M / geometry.resolution))
     wall_distance = (np.sqrt(squared_distance_capped(faces, cap)) * geometry.resolution).astype(np.float32)
     rows, columns = np.nonzero((static == FREE) & (wall_distance >= _FREE_CLEARANCE_M))
     return MapFields(

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 _HISTORY_S: Final = 3.0
 _EXTRAPOLATION_S: Final = 0.15
 _TWIST_OVER_S: Final = 0.15
-_TWIST_LEAST_S: Final = 0.03
+_TWIST_MIN_S: Final = 0.03
 
 
 class OdometryBuffer:
@@ -25,27 +25,27 @@ class OdometryBuffer:
     def __init__(self) -> None:
         self._history: deque[tuple[float, float, float, float]] = deque()
 
-    def add(self, at: float, x: float, y: float, theta: float) -> None:
+    def add(self, timestamp: float, x: float, y: float, theta: float) -> None:
         """Append a pose; one that is not newer than the last is ignored."""
-        if self._history and at <= self._history[-1][0]:
+        if self._history and timestamp <= self._history[-1][0]:
             return
-        self._history.append((at, x, y, theta))
-        while self._history[0][0] < at - _HISTORY_S:
+        self._history.append((timestamp, x, y, theta))
+        while self._history[0][0] < timestamp - _HISTORY_S:
             self._history.popleft()
 
-    def reaches_back_to(self, at: float) -> bool:
+    def reaches_back_to(self, timestamp: float) -> bool:
         """Whether there is a pose at this time (s) or before."""
-        return bool(self._history) and self._history[0][0] <= at
+        return bool(self._history) and self._history[0][0] <= timestamp
 
     def latest(self) -> Pose2 | None:
         """Return the newest pose; None before the first."""
         return self.pose(self._history[-1][0]) if self._history else None
 
-    def pose(self, at: float) -> Pose2 | None:
+    def pose(self, timestamp: float) -> Pose2 | None:
         """Return the pose at a time (s), interpolated; extrapolated by at most 0.15 s. None before the first."""
         if not self._history:
             return None
-        x, y, theta = self.poses(np.array([at]))
+        x, y, theta = self.poses(np.array([timestamp]))
         return Pose2(float(x[0]), float(y[0]), float(theta[0]))
 
     def poses(self, times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
@@ -62,16 +62,16 @@ class OdometryBuffer:
     def twist(self) -> tuple[float, float]:
         """Return forward speed (m/s) and turning rate (rad/s) over the last 0.15 s or more; zeros without that.
 
-        Readings that were held up arrive together: between them no time passes, so a stretch must not begin within
-        such a bunch.
+        Delayed readings arrive together with almost no time between them, so the interval must not begin within such a
+        burst.
         """
         if len(self._history) < 2:
             return 0.0, 0.0
-        at, x, y, theta = self._history[-1]
-        earlier = (entry for entry in reversed(self._history) if entry[0] <= at - _TWIST_OVER_S)
+        timestamp, x, y, theta = self._history[-1]
+        earlier = (entry for entry in reversed(self._history) if entry[0] <= timestamp - _TWIST_OVER_S)
         old = next(earlier, self._history[0])
-        span = at - old[0]
-        if span < _TWIST_LEAST_S:
+        span = timestamp - old[0]
+        if span < _TWIST_MIN_S:
             return 0.0, 0.0
         heading = 0.5 * (theta + old[3])
         forward = (x - old[1]) * math.cos(heading) + (y - old[2]) * math.sin(heading)

@@ -20,14 +20,14 @@ if TYPE_CHECKING:
     from robot_agent.localization.deskew import DeskewedScan
     from robot_agent.localization.map_fields import MapFields
 
-_SETTLE_SAMPLES: Final = 4000
+_REFINE_SAMPLES: Final = 4000
 """Poses tried per round of refining a given pose, ..."""
-_SETTLE_SHRINK: Final = 0.4
+_REFINE_SHRINK: Final = 0.4
 """... each round within this share of the spread of the one before."""
-_SETTLE_BEAMS_LEAST: Final = 5
-_SETTLED_SIGMAS: Final = (0.08, 0.04)
+_REFINE_BEAMS_MIN: Final = 5
+_REFINED_SIGMAS: Final = (0.08, 0.04)
 """Standard deviations (m, rad) of a refined pose."""
-_RANDOM_SHARE_MOST: Final = 0.1
+_RANDOM_SHARE_MAX: Final = 0.1
 
 
 class ParticleFilter:
@@ -47,7 +47,7 @@ class ParticleFilter:
         self._estimate: Pose2 | None = None
         self._anchor = Pose2(0.0, 0.0, 0.0)
         """Odometry at which the estimate was made."""
-        self._unsettled: tuple[float, float] | None = None
+        self._unrefined_sigmas: tuple[float, float] | None = None
         """Standard deviations (m, rad) of a given pose that no scan has refined yet."""
         self._slow = self._fast = 0.0
         self.covariance: NDArray[np.float64] = np.zeros((3, 3))
@@ -77,26 +77,26 @@ class ParticleFilter:
     def start(self, pose: Pose2, odom: Pose2, sigma_xy: float, sigma_theta: float) -> None:
         """Start at a pose in `map` with these standard deviations (m, rad), which the next scan refines by search."""
         self.place(pose, odom, sigma_xy, sigma_theta)
-        self._unsettled = (sigma_xy, sigma_theta)
+        self._unrefined_sigmas = (sigma_xy, sigma_theta)
 
     def place(self, pose: Pose2, odom: Pose2, sigma_xy: float, sigma_theta: float) -> None:
         """Start at a pose in `map` that was found by search, with these standard deviations (m, rad)."""
         self._anchor = odom
-        self._unsettled = None
+        self._unrefined_sigmas = None
         self._slow = self._fast = 0.0
         self._spread(pose, sigma_xy, sigma_theta)
 
     def forget(self) -> None:
-        """Drop the estimate: the robot may be anywhere."""
+        """Discard the estimate."""
         self._estimate = None
 
     def add(self, scan: DeskewedScan, fields: MapFields, *, recover: bool) -> None:
         """Correct the estimate by a scan when the robot moved since the last one; there must be an estimate.
 
-        `recover`: whether guesses may be scattered over the map when scans fit less and less.
+        `recover`: whether random particles may be added over the map when scans fit less and less.
         """
-        if self._unsettled is not None:
-            self._settle(scan, fields)
+        if self._unrefined_sigmas is not None:
+            self._refine(scan, fields)
         else:
             self._update(scan, fields, recover=recover)
 
@@ -109,25 +109,25 @@ class ParticleFilter:
         self._theta = (pose.theta + sigma_theta * self._rng.standard_normal(count)).astype(np.float32)
         self._weights = np.full(count, 1.0 / count)
 
-    def _settle(self, scan: DeskewedScan, fields: MapFields) -> None:
-        """Find the best pose within the stated doubt by search; weighing once would leave too few particles alive."""
+    def _refine(self, scan: DeskewedScan, fields: MapFields) -> None:
+        """Search the best pose within the given deviations; a single weighting would leave too few particles."""
         pose = self.pose(scan.odom)
         assert pose is not None
-        assert self._unsettled is not None
+        assert self._unrefined_sigmas is not None
         self._anchor = scan.odom
         points = scan.beams(self._config.beams)
-        if len(points) < _SETTLE_BEAMS_LEAST:
+        if len(points) < _REFINE_BEAMS_MIN:
             self._estimate = pose
             return
-        sigma_xy, sigma_theta = self._unsettled
+        sigma_xy, sigma_theta = self._unrefined_sigmas
         for field in (fields.coarse, fields.fine, fields.fine, fields.fine):
-            noise = self._rng.standard_normal((_SETTLE_SAMPLES, 3)) * (sigma_xy, sigma_xy, sigma_theta)
+            noise = self._rng.standard_normal((_REFINE_SAMPLES, 3)) * (sigma_xy, sigma_xy, sigma_theta)
             tried = np.array(pose) + noise
             tried[0] = pose
             pose = Pose2(*(float(v) for v in tried[int(np.argmax(fields.scores(tried, points, field)))]))
-            sigma_xy, sigma_theta = _SETTLE_SHRINK * sigma_xy, _SETTLE_SHRINK * sigma_theta
-        self._unsettled = None
-        self._spread(Pose2(pose.x, pose.y, wrap(pose.theta)), *_SETTLED_SIGMAS)
+            sigma_xy, sigma_theta = _REFINE_SHRINK * sigma_xy, _REFINE_SHRINK * sigma_theta
+        self._unrefined_sigmas = None
+        self._spread(Pose2(pose.x, pose.y, wrap(pose.theta)), *_REFINED_SIGMAS)
 
     def _update(self, scan: DeskewedScan, fields: MapFields, *, recover: bool) -> None:
         config = self._config
@@ -137,9 +137,9 @@ class ParticleFilter:
         delta = amcl.odometry_delta(self._anchor, scan.odom)
         amcl.motion_update(self._x, self._y, self._theta, *delta, config.alphas, self._state)
         self._anchor = scan.odom
-        random_share = self._weigh(scan, fields)
+        random_share = self._update_weights(scan, fields)
         if not recover:
-            # Unknown things lower the average too: guesses are scattered only while the map contradicts the pose.
+            # Unknown objects lower the average too: random particles are added only while the pose is not good.
             random_share = 0.0
         found = amcl.estimate(self._x, self._y, self._theta, self._weights)
         self._estimate = Pose2(found.x, found.y, found.theta)
@@ -161,8 +161,8 @@ class ParticleFilter:
             jitter=fields.geometry.resolution,
         )
 
-    def _weigh(self, scan: DeskewedScan, fields: MapFields) -> float:
-        """Weigh the particles by a scan; return the share of random ones that augmented recovery asks for."""
+    def _update_weights(self, scan: DeskewedScan, fields: MapFields) -> float:
+        """Weight the particles by a scan; return the share of random ones that augmented recovery asks for."""
         config = self._config
         points = scan.beams(config.beams)
         average = 0.0
@@ -178,4 +178,4 @@ class ParticleFilter:
         self._fast += (config.recovery_fast if self._fast else 1.0) * (average - self._fast)
         if self._slow <= 0.0:
             return 0.0
-        return min(_RANDOM_SHARE_MOST, max(0.0, 1.0 - self._fast / self._slow))
+        return min(_RANDOM_SHARE_MAX, max(0.0, 1.0 - self._fast / self._slow))

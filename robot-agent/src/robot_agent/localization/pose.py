@@ -1,4 +1,4 @@
-"""Poses in the plane, and going from one frame to another."""
+"""Poses in the plane, and transformations between frames."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def wrap(angle: float) -> float:
 
 
 class Pose2(NamedTuple):
-    """A pose (m, m, rad) in the frame that its holder says."""
+    """A pose (m, m, rad) in the frame that its owner documents."""
 
     x: float
     y: float

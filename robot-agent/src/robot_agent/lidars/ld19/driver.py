@@ -1,4 +1,4 @@
-"""The LD19 as a lidar: it spins and sends from power-on, so there is nothing to say to it, only to listen."""
+"""Driver of the LD19: it rotates and sends from power-on and takes no commands."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from msgspec import Meta
 from robot_agent.hardware import LaserScan, LidarEvents, LidarFactory, LidarTraits, SerialSettings
 from robot_agent.lidars.ld19 import protocol
 
-SILENT_S: Final = 1.0
+SAMPLES_TIMEOUT_S: Final = 1.0
 
 
 class Ld19Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """`range_max_m`: beyond it a return is not believed. `intensity_min`: a weaker return (0..255) counts as none."""
+    """`range_max_m`: returns beyond it are ignored. `intensity_min`: a weaker return (0..255) is ignored."""
 
     range_max_m: Annotated[float, Meta(ge=1.0, le=protocol.RANGE_MAX_M)] = protocol.RANGE_MAX_M
     intensity_min: Annotated[int, Meta(ge=0, le=255)] = 0
 
 
 class Ld19Driver:
-    """One lidar's conversation; see `robot_agent.hardware.LidarDriver`."""
+    """Protocol of one lidar; see `robot_agent.hardware.LidarDriver`."""
 
     serial = SerialSettings(protocol.BAUD)
     stop_command = b""
@@ -31,35 +31,37 @@ class Ld19Driver:
         self.traits = LidarTraits(range_min_m=protocol.RANGE_MIN_M, range_max_m=chosen.range_max_m, scan_period_s=0.1)
         self._parser = protocol.Parser()
         self._assembler = protocol.ScanAssembler(chosen.intensity_min)
-        self._heard_at = 0.0
+        self._samples_at = 0.0
         self.problem = ""
 
     @property
     def corrupted(self) -> int:
-        """Packets that came damaged."""
+        """Number of damaged packets."""
         return self._parser.corrupted
 
     def begin(self, now: float) -> bytes:
         """Begin (again), after the port was opened; there is nothing to send."""
         self._parser.reset()
         self._assembler.reset()
-        self._heard_at, self.problem = now, ""
+        self._samples_at, self.problem = now, ""
         return b""
 
     def receive(self, data: bytes, now: float) -> LidarEvents:
-        """Take what came from the port."""
+        """Parse bytes received from the port."""
         self._parser.receive_data(data)
         scans: list[LaserScan] = []
         samples = False
         while (packets := self._parser.next_event()) is not None:
-            samples, self._heard_at, self.problem = True, now, ""
+            samples, self._samples_at, self.problem = True, now, ""
             scans.extend(self._assembler.feed(packets, now))
         return LidarEvents(samples, tuple(scans))
 
     def tick(self, now: float) -> bytes:
-        """Let time pass: a silent lidar is problem, and nothing can be sent to mend it."""
-        if now - self._heard_at > SILENT_S:
-            self.problem = f"the lidar has sent no good packet for {SILENT_S:.0f} s; check its cable and power"
+        """Advance time; a silent lidar is a problem, but no command can restart it."""
+        if now - self._samples_at > SAMPLES_TIMEOUT_S:
+            self.problem = (
+                f"the lidar has sent no valid packet for {SAMPLES_TIMEOUT_S:.0f} s; check its cable and power"
+            )
         return b""
 
 

@@ -1,7 +1,7 @@
-"""An LD19 as its serial port shows it: packets of twelve samples from power-on. Pure; deaf, as the real one is.
+"""Emulator of an LD19 at its serial port: packets of twelve samples from power-on, and no input. Pure.
 
-The world's function gives the distances. The head's control holds 10 turns a second about, so that no two turns have
-their samples at the same angles.
+A function of the simulated world gives the distances. The head rotates not exactly 10 times a second, so no two
+revolutions have their samples at the same angles.
 """
 
 from __future__ import annotations
@@ -20,32 +20,32 @@ Measure = Callable[["NDArray[np.float64]", float], "NDArray[np.float64]"]
 
 BAUD: Final = 230_400
 SAMPLES_PER_S: Final = 4500.0
-TURNS_PER_S: Final = 10.03
+SCANS_PER_S: Final = 10.03
 RANGE_MIN_M: Final = 0.02
 RANGE_MAX_M: Final = 12.0
 _SAMPLES: Final = 12
 _PACKET_S: Final = _SAMPLES / SAMPLES_PER_S
-# A simulation that paused gives no burst of what it missed.
+# After a pause of the simulation, missed packets are not sent in a burst.
 _CATCH_UP_S: Final = 0.5
-# Packets whose samples one call of the world's function measures: 11 ms.
+# Packets per call of the measuring function: 11 ms.
 _CHUNK: Final = 4
 
 
 class Ld19Emulator:
-    """The lidar's end of the serial line, as `fognav_sim.devices.LidarEmulator` asks for it.
+    """The lidar's end of the serial line; implements `fognav_sim.devices.LidarEmulator`.
 
-    Two faults can be set at any time: `stalled` sends nothing more, `frozen` sends the same turn again and again, as a
-    stuck bridge does.
+    Two faults can be set at any time: `stalled` sends nothing more, `frozen` repeats the last revolution, as a stuck
+    serial bridge does.
     """
 
     def __init__(self, measure: Measure) -> None:
-        """Take the world's measuring function."""
+        """Store the measuring function of the simulated world."""
         self._measure = measure
         self._sent_until: float | None = None
         self._position = 0.25
         self._milliseconds = 0.0
-        self._turn: list[bytes] = []
-        self._last_turn: list[bytes] = []
+        self._revolution: list[bytes] = []
+        self._last_revolution: list[bytes] = []
         self._replayed = 0
         self.stalled = False
         self.frozen = False
@@ -56,10 +56,10 @@ class Ld19Emulator:
         return BAUD
 
     def receive(self, data: bytes, now: float) -> None:
-        """Take bytes of the host: the LD19 has no input."""
+        """Ignore bytes of the host: the LD19 has no input."""
 
     def outgoing(self, now: float) -> bytes:
-        """Return what the lidar has sent up to `now`, once; this is where the world is measured."""
+        """Return what the lidar has sent up to `now`, once; this measures the world."""
         if self._sent_until is None or now - self._sent_until > _CATCH_UP_S:
             self._sent_until = now
         due = math.floor((now - self._sent_until) / _PACKET_S + 1e-9)
@@ -68,49 +68,51 @@ class Ld19Emulator:
             count = min(due, _CHUNK)
             due -= count
             self._sent_until += count * _PACKET_S
-            if self.frozen and self._last_turn:
-                sent += self._again(count)
+            if self.frozen and self._last_revolution:
+                sent += self._replay(count)
             elif not self.stalled:
                 sent += self._packets(count, self._sent_until)
         return b"".join(sent)
 
-    def _again(self, count: int) -> list[bytes]:
-        chosen = [self._last_turn[(self._replayed + i) % len(self._last_turn)] for i in range(count)]
+    def _replay(self, count: int) -> list[bytes]:
+        chosen = [self._last_revolution[(self._replayed + i) % len(self._last_revolution)] for i in range(count)]
         self._replayed += count
         return chosen
 
-    def _packets(self, count: int, at: float) -> list[bytes]:
-        step = TURNS_PER_S / SAMPLES_PER_S
-        # Angles on the wire have hundredths of a degree; the host puts a packet's samples on the line between them.
+    def _packets(self, count: int, now: float) -> list[bytes]:
+        step = SCANS_PER_S / SAMPLES_PER_S
+        # Angles on the wire have hundredths of a degree; the host interpolates a packet's samples between them.
         starts = np.floor((self._position + np.arange(count) * _SAMPLES * step) % 1.0 * 36_000.0)
         span = round((_SAMPLES - 1) * step * 36_000.0)
         angles = (starts[:, None] + span * np.arange(_SAMPLES) / (_SAMPLES - 1)) % 36_000.0
         counter_clockwise = np.deg2rad(-angles.reshape(-1) / 100.0)
-        ranges = np.asarray(self._measure((counter_clockwise + math.pi) % math.tau - math.pi, at), np.float64)
-        seen = np.isfinite(ranges) & (ranges >= RANGE_MIN_M) & (ranges <= RANGE_MAX_M)
-        millimetres = np.where(seen, np.rint(np.where(seen, ranges, 0.0) * 1000.0), 0.0).astype(int)
-        strength = np.where(seen, np.clip(240.0 - 12.0 * np.where(seen, ranges, 0.0), 0.0, 255.0), 0.0).astype(int)
-        made = []
+        ranges = np.asarray(self._measure((counter_clockwise + math.pi) % math.tau - math.pi, now), np.float64)
+        returned = np.isfinite(ranges) & (ranges >= RANGE_MIN_M) & (ranges <= RANGE_MAX_M)
+        millimetres = np.where(returned, np.rint(np.where(returned, ranges, 0.0) * 1000.0), 0.0).astype(int)
+        strength = np.where(returned, np.clip(240.0 - 12.0 * np.where(returned, ranges, 0.0), 0.0, 255.0), 0.0).astype(
+            int
+        )
+        packets = []
         for number in range(count):
             part = slice(number * _SAMPLES, (number + 1) * _SAMPLES)
             start = int(starts[number])
             samples = list(zip(millimetres[part].tolist(), strength[part].tolist(), strict=True))
-            made.append(self._packet(start, (start + span) % 36_000, samples))
-        return made
+            packets.append(self._packet(start, (start + span) % 36_000, samples))
+        return packets
 
     def _packet(self, start: int, end: int, samples: list[tuple[int, int]]) -> bytes:
         body = bytearray((0x54, 0x2C))
-        body += round(TURNS_PER_S * 360.0).to_bytes(2, "little") + start.to_bytes(2, "little")
+        body += round(SCANS_PER_S * 360.0).to_bytes(2, "little") + start.to_bytes(2, "little")
         for millimetres, strength in samples:
             body += millimetres.to_bytes(2, "little") + bytes((strength,))
         body += end.to_bytes(2, "little") + (int(self._milliseconds) % 30_000).to_bytes(2, "little")
         body.append(crc8(body))
         before = self._position
-        self._position = (before + _SAMPLES * TURNS_PER_S / SAMPLES_PER_S) % 1.0
+        self._position = (before + _SAMPLES * SCANS_PER_S / SAMPLES_PER_S) % 1.0
         self._milliseconds += 1000.0 * _PACKET_S
         if self._position < before:
-            self._last_turn, self._turn, self._replayed = self._turn, [], 0
-        self._turn.append(bytes(body))
+            self._last_revolution, self._revolution, self._replayed = self._revolution, [], 0
+        self._revolution.append(bytes(body))
         return bytes(body)
 
 

@@ -1,4 +1,4 @@
-"""LD19: the packets that it sends from power-on, without being asked; it takes no commands.
+"""LD19: the packets that it sends from power-on without a request; it takes no commands.
 
 Nothing here touches a port or a clock. Packets are decoded in bulk by numpy: 375 of them come every second.
 Packet, 47 bytes, little-endian: 0x54, 0x2C (12 samples), speed u16 (degrees/s), start angle u16 (degrees / 100,
@@ -27,13 +27,13 @@ SAMPLES_PER_S: Final = 4500
 RANGE_MIN_M: Final = 0.02
 RANGE_MAX_M: Final = 12.0
 _HEADER: Final = b"\x54\x2c"
-_FULL_TURN: Final = 36_000
-# Twelve samples can't span more than half as much again as the head turns in their time.
+_FULL_CIRCLE: Final = 36_000
+# Twelve samples can't span more than 1.5 times the angle by which the head rotates in their time.
 _SPAN_MARGIN: Final = 1.5
 
 
 class Packets(NamedTuple):
-    """n good packets in order of arrival, 12 n samples.
+    """n valid packets in order of arrival, 12 n samples.
 
     angle: float64[12 n], degrees / 100, clockwise seen from above, 0 <= angle < 36000.
     distance_mm: uint16[12 n], 0 for no return. intensity: uint8[12 n].
@@ -59,10 +59,10 @@ _CRC: Final = _crc_table()
 
 
 class Parser:
-    """Bytes of the lidar -> packets. Never raises on what it is fed; finds its place again after damage.
+    """Bytes of the lidar -> packets. Never raises, whatever the bytes are; resynchronizes after damage.
 
-    `corrupted` counts damaged packets: once per loss of the packet boundary, and every packet that fails its checksum
-    or whose angles the head could not have; `skipped_bytes` counts every byte that belonged to no good packet.
+    `corrupted` counts damaged packets: once per loss of the packet boundary, and every packet with a wrong checksum
+    or impossible angles; `skipped_bytes` counts every byte that belonged to no valid packet.
     """
 
     def __init__(self) -> None:
@@ -73,59 +73,59 @@ class Parser:
         self.skipped_bytes = 0
 
     def receive_data(self, data: bytes) -> None:
-        """Take what a port gave, in pieces of any size."""
+        """Parse received bytes, in pieces of any size."""
         buffer = self._buffer + data
-        at = 0
-        while at < len(buffer):
-            if not _HEADER.startswith(buffer[at : at + 2]):
-                at = self._skip(buffer, at, damaged=self._synced)
+        position = 0
+        while position < len(buffer):
+            if not _HEADER.startswith(buffer[position : position + 2]):
+                position = self._skip(buffer, position, damaged=self._synced)
                 continue
-            count = (len(buffer) - at) // PACKET_BYTES
+            count = (len(buffer) - position) // PACKET_BYTES
             if not count:
                 break
-            raw = np.frombuffer(buffer, np.uint8, count * PACKET_BYTES, at).reshape(count, PACKET_BYTES)
+            raw = np.frombuffer(buffer, np.uint8, count * PACKET_BYTES, position).reshape(count, PACKET_BYTES)
             packets, good = _decode(raw)
             if good:
                 self._synced = True
                 self._events.append(packets)
-                at += good * PACKET_BYTES
+                position += good * PACKET_BYTES
             else:
-                at = self._skip(buffer, at, damaged=True)
-        self._buffer = buffer[at:]
+                position = self._skip(buffer, position, damaged=True)
+        self._buffer = buffer[position:]
 
     def next_event(self) -> Packets | None:
-        """Oldest packets not yet taken, or None: feed more bytes."""
+        """Return the oldest packets not yet returned; None until more bytes are received."""
         return self._events.popleft() if self._events else None
 
     def reset(self) -> None:
-        """Forget half a packet, after the port was reopened; counters stay."""
+        """Discard an incomplete packet, after the port was reopened; counters are kept."""
         self._buffer = b""
         self._events.clear()
         self._synced = False
 
-    def _skip(self, buffer: bytes, at: int, *, damaged: bool) -> int:
+    def _skip(self, buffer: bytes, position: int, *, damaged: bool) -> int:
         self.corrupted += damaged
         self._synced = False
-        found = buffer.find(_HEADER[:1], at + 1)
+        found = buffer.find(_HEADER[:1], position + 1)
         following = len(buffer) if found < 0 else found
-        self.skipped_bytes += following - at
+        self.skipped_bytes += following - position
         return following
 
 
 def _decode(raw: NDArray[np.uint8]) -> tuple[Packets, int]:
-    """Decode uint8[n, 47] up to the first packet that is damaged; return how many are good."""
+    """Decode uint8[n, 47] up to the first damaged packet; return the packets and their number."""
     crc = np.zeros(len(raw), np.uint8)
     for column in range(PACKET_BYTES - 1):
         crc = _CRC[crc ^ raw[:, column]]
     speed, start, end = (_u16(raw, column) for column in (2, 4, 42))
-    span = (end - start) % _FULL_TURN
+    span = (end - start) % _FULL_CIRCLE
     possible = _SPAN_MARGIN * 100.0 * speed * (SAMPLES / SAMPLES_PER_S)
-    right = (raw[:, 0] == _HEADER[0]) & (raw[:, 1] == _HEADER[1]) & (crc == raw[:, -1])
-    right &= (start < _FULL_TURN) & (end < _FULL_TURN) & (span <= possible)
-    good = len(raw) if right.all() else int(np.argmin(right))
+    valid = (raw[:, 0] == _HEADER[0]) & (raw[:, 1] == _HEADER[1]) & (crc == raw[:, -1])
+    valid &= (start < _FULL_CIRCLE) & (end < _FULL_CIRCLE) & (span <= possible)
+    good = len(raw) if valid.all() else int(np.argmin(valid))
     samples = raw[:good, 6:42].reshape(good * SAMPLES, 3)
     steps = np.arange(SAMPLES) / (SAMPLES - 1)
-    angle = (start[:good, None] + span[:good, None] * steps).reshape(-1) % _FULL_TURN
+    angle = (start[:good, None] + span[:good, None] * steps).reshape(-1) % _FULL_CIRCLE
     distance = (samples[:, 0].astype(np.uint16)) | samples[:, 1].astype(np.uint16) << np.uint16(8)
     return Packets(angle, distance, samples[:, 2].copy()), good
 
@@ -135,9 +135,9 @@ def _u16(raw: NDArray[np.uint8], column: int) -> NDArray[np.int64]:
 
 
 class ScanAssembler:
-    """Packets -> whole scans, each from one passage through straight ahead to the next.
+    """Packets -> whole scans, each from angle 0 to the next angle 0.
 
-    `intensity_min`: a weaker return (0..255) counts as none.
+    `intensity_min`: a weaker return (0..255) is ignored.
     """
 
     def __init__(self, intensity_min: int = 0) -> None:
@@ -147,21 +147,21 @@ class ScanAssembler:
 
     @property
     def incomplete(self) -> int:
-        """Scans that were thrown away because packets were missing."""
+        """Number of scans that were discarded because packets were missing."""
         return self._builder.incomplete
 
     def feed(self, packets: Packets, now: float) -> list[LaserScan]:
-        """Take packets that arrived at `now` (seconds, monotonic); return the scans that they complete."""
+        """Add packets that arrived at `now` (s, monotonic); return the scans that they complete."""
         before = packets.angle[:1] if self._angle is None else np.array([self._angle])
         self._angle = float(packets.angle[-1])
-        # The head only ever turns on: an angle that falls has passed straight ahead.
-        falls = np.diff(packets.angle, prepend=before) < -_FULL_TURN / 2
-        seen = (packets.distance_mm > 0) & (packets.intensity >= self._intensity_min)
-        ranges = np.where(seen, packets.distance_mm / 1000.0, np.nan)
+        # The head rotates in one direction only: a decreasing angle has passed 0.
+        passes_zero = np.diff(packets.angle, prepend=before) < -_FULL_CIRCLE / 2
+        returned = (packets.distance_mm > 0) & (packets.intensity >= self._intensity_min)
+        ranges = np.where(returned, packets.distance_mm / 1000.0, np.nan)
         samples = Samples(packets.angle * (np.pi / 18_000.0), ranges, packets.intensity)
-        return self._builder.feed(samples, (int(index) for index in np.flatnonzero(falls)), now)
+        return self._builder.feed(samples, (int(index) for index in np.flatnonzero(passes_zero)), now)
 
     def reset(self) -> None:
-        """Forget the scan at hand, after the port was reopened."""
+        """Discard the incomplete scan, after the port was reopened."""
         self._builder.reset()
         self._angle = None

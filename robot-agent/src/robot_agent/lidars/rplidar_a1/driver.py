@@ -1,4 +1,4 @@
-"""The RPLidar A1 as a lidar: stop, ask for its health, scan; again after silence or a bad answer."""
+"""Driver of the RPLidar A1: stop, request its health, scan; restart after silence or a bad answer."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from robot_agent.hardware import LaserScan, LidarEvents, LidarFactory, LidarTrai
 from robot_agent.lidars.rplidar_a1 import protocol as rplidar
 
 STOP_S: Final = 0.05
-"""Time between a stop and the next request; the device wants 1 ms, and its last bytes need to arrive."""
-ANSWER_S: Final = 1.0
-SILENT_S: Final = 1.0
+"""Time between a stop and the next request; the device needs 1 ms, and its last bytes must arrive."""
+ANSWER_TIMEOUT_S: Final = 1.0
+SAMPLES_TIMEOUT_S: Final = 1.0
 RESET_S: Final = 2.0
 
 
 class RplidarA1Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """`range_max_m`: beyond it a return is not believed (early A1 see 6 m far, later ones 12 m)."""
+    """`range_max_m`: returns beyond it are ignored (early A1 see 6 m far, later ones 12 m)."""
 
     range_max_m: Annotated[float, Meta(ge=1.0, le=rplidar.RANGE_MAX_M)] = rplidar.RANGE_MAX_M
 
 
 class RplidarA1Driver:
-    """One conversation with the scanner; see `robot_agent.hardware.LidarDriver`."""
+    """Protocol of one lidar; see `robot_agent.hardware.LidarDriver`."""
 
     # The motor of an A1 runs while DTR is cleared.
     serial = SerialSettings(rplidar.BAUD, dtr=False)
@@ -35,32 +35,32 @@ class RplidarA1Driver:
         self.traits = LidarTraits(range_min_m=rplidar.RANGE_MIN_M, range_max_m=range_max_m, scan_period_s=1 / 5.5)
         self._parser = rplidar.Parser()
         self._assembler = rplidar.ScanAssembler()
-        self._phase: Literal["closed", "stopping", "asking", "scanning", "resetting"] = "closed"
+        self._phase: Literal["closed", "stopping", "checking", "scanning", "resetting"] = "closed"
         self._since = 0.0
         self.problem = ""
 
     @property
     def incomplete(self) -> int:
-        """Scans that were thrown away because nodes were missing."""
+        """Number of scans that were discarded because nodes were missing."""
         return self._assembler.incomplete
 
     def begin(self, now: float) -> bytes:
-        """Begin (again), after the port was opened; return what to send."""
+        """Begin (again), after the port was opened; return the bytes to send."""
         self._parser.reset()
         self._assembler.reset()
         self.problem = ""
         return self._enter("stopping", now, rplidar.stop())
 
     def receive(self, data: bytes, now: float) -> LidarEvents:
-        """Take what came from the port."""
+        """Parse bytes received from the port."""
         self._parser.receive_data(data)
         nodes, answer = False, b""
         scans: list[LaserScan] = []
         while (event := self._parser.next_event()) is not None:
             if isinstance(event, rplidar.Descriptor):
-                # A new answer begins: what was measured before belongs to another scan.
+                # A new answer begins: earlier samples belong to another scan.
                 self._assembler.reset()
-            elif isinstance(event, rplidar.Health) and self._phase == "asking":
+            elif isinstance(event, rplidar.Health) and self._phase == "checking":
                 answer = self._on_health(event, now)
             elif isinstance(event, rplidar.Nodes) and self._phase == "scanning":
                 nodes, self._since, self.problem = True, now, ""
@@ -68,15 +68,15 @@ class RplidarA1Driver:
         return LidarEvents(nodes, tuple(scans), answer)
 
     def tick(self, now: float) -> bytes:
-        """Let time pass (20 Hz or more); return what to send."""
+        """Advance time (20 Hz or more); return the bytes to send."""
         waited = now - self._since
         if self._phase == "stopping" and waited >= STOP_S:
-            return self._enter("asking", now, rplidar.get_health())
-        if self._phase == "asking" and waited > ANSWER_S:
+            return self._enter("checking", now, rplidar.get_health())
+        if self._phase == "checking" and waited > ANSWER_TIMEOUT_S:
             self.problem = "the lidar does not answer; check its cable and power"
             return self._enter("stopping", now, rplidar.stop())
-        if self._phase == "scanning" and waited > SILENT_S:
-            self.problem = f"the lidar has sent no measurement for {SILENT_S:.0f} s; it is asked again"
+        if self._phase == "scanning" and waited > SAMPLES_TIMEOUT_S:
+            self.problem = f"the lidar has sent no measurement for {SAMPLES_TIMEOUT_S:.0f} s; its scan is restarted"
             return self._enter("stopping", now, rplidar.stop())
         if self._phase == "resetting" and waited > RESET_S:
             return self._enter("stopping", now, rplidar.stop())
@@ -88,7 +88,7 @@ class RplidarA1Driver:
             return self._enter("resetting", now, rplidar.reset())
         return self._enter("scanning", now, rplidar.scan())
 
-    def _enter(self, phase: Literal["stopping", "asking", "scanning", "resetting"], now: float, data: bytes) -> bytes:
+    def _enter(self, phase: Literal["stopping", "checking", "scanning", "resetting"], now: float, data: bytes) -> bytes:
         self._phase, self._since = phase, now
         return data
 

@@ -1,10 +1,10 @@
-"""An RPLidar A1 as its serial port shows it: descriptors, device data, standard nodes and express capsules.
+"""Emulator of an RPLidar A1 at its serial port: descriptors, device data, standard nodes and express capsules.
 
-Pure: bytes and times go in, bytes come out; distances come from a function that the world gives.
+Pure: bytes and times go in, bytes come out; distances come from a function of the simulated world.
 Source: Slamtec, RPLIDAR interface protocol and application notes, A1. Where it is silent: a request that has an answer
-ends a running scan; a head that starts to scan is somewhere in its turn.
-Not shown: the motor's start and the DTR line that switches it, because a pty has none: the head turns whenever a scan
-was asked for.
+ends a running scan; a scan starts at any angle of the head.
+Not emulated: the motor's start and the DTR line that switches it, because a pty has none: the head rotates whenever a
+scan was requested.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ Measure = Callable[["NDArray[np.float64]", float], "NDArray[np.float64]"]
 
 BAUD: Final = 115200
 NODES_PER_S: Final = 2000.0
-TURNS_PER_S: Final = 5.5
+SCANS_PER_S: Final = 5.5
 RANGE_MIN_M: Final = 0.15
 RANGE_MAX_M: Final = 12.0
 BOOT_TEXT: Final = b"RP LIDAR System.\r\nFirmware Ver 1.29 - RP, HW Ver 7\r\nModel: 18\r\n"
-_TURN_Q6: Final = 360 * 64
-# Nodes that one call of the world's function measures: 16 ms of a standard scan.
+_FULL_CIRCLE_Q6: Final = 360 * 64
+# Nodes per call of the measuring function: 16 ms of a standard scan.
 _CHUNK: Final = 32
-# A simulation that paused gives no burst of what it missed.
+# After a pause of the simulation, missed nodes are not sent in a burst.
 _CATCH_UP_S: Final = 0.5
 
 
 class RplidarEmulator:
-    """The lidar's end of the serial line, as `fognav_sim.devices.LidarEmulator` asks for it.
+    """The lidar's end of the serial line; implements `fognav_sim.devices.LidarEmulator`.
 
-    The port calls `receive` and `outgoing`; `now` is any monotonic clock, seconds. `health` and `error_code` are what
-    a health request gets. Two faults can be set at any time: `stalled` sends nothing more, `frozen` sends the bytes of
-    the last whole turn again and again, as a stuck bridge does.
+    The port calls `receive` and `outgoing`; `now` is any monotonic clock, seconds. `health` and `error_code` answer a
+    health request. Two faults can be set at any time: `stalled` sends nothing more, `frozen` repeats the bytes of the
+    last whole revolution, as a stuck serial bridge does.
     """
 
     def __init__(
@@ -47,21 +47,21 @@ class RplidarEmulator:
         measure: Measure,
         *,
         nodes_per_s: float = NODES_PER_S,
-        turns_per_s: float = TURNS_PER_S,
+        scans_per_s: float = SCANS_PER_S,
         start_angle_rad: float = 1.0,
         serial_number: bytes = bytes(range(16)),
     ) -> None:
-        """Take the world's measuring function; `start_angle_rad` is where, clockwise, the first scan begins.
+        """Store the measuring function; the first scan begins at `start_angle_rad`, clockwise.
 
-        An exact whole number of nodes per turn would give a resting robot equal turns, which hosts take for a fault.
+        A whole number of nodes per scan would give identical scans at rest, which hosts take for a fault.
         """
-        if not (0.0 < turns_per_s <= 20.0 and 10.0 * turns_per_s <= nodes_per_s <= 2304.0):
+        if not (0.0 < scans_per_s <= 20.0 and 10.0 * scans_per_s <= nodes_per_s <= 2304.0):
             raise ValueError(
-                f"{nodes_per_s} nodes/s at {turns_per_s} turns/s: 115200 baud carry 2304 nodes/s, a turn needs 10"
+                f"{nodes_per_s} nodes/s at {scans_per_s} scans/s: 115200 baud carry 2304 nodes/s, a scan needs 10"
             )
         self._measure = measure
         self._nodes_per_s = nodes_per_s
-        self._turns_per_s = turns_per_s
+        self._turns_per_s = scans_per_s
         self._serial_number = serial_number[:16].ljust(16, b"\0")
         self.health = 0
         self.error_code = 0
@@ -74,8 +74,8 @@ class RplidarEmulator:
         self._due_since = 0.0
         self._position = start_angle_rad / math.tau
         self._fresh_scan = False
-        self._turn = bytearray()
-        self._last_turn = b""
+        self._revolution = bytearray()
+        self._last_revolution = b""
         self._replayed = 0
 
     @property
@@ -85,11 +85,11 @@ class RplidarEmulator:
 
     @property
     def scanning(self) -> bool:
-        """A scan was asked for and not stopped."""
+        """A scan was requested and not stopped."""
         return self._scanning
 
     def receive(self, data: bytes, now: float) -> None:
-        """Take bytes from the host; whole requests act at once, wrong ones are skipped byte by byte."""
+        """Receive bytes from the host; whole requests take effect immediately, wrong ones are skipped byte by byte."""
         self._incoming += data
         while self._incoming:
             if self._incoming[0] != 0xA5:
@@ -113,7 +113,7 @@ class RplidarEmulator:
             self._act(command, payload, now)
 
     def outgoing(self, now: float) -> bytes:
-        """Return what the device has sent up to `now`, once; this is where the world is measured."""
+        """Return what the device has sent up to `now`, once; this measures the world."""
         if self._scanning:
             self._scan_until(now)
         sent = bytes(self._outgoing)
@@ -151,8 +151,8 @@ class RplidarEmulator:
         self._express = express
         self._due_since = now
         self._fresh_scan = True
-        self._turn.clear()
-        self._last_turn = b""
+        self._revolution.clear()
+        self._last_revolution = b""
 
     def _scan_until(self, now: float) -> None:
         rate = self._nodes_per_s * (2 if self._express else 1)
@@ -164,7 +164,7 @@ class RplidarEmulator:
             return
         if self.stalled:
             self._due_since += units * unit / rate
-        elif self.frozen and self._last_turn and not self._express:
+        elif self.frozen and self._last_revolution and not self._express:
             self._replay(units * 5)
             self._due_since += units / rate
         elif self._express:
@@ -178,13 +178,13 @@ class RplidarEmulator:
                 self._due_since += count / rate
                 self._nodes(count, self._due_since, rate)
 
-    def _nodes(self, count: int, at: float, rate: float) -> None:
-        turned = self._position + np.arange(1, count + 1) * (self._turns_per_s / rate)
-        angle = np.floor(turned % 1.0 * _TURN_Q6).astype(np.int64) % _TURN_Q6
-        before = np.concatenate(((self._position,), turned[:-1]))
-        start = np.floor(turned) > np.floor(before)
-        self._position = float(turned[-1])
-        distance = self._distances(angle / 64.0, at)
+    def _nodes(self, count: int, now: float, rate: float) -> None:
+        rotation = self._position + np.arange(1, count + 1) * (self._turns_per_s / rate)
+        angle = np.floor(rotation % 1.0 * _FULL_CIRCLE_Q6).astype(np.int64) % _FULL_CIRCLE_Q6
+        before = np.concatenate(((self._position,), rotation[:-1]))
+        start = np.floor(rotation) > np.floor(before)
+        self._position = float(rotation[-1])
+        distance = self._distances(angle / 64.0, now)
         quality = _quality(distance)
         raw = np.empty((count, 5), np.uint8)
         raw[:, 0] = quality << 2 | np.where(start, 1, 2)
@@ -194,27 +194,27 @@ class RplidarEmulator:
         raw[:, 4] = distance >> 8
         begin = 0
         for boundary in np.flatnonzero(start):
-            self._turn += raw[begin:boundary].tobytes()
-            self._last_turn = bytes(self._turn)
-            self._turn.clear()
+            self._revolution += raw[begin:boundary].tobytes()
+            self._last_revolution = bytes(self._revolution)
+            self._revolution.clear()
             self._replayed = 0
             begin = int(boundary)
-        self._turn += raw[begin:].tobytes()
+        self._revolution += raw[begin:].tobytes()
         self._outgoing += raw.tobytes()
 
     def _replay(self, size: int) -> None:
         for _ in range(size):
-            self._outgoing.append(self._last_turn[self._replayed % len(self._last_turn)])
+            self._outgoing.append(self._last_revolution[self._replayed % len(self._last_revolution)])
             self._replayed += 1
 
-    def _capsule(self, at: float, rate: float) -> None:
+    def _capsule(self, now: float, rate: float) -> None:
         step = self._turns_per_s / rate
-        begin = math.floor(self._position % 1.0 * _TURN_Q6) % _TURN_Q6
-        # The host puts the nodes on a line from this start angle to the next capsule's: measure where it will look.
+        begin = math.floor(self._position % 1.0 * _FULL_CIRCLE_Q6) % _FULL_CIRCLE_Q6
+        # The host interpolates the nodes between this start angle and the next capsule's: measure at those angles.
         self._position += 32 * step
-        following = math.floor(self._position % 1.0 * _TURN_Q6) % _TURN_Q6
-        angles = begin + (following - begin) % _TURN_Q6 * np.arange(32) / 32.0
-        distance = self._distances(angles % _TURN_Q6 / 64.0, at) & ~3
+        following = math.floor(self._position % 1.0 * _FULL_CIRCLE_Q6) % _FULL_CIRCLE_Q6
+        angles = begin + (following - begin) % _FULL_CIRCLE_Q6 * np.arange(32) / 32.0
+        distance = self._distances(angles % _FULL_CIRCLE_Q6 / 64.0, now) & ~3
         cabins = np.zeros((16, 5), np.uint8)
         for place in (0, 1):
             cabins[:, 2 * place] = distance[place::2] & 0xFF
@@ -224,12 +224,12 @@ class RplidarEmulator:
         checksum = int(np.bitwise_xor.reduce(np.frombuffer(body, np.uint8)))
         self._outgoing += bytes((0xA0 | checksum & 0xF, 0x50 | checksum >> 4)) + body
 
-    def _distances(self, clockwise_deg: NDArray[np.float64], at: float) -> NDArray[np.int64]:
-        """Distances in quarters of a millimetre, 0 where nothing comes back or it is out of the rated range."""
+    def _distances(self, clockwise_deg: NDArray[np.float64], now: float) -> NDArray[np.int64]:
+        """Return distances in quarters of a millimetre, 0 without a return within the rated range."""
         angles = -np.deg2rad(clockwise_deg)
-        ranges = np.asarray(self._measure((angles + math.pi) % math.tau - math.pi, at), np.float64)
-        seen = np.isfinite(ranges) & (ranges >= RANGE_MIN_M) & (ranges <= RANGE_MAX_M)
-        return np.where(seen, np.rint(np.where(seen, ranges, 0.0) * 4000.0), 0.0).astype(np.int64)
+        ranges = np.asarray(self._measure((angles + math.pi) % math.tau - math.pi, now), np.float64)
+        returned = np.isfinite(ranges) & (ranges >= RANGE_MIN_M) & (ranges <= RANGE_MAX_M)
+        return np.where(returned, np.rint(np.where(returned, ranges, 0.0) * 4000.0), 0.0).astype(np.int64)
 
 
 def _quality(distance_q2: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -25,19 +25,19 @@ if TYPE_CHECKING:
 BAUD: Final = 115200
 RANGE_MIN_M: Final = 0.15
 RANGE_MAX_M: Final = 12.0
-_FULL_TURN_Q6: Final = 360 * 64
+_FULL_CIRCLE_Q6: Final = 360 * 64
 
 
 # --- commands ---------------------------------------------------------------------------------------------------------
 
 
 def stop() -> bytes:
-    """Stop scanning (25); the device answers nothing and wants 1 ms of peace."""
+    """Stop scanning (25); the device sends no answer and needs 1 ms before the next request."""
     return b"\xa5\x25"
 
 
 def reset() -> bytes:
-    """Reboot the device (40); it prints text and wants 2 ms of peace."""
+    """Reboot the device (40); it prints text and needs 2 ms before the next request."""
     return b"\xa5\x40"
 
 
@@ -52,17 +52,17 @@ def express_scan() -> bytes:
 
 
 def get_info() -> bytes:
-    """Ask for model, versions and serial number (50)."""
+    """Request model, versions and serial number (50)."""
     return b"\xa5\x50"
 
 
 def get_health() -> bytes:
-    """Ask for the health (52)."""
+    """Request the health (52)."""
     return b"\xa5\x52"
 
 
 def get_sample_rate() -> bytes:
-    """Ask how long one sample takes (59)."""
+    """Request the duration of a sample (59)."""
     return b"\xa5\x59"
 
 
@@ -89,7 +89,7 @@ class Answer(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Descriptor:
-    """A response descriptor: what follows from here on."""
+    """A response descriptor: the type and size of the data that follow."""
 
     answer: Answer
     length: int
@@ -98,7 +98,7 @@ class Descriptor:
 
 @dataclass(frozen=True, slots=True)
 class DeviceInfo:
-    """Who answers: model id, (major, minor) firmware, hardware revision, serial number in hexadecimal."""
+    """Identity of the device: model id, (major, minor) firmware, hardware revision, serial number in hexadecimal."""
 
     model: int
     firmware: tuple[int, int]
@@ -131,9 +131,9 @@ class SampleRate:
 
 
 class Nodes(NamedTuple):
-    """A batch of n measurements in order of arrival; how they are cut into batches means nothing.
+    """A batch of n measurements in order of arrival; the boundaries between batches have no meaning.
 
-    start: bool[n], first node of a turn. quality: uint8[n], 0..63 (express: 63 for a return, 0 for none).
+    start: bool[n], first node of a scan. quality: uint8[n], 0..63 (express: 63 for a return, 0 for none).
     angle_q6: uint16[n], degrees / 64, clockwise seen from above, 0..23039.
     distance_q2: uint16[n], millimetres / 4, 0 for no return.
     """
@@ -161,20 +161,20 @@ _ANY_DESCRIPTOR: Final = re.compile(b"|".join(re.escape(pattern) for pattern in 
 
 
 class _Decoder(Protocol):
-    """Takes what follows one descriptor. `last` says that another descriptor ends it here."""
+    """Decodes the data after one descriptor. `last`: another descriptor ends the data here."""
 
     def feed(self, data: bytes, *, last: bool) -> list[Event]: ...
 
 
 class Parser:
-    """Bytes from the device -> events. Never raises on what it is fed; finds its place again after damage.
+    """Bytes from the device -> events. Never raises, whatever the bytes are; resynchronizes after damage.
 
-    A known descriptor always wins, wherever it stands: a new answer ends the one before, even in mid-node. What cannot
-    be the beginning of one goes to the decoder of the present answer; before the first descriptor (the tail of an old
-    scan, boot text) it is skipped.
+    A known descriptor has priority at any position: a new answer ends the one before, even in mid-node. Bytes that
+    can't begin a descriptor go to the decoder of the current answer; before the first descriptor (the tail of an old
+    scan, boot text) they are skipped.
 
-    `skipped_bytes` counts bytes that belonged to nothing, `resyncs` how often nodes or capsules lost their place,
-    `corrupted` capsules whose checksum was wrong.
+    `skipped_bytes` counts bytes outside of any answer, `resyncs` lost boundaries of nodes or capsules, `corrupted`
+    capsules with a wrong checksum.
     """
 
     def __init__(self) -> None:
@@ -186,7 +186,7 @@ class Parser:
         self.corrupted = 0
 
     def receive_data(self, data: bytes) -> None:
-        """Take what a port gave, in pieces of any size."""
+        """Parse received bytes, in pieces of any size."""
         buffer = self._held + data
         begin = 0
         for match in _ANY_DESCRIPTOR.finditer(buffer):
@@ -195,16 +195,16 @@ class Parser:
             descriptor = _DESCRIPTORS[match.group()]
             self._events.append(descriptor)
             self._decoder = self._decoder_for(descriptor)
-        keep = len(buffer) - _beginning_of_descriptor(buffer, begin)
+        keep = len(buffer) - _partial_descriptor_size(buffer, begin)
         self._pass_on(buffer[begin:keep], last=False)
         self._held = buffer[keep:]
 
     def next_event(self) -> Event | None:
-        """Oldest event not yet taken, or None: feed more bytes."""
+        """Return the oldest event not yet returned; None until more bytes are received."""
         return self._events.popleft() if self._events else None
 
     def reset(self) -> None:
-        """Forget the present answer, after the port was reopened; counters stay."""
+        """Discard the current answer, after the port was reopened; counters are kept."""
         self._held = b""
         self._events.clear()
         self._decoder = None
@@ -223,8 +223,8 @@ class Parser:
         return _SingleDecoder(self, descriptor)
 
 
-def _beginning_of_descriptor(buffer: bytes, begin: int) -> int:
-    """How many bytes at the end of the buffer could be the beginning of a descriptor."""
+def _partial_descriptor_size(buffer: bytes, begin: int) -> int:
+    """Return how many bytes at the end of the buffer could begin a descriptor."""
     for size in range(min(_DESCRIPTOR_SIZE - 1, len(buffer) - begin), 0, -1):
         tail = buffer[-size:]
         if any(pattern.startswith(tail) for pattern in _DESCRIPTORS):
@@ -269,13 +269,13 @@ def _health_status(value: int) -> HealthStatus | int:
 
 
 _NODE_SIZE: Final = 5
-# To find the node boundary again, this many nodes in a row must have right check bits and angles that turn onwards
-# like a spinning head's. Check bits alone are not enough: where no beam returns, the zeros and the even steps of the
-# angle look like nodes two bytes aside for seconds on end.
+# To find the node boundary again, this many nodes in a row must have right check bits and angles that advance like a
+# rotating head's. Check bits alone are not enough: without returns, the zeros and the even steps of the angle look like
+# nodes two bytes aside for whole seconds.
 _RESYNC_NODES: Final = 6
 _RESYNC_BACK_Q6: Final = 15 * 64
-_RESYNC_ON_Q6: Final = 30 * 64
-_RESYNC_TURN_Q6: Final = (32, 90 * 64)
+_RESYNC_FORWARD_Q6: Final = 30 * 64
+_RESYNC_TOTAL_Q6: Final = (32, 90 * 64)
 
 
 class _NodeDecoder:
@@ -289,22 +289,22 @@ class _NodeDecoder:
     def feed(self, data: bytes, *, last: bool) -> list[Event]:
         self._buffer += data
         events: list[Event] = []
-        while self._take_nodes(events) if self._synced else self._find_boundary():
+        while self._decode_nodes(events) if self._synced else self._find_boundary():
             pass
         if last:
             self._parser.skipped_bytes += len(self._buffer)
             self._buffer = b""
         return events
 
-    def _take_nodes(self, events: list[Event]) -> bool:
-        """Decode all whole nodes up to the first wrong one. True if there is one."""
+    def _decode_nodes(self, events: list[Event]) -> bool:
+        """Decode all whole nodes up to the first invalid one. True if there is one."""
         count = len(self._buffer) // _NODE_SIZE
         if not count:
             return False
         raw = np.frombuffer(self._buffer, np.uint8, count * _NODE_SIZE).reshape(count, _NODE_SIZE)
         angle = _angles_q6(raw[:, 1], raw[:, 2])
-        right = _is_node(raw[:, 0], raw[:, 1], angle)
-        good = count if right.all() else int(np.argmin(right))
+        valid = _is_node(raw[:, 0], raw[:, 1], angle)
+        good = count if valid.all() else int(np.argmin(valid))
         if good:
             raw = raw[:good]
             first = raw[:, 0]
@@ -326,12 +326,12 @@ class _NodeDecoder:
             return False
         angle = _angles_q6(raw[1:-3], raw[2:-2])
         single = _is_node(raw[:-4], raw[1:-3], angle)
-        row = np.ones(places, np.bool_)
+        run = np.ones(places, np.bool_)
         for node in range(_RESYNC_NODES):
-            row &= single[node * _NODE_SIZE : node * _NODE_SIZE + places]
+            run &= single[node * _NODE_SIZE : node * _NODE_SIZE + places]
         drop = places
-        for place in np.flatnonzero(row):
-            if _turns_onwards(angle[place : place + span + 1 : _NODE_SIZE]):
+        for place in np.flatnonzero(run):
+            if _is_rotating(angle[place : place + span + 1 : _NODE_SIZE]):
                 drop = int(place)
                 self._synced = True
                 break
@@ -351,15 +351,15 @@ def _u16(values: NDArray[np.uint8]) -> NDArray[np.uint16]:
 def _is_node(first: NDArray[np.uint8], second: NDArray[np.uint8], angle: NDArray[np.uint16]) -> NDArray[np.bool_]:
     one = np.uint8(1)
     bits = (first ^ (first >> one)) & second & one
-    return bits.astype(np.bool_) & (angle < _FULL_TURN_Q6)
+    return bits.astype(np.bool_) & (angle < _FULL_CIRCLE_Q6)
 
 
-def _turns_onwards(angles: NDArray[np.uint16]) -> bool:
-    turned = angles.astype(np.int32)
-    steps = (turned[1:] - turned[:-1] + _FULL_TURN_Q6 // 2) % _FULL_TURN_Q6 - _FULL_TURN_Q6 // 2
-    least, most = _RESYNC_TURN_Q6
+def _is_rotating(angles: NDArray[np.uint16]) -> bool:
+    rotation = angles.astype(np.int32)
+    steps = (rotation[1:] - rotation[:-1] + _FULL_CIRCLE_Q6 // 2) % _FULL_CIRCLE_Q6 - _FULL_CIRCLE_Q6 // 2
+    least, most = _RESYNC_TOTAL_Q6
     return bool(
-        (steps >= -_RESYNC_BACK_Q6).all() and (steps <= _RESYNC_ON_Q6).all() and least <= int(steps.sum()) <= most
+        (steps >= -_RESYNC_BACK_Q6).all() and (steps <= _RESYNC_FORWARD_Q6).all() and least <= int(steps.sum()) <= most
     )
 
 
@@ -385,18 +385,18 @@ class _CapsuleDecoder:
     def feed(self, data: bytes, *, last: bool) -> list[Event]:
         self._buffer += data
         events: list[Event] = []
-        at = 0
-        while at < len(self._buffer):
-            header = self._buffer[at : at + 2]
+        position = 0
+        while position < len(self._buffer):
+            header = self._buffer[position : position + 2]
             plausible = header[0] >> 4 == 0xA and (len(header) < 2 or header[1] >> 4 == 0x5)
-            if plausible and len(self._buffer) - at < _CAPSULE_SIZE:
+            if plausible and len(self._buffer) - position < _CAPSULE_SIZE:
                 break
             if plausible:
-                capsule = self._buffer[at : at + _CAPSULE_SIZE]
+                capsule = self._buffer[position : position + _CAPSULE_SIZE]
                 if _xor(capsule[2:]) == (capsule[0] & 0xF) | (capsule[1] & 0xF) << 4:
                     self._synced = True
-                    self._take(capsule, events)
-                    at += _CAPSULE_SIZE
+                    self._add(capsule, events)
+                    position += _CAPSULE_SIZE
                     continue
                 self._parser.corrupted += 1
             if self._synced:
@@ -404,15 +404,15 @@ class _CapsuleDecoder:
                 self._synced = False
             self._previous = None
             self._parser.skipped_bytes += 1
-            at += 1
-        self._buffer = self._buffer[at:]
+            position += 1
+        self._buffer = self._buffer[position:]
         if last:
             self._parser.skipped_bytes += len(self._buffer)
             self._buffer = b""
         return events
 
-    def _take(self, capsule: bytes, events: list[Event]) -> None:
-        # The flag marks the first capsule of a scan, not of a turn: nothing before it belongs to it.
+    def _add(self, capsule: bytes, events: list[Event]) -> None:
+        # The flag marks the first capsule after a scan request, not of a revolution: nothing before it belongs to it.
         if self._previous is not None and not _start_angle(capsule) & _NEW_SCAN:
             events.append(decode_capsule(self._previous, _start_angle(capsule)))
         self._previous = capsule
@@ -429,11 +429,11 @@ def _start_angle(capsule: bytes) -> int:
 def decode_capsule(capsule: bytes, next_start: int) -> Nodes:
     """Nodes of one legacy express capsule (84 bytes), given the start angle field of the next one.
 
-    Node k stands at start + k (next - start) / 32 minus its own correction (6 bits, degrees / 8); a turn begins where
+    Node k is at start + k (next - start) / 32 minus its own correction (6 bits, degrees / 8); a scan begins where
     that line passes 360 degrees. Source: Slamtec interface protocol, express scan, legacy capsules.
     """
     begin = _start_angle(capsule) & ~_NEW_SCAN
-    sweep = ((next_start & ~_NEW_SCAN) - begin) % _FULL_TURN_Q6
+    span_q6 = ((next_start & ~_NEW_SCAN) - begin) % _FULL_CIRCLE_Q6
     cabins = np.frombuffer(capsule, np.uint8, offset=4).reshape(16, 5).astype(np.int32)
     fields = np.empty((16, 2), np.int32)
     fields[:, 0] = cabins[:, 0] | cabins[:, 1] << 8
@@ -442,10 +442,10 @@ def decode_capsule(capsule: bytes, next_start: int) -> Nodes:
     correction_q3[:, 0] |= cabins[:, 4] & 0xF
     correction_q3[:, 1] |= cabins[:, 4] >> 4
     distance = (fields & 0xFFFC).reshape(-1).astype(np.uint16)
-    # In degrees / 2048, so that the thirty-seconds of the sweep stay whole.
-    line = begin * 32 + sweep * np.arange(_CAPSULE_NODES)
-    angle = ((line - (correction_q3.reshape(-1) << 8)) >> 5) % _FULL_TURN_Q6
-    start = (line + sweep) % (_FULL_TURN_Q6 * 32) < sweep
+    # In degrees / 2048, so that the thirty-seconds of the span stay whole.
+    line = begin * 32 + span_q6 * np.arange(_CAPSULE_NODES)
+    angle = ((line - (correction_q3.reshape(-1) << 8)) >> 5) % _FULL_CIRCLE_Q6
+    start = (line + span_q6) % (_FULL_CIRCLE_Q6 * 32) < span_q6
     quality = np.where(distance > 0, _RETURN_QUALITY, 0).astype(np.uint8)
     return Nodes(start, quality, angle.astype(np.uint16), distance)
 
@@ -453,7 +453,7 @@ def decode_capsule(capsule: bytes, next_start: int) -> Nodes:
 # --- scans ------------------------------------------------------------------------------------------------------------
 
 
-# Recorded heads start their turns between 350 and 360 degrees; a start flag far from zero is a damaged node.
+# Recorded heads start their scans between 350 and 360 degrees; a start flag far from zero is a damaged node.
 _START_WINDOW_Q6: Final = 45 * 64
 
 
@@ -465,13 +465,13 @@ class ScanAssembler:
 
     @property
     def incomplete(self) -> int:
-        """Scans that were thrown away because nodes were missing."""
+        """Number of scans that were discarded because nodes were missing."""
         return self._builder.incomplete
 
     def feed(self, nodes: Nodes, now: float) -> list[LaserScan]:
-        """Take a batch that arrived at `now` (seconds, monotonic); the scans that it completes."""
+        """Add a batch that arrived at `now` (s, monotonic); return the scans that it completes."""
         angle = nodes.angle_q6
-        near_zero = (angle < _START_WINDOW_Q6) | (angle >= _FULL_TURN_Q6 - _START_WINDOW_Q6)
+        near_zero = (angle < _START_WINDOW_Q6) | (angle >= _FULL_CIRCLE_Q6 - _START_WINDOW_Q6)
         boundaries = [int(index) for index in np.flatnonzero(nodes.start & near_zero)]
         clockwise = angle.astype(np.float64) * (np.pi / (180.0 * 64.0))
         ranges = nodes.distance_q2.astype(np.float64) * 0.00025
@@ -479,5 +479,5 @@ class ScanAssembler:
         return self._builder.feed(Samples(clockwise, ranges, nodes.quality), boundaries, now)
 
     def reset(self) -> None:
-        """Forget the scan at hand, after the device was told to begin anew."""
+        """Discard the incomplete scan, after the device was restarted."""
         self._builder.reset()

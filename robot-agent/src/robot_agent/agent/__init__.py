@@ -1,1 +1,1 @@
-"""The process that localizes, follows and judges: core, edges, settings."""
+"""The agent process: localization, path following and the safety gate, with its edges and settings."""

@@ -71,7 +71,7 @@ class BlockedPlaces:
 
 
 def _is_blocked(replica: Replica, pose: Pose2) -> bool:
-    """Whether the map says lethal where the pose is, and not because of a wall: a pose may be some centimetres off."""
+    """Whether the map is lethal at the pose, and not because of a wall: a pose may be some centimetres off."""
     geometry = replica.geometry
     if geometry is None:
         return False

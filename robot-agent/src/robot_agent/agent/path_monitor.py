@@ -90,13 +90,13 @@ class PathMonitor:
 
 
 def _find_blockage(path: RobotPath, follower: PathFollower, replica: Replica, version: Version) -> _Blockage | None:
-    """Return what first blocks the rest of the path on the robot's map; None when nothing does."""
+    """Return the first blockage of the rest of the path on the robot's map; None without one."""
     assert replica.geometry is not None
     same_map = path.map_epoch == version.epoch
     if same_map and path.map_seq > version.seq:
         # Checked as soon as the robot's map has caught up; the safety gate limits how long it may lag.
         return None
-    # A planner that knew this map may lead the robot out through what its lidar took for an obstacle.
+    # A planner that knew this map may lead the robot out through cells that its lidar reported as an obstacle.
     known = same_map and path.map_seq == version.seq
     ahead = first_blocked(replica.cost, replica.geometry, follower, known_to_planner=known)
     if ahead is None:

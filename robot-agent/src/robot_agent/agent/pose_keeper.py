@@ -20,7 +20,7 @@ _TURNED_RAD: Final = 0.03
 _SIGMA_CHANGED: Final = 0.05
 _START_SIGMA_M: Final = 0.25
 _START_SIGMA_RAD: Final = 0.15
-"""How well (standard deviations) somebody puts a robot on its start pose."""
+"""Standard deviations of a robot that was put on its start pose by hand."""
 
 
 class PoseKeeper:
@@ -73,7 +73,7 @@ class PoseKeeper:
 
 
 def start_pose(site: str, robot: RobotSite) -> SavedPose:
-    """Return where the site says that the robot starts, as a pose to restore when none was stored."""
+    """Return the site's start pose, to be restored when no pose was stored."""
     start = robot.start
     return SavedPose(
         site=site, x=start.x, y=start.y, theta=start.theta, sigma_xy=_START_SIGMA_M, sigma_theta=_START_SIGMA_RAD

@@ -43,7 +43,7 @@ class Fit:
 
 
 def evaluate_fit(fields: MapFields, pose: Pose2, points: NDArray[np.float64], range_max: float) -> Fit:
-    """Compare points (n, 2; m, frame `base`) seen at a pose in `map` with what the static map would show there.
+    """Compare points (n, 2; m, frame `base`) measured at a pose in `map` with the ranges of the static map there.
 
     `range_max`: m, the lidar's rated range.
     """

@@ -283,7 +283,7 @@ def resume_stream() -> bytes:
 
 
 class MissingPacketError(LookupError):
-    """A frame was asked for a packet that the stream does not carry."""
+    """The packet is not in this frame: the stream does not contain it."""
 
     def __init__(self, packet_id: int, present: Iterable[int]) -> None:
         """Name the missing packet and those present."""

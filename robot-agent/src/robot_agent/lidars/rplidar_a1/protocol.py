@@ -195,9 +195,9 @@ class Parser:
             descriptor = _DESCRIPTORS[match.group()]
             self._events.append(descriptor)
             self._decoder = self._decoder_for(descriptor)
-        keep = len(buffer) - _partial_descriptor_size(buffer, begin)
-        self._pass_on(buffer[begin:keep], last=False)
-        self._held = buffer[keep:]
+        end = len(buffer) - _partial_descriptor_size(buffer, begin)
+        self._pass_on(buffer[begin:end], last=False)
+        self._held = buffer[end:]
 
     def next_event(self) -> Event | None:
         """Return the oldest event not yet returned; None until more bytes are received."""

@@ -40,24 +40,24 @@ def stars(draw):
 
 
 @given(ring=stars())
-def test_normalizing_orients_opens_and_keeps_the_shape(ring):
-    got = normalized_polygon(ring)
-    assert signed_area(got) > 0
-    assert got[0] != got[-1]
-    assert set(got) == set(ring)
-    assert normalized_polygon(got) == got
-    assert signed_area(got) == pytest.approx(abs(signed_area(got[::-1])))
+def test_normalized_polygon_is_open_counter_clockwise_and_has_the_same_vertices(ring):
+    polygon = normalized_polygon(ring)
+    assert signed_area(polygon) > 0
+    assert polygon[0] != polygon[-1]
+    assert set(polygon) == set(ring)
+    assert normalized_polygon(polygon) == polygon
+    assert signed_area(polygon) == pytest.approx(abs(signed_area(polygon[::-1])))
 
 
 @given(ring=stars(), start=st.integers(0, 11))
-def test_where_the_ring_begins_does_not_matter(ring, start):
-    got = normalized_polygon(ring)
-    turned = got[start % len(got) :] + got[: start % len(got)]
-    assert set(normalized_polygon(turned)) == set(got)
+def test_normalizing_a_rotated_list_of_vertices_gives_the_same_polygon(ring, start):
+    polygon = normalized_polygon(ring)
+    shifted = polygon[start % len(polygon) :] + polygon[: start % len(polygon)]
+    assert set(normalized_polygon(shifted)) == set(polygon)
 
 
 @pytest.mark.parametrize(
-    ("points", "words"),
+    ("points", "reason"),
     [
         ([], "three distinct"),
         ([(0, 0), (1, 1)], "three distinct"),
@@ -74,12 +74,12 @@ def test_where_the_ring_begins_does_not_matter(ring, start):
         ([(0, 0), (1, 0), (1, 1, 1)], "vertex 2"),
     ],
 )
-def test_unusable_polygon_is_refused_in_words(points, words):
-    with pytest.raises(GeometryError, match=words):
+def test_invalid_polygon_is_refused_with_the_reason(points, reason):
+    with pytest.raises(GeometryError, match=reason):
         normalized_polygon(points)
 
 
-def test_straight_vertices_and_shared_doubles_are_fine():
+def test_collinear_vertices_are_kept_and_repeated_ones_removed():
     assert normalized_polygon([(0, 0), (1, 0), (2, 0), (2, 2), (2, 2), (0, 2)]) == [
         (0, 0),
         (1, 0),
@@ -90,26 +90,26 @@ def test_straight_vertices_and_shared_doubles_are_fine():
 
 
 @given(ring=stars())
-def test_raster_holds_every_cell_inside_or_touched_and_no_other(ring):
+def test_raster_contains_exactly_the_cells_within_half_a_diagonal_of_the_polygon(ring):
     polygon = normalized_polygon(ring)
     window, mask = rasterize(polygon, GRID)
     assert GRID.clip(window) == window
     assert mask.shape == (window.height, window.width) or window.empty
-    drawn = np.zeros(GRID.shape, dtype=bool)
+    raster = np.zeros(GRID.shape, dtype=bool)
     if not window.empty:
-        drawn[window.rows, window.columns] = mask
+        raster[window.rows, window.columns] = mask
     reach = GRID.resolution * math.sqrt(0.5)
     for row in range(0, GRID.height, 2):
         for column in range(0, GRID.width, 2):
             distance = distance_to_polygon(polygon, *GRID.centre(column, row))
             if abs(distance - reach) > 1e-9:
-                assert drawn[row, column] == (distance < reach), (column, row)
+                assert raster[row, column] == (distance < reach), (column, row)
 
 
 # Half of all points in a bounding box lie outside the polygon or the grid.
 @settings(suppress_health_check=[HealthCheck.filter_too_much])
 @given(ring=stars(), x=st.floats(0, 1), y=st.floats(0, 1))
-def test_every_point_of_a_polygon_lies_on_a_drawn_cell(ring, x, y):
+def test_every_point_of_a_polygon_lies_on_a_cell_of_its_raster(ring, x, y):
     polygon = normalized_polygon(ring)
     left, bottom, right, top = bounding_box(polygon)
     px, py = left + x * (right - left), bottom + y * (top - bottom)
@@ -145,7 +145,7 @@ windows = st.builds(Window, st.integers(-50, 60), st.integers(-50, 60), st.integ
 
 
 @given(st.lists(st.tuples(st.floats(-9, 9), st.floats(-9, 9)), max_size=12))
-def test_points_in_bulk_get_the_cells_that_single_points_get(points):
+def test_cells_of_an_array_of_points_equal_those_of_single_points(points):
     cells, inside = GRID.cells(np.array(points, dtype=np.float64))
     assert [tuple(cell) for cell in cells.tolist()] == [GRID.cell(x, y) for x, y in points]
     assert inside.tolist() == [GRID.contains(x, y) for x, y in points]
@@ -153,13 +153,13 @@ def test_points_in_bulk_get_the_cells_that_single_points_get(points):
 
 
 @given(st.lists(st.tuples(st.floats(-9, 9), st.floats(-9, 9)), max_size=12))
-def test_grid_coordinates_have_whole_numbers_at_centres_and_lead_back(points):
+def test_grid_coordinates_are_whole_at_centres_and_invertible(points):
     coordinates = GRID.grid_coordinates(np.array(points, dtype=np.float64))
     assert GRID.centres(coordinates) == pytest.approx(np.array(points, dtype=np.float64).reshape(-1, 2), abs=1e-9)
     assert GRID.grid_coordinates(np.array([GRID.centre(3, 5)]))[0] == pytest.approx((3.0, 5.0))
 
 
-def test_sampling_a_grid_gives_the_cells_values_and_the_stated_one_outside():
+def test_sampling_returns_cell_values_and_the_given_value_outside():
     grid = np.arange(GRID.width * GRID.height, dtype=np.uint8).reshape(GRID.shape)
     points = np.array([(-1.95, -0.95), (-1.85, -0.85), (-2.01, 0.0), (1.99, 1.99), (2.01, 0.0), (0.0, 9.0)])
     assert GRID.sample(grid, points, 7).tolist() == [0, grid[1, 1], 7, grid[29, 39], 7, 7]
@@ -173,24 +173,24 @@ def test_axes_are_the_centres_of_a_windows_columns_and_rows():
 
 
 @given(a=windows, b=windows)
-def test_windows_clip_and_join(a, b):
+def test_windows_are_clipped_joined_and_intersected(a, b):
     clipped = GRID.clip(a)
     assert GRID.clip(clipped) == clipped or clipped.empty
     joined = a.union(b)
     for part in (a, b):
         if not part.empty:
             assert joined.union(part) == joined
-    marks = [np.zeros((200, 200), dtype=bool) for _ in range(3)]
-    for mark, window in zip(marks, (a, b, a.intersection(b)), strict=True):
+    masks = [np.zeros((200, 200), dtype=bool) for _ in range(3)]
+    for mask, window in zip(masks, (a, b, a.intersection(b)), strict=True):
         shifted = Window(window.x + 60, window.y + 60, window.width, window.height)
-        mark[shifted.rows, shifted.columns] = True
-    assert np.array_equal(marks[0] & marks[1], marks[2])
+        mask[shifted.rows, shifted.columns] = True
+    assert np.array_equal(masks[0] & masks[1], masks[2])
     grid = np.zeros(GRID.shape, dtype=np.uint8)
     assert grid[clipped.rows, clipped.columns].shape == (clipped.height, clipped.width) or clipped.empty
 
 
 @pytest.mark.parametrize("wrong", [{"width": 0}, {"resolution": 0.0}, {"resolution": math.nan}, {"origin_x": math.inf}])
-def test_impossible_grid_is_refused(wrong):
+def test_invalid_grid_geometry_is_refused(wrong):
     good = {"width": 2, "height": 2, "resolution": 0.1, "origin_x": 0.0, "origin_y": 0.0}
     with pytest.raises(ValueError, match=r"grid|resolution|origin"):
         GridGeometry(**{**good, **wrong})

@@ -1,4 +1,4 @@
-"""Every shape: what it holds, which cells it covers, when it is refused."""
+"""Every shape: containment of points, rasterization, validation."""
 
 import math
 import typing
@@ -24,14 +24,14 @@ shapes = st.one_of(
 )
 
 
-def drawn(shape: Shape, geometry: GridGeometry = GRID) -> np.ndarray:
+def raster(shape: Shape, geometry: GridGeometry = GRID) -> np.ndarray:
     window, mask = rasterize_shape(shape, geometry)
     whole = np.zeros(geometry.shape, dtype=bool)
     whole[window.rows, window.columns] = mask
     return whole
 
 
-def test_every_shape_that_a_zone_may_have_is_known():
+def test_every_zone_shape_is_implemented():
     assert set(KINDS) == set(typing.get_args(Shape))
 
 
@@ -44,26 +44,26 @@ def test_every_shape_that_a_zone_may_have_is_known():
         (CorridorShape(line=[(0.0, 0.5), (1.0, 0.5), (1.0, 1.5)], width=0.4), (1.15, 1.2), (0.7, 1.0)),
     ],
 )
-def test_every_shape_holds_its_points_and_covers_their_cells(shape, inside, outside):
+def test_shape_contains_a_point_inside_and_rasterizes_its_cell(shape, inside, outside):
     assert shape_contains(shape, *inside)
     assert not shape_contains(shape, *outside)
-    assert drawn(shape)[GRID.cell(*inside)[::-1]]
-    assert not drawn(shape)[GRID.cell(*outside)[::-1]]
+    assert raster(shape)[GRID.cell(*inside)[::-1]]
+    assert not raster(shape)[GRID.cell(*outside)[::-1]]
 
 
 @given(shapes, point)
 @settings(deadline=None)
-def test_every_point_of_a_shape_lies_on_one_of_its_cells(shape, at):
+def test_every_point_of_a_shape_lies_on_a_cell_of_its_raster(shape, inside):
     try:
-        cells = drawn(shape)
+        cells = raster(shape)
     except ShapeError:
         return
-    if shape_contains(shape, *at) and GRID.contains(*at):
-        assert cells[GRID.cell(*at)[::-1]]
+    if shape_contains(shape, *inside) and GRID.contains(*inside):
+        assert cells[GRID.cell(*inside)[::-1]]
 
 
 @pytest.mark.parametrize(
-    ("shape", "field", "words"),
+    ("shape", "field", "reason"),
     [
         (PolygonShape(points=[(0.0, 0.0), (1.0, 1.0), (1.0, 0.0), (0.0, 1.0)]), "points", "crosses itself"),
         (PolygonShape(points=[(0.0, 0.0), (1.0, 1.0), (0.0, 0.0)]), "points", "three corners"),
@@ -71,21 +71,21 @@ def test_every_point_of_a_shape_lies_on_one_of_its_cells(shape, at):
         (CorridorShape(line=[(0.0, 0.0), (0.0, 0.0)], width=1.0), "line", "two different points"),
     ],
 )
-def test_a_shape_that_cannot_be_used_is_refused_by_field(shape, field, words):
-    with pytest.raises(ShapeError, match=words) as caught:
+def test_invalid_shape_is_refused_by_field(shape, field, reason):
+    with pytest.raises(ShapeError, match=reason) as caught:
         normalized_shape(shape)
     assert caught.value.field == field
 
 
-def test_normalizing_turns_a_polygon_counter_clockwise_and_leaves_the_others():
+def test_normalizing_makes_a_polygon_counter_clockwise_and_keeps_other_shapes():
     clockwise = [(0.5, 0.5), (0.5, 1.5), (1.5, 0.5)]
     assert normalized_shape(PolygonShape(points=clockwise)) == PolygonShape(points=clockwise[::-1])
     for shape in (CircleShape(centre=(0.0, 0.0), radius=1.0), RectangleShape(corner=(1.0, 1.0), opposite=(0.0, 0.0))):
         assert normalized_shape(shape) == shape
 
 
-def slowly(polygon: list[tuple[float, float]]) -> np.ndarray:
-    """Rasterize by the definition: every cell against every side."""
+def rasterize_by_definition(polygon: list[tuple[float, float]]) -> np.ndarray:
+    """Rasterize by the definition, testing every cell against every side."""
     margin = GRID.resolution * math.sqrt(0.5)
     px, py = np.meshgrid(*GRID.axes(GRID.whole))
     inside, near = np.zeros(GRID.shape, dtype=bool), np.zeros(GRID.shape, dtype=bool)
@@ -102,7 +102,7 @@ def slowly(polygon: list[tuple[float, float]]) -> np.ndarray:
 @given(st.lists(point, min_size=3, max_size=9))
 @example([(0.0, -1.0), (0.0, -1.5), (1.0, -1.0)])  # wholly below the grid
 @settings(max_examples=200, deadline=None)
-def test_scan_lines_give_the_cells_of_the_definition(points):
+def test_scan_line_raster_equals_the_definition(points):
     try:
         ring = normalized_polygon(points)
     except GeometryError:
@@ -113,4 +113,4 @@ def test_scan_lines_give_the_cells_of_the_definition(points):
     window, mask = rasterize(ring, GRID)
     found = np.zeros(GRID.shape, dtype=bool)
     found[window.rows, window.columns] = mask
-    assert np.array_equal(found, slowly(ring))
+    assert np.array_equal(found, rasterize_by_definition(ring))

@@ -1,4 +1,4 @@
-"""The REST frame over a real socket."""
+"""The REST base over a real socket."""
 
 import asyncio
 import contextlib
@@ -135,7 +135,7 @@ async def test_validation_error_is_a_problem_with_field_path_and_sentence(client
     is_problem(await client.post("/points", content=b"{", headers={"Content-Type": "application/json"}), 422)
 
 
-async def test_contract_body_is_checked_by_its_type(client):
+async def test_message_body_is_validated_by_its_type(client):
     zone = {"id": "z1", "kind": "BLOCKED", "shape": {"type": "circle", "centre": [1, 2], "radius": 1}}
     assert (await client.put("/zones/z1", json=zone)).json() == {"kind": "BLOCKED"}
     zone["shape"]["radius"] = -1
@@ -144,7 +144,7 @@ async def test_contract_body_is_checked_by_its_type(client):
     assert is_problem(await client.put("/zones/z1", content=b"\xff{"), 422)["errors"][0]["field"] == "body"
 
 
-async def test_a_route_answers_as_its_signature_and_its_exceptions_say(client):
+async def test_route_responds_by_its_signature_and_exceptions(client):
     zone = {"id": "z1", "kind": "BLOCKED", "shape": {"type": "circle", "centre": [1, 2], "radius": 1}, "version": 3}
     headers = {"Authorization": "Bearer op-token", "If-Match": '"7"'}
     made = await client.post("/zones", json=zone, headers=headers)
@@ -161,11 +161,11 @@ async def test_a_route_answers_as_its_signature_and_its_exceptions_say(client):
 @pytest.mark.parametrize(
     ("header", "version"), [(None, None), ("*", None), ('"12"', 12), ("12", -1), ('"x"', -1), ('W/"1"', -1)]
 )
-def test_an_if_match_names_a_version_any_or_none_that_ever_is(header, version):
+def test_if_match_header_gives_a_version_or_any_or_an_invalid_one(header, version):
     assert expected_version(header) == version
 
 
-async def test_openapi_tells_answers_errors_and_tokens_from_the_same_signature(client):
+async def test_openapi_describes_responses_errors_and_tokens_by_the_signature(client):
     paths = (await client.get("/openapi.json")).json()["paths"]
     post = paths["/zones"]["post"]
     assert set(post["responses"]) == {"201", "401", "403", "409", "413", "422", "503", "default"}
@@ -181,7 +181,7 @@ async def test_openapi_tells_answers_errors_and_tokens_from_the_same_signature(c
     assert "content" not in paths["/zones/{zone}"]["delete"]["responses"]["204"]
 
 
-async def test_openapi_describes_contract_bodies_and_resolves_all_references(client):
+async def test_openapi_describes_message_bodies_and_resolves_all_references(client):
     described = (await client.get("/openapi.json")).json()
     put = described["paths"]["/zones/{zone}"]["put"]
     assert put["requestBody"]["content"]["application/json"]["schema"] == {"$ref": "#/components/schemas/Zone"}
@@ -202,26 +202,26 @@ async def test_openapi_describes_contract_bodies_and_resolves_all_references(cli
 
 
 @pytest.mark.parametrize(
-    ("header", "status", "words"),
+    ("header", "status", "detail"),
     [
         (None, 401, "needs a token"),
-        ("Bearer wrong", 401, "nobody has"),
+        ("Bearer wrong", 401, "the token is unknown"),
         ("Basic b3A6eA==", 401, "needs a token"),
-        ("Bearer vi-token", 403, "needs the role operator; vi is viewer"),
+        ("Bearer vi-token", 403, "needs the role operator; vi has the role viewer"),
     ],
 )
-async def test_who_may_not_is_told_why(client, header, status, words):
+async def test_missing_unknown_or_insufficient_token_is_refused(client, header, status, detail):
     answer = await client.get("/secret", headers={"Authorization": header} if header else {})
-    assert words in is_problem(answer, status)["detail"]
+    assert detail in is_problem(answer, status)["detail"]
     assert ("www-authenticate" in answer.headers) == (status == 401)
 
 
 @pytest.mark.parametrize("name", ["op", "ad"])
-async def test_role_or_higher_may(client, name):
+async def test_sufficient_role_is_admitted(client, name):
     assert (await client.get("/secret", headers={"Authorization": f"Bearer {name}-token"})).json() == name
 
 
-async def test_problems_carry_fields_headers_and_more(client):
+async def test_problems_contain_fields_headers_and_extra_members(client):
     answer = await client.get("/stale")
     body = is_problem(answer, 412)
     assert body["errors"] == [{"field": "header.if-match", "problem": "it has changed"}]
@@ -231,7 +231,7 @@ async def test_problems_carry_fields_headers_and_more(client):
     assert "inner detail" not in is_problem(await client.get("/bug"), 500)["detail"]
 
 
-async def test_large_bodies_are_refused_announced_or_not(client):
+async def test_oversized_bodies_are_refused_with_and_without_content_length(client):
     async def chunks():
         for _ in range(20):
             yield b"x" * 100
@@ -241,14 +241,14 @@ async def test_large_bodies_are_refused_announced_or_not(client):
     assert (await client.get("/healthz")).status_code == 200
 
 
-async def test_taken_port_is_an_error(client):
+async def test_port_in_use_raises(client):
     port = client.base_url.port
     with pytest.raises(OSError, match="in use"):
         await serve(make_app("x", Health(), load_tokens(None)), port=port)
 
 
 @pytest.mark.parametrize(
-    ("content", "words"),
+    ("content", "reason"),
     [
         ('[[tokens]]\nname = "x"\nrole = "king"\nsha256 = ""', "king"),
         ('[[tokens]]\nname = "x"\nrole = "admin"\nsha256 = "abc"', "sha256"),
@@ -256,15 +256,15 @@ async def test_taken_port_is_an_error(client):
         ("[[token]]", "token"),
     ],
 )
-def test_broken_tokens_file_is_named(tmp_path, content, words):
+def test_invalid_tokens_file_is_refused_by_name(tmp_path, content, reason):
     file = tmp_path / "t.toml"
     file.write_text(content)
-    with pytest.raises(TokensError, match=words) as refused:
+    with pytest.raises(TokensError, match=reason) as refused:
         load_tokens(file)
     assert str(file) in str(refused.value)
 
 
-def test_two_callers_never_share_a_token(tmp_path):
+def test_tokens_file_with_a_repeated_hash_is_refused(tmp_path):
     entry = f'[[tokens]]\nname = "x"\nrole = "admin"\nsha256 = "{token_hash("t")}"\n'
     (tmp_path / "t.toml").write_text(entry * 2)
     with pytest.raises(TokensError, match="same sha256"):

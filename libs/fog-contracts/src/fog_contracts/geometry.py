@@ -14,11 +14,11 @@ Point = tuple[float, float]
 Polygon = Sequence[Point]
 
 _COLLINEAR: Final = 1e-12
-"""Twice a triangle's area, relative to the square of its size, below which rounding decides about its sign."""
+"""Twice a triangle's area, relative to the square of its size, below which its sign is only rounding."""
 
 
 class GeometryError(ValueError):
-    """A shape that can't be used; the message names what is wrong with it."""
+    """A shape is invalid; the message says what is wrong."""
 
 
 def signed_area(polygon: Polygon) -> float:
@@ -79,10 +79,10 @@ def _open_ring(points: Sequence[Sequence[float]]) -> list[Point]:
 
 
 def _first_crossing(ring: Sequence[Point]) -> tuple[int, int] | None:
-    """Return the numbers of the first two sides that touch without being neighbours; None where none do."""
+    """Return the numbers of the first two sides that touch without being neighbours, or None."""
     count = len(ring)
     for i in range(count):
-        # The neighbours of a side share a corner with it: the next one, and for the first side the last one.
+        # Neighbouring sides share a vertex: each with the next, and the first with the last.
         for j in range(i + 2, count - 1 if i == 0 else count):
             if segments_touch(ring[i], ring[i + 1], ring[j], ring[(j + 1) % count]):
                 return i, j
@@ -133,11 +133,11 @@ class ShapeMask(NamedTuple):
 def rasterize(polygon: Polygon, geometry: GridGeometry) -> ShapeMask:
     """Return the cells of a polygon.
 
-    A cell belongs to the polygon when its centre lies inside or within half a cell's diagonal of the border: a
-    danger is rather drawn one cell too large than too small. The window is empty when the polygon lies off the grid.
+    A cell belongs to the polygon when its centre lies inside or within half a cell's diagonal of the border, so that
+    no part of a hazard is missing. The window is empty when the polygon lies off the grid.
 
-    Inside is judged by the even-odd rule along scan lines: every side flips, in each row that it crosses, all cells to
-    its left. The time does not grow with sides times cells.
+    Inside is determined by the even-odd rule along scan lines: every side flips, in each row that it crosses, all cells
+    to its left, so the time does not grow with sides times cells.
     """
     window, near = rasterize_line([*polygon, polygon[0]], 0.0, geometry)
     if window.empty:
@@ -154,9 +154,9 @@ def rasterize(polygon: Polygon, geometry: GridGeometry) -> ShapeMask:
 
 
 def rasterize_line(line: Sequence[Point], reach: float, geometry: GridGeometry) -> ShapeMask:
-    """Return the cells of everything within `reach` (m) of a polyline; one point makes a disc.
+    """Return the cells within `reach` (m) of a polyline; a single point gives a disc.
 
-    As of a polygon, cells within half a cell's diagonal of the border belong to it.
+    As with a polygon, cells within half a cell's diagonal of the border belong to it.
     """
     reach += geometry.resolution * math.sqrt(0.5)
     left, bottom, right, top = bounding_box(line)

@@ -1,4 +1,4 @@
-"""What each shape of a zone is: how it is checked, which points it holds, which cells it covers.
+"""The shapes of zones: validation, containment of points, and rasterization.
 
 To add a shape, define its message in `fog_contracts.messages` (and name it in `Shape`), write its class here and add
 both to `KINDS`. Nobody else asks which shape it has before them.
@@ -25,7 +25,7 @@ S = TypeVar("S")
 
 
 class ShapeError(GeometryError):
-    """A shape that can't be used: `field` is the path in it, the message says what is wrong and what to do."""
+    """A shape is invalid: `field` is the path of the invalid part, the message says what is wrong and the remedy."""
 
     def __init__(self, field: str, problem: str) -> None:
         super().__init__(f"{field}: {problem}")
@@ -37,7 +37,7 @@ class ShapeKind(ABC, Generic[S]):
     """One kind of shape."""
 
     def normalized(self, shape: S) -> S:
-        """Return the shape as it is stored; raises `ShapeError` for one that can't be used."""
+        """Return the shape as it is stored; raises `ShapeError` for an invalid one."""
         return shape
 
     @abstractmethod
@@ -46,7 +46,7 @@ class ShapeKind(ABC, Generic[S]):
 
     @abstractmethod
     def rasterized(self, shape: S, geometry: GridGeometry) -> ShapeMask:
-        """Return the cells of a shape, as generously as `rasterize` does; raises `ShapeError`."""
+        """Return the cells of a shape, with the same margin as `rasterize`; raises `ShapeError`."""
 
 
 class _Polygon(ShapeKind[PolygonShape]):
@@ -112,7 +112,7 @@ KINDS: Final[Mapping[type, ShapeKind[Any]]] = {
 
 
 def normalized_shape(shape: Shape) -> Shape:
-    """Return a shape as it is stored (polygons counter-clockwise); raises `ShapeError` for one that can't be used."""
+    """Return a shape as it is stored (polygons counter-clockwise); raises `ShapeError` for an invalid one."""
     normalized: Shape = KINDS[type(shape)].normalized(shape)
     return normalized
 
@@ -123,8 +123,8 @@ def shape_contains(shape: Shape, x: float, y: float) -> bool:
 
 
 def rasterize_shape(shape: Shape, geometry: GridGeometry) -> ShapeMask:
-    """Return the cells of a shape: those within half a cell's diagonal of it, so that none is drawn too small.
+    """Return the cells of a shape and those within half a cell's diagonal of it, so that no part is missing.
 
-    The window is empty for a shape off the grid. Raises `ShapeError` for one that can't be used.
+    The window is empty for a shape off the grid. Raises `ShapeError` for an invalid one.
     """
     return KINDS[type(shape)].rasterized(shape, geometry)

@@ -1,6 +1,6 @@
 """Compiled kernels: A*, inflation, ray casting, likelihood field, particle filter, DWA.
 
-Import the submodule that is needed: none imports another one's kernels without using them, so a robot loads only
-its own. Every kernel is compiled, or loaded from numba's cache, when its module is imported and never later: all
-signatures are explicit, and arrays of another type are refused instead of being compiled for.
+Import only the submodules that are needed: none imports another without using it, so a process loads only its own
+kernels. Every kernel is compiled, or loaded from numba's cache, when its module is imported and never later: all
+signatures are explicit, and arrays of other types are refused.
 """

@@ -1,4 +1,4 @@
-"""What the wrappers share: numba types of arguments, and checks that name the argument and the remedy."""
+"""Numba types and argument checks that the kernels' wrappers share; errors name the argument and the remedy."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def grid(array: NDArray[Any], name: str) -> NDArray[np.uint8]:
     if array.dtype == np.bool_:
         array = array.view(np.uint8)
     if array.dtype != np.uint8:
-        raise TypeError(f"{name} must be uint8 or bool, not {array.dtype}: convert it where it is made")
+        raise TypeError(f"{name} must be uint8 or bool, not {array.dtype}: convert it where it is created")
     if array.ndim != 2 or array.size == 0:
         raise ValueError(f"{name} must have shape (height, width) and cells, not {array.shape}")
     if not array.flags.c_contiguous:
@@ -45,7 +45,7 @@ def grid(array: NDArray[Any], name: str) -> NDArray[np.uint8]:
 def exact(array: NDArray[Any], dtype: type[np.generic], ndim: int, name: str) -> None:
     """Raise TypeError or ValueError unless the array has this dtype, this many axes and C order."""
     if array.dtype != dtype:
-        raise TypeError(f"{name} must be {np.dtype(dtype)}, not {array.dtype}: convert it where it is made")
+        raise TypeError(f"{name} must be {np.dtype(dtype)}, not {array.dtype}: convert it where it is created")
     if array.ndim != ndim:
         raise ValueError(f"{name} must have {ndim} axes, not shape {array.shape}")
     if not array.flags.c_contiguous:

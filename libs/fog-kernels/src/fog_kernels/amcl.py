@@ -8,8 +8,8 @@ Methods: odometry motion model (Thrun, Burgard and Fox 2005, table 5.6); likelih
 (chapter 6.4); sample size by Kullback-Leibler distance (Fox 2001), drawn with low variance (chapter 4.3).
 """
 
-# Kernels take arrays and scalars, typed by their compiled signatures, and are one piece where a call per cell would
-# cost more than the work that it does.
+# Kernels take arrays and scalars, typed by their compiled signatures, and are single functions where a call per cell
+# would cost more than its work.
 # ruff: noqa: ANN401, C901, PLR0912, PLR0913, PLR0915
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Estimate(NamedTuple):
 
 
 class Cluster(NamedTuple):
-    """Particles in adjacent bins: their share of all weight and their estimate."""
+    """Particles in adjacent bins: their share of the total weight and their estimate."""
 
     share: float
     estimate: Estimate
@@ -115,12 +115,12 @@ def _hash(key: Any, mask: Any) -> Any:
     nogil=True,
 )
 def _move(x: Any, y: Any, theta: Any, rot1: float, trans: float, rot2: float, alphas: Any, state: Any) -> None:
-    # A robot that backs up turns by nearly pi twice in this model; the noise is that of the small turn it really made.
-    turn1 = min(abs(_wrap(rot1)), abs(_wrap(rot1 - math.pi)))
-    turn2 = min(abs(_wrap(rot2)), abs(_wrap(rot2 - math.pi)))
-    spread1 = math.sqrt(alphas[0] * turn1 * turn1 + alphas[1] * trans * trans)
-    spread_trans = math.sqrt(alphas[2] * trans * trans + alphas[3] * (turn1 * turn1 + turn2 * turn2))
-    spread2 = math.sqrt(alphas[0] * turn2 * turn2 + alphas[1] * trans * trans)
+    # In this model a reversing robot rotates by nearly pi twice; the noise is that of its actual small rotation.
+    rotation1 = min(abs(_wrap(rot1)), abs(_wrap(rot1 - math.pi)))
+    rotation2 = min(abs(_wrap(rot2)), abs(_wrap(rot2 - math.pi)))
+    spread1 = math.sqrt(alphas[0] * rotation1 * rotation1 + alphas[1] * trans * trans)
+    spread_trans = math.sqrt(alphas[2] * trans * trans + alphas[3] * (rotation1 * rotation1 + rotation2 * rotation2))
+    spread2 = math.sqrt(alphas[0] * rotation2 * rotation2 + alphas[1] * trans * trans)
     s0, s1, s2, s3 = state[0], state[1], state[2], state[3]
     spare = 0.0
     for i in range(x.size):
@@ -203,7 +203,7 @@ def _sample_size(
     n_theta: int,
     state: Any,
 ) -> int:
-    """Draw particles until as many are drawn as the number of bins that they fall into calls for (Fox 2001)."""
+    """Draw particles until their number suffices for the number of bins that they occupy (Fox 2001)."""
     if n_min >= n_max:
         return n_max
     size = 1024
@@ -310,7 +310,7 @@ def _draw_low_variance(
     nogil=True,
 )
 def _clusters(x: Any, y: Any, theta: Any, weights: Any, bin_xy: float, n_theta: int) -> Any:
-    """Return rows of share, x, y, theta and covariance (9), one per group of bins that touch."""
+    """Return rows of share, x, y, theta and covariance (9), one per group of adjacent bins."""
     n = x.size
     size = 64
     while size < 2 * n:
@@ -378,19 +378,19 @@ def _clusters(x: Any, y: Any, theta: Any, weights: Any, bin_xy: float, n_theta: 
             count += 1
         index[number] = index[root]
     table = np.zeros((count, 13))
-    turns = np.zeros((count, 2))
+    heading_sums = np.zeros((count, 2))
     for number in range(bins):
         group = index[number]
         for k in range(3):
             table[group, k] += sums[number, k]
-        turns[group, 0] += sums[number, 3]
-        turns[group, 1] += sums[number, 4]
+        heading_sums[group, 0] += sums[number, 3]
+        heading_sums[group, 1] += sums[number, 4]
     for group in range(count):
         share = table[group, 0]
         if share > 0.0:
             table[group, 1] /= share
             table[group, 2] /= share
-        table[group, 3] = math.atan2(turns[group, 1], turns[group, 0])
+        table[group, 3] = math.atan2(heading_sums[group, 1], heading_sums[group, 0])
     for i in range(n):
         group = index[bin_of[i]]
         share = table[group, 0]
@@ -399,13 +399,13 @@ def _clusters(x: Any, y: Any, theta: Any, weights: Any, bin_xy: float, n_theta: 
         part = weights[i] / share
         dx_mean = x[i] - table[group, 1]
         dy_mean = y[i] - table[group, 2]
-        turn = _wrap(theta[i] - table[group, 3])
+        dtheta_mean = _wrap(theta[i] - table[group, 3])
         table[group, 4] += part * dx_mean * dx_mean
         table[group, 5] += part * dx_mean * dy_mean
-        table[group, 6] += part * dx_mean * turn
+        table[group, 6] += part * dx_mean * dtheta_mean
         table[group, 8] += part * dy_mean * dy_mean
-        table[group, 9] += part * dy_mean * turn
-        table[group, 12] += part * turn * turn
+        table[group, 9] += part * dy_mean * dtheta_mean
+        table[group, 12] += part * dtheta_mean * dtheta_mean
     for group in range(count):
         table[group, 7] = table[group, 5]
         table[group, 10] = table[group, 6]
@@ -448,7 +448,7 @@ def _check_state(state: NDArray[np.uint64]) -> None:
 def odometry_delta(old: tuple[float, float, float], new: tuple[float, float, float]) -> tuple[float, float, float]:
     """Split the motion between two odometry poses (x, y, theta) into rot1, trans, rot2 (rad, m, rad).
 
-    Below a centimetre the direction of travel is noise: the whole turn then counts as rot2.
+    Below a centimetre the direction of travel is noise: the whole rotation then counts as rot2.
     """
     dx, dy = new[0] - old[0], new[1] - old[1]
     trans = math.hypot(dx, dy)
@@ -468,8 +468,9 @@ def motion_update(
 ) -> None:
     """Move all particles in place by a noisy odometry step (rad, m, rad); `alphas` are the model's four.
 
-    alpha1: turn noise from turning, alpha2: turn noise from driving, alpha3: distance noise from driving, alpha4:
-    distance noise from turning (all variances per squared motion). Raises TypeError or ValueError for wrong arrays.
+    alpha1: rotation noise from rotation, alpha2: rotation noise from translation, alpha3: translation noise from
+    translation, alpha4: translation noise from rotation (all are variances per squared motion). Raises TypeError or
+    ValueError for wrong arrays.
     """
     _check_particles(x, y, theta)
     _check_state(rng_state)
@@ -546,11 +547,11 @@ def resample(
     free_xy: NDArray[np.float64] | None = None,
     jitter: float = 0.05,
 ) -> Resampled:
-    """Draw new particles in proportion to the weights; their number lies in n_min..n_max and fits their spread.
+    """Draw new particles in proportion to the weights; their number, n_min..n_max, depends on their spread.
 
-    The number is the one for which, with the confidence of quantile `kld_z`, the Kullback-Leibler distance between the
-    samples and the distribution over bins stays below `kld_err` (Fox 2001); the draw itself is systematic, of low
-    variance. `random_share` of the particles is drawn from the places `free_xy`, float64 (m, 2) in metres, within
+    With this number the Kullback-Leibler distance between the samples and the distribution over bins stays below
+    `kld_err` with the confidence of the quantile `kld_z` (Fox 2001); the draw is systematic, with low variance.
+    `random_share` of the particles is drawn around the positions `free_xy`, float64 (m, 2) in metres, within
     +-jitter/2, at any heading (augmented MCL's recovery). n_min = n_max gives a fixed number.
     Raises TypeError or ValueError for wrong types, shapes or ranges, and when no weight is above 0.
     """
@@ -598,7 +599,7 @@ def clusters(
     bin_xy: float = BIN_XY,
     bin_theta: float = BIN_THETA,
 ) -> list[Cluster]:
-    """Group particles whose bins touch and return the groups, heaviest first.
+    """Group particles in adjacent bins and return the groups, highest weight first.
 
     Raises TypeError or ValueError for wrong types or shapes, and when no weight is above 0.
     """
@@ -625,5 +626,5 @@ def estimate(
     bin_xy: float = BIN_XY,
     bin_theta: float = BIN_THETA,
 ) -> Estimate:
-    """Return mean and covariance of the heaviest cluster of particles; errors as for `clusters`."""
+    """Return mean and covariance of the cluster with the highest weight; errors as for `clusters`."""
     return clusters(x, y, theta, weights, bin_xy, bin_theta)[0].estimate

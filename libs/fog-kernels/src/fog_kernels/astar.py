@@ -6,12 +6,12 @@ symmetric. Lengths are the integers 408 and 577 (577/408 is sqrt 2 within 2e-6),
 search is exact for this integer problem, and no float rounding can make it depend on the order of expansion.
 
 Methods: A* (Hart, Nilsson and Raphael 1968) on a circular bucket queue (Dial 1969). A bucket spans several costs, so a
-cell is expanded again when a cheaper way to it appears; the search ends only when no open cell can lead to a cheaper
+cell is expanded again when a cheaper path to it appears; the search ends only when no open cell can lead to a cheaper
 path. Shortcuts integrate the cost along lines of sight cell by cell (Amanatides and Woo 1987).
 """
 
-# Kernels take arrays and scalars, typed by their compiled signatures, and are one piece where a call per cell would
-# cost more than the work that it does.
+# Kernels take arrays and scalars, typed by their compiled signatures, and are single functions where a call per cell
+# would cost more than its work.
 # ruff: noqa: ANN401, C901, PLR0912, PLR0913, PLR0915
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def _search_signature(costs: Any) -> Any:
         type_scratch,  # queue_next
         type_scratch,  # heads
         int64,  # shift
-        type_scratch,  # touched
+        type_scratch,  # reached_cells
         int64,  # max_expansions
         _arrays.I64_OUT,  # result
     )
@@ -77,7 +77,7 @@ def _search(
     queue_next: Any,
     heads: Any,
     shift: int,
-    touched: Any,
+    reached_cells: Any,
     max_expansions: int,
     result: Any,
 ) -> None:
@@ -86,7 +86,7 @@ def _search(
     `g` holds its largest value everywhere before and after. A negative g is the complement of an expanded cell's
     cost. `result` receives status, cost, path length, expansions; the path itself ends in queue_cell, goal first.
     """
-    # Indices are unsigned because numba tests signed ones for being negative, a fifth of the time of the search.
+    # Indices are unsigned: numba checks signed ones for negative values, which costs a fifth of the search's time.
     unset = g[start]
     highest = np.int64(2147483646) if g.itemsize == 4 else np.int64(1) << 61
     height = costmap.size // width
@@ -136,15 +136,15 @@ def _search(
     queue_cell[0] = start
     queue_next[0] = -1
     heads[np.uint64(bucket & mask)] = 0
-    waiting = 1
+    queued = 1
     g[start] = 0
-    touched[0] = start
-    n_touched = 1
+    reached_cells[0] = start
+    n_reached = 1
     best = highest
     expansions = 0
     status = _NOT_FOUND
 
-    while waiting > 0:
+    while queued > 0:
         entry: Any = np.int64(heads[np.uint64(bucket & mask)])
         while entry == -1:
             bucket += 1
@@ -155,10 +155,10 @@ def _search(
         heads[np.uint64(bucket & mask)] = queue_next[np.uint64(entry)]
         queue_next[np.uint64(entry)] = free
         free = entry
-        waiting -= 1
+        queued -= 1
         here = np.int64(g[np.uint64(cell)])
         if here < 0:
-            continue  # a stale entry: expanded already at its present cost
+            continue  # a stale entry: the cell was expanded at its current cost
         y: Any = np.int64(np.uint32(cell) // np.uint32(width))
         x = cell - y * width
         if best != highest:
@@ -201,7 +201,7 @@ def _search(
             neighbour = cell + offsets[k]
             reached = here + lengths[k] * (own + other)
             old = np.int64(g[np.uint64(neighbour)])
-            fresh = old == unset
+            first_reached = old == unset
             if old < 0:
                 old = ~old
             if reached >= old:
@@ -212,7 +212,7 @@ def _search(
             if use_field:
                 remaining = np.int64(field[np.uint64(neighbour)])
                 if remaining == unset:
-                    continue  # the goal can't be reached from there
+                    continue  # the goal is unreachable from there
             else:
                 dx = abs(x + columns[k] - goal_x)
                 dy = abs(y + rows[k] - goal_y)
@@ -223,9 +223,9 @@ def _search(
                 break
             if f >= best:
                 continue
-            if fresh:
-                touched[n_touched] = neighbour
-                n_touched += 1
+            if first_reached:
+                reached_cells[n_reached] = neighbour
+                n_reached += 1
             g[np.uint64(neighbour)] = reached
             if neighbour == goal:
                 best = reached
@@ -244,12 +244,13 @@ def _search(
             queue_cell[np.uint64(entry)] = neighbour
             queue_next[np.uint64(entry)] = heads[np.uint64(slot)]
             heads[np.uint64(slot)] = entry
-            waiting += 1
+            queued += 1
         if status in (_OVERFLOW, _QUEUE_FULL):
             break
 
     if status == _FOUND:
-        # No parents are stored: a predecessor is the neighbour whose cost and edge add up; straight on is preferred.
+        # Parents are not stored: a predecessor is a neighbour whose cost plus edge is the cell's cost. Among several
+        # the one in the same direction as before is preferred.
         cell = goal
         count = 0
         direction = 0
@@ -286,8 +287,8 @@ def _search(
         result[2] = count
     result[0] = status
     result[3] = expansions
-    for i in range(n_touched):
-        g[touched[i]] = unset
+    for i in range(n_reached):
+        g[reached_cells[i]] = unset
 
 
 def _field_signature(costs: Any) -> Any:
@@ -316,9 +317,9 @@ def _fill_field(
     heads: Any,
     shift: int,
 ) -> int:
-    """Write the exact cost from every cell to the goal; cells without a way keep the largest value.
+    """Write the exact cost from every cell to the goal; cells without a path keep the largest value.
 
-    A bucket is no wider than the cheapest edge, so whatever stands in the lowest bucket is final (Dinitz's caliber).
+    A bucket is no wider than the cheapest edge, so the costs in the lowest bucket are final (Dinitz's caliber).
     """
     unset = field[goal]
     highest = np.int64(2147483646) if field.itemsize == 4 else np.int64(1) << 61
@@ -339,10 +340,10 @@ def _fill_field(
     queue_cell[0] = goal
     queue_next[0] = -1
     heads[0] = 0
-    waiting = 1
+    queued = 1
     field[goal] = 0
     bucket: Any = np.int64(0)
-    while waiting > 0:
+    while queued > 0:
         entry: Any = np.int64(heads[np.uint64(bucket & mask)])
         while entry == -1:
             bucket += 1
@@ -351,10 +352,10 @@ def _fill_field(
         heads[np.uint64(bucket & mask)] = queue_next[np.uint64(entry)]
         queue_next[np.uint64(entry)] = free
         free = entry
-        waiting -= 1
+        queued -= 1
         here = np.int64(field[np.uint64(cell)])
         if here >> shift != bucket:
-            continue  # a stale entry: its cell left from a lower bucket
+            continue  # a stale entry: the cell was expanded from a lower bucket
         y = np.int64(np.uint32(cell) // np.uint32(width))
         x = cell - y * width
         own = np.int64(weight[costmap[np.uint64(cell)]])
@@ -393,14 +394,14 @@ def _fill_field(
             queue_cell[np.uint64(entry)] = neighbour
             queue_next[np.uint64(entry)] = heads[np.uint64(slot)]
             heads[np.uint64(slot)] = entry
-            waiting += 1
-    # `unset` cells stay as they were: no way leads from them to the goal.
+            queued += 1
+    # Cells that are still `unset` have no path to the goal.
     return _FOUND if unset != 0 else _NOT_FOUND
 
 
 @njit(int64(_arrays.U8_FLAT, int64, int64, int64, int64, _arrays.U8_GRID_OUT, type_scratch), cache=True, nogil=True)
 def _nearest_reachable(costmap: Any, width: int, start: int, goal_x: int, goal_y: int, seen: Any, stack: Any) -> Any:
-    # A diagonal needs both orthogonal cells, so 4-connectivity decides what can be reached.
+    # A diagonal needs both orthogonal cells, so 4-connectivity determines what is reachable.
     height = costmap.size // width
     nearest: Any = start
     least: Any = (start % width - goal_x) ** 2 + (start // width - goal_y) ** 2
@@ -472,7 +473,7 @@ def _line_cost(costmap: Any, weight: Any, x0: float, y0: float, x1: float, y1: f
     delta_y = abs(1.0 / dy) if dy != 0.0 else math.inf
     done = 0.0
     total = 0.0
-    # Counting cells instead of parameters: rounding can't make the walk miss its last cell.
+    # Cells are counted instead of comparing parameters, so that rounding can't miss the last cell.
     left_x = abs(last_x - x)
     left_y = abs(last_y - y)
     while True:
@@ -483,7 +484,7 @@ def _line_cost(costmap: Any, weight: Any, x0: float, y0: float, x1: float, y1: f
             return total + max(1.0 - done, 0.0) * length * own
         corner = left_x > 0 and left_y > 0 and abs(next_x - next_y) < 1e-9
         if corner:
-            # Through a corner only where a diagonal step may go.
+            # A corner may be crossed only where a diagonal step is allowed.
             if weight[costmap[y, x + step_x]] == 0 or weight[costmap[y + step_y, x]] == 0:
                 return math.inf
             until = next_x
@@ -544,7 +545,7 @@ def _cells_cost(costmap: Any, weight: Any, cells: Any, cumulated: Any) -> float:
     nogil=True,
 )
 def _shortcut(costmap: Any, weight: Any, cells: Any, cumulated: Any, slack: float, kept: Any) -> int:
-    """Keep the cells between which lines are no dearer than the path: gallop forward, then bisect."""
+    """Keep cells between which straight lines cost no more than the path: exponential, then binary search."""
     last = cells.shape[0] - 1
     kept[0] = 0
     count = 1
@@ -595,7 +596,7 @@ def _shortcut(costmap: Any, weight: Any, cells: Any, cumulated: Any, slack: floa
 
 
 def _weights(neutral: int, factor: float) -> NDArray[np.int32]:
-    """Tabulate the weight of every cost; 0 marks what can't be crossed."""
+    """Tabulate the weight of every cost; 0 marks impassable cells."""
     if neutral < 1 or factor < 0.0 or not math.isfinite(factor):
         raise ValueError(f"neutral must be at least 1 and factor at least 0, not {neutral} and {factor}")
     weight = np.zeros(256, np.int32)
@@ -625,11 +626,11 @@ def _cells_array(cells: NDArray[np.int32]) -> NDArray[np.int32]:
 
 @dataclass(frozen=True, slots=True)
 class PlanResult:
-    """What a search found.
+    """Result of a search.
 
-    `cost` is the sum over edges of length in cells times mean weight (infinite when nothing was found), `cells` the
-    path from start to goal, int32 (n, 2) as (column, row), empty when nothing was found. `timed_out` says that the
-    bound on expansions ended the search.
+    `cost` is the sum over edges of length in cells times mean weight (infinite without a path), `cells` the path from
+    start to goal, int32 (n, 2) as (column, row), empty without a path. `timed_out`: the limit of expansions ended the
+    search.
     """
 
     found: bool
@@ -639,7 +640,7 @@ class PlanResult:
     timed_out: bool = False
 
 
-class _Guide(NamedTuple):
+class _GoalField(NamedTuple):
     """A goal and the exact cost from every cell to it."""
 
     goal: tuple[int, int]
@@ -654,11 +655,11 @@ def _as_wide(field: NDArray[np.int32 | np.int64]) -> NDArray[np.int64]:
 
 
 class Planner:
-    """Exact A* on costmaps of one size; owns all memory that a search needs, so that plans allocate nothing large.
+    """Exact A* on costmaps of one size; owns the memory of its searches, so that planning allocates little.
 
     One thread may call `plan` at a time; `set_goal_field` uses memory of its own and may run in another thread.
-    `neutral` is the weight of a free cell, `factor` multiplies the cost (0..252) that is added to it: the defaults let
-    a robot pay for the corridor's middle with a detour of at most about five times the length in the dearest cells.
+    `neutral` is the weight of a free cell, `factor` multiplies the cost (0..252) that is added to it: with the defaults
+    a path through cells of the highest cost weighs about as much as a detour five times as long over free cells.
     """
 
     def __init__(self, width: int, height: int, neutral: int = NEUTRAL_WEIGHT, factor: float = COST_WEIGHT) -> None:
@@ -669,22 +670,22 @@ class Planner:
         self.neutral = neutral
         self.factor = factor
         self._weight = _weights_of(neutral, factor)
-        dearest_edge = 2 * DIAGONAL * int(self._weight.max())
-        # The total estimate rises by at most twice the dearest edge per step: that many buckets are open at once.
-        self._shift = max(0, (2 * dearest_edge // (BUCKETS - 2)).bit_length())
+        highest_edge_cost = 2 * DIAGONAL * int(self._weight.max())
+        # The total estimate rises by at most twice the highest edge cost per step, which bounds the open buckets.
+        self._shift = max(0, (2 * highest_edge_cost // (BUCKETS - 2)).bit_length())
         self._field_shift = (2 * STRAIGHT * int(self._weight[0])).bit_length() - 1
-        open_buckets = (dearest_edge >> self._field_shift) + 3
+        open_buckets = (highest_edge_cost >> self._field_shift) + 3
         self._field_buckets = 1 << open_buckets.bit_length()
         self._costs: type[np.int32 | np.int64] = np.int32
         self._capacity = width * height
         self._allocate()
         self._heads = np.empty(BUCKETS, np.int32)
-        self._touched = np.empty(width * height, np.int32)
+        self._reached_cells = np.empty(width * height, np.int32)
         self._result = np.zeros(4, np.int64)
-        self._guide: _Guide | None = None
+        self._goal_field: _GoalField | None = None
 
     def _allocate(self) -> None:
-        # Pages that no search touches cost no memory: np.empty only reserves them. g must hold its mark.
+        # np.empty only reserves memory; pages that no search uses cost none. g must be initialized.
         self._g: NDArray[np.int32 | np.int64] = np.full(
             self.width * self.height, np.iinfo(self._costs).max, self._costs
         )
@@ -713,21 +714,21 @@ class Planner:
     ) -> PlanResult:
         """Return a cheapest path from start to goal, both (column, row), on a uint8 (h, w) costmap.
 
-        While a goal field for this goal is set, it guides the search: still exact as long as no cell of the costmap is
-        lower than in the field's static costmap. `max_expansions` above 0 bounds the work. A start or goal that isn't
+        A goal field that is set for this goal guides the search, which stays exact as long as no cell of the costmap is
+        lower than in the field's static costmap. `max_expansions` above 0 limits the work. A start or goal that isn't
         traversable gives `found=False`. Raises ValueError for cells outside and for a costmap of another shape.
         """
         costmap = self._grid(costmap)
         first = self._index(start, "start")
         last = self._index(goal, "goal")
         while True:
-            guide = self._guide  # read once: another thread may set a new one meanwhile
+            goal_field = self._goal_field  # read once: another thread may replace it
             field = self._no_field
-            if guide is not None and guide.goal == (int(goal[0]), int(goal[1])):
-                if guide.field.dtype != self._g.dtype:
+            if goal_field is not None and goal_field.goal == (int(goal[0]), int(goal[1])):
+                if goal_field.field.dtype != self._g.dtype:
                     self._widen()
                     continue
-                field = guide.field
+                field = goal_field.field
             _search(
                 costmap.ravel(),
                 self.width,
@@ -740,7 +741,7 @@ class Planner:
                 self._queue_next,
                 self._heads,
                 self._shift,
-                self._touched,
+                self._reached_cells,
                 max_expansions,
                 self._result,
             )
@@ -767,19 +768,19 @@ class Planner:
         return PlanResult(found=True, cost=cost / (2.0 * STRAIGHT), cells=cells, expansions=expansions)
 
     def _widen(self) -> None:
-        """Go over to 64-bit costs for good: some path here is too dear for 32 bits."""
+        """Switch to 64-bit costs permanently: a path's cost exceeds 32 bits."""
         self._costs = np.int64
         self._allocate()
-        guide = self._guide
-        if guide is not None:
-            self._guide = _Guide(guide.goal, _as_wide(guide.field))
+        goal_field = self._goal_field
+        if goal_field is not None:
+            self._goal_field = _GoalField(goal_field.goal, _as_wide(goal_field.field))
 
     def set_goal_field(self, static_costmap: NDArray[np.uint8], goal: tuple[int, int]) -> None:
-        """Compute the exact cost to the goal from every cell, to guide `plan` for this goal from now on.
+        """Compute the exact cost to the goal from every cell, which from now on guides `plan` for this goal.
 
-        Guided plans are exact as long as costs are only raised above the static costmap. Takes about a full Dijkstra
-        search; safe to run in a thread beside `plan`, and the static costmap may change meanwhile: it is copied first.
-        Raises ValueError as `plan` does.
+        Guided plans are exact as long as costs are only raised above the static costmap. Takes as long as a Dijkstra
+        search of the whole map; it may run in a thread beside `plan`, and the static costmap is copied first. Raises
+        ValueError as `plan` does.
         """
         static = self._grid(static_costmap).copy()
         target = self._index(goal, "goal")
@@ -804,7 +805,7 @@ class Planner:
                 capacity *= 2
             else:
                 break
-        self._guide = _Guide((int(goal[0]), int(goal[1])), field)
+        self._goal_field = _GoalField((int(goal[0]), int(goal[1])), field)
 
     def nearest_reachable(
         self, costmap: NDArray[np.uint8], start: tuple[int, int], goal: tuple[int, int]
@@ -819,7 +820,9 @@ class Planner:
         self._index(goal, "goal")
         seen = np.zeros((self.height, self.width), np.uint8)
         nearest = int(
-            _nearest_reachable(costmap.ravel(), self.width, first, int(goal[0]), int(goal[1]), seen, self._touched)
+            _nearest_reachable(
+                costmap.ravel(), self.width, first, int(goal[0]), int(goal[1]), seen, self._reached_cells
+            )
         )
         return nearest % self.width, nearest // self.width
 
@@ -831,7 +834,7 @@ class Planner:
 def nearest_traversable(costmap: NDArray[np.uint8], cell: tuple[int, int], reach: int) -> tuple[int, int] | None:
     """Return the traversable (column, row) nearest to a cell within `reach` cells, or None.
 
-    Walls between are not considered: this is for a robot whose own cell became impassable. Raises TypeError or
+    Walls in between are ignored: this is for a robot whose own cell became impassable. Raises TypeError or
     ValueError for a costmap of another type or shape.
     """
     costmap = _arrays.grid(costmap, "costmap")
@@ -852,7 +855,7 @@ def line_cost(
 ) -> float:
     """Return the integral of the weight along a straight line, in cells times weight.
 
-    Coordinates are columns and rows, whole numbers being the centres of cells. Infinite when the line touches a cell
+    Coordinates are columns and rows, whole numbers being the centres of cells. Infinite when the line crosses a cell
     that isn't traversable, cuts a corner that a diagonal step may not cut, or leaves the grid.
     Raises TypeError or ValueError for a costmap of another type or shape.
     """
@@ -868,7 +871,7 @@ def shortcut(
     factor: float = COST_WEIGHT,
     slack: float = 0.01,
 ) -> NDArray[np.float64]:
-    """Straighten a path along lines of sight that cost at most `1 + slack` times the part that they replace.
+    """Straighten a path along lines of sight that cost at most `1 + slack` times the section that they replace.
 
     `cells` is int32 (n, 2) as (column, row), a path of `Planner.plan` on this costmap. Returns float64 (m, 2) in the
     same coordinates, the first and last cell kept: corners to be joined by straight lines, none of which crosses a

@@ -4,8 +4,8 @@ Method: separable transform, columns first, then the minimum over a window of ea
 cap bounds the window, which makes a plain vectorized minimum faster than lower envelopes.
 """
 
-# Kernels take arrays and scalars, typed by their compiled signatures, and are one piece where a call per cell would
-# cost more than the work that it does.
+# Kernels take arrays and scalars, typed by their compiled signatures, and are single functions where a call per cell
+# would cost more than its work.
 # ruff: noqa: ANN401, C901
 
 from __future__ import annotations

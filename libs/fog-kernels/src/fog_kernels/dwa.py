@@ -1,15 +1,15 @@
 """Local motion by the Dynamic Window Approach (Fox, Burgard and Thrun 1997) for a round robot with two driven wheels.
 
 Every pair of speeds that the motors can reach within a control period is rolled out as an arc over the local costmap;
-among the arcs that stay clear of obstacles the cheapest wins. Costs count metres off the path, metres still to go,
-the heading relative to the path ahead, and the highest cost touched. Large heading errors are turned away in place,
-so that a path that starts behind the robot isn't reached by a wide arc.
+among the collision-free arcs the one with the lowest cost is chosen. The cost adds up the distance from the path, the
+distance to go, the heading error relative to the path ahead, and the highest costmap value on the arc. Large heading
+errors are corrected by turning in place, so that a path that starts behind the robot isn't reached by a wide arc.
 
-The tests hold a plain reimplementation of this definition, which a property test compares with the kernel.
+The tests contain a plain reference implementation, with which a property test compares the kernel.
 """
 
-# Kernels take arrays and scalars, typed by their compiled signatures, and are one piece where a call per cell would
-# cost more than the work that it does.
+# Kernels take arrays and scalars, typed by their compiled signatures, and are single functions where a call per cell
+# would cost more than its work.
 # ruff: noqa: ANN401, C901, PLR0912, PLR0913, PLR0915
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ if TYPE_CHECKING:
 _MAX_STEPS = 200
 _MAX_SEGMENTS = 64
 _MERGED_LENGTH = 0.25
-"""Points of the path are merged into segments of at most this length (m), ..."""
+"""Points of the path are merged into segments of at most this length (m)."""
 _MERGED_OFFSET = 0.01
-"""... as long as they lie this close (m) to a straight line."""
-_TURN_STANDING = 10.0
-"""Weight per m/s while turning in place: high enough that it only ever costs braking."""
+"""Points are merged only if they lie this close (m) to the segment."""
+_TURN_IN_PLACE_WEIGHT = 10.0
+"""Weight per m/s of forward speed while turning in place; high enough that braking always wins."""
 _ESCAPE_LENGTH = 0.3
-"""A robot on inscribed cells must have left them after driving this far (m)."""
+"""Distance (m) within which an escaping robot must leave the inscribed cells."""
 
 
 @dataclass(frozen=True, slots=True)
 class DwaLimits:
-    """What the base can do: m/s, rad/s, m/s^2, rad/s^2, and the bound on each wheel (m/s) with the axle's length (m).
+    """Limits of the base: m/s, rad/s, m/s^2, rad/s^2, the limit of each wheel (m/s) and the distance of the wheels (m).
 
     The defaults are a Roomba 600's with the speeds and accelerations of the thesis that Fognav builds on.
     """
@@ -64,13 +64,13 @@ class DwaLimits:
 class DwaSettings:
     """How arcs are sampled, rolled out and scored; lengths in metres, times in seconds.
 
-    `period` is the time until the next decision. Weights: `w_path` per metre off the path, `w_goal` per metre still to
-    go, `w_heading` per radian between the heading at the end and the path ahead of there, `w_cost` for the highest
-    cost touched (0..1), `w_turn` per rad/s of change in turning rate. `lookahead` is how far ahead on the path the
-    heading aims; heading errors above `turn_in_place` are turned away standing. Towards the goal the speed follows
-    sqrt(2 * approach * distance). A robot whose centre already stands on an inscribed cell (253), where a map change or
-    the rounding to cells may put it, may turn, and drive at up to `escape_v` on arcs that leave these cells within
-    0.3 m and never touch 254 or 255; with 0 it may not move at all.
+    `period` is the time until the next decision. Weights: `w_path` per metre of distance from the path, `w_goal` per
+    metre to go, `w_heading` per radian between the heading at the arc's end and the path ahead of it, `w_cost` for the
+    highest cost on the arc (0..1), `w_turn` per rad/s of change in angular speed. `lookahead` is the distance ahead on
+    the path of the point at which the heading aims; heading errors above `turn_in_place` are corrected by turning in
+    place. Towards the goal the speed follows sqrt(2 * approach * distance). A robot whose centre is already on an
+    inscribed cell (253), because of a map change or the rounding to cells, may turn, and drive at up to `escape_v` on
+    arcs that leave these cells within 0.3 m and contain no 254 or 255; with an `escape_v` of 0 it may not move.
     """
 
     n_v: int = 25
@@ -116,7 +116,7 @@ DEFAULT_SETTINGS = DwaSettings()
 
 
 class DwaParameters(NamedTuple):
-    """`DwaLimits` and `DwaSettings` as the kernel reads them: named tuples are what numba takes by name.
+    """`DwaLimits` and `DwaSettings` as a named tuple, which numba kernels can read by name.
 
     m/s: v_max, wheel_max, escape_v. rad/s: w_max. m/s^2: acc_v, approach. rad/s^2: acc_w. m: axle, lookahead,
     goal_tolerance. rad: turn_in_place, heading_tolerance. s: sim_time, dt, period. Weights: w_path and w_goal per m,
@@ -148,10 +148,10 @@ class DwaParameters(NamedTuple):
 
 
 class _Route(NamedTuple):
-    """The path from its point nearest to the robot on, as straight segments.
+    """The path ahead as straight segments, from its point nearest to the robot.
 
     Segment i < size begins at (x[i], y[i]) in m, points along the unit vector (ux[i], uy[i]), is length[i] m long and
-    begins start[i] m along the route; all float64 (64,). `remaining`: m from the route's begin to the goal.
+    begins start[i] m along the route; all float64 (64,). `remaining`: m from the route's start to the goal.
     """
 
     x: NDArray[np.float64]
@@ -176,8 +176,8 @@ class _Window(NamedTuple):
 _PARAMETERS: Any = types.NamedTuple((*(float64,) * 20, int64, int64), DwaParameters)  # type: ignore[no-untyped-call]  # numba has no types
 _RESULT: Any = types.NamedTuple((float64, float64, float64, int64), DwaResult)  # type: ignore[no-untyped-call]  # numba has no types
 
-# Inlined before compilation: an array that is passed to a compiled function has its references counted at each call,
-# which makes the loop over the arcs twice as slow and more.
+# Inlined before compilation: passing an array to a compiled function costs reference counting at each call, which more
+# than doubles the time of the loop over the arcs.
 _helper = njit(inline="always", cache=True)
 
 
@@ -197,29 +197,29 @@ def _path_point(path: Any, index: int, goal_x: float, goal_y: float) -> tuple[fl
 
 
 @_helper
-def _nearest_piece(path: Any, goal_x: float, goal_y: float, x: float, y: float) -> tuple[int, float]:
-    """Return the index of the path's piece nearest to (x, y), and the share (0..1) of it before the nearest point."""
+def _nearest_segment(path: Any, goal_x: float, goal_y: float, x: float, y: float) -> tuple[int, float]:
+    """Return the index of the path's segment nearest to (x, y), and the nearest point's position (0..1) on it."""
     nearest = 0
-    nearest_share = 0.0
+    nearest_fraction = 0.0
     least = math.inf
     for i in range(path.shape[0]):
         ax, ay = path[i, 0], path[i, 1]
         bx, by = _path_point(path, i + 1, goal_x, goal_y)
         ux, uy = bx - ax, by - ay
         square = ux * ux + uy * uy
-        share = ((x - ax) * ux + (y - ay) * uy) / square if square > 0.0 else 0.0
-        share = min(max(share, 0.0), 1.0)
-        away = (ax + share * ux - x) ** 2 + (ay + share * uy - y) ** 2
-        if away < least - 1e-12:
-            least = away
+        fraction = ((x - ax) * ux + (y - ay) * uy) / square if square > 0.0 else 0.0
+        fraction = min(max(fraction, 0.0), 1.0)
+        square_distance = (ax + fraction * ux - x) ** 2 + (ay + fraction * uy - y) ** 2
+        if square_distance < least - 1e-12:
+            least = square_distance
             nearest = i
-            nearest_share = share
-    return nearest, nearest_share
+            nearest_fraction = fraction
+    return nearest, nearest_fraction
 
 
 @_helper
 def _route_ahead(path: Any, goal_x: float, goal_y: float, x: float, y: float, p: DwaParameters) -> _Route:
-    """Return the route from the path's point nearest to the robot on, with the segments that a decision can reach.
+    """Return the path ahead of its point nearest to the robot, as far as the arcs can reach.
 
     Without a path, or beside its end, the route leads straight to the goal.
     """
@@ -234,12 +234,12 @@ def _route_ahead(path: Any, goal_x: float, goal_y: float, x: float, y: float, p:
     reach = p.v_max * p.sim_time + 2.0 * p.lookahead
     points = path.shape[0]
     if points > 0:
-        nearest, share = _nearest_piece(path, goal_x, goal_y, x, y)
+        nearest, fraction = _nearest_segment(path, goal_x, goal_y, x, y)
         to_x, to_y = _path_point(path, nearest + 1, goal_x, goal_y)
-        from_x = path[nearest, 0] + share * (to_x - path[nearest, 0])
-        from_y = path[nearest, 1] + share * (to_y - path[nearest, 1])
+        from_x = path[nearest, 0] + fraction * (to_x - path[nearest, 0])
+        from_y = path[nearest, 1] + fraction * (to_y - path[nearest, 1])
         for i in range(nearest + 2, points + 2):
-            # The segment from..to grows over points that lie nearly on it: few segments to measure to.
+            # The segment from..to is extended over points that lie nearly on it, to get few segments.
             ux, uy = to_x - from_x, to_y - from_y
             length = math.sqrt(ux * ux + uy * uy)
             next_x, next_y = _path_point(path, i, goal_x, goal_y)
@@ -298,9 +298,9 @@ def _offset(dx: float, dy: float, ux: float, uy: float, length: float) -> tuple[
 
 @_helper
 def _reachable_speeds(v_now: float, w_now: float, v_top: float, p: DwaParameters) -> _Window:
-    """Return the speeds that can be reached within a period; `v_top` (m/s) limits the forward speed beside the base.
+    """Return the speeds that can be reached within a period; `v_top` (m/s) is a further limit of the forward speed.
 
-    A speed that is above its limit already is braked as hard as possible.
+    A speed above its limit is reduced as fast as possible.
     """
     v_low = min(max(v_now - p.acc_v * p.period, 0.0), p.v_max)
     v_high = max(min(v_now + p.acc_v * p.period, p.v_max, v_top), v_low)
@@ -313,19 +313,19 @@ def _reachable_speeds(v_now: float, w_now: float, v_top: float, p: DwaParameters
 
 @_helper
 def _turning_rate(error: float, w_now: float, p: DwaParameters) -> float:
-    """Return the turning rate (rad/s) for turning a heading error (rad) away in place.
+    """Return the angular speed (rad/s) for correcting a heading error (rad) by turning in place.
 
-    So fast that the error can be braked away, at a third of the braking power to stay smooth.
+    It lets the robot stop at the desired heading with a third of its angular deceleration, for smooth motion.
     """
     rate = math.copysign(min(p.w_max, 2.0 * abs(error), math.sqrt(0.67 * p.acc_w * abs(error))), error)
     if abs(error) > 2.8 and rate * w_now < -0.01:
-        rate = -rate  # about face: keep the sense of turning, noise must not reverse it
+        rate = -rate  # half a turn: keep the direction of rotation, noise must not reverse it
     return rate
 
 
 @_helper
 def _roll_out(w: float, theta: float, dt: float, cells_per_m: float, unit_x: Any, unit_y: Any) -> None:
-    """Fill unit_x, unit_y with the exact arc of turning rate w per unit of speed (cells per m/s), at each step."""
+    """Fill unit_x, unit_y with the exact arc of angular speed w per unit of speed (cells per m/s), at each step."""
     half = 0.5 * w * dt
     chord = dt * cells_per_m * (math.sin(half) / half if abs(half) > 1e-9 else 1.0)
     cos_now = math.cos(theta + half)
@@ -351,12 +351,12 @@ def _highest_cost(
     unit_x: Any,
     unit_y: Any,
     steps: int,
-    escaping: bool,  # noqa: FBT001  # numba knows no keyword-only arguments
+    escaping: bool,  # noqa: FBT001  # numba supports no keyword-only arguments
 ) -> int:
     """Return the highest cost (0..252) on an arc from (column, row), LETHAL when the arc is blocked.
 
-    An arc that is `escaping` may begin on inscribed cells, but not come back to them; INSCRIBED: it never leaves them.
-    Leave the returns where they are: with one at the end, numba's code is half as fast.
+    An `escaping` arc may begin on inscribed cells, but not return to them; INSCRIBED means that it never leaves them.
+    Keep the early returns: with a single one at the end, numba's code is half as fast.
     """
     height, width = costmap.shape
     highest = 0
@@ -380,7 +380,7 @@ def _highest_cost(
 def _route_cost(
     route: _Route, mid_x: float, mid_y: float, end_x: float, end_y: float, end_theta: float, p: DwaParameters
 ) -> float:
-    """Weigh how an arc with this middle (m) and end (m, rad) follows the route."""
+    """Return the weighted cost of how an arc with this middle (m) and end (m, rad) follows the route."""
     off_end = math.inf
     off_mid = math.inf
     along = 0.0
@@ -395,7 +395,7 @@ def _route_cost(
     aim_x, aim_y = _point_along(route, min(along + p.lookahead, route.remaining))
     ahead_x = aim_x - end_x
     ahead_y = aim_y - end_y
-    # Near its end the path gives no direction any more.
+    # Near its end the path gives no direction.
     trust = min(math.sqrt(ahead_x * ahead_x + ahead_y * ahead_y) / p.lookahead, 1.0)
     turn = abs(_wrapped(math.atan2(ahead_y, ahead_x) - end_theta)) * trust
     return (
@@ -474,7 +474,7 @@ def _choose(
     window = _reachable_speeds(v_now, w_now, v_top, p)
     rate = _turning_rate(error, w_now, p) if turning else 0.0
 
-    # Long enough to prove that the fastest arc can be braked before anything that it would hit.
+    # Long enough to stop the robot on the fastest arc before an obstacle on it.
     horizon = max(p.sim_time, p.period + window.v_high / p.acc_v)
     if escaping:
         horizon = max(horizon, _ESCAPE_LENGTH / p.escape_v)
@@ -498,16 +498,16 @@ def _choose(
         for i in range(p.n_v if v_step > 0.0 else 1):
             v = window.v_low + i * v_step
             if v + 0.5 * p.axle * abs(w) > p.wheel_max + 1e-9:
-                break  # so would every faster one
+                break  # faster ones exceed the wheel limit too
             highest = _highest_cost(costmap, column, row, v, unit_x, unit_y, steps, escaping)
             if highest == LETHAL:
                 continue
             if turning:
-                total = abs(w - rate) + _TURN_STANDING * v
+                total = abs(w - rate) + _TURN_IN_PLACE_WEIGHT * v
             elif highest == INSCRIBED and v > 0.0:
-                continue  # this way leads along the wall, not off it
+                continue  # the arc leads along the wall, not away from it
             else:
-                touched = 0 if highest == INSCRIBED else highest
+                arc_cost = 0 if highest == INSCRIBED else highest
                 total = (
                     _route_cost(
                         route,
@@ -518,7 +518,7 @@ def _choose(
                         theta + w * p.sim_time,
                         p,
                     )
-                    + p.w_cost * touched / PENALTY_MAX
+                    + p.w_cost * arc_cost / PENALTY_MAX
                     + p.w_turn * abs(w - w_now)
                 )
             admissible += 1
@@ -530,7 +530,7 @@ def _choose(
 
 
 def _parameters(limits: DwaLimits, settings: DwaSettings) -> DwaParameters:
-    """Return both as the kernel reads them."""
+    """Return limits and settings as the kernel reads them."""
     return DwaParameters(
         v_max=float(limits.v_max),
         w_max=float(limits.w_max),
@@ -576,11 +576,11 @@ def dwa(
 ) -> DwaResult:
     """Choose the speeds for the next control period.
 
-    `v`, `w`: present speeds (m/s, rad/s). `x`, `y`, `theta`: pose of the robot's centre in `map`. `costmap`: inflated
-    local window, uint8 (h, w), row 0 at the bottom, its lower-left corner at (origin_x, origin_y) in `map`; arcs that
-    touch 253 or more, or leave the window, are inadmissible. `path`: (n, 2) points in `map`, what is left of the route
+    `v`, `w`: current speeds (m/s, rad/s). `x`, `y`, `theta`: pose of the robot's centre in `map`. `costmap`: inflated
+    local window, uint8 (h, w), row 0 at the bottom, its lower-left corner at (origin_x, origin_y) in `map`; arcs over
+    cells of 253 or more, or beyond the window, are inadmissible. `path`: (n, 2) points in `map`, the rest of the path
     (earlier points do no harm unless the path passes here twice; none means straight to the goal). `goal_x`, `goal_y`:
-    where to stop; the path is continued to it in a straight line. `goal_theta`: heading to turn to there, or None.
+    where to stop; the path is extended to it in a straight line. `goal_theta`: final heading, or None.
 
     Returns the best admissible pair. Within `goal_tolerance` of the goal it brakes and turns to `goal_theta`.
     Raises TypeError or ValueError for wrong types or shapes, and ValueError for numbers that aren't finite.
@@ -590,7 +590,7 @@ def dwa(
     state = (float(v), float(w), float(x), float(y), float(theta), float(origin_x), float(origin_y))
     aims = (float(goal_x), float(goal_y), 0.0 if goal_theta is None else float(goal_theta))
     if not all(map(math.isfinite, state + aims)) or not np.isfinite(points).all():
-        raise ValueError("speeds, pose, origin, path and goal must be finite: don't decide on a lost pose")
+        raise ValueError("speeds, pose, origin, path and goal must be finite: stop the robot while its pose is unknown")
     chosen: DwaResult = _choose(
         *state[:5],
         costmap,

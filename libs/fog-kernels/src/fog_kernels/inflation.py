@@ -1,11 +1,11 @@
-"""Inflation of lethal cells: whole maps, and only what a change can alter.
+"""Inflation of lethal cells, for whole maps and for the cells that a change affects.
 
 Costs follow Nav2's inflation layer: 254 on a lethal cell, 253 within the inscribed radius, an exponential decay beyond.
 Unknown cells (255) stay unknown and are not inflated.
 """
 
-# Kernels take arrays and scalars, typed by their compiled signatures, and are one piece where a call per cell would
-# cost more than the work that it does.
+# Kernels take arrays and scalars, typed by their compiled signatures, and are single functions where a call per cell
+# would cost more than its work.
 # ruff: noqa: ANN401, C901, PLR0912, PLR0913, PLR0915
 
 from __future__ import annotations
@@ -166,7 +166,7 @@ def inflate(raw: NDArray[np.uint8], table: InflationTable, out: NDArray[np.uint8
 def inflate_window(
     raw: NDArray[np.uint8], table: InflationTable, x: int, y: int, w: int, h: int, out: NDArray[np.uint8]
 ) -> tuple[int, int, int, int]:
-    """Bring `out` up to date after cells of `raw` inside the window (column x, row y, w by h cells) changed.
+    """Update `out` after cells of `raw` inside the window (column x, row y, w by h cells) changed.
 
     `out` must be `inflate` of `raw` before the change; afterwards it equals `inflate(raw, table)` bit for bit.
     Returns the window (x, y, w, h) that was rewritten: the change and the reach around it, inside the map; empty

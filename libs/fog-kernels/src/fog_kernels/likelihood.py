@@ -23,7 +23,7 @@ def likelihood_field(  # noqa: PLR0913  # the field's grid and the sensor's mode
     z_rand: float = 0.5,
     range_max: float = 12.0,
 ) -> NDArray[np.float32]:
-    """Tabulate what a beam that ends in each cell contributes: p^3, float32 (h, w).
+    """Return each cell's contribution to the score of a beam that ends in it: p^3, float32 (h, w).
 
     p = z_hit * exp(-d^2 / (2 sigma_hit^2)) + z_rand / range_max, with d the distance in metres to the nearest occupied
     cell, at most `max_distance`. Summing cubes over beams instead of multiplying p is what AMCL's likelihood field

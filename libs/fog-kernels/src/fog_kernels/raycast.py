@@ -1,7 +1,7 @@
 """Ranges to the nearest occupied cell along rays, by exact grid traversal (Amanatides and Woo 1987)."""
 
-# Kernels take arrays and scalars, typed by their compiled signatures, and are one piece where a call per cell would
-# cost more than the work that it does.
+# Kernels take arrays and scalars, typed by their compiled signatures, and are single functions where a call per cell
+# would cost more than its work.
 # ruff: noqa: ANN401, C901, PLR0913
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     nogil=True,
 )
 def _cast(occupied: Any, x: float, y: float, angles: Any, reach: float, out: Any) -> None:
-    """All in cells; out[i] is the distance at which ray i enters an occupied cell, or infinite."""
+    """Lengths are in cells; out[i] is the distance at which ray i enters an occupied cell, or infinite."""
     height, width = occupied.shape
     for i in range(angles.size):
         out[i] = math.inf

@@ -42,7 +42,7 @@ def _dispatchers() -> list[Dispatcher]:
 def kernels(module: str) -> list[str]:
     """Return the kernels that importing a module of this package compiles: those with explicit signatures.
 
-    Looks at the source only. Raises ValueError for a module that is not there.
+    Reads only the source. Raises ValueError for a module that does not exist.
     """
     spec = importlib.util.find_spec(f"fog_kernels.{module}")
     if spec is None or spec.origin is None:
@@ -66,39 +66,39 @@ class _Compiled(event.Listener):
     """Counts the kernels of one module as they are compiled; those that come from the cache raise no event."""
 
     def __init__(self, names: list[str], on_kernel: Callable[[int, str], None]) -> None:
-        self._left = set(names)
+        self._remaining = set(names)
         self._total = len(names)
         self._on_kernel = on_kernel
 
     def on_start(self, _: event.Event) -> None:
-        """Nothing is known of a kernel before it is compiled."""
+        """Ignore the start of a compilation."""
 
     def on_end(self, ended: event.Event) -> None:
         """Count a kernel once, whatever the number of its signatures."""
         name = ended.data["dispatcher"].py_func.__name__
-        if name in self._left:
-            self._left.remove(name)
-            self._on_kernel(self._total - len(self._left), name)
+        if name in self._remaining:
+            self._remaining.remove(name)
+            self._on_kernel(self._total - len(self._remaining), name)
 
 
 def warm(profile: str = "all", on_progress: Callable[[int, int, str], None] = lambda *_: None) -> None:
     """Compile, or load from the cache, every kernel that the profile's processes use.
 
-    All signatures are explicit, so importing a module is what compiles it. `on_progress` is given how many kernels are
-    ready, of how many, and the name of the one that was compiled or the module that was loaded last. Raises ValueError
-    for an unknown profile.
+    All signatures are explicit, so importing a module compiles it. `on_progress` is called with the number of kernels
+    that are ready, their total number, and the name of the kernel compiled or module loaded last. Raises ValueError for
+    an unknown profile.
     """
     if profile not in PROFILES:
         raise ValueError(f"profile must be one of {', '.join(sorted(PROFILES))}, not {profile!r}")
     names = {module: kernels(module) for module in PROFILES[profile]}
     total = sum(map(len, names.values()))
     ready = 0
-    for module, own in names.items():
+    for module, module_kernels in names.items():
         before = ready
-        listener = _Compiled(own, lambda done, name: on_progress(before + done, total, f"{module}.{name}"))  # noqa: B023  # called in this pass only
+        listener = _Compiled(module_kernels, lambda done, name: on_progress(before + done, total, f"{module}.{name}"))  # noqa: B023  # called in this pass only
         with event.install_listener("numba:compile", listener):
             importlib.import_module(f"fog_kernels.{module}")
-        ready += len(own)
+        ready += len(module_kernels)
         on_progress(ready, total, module)
 
 
@@ -108,7 +108,7 @@ def cache_misses() -> int:
 
 
 def main() -> None:
-    """Warm a profile, say how far it is, and how many kernels had to be compiled."""
+    """Compile a profile's kernels; print the progress and how many were not in the cache."""
     parser = argparse.ArgumentParser(prog="python -m fog_kernels.warm", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("profile", nargs="?", default="all", choices=sorted(PROFILES))
     profile: str = parser.parse_args().profile

@@ -1,4 +1,4 @@
-"""REST as all services speak it: problem documents (RFC 9457), bearer tokens with roles, health, metrics, limits."""
+"""The REST interface of all services: problem documents (RFC 9457), tokens with roles, health, metrics, limits."""
 
 from fog_runtime.http.app import make_app
 from fog_runtime.http.problems import ProblemError

@@ -1,4 +1,4 @@
-"""The frame of every service's REST interface: health, metrics, problem documents, roles, a body limit, OpenAPI."""
+"""The base of every service's REST interface: health, metrics, problem documents, roles, a body limit, OpenAPI."""
 
 from collections.abc import Awaitable, Callable, MutableMapping
 from typing import Any, Final
@@ -13,7 +13,8 @@ from fog_runtime.http.tokens import Tokens
 from fog_runtime.version import VERSION
 
 BODY_LIMIT: Final = 1024 * 1024
-_DRAINED: Final = 16
+_DRAIN_FACTOR: Final = 16
+"""A body is read and discarded up to this many times the limit."""
 
 Scope = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
@@ -21,7 +22,7 @@ Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
 
 
 class _BodyLimit:
-    """Takes a request's body in before the app runs, up to the limit: no handler can be made to hold more."""
+    """Reads a request's body, up to the limit, before the app runs, so that no handler has to hold more."""
 
     def __init__(self, app: Callable[[Scope, Receive, Send], Awaitable[None]], limit: int) -> None:
         self._app = app
@@ -34,12 +35,12 @@ class _BodyLimit:
         body = bytearray()
         size = 0
         more = True
-        # What is too much is read on for a while and thrown away: a client that is cut off in the middle of its
-        # sending sees a reset connection instead of the answer.
-        while more and size <= _DRAINED * self._limit:
+        # The excess of a body is read for a while and discarded: a client whose connection is closed while it sends
+        # sees a reset connection instead of the response.
+        while more and size <= _DRAIN_FACTOR * self._limit:
             message = await receive()
             if message["type"] != "http.request":
-                return  # the client went away
+                return  # the client disconnected
             part = message.get("body", b"")
             size += len(part)
             more = message.get("more_body", False)
@@ -47,16 +48,16 @@ class _BodyLimit:
                 body += part
         if size > self._limit:
             headers = {"Connection": "close"} if more else None
-            answer = problem(413, f"the body has more than {self._limit} bytes", headers=headers)
-            await answer(scope, receive, send)
+            response = problem(413, f"the body has more than {self._limit} bytes", headers=headers)
+            await response(scope, receive, send)
             return
-        given = False
+        replayed = False
 
         async def replay() -> MutableMapping[str, Any]:
-            nonlocal given
-            if given:
+            nonlocal replayed
+            if replayed:
                 return await receive()
-            given = True
+            replayed = True
             return {"type": "http.request", "body": bytes(body), "more_body": False}
 
         await self._app(scope, replay, send)
@@ -80,7 +81,7 @@ def _add_health(app: FastAPI, health: Health) -> None:
 
 def make_app(title: str, health: Health, tokens: Tokens, *, body_limit: int = BODY_LIMIT) -> FastAPI:
     """Build an app with health, metrics, problem documents, roles and a body limit; OpenAPI is at /openapi.json."""
-    # The interactive pages would load scripts from the internet.
+    # FastAPI's interactive pages would load scripts from the internet.
     app = FastAPI(title=title, version=VERSION, docs_url=None, redoc_url=None)
     app.state.tokens = tokens
     app.state.schemas = {}

@@ -18,7 +18,7 @@ _log = logs.get("http")
 
 
 class FieldProblem(msgspec.Struct, frozen=True):
-    """One thing that is wrong in a request: where, and what."""
+    """One invalid field of a request: its path, and what is wrong."""
 
     field: str
     problem: str
@@ -35,9 +35,9 @@ class Problem(msgspec.Struct, frozen=True):
 
 
 class ProblemError(Exception):
-    """An answer that is an error: raise it anywhere in a handler, it becomes a problem document.
+    """An error response: raised anywhere in a handler, it becomes a problem document.
 
-    `field` is the path of what is wrong in the request (`body.polygon.0`); `extra` members are added as they are.
+    `field` is the path of the invalid part of the request (`body.polygon.0`); `extra` members are added unchanged.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ def problem(
     headers: dict[str, str] | None = None,
     **extra: object,
 ) -> JSONResponse:
-    """Build a problem document: `errors` holds one `{"field": path, "problem": sentence}` for each thing wrong."""
+    """Build a problem document: `errors` holds one `{"field": path, "problem": sentence}` for each invalid field."""
     body: dict[str, object] = {
         "type": "about:blank",
         "title": HTTPStatus(status).phrase,
@@ -82,7 +82,7 @@ _SENTENCES: Final = re.compile(r"^(Value error|Assertion failed), ")
 
 
 def add_problem_handlers(app: FastAPI) -> None:
-    """Have whatever goes wrong in a request answered by a problem document."""
+    """Answer every error in a request with a problem document."""
 
     @app.exception_handler(ProblemError)
     async def _(_: Request, error: ProblemError) -> Response:
@@ -106,4 +106,4 @@ def add_problem_handlers(app: FastAPI) -> None:
     @app.exception_handler(Exception)
     async def _(request: Request, error: Exception) -> Response:
         _log.error("request_failed", error=error, method=request.method, path=request.url.path)
-        return problem(500, "the service failed; its log has the reason")
+        return problem(500, "the service failed: see its log for the reason")

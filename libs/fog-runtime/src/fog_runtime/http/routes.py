@@ -1,4 +1,4 @@
-"""Routes that say what they take and give once, in their signature; OpenAPI and behaviour both follow from it.
+"""Routes whose signatures declare body, response, role and headers; behaviour and OpenAPI follow from them.
 
 routes = Routes(app, "zones")
 routes.raises(StoreError, {503: "The store does not answer"}, lambda error: ProblemError(503, str(error)))
@@ -8,7 +8,7 @@ async def put_zone(zone_id: str, body: Body[ZoneBody], caller: Operator, if_matc
 ...
 """
 
-# Bodies and answers are whatever annotations say at run time, `list[Zone] | None` too: no type fits all of them.
+# The types of bodies and answers are read from annotations at run time, so they can't be typed more closely here.
 # ruff: noqa: ANN401
 
 import functools
@@ -32,14 +32,15 @@ _SCHEMAS: Final = "#/components/schemas/{name}"
 
 
 class _BodyMarker:
-    """Marks the parameter of a route that takes the decoded body."""
+    """Marks the parameter of a route that receives the decoded body."""
 
 
 Body = Annotated[T, _BodyMarker()]
-"""A parameter that takes the JSON body, decoded and checked as this msgspec type."""
+"""A parameter that receives the JSON body, decoded and validated as this msgspec type."""
 
 IfMatch = Annotated[
-    str | None, Header(alias="If-Match", description="The ETag that was read: refuse if it has changed since")
+    str | None,
+    Header(alias="If-Match", description="The ETag that was read: refuse the request if the record has changed since"),
 ]
 
 
@@ -52,12 +53,12 @@ class Answer(Generic[T]):
 
 
 def etag(version: int) -> dict[str, str]:
-    """Return the header that names a record's version."""
+    """Return the header with a record's version."""
     return {"ETag": f'"{version}"'}
 
 
 def expected_version(if_match: str | None) -> int | None:
-    """Return the version that an If-Match header names: None when any will do, -1 for what no version ever is."""
+    """Return the version in an If-Match header: None when any version is accepted, -1 for an invalid one."""
     if if_match is None or if_match.strip() == "*":
         return None
     tag = re.fullmatch(r'"([0-9]{1,16})"', if_match.strip())
@@ -67,9 +68,10 @@ def expected_version(if_match: str | None) -> int | None:
 class Routes:
     """Adds routes to an app, all under one tag.
 
-    A route is an async function. `Body[T]` names the type of its body, `Viewer` or `Operator` who may call it, and what
-    it returns what it answers: a msgspec type, an `Answer` of one, None for 204, or a ready `Response`. `raises` lists
-    exceptions that become the problem documents which `Routes.raises` was told of; `problems` describes further ones.
+    A route is an async function. `Body[T]` declares the type of its body, `Viewer` or `Operator` the role of its
+    callers, and the return type its response: a msgspec type, an `Answer` of one, None for 204, or a ready `Response`.
+    `raises` lists exceptions that become problem documents as registered by `Routes.raises`; `problems` describes
+    further ones.
     """
 
     def __init__(self, app: FastAPI, tag: str) -> None:
@@ -78,7 +80,7 @@ class Routes:
         self._raised: dict[type[Exception], Mapping[int, str]] = {}
 
     def raises(self, kind: type[E], described: Mapping[int, str], convert: Callable[[E], ProblemError]) -> None:
-        """Have exceptions of this kind answered by the problem that `convert` makes, described by status."""
+        """Answer exceptions of this type with the problem that `convert` returns; `described` documents each status."""
         self._raised[kind] = described
         handle = self._app.exception_handlers[ProblemError]
 
@@ -94,7 +96,7 @@ class Routes:
         return self._route("GET", path, **options)
 
     def post(self, path: str, **options: Any) -> Callable[[Handler], Handler]:
-        """Add a route that makes something, or asks with a body."""
+        """Add a route that creates something, or queries with a body."""
         return self._route("POST", path, **options)
 
     def put(self, path: str, **options: Any) -> Callable[[Handler], Handler]:
@@ -152,9 +154,9 @@ class Routes:
             answer["content"] = {"application/json": {"schema": schema(self._app, signature.answer)}}
         described: dict[int, str] = {}
         if signature.needs_token:
-            described |= {401: "No token, or one that nobody has", 403: "The token's role may not do this"}
+            described |= {401: "The token is missing or unknown", 403: "The token's role does not allow this"}
         if signature.body is not None:
-            described |= {413: "The body is too large", 422: "The body can't be used: `errors` names its fields"}
+            described |= {413: "The body is too large", 422: "The body is invalid: `errors` names the fields"}
         described.update(problems)
         content = {PROBLEM: {"schema": schema(self._app, Problem)}}
         responses: dict[int | str, dict[str, Any]] = {status: answer}
@@ -178,9 +180,9 @@ class _Signature:
             if any(isinstance(mark, _BodyMarker) for mark in arguments[1:]):
                 self.body = (name, arguments[0])
                 kind = Annotated[arguments[0], Depends(_reader(arguments[0]))]
-            # By keyword, so that one without a default may follow one with.
+            # Keyword-only, so that a parameter without a default may follow one with a default.
             replaced = parameter.replace(annotation=kind, kind=inspect.Parameter.KEYWORD_ONLY)
-            # Who may not call is told so before anything else is looked at.
+            # The caller's role is checked before everything else.
             (first if arguments[0] is Caller else others).append(replaced)
         self.needs_token = bool(first)
         self.parameters = [*first, *others]
@@ -191,7 +193,7 @@ class _Signature:
 def _endpoint(
     handler: Callable[..., Awaitable[object]], signature: _Signature, status: int
 ) -> Callable[..., Awaitable[Response]]:
-    """Return what FastAPI calls: the function with its body decoded before, and its answer encoded after."""
+    """Return the function that FastAPI calls: it decodes the body, calls the handler and encodes its answer."""
 
     @functools.wraps(handler)
     async def endpoint(**arguments: Any) -> Response:
@@ -215,7 +217,7 @@ def _reader(kind: Any) -> Callable[[Request], Awaitable[Any]]:
 
 
 class InvalidBodyError(ProblemError):
-    """A body that is not of its type; raised again with other words by whoever knows better ones."""
+    """A body that does not fit its type; a route may raise it again with a more helpful text."""
 
     def __init__(self, errors: list[dict[str, str]]) -> None:
         super().__init__(422, "; ".join(f"{error['field']}: {error['problem']}" for error in errors))
@@ -229,17 +231,17 @@ def _error_of(error: msgspec.DecodeError) -> dict[str, str]:
 
 
 async def read_body(request: Request, kind: type[T]) -> T:
-    """Decode a JSON body as a msgspec type; a body that is none becomes a problem that names the field."""
+    """Decode a JSON body as a msgspec type; an invalid body becomes a problem that names the field."""
     try:
         return msgspec.json.decode(await request.body(), type=kind)
     except msgspec.ValidationError as error:
         raise InvalidBodyError([_error_of(error)]) from error
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise InvalidBodyError([{"field": "body", "problem": f"no valid JSON: {error}"}]) from error
+        raise InvalidBodyError([{"field": "body", "problem": f"not valid JSON: {error}"}]) from error
 
 
 def schema(app: FastAPI, kind: Any) -> dict[str, Any]:
-    """Return the JSON schema of a msgspec type; the types that it refers to become components of the app's OpenAPI."""
+    """Return the JSON schema of a msgspec type; types that it references become components of the app's OpenAPI."""
     (described,), components = msgspec.json.schema_components([kind], ref_template=_SCHEMAS)
     app.state.schemas.update(components)
     return described

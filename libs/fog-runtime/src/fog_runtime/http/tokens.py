@@ -1,4 +1,4 @@
-"""Who may do what: bearer tokens with roles, read from a file that holds their hashes."""
+"""Authorization: bearer tokens with roles, read from a file with their hashes."""
 
 import hashlib
 import tomllib
@@ -19,14 +19,14 @@ _bearer = HTTPBearer(auto_error=False, description="A token of the tokens file")
 
 
 class Caller(msgspec.Struct, frozen=True):
-    """Somebody who showed a valid token; the name goes into the audit log."""
+    """The owner of a valid token; the name appears in the audit log."""
 
     name: str
     role: Role
 
 
 class TokensError(ValueError):
-    """A tokens file that can't be used; the message names the file, the entry and the remedy."""
+    """A tokens file is missing or invalid; the message names the file, the entry and the remedy."""
 
 
 class _Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -40,23 +40,23 @@ class _TokensFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Tokens:
-    """The callers by their tokens' SHA-256 (tokens are long and random, so a plain hash is enough)."""
+    """The callers by the SHA-256 of their tokens (tokens are long and random, so a plain hash is enough)."""
 
     def __init__(self, callers: dict[str, Caller] | None = None) -> None:
         self._callers = callers or {}
 
     def caller(self, token: str) -> Caller | None:
-        """Return who this token belongs to, or None."""
+        """Return the owner of a token, or None for an unknown one."""
         return self._callers.get(token_hash(token))
 
 
 def token_hash(token: str) -> str:
-    """Return what stands in the tokens file for a token."""
+    """Return the hash of a token, as in the tokens file."""
     return hashlib.sha256(token.encode()).hexdigest()
 
 
 def load_tokens(file: Path | None) -> Tokens:
-    """Read a tokens file (TOML: `[[tokens]]` with name, role, sha256); without a file nobody may write anything.
+    """Read a tokens file (TOML: `[[tokens]]` with name, role, sha256); without a file every write is refused.
 
     Raises `TokensError`.
     """
@@ -67,7 +67,7 @@ def load_tokens(file: Path | None) -> Tokens:
     except OSError as error:
         raise TokensError(f"{file}: can't be read ({error.strerror}). Create it or unset FOGNAV_TOKENS_FILE") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise TokensError(f"{file}: is no valid TOML ({error}). Correct the place it names") from error
+        raise TokensError(f"{file}: is not valid TOML ({error}). Correct that line") from error
     except msgspec.ValidationError as error:
         raise TokensError(f"{file}: {error}. Each of [[tokens]] needs name, role and sha256") from error
     callers = {entry.sha256: Caller(entry.name, entry.role) for entry in entries}
@@ -77,20 +77,20 @@ def load_tokens(file: Path | None) -> Tokens:
 
 
 def require(role: Role) -> Callable[..., Caller]:
-    """Return a dependency that lets callers of this role or a higher one through: `Depends(require("operator"))`."""
+    """Return a dependency that admits callers of this role or a higher one: `Depends(require("operator"))`."""
 
     def check(
         request: Request, credentials: Annotated[HTTPAuthorizationCredentials | None, Depends(_bearer)]
     ) -> Caller:
         challenge = {"WWW-Authenticate": "Bearer"}
         if credentials is None:
-            raise ProblemError(401, "this needs a token: send `Authorization: Bearer TOKEN`", headers=challenge)
+            raise ProblemError(401, "this request needs a token: send `Authorization: Bearer TOKEN`", headers=challenge)
         tokens: Tokens = request.app.state.tokens
         caller = tokens.caller(credentials.credentials)
         if caller is None:
-            raise ProblemError(401, "nobody has this token", headers=challenge)
+            raise ProblemError(401, "the token is unknown: use one of the site's tokens", headers=challenge)
         if _RANKS[caller.role] < _RANKS[role]:
-            raise ProblemError(403, f"this needs the role {role}; {caller.name} is {caller.role}")
+            raise ProblemError(403, f"this request needs the role {role}; {caller.name} has the role {caller.role}")
         return caller
 
     return check

@@ -1,4 +1,4 @@
-"""Tests with the compiler on and off: sizes, what to leave out, and guards that only plain Python can have.
+"""Support for tests with and without the compiler: numbers of examples, skipped tests, guarded arrays.
 
 With NUMBA_DISABLE_JIT=1 kernels run as plain Python: coverage sees their lines, numpy warns of overflowing integers,
 and an index beyond an array's end raises instead of reading foreign memory. They are a hundred times slower then.
@@ -24,12 +24,12 @@ compiled_only = pytest.mark.skipif(not COMPILED, reason="too slow without the co
 
 
 def examples(count: int) -> int:
-    """Return how many examples to try: fewer of them without the compiler."""
+    """Return the number of examples: fewer without the compiler."""
     return count if COMPILED else max(count // 20, 5)
 
 
 class Guarded(np.ndarray):
-    """An array that refuses negative indices: kernels compute theirs, so that a negative one is a mistake."""
+    """An array that refuses negative indices: kernels compute their indices, so a negative one is a bug."""
 
     def __getitem__(self, index: Any) -> Any:
         refuse_negative(index)
@@ -59,7 +59,7 @@ def guarded(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def guard_kernels(module: ModuleType) -> None:
-    """Guard the arrays that a module's wrappers pass to its kernels; only of use without the compiler."""
+    """Guard the arrays that a module's wrappers pass to its kernels; has an effect only without the compiler."""
     for name, function in list(vars(module).items()):
         if name.startswith("_") and inspect.isfunction(function) and function.__module__ == module.__name__:
             setattr(module, name, guarded(function))

@@ -1,4 +1,4 @@
-"""Lets the tests of this member import what lies beside them, and guards the kernels' arrays without the compiler."""
+"""Lets tests import modules of this folder, and guards the kernels' arrays when the compiler is off."""
 
 from __future__ import annotations
 

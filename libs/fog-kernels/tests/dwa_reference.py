@@ -1,4 +1,4 @@
-"""The dynamic window by its definition, in plain numpy: what `fog_kernels.dwa` must choose, without its shortcuts.
+"""A reference implementation of the dynamic window approach in plain numpy, without `fog_kernels.dwa`'s optimizations.
 
 Every arc is rolled out in closed form at every step, the path is a polyline whose points are all kept, and all scores
 are returned, so that a test can compare arcs and not only the winner. Metres, radians, seconds; frame `map`.
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Scene:
-    """What a decision sees: speeds, pose, costmap with its resolution and origin, path (n, 2), goal (x, y), heading."""
+    """The inputs of a decision: speeds, pose, costmap with resolution and origin, path (n, 2), goal (x, y), heading."""
 
     v: float
     w: float
@@ -36,7 +36,7 @@ class Scene:
     goal_theta: float | None
 
     def cost_at(self, x: float, y: float) -> int:
-        """Return the cost at a point; beyond the window nothing is known."""
+        """Return the cost at a point; outside the window it is unknown."""
         column = math.floor((x - self.origin[0]) / self.resolution)
         row = math.floor((y - self.origin[1]) / self.resolution)
         height, width = self.costmap.shape
@@ -45,7 +45,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class Arc:
-    """An admissible arc; the higher score is the better."""
+    """An admissible arc; a higher score is better."""
 
     v: float
     w: float
@@ -73,7 +73,7 @@ class Route:
             self.length = float(np.hypot(*(goal - here)))
         steps = np.hypot(*np.diff(points, axis=0).T)
         starts = np.concatenate(([0.0], np.cumsum(steps)))[: len(steps)]
-        # A route that comes back later must not attract an arc now.
+        # A later part of the route that passes here again must not attract the arc.
         reached = (starts < limits.v_max * settings.sim_time + 2.0 * settings.lookahead) & (steps > 0.0)
         self.begins, self.ends = points[:-1][reached], points[1:][reached]
         self.starts, self.steps = starts[reached], steps[reached]
@@ -116,8 +116,8 @@ def highest_cost(scene: Scene, v: float, w: float, times: NDArray[np.float64], *
     return max(costs[outside:], default=INSCRIBED)
 
 
-def decide(scene: Scene, limits: DwaLimits, settings: DwaSettings) -> list[Arc] | None:  # noqa: C901, PLR0912  # it reads as the method is described, in one piece
-    """Return all admissible arcs, the best one anywhere among them; None when the goal is reached, heading and all."""
+def decide(scene: Scene, limits: DwaLimits, settings: DwaSettings) -> list[Arc] | None:  # noqa: C901, PLR0912  # a single function, like the description of the method
+    """Return all admissible arcs in any order; None when the goal and its heading are reached."""
     x, y, theta = scene.pose
     here = scene.cost_at(x, y)
     escaping = here == INSCRIBED and settings.escape_v > 0.0
@@ -169,7 +169,7 @@ def decide(scene: Scene, limits: DwaLimits, settings: DwaSettings) -> list[Arc] 
 
 
 def turning_rates(w_now: float, limits: DwaLimits, settings: DwaSettings) -> list[float]:
-    """Return the reachable turning rates; the one nearest to straight ahead is straight ahead."""
+    """Return the reachable angular speeds; the one nearest to zero is set to zero."""
     change = limits.acc_w * settings.period
     low, high = max(w_now - change, -limits.w_max), min(w_now + change, limits.w_max)
     if high < low:  # faster than allowed: only braking
@@ -181,7 +181,7 @@ def turning_rates(w_now: float, limits: DwaLimits, settings: DwaSettings) -> lis
 
 
 def turning_goal(error: float, w_now: float, limits: DwaLimits) -> float:
-    """Return the rate at which a heading error is turned away."""
+    """Return the angular speed at which a heading error is corrected."""
     size = min(limits.w_max, 2.0 * abs(error), math.sqrt(0.67 * limits.acc_w * abs(error)))
     sign = math.copysign(1.0, error)
     if abs(error) > 2.8 and sign * size * w_now < -0.01:
@@ -190,7 +190,7 @@ def turning_goal(error: float, w_now: float, limits: DwaLimits) -> float:
 
 
 def route_total(scene: Scene, route: Route, v: float, w: float, steps: int, settings: DwaSettings) -> float:
-    """Weigh how an arc follows the route: offsets at its middle and end, what is left, and the heading at its end."""
+    """Return the cost of following the route: offsets at middle and end, distance to go, heading error at the end."""
     end = min(max(round(settings.sim_time / settings.dt), 1), steps)
     at_end = position(scene, v, w, end * settings.dt)
     at_middle = position(scene, v, w, max(end // 2, 1) * settings.dt)

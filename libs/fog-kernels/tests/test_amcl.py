@@ -31,7 +31,7 @@ BEAMS = np.linspace(-math.pi, math.pi, 60, endpoint=False)
 
 
 def building() -> NDArray[np.bool_]:
-    """A 12 x 8 m floor of unequal rooms."""
+    """Return a 12 x 8 m floor of unequal rooms."""
     occupied = np.zeros((160, 240), bool)
     occupied[[0, -1]] = True
     occupied[:, [0, -1]] = True
@@ -58,7 +58,7 @@ def cloud(n: int, x: float, y: float, theta: float) -> list[NDArray[np.float32]]
     return [np.full(n, value, np.float32) for value in (x, y, theta)]
 
 
-def test_the_field_is_the_cubed_mixture_of_the_distance() -> None:
+def test_likelihood_field_is_the_cubed_mixture_of_the_distance() -> None:
     occupied = np.zeros((1, 50), bool)
     occupied[0, 0] = True
     field = likelihood_field(occupied, 0.1, sigma_hit=0.2, max_distance=2.0, z_hit=0.5, z_rand=0.5, range_max=10.0)
@@ -68,7 +68,7 @@ def test_the_field_is_the_cubed_mixture_of_the_distance() -> None:
         assert field[0, column] == pytest.approx(expected, rel=1e-5)
 
 
-def test_motion_noise_has_the_models_moments() -> None:
+def test_motion_noise_has_the_mean_and_variance_of_the_model() -> None:
     n = 40_000
     x, y, theta = cloud(n, 1.0, 2.0, 0.5)
     motion_update(x, y, theta, 0.3, 1.0, -0.1, (0.04, 0.01, 0.02, 0.03), rng_state(1))
@@ -87,7 +87,7 @@ def test_motion_noise_has_the_models_moments() -> None:
     assert (normal**4).mean() == pytest.approx(3.0, abs=0.15)
 
 
-def test_without_noise_every_particle_makes_the_same_step() -> None:
+def test_particles_move_alike_without_noise() -> None:
     x, y, theta = cloud(3, 0.0, 0.0, math.pi / 2)
     step = odometry_delta((5.0, 5.0, 1.0), (5.0 + math.cos(1.2), 5.0 + math.sin(1.2), 1.5))
     assert step == pytest.approx((0.2, 1.0, 0.3))
@@ -97,7 +97,7 @@ def test_without_noise_every_particle_makes_the_same_step() -> None:
     assert theta == pytest.approx(np.full(3, math.pi / 2 + 0.5), abs=1e-6)
 
 
-def test_backing_up_is_as_precise_as_driving_forward() -> None:
+def test_reversing_has_the_noise_of_driving_forward() -> None:
     step = odometry_delta((0.0, 0.0, 0.0), (-0.5, 0.0, 0.0))
     assert abs(step[0]) == pytest.approx(math.pi)
     backward, forward = (cloud(5000, 0.0, 0.0, 0.0) for _ in range(2))
@@ -110,7 +110,7 @@ def test_backing_up_is_as_precise_as_driving_forward() -> None:
 
 @settings(max_examples=examples(25), deadline=None)
 @given(st.integers(0, 2**32 - 1))
-def test_scores_follow_their_definition(seed: int) -> None:
+def test_scores_equal_their_definition(seed: int) -> None:
     rng = np.random.default_rng(seed)
     n = 20
     x = rng.uniform(-1, 13, n).astype(np.float32)
@@ -133,7 +133,7 @@ def test_scores_follow_their_definition(seed: int) -> None:
     assert np.abs(scores * valid.sum() - sums).max() < 0.12
 
 
-def test_a_scan_without_valid_beams_scores_zero() -> None:
+def test_scan_without_valid_beams_scores_zero() -> None:
     particles = cloud(4, 1.0, 1.0, 0.0)
     scores = score_poses(*particles, FIELD, RESOLUTION, 0.0, 0.0, [0.0, 1.0], [math.nan, math.inf])
     assert scores.tolist() == [0.0, 0.0, 0.0, 0.0]
@@ -150,7 +150,7 @@ def test_resampling_keeps_proportions_with_low_variance() -> None:
     assert result.weights.sum() == pytest.approx(1.0)
 
 
-def test_the_number_of_particles_follows_their_spread() -> None:
+def test_number_of_particles_grows_with_their_spread() -> None:
     rng = np.random.default_rng(0)
     n = 5000
     weights = np.full(n, 1.0 / n)
@@ -164,7 +164,7 @@ def test_the_number_of_particles_follows_their_spread() -> None:
     assert sizes[0] < sizes[1] < sizes[2] == 3000
 
 
-def test_one_bin_more_asks_for_foxs_number() -> None:
+def test_number_of_particles_equals_foxs_formula() -> None:
     x = np.array([0.1, 1.1, 2.1, 3.1], np.float32)
     zero = np.zeros(4, np.float32)
     result = resample(x, zero, zero, np.full(4, 0.25), 10, 10_000, 0.02, rng_state(5))
@@ -173,7 +173,7 @@ def test_one_bin_more_asks_for_foxs_number() -> None:
     assert len(result.x) == math.ceil(bound)
 
 
-def test_a_share_of_random_particles_comes_from_the_free_places() -> None:
+def test_random_share_of_particles_is_drawn_from_the_free_positions() -> None:
     particles = cloud(2000, 1.0, 1.0, 0.0)
     free = np.array([[5.0, 6.0], [8.0, 2.0]])
     result = resample(
@@ -186,7 +186,7 @@ def test_a_share_of_random_particles_comes_from_the_free_places() -> None:
     assert np.ptp(result.theta[fresh]) > 6.0
 
 
-def test_the_estimate_is_the_heaviest_clusters_and_turns_are_circular() -> None:
+def test_estimate_is_the_circular_mean_of_the_cluster_with_the_highest_weight() -> None:
     rng = np.random.default_rng(4)
     x = np.concatenate([rng.normal(2, 0.1, 300), rng.normal(9, 0.1, 700)]).astype(np.float32)
     y = np.concatenate([rng.normal(3, 0.1, 300), rng.normal(1, 0.2, 700)]).astype(np.float32)
@@ -204,7 +204,7 @@ def test_the_estimate_is_the_heaviest_clusters_and_turns_are_circular() -> None:
 
 
 def track(seed: int, steps: int) -> tuple[list[NDArray[np.float32]], tuple[float, float, float], list[float]]:
-    """Drive a loop with drifting odometry from a vague start; return particles, true pose, errors."""
+    """Drive a loop with drifting odometry from an uncertain start; return particles, true pose and errors."""
     state = rng_state(seed)
     n = 2000
     truth = [1.0, 1.0, 0.2]
@@ -233,7 +233,7 @@ def track(seed: int, steps: int) -> tuple[list[NDArray[np.float32]], tuple[float
 
 
 @compiled_only
-def test_the_filter_converges_and_keeps_the_pose() -> None:
+def test_filter_converges_and_tracks_the_pose() -> None:
     particles, truth, errors = track(11, 40)
     assert max(errors[10:]) < 0.15
     assert np.median(errors[10:]) < 0.06
@@ -242,7 +242,7 @@ def test_the_filter_converges_and_keeps_the_pose() -> None:
 
 
 @compiled_only
-def test_the_same_seed_repeats_bit_for_bit_and_another_does_not() -> None:
+def test_same_seed_gives_the_same_particles_and_another_seed_does_not() -> None:
     first, second, other = track(11, 12)[0], track(11, 12)[0], track(12, 12)[0]
     for a, b in zip(first, second, strict=True):
         assert a.tobytes() == b.tobytes()
@@ -250,7 +250,7 @@ def test_the_same_seed_repeats_bit_for_bit_and_another_does_not() -> None:
 
 
 @compiled_only
-def test_global_localization_by_scoring_poses_everywhere() -> None:
+def test_scoring_poses_on_the_whole_map_finds_the_true_pose() -> None:
     truth = (9.2, 1.6, 2.0)
     ranges = scan(*truth)
     grid = np.array(
@@ -267,7 +267,7 @@ def test_global_localization_by_scoring_poses_everywhere() -> None:
     assert abs(math.remainder(best[2] - truth[2], 2 * math.pi)) < 0.2
 
 
-def test_wrong_arrays_and_states_are_refused_by_name() -> None:
+def test_invalid_arrays_and_generator_states_are_refused_by_name() -> None:
     x, y, theta = cloud(3, 0.0, 0.0, 0.0)
     weights = np.full(3, 1 / 3)
     with pytest.raises(TypeError, match="theta must be float32"):

@@ -84,7 +84,7 @@ def cell_of(data: st.DataObject, costmap: NDArray[np.uint8]) -> Cell:
 
 
 def assert_valid(costmap: NDArray[np.uint8], cells: NDArray[np.int32], start: Cell, goal: Cell, cost: float) -> None:
-    """A path from start to goal, every step of it one that the planner may take, of this cost."""
+    """Assert that the cells are a path of allowed steps from start to goal with this cost."""
     assert tuple(cells[0]) == start
     assert tuple(cells[-1]) == goal
     total = 0
@@ -116,7 +116,9 @@ def test_cost_equals_dijkstra_and_the_path_has_that_cost(costmap: NDArray[np.uin
 
 @settings(max_examples=examples(60), deadline=None)
 @given(costmaps(), st.integers(1, 3000), st.floats(0, 20), st.data())
-def test_any_weights_are_exact(costmap: NDArray[np.uint8], neutral: int, factor: float, data: st.DataObject) -> None:
+def test_cost_equals_dijkstra_for_any_weights(
+    costmap: NDArray[np.uint8], neutral: int, factor: float, data: st.DataObject
+) -> None:
     start, goal = cell_of(data, costmap), cell_of(data, costmap)
     expected = dijkstra(costmap, start, neutral, factor).get(goal)
     result = Planner(costmap.shape[1], costmap.shape[0], neutral, factor).plan(costmap, start, goal)
@@ -149,7 +151,7 @@ def test_replanning_with_the_goal_field_equals_a_full_search(static: NDArray[np.
     ("side", "neutral", "factor"), [pytest.param(101, 2000, 30.0, marks=compiled_only), (13, 50_000, 198.0)]
 )
 def test_costs_beyond_32_bits_are_exact(side: int, neutral: int, factor: float) -> None:
-    """A serpentine of the dearest cells costs more than 2^31."""
+    """A serpentine over cells of the highest cost costs more than 2^31."""
     costmap = np.full((side, side), 252, np.uint8)
     costmap[1::4, :-1] = 254
     costmap[3::4, 1:] = 254
@@ -169,8 +171,8 @@ def test_costs_beyond_32_bits_are_exact(side: int, neutral: int, factor: float) 
 
 
 @compiled_only
-def test_a_goal_field_set_in_another_thread_never_misleads_a_plan() -> None:
-    """A plan sees the field of its goal or none, whatever is being set beside it."""
+def test_plans_stay_exact_while_another_thread_sets_goal_fields() -> None:
+    """A plan uses the field of its own goal or none, whatever another thread sets."""
     rng = np.random.default_rng(2)
     costmap = rng.integers(0, 253, (80, 80)).astype(np.uint8)
     goals = [(79, 79), (0, 79), (79, 0)]
@@ -195,8 +197,8 @@ def test_a_goal_field_set_in_another_thread_never_misleads_a_plan() -> None:
 
 
 @pytest.mark.parametrize("side", [pytest.param(101, marks=compiled_only), 17])
-def test_a_dear_plan_after_a_cheap_goal_field_stays_exact(side: int) -> None:
-    """Going over to 64-bit costs converts the field that is already set."""
+def test_plan_beyond_32_bits_after_a_32_bit_goal_field_is_exact(side: int) -> None:
+    """Switching to 64-bit costs converts the goal field that is already set."""
     static = np.zeros((side, side), np.uint8)
     goal = (side - 1, side - 1)
     static[1::4, :-1] = 254
@@ -213,7 +215,7 @@ def test_a_dear_plan_after_a_cheap_goal_field_stays_exact(side: int) -> None:
     assert not planner.plan(cut, (0, 0), goal).found
 
 
-def test_the_bound_on_expansions_ends_a_search_and_leaves_the_planner_usable() -> None:
+def test_planner_is_usable_after_a_search_ended_by_the_expansion_limit() -> None:
     costmap = np.zeros((60, 60), np.uint8)
     costmap[:50, 30] = 254
     planner = Planner(60, 60)
@@ -224,7 +226,7 @@ def test_the_bound_on_expansions_ends_a_search_and_leaves_the_planner_usable() -
     assert result.cost == dijkstra(costmap, (0, 0))[59, 0] / (2 * STRAIGHT)
 
 
-def test_cells_outside_and_wrong_shapes_are_refused() -> None:
+def test_cells_outside_the_grid_and_wrong_shapes_are_refused() -> None:
     planner = Planner(5, 4)
     costmap = np.zeros((4, 5), np.uint8)
     with pytest.raises(ValueError, match="goal"):
@@ -249,7 +251,7 @@ def test_nearest_reachable_is_the_nearest_of_all_reachable(costmap: NDArray[np.u
     )
 
 
-def test_nearest_traversable_looks_around_the_cell() -> None:
+def test_nearest_traversable_cell_is_found_within_reach() -> None:
     costmap = np.full((9, 9), 254, np.uint8)
     costmap[2, 7] = 252
     assert nearest_traversable(costmap, (4, 4), 3) is None
@@ -258,7 +260,7 @@ def test_nearest_traversable_looks_around_the_cell() -> None:
 
 @settings(max_examples=examples(200), deadline=None)
 @given(costmaps(), st.data())
-def test_a_shortcut_stays_off_walls_and_costs_no_more(costmap: NDArray[np.uint8], data: st.DataObject) -> None:
+def test_shortcut_crosses_no_obstacle_and_costs_no_more(costmap: NDArray[np.uint8], data: st.DataObject) -> None:
     start, goal = cell_of(data, costmap), cell_of(data, costmap)
     result = Planner(costmap.shape[1], costmap.shape[0]).plan(costmap, start, goal)
     if not result.found:
@@ -276,7 +278,7 @@ def test_a_shortcut_stays_off_walls_and_costs_no_more(costmap: NDArray[np.uint8]
     assert total <= result.cost * 1.01 + 1e-6 * len(result.cells) + 1e-3
 
 
-def test_an_open_room_is_crossed_in_one_line() -> None:
+def test_path_through_an_open_room_becomes_one_line() -> None:
     costmap = np.zeros((40, 90), np.uint8)
     result = Planner(90, 40).plan(costmap, (2, 3), (85, 30))
     assert shortcut(costmap, result.cells).tolist() == [[2.0, 3.0], [85.0, 30.0]]
@@ -295,14 +297,14 @@ def test_line_cost_is_the_integral_of_the_weight() -> None:
         assert line_cost(costmap, x1, y1, x0, y0) == pytest.approx(line_cost(costmap, x0, y0, x1, y1), rel=1e-9)
 
 
-def test_a_line_between_two_diagonal_walls_is_blocked() -> None:
+def test_line_between_two_diagonal_obstacles_is_blocked() -> None:
     costmap = np.zeros((4, 4), np.uint8)
     costmap[1, 2] = costmap[2, 1] = 254
     assert line_cost(costmap, 0, 0, 3, 3) == math.inf
     assert line_cost(costmap, 0, 0, 4, 0) == math.inf
 
 
-def test_the_path_keeps_to_the_middle_of_a_corridor() -> None:
+def test_path_follows_the_middle_of_a_corridor() -> None:
     raw = np.zeros((40, 200), np.uint8)
     raw[:3] = raw[-3:] = 254
     costmap = inflate(raw, inflation_table(0.05, DEFAULT_INFLATION))
@@ -323,7 +325,7 @@ def read_movingai(path: Path) -> NDArray[np.uint8]:
 @pytest.mark.parametrize(
     "scenario", sorted((DATA / "movingai").glob("*.scen")) or [None], ids=lambda path: path.stem if path else "none"
 )
-def test_published_lengths_are_reached(scenario: Path | None) -> None:
+def test_path_lengths_equal_the_published_ones(scenario: Path | None) -> None:
     if scenario is None:
         pytest.skip("no data")
     lines = scenario.read_text().splitlines()[1:]

@@ -64,7 +64,7 @@ def test_inflation_equals_its_definition(raw: NDArray[np.uint8], radius: float) 
 
 @settings(max_examples=examples(150), deadline=None)
 @given(raw_maps(), st.data())
-def test_a_window_brings_the_whole_map_up_to_date(raw: NDArray[np.uint8], data: st.DataObject) -> None:
+def test_inflating_a_window_updates_the_whole_map(raw: NDArray[np.uint8], data: st.DataObject) -> None:
     table = inflation_table(0.05, Inflation(inflation_radius=data.draw(st.sampled_from([0.0, 0.2, 0.55]))))
     out = inflate(raw, table)
     height, width = raw.shape
@@ -99,7 +99,7 @@ def test_read_only_maps_are_accepted() -> None:
     assert inflate(raw, table).tolist() == [[0, 254], [0, 0]]
 
 
-def test_wrong_arrays_are_refused_by_name() -> None:
+def test_invalid_arrays_are_refused_by_name() -> None:
     table = inflation_table(0.05, DEFAULT_INFLATION)
     with pytest.raises(TypeError, match="raw must be uint8"):
         inflate(np.zeros((4, 4), np.int32), table)

@@ -1,4 +1,4 @@
-"""DWA in a closed loop: a unicycle follows paths through corridors, a doorway and about face, and brakes."""
+"""DWA in a closed loop: a unicycle follows paths through corridors and a doorway, turns round and brakes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Point = tuple[float, float]
 
 
 def world(*rooms: tuple[float, float, float, float]) -> NDArray[np.uint8]:
-    """8 x 8 m of wall with free boxes x0, y0, x1, y1, inflated."""
+    """Return an inflated costmap: 8 x 8 m of wall with free boxes x0, y0, x1, y1."""
     raw = np.full((160, 160), 254, np.uint8)
     for x0, y0, x1, y1 in rooms:
         raw[round(y0 / RESOLUTION) : round(y1 / RESOLUTION), round(x0 / RESOLUTION) : round(x1 / RESOLUTION)] = 0
@@ -74,7 +74,7 @@ def drive(  # noqa: PLR0913  # the kernel's inputs, and how long
     noise: float = 0.0,
     seconds: float = 90.0,
 ) -> Drive:
-    """Decide at 5 Hz on noisy poses and integrate the unicycle at 100 Hz until it stands still."""
+    """Run the controller at 5 Hz on noisy poses and integrate the unicycle at 100 Hz until it stops."""
     x, y, theta = pose
     v = w = t = 0.0
     rng = np.random.default_rng(1)
@@ -112,7 +112,7 @@ def off_path(run: Drive, path: list[Point]) -> float:
 @compiled_only
 @pytest.mark.parametrize("noise", [0.0, 0.01, 0.03])
 @pytest.mark.parametrize("theta", [0.0, math.pi, -2.0])
-def test_an_l_shaped_corridor_is_followed_to_its_end(noise: float, theta: float) -> None:
+def test_robot_follows_an_l_shaped_corridor_to_its_end(noise: float, theta: float) -> None:
     path = [(1.0, 1.25), (5.25, 1.25), (5.25, 6.5)]
     run = drive(L_CORRIDOR, (1.0, 1.25, theta), path, path[-1], noise=noise)
     assert run.distance_to(path[-1]) < 0.10 + 2 * noise
@@ -126,7 +126,7 @@ def test_an_l_shaped_corridor_is_followed_to_its_end(noise: float, theta: float)
 
 
 @compiled_only
-def test_dense_and_sparse_paths_are_driven_alike() -> None:
+def test_dense_and_sparse_points_of_a_path_give_the_same_drive() -> None:
     sparse = [(1.0, 1.25), (5.25, 1.25), (5.25, 6.5)]
     dense = [(1 + i * 0.05, 1.25) for i in range(85)] + [(5.25, 1.25 + i * 0.05) for i in range(105)]
     runs = [drive(L_CORRIDOR, (1.0, 1.25, 0.0), path, (5.25, 6.5)) for path in (sparse, dense)]
@@ -142,14 +142,14 @@ def test_dense_and_sparse_paths_are_driven_alike() -> None:
         [(2.0, 0.8), (3.7, 0.8), (3.7, 2.25), (5.0, 2.25)],  # hugs the wall, then a right angle into the doorway
     ],
 )
-def test_a_doorway_of_90_cm_is_passed_without_touching(noise: float, path: list[Point]) -> None:
+def test_robot_passes_a_doorway_of_90_cm_without_contact(noise: float, path: list[Point]) -> None:
     run = drive(DOORWAY, (*path[0], 1.5), path, path[-1], noise=noise)
     assert run.distance_to(path[-1]) < 0.10 + 2 * noise
     assert run.log[:, 6].max() < 254
 
 
 @compiled_only
-def test_a_path_that_starts_behind_is_turned_to_in_place() -> None:
+def test_robot_turns_in_place_to_a_path_that_starts_behind_it() -> None:
     run = drive(OPEN, (3.0, 3.0, math.pi), [(3.0, 3.0), (6.0, 3.0)], (6.0, 3.0))
     moving = run.log[run.log[:, 4] > 0.02]
     first = moving[0]
@@ -159,7 +159,7 @@ def test_a_path_that_starts_behind_is_turned_to_in_place() -> None:
 
 
 @compiled_only
-def test_it_brakes_within_the_tolerance_and_turns_to_the_goals_heading() -> None:
+def test_robot_stops_within_the_tolerance_and_turns_to_the_goals_heading() -> None:
     run = drive(OPEN, (3.0, 3.0, 0.0), [(3.0, 3.0), (5.0, 3.0)], (5.0, 3.0), goal_theta=2.0)
     assert run.distance_to((5.0, 3.0)) < 0.10
     assert abs(math.remainder(run.log[-1, 3] - 2.0, 2 * math.pi)) < 0.17
@@ -167,13 +167,13 @@ def test_it_brakes_within_the_tolerance_and_turns_to_the_goals_heading() -> None
 
 
 @compiled_only
-def test_beside_the_paths_end_the_goal_is_still_reached() -> None:
+def test_goal_is_reached_from_beside_the_end_of_the_path() -> None:
     run = drive(OPEN, (5.05, 3.3, 0.0), [(3.0, 3.0), (5.0, 3.0)], (5.0, 3.0))
     assert run.distance_to((5.0, 3.0)) < 0.10
 
 
 @compiled_only
-def test_an_unmapped_wall_across_the_path_is_never_touched() -> None:
+def test_robot_stops_without_contact_before_an_unmapped_wall() -> None:
     costmap = world((0.5, 0.5, 4.0, 7.5), (4.2, 0.5, 7.5, 7.5))
     run = drive(costmap, (1.0, 3.0, 0.0), [(1.0, 3.0), (7.0, 3.0)], (7.0, 3.0), seconds=40)
     assert run.log[:, 6].max() < 253
@@ -181,7 +181,7 @@ def test_an_unmapped_wall_across_the_path_is_never_touched() -> None:
     assert run.log[:, 7].min() > 0
 
 
-def test_weak_brakes_keep_a_longer_distance() -> None:
+def test_low_deceleration_gives_a_longer_stopping_distance() -> None:
     """With 0.05 m/s^2 of braking, 0.3 m/s needs 0.9 m: more than the arcs' 0.45 m."""
     costmap = world((0.5, 2.7, 4.0, 3.3))  # a dead end too narrow to circle in
     limits = DwaLimits(acc_v=0.05)
@@ -194,12 +194,12 @@ def test_weak_brakes_keep_a_longer_distance() -> None:
 
 
 @pytest.mark.parametrize("blocked", [254, 255])
-def test_a_robot_on_a_lethal_or_unknown_cell_may_not_move(blocked: int) -> None:
+def test_robot_on_a_lethal_or_unknown_cell_does_not_move(blocked: int) -> None:
     costmap = np.full((160, 160), blocked, np.uint8)
     assert decide(costmap, (3.0, 3.0, 0.0), (0.2, 0.0), [(3.0, 3.0)], (5.0, 3.0)) == (0.0, 0.0, -math.inf, 0)
 
 
-def test_an_inscribed_cell_is_left_slowly_and_only_away_from_the_wall() -> None:
+def test_robot_on_inscribed_cells_escapes_slowly_away_from_the_wall() -> None:
     costmap = world((0.5, 0.5, 4.0, 7.5))
     band = (3.88, 3.0)
     assert costmap[int(band[1] / 0.05), int(band[0] / 0.05)] == 253
@@ -212,14 +212,14 @@ def test_an_inscribed_cell_is_left_slowly_and_only_away_from_the_wall() -> None:
     assert decide(costmap, (*band, math.pi), (0.0, 0.0), path, path[-1], settings=strict).n_admissible == 0
 
 
-def test_an_escape_does_not_lead_back_onto_inscribed_cells() -> None:
+def test_escaping_arc_does_not_return_to_inscribed_cells() -> None:
     costmap = np.zeros((160, 160), np.uint8)
     costmap[:, 58:62] = costmap[:, 64:] = 253  # columns 58 to 61, 10 cm of free floor, and inscribed ever after
     chosen = decide(costmap, (3.07, 3.0, 0.0), (0.0, 0.0), [(3.0, 3.0), (7.0, 3.0)], (7.0, 3.0))
     assert 3.10 < 3.07 + 3.0 * chosen.v < 3.20
 
 
-def test_what_cannot_be_judged_is_refused() -> None:
+def test_non_finite_or_malformed_inputs_are_refused() -> None:
     with pytest.raises(ValueError, match="finite"):
         decide(OPEN, (3.0, 3.0, math.inf), (0.0, 0.0), [], (4.0, 3.0))
     with pytest.raises(ValueError, match="acc_v"):

@@ -1,4 +1,4 @@
-"""The dynamic window's kernel against its definition: the same arcs, the same scores, the same choice."""
+"""The DWA kernel against the reference implementation: the same arcs, scores and choice."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def route(rng: np.random.Generator, kind: str) -> NDArray[np.float64]:
 
 @st.composite
 def scenes(draw: st.DrawFn, routes: list[str]) -> Scene:
-    """Decisions of all kinds; numbers are drawn by a seeded generator, so that none lies on a cell's border."""
+    """Random decisions; numbers come from a seeded generator, so that none lies on a cell's border."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     path = route(rng, draw(st.sampled_from(routes)))
     goal = path[-1] if len(path) else rng.uniform(0.2, 2.8, 2)
@@ -125,7 +125,7 @@ def choose(scene: Scene, bounds: DwaLimits, chosen: DwaSettings) -> DwaResult:
 
 @settings(max_examples=examples(300), deadline=None)
 @given(scenes(["corners", "hairpin", "line", "none"]), limits, parameters)
-def test_kernel_chooses_as_the_definition_does(scene: Scene, bounds: DwaLimits, weights: DwaSettings) -> None:
+def test_kernel_chooses_the_same_arc_as_the_reference(scene: Scene, bounds: DwaLimits, weights: DwaSettings) -> None:
     result = choose(scene, bounds, weights)
     arcs = decide(scene, bounds, weights)
     if arcs is None:
@@ -143,7 +143,7 @@ def test_kernel_chooses_as_the_definition_does(scene: Scene, bounds: DwaLimits, 
 
 @settings(max_examples=examples(60), deadline=None)
 @given(scenes(["curve"]))
-def test_merging_a_curves_points_costs_next_to_nothing(scene: Scene) -> None:
+def test_merging_points_of_a_curve_changes_scores_only_slightly(scene: Scene) -> None:
     """Points within a centimetre of a straight line are merged: a score moves by centimetres of path.
 
     On free floor, near the path, and never turning in place: elsewhere centimetres decide, and rightly so, at a
@@ -160,8 +160,8 @@ def test_merging_a_curves_points_costs_next_to_nothing(scene: Scene) -> None:
 
 
 @compiled_only
-def test_scenes_hold_all_kinds_of_decisions() -> None:
-    """The comparison means something: goals reached, nothing free, turning in place, driving and escaping all occur."""
+def test_generated_scenes_cover_all_kinds_of_decisions() -> None:
+    """The comparison covers goals reached, no admissible arc, turning in place, driving and escaping."""
     kinds = set()
 
     @settings(max_examples=examples(150), deadline=None, database=None, derandomize=True)

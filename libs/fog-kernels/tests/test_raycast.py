@@ -1,4 +1,4 @@
-"""Ray casting: exact against a brute-force walk, inside and from outside the grid."""
+"""Ray casting compared with brute force, from inside and outside the grid."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def walk(occupied: NDArray[np.bool_], x: float, y: float, angle: float, reach: float, step: float) -> float:
-    """First sampled distance (cells) inside an occupied cell."""
+    """Return the first sampled distance (cells) inside an occupied cell."""
     distances = np.arange(0.0, reach, step)
     columns = np.floor(x + distances * math.cos(angle)).astype(int)
     rows = np.floor(y + distances * math.sin(angle)).astype(int)
@@ -30,7 +30,7 @@ def walk(occupied: NDArray[np.bool_], x: float, y: float, angle: float, reach: f
 
 
 def box_distance(x: float, y: float, angle: float, column: int, row: int) -> float:
-    """Exact distance at which a ray enters one cell; to touch its rim in one point is not to enter it."""
+    """Return the exact distance at which a ray enters a cell; touching its border in one point does not count."""
     dx, dy = math.cos(angle), math.sin(angle)
     enter, leave = 0.0, math.inf
     for start, direction, low in ((x, dx, column), (y, dy, row)):
@@ -53,7 +53,7 @@ def box_distance(x: float, y: float, angle: float, column: int, row: int) -> flo
     st.floats(-10, 10),
     st.sampled_from([0.02, 0.2, 0.6]),
 )
-def test_ranges_are_the_entry_into_the_first_occupied_cell(  # noqa: PLR0913  # one argument per drawn value
+def test_range_is_the_distance_to_the_first_occupied_cell(  # noqa: PLR0913  # one argument per drawn value
     seed: int, height: int, width: int, x: float, y: float, angle: float, density: float
 ) -> None:
     occupied = np.random.default_rng(seed).random((height, width)) < density
@@ -61,7 +61,7 @@ def test_ranges_are_the_entry_into_the_first_occupied_cell(  # noqa: PLR0913  # 
         (box_distance(x, y, angle, int(column), int(row)) for row, column in np.argwhere(occupied)), default=math.inf
     )
     measured = cast(occupied, 1.0, 0.0, 0.0, x, y, [angle], 100.0)[0]
-    # A ray through a corner may pass on either side of it: compare with rays beside it, too.
+    # A ray through a corner may pass on either side of it: compare also with rays beside it.
     beside = [
         min((box_distance(x, y, angle + e, int(c), int(r)) for r, c in np.argwhere(occupied)), default=math.inf)
         for e in (-1e-9, 1e-9)
@@ -69,7 +69,7 @@ def test_ranges_are_the_entry_into_the_first_occupied_cell(  # noqa: PLR0913  # 
     assert any(measured == pytest.approx(value, abs=1e-5) for value in [expected, *beside])
 
 
-def test_a_scan_equals_dense_sampling_in_metres_with_an_origin() -> None:
+def test_scan_in_metres_with_an_origin_equals_dense_sampling() -> None:
     rng = np.random.default_rng(3)
     occupied = rng.random((60, 80)) < 0.03
     angles = np.linspace(-math.pi, math.pi, 181)
@@ -82,7 +82,7 @@ def test_a_scan_equals_dense_sampling_in_metres_with_an_origin() -> None:
             assert sampled - 0.011 <= measured <= sampled + 1e-9
 
 
-def test_nothing_within_range_is_infinite_and_inside_a_wall_is_zero() -> None:
+def test_range_is_infinite_without_a_hit_and_zero_inside_an_obstacle() -> None:
     occupied = np.zeros((10, 10), bool)
     occupied[5, 9] = True
     assert cast(occupied, 0.1, 0.0, 0.0, 0.05, 0.55, [0.0], 2.0)[0] == pytest.approx(0.85)
@@ -92,7 +92,7 @@ def test_nothing_within_range_is_infinite_and_inside_a_wall_is_zero() -> None:
     assert cast(occupied, 0.1, 0.0, 0.0, 2.0, 0.55, [math.pi], 2.0)[0] == pytest.approx(1.0)
 
 
-def test_a_lost_pose_is_refused() -> None:
+def test_non_finite_pose_is_refused() -> None:
     with pytest.raises(ValueError, match="finite"):
         cast(np.zeros((2, 2), bool), 0.1, 0.0, 0.0, math.nan, 0.0, [0.0], 1.0)
     with pytest.raises(TypeError, match="occupied"):

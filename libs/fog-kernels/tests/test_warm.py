@@ -1,4 +1,4 @@
-"""Warm-up: a second process compiles nothing, and processes load only the kernels that they need."""
+"""Cache of compiled kernels: a second process compiles nothing, and processes load only the kernels that they need."""
 
 from __future__ import annotations
 
@@ -54,13 +54,13 @@ def python(*arguments: str) -> str:
     ).stdout.strip()
 
 
-def test_after_warming_a_process_that_calls_everything_compiles_nothing() -> None:
+def test_process_that_calls_every_kernel_compiles_nothing_after_warming() -> None:
     python("-m", "fog_kernels.warm")
     assert python("-c", RUN_ALL) == "0"
 
 
-def test_misses_are_counted() -> None:
-    """The zero above means something: without a cache the same counter is not zero."""
+def test_cache_misses_are_counted() -> None:
+    """Without a cache the counter that is zero in the test above is not zero."""
     code = (
         "import tempfile, os; os.environ['NUMBA_CACHE_DIR'] = tempfile.mkdtemp()\n"
         "from fog_kernels import warm, raycast\nprint(warm.cache_misses())"
@@ -77,17 +77,17 @@ def test_misses_are_counted() -> None:
         ("astar", {"inflation", "dwa", "raycast", "amcl", "likelihood", "distance"}),
     ],
 )
-def test_importing_one_module_loads_no_other_kernels(module: str, others: set[str]) -> None:
+def test_importing_a_module_loads_no_unneeded_kernels(module: str, others: set[str]) -> None:
     loaded = python("-c", f"import sys, fog_kernels.{module}\nprint(*sys.modules)").split()
     assert not {f"fog_kernels.{other}" for other in others} & set(loaded)
 
 
-def test_an_unknown_profile_is_refused_with_the_known_ones() -> None:
+def test_unknown_profile_is_refused_with_the_known_ones() -> None:
     with pytest.raises(ValueError, match="robot"):
         warm.warm("toaster")
 
 
-def test_progress_counts_every_kernel_once_and_names_it(tmp_path):
+def test_progress_reports_every_kernel_once_by_name(tmp_path):
     cold = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
     command = [sys.executable, "-m", "fog_kernels.warm", "map"]
     names = [f"{module}.{name}" for module in warm.PROFILES["map"] for name in warm.kernels(module)]
@@ -101,6 +101,6 @@ def test_progress_counts_every_kernel_once_and_names_it(tmp_path):
     assert " 0 compiled now" in again.stdout
 
 
-def test_the_kernels_of_a_module_that_is_not_there_are_refused():
+def test_kernels_of_an_unknown_module_are_refused():
     with pytest.raises(ValueError, match=r"no module fog_kernels\.nothing"):
         warm.kernels("nothing")

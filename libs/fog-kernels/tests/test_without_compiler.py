@@ -1,4 +1,4 @@
-"""Every kernel's tests once more as plain Python, where overflow warns and a wrong index raises."""
+"""Every kernel's tests repeated as plain Python, where an overflow warns and a wrong index raises."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 from compiler import Guarded, compiled_only
 
-OVERFLOW_WANTED = "ignore:overflow encountered in scalar:RuntimeWarning:fog_kernels.amcl"
-"""The generator of random numbers counts modulo 2^64; nothing else may overflow."""
+EXPECTED_OVERFLOW = "ignore:overflow encountered in scalar:RuntimeWarning:fog_kernels.amcl"
+"""The random number generator computes modulo 2^64; nothing else may overflow."""
 
 
 @compiled_only
-def test_kernels_hold_as_plain_python() -> None:
-    # Its own process: numba decides at import. Seconds, not minutes, on one core; the limit is there for a hang.
+def test_kernels_pass_their_tests_as_plain_python() -> None:
+    # In a separate process, because numba reads the setting at import. It takes seconds; the timeout is for a hang.
     done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "-W", OVERFLOW_WANTED,
+        [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "-W", EXPECTED_OVERFLOW,
          str(Path(__file__).parent)],
         env={**os.environ, "NUMBA_DISABLE_JIT": "1"},
         capture_output=True,
@@ -32,7 +32,7 @@ def test_kernels_hold_as_plain_python() -> None:
     assert " passed" in done.stdout
 
 
-def test_guarded_arrays_refuse_what_compiled_kernels_would_read() -> None:
+def test_guarded_arrays_refuse_indices_out_of_bounds() -> None:
     array = np.arange(6).reshape(2, 3).view(Guarded)
     assert array[1, np.int64(2)] == 5
     with pytest.raises(IndexError, match="negative"):

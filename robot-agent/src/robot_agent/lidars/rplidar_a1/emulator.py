@@ -61,7 +61,7 @@ class RplidarEmulator:
             )
         self._measure = measure
         self._nodes_per_s = nodes_per_s
-        self._turns_per_s = scans_per_s
+        self._scans_per_s = scans_per_s
         self._serial_number = serial_number[:16].ljust(16, b"\0")
         self.health = 0
         self.error_code = 0
@@ -179,7 +179,7 @@ class RplidarEmulator:
                 self._nodes(count, self._due_since, rate)
 
     def _nodes(self, count: int, now: float, rate: float) -> None:
-        rotation = self._position + np.arange(1, count + 1) * (self._turns_per_s / rate)
+        rotation = self._position + np.arange(1, count + 1) * (self._scans_per_s / rate)
         angle = np.floor(rotation % 1.0 * _FULL_CIRCLE_Q6).astype(np.int64) % _FULL_CIRCLE_Q6
         before = np.concatenate(((self._position,), rotation[:-1]))
         start = np.floor(rotation) > np.floor(before)
@@ -208,7 +208,7 @@ class RplidarEmulator:
             self._replayed += 1
 
     def _capsule(self, now: float, rate: float) -> None:
-        step = self._turns_per_s / rate
+        step = self._scans_per_s / rate
         begin = math.floor(self._position % 1.0 * _FULL_CIRCLE_Q6) % _FULL_CIRCLE_Q6
         # The host interpolates the nodes between this start angle and the next capsule's: measure at those angles.
         self._position += 32 * step

@@ -30,7 +30,7 @@ async def main() -> None:
     """Connect, restore the stored state, then localize, follow paths and gate the wheels until cancelled."""
     settings = load(Settings, environ=os.environ)
     logs.configure("robot-agent", settings.log_level, settings.log_format)
-    _log.info("settings", **describe(settings))
+    _log.info("settings_loaded", **describe(settings))
     site, body = read_site(settings)
     config = agent_config(
         settings.robot, read_operator_key(settings.operator_key_file), body, obstacle_ttl=settings.obstacle_memory_s

@@ -38,7 +38,7 @@ async def main() -> None:
     """Simulate until cancelled."""
     settings = load(Settings, environ=os.environ)
     logs.configure("sim", settings.log_level, settings.log_format)
-    _log.info("settings", **describe(settings))
+    _log.info("settings_loaded", **describe(settings))
     loaded = load_site(settings.site_dir)
     robot = _robot(loaded, settings.robot)
     clock = SystemClock(settings.speed)

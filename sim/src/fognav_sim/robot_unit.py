@@ -149,7 +149,7 @@ async def main() -> None:
     """Start the robot's programs and drive until told to end."""
     settings = load(Settings, environ=os.environ)
     logs.configure("sim-robot", settings.log_level, settings.log_format)
-    _log.info("settings", **describe(settings))
+    _log.info("settings_loaded", **describe(settings))
     site = load_site(settings.site_dir).site
     if site.demo is None or not site.robots:
         raise SettingsError(f"{settings.site_dir}/site.toml needs [demo] and one of [[robots]] for a simulated drive")

@@ -1,4 +1,7 @@
-"""Structured logs: one event per line on standard error, as JSON or as text for people."""
+"""Structured logs: one event per line on standard error, as JSON or as text for people.
+
+An event's name is a noun and what happened to it: `message_refused`, `broker_connected`; details are its fields.
+"""
 
 import json
 import logging

@@ -26,7 +26,7 @@ async def main() -> None:
     """Connect, read the missions, then plan until cancelled."""
     settings = load(Settings, environ=os.environ)
     logs.configure("planner", settings.log_level, settings.log_format)
-    _log.info("settings", **describe(settings))
+    _log.info("settings_loaded", **describe(settings))
     loaded = load_site(settings.site_dir)
     site = settings.site or loaded.site.id
     clock = SystemClock(settings.speed)

@@ -25,7 +25,7 @@ class Drive:
         plan = DrivePlan.of(site, Options(speed=speed))
         self.attempt = Attempt(plan, Scene(site, plan.robot, 1, speed))
         self.evaluation = self.attempt.evaluation = DriveEvaluation(
-            goal=(59.0, 44.0), goal_id="g", areas=site.site.areas, begun=0.0, timeout_s=600.0
+            goal=(59.0, 44.0), goal_id="g", areas=site.site.areas, started_at=0.0, timeout_s=600.0
         )
         self.hazard_done = True
         self.is_at(5.0, 25.4)
@@ -134,7 +134,7 @@ def test_neither_a_touch_nor_a_blocked_area_entered_is_ever_excused(late: int) -
     touched.robot_is("NORMAL", late=late)
     touched.check()
     touched.robot_is("FAULT", "the bumper is pressed", late=late)
-    touched.end(DriveOutcome("contact", "the robot touched something"))
+    touched.end(DriveOutcome("contact", "the robot made contact with an obstacle"))
 
     entered = Drive(3.0)
     z1 = next(area for area in entered.attempt.plan.site.site.areas if area.id == "z1")

@@ -1,4 +1,4 @@
-"""The world as bytes: what the base is told moves the robot, and nothing is faster than its line."""
+"""Base and lidar as bytes: drive commands move the robot, and no line is faster than its baud rate."""
 
 import numpy as np
 import pytest
@@ -31,31 +31,31 @@ def hardware_in(world, start=0.0, **more):
 
 
 @given(chunks=st.lists(st.integers(0, 400), min_size=1, max_size=60))
-def test_a_line_keeps_order_loses_nothing_below_its_rate_and_is_never_faster(chunks):
-    line, sent, given_, at = Line(BAUD), b"", b"", 0.0
+def test_line_delivers_bytes_in_order_and_never_faster_than_its_rate(chunks):
+    line, delivered, queued, now = Line(BAUD), b"", b"", 0.0
     for size in chunks:
-        data = bytes(len(given_) + n & 0xFF for n in range(size))
-        given_ += data
-        sent += line.send(data, 0.01)
-        at += 0.01
-        assert len(sent) <= BAUD / 10 * at + 1e-6
-        assert sent == given_[: len(sent)] or line.lost
-    if not line.lost:
+        data = bytes(len(queued) + n & 0xFF for n in range(size))
+        queued += data
+        delivered += line.send(data, 0.01)
+        now += 0.01
+        assert len(delivered) <= BAUD / 10 * now + 1e-6
+        assert delivered == queued[: len(delivered)] or line.lost_bytes
+    if not line.lost_bytes:
         for _ in range(1000):
-            sent += line.send(b"", 0.01)
-        assert sent == given_
+            delivered += line.send(b"", 0.01)
+        assert delivered == queued
 
 
-def test_a_line_that_is_too_slow_drops_the_oldest_bytes_and_counts_them():
+def test_line_that_is_too_slow_drops_the_oldest_bytes_and_counts_them():
     line = Line(BAUD)
     data = bytes(6000)
     line.send(data, 0.0)
-    assert line.lost == 6000 - 4096
+    assert line.lost_bytes == 6000 - 4096
 
 
 def test_drive_direct_moves_the_robot_and_its_encoders():
     world = hall()
-    hardware = hardware_in(world, 5.0, rolled=(65_500 * TICK_M, 0.0))
+    hardware = hardware_in(world, 5.0, initial_wheel_travel_m=(65_500 * TICK_M, 0.0))
     hardware.receive(DRIVE_200, b"")
     for _ in range(200):
         hardware.step()
@@ -65,7 +65,7 @@ def test_drive_direct_moves_the_robot_and_its_encoders():
     assert ticks == pytest.approx(0.4 * 508.8 / (np.pi * 0.072), rel=0.05)
 
 
-def test_a_wall_stops_the_robot_counts_once_and_presses_the_bumper_in_the_stream():
+def test_wall_stops_the_robot_as_one_contact_and_shows_in_the_bumper_bits():
     world = hall()
     hardware = hardware_in(world)
     hardware.receive(DRIVE_200 + STREAM, b"")
@@ -76,15 +76,15 @@ def test_a_wall_stops_the_robot_counts_once_and_presses_the_bumper_in_the_stream
     assert world.pose[0] < 6.0 - 0.1 - 0.17 + 0.01
     frame = received[received.rindex(b"\x13\x08\x07") :]
     assert frame[3] & 3 == 3  # both halves: it drove straight into the wall
-    moved = world.pose[0]
+    x_at_wall = world.pose[0]
     hardware.receive(bytes([145, 0xFF, 0x38, 0xFF, 0x38]), b"")
     for _ in range(200):
         hardware.step()
-    assert world.pose[0] < moved - 0.2
+    assert world.pose[0] < x_at_wall - 0.2
     assert (world.contacts, world.bumpers) == (1, (False, False))
 
 
-def test_a_scan_and_the_stream_fit_on_their_lines():
+def test_scans_and_sensor_stream_fit_on_their_lines():
     hardware = hardware_in(hall())
     hardware.receive(DRIVE_200 + STREAM, SCAN)
     base, lidar = 0, 0

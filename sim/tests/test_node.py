@@ -1,4 +1,4 @@
-"""A node's rhythm and judgement are the firmware's."""
+"""A simulated node measures and classifies like the firmware."""
 
 import pytest
 
@@ -6,13 +6,13 @@ from fog_contracts.channels import NODE_READING
 from fog_contracts.codec import decode, encode
 from fog_contracts.messages import NodeConfig, NodeReading
 from fog_contracts.site import NodeSite, Sonar
-from fognav_sim.node import SonarNode, default_config, judge
+from fognav_sim.node import SonarNode, classify, default_config
 
 SITE = NodeSite(id="n1", area="z1", x=0.0, y=0.0, theta=0.0, sonars=[Sonar(range_limit=2.0), Sonar(range_limit=2.5)])
 
 
 class Ranges:
-    """Stands in for the world: both sonars measure what it is told."""
+    """A stand-in for the world: the sonars measure the given ranges."""
 
     def __init__(self, *metres):
         self.metres = metres
@@ -27,27 +27,27 @@ def readings(world, seconds, node=None):
 
 
 @pytest.mark.parametrize("metres", [(2.0, 2.0), (3.0, 3.0), (2.2, None), (None, None)])
-def test_eight_to_ten_readings_a_second_with_echoes_and_without(metres):
+def test_node_publishes_eight_to_ten_readings_a_second_with_and_without_echoes(metres):
     assert 8.0 <= len(readings(Ranges(*metres), 20.0)) / 20.0 <= 10.0
 
 
-def test_readings_count_up_keep_their_time_and_fit_the_channel():
-    told = readings(Ranges(2.2, 2.7), 5.0)
-    assert [reading.seq for reading in told] == list(range(1, len(told) + 1))
-    uptimes = [reading.uptime_ms for reading in told]
+def test_readings_have_consecutive_numbers_and_true_uptimes_and_fit_the_channel():
+    published = readings(Ranges(2.2, 2.7), 5.0)
+    assert [reading.seq for reading in published] == list(range(1, len(published) + 1))
+    uptimes = [reading.uptime_ms for reading in published]
     assert uptimes == sorted(uptimes)
     assert uptimes[-1] == pytest.approx(5000, abs=150)
-    assert all(decode(NODE_READING, encode(NODE_READING, reading), NodeReading) == reading for reading in told)
+    assert all(decode(NODE_READING, encode(NODE_READING, reading), NodeReading) == reading for reading in published)
 
 
-def test_a_longer_pause_is_kept_and_a_configuration_for_other_hardware_refused():
+def test_new_pause_is_applied_and_configuration_for_another_number_of_sonars_is_ignored():
     node = SonarNode(SITE, boot=7, start=100.0)
     assert not node.configure(NodeConfig(version=1, range_limit_m=[1.0], no_echo_is_clear=[True]))
     assert node.config == default_config(SITE)
     assert node.configure(NodeConfig(version=2, range_limit_m=[3.0, 3.0], no_echo_is_clear=[True, True], pause_ms=950))
-    told = readings(Ranges(2.5, 2.8), 10.0, node)
-    assert 9 <= len(told) <= 10
-    assert {reading.state for reading in told} == {"blocked"}
+    published = readings(Ranges(2.5, 2.8), 10.0, node)
+    assert 9 <= len(published) <= 10
+    assert {reading.state for reading in published} == {"blocked"}
 
 
 @pytest.mark.parametrize(
@@ -62,12 +62,12 @@ def test_a_longer_pause_is_kept_and_a_configuration_for_other_hardware_refused()
         ([None, None], (True, False), "unknown"),
     ],
 )
-def test_no_echo_is_clear_only_where_calibration_says_so(ranges, no_echo_is_clear, state):
+def test_no_echo_means_clear_only_if_calibrated_so(ranges, no_echo_is_clear, state):
     config = NodeConfig(version=0, range_limit_m=[2.0, 2.5], no_echo_is_clear=list(no_echo_is_clear))
-    assert judge(ranges, config) == state
+    assert classify(ranges, config) == state
 
 
-def test_after_a_pause_of_the_simulation_no_burst_is_sent():
+def test_no_burst_of_readings_follows_a_pause_of_the_simulation():
     node = SonarNode(SITE, boot=7, start=100.0)
     readings(Ranges(2.2, 2.7), 1.0, node)
     assert len(node.poll(Ranges(2.2, 2.7), 200.0)) <= 1

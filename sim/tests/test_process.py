@@ -1,4 +1,4 @@
-"""The simulator as others meet it: devices, nodes on a real broker, truth and commands over a real router."""
+"""The simulator as a process: its devices, nodes on a real broker, ground truth and commands over a real router."""
 
 import asyncio
 import contextlib
@@ -43,15 +43,15 @@ start = { x = 1.0, y = 1.5, theta = 0.0 }
 BOX = SimObstacle(id="box", polygon=[(3.5, 1.0), (4.5, 1.0), (4.5, 1.4), (3.5, 1.4)], height=1.0)
 
 
-async def until(condition, what, seconds=45.0):
+async def until(condition, description, seconds=45.0):
     deadline = time.monotonic() + seconds
     while not condition():
-        assert time.monotonic() < deadline, what
+        assert time.monotonic() < deadline, description
         await asyncio.sleep(0.02)
 
 
 class Rig:
-    """What surrounds the simulator, and what was heard of it."""
+    """The simulator's environment, and what it has published."""
 
     def __init__(self, folder, mqtt_url, zenoh):
         self.folder, self.mqtt_url, self.zenoh = folder, mqtt_url, zenoh
@@ -73,7 +73,7 @@ class Rig:
         environment = os.environ | {f"FOGNAV_{key}": str(value) for key, value in values.items()}
         return await asyncio.create_subprocess_exec(sys.executable, "-m", "fognav_sim", env=environment)
 
-    async def ask(self, **command):
+    async def send_command(self, **command):
         return await self.edge.query(ch.SIM_COMMAND, SimCommand(**command), CommandReply, 5.0, robot="r1")
 
     def log(self):
@@ -115,7 +115,7 @@ async def simulator(folder: Path, speed=1):
                 await asyncio.gather(listening, return_exceptions=True)
 
 
-async def test_commands_drive_the_robot_and_the_truth_tells_it(tmp_path):
+async def test_drive_commands_move_the_robot_and_the_ground_truth_shows_it(tmp_path):
     async with simulator(tmp_path) as (rig, process):
         port = rig.port_file.read_text("utf-8").split()[0]
         answer = await asyncio.to_thread(urllib.request.urlopen, f"http://127.0.0.1:{port}/readyz")
@@ -142,32 +142,32 @@ async def test_commands_drive_the_robot_and_the_truth_tells_it(tmp_path):
     assert len(log) / (log[-1]["now"] - log[0]["now"]) > 50.0
 
 
-async def test_what_is_placed_is_seen_by_the_nodes_and_told_by_the_truth(tmp_path):
+async def test_placed_obstacle_shows_in_the_readings_and_in_the_ground_truth(tmp_path):
     async with simulator(tmp_path, speed=4) as (rig, _):
         await until(lambda: rig.readings[-1].state == "clear", "the floor is clear")
-        assert (await rig.ask(place=[BOX])).accepted
+        assert (await rig.send_command(place=[BOX])).accepted
         await until(lambda: rig.readings[-1].state == "blocked", "the node sees the box")
-        await until(lambda: [o.id for o in rig.truths[-1].obstacles] == ["box"], "the truth tells of it")
+        await until(lambda: [o.id for o in rig.truths[-1].obstacles] == ["box"], "the ground truth lists it")
         trap = SimObstacle(id="trap", polygon=[(0.9, 1.4), (1.1, 1.4), (1.1, 1.6)], height=1.0)
-        reply = await rig.ask(place=[trap])
+        reply = await rig.send_command(place=[trap])
         assert not reply.accepted
         assert "would stand on robot r1" in reply.reason
-        assert (await rig.ask(remove=["box"], kidnap=Pose(x=6.0, y=1.0, theta=1.0))).accepted
+        assert (await rig.send_command(remove=["box"], kidnap=Pose(x=6.0, y=1.0, theta=1.0))).accepted
         await until(lambda: rig.readings[-1].state == "clear", "the box is gone")
-        await until(lambda: abs(rig.truths[-1].x - 6.0) < 0.01, "the robot was carried away")
-        reply = await rig.ask(remove=["nothing"])
+        await until(lambda: abs(rig.truths[-1].x - 6.0) < 0.01, "the robot was moved")
+        reply = await rig.send_command(remove=["nothing"])
         assert not reply.accepted
 
 
-async def test_a_silent_node_sends_nothing_and_a_killed_one_leaves_its_last_will(tmp_path):
+async def test_silenced_node_publishes_nothing_and_a_killed_one_leaves_its_last_will(tmp_path):
     async with simulator(tmp_path) as (rig, process):
         assert rig.availability == ["online"]
-        assert (await rig.ask(nodes_silent=["n1"])).accepted
+        assert (await rig.send_command(nodes_silent=["n1"])).accepted
         count = len(rig.readings)
         truths = len(rig.truths)
         await until(lambda: len(rig.truths) > truths + 10, "a second passed")
         assert len(rig.readings) <= count + 1
-        assert (await rig.ask(nodes_silent=[])).accepted
-        await until(lambda: len(rig.readings) > count + 5, "the node speaks again")
+        assert (await rig.send_command(nodes_silent=[])).accepted
+        await until(lambda: len(rig.readings) > count + 5, "the node publishes again")
         process.kill()
         await until(lambda: rig.availability[-1] == "offline", "the last will")

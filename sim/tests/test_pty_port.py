@@ -29,19 +29,19 @@ def read_host(fd: int) -> bytes:
 
 
 def test_every_byte_value_passes_both_ways():
-    every = bytes(range(256))
+    all_bytes = bytes(range(256))
     with PtyPort() as port:
         host = open_host(port)
-        port.write(every)
-        assert read_until(lambda: read_host(host), 256) == every
-        os.write(host, every)
+        port.write(all_bytes)
+        assert read_until(lambda: read_host(host), 256) == all_bytes
+        os.write(host, all_bytes)
         assert select.select([port], [], [], 5.0)[0]
-        assert read_until(port.read, 256) == every
+        assert read_until(port.read, 256) == all_bytes
         assert port.read() == b""
         os.close(host)
 
 
-def test_hosts_may_come_go_and_crash():
+def test_hosts_can_reconnect_and_crash():
     code = "import os, sys; fd = os.open(sys.argv[1], os.O_RDWR | os.O_NOCTTY); os.write(fd, b'hi'); os._exit(3)"
     with PtyPort() as port:
         for _ in range(2):
@@ -51,7 +51,7 @@ def test_hosts_may_come_go_and_crash():
             port.write(b"")
 
 
-def test_a_host_that_does_not_read_loses_old_bytes_and_never_blocks():
+def test_host_that_does_not_read_loses_old_bytes_and_never_blocks():
     with PtyPort() as port:
         host = open_host(port)
         for number in range(40_000):
@@ -66,7 +66,7 @@ def test_a_host_that_does_not_read_loses_old_bytes_and_never_blocks():
         os.close(host)
 
 
-def test_the_link_is_replaced_at_once_and_removed_at_the_end(tmp_path):
+def test_link_is_replaced_atomically_and_removed_on_close(tmp_path):
     link = tmp_path / "run" / "roomba"
     first = PtyPort(link)
     second = PtyPort(link)
@@ -79,9 +79,9 @@ def test_the_link_is_replaced_at_once_and_removed_at_the_end(tmp_path):
     assert not link.is_symlink()
 
 
-def test_a_plain_file_is_never_replaced(tmp_path):
+def test_regular_file_is_never_replaced_by_the_link(tmp_path):
     link = tmp_path / "roomba"
     link.write_text("mine")
-    with pytest.raises(FileExistsError, match="no symbolic link"):
+    with pytest.raises(FileExistsError, match="not a symbolic link"):
         PtyPort(link)
     assert link.read_text() == "mine"

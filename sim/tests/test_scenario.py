@@ -1,4 +1,4 @@
-"""Barriers really bar, nodes see them, and events come true when they are due and the robot is far enough."""
+"""Barriers close corridors, nodes see them, and events happen once they are due and the robot is far enough away."""
 
 import math
 
@@ -44,7 +44,7 @@ def can_pass(static, obstacle):
     cells = static.cells.copy()
     window, mask = rasterize([(x, y) for x, y in obstacle.polygon], static.geometry)
     cells[window.rows, window.columns][mask] = 254
-    # A little less than the robot: a wider gap must not pass unseen.
+    # A little narrower than the robot, so that a gap of just its width is found.
     table = inflation_table(RES, Inflation(inscribed_radius=0.16, inflation_radius=0.2))
     cost = inflate((cells == 254).astype(np.uint8) * 254, table)
     y = static.geometry.cell(1.0, 2.0)[1]
@@ -54,9 +54,9 @@ def can_pass(static, obstacle):
 @settings(max_examples=30, deadline=None)
 @given(width=st.sampled_from([1.6, 2.0, 2.4, 3.2]), door=st.sampled_from([0.0, 0.1, 0.25]), seed=st.integers(0, 10_000),
        watched=st.booleans())  # fmt: skip
-def test_a_barrier_bars_the_corridor_enters_no_wall_and_stands_in_its_area(width, door, seed, watched):
-    static, where = corridor(width, door=door), site(width, 6.0 if watched else 0.0)
-    barrier = barrier_across(where.areas[0], where, static, seed)
+def test_barrier_closes_the_corridor_inside_its_area_without_entering_a_wall(width, door, seed, watched):
+    static, floor = corridor(width, door=door), site(width, 6.0 if watched else 0.0)
+    barrier = barrier_across(floor.areas[0], floor, static, seed)
     assert not can_pass(static, barrier)
     xs, ys = zip(*barrier.polygon, strict=True)
     assert all(4.0 <= x <= 8.0 for x in xs)
@@ -64,31 +64,31 @@ def test_a_barrier_bars_the_corridor_enters_no_wall_and_stands_in_its_area(width
     assert all(static.cells[static.geometry.cell(x, y)[::-1]] == 0 for x, y in barrier.polygon)
 
 
-def test_the_areas_node_sees_a_barrier_that_would_swallow_sound_at_its_flanks():
-    static, where = corridor(2.4), site(2.4)
-    world = World(static.geometry, static.cells, where.robots[0], seed=1)
-    free = [world.sonar(where.nodes[0], index) for index in (0, 1)]
-    world.place(barrier_across(where.areas[0], where, static, seed=5))
-    barred = [world.sonar(where.nodes[0], index) for index in (0, 1)]
-    limits = [sonar.range_limit for sonar in where.nodes[0].sonars]
+def test_node_of_the_area_gets_an_echo_from_the_barrier():
+    static, floor = corridor(2.4), site(2.4)
+    world = World(static.geometry, static.cells, floor.robots[0], seed=1)
+    free = [world.sonar(floor.nodes[0], index) for index in (0, 1)]
+    world.place(barrier_across(floor.areas[0], floor, static, seed=5))
+    blocked = [world.sonar(floor.nodes[0], index) for index in (0, 1)]
+    limits = [sonar.range_limit for sonar in floor.nodes[0].sonars]
     assert all(r > limit for r, limit in zip(free, limits, strict=True))
-    assert any(r is not None and r < limit for r, limit in zip(barred, limits, strict=True))
+    assert any(r is not None and r < limit for r, limit in zip(blocked, limits, strict=True))
 
 
-def test_the_same_seed_places_the_same_barrier():
-    static, where = corridor(2.4), site(2.4)
-    first, again, other = (barrier_across(where.areas[0], where, static, seed) for seed in (1, 1, 2))
+def test_same_seed_places_the_same_barrier():
+    static, floor = corridor(2.4), site(2.4)
+    first, again, other = (barrier_across(floor.areas[0], floor, static, seed) for seed in (1, 1, 2))
     assert first == again
     assert first != other
 
 
-def test_where_no_barrier_fits_the_error_names_the_area():
-    static, where = corridor(2.4, door=1.5), site(2.4)
+def test_area_without_room_for_a_barrier_is_named_in_the_error():
+    static, floor = corridor(2.4, door=1.5), site(2.4)
     with pytest.raises(ScenarioError, match="area z1: no barrier fits"):
-        barrier_across(where.areas[0], where, static, seed=1)
+        barrier_across(floor.areas[0], floor, static, seed=1)
 
 
-def test_a_person_is_as_wide_and_tall_as_one():
+def test_person_has_the_width_and_height_of_a_human():
     person = person_at(3.0, 2.0)
     xs, _ = zip(*person.polygon, strict=True)
     assert 0.4 < max(xs) - min(xs) < 0.5
@@ -97,39 +97,39 @@ def test_a_person_is_as_wide_and_tall_as_one():
 
 
 def drive(scenario, world, seconds):
-    happened = []
+    occurred = []
     for step in range(round(seconds / 0.01)):
         world.step(0.01)
-        happened += scenario.step(world, 100.0 + step * 0.01)
-    return happened
+        occurred += scenario.step(world, 100.0 + step * 0.01)
+    return occurred
 
 
-def a_world():
-    static, where = corridor(2.4), site(2.4)
-    world = World(static.geometry, static.cells, where.robots[0], seed=1)
+def moving_world():
+    static, floor = corridor(2.4), site(2.4)
+    world = World(static.geometry, static.cells, floor.robots[0], seed=1)
     world.set_wheels(0.3, 0.3)
     return world
 
 
-def test_an_event_comes_true_after_its_way_and_its_time_and_only_once():
-    world = a_world()
-    by_way = Event(name="by way", place=(person_at(10.0, 2.0),), at_distance=0.6)
+def test_event_happens_once_after_its_distance_or_time():
+    world = moving_world()
+    by_distance = Event(name="by distance", place=(person_at(10.0, 2.0),), at_distance=0.6)
     by_time = Event(name="by time", remove=("person",), at_time=4.0)
-    scenario = Scenario([by_way, by_time], start=100.0)
-    happened = drive(scenario, world, 6.0)
-    assert [event.name for event in happened] == ["by way", "by time"]
-    assert happened[0].distance == pytest.approx(0.6, abs=0.01)
-    assert happened[1].time == pytest.approx(4.0, abs=0.011)
+    scenario = Scenario([by_distance, by_time], start=100.0)
+    occurred = drive(scenario, world, 6.0)
+    assert [event.name for event in occurred] == ["by distance", "by time"]
+    assert occurred[0].distance == pytest.approx(0.6, abs=0.01)
+    assert occurred[1].time == pytest.approx(4.0, abs=0.011)
     assert world.obstacles == []
-    assert scenario.waiting == []
+    assert scenario.pending == []
 
 
-def test_nothing_appears_beside_the_robot_and_a_word_is_waited_for():
-    world = a_world()
+def test_event_waits_for_its_signal_and_for_the_robot_to_be_far_away():
+    world = moving_world()
     near = Event(name="near", place=(person_at(3.0, 2.2),))
-    told = Event(name="told", place=(person_at(11.0, 2.2, name="late"),), on_word="now")
-    scenario = Scenario([near, told], start=100.0)
+    signalled = Event(name="signalled", place=(person_at(11.0, 2.2, name="late"),), on_signal="now")
+    scenario = Scenario([near, signalled], start=100.0)
     assert drive(scenario, world, 1.0) == []
-    scenario.say("now")
-    assert [event.name for event in drive(scenario, world, 0.1)] == ["told"]
-    assert [event.name for event in scenario.waiting] == ["near"]
+    scenario.signal("now")
+    assert [event.name for event in drive(scenario, world, 0.1)] == ["signalled"]
+    assert [event.name for event in scenario.pending] == ["near"]

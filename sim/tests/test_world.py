@@ -1,4 +1,4 @@
-"""The simulated floor against geometry that can be worked out by hand."""
+"""The simulated floor against geometry computed by hand."""
 
 import math
 
@@ -56,7 +56,7 @@ def test_constant_wheel_speeds_drive_the_exact_arc(v, w, theta):
     assert math.remainder(heading - theta - turn, math.tau) == pytest.approx(0.0, abs=1e-6)
 
 
-def test_wheels_follow_with_lag_and_then_reach_what_was_asked():
+def test_wheels_lag_behind_the_command_and_then_reach_it():
     world = hall(wheel_lag=0.05)
     world.set_wheels(0.3, 0.3)
     first = world.step(0.01)[0] / 0.01
@@ -65,7 +65,7 @@ def test_wheels_follow_with_lag_and_then_reach_what_was_asked():
     assert world.step(0.01) == pytest.approx((0.003, 0.003))
 
 
-def test_odometry_errs_by_the_wheels_and_the_same_seed_errs_the_same():
+def test_odometry_error_is_repeatable_by_the_seed():
     paths = []
     for seed in (1, 1, 2):
         world = hall(1.0, 2.0, noise=Noise(), seed=seed)
@@ -82,11 +82,11 @@ def test_odometry_errs_by_the_wheels_and_the_same_seed_errs_the_same():
 def test_clearance_is_the_distance_to_the_nearest_wall(x, y):
     world = hall(x, y)
     nearest = min(x - WALL, 6.0 - WALL - x, y - WALL, 4.0 - WALL - y) - 0.17
-    # Beyond 0.6 m the distance is that of the cell's centre.
+    # Beyond 0.6 m the distance is measured from the cell's centre.
     assert world.clearance() == pytest.approx(nearest, abs=1e-6 if nearest < 0.35 else 0.06)
 
 
-def test_obstacles_count_for_clearance_and_none_can_be_put_on_the_robot():
+def test_obstacles_limit_the_clearance_and_none_can_be_placed_on_the_robot():
     world = hall()
     world.place(box(2.5, 1.5, 2.7, 2.5))
     assert world.clearance() == pytest.approx(0.33)
@@ -94,13 +94,13 @@ def test_obstacles_count_for_clearance_and_none_can_be_put_on_the_robot():
         world.place(box(1.9, 1.9, 2.1, 2.1, name="trap"))
     with pytest.raises(GeometryError):
         world.place(SimObstacle(id="line", polygon=[(4.0, 1.0), (5.0, 1.0), (4.5, 1.0)]))
-    assert [thing.id for thing in world.obstacles] == ["box"]
+    assert [obstacle.id for obstacle in world.obstacles] == ["box"]
     assert world.remove("box")
     assert not world.remove("box")
 
 
 @pytest.mark.parametrize(("bearing", "pressed"), [(0.0, (True, True)), (0.6, (False, True)), (-0.6, (True, False))])
-def test_a_touch_is_counted_once_stops_the_robot_and_presses_the_side_that_met_the_wall(bearing, pressed):
+def test_contact_counts_once_stops_the_robot_and_presses_the_bumper_on_its_side(bearing, pressed):
     world = hall(5.0, 2.0, bearing, noise=Noise(), wheel_lag=0.05)
     run(world, 6.0, 0.2, 0.2)
     assert world.contacts == 1
@@ -113,7 +113,7 @@ def test_a_touch_is_counted_once_stops_the_robot_and_presses_the_side_that_met_t
     assert world.contacts == 2
 
 
-def test_a_kidnapped_robot_stands_elsewhere_but_never_in_a_wall():
+def test_robot_can_be_kidnapped_but_not_into_a_wall():
     world = hall()
     with pytest.raises(ValueError, match="not free"):
         world.kidnap(Pose(x=0.1, y=0.1, theta=0.0))
@@ -122,14 +122,14 @@ def test_a_kidnapped_robot_stands_elsewhere_but_never_in_a_wall():
     assert world.pose == (4.0, 1.0, 1.0)
 
 
-def test_a_start_inside_a_wall_is_refused_with_its_remedy():
+def test_start_inside_a_wall_is_refused_with_the_remedy():
     with pytest.raises(ValueError, match=r"move its start in site\.toml"):
         hall(0.25, 2.0)
 
 
 @settings(deadline=None, max_examples=50)
 @given(theta=st.floats(-3.1, 3.1), angle=st.floats(-3.1, 3.1))
-def test_the_lidar_measures_to_the_wall_that_the_beam_meets(theta, angle):
+def test_lidar_measures_the_distance_to_the_first_wall(theta, angle):
     world = hall(2.0, 2.0, theta)
     direction = theta + angle
     c, s = math.cos(direction), math.sin(direction)
@@ -138,7 +138,7 @@ def test_the_lidar_measures_to_the_wall_that_the_beam_meets(theta, angle):
     assert world.lidar(np.array([angle]), 0.0)[0] == pytest.approx(min(to_x, to_y), abs=1e-6)
 
 
-def test_the_lidar_sees_over_what_is_lower_than_its_plane():
+def test_lidar_does_not_see_obstacles_below_its_plane():
     world = hall()
     world.place(box(3.0, 1.5, 3.2, 2.5, height=0.2))
     assert world.lidar(np.zeros(1), 0.0)[0] == pytest.approx(3.8)
@@ -146,7 +146,7 @@ def test_the_lidar_sees_over_what_is_lower_than_its_plane():
     assert world.lidar(np.zeros(1), 0.0)[0] == pytest.approx(1.0)
 
 
-def test_lidar_noise_and_dropouts_have_their_size():
+def test_lidar_noise_and_dropout_rate_are_as_configured():
     world = hall(noise=Noise(range_sigma=0.01, range_share=0.0, lidar_dropout=0.1))
     ranges = np.concatenate([world.lidar(np.zeros(100), 0.0) for _ in range(50)])
     assert np.isnan(ranges).mean() == pytest.approx(0.1, abs=0.02)
@@ -154,7 +154,7 @@ def test_lidar_noise_and_dropouts_have_their_size():
     assert np.nanstd(ranges) == pytest.approx(0.01, rel=0.1)
 
 
-def test_what_is_farther_than_twelve_metres_returns_nothing():
+def test_lidar_gets_no_return_beyond_twelve_metres():
     geometry = GridGeometry(400, 80, 0.05, 0.0, 0.0)
     cells = np.zeros(geometry.shape, np.uint8)
     cells[:, -4:] = 254
@@ -174,32 +174,32 @@ def node(x=3.0, y=0.25, theta=math.pi / 2, angle=0.0, height=0.3):
     )
 
 
-def test_a_wall_met_squarely_echoes_from_its_nearest_point():
+def test_wall_at_a_right_angle_echoes_from_its_nearest_point():
     assert hall(1.0, 1.0).sonar(node(), 0) == pytest.approx(3.55, abs=0.01)
 
 
-def test_a_wall_met_at_a_grazing_angle_is_a_mirror():
-    # A turned box is the only thing in front: at 30 degrees it echoes, at 70 degrees it throws the sound away.
-    for tilt, heard in ((math.radians(30.0), True), (math.radians(70.0), False)):
+def test_surface_at_a_grazing_angle_gives_no_echo():
+    # Only a tilted board is in front: at 30 degrees it echoes, at 70 degrees it reflects the sound away.
+    for tilt, has_echo in ((math.radians(30.0), True), (math.radians(70.0), False)):
         world = hall(1.0, 1.0)
         c, s = math.cos(tilt), math.sin(tilt)
         corners = [(-1.2, 0.0), (1.2, 0.0), (1.2, 0.05), (-1.2, 0.05)]
         ring = [(3.0 + c * u - s * v, 1.6 + s * u + c * v) for u, v in corners]
         world.place(SimObstacle(id="board", polygon=ring, height=1.0))
         measured = world.sonar(node(), 0)
-        if heard:
+        if has_echo:
             assert measured == pytest.approx(1.2, abs=0.25)
         else:
             assert measured is None or measured > 3.0
 
 
-def test_the_robot_is_seen_when_it_is_higher_than_the_node_hangs():
+def test_sonar_sees_the_robot_only_if_it_reaches_up_to_the_node():
     world = hall(3.0, 2.0)
     assert world.sonar(node(height=0.3), 0) == pytest.approx(2.0 - 0.25 - 0.17, abs=0.01)
     assert world.sonar(node(height=1.5), 0) == pytest.approx(3.55, abs=0.01)
 
 
-def test_what_is_beside_the_cone_or_lower_than_it_is_not_seen():
+def test_obstacles_beside_or_below_the_cone_are_not_seen():
     world = hall(1.0, 1.0)
     world.place(box(4.0, 1.5, 4.4, 2.0))
     assert world.sonar(node(), 0) == pytest.approx(3.55, abs=0.01)
@@ -209,9 +209,9 @@ def test_what_is_beside_the_cone_or_lower_than_it_is_not_seen():
     assert world.sonar(node(height=0.5), 0) == pytest.approx(0.75, abs=0.01)
 
 
-def test_spikes_are_single_samples_at_their_rate():
+def test_sonar_outliers_are_single_samples_at_their_rate():
     world = hall(1.0, 1.0, noise=Noise(sonar_spike=0.05, sonar_sigma=0.004))
     measured = np.array([world.sonar(node(), 0) for _ in range(2000)])
-    wild = np.abs(measured - 3.55) > 0.05
-    assert wild.mean() == pytest.approx(0.05, abs=0.02)
-    assert measured[~wild].std() == pytest.approx(0.004, rel=0.2)
+    outliers = np.abs(measured - 3.55) > 0.05
+    assert outliers.mean() == pytest.approx(0.05, abs=0.02)
+    assert measured[~outliers].std() == pytest.approx(0.004, rel=0.2)

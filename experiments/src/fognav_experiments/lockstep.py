@@ -242,7 +242,7 @@ class _Drive:
             goal=(self.goal.pose.x, self.goal.pose.y),
             goal_id=self.goal.goal_id,
             areas=self.site.site.areas,
-            begun=self.now,
+            started_at=self.now,
             timeout_s=timeout_s,
         )
         self._evaluate(self.evaluation)

@@ -43,8 +43,8 @@ if TYPE_CHECKING:
 STAMP: Final = 1_700_000_000.0
 """Where the emulated wall clock stands at time zero: runs must not depend on when they are made."""
 OPERATOR_KEY: Final = b"lockstep operator key, no secret"
-_ROLLED_M: Final = (28.9, 0.04)
-"""The wheels have rolled before: a counter of 16 bits wraps on the way."""
+_INITIAL_WHEEL_TRAVEL_M: Final = (28.9, 0.04)
+"""How far (m) the wheels have rolled before the start: a 16-bit encoder counter wraps during the drive."""
 _GUARDIAN_STEPS: Final = 2
 _LIDAR_STEPS: Final = 2
 _STREAM_STEPS: Final = 5
@@ -79,7 +79,7 @@ class RobotRig:
         self._bus = bus
         driver, self._scan = make_base(base), make_lidar(lidar)
         emulators = devices.make_base(base), devices.make_lidar(lidar, world.lidar)
-        self.hardware = Hardware(world, *emulators, start, rolled=_ROLLED_M)
+        self.hardware = Hardware(world, *emulators, start, initial_wheel_travel_m=_INITIAL_WHEEL_TRAVEL_M)
         self.guardian = GuardianCore(driver)
         config = agent_config(robot.id, OPERATOR_KEY, robot).with_hardware(driver.drive_train, self._scan.traits)
         self.agent = make_agent(config, seed)

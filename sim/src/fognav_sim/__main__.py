@@ -1,6 +1,7 @@
-"""The simulator: `python -m fognav_sim`, told by FOGNAV_* in the environment.
+"""The simulator: `python -m fognav_sim`, configured by FOGNAV_* environment variables.
 
-Offers the devices RUN_DIR/base and RUN_DIR/lidar, publishes as every sensor node of the site, and tells the truth.
+It provides the devices RUN_DIR/base and RUN_DIR/lidar, publishes as every sensor node of the site, and publishes the
+ground truth.
 """
 
 import asyncio
@@ -15,23 +16,23 @@ from fog_runtime.site import LoadedSite, load_site
 from fog_runtime.zenoh_edge import ZenohEdge
 from fognav_sim import devices
 from fognav_sim.hardware import Hardware
-from fognav_sim.live import Floor, Node, run_nodes
+from fognav_sim.live import LiveWorld, VirtualNode, run_nodes
 from fognav_sim.node import SonarNode
 from fognav_sim.settings import Settings
 from fognav_sim.world import World
 
 _log = logs.get("sim")
-_ROLLED_M = (28.4, 0.5)
-"""The wheels have rolled before this day: soon after it drives on, a counter of 16 bits wraps."""
+_INITIAL_WHEEL_TRAVEL_M = (28.4, 0.5)
+"""How far (m) the wheels have rolled before the start: soon after it, a 16-bit encoder counter wraps."""
 
 
-def _robot(loaded: LoadedSite, wanted: str) -> RobotSite:
+def _find_robot(loaded: LoadedSite, robot_id: str) -> RobotSite:
     robots = {robot.id: robot for robot in loaded.site.robots}
     if not robots:
         raise SettingsError(f"{loaded.directory}/site.toml has no [[robots]]: add one with its start")
-    if wanted and wanted not in robots:
-        raise SettingsError(f"FOGNAV_ROBOT: the site has no robot {wanted!r}, only {', '.join(robots)}")
-    return robots[wanted] if wanted else loaded.site.robots[0]
+    if robot_id and robot_id not in robots:
+        raise SettingsError(f"FOGNAV_ROBOT: the site has no robot {robot_id!r}, only {', '.join(robots)}")
+    return robots[robot_id] if robot_id else loaded.site.robots[0]
 
 
 async def main() -> None:
@@ -40,30 +41,30 @@ async def main() -> None:
     logs.configure("sim", settings.log_level, settings.log_format)
     _log.info("settings_loaded", **describe(settings))
     loaded = load_site(settings.site_dir)
-    robot = _robot(loaded, settings.robot)
+    robot = _find_robot(loaded, settings.robot)
     clock = SystemClock(settings.speed)
     world = World(loaded.map.geometry, loaded.map.cells, robot, settings.seed)
     base, lidar = devices.make_base(settings.base), devices.make_lidar(settings.lidar, world.lidar)
-    hardware = Hardware(world, base, lidar, clock.now(), rolled=_ROLLED_M)
+    hardware = Hardware(world, base, lidar, clock.now(), initial_wheel_travel_m=_INITIAL_WHEEL_TRAVEL_M)
     boot = int(clock.stamp())
     health = Health("devices", "zenoh")
     site = settings.site or loaded.site.id
-    with Floor(hardware, clock, settings.run_dir, settings.truth_log) as floor:
+    with LiveWorld(hardware, clock, settings.run_dir, settings.truth_log) as live_world:
         health.set("devices", ok=True)
         async with ZenohEdge.open(
             connect=settings.zenoh_endpoints, clock=clock, role="sim", id=robot.id, site=site
         ) as edge:
-            floor.serve(edge, robot.id)
+            live_world.serve(edge, robot.id)
             with serve_health(health, settings.http_host, settings.http_port, settings.port_file):
                 async with asyncio.TaskGroup() as tasks:
-                    tasks.create_task(floor.run(), name="world")
-                    tasks.create_task(floor.tell(edge, robot.id), name="truth")
+                    tasks.create_task(live_world.run(), name="world")
+                    tasks.create_task(live_world.publish_truth(edge, robot.id), name="truth")
                     sonars = [SonarNode(node, boot, clock.now()) for node in loaded.site.nodes]
-                    nodes = [Node(each, floor, settings.mqtt_url, clock, site) for each in sonars]
+                    nodes = [VirtualNode(each, live_world, settings.mqtt_url, clock, site) for each in sonars]
                     tasks.create_task(run_nodes(nodes, clock), name="nodes")
                     while True:
-                        there = edge.connected
-                        health.set("zenoh", ok=there, detail="" if there else "no router: is it running?")
+                        connected = edge.connected
+                        health.set("zenoh", ok=connected, detail="" if connected else "no router: is it running?")
                         await asyncio.sleep(clock.real(1.0))
 
 

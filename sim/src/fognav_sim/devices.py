@@ -1,7 +1,7 @@
-"""The devices of the simulated robot, whatever their make: byte-exact stand-ins, found by name.
+"""The devices of the simulated robot, of any make: byte-exact emulators, found by name.
 
-A base or lidar brings its emulator along and registers it by entry points, as it does its driver. Emulator and driver
-share no code: two independent readings of the same data sheet keep each other honest.
+A base or lidar comes with its emulator, and registers it by an entry point like its driver. Emulator and driver share
+no code: two independent implementations of one data sheet reveal each other's errors.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ class SerialEmulator(Protocol):
         """Speed of its line, 8N1."""
 
     def receive(self, data: bytes, now: float) -> None:
-        """Take bytes of the host; whole commands act at once."""
+        """Receive bytes from the host; complete commands take effect at once."""
 
     def outgoing(self, now: float) -> bytes:
-        """Return what the device has sent up to `now`, once."""
+        """Return the bytes that the device has sent since the last call, up to `now`."""
 
 
 class BaseEmulator(SerialEmulator, Protocol):
-    """A base. The simulation reads its wheel speeds, moves the robot, and tells it what came of that."""
+    """A base. The simulation reads its wheel speeds, moves the robot, and sets the base's encoders and sensors."""
 
     @property
     def axle_m(self) -> float:
@@ -54,7 +54,7 @@ class BaseEmulator(SerialEmulator, Protocol):
         """(left, right) speeds at which the motors are driven now, m/s."""
 
     def add_wheel_travel(self, left_m: float, right_m: float) -> None:
-        """Let the wheels roll this far, m: the encoders count it."""
+        """Add the distance (m) that each wheel has rolled to its encoder."""
 
     def set_sensors(self, *, bump_left: bool, bump_right: bool, cliff: bool) -> None:
         """Set the state of its contact sensors."""
@@ -64,11 +64,11 @@ class BaseEmulator(SerialEmulator, Protocol):
 
 
 class LidarEmulator(SerialEmulator, Protocol):
-    """A lidar: it measures the world when its bytes are asked for."""
+    """A lidar. It measures the world whenever its outgoing bytes are read."""
 
 
 def make_base(name: str) -> BaseEmulator:
-    """Make the emulator of a base. Raises `SettingsError` when there is none of this name."""
+    """Make the emulator of a base. Raises `SettingsError` for an unknown name."""
     try:
         emulator: BaseEmulator = parts.load(BASES, name, type)()
     except parts.PartError as error:
@@ -77,7 +77,7 @@ def make_base(name: str) -> BaseEmulator:
 
 
 def make_lidar(name: str, measure: Measure) -> LidarEmulator:
-    """Make the emulator of a lidar in this world. Raises `SettingsError` when there is none of this name."""
+    """Make the emulator of a lidar that measures by `measure`. Raises `SettingsError` for an unknown name."""
     try:
         emulator: LidarEmulator = parts.load(LIDARS, name, type)(measure)
     except parts.PartError as error:

@@ -1,4 +1,4 @@
-"""A robot's devices in the simulated world, as bytes on their two serial lines. Pure."""
+"""A robot's base and lidar in the simulated world, as bytes on their two serial lines. Pure."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ _BUFFER_BYTES: Final = 4096
 
 
 class Line:
-    """A serial line's pace: bytes go in at once and come out at the line's rate. Old ones are lost when it is full."""
+    """The rate of a serial line: bytes are queued and delivered at the line's rate; overflow drops the oldest."""
 
     def __init__(self, baud: int) -> None:
         self._rate = baud / _BITS_PER_BYTE
-        self._waiting = bytearray()
+        self._queue = bytearray()
         self._credit = 0.0
-        self.lost = 0
+        self.lost_bytes = 0
 
     def send(self, data: bytes, dt: float) -> bytes:
-        """Take bytes to send; return those that the line carries in the `dt` seconds that passed."""
-        self._waiting += data
-        surplus = len(self._waiting) - _BUFFER_BYTES
+        """Queue bytes; return those that the line delivers in `dt` seconds."""
+        self._queue += data
+        surplus = len(self._queue) - _BUFFER_BYTES
         if surplus > 0:
-            del self._waiting[:surplus]
-            self.lost += surplus
+            del self._queue[:surplus]
+            self.lost_bytes += surplus
         self._credit += self._rate * dt
-        count = min(int(self._credit), len(self._waiting))
-        # An idle line saves nothing up: the next byte takes its time.
-        self._credit = self._credit - count if self._waiting[count:] else 0.0
-        sent = bytes(self._waiting[:count])
-        del self._waiting[:count]
+        count = min(int(self._credit), len(self._queue))
+        # An idle line accumulates no credit: the next byte takes its full time.
+        self._credit = self._credit - count if self._queue[count:] else 0.0
+        sent = bytes(self._queue[:count])
+        del self._queue[:count]
         return sent
 
 
@@ -49,31 +49,31 @@ class Hardware:
         lidar: LidarEmulator,
         start: float,
         *,
-        rolled: tuple[float, float] = (0.0, 0.0),
+        initial_wheel_travel_m: tuple[float, float] = (0.0, 0.0),
     ) -> None:
-        """Put the devices on the robot. `rolled` is how far (m) its wheels have rolled before: counters may wrap."""
+        """Mount base and lidar on the robot; its encoders begin after `initial_wheel_travel_m` (left, right)."""
         self.world = world
         self.now = start
         self.base = base
         self.lidar = lidar
-        base.add_wheel_travel(*rolled)
+        base.add_wheel_travel(*initial_wheel_travel_m)
         world.axle = base.axle_m
         self._base_line, self._lidar_line = Line(base.baud), Line(lidar.baud)
 
     @property
     def lost_bytes(self) -> int:
-        """Bytes that the devices had to drop because the lines were too slow for them."""
-        return self._base_line.lost + self._lidar_line.lost
+        """Bytes dropped because the lines were too slow for the devices."""
+        return self._base_line.lost_bytes + self._lidar_line.lost_bytes
 
     def receive(self, to_base: bytes, to_lidar: bytes) -> None:
-        """Take what the host has written on both lines."""
+        """Pass on what the host has written to both lines."""
         if to_base:
             self.base.receive(to_base, self.now)
         if to_lidar:
             self.lidar.receive(to_lidar, self.now)
 
     def step(self, dt: float = STEP_S) -> tuple[bytes, bytes]:
-        """Let the world move on by `dt` seconds; return what base and lidar sent meanwhile."""
+        """Simulate `dt` seconds; return the bytes that base and lidar sent meanwhile."""
         world, base = self.world, self.base
         world.set_wheels(*base.wheel_speeds_m_s)
         base.add_wheel_travel(*world.step(dt))

@@ -1,4 +1,4 @@
-"""The edge of the simulator: pace, ptys, MQTT nodes, truth and commands over zenoh."""
+"""The edge of the simulator: real time, ptys, sensor nodes over MQTT, ground truth and commands over zenoh."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 LOG_S: Final = 0.01
 CATCH_UP_S: Final = 0.25
-"""A simulation that is further behind than this lets the time pass unsimulated, and says so in its sustained speed."""
+"""A simulation that is further behind than this skips the time; its sustained speed then drops."""
 _SPEED_OVER_S: Final = 5.0
 
 _log = logs.get("sim")
@@ -40,29 +40,29 @@ _SUSTAINED = Gauge("fognav_sim_sustained_speed", "Simulated seconds per wall sec
 
 
 class SpeedMeter:
-    """How fast the simulation really runs: simulated over wall time, in a window of 5 s of wall time."""
+    """Measures simulated time over wall time, in a window of 5 s of wall time."""
 
     def __init__(self) -> None:
-        self._marks: deque[tuple[float, float]] = deque()
+        self._samples: deque[tuple[float, float]] = deque()
 
-    def mark(self, wall: float, simulated: float) -> float:
-        """Take in how much was simulated until now; return the speed."""
-        self._marks.append((wall, simulated))
-        while wall - self._marks[0][0] > _SPEED_OVER_S and len(self._marks) > 2:
-            self._marks.popleft()
-        passed = wall - self._marks[0][0]
-        return (simulated - self._marks[0][1]) / passed if passed > 0 else 0.0
+    def update(self, wall: float, simulated: float) -> float:
+        """Record how much has been simulated by now (s); return the speed."""
+        self._samples.append((wall, simulated))
+        while wall - self._samples[0][0] > _SPEED_OVER_S and len(self._samples) > 2:
+            self._samples.popleft()
+        passed = wall - self._samples[0][0]
+        return (simulated - self._samples[0][1]) / passed if passed > 0 else 0.0
 
 
 class TruthLog:
-    """Lines of JSON, 100 a simulated second, written through at once: a test reads them after a kill."""
+    """Ground truth as lines of JSON, 100 per simulated second; unbuffered, for tests that read them after a kill."""
 
     def __init__(self, path: Path | None) -> None:
         self._file = None if path is None else path.open("ab", buffering=0)
         self._next = 0.0
 
     def write(self, hardware: Hardware, wheels: tuple[float, float], now: float) -> None:
-        """Write a line if one is due. `wheels` are the speeds that the base was commanded last (m/s)."""
+        """Write a line if one is due. `wheels` are the wheel speeds last commanded (m/s)."""
         if self._file is None or now < self._next:
             return
         self._next = now + LOG_S
@@ -88,8 +88,8 @@ class TruthLog:
             self._file.close()
 
 
-class Floor:
-    """The world at its pace, with its two serial devices; the nodes look at it, and commands change it."""
+class LiveWorld:
+    """The world simulated in real time, with base and lidar on ptys; sensor nodes measure it, commands change it."""
 
     def __init__(self, hardware: Hardware, clock: Clock, run_dir: Path, truth_log: Path | None) -> None:
         self.world = hardware.world
@@ -114,11 +114,11 @@ class Floor:
 
     @property
     def now(self) -> float:
-        """Until when the world is simulated (s of the clock)."""
+        """The time up to which the world has been simulated (s of the clock)."""
         return self._hardware.now
 
     async def run(self) -> None:
-        """Simulate in steps of 10 ms as time goes by, until cancelled."""
+        """Simulate in steps of 10 ms in real time, until cancelled."""
         meter = SpeedMeter()
         simulated = 0.0
         async for now in Ticker(self._clock, STEP_S):
@@ -129,7 +129,7 @@ class Floor:
             while self._hardware.now + STEP_S <= now:
                 self._step()
                 simulated += STEP_S
-            self.sustained_speed = meter.mark(time.monotonic(), simulated)
+            self.sustained_speed = meter.update(time.monotonic(), simulated)
             _SUSTAINED.set(self.sustained_speed)
 
     def _step(self) -> None:
@@ -143,7 +143,7 @@ class Floor:
         self._truth_log.write(hardware, hardware.base.wheel_speeds_m_s, hardware.now)
 
     def serve(self, edge: ZenohEdge, robot: str) -> None:
-        """Answer commands that change the world."""
+        """Serve commands that change the world."""
         edge.serve(ch.SIM_COMMAND, lambda _, command: self._on_command(command), robot=robot)
 
     def _on_command(self, command: SimCommand) -> CommandReply:
@@ -161,22 +161,22 @@ class Floor:
         if command.nodes_silent is not None:
             self.silent_nodes = frozenset(command.nodes_silent)
         if missing:
-            return CommandReply(accepted=False, reason=f"there is no obstacle {', '.join(missing)} to remove")
+            return CommandReply(accepted=False, reason=f"no such obstacle to remove: {', '.join(missing)}")
         return CommandReply(accepted=True, reason="")
 
-    async def tell(self, edge: ZenohEdge, robot: str) -> None:
-        """Publish the truth ten times a second, until cancelled."""
+    async def publish_truth(self, edge: ZenohEdge, robot: str) -> None:
+        """Publish the ground truth ten times a second, until cancelled."""
         async for _ in Ticker(self._clock, ch.SIM_TRUTH.period_s):
             truth = self.world.truth(self._clock.stamp(), self.sustained_speed)
             edge.publish(ch.SIM_TRUTH, truth, robot=robot)
 
 
-class Node:
-    """A virtual sensor node with an MQTT connection of its own, as a real one has."""
+class VirtualNode:
+    """A simulated sensor node with its own MQTT connection, as a real one has."""
 
-    def __init__(self, sonars: SonarNode, floor: Floor, url: str, clock: Clock, site: str) -> None:
+    def __init__(self, sonars: SonarNode, live_world: LiveWorld, url: str, clock: Clock, site: str) -> None:
         self._sonars = sonars
-        self._floor = floor
+        self._world = live_world
         self._clock = clock
         self._id = sonars.node.id
         will = Will(ch.NODE_AVAILABILITY, "offline", {"node": self._id})
@@ -185,7 +185,7 @@ class Node:
         self._mqtt.on_connect(self._announce)
 
     async def connect(self) -> None:
-        """Keep the connection until cancelled."""
+        """Stay connected until cancelled."""
         await self._mqtt.run()
 
     async def _announce(self) -> None:
@@ -193,17 +193,17 @@ class Node:
 
     def _on_config(self, ids: Mapping[str, str], config: NodeConfig) -> None:
         if ids["node"] == self._id and not self._sonars.configure(config):
-            _log.warning("config_ignored", node=self._id, reason="it is for another number of sonars")
+            _log.warning("config_ignored", node=self._id, reason="its number of sonars does not match")
 
     async def measure(self) -> None:
         """Publish the readings that are due."""
-        for reading in self._sonars.poll(self._floor.world, self._floor.now):
-            # A node without a connection, or one that a scenario has silenced, measures and tells nobody.
-            if self._mqtt.connected and self._id not in self._floor.silent_nodes:
+        for reading in self._sonars.poll(self._world.world, self._world.now):
+            # A node that is not connected, or silenced by a scenario, measures but does not publish.
+            if self._mqtt.connected and self._id not in self._world.silent_nodes:
                 await self._mqtt.publish(ch.NODE_READING, reading, node=self._id)
 
 
-async def run_nodes(nodes: list[Node], clock: Clock) -> None:
+async def run_nodes(nodes: list[VirtualNode], clock: Clock) -> None:
     """Let all nodes measure and publish, until cancelled."""
     async with asyncio.TaskGroup() as tasks:
         for node in nodes:

@@ -1,8 +1,8 @@
-"""A sensor node: the firmware's cycle and judgement, with the real sonar's timing. Pure.
+"""A sensor node: the firmware's measurement cycle and classification, with the real sonar's timing. Pure.
 
-One sonar after the other, each for the time of flight (36 ms when no echo comes) but at least as long as its echoes
-take to die away; then the reading is published and the firmware pauses. With echoes this gives about 9 readings a
-second, without about 8. Source of the timing: HC-SR04 data sheet; the pause is the thesis's (section 3.3).
+The sonars measure one after the other, each for its time of flight (36 ms without an echo) but at least until its
+echoes have decayed; then the reading is published and the firmware pauses. This gives about 9 readings a second with
+echoes, about 8 without. Source of the timing: HC-SR04 data sheet; the pause is the thesis's (section 3.3).
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
     from fog_contracts.site import NodeSite
 
 NO_ECHO_S: Final = 0.036
-"""The module ends its pulse by itself after some 38 ms without an echo; the firmware gives up just before."""
-SETTLE_S: Final = 0.027
+"""The module ends its pulse after about 38 ms without an echo; the firmware times out just before."""
+ECHO_DECAY_S: Final = 0.027
 PUBLISH_S: Final = 0.002
 FIRMWARE: Final = "sim-1"
 
 
 def default_config(node: NodeSite) -> NodeConfig:
-    """Return what a node is flashed with: the calibration of its site."""
+    """Return the configuration that a node is flashed with: the calibration of its site."""
     return NodeConfig(
         version=0,
         range_limit_m=[sonar.range_limit for sonar in node.sonars],
@@ -31,17 +31,17 @@ def default_config(node: NodeSite) -> NodeConfig:
     )
 
 
-def judge(ranges: list[float | None], config: NodeConfig) -> AreaState:
-    """Judge as the firmware does: one near echo blocks; clear needs every sonar to say so."""
-    near = zip(ranges, config.range_limit_m, strict=True)
-    if any(measured is not None and measured < limit for measured, limit in near):
+def classify(ranges: list[float | None], config: NodeConfig) -> AreaState:
+    """Classify ranges (m) as the firmware does: one near echo means blocked; clear takes every sonar."""
+    limits = zip(ranges, config.range_limit_m, strict=True)
+    if any(measured is not None and measured < limit for measured, limit in limits):
         return "blocked"
-    quiet = zip(ranges, config.no_echo_is_clear, strict=True)
-    return "clear" if all(measured is not None or clear for measured, clear in quiet) else "unknown"
+    silences = zip(ranges, config.no_echo_is_clear, strict=True)
+    return "clear" if all(measured is not None or clear for measured, clear in silences) else "unknown"
 
 
 class SonarNode:
-    """One node of the site; ask it for its readings as time goes by."""
+    """One sensor node of the site."""
 
     def __init__(self, node: NodeSite, boot: int, start: float) -> None:
         self.node = node
@@ -54,7 +54,7 @@ class SonarNode:
         self._ranges: list[float | None] = []
 
     def configure(self, config: NodeConfig) -> bool:
-        """Take a configuration; False when it is for another number of sonars and was ignored."""
+        """Apply a configuration; return False if it is for another number of sonars, and ignore it."""
         count = len(self.node.sonars)
         if len(config.range_limit_m) != count or len(config.no_echo_is_clear) != count:
             return False
@@ -62,10 +62,10 @@ class SonarNode:
         return True
 
     def poll(self, world: World, now: float) -> list[NodeReading]:
-        """Let time pass up to `now` (s); return the readings that were due, oldest first."""
+        """Measure up to `now` (s); return the readings that were due, oldest first."""
         readings: list[NodeReading] = []
         if now - self._due > 1.0:
-            # The simulation paused: a node does not make up for readings that it never took.
+            # The simulation paused: a node does not catch up on readings that it missed.
             self._due = now
         while self._due <= now:
             if self._index < len(self.node.sonars):
@@ -73,7 +73,7 @@ class SonarNode:
                 flight = NO_ECHO_S if measured is None else 2 * measured / SOUND_M_S
                 self._ranges.append(measured)
                 self._index += 1
-                self._due += max(flight, SETTLE_S)
+                self._due += max(flight, ECHO_DECAY_S)
                 continue
             readings.append(self._reading())
             self._index, self._ranges = 0, []
@@ -89,7 +89,7 @@ class SonarNode:
             uptime_ms=round((self._due - self._started) * 1000),
             range_m=[None if measured is None else round(measured, 4) for measured in self._ranges],
             status=status,
-            state=judge(self._ranges, self.config),
+            state=classify(self._ranges, self.config),
             rssi=-55,
             fw=FIRMWARE,
         )

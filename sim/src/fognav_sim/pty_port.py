@@ -1,4 +1,4 @@
-"""The edge: a pseudo terminal that a driver opens as if it were a serial device."""
+"""A pseudo terminal that a driver opens as if it were a serial device."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ _BUFFER_BYTES: Final = 8192
 
 
 class PtyPort:
-    """One pty in raw mode, held open at both ends, so that hosts may come, go and crash.
+    """One pty in raw mode, held open at both ends, so that hosts can connect, disconnect and crash.
 
-    A host that does not read loses the oldest bytes, as on a real line, and never holds up the simulator. Bytes that
-    the kernel still holds from before (up to 4 KiB) reach the next host; a real line has such remains too.
+    A host that does not read loses the oldest bytes, as on a real line, and never blocks the simulator. Bytes that
+    remain in the kernel's buffer (up to 4 KiB) reach the next host, as on a real line.
     Close it or use it in a `with` statement.
     """
 
@@ -25,8 +25,8 @@ class PtyPort:
         """Open the pty; `link` becomes a symbolic link to it, replacing one of the same name.
 
         Raises:
-            FileExistsError: if something that is no symbolic link stands at `link`.
-            OSError: if the link can't be made or no pty is left.
+            FileExistsError: if `link` exists and is not a symbolic link.
+            OSError: if the link can't be created or no pty is left.
 
         """
         self._master, self._slave = pty.openpty()
@@ -53,14 +53,14 @@ class PtyPort:
         return self._master
 
     def read(self) -> bytes:
-        """Return what the host has written, at once; b"" if nothing."""
+        """Return what the host has written, without waiting; b"" if nothing."""
         try:
             return os.read(self._master, _READ_BYTES)
         except BlockingIOError:
             return b""
 
     def write(self, data: bytes) -> None:
-        """Send to the host as much as the line takes and keep the rest, the newest 8 KiB, for the next call."""
+        """Send as much as the line accepts; keep the newest 8 KiB of the rest for the next call."""
         self._pending += data
         try:
             while self._pending:
@@ -72,7 +72,7 @@ class PtyPort:
                 self.lost_bytes += surplus
 
     def close(self) -> None:
-        """Remove the link, if it is still ours, and close both ends; harmless when done twice."""
+        """Remove the link, if it still points to this pty, and close both ends. Closing twice is allowed."""
         if self._link is not None and self._link.is_symlink() and self._link.readlink() == self.slave_path:
             self._link.unlink()
         self._link = None
@@ -89,7 +89,7 @@ class PtyPort:
 
     def _put_link(self, link: Path) -> None:
         if link.exists() and not link.is_symlink():
-            raise FileExistsError(f"{link} is no symbolic link: remove it, or give the port another path")
+            raise FileExistsError(f"{link} is not a symbolic link: remove it, or give the port another path")
         link.parent.mkdir(parents=True, exist_ok=True)
         temporary = link.with_name(f".{link.name}.{secrets.token_hex(4)}")
         temporary.symlink_to(self.slave_path)

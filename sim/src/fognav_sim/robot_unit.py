@@ -1,7 +1,7 @@
 """A simulated robot for a fog node that runs elsewhere: `python -m fognav_sim.robot_unit`, as in docker-compose.yml.
 
-Runs simulator, watchdog, guardian and agent as one unit, because ptys don't cross containers, and acts as the operator:
-it enables the robot whenever that asks for it, and sends it back and forth between the demo's two places.
+Runs simulator, watchdog, guardian and agent in one container, because containers can't share ptys, and acts as the
+operator: it enables the robot whenever it waits for that, and sends it back and forth between the demo's two places.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from fog_runtime.zenoh_edge import ZenohEdge
 from fog_supervisor.supervisor import Event, Program, Supervisor
 from fognav_sim.drive.operator import OperatorCommand, OperatorPolicy, Shuttle
 
-_LOOK_S: Final = 1.0
+_POLICY_PERIOD_S: Final = 1.0
 _TIMEOUT_S: Final = 5.0
 _log = logs.get("sim-robot")
 
 
 class Settings(CommonSettings, frozen=True, kw_only=True):
-    """What the unit needs to know besides what all processes do."""
+    """Settings of the simulated robot, besides those common to all processes."""
 
     run_dir: Path
     planner_url: str
@@ -46,7 +46,7 @@ class Settings(CommonSettings, frozen=True, kw_only=True):
 
 
 class _Operator:
-    """The operator's part: what the robot last said, and where it is to go next."""
+    """Acts as the operator of the robot: enables it, resets faults, sends goals."""
 
     def __init__(self, settings: Settings, robot: str, places: tuple[str, str], edge: ZenohEdge) -> None:
         self._settings = settings
@@ -61,20 +61,20 @@ class _Operator:
         self._shuttle = Shuttle(*places)
 
     async def run(self) -> None:
-        """Enable and send, once a second as needed, until cancelled."""
-        async for now in ticker(self._clock, _LOOK_S):
+        """Send the commands and goals that are due, once a second, until cancelled."""
+        async for now in ticker(self._clock, _POLICY_PERIOD_S):
             state = self._state.get()
             if state is None:
                 continue
             self._policy.on_state(state, now)
             if (command := self._policy.command_due(now)) is not None:
-                await self._command(command)
+                await self._send_command(command)
             if (place := self._shuttle.on_state(state)) is not None:
                 _log.info("arrived", place=place, legs=self._shuttle.legs)
             if (place := self._shuttle.goal_due(state)) is not None:
-                await self._send(place)
+                await self._send_goal(place)
 
-    async def _command(self, kind: OperatorCommand) -> None:
+    async def _send_command(self, kind: OperatorCommand) -> None:
         unsigned = RobotCommand(
             kind=kind,
             robot=self._robot,
@@ -89,20 +89,20 @@ class _Operator:
             _log.warning("command_failed", kind=kind, reason=str(error))
             return
         _log.info(
-            "command",
+            "command_sent",
             kind=kind,
             accepted=reply is not None and reply.accepted,
-            reason=reply.reason if reply else "silent",
+            reason=reply.reason if reply else "no reply",
         )
 
-    async def _send(self, place: str) -> None:
+    async def _send_goal(self, place: str) -> None:
         try:
             await asyncio.to_thread(self._put_goal, place)
         except (OSError, urllib.error.URLError) as error:
             _log.warning("goal_failed", place=place, reason=str(error), url=self._settings.planner_url)
             return
         self._shuttle.under_way = True
-        _log.info("goal", place=place)
+        _log.info("goal_accepted", place=place)
 
     def _put_goal(self, place: str) -> None:
         request = urllib.request.Request(  # noqa: S310  # the address is the operator's own setting
@@ -141,18 +141,20 @@ def _programs(settings: Settings, robot: str) -> list[Program]:
     return programs
 
 
-def _say(event: Event) -> None:
+def _log_program_event(event: Event) -> None:
     _log.info(f"program_{event.kind}", program=event.program, detail=event.detail)
 
 
 async def main() -> None:
-    """Start the robot's programs and drive until told to end."""
+    """Start the robot's programs and operate the robot until cancelled."""
     settings = load(Settings, environ=os.environ)
     logs.configure("sim-robot", settings.log_level, settings.log_format)
     _log.info("settings_loaded", **describe(settings))
     site = load_site(settings.site_dir).site
     if site.demo is None or not site.robots:
-        raise SettingsError(f"{settings.site_dir}/site.toml needs [demo] and one of [[robots]] for a simulated drive")
+        raise SettingsError(
+            f"{settings.site_dir}/site.toml needs [demo] and a robot in [[robots]] for a simulated drive"
+        )
     if settings.operator_key_file is None:
         raise SettingsError("FOGNAV_OPERATOR_KEY_FILE is missing: name the site's operator.key")
     robot = settings.robot or site.robots[0].id
@@ -164,7 +166,7 @@ async def main() -> None:
             id=robot,
             site=settings.site or site.id,
         ) as edge,
-        Supervisor(_say) as supervisor,
+        Supervisor(_log_program_event) as supervisor,
     ):
         for program in _programs(settings, robot):
             supervisor.add(program)

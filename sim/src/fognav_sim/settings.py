@@ -1,4 +1,4 @@
-"""What the simulator can be told."""
+"""Settings of the simulator."""
 
 from pathlib import Path
 
@@ -7,14 +7,14 @@ from fognav_sim.devices import DEFAULT_BASE, DEFAULT_LIDAR
 
 
 class Settings(CommonSettings, frozen=True, kw_only=True):
-    """FOGNAV_RUN_DIR: folder of the devices `base` and `lidar`; FOGNAV_TRUTH_LOG: file for what is really so."""
+    """FOGNAV_RUN_DIR: folder of the devices `base` and `lidar`; FOGNAV_TRUTH_LOG: file for the ground truth."""
 
     run_dir: Path
     robot: str = ""
-    """Id of the robot in `site.toml`; empty: its first."""
+    """Id of the robot in `site.toml`; empty: the first."""
     base: str = DEFAULT_BASE
-    """What the robot drives on: a name in the entry points `fognav.base_emulators`."""
+    """The robot's base: a name in the entry points `fognav.base_emulators`."""
     lidar: str = DEFAULT_LIDAR
-    """What it sees with: a name in the entry points `fognav.lidar_emulators`."""
+    """The robot's lidar: a name in the entry points `fognav.lidar_emulators`."""
     seed: int = 1
     truth_log: Path | None = None

@@ -1,13 +1,13 @@
-"""The simulated floor and the robot on it: what is really so. Pure; every chance comes from one seed.
+"""The simulated floor and the robot on it: the ground truth. Pure; all randomness comes from one seed.
 
-Frames as everywhere: x right, y up, metres, radians; row 0 of the grid at the bottom. Wheels are what the motors turn,
-the ground is what the robot gains by it: between the two stand a systematic error of each wheel's diameter and slip.
+Frames as everywhere: x right, y up, metres, radians; row 0 of the grid at the bottom. The distance that a wheel rolls
+and the distance that the robot covers differ by a systematic error of each wheel's diameter and by slip.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -32,24 +32,25 @@ SONAR_HALF_CONE: Final = math.radians(7.5)
 SONAR_MIN_M: Final = 0.02
 SONAR_MAX_M: Final = 4.0
 SONAR_RAYS: Final = 16
-SONAR_GRAZING: Final = math.radians(45.0)
-"""Ultrasound is mirrored by smooth surfaces: met more obliquely than this, no echo comes back."""
+SONAR_MAX_INCIDENCE: Final = math.radians(45.0)
+"""Smooth surfaces reflect ultrasound like a mirror: beyond this angle of incidence no echo returns."""
 LIDAR_MIN_M: Final = 0.15
 LIDAR_MAX_M: Final = 12.0
 LIDAR_HEIGHT_M: Final = 0.25
-_NEAR_M: Final = 0.6
-_RELEASED_M: Final = 0.01
-"""A touch has ended when the robot is this far off again."""
-_FAR_M: Final = 2.0
+_EXACT_CLEARANCE_M: Final = 0.6
+"""Below this distance to a wall the clearance is computed exactly, above it to half a cell."""
+_CONTACT_RELEASE_M: Final = 0.01
+"""A contact has ended when the clearance exceeds this."""
+_MAX_CLEARANCE_M: Final = 2.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Noise:
-    """How imperfect the robot and its sensors are; zeros give a perfect world.
+    """Errors of the robot and its sensors; zeros give a perfect world.
 
     Standard deviations: `wheel_diameter` (share, drawn once per wheel), `slip` (share of the travel, per square root
     of a metre), lidar `range_sigma` (m) plus `range_share` of the range, `lidar_dropout` (probability per beam),
-    `sonar_sigma` (m), `sonar_spike` (probability of a single wild sample).
+    `sonar_sigma` (m), `sonar_spike` (probability of a single outlier).
     """
 
     wheel_diameter: float = 0.004
@@ -70,11 +71,10 @@ class _Body:
     right: float = 0.0
     distance: float = 0.0
     contacts: int = 0
-    touching: bool = False
+    in_contact: bool = False
     bump_left: bool = False
     bump_right: bool = False
-    min_clearance: float = _FAR_M
-    travel: list[float] = field(default_factory=lambda: [0.0, 0.0])
+    min_clearance: float = _MAX_CLEARANCE_M
 
 
 class World:
@@ -97,23 +97,23 @@ class World:
         self.robot = robot
         self.noise = noise or Noise()
         self.axle = 0.235
-        """Distance (m) between the wheels of the base that drives; the hardware that is put on the floor sets it."""
+        """Distance (m) between the base's wheels; `Hardware` sets it."""
         self._wheel_lag = wheel_lag
         self._occupied = np.ascontiguousarray(cells == LETHAL, dtype=np.uint8)
-        squared = squared_distance_capped(self._occupied, math.ceil(_FAR_M / geometry.resolution))
-        self._distance = np.sqrt(squared.astype(np.float64)) * geometry.resolution
+        squared = squared_distance_capped(self._occupied, math.ceil(_MAX_CLEARANCE_M / geometry.resolution))
+        self._wall_distance = np.sqrt(squared.astype(np.float64)) * geometry.resolution
         self._rng = np.random.default_rng(seed)
-        self._scale = [1.0 + self.noise.wheel_diameter * float(self._rng.standard_normal()) for _ in range(2)]
+        self._diameter_scale = [1.0 + self.noise.wheel_diameter * float(self._rng.standard_normal()) for _ in range(2)]
         self._obstacles: dict[str, SimObstacle] = {}
         self._outlines: dict[str, list[Point]] = {}
         self._edges: dict[str, NDArray[np.float64]] = {}
-        self._wanted = (0.0, 0.0)
+        self._wheel_commands = (0.0, 0.0)
         start = robot.start
         self._body = _Body(start.x, start.y, start.theta)
         clearance = self.clearance()
         if clearance < 0:
             raise ValueError(
-                f"robot {robot.id} starts at ({start.x:.2f}, {start.y:.2f}), {-clearance:.2f} m inside something: "
+                f"robot {robot.id} starts at ({start.x:.2f}, {start.y:.2f}), {-clearance:.2f} m inside an obstacle: "
                 "move its start in site.toml"
             )
         self._body.min_clearance = clearance
@@ -122,13 +122,13 @@ class World:
 
     @property
     def obstacles(self) -> list[SimObstacle]:
-        """What stands on the floor besides the walls."""
+        """The obstacles on the floor; walls are in the map."""
         return list(self._obstacles.values())
 
     def place(self, obstacle: SimObstacle) -> None:
-        """Put an obstacle there, in place of one with the same id.
+        """Place an obstacle, replacing one with the same id.
 
-        Raises `GeometryError` for a shape that is none, `ValueError` where it would stand on the robot.
+        Raises `GeometryError` for an invalid outline, `ValueError` if it would stand on the robot.
         """
         outline = normalized_polygon(obstacle.polygon)
         if distance_to_polygon(outline, self._body.x, self._body.y) <= self.robot.radius:
@@ -139,7 +139,7 @@ class World:
         self._edges[obstacle.id] = np.hstack((points, np.roll(points, -1, axis=0)))
 
     def remove(self, obstacle_id: str) -> bool:
-        """Take an obstacle away; False when there is none of this id."""
+        """Remove an obstacle; return False if there is none with this id."""
         self._outlines.pop(obstacle_id, None)
         self._edges.pop(obstacle_id, None)
         return self._obstacles.pop(obstacle_id, None) is not None
@@ -148,7 +148,7 @@ class World:
 
     @property
     def pose(self) -> tuple[float, float, float]:
-        """Where the robot really is: x, y, theta."""
+        """The robot's true pose: x, y (m), theta (rad)."""
         return self._body.x, self._body.y, self._body.theta
 
     @property
@@ -158,76 +158,76 @@ class World:
 
     @property
     def contacts(self) -> int:
-        """How many times the robot has begun to touch something."""
+        """Number of contacts with walls and obstacles so far."""
         return self._body.contacts
 
     @property
     def distance(self) -> float:
-        """Metres that the robot has really travelled."""
+        """True distance travelled, m."""
         return self._body.distance
 
     def set_wheels(self, left: float, right: float) -> None:
-        """Drive the motors at these speeds (m/s) from now on."""
-        self._wanted = (left, right)
+        """Command these wheel speeds (m/s) from now on."""
+        self._wheel_commands = (left, right)
 
     def kidnap(self, pose: Pose) -> None:
-        """Carry the robot elsewhere; raises `ValueError` when something is there."""
+        """Move the robot to another pose; raises `ValueError` if that is not free."""
         old = self.pose
         self._body.x, self._body.y, self._body.theta = pose.x, pose.y, pose.theta
         if self.clearance() < 0:
             self._body.x, self._body.y, self._body.theta = old
-            raise ValueError(f"({pose.x:.2f}, {pose.y:.2f}) is not free: carry the robot to a free place")
+            raise ValueError(f"({pose.x:.2f}, {pose.y:.2f}) is not free: choose a free place for the robot")
 
     def step(self, dt: float) -> tuple[float, float]:
-        """Let `dt` seconds pass; return how far the left and the right wheel turned (m at nominal diameter)."""
+        """Simulate `dt` seconds; return how far the left and the right wheel rolled (m at nominal diameter)."""
         body = self._body
         share = 1.0 - math.exp(-dt / self._wheel_lag) if self._wheel_lag > 0 else 1.0
-        # The motors stop turning within a few millimetres: below that the exponential tail is friction's.
-        body.left = _towards(body.left, self._wanted[0], share)
-        body.right = _towards(body.right, self._wanted[1], share)
-        turned = (body.left * dt, body.right * dt)
-        if turned == (0.0, 0.0):
-            return turned
+        # Friction stops the motors within a few millimetres, which cuts off the exponential tail.
+        body.left = _first_order_step(body.left, self._wheel_commands[0], share)
+        body.right = _first_order_step(body.right, self._wheel_commands[1], share)
+        wheel_travel = (body.left * dt, body.right * dt)
+        if wheel_travel == (0.0, 0.0):
+            return wheel_travel
         ground = [
             travel * scale + self.noise.slip * math.sqrt(abs(travel)) * float(self._rng.standard_normal())
-            for travel, scale in zip(turned, self._scale, strict=True)
+            for travel, scale in zip(wheel_travel, self._diameter_scale, strict=True)
         ]
         self._move(ground[0], ground[1])
-        return turned
+        return wheel_travel
 
     def _move(self, left: float, right: float) -> None:
         body = self._body
-        ahead, turn = (left + right) / 2, (right - left) / self.axle
-        middle = body.theta + turn / 2
-        x, y = body.x + ahead * math.cos(middle), body.y + ahead * math.sin(middle)
-        clearance, towards = self._nearest(x, y)
-        body.theta = math.remainder(body.theta + turn, math.tau)
-        if clearance < 0 and clearance < self._nearest(body.x, body.y)[0]:
-            # Against something: the wheels turn on, the robot stays.
-            if not body.touching:
+        travel, rotation = (left + right) / 2, (right - left) / self.axle
+        middle = body.theta + rotation / 2
+        x, y = body.x + travel * math.cos(middle), body.y + travel * math.sin(middle)
+        clearance, towards = self._nearest_obstacle(x, y)
+        body.theta = math.remainder(body.theta + rotation, math.tau)
+        if clearance < 0 and clearance < self._nearest_obstacle(body.x, body.y)[0]:
+            # In contact: the wheels keep turning, the robot stays.
+            if not body.in_contact:
                 body.contacts += 1
-            body.touching = True
-            self._press(towards)
+            body.in_contact = True
+            self._press_bumper(towards)
         else:
             body.distance += math.hypot(x - body.x, y - body.y)
             body.x, body.y = x, y
-            # A robot that pushes against something trembles by its wheels' slip: that is one touch.
-            if clearance > _RELEASED_M:
-                body.touching = body.bump_left = body.bump_right = False
+            # Slip makes the clearance of a robot that pushes against an obstacle vary: that counts as one contact.
+            if clearance > _CONTACT_RELEASE_M:
+                body.in_contact = body.bump_left = body.bump_right = False
         body.min_clearance = min(body.min_clearance, clearance)
 
-    def _press(self, direction: float) -> None:
+    def _press_bumper(self, direction: float) -> None:
         side = math.remainder(direction - self._body.theta, math.tau)
         if abs(side) < math.radians(95.0):
             self._body.bump_left = side > -math.radians(10.0)
             self._body.bump_right = side < math.radians(10.0)
 
     def clearance(self) -> float:
-        """Distance (m) from the robot's rim to the nearest thing, negative inside it; at most about 2."""
-        return self._nearest(self._body.x, self._body.y)[0]
+        """Distance (m) from the robot's rim to the nearest wall or obstacle, negative inside it; at most about 2."""
+        return self._nearest_obstacle(self._body.x, self._body.y)[0]
 
-    def _nearest(self, x: float, y: float) -> tuple[float, float]:
-        """Clearance at (x, y) and the direction towards the nearest thing."""
+    def _nearest_obstacle(self, x: float, y: float) -> tuple[float, float]:
+        """Return the clearance (m) at (x, y) and the direction (rad) to the nearest wall or obstacle."""
         nearest, direction = self._nearest_wall(x, y)
         for outline in self._outlines.values():
             distance = distance_to_polygon(outline, x, y)
@@ -241,10 +241,10 @@ class World:
         column, row = g.cell(x, y)
         if not g.contains_cell(column, row):
             return 0.0, 0.0
-        coarse = float(self._distance[row, column])
-        if coarse > _NEAR_M:
+        coarse = float(self._wall_distance[row, column])
+        if coarse > _EXACT_CLEARANCE_M:
             return coarse - g.resolution / 2, 0.0
-        reach = math.ceil(_NEAR_M / g.resolution) + 1
+        reach = math.ceil(_EXACT_CLEARANCE_M / g.resolution) + 1
         left, bottom = max(0, column - reach), max(0, row - reach)
         part = self._occupied[bottom : row + reach + 1, left : column + reach + 1]
         rows, columns = np.nonzero(part)
@@ -259,12 +259,12 @@ class World:
         best = int(np.argmin(squared))
         return math.sqrt(float(squared[best])), math.atan2(float(dy[best]), float(dx[best]))
 
-    # --- what sensors see ---------------------------------------------------------------------------------------------
+    # --- sensors ------------------------------------------------------------------------------------------------------
 
     def lidar(self, angles: NDArray[np.float64], now: float) -> NDArray[np.float64]:
-        """Measure along `angles` (rad, counter-clockwise, frame of the laser): ranges (m), nan where nothing returns.
+        """Measure along `angles` (rad, counter-clockwise, frame of the lidar): ranges (m), nan without a return.
 
-        The robot stands still for the few nodes of a call; `now` is not used, because the world knows one time only.
+        The robot does not move during a call; `now` is unused, because the world has only its current state.
         """
         del now
         body = self._body
@@ -280,25 +280,27 @@ class World:
         return np.where(valid, ranges, np.nan)
 
     def sonar(self, node: NodeSite, index: int) -> float | None:
-        """Measure with one sonar of a node: range of the nearest echo (m), None when none comes back.
+        """Measure with one sonar of a node: range of the nearest echo (m), None without an echo.
 
-        The cone is a fan of rays. Walls and boxes echo only where they are met squarely enough; what is lower than the
-        cone at its place is not seen.
+        The cone is a fan of rays. Walls and boxes echo only below a maximum angle of incidence; an obstacle that is
+        lower than the cone at its range is not seen.
         """
         sonar = node.sonars[index]
         middle = node.theta + sonar.angle
         directions = middle + np.linspace(-SONAR_HALF_CONE, SONAR_HALF_CONE, SONAR_RAYS)
         if self._rng.random() < self.noise.sonar_spike:
             return float(self._rng.uniform(0.1, SONAR_MAX_M))
-        # A node hangs on a wall, and its own cell may count as occupied: look from 5 cm in front of it.
+        # A node is mounted on a wall, and its own cell may be occupied: measure from one cell in front of it.
         ahead = self.geometry.resolution
         x, y = node.x + ahead * math.cos(node.theta), node.y + ahead * math.sin(node.theta)
         walls = self._cast(x, y, directions, SONAR_MAX_M)
-        # A wall hides what is behind it, whether it echoes or not.
-        echoes = [_squarely(walls, directions)]
+        # A wall hides everything behind it, whether it echoes or not.
+        echoes = [_echo_ranges(walls, directions)]
         for obstacle_id, obstacle in self._obstacles.items():
             ranges, incidence = _edge_ranges(self._edges[obstacle_id], x, y, directions)
-            seen = (ranges < walls) & (incidence <= SONAR_GRAZING) & _in_cone(obstacle.height, node.height, ranges)
+            seen = (
+                (ranges < walls) & (incidence <= SONAR_MAX_INCIDENCE) & _in_cone(obstacle.height, node.height, ranges)
+            )
             echoes.append(np.where(seen, ranges, np.inf))
         ranges = _circle_ranges(self._body.x, self._body.y, self.robot.radius, x, y, directions)
         seen = (ranges < walls) & _in_cone(self.robot.height, node.height, ranges)
@@ -313,7 +315,7 @@ class World:
         return cast(self._occupied, g.resolution, g.origin_x, g.origin_y, x, y, directions, reach)
 
     def truth(self, stamp: float, sustained_speed: float = 1.0) -> SimTruth:
-        """Return what is really so."""
+        """Return the ground truth."""
         body = self._body
         return SimTruth(
             robot=self.robot.id,
@@ -332,25 +334,26 @@ class World:
         )
 
 
-def _towards(current: float, wanted: float, share: float) -> float:
-    following = current + (wanted - current) * share
-    return wanted if abs(wanted - following) < 1e-3 else following
+def _first_order_step(current: float, target: float, share: float) -> float:
+    """Move a speed (m/s) this share of the way to its target, as a first-order lag does."""
+    following = current + (target - current) * share
+    return target if abs(target - following) < 1e-3 else following
 
 
 def _in_cone(top: float, node_height: float, ranges: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Whether something that stands on the floor reaches up into the cone at its range."""
+    """Whether an obstacle of height `top` (m) reaches up into the cone at its range."""
     reach = np.where(np.isfinite(ranges), ranges, 0.0) * math.tan(SONAR_HALF_CONE)
     return np.asarray(top >= node_height - reach)
 
 
-def _squarely(ranges: NDArray[np.float64], directions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Keep the ranges of a fan where the surface, as neighbouring rays outline it, is met squarely enough."""
+def _echo_ranges(ranges: NDArray[np.float64], directions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Keep the ranges of a fan where the angle of incidence, estimated from neighbouring rays, gives an echo."""
     finite = np.where(np.isfinite(ranges), ranges, 1e3)
     x, y = finite * np.cos(directions), finite * np.sin(directions)
     dx, dy = np.gradient(x), np.gradient(y)
-    # The surface runs along (dx, dy); it is met squarely when the ray is at a right angle to it.
+    # The surface runs along (dx, dy); the incidence is zero where the ray is at a right angle to it.
     along = np.abs(dx * np.cos(directions) + dy * np.sin(directions)) / np.maximum(np.hypot(dx, dy), 1e-9)
-    return np.where(np.isfinite(ranges) & (along <= math.sin(SONAR_GRAZING)), ranges, np.inf)
+    return np.where(np.isfinite(ranges) & (along <= math.sin(SONAR_MAX_INCIDENCE)), ranges, np.inf)
 
 
 def _edge_ranges(

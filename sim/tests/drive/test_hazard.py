@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from fog_contracts.messages import SimObstacle
 from fog_contracts.site import AreaSite, DemoPlan, NodeSite, Site, Sonar
-from fognav_sim.drive.hazard import HazardSchedule, along, draw_hazard, draw_trigger, may_appear
+from fognav_sim.drive.hazard import HazardSchedule, draw_hazard, draw_trigger, entry_distance, is_clear_of_robot
 from fognav_sim.scenario import KEEP_AWAY_M, ScenarioError
 
 PATH = [(0.0, 0.0), (10.0, 0.0), (30.0, 0.0)]
@@ -28,66 +28,66 @@ def site(*names_and_places: tuple[str, float]) -> Site:
     return Site(id="test", areas=areas, nodes=nodes, demo=demo)
 
 
-def anywhere(area: AreaSite) -> SimObstacle:
+def fill_area(area: AreaSite) -> SimObstacle:
     return SimObstacle(id="barrier", polygon=area.polygon)
 
 
-def test_distance_to_an_area_is_counted_along_the_path() -> None:
+def test_distance_to_an_area_is_measured_along_the_path() -> None:
     corner = [(0.0, 0.0), (4.0, 0.0), (4.0, 6.0)]
     polygon = [(3.0, 5.0), (5.0, 5.0), (5.0, 7.0), (3.0, 7.0)]
-    assert along(corner, polygon) == pytest.approx(9.0, abs=0.05)
+    assert entry_distance(corner, polygon) == pytest.approx(9.0, abs=0.05)
 
 
-def test_an_area_beside_the_path_is_not_on_it() -> None:
-    assert along(PATH, [(5.0, 2.0), (8.0, 2.0), (8.0, 4.0)]) is None
+def test_area_beside_the_path_has_no_entry_distance() -> None:
+    assert entry_distance(PATH, [(5.0, 2.0), (8.0, 2.0), (8.0, 4.0)]) is None
 
 
-def test_an_area_that_can_t_be_closed_is_left_out_and_said_so() -> None:
-    def nowhere(area: AreaSite) -> SimObstacle:
+def test_area_that_no_barrier_can_close_is_refused_with_the_reason() -> None:
+    def no_barrier(area: AreaSite) -> SimObstacle:
         raise ScenarioError(f"area {area.id}: no barrier fits")
 
     with pytest.raises(ScenarioError, match="z1: no barrier fits"):
-        draw_hazard(site(("z1", 12.0)), PATH, 1, nowhere)
+        draw_hazard(site(("z1", 12.0)), PATH, 1, no_barrier)
 
 
 @given(seed=st.integers(0, 10_000))
-def test_the_draw_is_the_same_for_the_same_seed_and_early_enough(seed: int) -> None:
+def test_hazard_is_the_same_for_the_same_seed_and_appears_early_enough(seed: int) -> None:
     plan = site(("z1", 9.0), ("z2", 20.0), ("z3", 40.0))
-    drawn = draw_hazard(plan, PATH, seed, anywhere)
-    assert drawn == draw_hazard(plan, PATH, seed, anywhere)
+    drawn = draw_hazard(plan, PATH, seed, fill_area)
+    assert drawn == draw_hazard(plan, PATH, seed, fill_area)
     assert drawn.area.id in {"z1", "z2"}
-    entry = along(PATH, drawn.area.polygon)
+    entry = entry_distance(PATH, drawn.area.polygon)
     assert entry is not None
     assert drawn.trigger_m <= draw_trigger(seed)
     assert 0.0 <= drawn.trigger_m <= min(8.0, entry - KEEP_AWAY_M)
-    assert may_appear(drawn, (drawn.trigger_m, 0.0))
+    assert is_clear_of_robot(drawn, (drawn.trigger_m, 0.0))
 
 
-def test_every_area_on_the_way_is_drawn_by_some_seed() -> None:
+def test_every_area_on_the_path_is_drawn_by_some_seed() -> None:
     plan = site(("z1", 9.0), ("z2", 20.0))
-    assert {draw_hazard(plan, PATH, seed, anywhere).area.id for seed in range(30)} == {"z1", "z2"}
+    assert {draw_hazard(plan, PATH, seed, fill_area).area.id for seed in range(30)} == {"z1", "z2"}
 
 
-def test_a_way_that_meets_no_area_says_why() -> None:
+def test_path_that_crosses_no_area_is_refused_with_the_reason() -> None:
     with pytest.raises(ScenarioError, match="does not cross far"):
-        draw_hazard(site(("far", 60.0)), PATH, 1, anywhere)
+        draw_hazard(site(("far", 60.0)), PATH, 1, fill_area)
 
 
-def test_nothing_appears_near_the_robot() -> None:
-    drawn = draw_hazard(site(("z1", 12.0)), PATH, 1, anywhere)
-    assert not may_appear(drawn, (9.5, 0.0))
+def test_barrier_does_not_appear_near_the_robot() -> None:
+    drawn = draw_hazard(site(("z1", 12.0)), PATH, 1, fill_area)
+    assert not is_clear_of_robot(drawn, (9.5, 0.0))
 
 
-def test_a_barrier_is_due_after_its_distance_and_never_near_the_robot() -> None:
-    schedule = HazardSchedule(site(("z1", 12.0)), 1, anywhere)
+def test_barrier_is_due_after_its_distance_but_never_near_the_robot() -> None:
+    schedule = HazardSchedule(site(("z1", 12.0)), 1, fill_area)
     planned = schedule.draw(PATH)
     assert schedule.due(PATH, planned.trigger_m - 0.1, (planned.trigger_m - 0.1, 0.0)) is None
     assert schedule.due(PATH, planned.trigger_m, (9.5, 0.0)) is None
     assert schedule.due(PATH, planned.trigger_m, (planned.trigger_m, 0.0)) == planned
 
 
-def test_a_robot_that_goes_another_way_meanwhile_gets_an_area_of_that_way() -> None:
-    schedule = HazardSchedule(site(("z1", 12.0), ("z2", -30.0)), 1, anywhere)
+def test_robot_with_a_new_path_gets_a_hazard_on_that_path() -> None:
+    schedule = HazardSchedule(site(("z1", 12.0), ("z2", -30.0)), 1, fill_area)
     assert schedule.draw(PATH).area.id == "z1"
     back = [(-x, y) for x, y in PATH]
     due = schedule.due(back, 9.0, (0.0, 0.0))

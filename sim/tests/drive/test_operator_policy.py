@@ -1,12 +1,12 @@
-"""What an operator does about a robot's states, swept without a robot."""
+"""The operator's commands for every state of a robot, without a robot."""
 
 import msgspec
 import pytest
 
 from fog_contracts.messages import Mode, RobotState
-from fognav_sim.drive.operator import FAULT_S, HELD_S, LOOK_S, OperatorPolicy, Shuttle
+from fognav_sim.drive.operator import FAULT_RESPONSE_S, HOLD_RESPONSE_S, STOP_RESPONSE_S, OperatorPolicy, Shuttle
 
-ASKS = "waiting for an operator to enable"
+WAITING = "waiting for an operator to enable"
 
 
 def state(mode: Mode, *reasons: str, enabled: bool = True, reached: bool = False) -> RobotState:
@@ -16,46 +16,50 @@ def state(mode: Mode, *reasons: str, enabled: bool = True, reached: bool = False
     )  # fmt: skip
 
 
-def test_nothing_is_due_before_the_robot_has_spoken() -> None:
+def test_no_command_is_due_before_the_first_state() -> None:
     assert OperatorPolicy(0.0).command_due(1000.0) is None
 
 
-def test_a_robot_that_lacks_only_the_operator_is_enabled_at_once_and_another_after_a_look() -> None:
+def test_ready_robot_is_enabled_at_once_and_one_that_is_not_ready_after_a_while() -> None:
     policy = OperatorPolicy(0.0)
-    policy.on_state(state("INIT", "the pose is not known", ASKS), 1.0)
-    assert policy.command_due(1.0 + LOOK_S - 0.1) is None
-    assert policy.command_due(1.0 + LOOK_S) == "enable"
-    policy.on_state(state("INIT", ASKS), 2.0)
+    policy.on_state(state("INIT", "the pose is not known", WAITING), 1.0)
+    assert policy.command_due(1.0 + STOP_RESPONSE_S - 0.1) is None
+    assert policy.command_due(1.0 + STOP_RESPONSE_S) == "enable"
+    policy.on_state(state("INIT", WAITING), 2.0)
     assert policy.command_due(2.0) == "enable"
     assert policy.ready_s(5.0) == pytest.approx(4.0)
 
 
 @pytest.mark.parametrize(
-    ("mode", "after_s", "command"), [("FAULT", FAULT_S, "reset"), ("PROTECTIVE_STOP", LOOK_S, "enable"),
-                                     ("HOLD", HELD_S, "enable")]
-)  # fmt: skip
-def test_what_stands_is_looked_at_after_a_time_that_begins_with_its_mode(
+    ("mode", "after_s", "command"),
+    [
+        ("FAULT", FAULT_RESPONSE_S, "reset"),
+        ("PROTECTIVE_STOP", STOP_RESPONSE_S, "enable"),
+        ("HOLD", HOLD_RESPONSE_S, "enable"),
+    ],
+)
+def test_operator_responds_to_a_stop_after_a_time_that_starts_with_the_mode(
     mode: Mode, after_s: float, command: str
 ) -> None:
     policy = OperatorPolicy(0.0)
     policy.on_state(state("NORMAL"), 1.0)
-    policy.on_state(state(mode, "why"), 10.0)
-    policy.on_state(state(mode, "why, still"), 10.0 + after_s / 2)
+    policy.on_state(state(mode, "reason"), 10.0)
+    policy.on_state(state(mode, "another reason"), 10.0 + after_s / 2)
     assert policy.command_due(10.0 + after_s - 0.01) is None
     assert policy.command_due(10.0 + after_s) == command
 
 
 @pytest.mark.parametrize("mode", ["NORMAL", "DEGRADED"])
-def test_a_robot_that_drives_is_left_alone(mode: Mode) -> None:
+def test_no_command_is_due_while_the_robot_drives(mode: Mode) -> None:
     policy = OperatorPolicy(0.0)
     policy.on_state(state(mode), 0.0)
     assert policy.command_due(1e6) is None
     assert policy.ready_s(1e6) == 0.0
 
 
-def test_a_shuttle_goes_back_and_forth_and_sends_once_for_each_leg() -> None:
+def test_shuttle_alternates_between_its_places_with_one_goal_per_leg() -> None:
     shuttle = Shuttle("a", "b")
-    assert shuttle.goal_due(state("INIT", ASKS)) is None
+    assert shuttle.goal_due(state("INIT", WAITING)) is None
     places = []
     for _ in range(3):
         place = shuttle.goal_due(state("NORMAL"))
@@ -63,7 +67,7 @@ def test_a_shuttle_goes_back_and_forth_and_sends_once_for_each_leg() -> None:
         shuttle.under_way = True
         assert shuttle.goal_due(state("NORMAL")) is None
         assert shuttle.on_state(state("NORMAL")) is None
-        stopped = msgspec.structs.replace(state("INIT", ASKS), goal_reached=True)
+        stopped = msgspec.structs.replace(state("INIT", WAITING), goal_reached=True)
         assert shuttle.on_state(stopped) is None
         assert shuttle.on_state(state("NORMAL", reached=True)) == place
         places.append(place)

@@ -153,7 +153,7 @@ class Attempt:
             goal=(place.x, place.y),
             goal_id=goal.goal_id,
             areas=self.plan.site.site.areas,
-            begun=clock.now(),
+            started_at=clock.now(),
             timeout_s=_TIMEOUT_BASE_S + _DETOUR * span / _SLOWEST_MPS,
         )
         self.scene.phase = "driving"

@@ -43,7 +43,7 @@ def _outcome(attempt: Attempt) -> dict[str, object]:
 
 def _drive(attempt: Attempt) -> dict[str, object]:
     evaluation, trace = attempt.evaluation, attempt.hazard.trace()
-    begun, ended = (evaluation.begun if evaluation else 0.0), attempt.ended_at
+    begun, ended = (evaluation.started_at if evaluation else 0.0), attempt.ended_at
     return {
         "distance_m": round(evaluation.distance_m, 2) if evaluation else 0.0,
         "time_s": round(ended - begun, 2) if evaluation and ended else None,

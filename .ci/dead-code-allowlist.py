@@ -90,7 +90,7 @@ _.ticks  # counters and views that tests assert on
 _.frames
 _.lost_bytes
 _.particles
-_.recomputed
+_.recompute
 _.refused
 _.resyncs
 _.scanning

@@ -235,4 +235,4 @@ async def test_a_zone_with_two_points_is_refused_with_remedy_and_field(floor: Fl
     answer = await floor.zone({"kind": "BLOCKED", "shape": {"type": "polygon", "points": [[30, 28], [31, 28]]}})
     assert answer.status == 422
     assert [error["field"] for error in answer.body["errors"]] == ["body.shape.points"]
-    assert "an outline needs at least three corners: draw one more" in answer.reason
+    assert "a polygon needs at least three corners: add one" in answer.reason

@@ -1,4 +1,4 @@
-"""The running map-service with a real broker, Redis and router: what arrives, and what survives which death."""
+"""The running map-service with a real broker, Redis and router, each of them killed and restarted."""
 
 import asyncio
 import io
@@ -29,28 +29,28 @@ pytestmark = pytest.mark.live
 CIRCLE = {"kind": "BLOCKED", "shape": {"type": "circle", "centre": [6.0, 3.0], "radius": 0.5}, "reason": "wet floor"}
 
 
-async def first(ask, good):
-    """Ask until the answer is good, and return it."""
+async def poll(request, accepted):
+    """Repeat a request until its reply is accepted, and return that reply."""
     async with asyncio.timeout(15):
         while True:
-            answer = await ask()
-            if good(answer):
-                return answer
+            reply = await request()
+            if accepted(reply):
+                return reply
             await asyncio.sleep(0.02)
 
 
 class Robot:
-    """Keeps a replica as a robot does, and notes what came."""
+    """Follows the map as a robot does, and records what it receives."""
 
     def __init__(self, zenoh) -> None:
         self.zenoh = zenoh
         self.replica = Replica()
         self.deltas: list[MapDelta] = []
-        self.beats: list[MapHeartbeat] = []
+        self.heartbeats: list[MapHeartbeat] = []
         self.hazards: list[HazardArea] = []
         self.zones: list[ZoneSet] = []
         zenoh.subscribe(ch.MAP_DELTA, MapDelta, self._on_delta)
-        zenoh.subscribe(ch.MAP_HEARTBEAT, MapHeartbeat, lambda _, m: self.beats.append(m))
+        zenoh.subscribe(ch.MAP_HEARTBEAT, MapHeartbeat, lambda _, m: self.heartbeats.append(m))
         zenoh.subscribe(ch.HAZARD, HazardArea, lambda _, m: self.hazards.append(m))
         zenoh.subscribe(ch.ZONES, ZoneSet, lambda _, m: self.zones.append(m))
 
@@ -59,8 +59,8 @@ class Robot:
             self.deltas.append(delta)
 
     async def load(self) -> None:
-        ask = partial(self.zenoh.query, ch.MAP_SNAPSHOT, None, MapSnapshot, 1.0)
-        self.replica.load(await first(ask, lambda snapshot: snapshot is not None))
+        request = partial(self.zenoh.query, ch.MAP_SNAPSHOT, None, MapSnapshot, 1.0)
+        self.replica.load(await poll(request, lambda snapshot: snapshot is not None))
 
     def cost(self, x: float, y: float) -> int:
         column, row = self.replica.geometry.cell(x, y)
@@ -69,7 +69,7 @@ class Robot:
 
 @asynccontextmanager
 async def running(fog, *modules: str):
-    """Start processes (the map-service among them or before); give its client, a robot, and the broker's side."""
+    """Start processes (unless the map-service runs already); yield its HTTP client, a robot and an MQTT edge."""
     for module in modules:
         fog.start(module)
     url = await fog.ready("map_service")
@@ -89,7 +89,7 @@ def hazard(state: str, seq: int) -> AreaHazard:
     return AreaHazard(area="hall", state=state, severity=3, penalty=penalty, since=0, seq=seq, epoch=1, cause="test")
 
 
-async def test_five_readings_in_the_corridor_become_lethal_cells_at_the_robot(fog, until):
+async def test_five_blocked_readings_become_lethal_cells_on_the_robots_map(fog, until):
     pytest.importorskip("hazard_aggregator")
     async with running(fog, "hazard_aggregator", "map_service") as (_, robot, mqtt):
         await fog.ready("hazard_aggregator")
@@ -108,37 +108,39 @@ async def test_five_readings_in_the_corridor_become_lethal_cells_at_the_robot(fo
         assert asked.hazard.state == "blocked"
 
 
-async def test_a_map_service_that_never_hears_an_aggregator_calls_nothing_clear(fog, until):
+async def test_no_area_is_clear_without_an_aggregator(fog, until):
     async with running(fog, "map_service") as (client, robot, mqtt):
         await mqtt.publish(ch.AREA_HAZARD, hazard("clear", 1), area="hall")
-        ask = partial(client.get, "/api/v1/hazards")
-        answer = await first(ask, lambda got: "aggregator is gone" in got.json()[0]["hazard"]["cause"])
+        request = partial(client.get, "/api/v1/hazards")
+        answer = await poll(
+            request, lambda got: "aggregator or the broker is not connected" in got.json()[0]["hazard"]["cause"]
+        )
         assert answer.json()[0]["hazard"]["state"] == "unknown"
-        await until(lambda: robot.beats, "it beats all the same")
+        await until(lambda: robot.heartbeats, "heartbeats")
         await mqtt.publish(ch.AREA_HAZARD, hazard("blocked", 2), area="hall")
         await until(lambda: robot.cost(3.5, 3.0) == LETHAL, "lethal", lambda: fog.log("map_service"))
 
 
-async def test_a_drawn_zone_reaches_the_robot_and_survives_a_kill(fog, until, tokens):
+async def test_zone_reaches_the_robot_and_survives_a_kill_of_the_map_service(fog, until, tokens):
     async with running(fog, "map_service") as (client, robot, _):
         answer = await client.post("/api/v1/zones", json=CIRCLE, headers=tokens["operator"])
         assert answer.status_code == 201, answer.text
         zone = answer.json()
         assert (zone["author"], zone["version"], answer.headers["etag"]) == ("anna", 1, '"1"')
-        await until(lambda: robot.cost(6.0, 3.0) == LETHAL, "the delta", lambda: fog.log("map_service"))
+        await until(lambda: robot.cost(6.0, 3.0) == LETHAL, "lethal", lambda: fog.log("map_service"))
         await until(lambda: robot.zones and robot.zones[-1].zones, "the reason")
         assert robot.deltas[-1].causes[0].id == zone["id"]
         epoch = robot.replica.version.epoch
         fog.kill("map_service")
         fog.start("map_service")
         await fog.ready("map_service")
-        await until(lambda: robot.beats[-1].epoch > epoch, "a new epoch")
+        await until(lambda: robot.heartbeats[-1].epoch > epoch, "a new epoch")
         assert robot.replica.version.epoch == epoch
         await robot.load()
         assert robot.cost(6.0, 3.0) == LETHAL
 
 
-async def test_zones_are_changed_by_version_and_audited(shared_fog, tokens):
+async def test_zones_are_versioned_and_audited(shared_fog, tokens):
     async with running(shared_fog) as (client, _, _):
         operator = tokens["operator"]
         body = {**CIRCLE, "id": "wet"}
@@ -163,20 +165,20 @@ async def test_zones_are_changed_by_version_and_audited(shared_fog, tokens):
         assert entries[1]["before"]["reason"] == "wet floor"
 
 
-async def test_of_eight_concurrent_changes_to_one_version_one_is_made(shared, tokens):
+async def test_one_of_eight_concurrent_changes_to_a_version_succeeds(client, tokens):
     body = {**CIRCLE, "id": "contested"}
-    assert (await shared.post("/api/v1/zones", json=body, headers=tokens["operator"])).status_code == 201
+    assert (await client.post("/api/v1/zones", json=body, headers=tokens["operator"])).status_code == 201
     headers = {**tokens["operator"], "If-Match": '"1"'}
     answers = await asyncio.gather(
-        *(shared.put("/api/v1/zones/contested", json=CIRCLE, headers=headers) for _ in range(8))
+        *(client.put("/api/v1/zones/contested", json=CIRCLE, headers=headers) for _ in range(8))
     )
     assert sorted(answer.status_code for answer in answers) == [200] + 7 * [412]
-    assert (await shared.get("/api/v1/zones/contested")).headers["etag"] == '"2"'
+    assert (await client.get("/api/v1/zones/contested")).headers["etag"] == '"2"'
 
 
-async def test_a_zone_that_cannot_be_is_refused_by_field(shared, tokens):
+async def test_invalid_zone_is_refused_naming_its_field(client, tokens):
     bowtie = [[1, 1], [2, 2], [2, 1], [1, 2]]
-    for change, field, words in (
+    for change, field, message in (
         ({"shape": {"type": "polygon", "points": [[1, 1], [2, 2]]}}, "body.shape.points", "three corners"),
         ({"shape": {"type": "polygon", "points": bowtie}}, "body.shape.points", "crosses itself"),
         ({"shape": {"type": "circle", "centre": [90, 3], "radius": 1}}, "body.shape", "off the map"),
@@ -184,37 +186,37 @@ async def test_a_zone_that_cannot_be_is_refused_by_field(shared, tokens):
         ({"kind": "CLOSED"}, "body.kind", "CLOSED"),
         ({"ttl_s": 5, "expires_at": 5}, "body.ttl_s", "not both"),
     ):
-        answer = await shared.post("/api/v1/zones", json={**CIRCLE, **change}, headers=tokens["operator"])
+        answer = await client.post("/api/v1/zones", json={**CIRCLE, **change}, headers=tokens["operator"])
         assert answer.status_code == 422
         assert answer.headers["content-type"] == "application/problem+json"
         (error,) = answer.json()["errors"]
         assert error["field"] == field
-        assert words in error["problem"]
+        assert message in error["problem"]
 
 
 @pytest.fixture
-async def shared(shared_fog):
+async def client(shared_fog):
     url = await shared_fog.ready("map_service")
     async with httpx.AsyncClient(base_url=url, timeout=15) as client:
         yield client
 
 
-async def test_only_operators_write_and_the_interface_is_described(shared, tokens):
-    assert (await shared.post("/api/v1/zones", json=CIRCLE)).status_code == 401
-    assert (await shared.post("/api/v1/zones", json=CIRCLE, headers=tokens["viewer"])).status_code == 403
-    described = (await shared.get("/openapi.json")).json()
+async def test_only_operators_write_and_openapi_describes_the_routes(client, tokens):
+    assert (await client.post("/api/v1/zones", json=CIRCLE)).status_code == 401
+    assert (await client.post("/api/v1/zones", json=CIRCLE, headers=tokens["viewer"])).status_code == 403
+    described = (await client.get("/openapi.json")).json()
     assert {"/api/v1/zones", "/api/v1/zones/{zone_id}", "/api/v1/hazards", "/api/v1/map"} <= set(described["paths"])
     assert "ZoneBody" in described["components"]["schemas"]
-    info = (await shared.get("/api/v1/map")).json()
+    info = (await client.get("/api/v1/map")).json()
     assert info["geometry"]["width"] == 160
     for name in ("map", "costmap"):
-        picture = Image.open(io.BytesIO((await shared.get(f"/api/v1/{name}.png")).content))
+        picture = Image.open(io.BytesIO((await client.get(f"/api/v1/{name}.png")).content))
         assert picture.size == (160, 120)
         assert np.asarray(picture)[0, 0] == LETHAL
-    assert (await shared.get("/api/v1/places")).json() == {}
+    assert (await client.get("/api/v1/places")).json() == {}
 
 
-async def test_without_redis_zones_stay_writes_wait_and_a_restart_serves_nothing_until_they_are_read(
+async def test_without_redis_zones_stay_writes_fail_and_a_restart_serves_no_map_until_zones_are_loaded(
     fog, until, tokens
 ):
     async with running(fog, "map_service") as (client, robot, _):
@@ -231,28 +233,28 @@ async def test_without_redis_zones_stay_writes_wait_and_a_restart_serves_nothing
             report = (await restarted.get("/readyz")).json()
             assert {"store", "zones", "map"} <= set(report["missing"])
             assert (await restarted.get("/api/v1/zones")).status_code == 503
-            robot.beats.clear()
-            # It has tried to read the zones several times and waited long enough for hazards: only they hold it back.
-            tries = partial(restarted.get, "/readyz")
+            robot.heartbeats.clear()
+            # Long enough for several attempts to load the zones, and for the hazards: only the zones are missing.
             for _ in range(15):
-                assert "zones" in (await tries()).json()["missing"]
+                assert "zones" in (await restarted.get("/readyz")).json()["missing"]
                 await asyncio.sleep(0.1)
-            assert robot.beats == []
+            assert robot.heartbeats == []
             fog.redis.start()
-            await until(lambda: robot.beats, "the heart beats again", lambda: fog.log("map_service"))
+            await until(lambda: robot.heartbeats, "heartbeats again", lambda: fog.log("map_service"))
             await robot.load()
             assert robot.cost(6.0, 3.0) == LETHAL
 
 
-async def test_hazards_are_back_after_the_broker_was_killed_and_garbage_stops_nothing(fog, until):
+async def test_hazards_arrive_after_malformed_messages_and_a_restart_of_the_broker(fog, until):
     async with running(fog, "hazard_aggregator", "map_service") as (client, robot, mqtt):
         await fog.ready("hazard_aggregator")
         hall = {"site": "test", "area": "hall"}
         await mqtt._client.publish(ch.AREA_HAZARD.key(**hall), b"x" * 200_000, qos=1, timeout=30)
         await mqtt._client.publish(ch.AREA_DEFINITION.key(**hall), json.dumps({"id": "hall"}).encode(), qos=1)
-        refused = ('{channel="area_hazard"} 1.0', '{channel="area_definition"} 1.0')
-        ask = partial(client.get, "/metrics")
-        await first(ask, lambda answer: all(f"fognav_refused_messages_total{line}" in answer.text for line in refused))
+        counter = 'fognav_refused_messages_total{{channel="{}"}} 1.0'
+        counters = [counter.format(channel) for channel in ("area_hazard", "area_definition")]
+        request = partial(client.get, "/metrics")
+        await poll(request, lambda reply: all(line in reply.text for line in counters))
         fog.mosquitto.kill()
         (fog.mosquitto.folder / "mosquitto.db").unlink(missing_ok=True)
         fog.mosquitto.start()
@@ -268,7 +270,7 @@ async def test_hazards_are_back_after_the_broker_was_killed_and_garbage_stops_no
         assert robot.cost(3.5, 3.0) == LETHAL, fog.log("map_service")
 
 
-async def test_a_robots_obstacles_are_shared_and_vanish(shared_fog, until):
+async def test_obstacles_of_a_robot_are_on_the_map_until_they_expire(shared_fog, until):
     async with running(shared_fog) as (_, robot, _):
         seen = RobotObstacles(points=[(1.0, 1.0)], stamp=1.0, ttl=0.5)
         robot.zenoh.publish(ch.ROBOT_OBSTACLES, seen, robot="r1")
@@ -276,7 +278,7 @@ async def test_a_robots_obstacles_are_shared_and_vanish(shared_fog, until):
         await until(lambda: robot.cost(1.0, 1.0) == 0, "gone")
 
 
-async def test_an_aggregator_that_dies_leaves_no_area_clear(fog, until):
+async def test_clear_area_becomes_unknown_when_the_aggregator_dies(fog, until):
     async with running(fog, "hazard_aggregator", "map_service") as (_, robot, mqtt):
         await fog.ready("hazard_aggregator")
         for seq in range(300):

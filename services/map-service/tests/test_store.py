@@ -1,4 +1,4 @@
-"""Zones in a real Redis: versions, repeated writes, crashes."""
+"""Zones in a real Redis: versions, repeated writes, kills."""
 
 import asyncio
 from pathlib import Path
@@ -24,7 +24,7 @@ def zone(version: int = 1, radius: float = 0.5) -> Zone:
     return Zone(id="z1", kind="BLOCKED", shape=CircleShape(centre=(1.0, 1.0), radius=radius), version=version)
 
 
-async def test_a_version_is_written_once_and_a_stale_one_is_refused(redis: Server):
+async def test_version_is_written_once_and_a_stale_one_is_refused(redis: Server):
     async with Store(redis.url, "test") as store:
         assert await store.put(zone(), expected=0, audit=AUDIT) == "ok"
         assert await store.put(zone(radius=0.7), expected=0, audit=AUDIT) == "exists"
@@ -36,7 +36,7 @@ async def test_a_version_is_written_once_and_a_stale_one_is_refused(redis: Serve
         assert await store.zones() == []
 
 
-async def test_a_repeated_write_counts_once(redis: Server):
+async def test_repeated_write_leaves_one_audit_entry(redis: Server):
     async with Store(redis.url, "test") as store, Redis.from_url(redis.url) as raw:
         for _ in range(2):
             assert await store.put(zone(), expected=0, audit=AUDIT) == "ok"
@@ -56,7 +56,7 @@ async def test_acknowledged_zones_survive_kills_of_redis(redis: Server):
             assert await store.zones() == [zone(version)]
 
 
-async def test_a_dead_redis_is_a_store_error_and_epochs_go_on(redis: Server):
+async def test_write_to_a_dead_redis_is_a_store_error_and_epochs_still_grow(redis: Server):
     async with Store(redis.url, "test") as store:
         first = await store.begin_epoch("map")
         assert await store.begin_epoch("map") > first
@@ -67,7 +67,7 @@ async def test_a_dead_redis_is_a_store_error_and_epochs_go_on(redis: Server):
         assert await store.begin_epoch("map") > first
 
 
-async def test_what_is_no_zone_is_an_error_not_a_missing_zone(redis: Server):
+async def test_unreadable_zone_is_a_store_error(redis: Server):
     async with Store(redis.url, "test") as store, Redis.from_url(redis.url) as raw:
         await raw.hset("fog:test:zones", "z1", b'{"id": "z1"}')
         with pytest.raises(StoreError, match="fog:test:zones"):

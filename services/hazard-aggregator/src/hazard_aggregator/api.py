@@ -89,7 +89,7 @@ def _add_areas(routes: Routes, service: Service, geometry: GridGeometry) -> None
     routes.raises(
         ConflictError,
         {412: "Somebody else changed the area"},
-        lambda error: ProblemError(412, f"{error}: read it again, then repeat your change"),
+        lambda error: ProblemError(412, f"{error}: read it again, then retry"),
     )
 
     def area_views() -> dict[str, AreaView]:

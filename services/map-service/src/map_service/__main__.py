@@ -1,4 +1,4 @@
-"""The map-service: `python -m map_service`, told by FOGNAV_* in the environment. Safe to kill and start at any time."""
+"""The map-service: `python -m map_service`, configured by FOGNAV_* variables. Safe to kill and restart at any time."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _log = logs.get("map")
 
 
 async def main() -> None:
-    """Connect, read what is stored, then keep the map until cancelled."""
+    """Connect, load the stored zones, then maintain the map until cancelled."""
     settings = load(Settings, environ=os.environ)
     logs.configure("map-service", settings.log_level, settings.log_format)
     _log.info("settings_loaded", **describe(settings))

@@ -1,6 +1,6 @@
-"""REST under /api/v1: zones for operators; hazards, places, map, costmap and audit entries to look at.
+"""REST under /api/v1: reading and writing zones; reading hazards, places, map, costmap and audit log.
 
-Reading needs no token but for the audit log; writing needs the role operator.
+Reading needs no token, except for the audit log; writing needs the role operator.
 """
 
 import asyncio
@@ -47,13 +47,13 @@ from map_service.store import AuditEntry, StoreError
 from map_service.zone_validation import ZoneError
 
 _PNG: Final = "image/png"
-_NOT_READ: Final = {503: "The stored zones are not read yet, or the store does not answer"}
-_UNKNOWN: Final = {404: "There is no such zone", **_NOT_READ}
+_ZONES_NOT_LOADED: Final = {503: "The stored zones are not loaded yet, or the store does not answer"}
+_NO_SUCH_ZONE: Final = {404: "No zone has this id", **_ZONES_NOT_LOADED}
 _RETRY_AFTER: Final = {"Retry-After": "1"}
 
 
 class ZoneBody(Message, frozen=True, kw_only=True):
-    """What an operator draws; without `id` one is made up; `ttl_s` (s from now) is another way to say `expires_at`."""
+    """A zone that an operator draws; without `id` one is generated; `ttl_s` (s from now) may replace `expires_at`."""
 
     id: Id | None = None
     kind: ZoneKind
@@ -68,7 +68,7 @@ class ZoneBody(Message, frozen=True, kw_only=True):
 
 
 class ZoneList(Message, frozen=True, kw_only=True):
-    """All zones, the ids of those that hold now, and the map version that shows them."""
+    """All zones, the ids of the active ones, and the map version that contains them."""
 
     zones: list[Zone]
     active: list[str]
@@ -77,7 +77,7 @@ class ZoneList(Message, frozen=True, kw_only=True):
 
 
 class MapInfo(Message, frozen=True, kw_only=True):
-    """The map's geometry and version; pictures have the geometry's size, their first row is the map's top."""
+    """The map's geometry and version; its images have the geometry's size, and their first row is the map's top."""
 
     site: str
     geometry: MapGeometry
@@ -96,106 +96,110 @@ def make_api(service: Service, site: Site, clock: Clock, health: Health, tokens:
 def _add_zones(routes: Routes, service: Service, clock: Clock) -> None:
     _add_errors(routes)
 
-    @routes.get("/api/v1/zones", problems=_NOT_READ)
+    @routes.get("/api/v1/zones", problems=_ZONES_NOT_LOADED)
     async def list_zones() -> ZoneList:
-        """List all zones with the map version that shows them."""
-        _check_read(service)
+        """List all zones with the map version that contains them."""
+        _require_zones(service)
         version = service.core.costmap.version
         zones = service.core.zones()
         return ZoneList(zones=zones, active=service.core.active_zones(), epoch=version.epoch, seq=version.seq)
 
-    @routes.post("/api/v1/zones", status=201, raises=[ZoneError, ConflictError, StoreError], problems=_NOT_READ)
+    @routes.post("/api/v1/zones", status=201, raises=[ZoneError, ConflictError, StoreError], problems=_ZONES_NOT_LOADED)
     async def create_zone(body: Body[ZoneBody], caller: Operator) -> Answer[Zone]:
-        """Draw a zone; the answer comes once it is stored for good and on the map."""
-        _check_read(service)
-        name = body.id or f"z-{secrets.token_hex(4)}"
-        zone = await service.create(_zone(body, name, caller.name, clock.stamp()), caller.name)
+        """Add a zone; replies once it is durably stored and on the map."""
+        _require_zones(service)
+        zone_id = body.id or f"z-{secrets.token_hex(4)}"
+        zone = await service.create(_zone_from_body(body, zone_id, caller.name, clock.stamp()), caller.name)
         return Answer(zone, {**etag(zone.version), "Location": f"/api/v1/zones/{zone.id}"})
 
-    @routes.get("/api/v1/zones/{zone_id}", problems=_UNKNOWN)
+    @routes.get("/api/v1/zones/{zone_id}", problems=_NO_SUCH_ZONE)
     async def get_zone(zone_id: str) -> Answer[Zone]:
         """Return one zone with its ETag."""
-        zone = _known(service, zone_id)
+        zone = _find_zone(service, zone_id)
         return Answer(zone, etag(zone.version))
 
-    @routes.put("/api/v1/zones/{zone_id}", raises=[ZoneError, ConflictError, StoreError], problems=_UNKNOWN)
+    @routes.put("/api/v1/zones/{zone_id}", raises=[ZoneError, ConflictError, StoreError], problems=_NO_SUCH_ZONE)
     async def put_zone(zone_id: str, body: Body[ZoneBody], caller: Operator, if_match: IfMatch = None) -> Answer[Zone]:
-        """Replace a zone; with If-Match only if nobody changed it since."""
+        """Replace a zone; with If-Match, only if it is unchanged."""
         if body.id not in (None, zone_id):
-            raise ProblemError(422, f"the path says {zone_id}: leave the id out or say the same", field="body.id")
-        old = _matching(service, zone_id, if_match)
-        zone = await service.replace(_zone(body, zone_id, caller.name, clock.stamp()), old.version, caller.name)
+            raise ProblemError(
+                422, f"the path names zone {zone_id}: leave the id out, or give the same id", field="body.id"
+            )
+        old = _find_matching(service, zone_id, if_match)
+        zone = await service.replace(
+            _zone_from_body(body, zone_id, caller.name, clock.stamp()), old.version, caller.name
+        )
         return Answer(zone, etag(zone.version))
 
-    @routes.delete("/api/v1/zones/{zone_id}", raises=[ConflictError, StoreError], problems=_UNKNOWN)
+    @routes.delete("/api/v1/zones/{zone_id}", raises=[ConflictError, StoreError], problems=_NO_SUCH_ZONE)
     async def delete_zone(zone_id: str, caller: Operator, if_match: IfMatch = None) -> None:
-        """Take a zone away; with If-Match only if nobody changed it since."""
-        await service.delete(_matching(service, zone_id, if_match), caller.name)
+        """Delete a zone; with If-Match, only if it is unchanged."""
+        await service.delete(_find_matching(service, zone_id, if_match), caller.name)
 
     @routes.get("/api/v1/audit", raises=[StoreError])
     async def audit(_caller: Viewer, limit: int = 100) -> list[AuditEntry]:
-        """Return who did what, newest first."""
+        """Return the audit log of the zones, newest first."""
         return await service.audit(max(1, min(limit, 1000)))
 
 
 def _add_errors(routes: Routes) -> None:
-    """Say which problem each exception of the service is."""
+    """Register the problem document of each exception that the service raises."""
     routes.raises(
         ZoneError,
-        {422: "The zone can't be used: `errors` names its fields"},
+        {422: "The zone is invalid: `errors` names its fields"},
         lambda error: ProblemError(422, error.message, field=f"body.{error.field}"),
     )
     routes.raises(
         StoreError,
-        {503: "The store does not answer, so nothing was changed for certain"},
+        {503: "The store does not answer; the change may not be stored"},
         lambda error: ProblemError(
             503,
-            f"the store does not answer, so nothing was changed for certain: try again ({error})",
+            f"the store does not answer, so the change may not be stored: try again ({error})",
             headers=_RETRY_AFTER,
         ),
     )
     routes.raises(
         ConflictError,
-        {409: "There is such a zone already", 412: "Somebody else changed it"},
+        {409: "A zone with this id exists already", 412: "Somebody else changed the zone"},
         lambda error: (
             ProblemError(409, f"zone {error.zone} exists already: choose another id, or PUT it")
             if error.outcome == "exists"
-            else ProblemError(412, f"zone {error.zone} was changed by somebody else: read it again and decide")
+            else ProblemError(412, f"zone {error.zone} was changed by somebody else: read it again, then retry")
         ),
     )
-    routes.raises(InvalidBodyError, {}, _with_remedy)
+    routes.raises(InvalidBodyError, {}, _with_remedies)
 
 
-def _with_remedy(error: InvalidBodyError) -> InvalidBodyError:
-    """Say what to do about an outline that is too short, in the operator's words."""
+def _with_remedies(error: InvalidBodyError) -> InvalidBodyError:
+    """Add a remedy to the errors about shapes with too few points."""
     remedies = {
-        "body.shape.points": "an outline needs at least three corners: draw one more",
-        "body.shape.line": "a corridor needs at least two points: draw one more",
+        "body.shape.points": "a polygon needs at least three corners: add one",
+        "body.shape.line": "a corridor needs at least two points: add one",
     }
     errors = [
-        {**known, "problem": f"{known['problem']}; {remedies[known['field']]}"}
-        if known["field"] in remedies and "length" in known["problem"]
-        else known
-        for known in error.errors
+        {**entry, "problem": f"{entry['problem']}; {remedies[entry['field']]}"}
+        if entry["field"] in remedies and "length" in entry["problem"]
+        else entry
+        for entry in error.errors
     ]
     return InvalidBodyError(errors)
 
 
 def _add_views(routes: Routes, service: Service, site: Site) -> None:
     core, costmap = service.core, service.core.costmap
-    pictures: dict[str, tuple[object, bytes]] = {}
+    images: dict[str, tuple[object, bytes]] = {}
 
-    async def picture(name: str, cells: Grid, palette: bytes) -> Response:
-        """Encode off the loop, once per version; the pixels' values are the cells'."""
-        known = pictures.get(name)
-        if known is None or known[0] != costmap.version:
-            # The copy is taken before the loop can change the map.
-            pictures[name] = known = (costmap.version, await asyncio.to_thread(_png, cells.copy(), palette))
-        return Response(known[1], media_type=_PNG, headers={"Cache-Control": "no-cache"})
+    async def image(name: str, cells: Grid, palette: bytes) -> Response:
+        """Return a PNG whose pixel values are the cells'; encoded in a thread, once per map version."""
+        cached = images.get(name)
+        if cached is None or cached[0] != costmap.version:
+            # Copied before the event loop can change the map.
+            images[name] = cached = (costmap.version, await asyncio.to_thread(_png, cells.copy(), palette))
+        return Response(cached[1], media_type=_PNG, headers={"Cache-Control": "no-cache"})
 
     @routes.get("/api/v1/hazards")
     async def hazards() -> list[HazardArea]:
-        """Return every area with its hazard as it stands on the map."""
+        """Return every area with its hazard as on the map."""
         return core.hazards()
 
     @routes.get("/api/v1/places")
@@ -215,43 +219,43 @@ def _add_views(routes: Routes, service: Service, site: Site) -> None:
     @routes.get("/api/v1/map.png", media_type=_PNG)
     async def map_png() -> Response:
         """Return the floor plan: white is free, black occupied, grey unknown."""
-        return await picture("map", costmap.static, _PLAN)
+        return await image("map", costmap.static, _PLAN)
 
-    @routes.get("/api/v1/costmap.png", media_type=_PNG, problems=_NOT_READ)
+    @routes.get("/api/v1/costmap.png", media_type=_PNG, problems=_ZONES_NOT_LOADED)
     async def costmap_png() -> Response:
         """Return the master costmap; a pixel's palette index is the cell's cost."""
-        _check_read(service)
-        return await picture("cost", costmap.cost, _COSTS)
+        _require_zones(service)
+        return await image("cost", costmap.cost, _COSTS)
 
 
-def _check_read(service: Service) -> None:
-    if not service.core.zones_are_read:
+def _require_zones(service: Service) -> None:
+    if not service.core.zones_loaded:
         raise ProblemError(
-            503, "the stored zones are not read yet: try again once /readyz says so", headers=_RETRY_AFTER
+            503, "the stored zones are not loaded yet: try again once /readyz reports ready", headers=_RETRY_AFTER
         )
 
 
-def _known(service: Service, zone_id: str) -> Zone:
-    _check_read(service)
+def _find_zone(service: Service, zone_id: str) -> Zone:
+    _require_zones(service)
     for zone in service.core.zones():
         if zone.id == zone_id:
             return zone
     raise ProblemError(404, f"there is no zone {zone_id}")
 
 
-def _matching(service: Service, zone_id: str, if_match: str | None) -> Zone:
-    zone = _known(service, zone_id)
+def _find_matching(service: Service, zone_id: str, if_match: str | None) -> Zone:
+    zone = _find_zone(service, zone_id)
     if expected_version(if_match) not in (None, zone.version):
-        detail = f"zone {zone_id} is at version {zone.version}, not {if_match}: read it again and decide"
+        detail = f"zone {zone_id} is at version {zone.version}, not {if_match}: read it again, then retry"
         raise ProblemError(412, detail)
     return zone
 
 
-def _zone(body: ZoneBody, name: str, author: str, stamp: float) -> Zone:
+def _zone_from_body(body: ZoneBody, zone_id: str, author: str, stamp: float) -> Zone:
     if body.ttl_s is not None and body.expires_at is not None:
         raise ProblemError(422, "give either ttl_s or expires_at, not both", field="body.ttl_s")
     return Zone(
-        id=name,
+        id=zone_id,
         kind=body.kind,
         shape=body.shape,
         factor=body.factor,
@@ -265,7 +269,7 @@ def _zone(body: ZoneBody, name: str, author: str, stamp: float) -> Zone:
 
 
 def _png(cells: Grid, palette: bytes) -> bytes:
-    """Return a PNG whose palette indices are the cells; the picture's first row is the grid's last."""
+    """Return a PNG whose palette indices are the cells; the image's first row is the grid's last."""
     image = Image.fromarray(np.ascontiguousarray(cells[::-1]))
     image.putpalette(palette)
     data = io.BytesIO()
@@ -274,11 +278,11 @@ def _png(cells: Grid, palette: bytes) -> bytes:
 
 
 def _palette(special: dict[int, tuple[int, int, int]]) -> bytes:
-    """Return 256 colours: graded costs run from near white to orange."""
+    """Return a palette of 256 colours: graded costs from near white to orange, other costs as in `special`."""
     colours = [(255, 250 - cost // 2, 240 - cost * 220 // 252) for cost in range(253)] + [(0, 0, 0)] * 3
     for cost, colour in special.items():
         colours[cost] = colour
-    return bytes(part for colour in colours for part in colour)
+    return bytes(channel for colour in colours for channel in colour)
 
 
 _PLAN: Final = _palette({0: (255, 255, 255), 254: (0, 0, 0), 255: (205, 205, 205)})

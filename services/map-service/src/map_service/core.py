@@ -1,7 +1,7 @@
-"""What the map-service decides: which inputs change the map, whether areas count as clear, when the map is served.
+"""The map-service's decisions: which inputs change the map, whether areas count as clear, when the map is served.
 
-Pure: every input comes with its `Moment`, and everything that is to be published is returned. The layers listen for
-themselves (`map_service.layers`), the costmap turns what they changed into versions (`map_service.costmap`).
+Pure: every input comes with its `Moment`, and everything to be published is returned. The layers handle the messages
+(`map_service.layers`), the costmap turns their changes into versions (`map_service.costmap`).
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ if TYPE_CHECKING:
 L = TypeVar("L", bound="CostLayer")
 
 AGGREGATOR_LOST_S: Final = 3.0
-"""How long (s) the aggregator, or the broker, may be gone until no area counts as clear any more."""
+"""How long (s) the aggregator or the broker may be disconnected until no area counts as clear any more."""
 
 
 class MapCore:
-    """The map-service's core; nothing is published before the map is whole (`serving`).
+    """The map-service's core; nothing is published before the map is complete (`serving`).
 
-    `layers` are bottom first, with a `HazardsLayer` and a `ZonesLayer` among them (`map_service.registry`).
-    `definitions` are areas known from the site: until the aggregator speaks of them they count as unknown.
-    `hazards_wait_s` is how long the first tick's map waits for the hazards of all areas.
+    `layers` are bottom first and include a `HazardsLayer` and a `ZonesLayer` (`map_service.registry`). `definitions` is
+    a list of the site's areas, which are unknown until the aggregator publishes their hazards. `hazards_wait_s` is how
+    long the map waits, from the first tick on, for the hazards of all areas.
     """
 
-    def __init__(  # noqa: PLR0913  # what the map is made of, each with its name
+    def __init__(  # noqa: PLR0913  # everything that the map consists of, by name
         self,
         site: str,
         static: StaticMap,
@@ -53,12 +53,12 @@ class MapCore:
         hazards_wait_s: float = 0.0,
     ) -> None:
         self._layers = layers
-        self._hazards = _only(layers, HazardsLayer)
-        self._zones = _only(layers, ZonesLayer)
+        self._hazards = _find_layer(layers, HazardsLayer)
+        self._zones = _find_layer(layers, ZonesLayer)
         for definition in definitions:
             self._hazards.define(definition)
         self.costmap = LayeredCostmap(site, static, layers, inflation, epoch)
-        self._zones_read = False
+        self._zones_loaded = False
         self._hazards_wait_s = hazards_wait_s
         self._serving = False
         self._first_tick: float | None = None
@@ -66,24 +66,24 @@ class MapCore:
         self._broker_connected = False
         self._aggregator_lost_since: float | None = None
 
-    # --- What it holds ----------------------------------------------------------------------------------------------
+    # --- State ------------------------------------------------------------------------------------------------------
 
     @property
     def serving(self) -> bool:
-        """Whether the map is whole and may be published and asked for."""
+        """Whether the map is complete, so that it is published and queries are answered."""
         return self._serving
 
     @property
-    def zones_are_read(self) -> bool:
+    def zones_loaded(self) -> bool:
         """Whether the stored zones are on the map."""
-        return self._zones_read
+        return self._zones_loaded
 
     def missing(self) -> str:
-        """Say what the map waits for before it is served; empty when it waits for nothing."""
-        if not self._zones_read:
-            return "the zones are not read yet"
+        """Return what must arrive before the map is served; empty when nothing is missing."""
+        if not self._zones_loaded:
+            return "the stored zones are not loaded yet"
         if not self._serving:
-            return f"waiting for the hazards of {', '.join(self._hazards.unheard()) or 'no area'}"
+            return f"waiting for the hazards of {', '.join(self._hazards.areas_without_hazard()) or 'no area'}"
         return ""
 
     def zones(self) -> list[Zone]:
@@ -91,11 +91,11 @@ class MapCore:
         return self._zones.zones()
 
     def active_zones(self) -> list[str]:
-        """Return the ids of the zones that hold now."""
+        """Return the ids of the zones that are in force now."""
         return self._zones.active()
 
     def zone_set(self) -> ZoneSet:
-        """Return all zones with the map version that shows them."""
+        """Return all zones with the map version that contains them."""
         version = self.costmap.version
         return ZoneSet(epoch=version.epoch, seq=version.seq, zones=self.zones())
 
@@ -106,19 +106,19 @@ class MapCore:
     # --- Channels ---------------------------------------------------------------------------------------------------
 
     def handlers(self) -> Mapping[Channel, Handler]:
-        """Return the handler of every channel that a layer listens to."""
-        listening: dict[Channel, list[Handler]] = {}
+        """Return the handler of every channel that a layer subscribes to."""
+        subscribed: dict[Channel, list[Handler]] = {}
         for layer in self._layers:
             for channel, handler in layer.handlers().items():
-                listening.setdefault(channel, []).append(handler)
-        return {channel: self._input(handlers) for channel, handlers in listening.items()}
+                subscribed.setdefault(channel, []).append(handler)
+        return {channel: self._combined(handlers) for channel, handlers in subscribed.items()}
 
     def query_handlers(self) -> Mapping[Channel, QueryHandler]:
-        """Return who answers queries, once the map is served."""
-        return {ch.MAP_SNAPSHOT: self._snapshot, ch.ZONES: self._zone_set, ch.HAZARD: self._hazard}
+        """Return the handler of every query; queries are answered once the map is served."""
+        return {ch.MAP_SNAPSHOT: self._answer_snapshot, ch.ZONES: self._answer_zones, ch.HAZARD: self._answer_hazard}
 
     def tick(self, at: Moment) -> list[Publication]:
-        """Let zones begin and end, obstacles expire, clear areas become unknown; call ten times a second."""
+        """Activate and end zones, expire obstacles, check the aggregator's liveliness; call ten times a second."""
         if self._first_tick is None:
             self._first_tick = at.now
         publications = self._check_aggregator_liveness(at)
@@ -126,58 +126,58 @@ class MapCore:
             publications += layer.tick(at)
         publications = self._commit(publications, at)
         if not self._serving:
-            if not self._is_whole(at.now):
+            if not self._is_complete(at.now):
                 return []
             self._serving = True
             publications = [*self._hazards.publications(), Publication(ch.ZONES, self.zone_set())]
         return [*publications, Publication(ch.MAP_HEARTBEAT, self.costmap.heartbeat(at.stamp))]
 
-    # --- What no channel carries ------------------------------------------------------------------------------------
+    # --- Inputs without a channel -----------------------------------------------------------------------------------
 
     def on_aggregator(self, name: str, at: Moment, *, alive: bool) -> list[Publication]:
-        """Take that an aggregator came or went, by its liveliness token."""
+        """Handle the appearance or loss of an aggregator's liveliness token."""
         (self._aggregators.add if alive else self._aggregators.discard)(name)
         return self._commit(self._check_aggregator_liveness(at), at)
 
     def on_broker(self, at: Moment, *, connected: bool) -> list[Publication]:
-        """Take whether the broker, which carries the aggregator's messages, is connected."""
+        """Record whether the broker, which carries the aggregator's messages, is connected."""
         self._broker_connected = connected
         return self._commit(self._check_aggregator_liveness(at), at)
 
     def load_zones(self, zones: Iterable[Zone], at: Moment) -> list[Publication]:
-        """Make the map's zones those that are stored; raises `ShapeError`, and changes nothing, for an unusable one."""
+        """Replace the map's zones by the stored ones; raises `ShapeError`, and changes nothing, for an invalid one."""
         self._zones.replace_all(zones, at.stamp)
-        self._zones_read = True
+        self._zones_loaded = True
         return self._commit([], at)
 
     def put_zone(self, zone: Zone, at: Moment) -> list[Publication]:
-        """Add or replace a zone that is stored; raises `ShapeError` for a shape that can't be used."""
+        """Add or replace a stored zone; raises `ShapeError` for an invalid shape."""
         self._zones.put(zone, at.stamp)
         return self._commit([], at)
 
     def remove_zone(self, zone_id: str, at: Moment) -> list[Publication]:
-        """Forget a zone that is not stored any more."""
+        """Remove a zone that is not stored any more."""
         self._zones.remove(zone_id)
         return self._commit([], at)
 
     # --- Inside -----------------------------------------------------------------------------------------------------
 
-    def _input(self, handlers: Sequence[Handler]) -> Handler:
+    def _combined(self, handlers: Sequence[Handler]) -> Handler:
         def handle(ids: Ids, message: object, at: Moment) -> list[Publication]:
             return self._commit([p for handler in handlers for p in handler(ids, message, at)], at)
 
         return handle
 
     def _commit(self, publications: list[Publication], at: Moment) -> list[Publication]:
-        """Turn what the layers changed into a version; return its deltas with the reasons, once the map is served."""
+        """Make a version of the layers' changes; return its deltas and all publications, once the map is served."""
         deltas = [Publication(ch.MAP_DELTA, delta) for delta in self.costmap.update(at.stamp)]
         zones = [Publication(ch.ZONES, self.zone_set())] if self._zones.take_changed() else []
         return [*deltas, *publications, *zones] if self._serving else []
 
     def _check_aggregator_liveness(self, at: Moment) -> list[Publication]:
-        """Let areas count as clear only while an aggregator is alive, and the broker between is connected.
+        """Let areas count as clear only while an aggregator is alive and the broker is connected.
 
-        An aggregator that has not appeared since the start counts as lost as one that left.
+        An aggregator that has not appeared since the start is lost, like one that disappeared.
         """
         if self._aggregators and self._broker_connected:
             self._aggregator_lost_since = None
@@ -188,23 +188,23 @@ class MapCore:
             return self._hazards.set_aggregator_lost(True)
         return []
 
-    def _is_whole(self, now: float) -> bool:
-        """Whether the zones are read and every area was heard of; after the wait, the others count as unknown."""
+    def _is_complete(self, now: float) -> bool:
+        """Whether zones and all hazards have arrived; areas whose hazard is missing after the wait are unknown."""
         waited = self._first_tick is not None and now - self._first_tick >= self._hazards_wait_s
-        return self._zones_read and (waited or not self._hazards.unheard())
+        return self._zones_loaded and (waited or not self._hazards.areas_without_hazard())
 
-    def _snapshot(self, _ids: Ids, _request: None, _at: Moment) -> MapSnapshot:
+    def _answer_snapshot(self, _ids: Ids, _request: None, _at: Moment) -> MapSnapshot:
         return self.costmap.snapshot()
 
-    def _zone_set(self, _ids: Ids, _request: None, _at: Moment) -> ZoneSet:
+    def _answer_zones(self, _ids: Ids, _request: None, _at: Moment) -> ZoneSet:
         return self.zone_set()
 
-    def _hazard(self, ids: Ids, _request: None, _at: Moment) -> HazardArea:
-        return next(described for described in self.hazards() if described.hazard.area == ids["area"])
+    def _answer_hazard(self, ids: Ids, _request: None, _at: Moment) -> HazardArea:
+        return next(area for area in self.hazards() if area.hazard.area == ids["area"])
 
 
-def _only(layers: Iterable[CostLayer], kind: type[L]) -> L:
+def _find_layer(layers: Iterable[CostLayer], kind: type[L]) -> L:
     for layer in layers:
         if isinstance(layer, kind):
             return layer
-    raise ValueError(f"the map-service can't do without its {kind.__name__}: name it among the layers")
+    raise ValueError(f"the map-service needs a {kind.__name__}: add it to the layers")

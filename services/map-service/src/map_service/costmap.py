@@ -1,4 +1,4 @@
-"""The master costmap: layers combined, inflated and turned into versions. Pure."""
+"""The master costmap: combines and inflates the layers, and versions the result. Pure."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ class StaticMap(Protocol):
 
     @property
     def cells(self) -> Grid:
-        """The plan itself."""
+        """The cells of the plan."""
 
 
 class LayeredCostmap:
-    """Holds the versioned map that its layers (bottom first) and inflation make."""
+    """The versioned map that its layers (bottom first) and inflation result in."""
 
     def __init__(
         self, site: str, static: StaticMap, layers: Sequence[CostLayer], inflation: Inflation, epoch: int
@@ -42,15 +42,15 @@ class LayeredCostmap:
         self.geometry = static.geometry
         self._layers = layers
         for layer in layers:
-            layer.take_updated()  # all of it is computed here
-        self._raw, speed = self._computed(self.geometry.whole)
+            layer.take_updated()  # everything is computed below
+        self._raw, speed = self._combine_layers(self.geometry.whole)
         self._inflation = InflationLayer(self._raw, static.geometry.resolution, inflation)
         self._master = MasterMap(site, static.geometry, static.cells, self._inflation.cost, epoch)
         self._master.write([("speed", self.geometry.whole, speed)], [], [])
 
     @property
     def version(self) -> Version:
-        """The version that holds now."""
+        """The current version."""
         return self._master.version
 
     @property
@@ -76,23 +76,23 @@ class LayeredCostmap:
         """Return the whole map."""
         return self._master.snapshot()
 
-    def recomputed(self) -> tuple[Grid, Grid]:
-        """Return cost and speed layer computed from scratch: what the master must equal, cell by cell."""
-        raw, speed = self._computed(self.geometry.whole)
-        return self._inflation.whole(raw), speed
+    def recompute(self) -> tuple[Grid, Grid]:
+        """Return cost and speed layer computed from scratch; the master must equal them, cell by cell."""
+        raw, speed = self._combine_layers(self.geometry.whole)
+        return self._inflation.inflate_all(raw), speed
 
     def update(self, stamp: float) -> list[MapDelta]:
-        """Compute anew what layers marked as updated; return the deltas of the new version, none when no cell differs.
+        """Recompute the layers' updated bounds; return the deltas of the new version, none when no cell differs.
 
-        `stamp` (s since the epoch) enters the traces of hazards that caused it.
+        `stamp` (s since the epoch) is added to the traces of the hazards that caused it.
         """
         updated = [bounds for layer in self._layers for bounds in layer.take_updated()]
         if not updated:
             return []
-        windows = merged([bounds.window for bounds in updated])
+        windows = merge_overlapping([bounds.window for bounds in updated])
         changes: list[tuple[Layer, Window, Grid]] = []
         for window in windows:
-            cost, speed = self._computed(window)
+            cost, speed = self._combine_layers(window)
             self._raw[window.rows, window.columns] = cost
             changes.append(("speed", window, speed))
         changes.extend(
@@ -107,7 +107,7 @@ class LayeredCostmap:
         }
         return self._master.write(changes, causes, list[Trace](traces.values()))
 
-    def _computed(self, window: Window) -> tuple[Grid, Grid]:
+    def _combine_layers(self, window: Window) -> tuple[Grid, Grid]:
         """Return cost (not inflated) and speed limit of a window, combined from all layers."""
         cost = np.zeros((window.height, window.width), dtype=np.uint8)
         speed = np.zeros((window.height, window.width), dtype=np.uint8)
@@ -116,19 +116,19 @@ class LayeredCostmap:
         return cost, speed
 
 
-def merged(windows: list[Window]) -> list[Window]:
-    """Unite windows that overlap, so that no cell is computed twice; windows apart stay apart and small."""
+def merge_overlapping(windows: list[Window]) -> list[Window]:
+    """Merge overlapping windows, so that no cell is computed twice; disjoint windows stay separate and small."""
     result: list[Window] = []
     for window in windows:
         if window.empty:
             continue
         grown = window
-        apart = []
+        disjoint = []
         for other in result:
             if grown.intersection(other).empty:
-                apart.append(other)
+                disjoint.append(other)
             else:
                 grown = grown.union(other)
-        # Having grown, it may overlap one that it did not before.
-        result = [*apart, grown] if grown == window else merged([*apart, grown])
+        # Once grown, it may overlap further windows.
+        result = [*disjoint, grown] if grown == window else merge_overlapping([*disjoint, grown])
     return result

@@ -1,4 +1,4 @@
-"""Cost layers by name, ours like anybody's: what installed packages registered as entry points."""
+"""Cost layers by name: those that installed packages, this one included, registered as entry points."""
 
 from __future__ import annotations
 
@@ -14,32 +14,32 @@ if TYPE_CHECKING:
     from map_service.costmap import StaticMap
 
 GROUP: Final = "fognav.cost_layers"
-STANDARD: Final = ("static", "hazards", "zones", "obstacles")
-"""The layers of a site that chooses none, bottom first."""
+DEFAULT_LAYERS: Final = ("static", "hazards", "zones", "obstacles")
+"""The layers of a site that configures none, bottom first."""
 
 
 class LayersError(ValueError):
-    """A site's choice of layers that can't be used; the message names the entry, the field and the remedy."""
+    """A site's configuration of layers is invalid; the message names the entry, the field and the remedy."""
 
 
-def make_layers(static: StaticMap, chosen: Sequence[str | Mapping[str, Any]] = ()) -> list[CostLayer]:
+def make_layers(static: StaticMap, configured: Sequence[str | Mapping[str, Any]] = ()) -> list[CostLayer]:
     """Return a site's layers over its floor plan, bottom first; raises `LayersError`.
 
-    An entry is a layer's name, or a table with its `name` and its own options. The floor plan (`static`) is at the
-    bottom, hazards and zones are never missing.
+    An entry is a layer's name, or a table with its `name` and its options. The floor plan (`static`) must be the bottom
+    layer; `hazards` and `zones` are mandatory.
     """
-    entries = [{"name": entry} if isinstance(entry, str) else dict(entry) for entry in chosen or STANDARD]
+    entries = [{"name": entry} if isinstance(entry, str) else dict(entry) for entry in configured or DEFAULT_LAYERS]
     names = [entry.get("name", "") for entry in entries]
-    if names[0] != STANDARD[0]:
-        raise LayersError(f"layers[0]: {STANDARD[0]!r} has to be the first, at the bottom. Put it there")
-    for needed in STANDARD[:3]:
-        if names.count(needed) != 1:
-            raise LayersError(f"layers: {needed!r} has to be there once. List it, without it robots would be misled")
+    if names[0] != DEFAULT_LAYERS[0]:
+        raise LayersError(f"layers[0]: {DEFAULT_LAYERS[0]!r} must be the first (bottom) layer. Move it there")
+    for mandatory in DEFAULT_LAYERS[:3]:
+        if names.count(mandatory) != 1:
+            raise LayersError(f"layers: {mandatory!r} must occur exactly once. List it once: robots rely on it")
     plan = FloorPlan(static.geometry, static.cells)
-    return [_layer(plan, index, entry) for index, entry in enumerate(entries)]
+    return [_make_layer(plan, index, entry) for index, entry in enumerate(entries)]
 
 
-def _layer(plan: FloorPlan, index: int, entry: dict[str, Any]) -> CostLayer:
+def _make_layer(plan: FloorPlan, index: int, entry: dict[str, Any]) -> CostLayer:
     name = str(entry.pop("name", ""))
     try:
         factory: LayerFactory[Any] = parts.load(GROUP, name, LayerFactory)

@@ -1,4 +1,4 @@
-"""Between the core and the world: publishes what the core returns, and stores zones before they count."""
+"""Runs the core: publishes what it returns, and stores zones before they take effect."""
 
 from __future__ import annotations
 
@@ -29,21 +29,23 @@ if TYPE_CHECKING:
     from map_service.store import AuditEntry, Outcome, Store
 
 TICK_S = ch.MAP_HEARTBEAT.period_s
-RETRY_S = 0.5
-AGGREGATOR = "hazard-aggregator"
+STORE_PERIOD_S = 0.5
+AGGREGATOR_ROLE = "hazard-aggregator"
 
-VERSION = Gauge("fognav_map_seq", "Version (seq) of the map within this epoch")
+VERSION = Gauge("fognav_map_seq", "Sequence number of the map version within this epoch")
 DELTA_BYTES = Histogram(
-    "fognav_map_delta_bytes", "Cells of one delta, packed", buckets=(64, 256, 1024, 2048, 4096, 16384, 65536)
+    "fognav_map_delta_bytes",
+    "Size of the cells of one delta, encoded",
+    buckets=(64, 256, 1024, 2048, 4096, 16384, 65536),
 )
-ZONES = Gauge("fognav_zones", "Zones that are stored", ["state"])
-ZONE_WRITES = Counter("fognav_zone_writes_total", "Writes of zones by outcome", ["outcome"])
+ZONES = Gauge("fognav_zones", "Zones, stored and active", ["state"])
+ZONE_WRITES = Counter("fognav_zone_writes_total", "Writes of zones to the store, by outcome", ["outcome"])
 
 _log = logs.get("map")
 
 
 class ConflictError(Exception):
-    """A write met another version than it expected."""
+    """A zone has another version than the writer expected, or exists already."""
 
     def __init__(self, outcome: Outcome, zone_id: str) -> None:
         super().__init__(f"zone {zone_id}: {outcome}")
@@ -64,42 +66,42 @@ class Service:
         self._clock = clock
         self._health = health
         self._edges = Edges(clock, mqtt=mqtt, zenoh=zenoh)
-        self._writing = asyncio.Lock()
-        self._in_doubt = False
-        self._answering = False
-        self._answered_areas: set[str] = set()
+        self._zone_lock = asyncio.Lock()
+        self._reload_zones = False
+        self._serving_queries = False
+        self._served_areas: set[str] = set()
 
     def subscribe(self) -> None:
         """Register the core's handlers; call before the connections run."""
         self._edges.subscribe(self.core.handlers(), self._publish)
-        self._zenoh.subscribe_liveliness(self._on_live)
+        self._zenoh.subscribe_liveliness(self._on_liveliness)
 
-    def _on_live(self, role: str, name: str, alive: bool) -> None:  # noqa: FBT001  # the edge's callback
-        if role == AGGREGATOR:
+    def _on_liveliness(self, role: str, name: str, alive: bool) -> None:  # noqa: FBT001  # the edge's callback
+        if role == AGGREGATOR_ROLE:
             self._publish(self.core.on_aggregator(name, self._edges.now(), alive=alive))
 
     async def tick_loop(self) -> None:
-        """Let time pass in the core, and answer queries once it serves the map."""
+        """Tick the core, and answer queries once it serves the map."""
         async for _ in ticker(self._clock, TICK_S):
             connected, at = self._mqtt.connected, self._edges.now()
             self._publish(self.core.on_broker(at, connected=connected))
             self._publish(self.core.tick(at))
-            if self.core.serving and not self._answering:
-                self._answering = True
+            if self.core.serving and not self._serving_queries:
+                self._serving_queries = True
                 query_handlers = self.core.query_handlers()
                 self._edges.serve({channel: query_handlers[channel] for channel in (ch.MAP_SNAPSHOT, ch.ZONES)})
             self._health.set("map", ok=self.core.serving, detail=self.core.missing())
-            self._health.set("mqtt", ok=connected, detail="" if connected else "no broker")
+            self._health.set("mqtt", ok=connected, detail="" if connected else "not connected to the broker")
 
-    # --- Zones: stored first, then they count -----------------------------------------------------------------------
+    # --- Zones: stored first, then put on the map -------------------------------------------------------------------
 
     async def create(self, zone: Zone, who: str) -> Zone:
         """Store a new zone and put it on the map; raises `ZoneError`, `ConflictError` (exists), `StoreError`."""
-        async with self._writing:
+        async with self._zone_lock:
             stamp = self._clock.stamp()
             zone = validated_zone(structs.replace(zone, version=1), self.core.costmap.geometry, stamp)
             if any(known.id == zone.id for known in self.core.zones()):
-                # The store would take a zone that is the very same for a repeated attempt.
+                # The store would treat an identical zone as a repeated attempt.
                 raise ConflictError("exists", zone.id)
             await self._write(
                 self._store.put(zone, expected=0, audit=Audit(at=stamp, who=who, action="create")), zone.id
@@ -109,9 +111,9 @@ class Service:
 
     async def replace(self, zone: Zone, expected: int, who: str) -> Zone:
         """Store a new version of a zone; raises `ZoneError`, `ConflictError` (stale, missing), `StoreError`."""
-        async with self._writing:
+        async with self._zone_lock:
             if not any(known.id == zone.id and known.version == expected for known in self.core.zones()):
-                # The store would take a zone that is the very same for a repeated attempt.
+                # The store would treat an identical zone as a repeated attempt.
                 raise ConflictError("stale", zone.id)
             stamp = self._clock.stamp()
             zone = validated_zone(structs.replace(zone, version=expected + 1), self.core.costmap.geometry, stamp)
@@ -122,7 +124,7 @@ class Service:
 
     async def delete(self, zone: Zone, who: str) -> None:
         """Delete this version of a zone; raises `ConflictError` (stale) and `StoreError`."""
-        async with self._writing:
+        async with self._zone_lock:
             audit = Audit(at=self._clock.stamp(), who=who, action="delete")
             await self._write(self._store.delete(zone, audit), zone.id)
             self._publish(self.core.remove_zone(zone.id, self._edges.now()))
@@ -135,64 +137,69 @@ class Service:
         try:
             outcome = await attempt
         except StoreError as error:
-            # It may have been written although the answer was lost: read again before trusting the memory.
-            self._in_doubt = True
+            # It may have been written although the reply was lost: reload the zones.
+            self._reload_zones = True
             self._health.set("store", ok=False, detail=str(error))
             ZONE_WRITES.labels("failed").inc()
             raise
         ZONE_WRITES.labels(outcome).inc()
         if outcome != "ok":
-            self._in_doubt = True
+            self._reload_zones = True
             raise ConflictError(outcome, zone_id)
 
-    async def read_zones(self) -> None:
-        """Make the map's zones those that are stored; raises `StoreError`."""
-        async with self._writing:
+    async def load_zones(self) -> None:
+        """Replace the map's zones by the stored ones; raises `StoreError`."""
+        async with self._zone_lock:
             zones = await self._store.zones()
             try:
                 self._publish(self.core.load_zones(zones, self._edges.now()))
             except ShapeError as error:
-                raise StoreError(f"a stored zone can't be used: {error}; repair or delete it") from error
-            self._in_doubt = False
-        self._health.set("zones", ok=True, detail=f"{len(zones)} read")
+                raise StoreError(f"a stored zone is invalid: {error}; repair or delete it") from error
+            self._reload_zones = False
+        self._health.set("zones", ok=True, detail=f"{len(zones)} loaded")
         self._health.set("store", ok=True)
 
     async def store_loop(self) -> None:
-        """Read the zones, however long it takes; afterwards watch the store and read again when in doubt."""
+        """Load the zones, retrying until the store answers; then monitor it, and reload after an uncertain write."""
         while True:
             try:
-                if self._in_doubt or not self.core.zones_are_read:
-                    await self.read_zones()
+                if self._reload_zones or not self.core.zones_loaded:
+                    await self.load_zones()
                     if warning := await self._store.durability_warning():
-                        _log.warning("store_is_weak", remedy=warning)
+                        _log.warning("store_not_durable", remedy=warning)
                 else:
                     await self._store.ping()
                     self._health.set("store", ok=True)
             except StoreError as error:
                 self._health.set("store", ok=False, detail=str(error))
-                if not self.core.zones_are_read:
-                    self._health.set("zones", ok=False, detail=f"not read yet, so the map is not served: {error}")
-            await asyncio.sleep(RETRY_S)
+                if not self.core.zones_loaded:
+                    self._health.set("zones", ok=False, detail=f"not loaded yet, so the map is not served: {error}")
+            await asyncio.sleep(STORE_PERIOD_S)
 
-    # --- What goes out ----------------------------------------------------------------------------------------------
+    # --- Publishing -------------------------------------------------------------------------------------------------
 
     def _publish(self, publications: Sequence[Publication]) -> None:
         for publication in publications:
             if isinstance(publication.message, MapDelta):
-                self._count_delta(publication.message)
+                self._record_delta(publication.message)
             elif isinstance(publication.message, ZoneSet):
                 ZONES.labels("stored").set(len(publication.message.zones))
                 ZONES.labels("active").set(len(self.core.active_zones()))
             self._edges.publish(publication)
-            if publication.channel is ch.HAZARD and publication.ids["area"] not in self._answered_areas:
-                self._answered_areas.add(publication.ids["area"])
+            if publication.channel is ch.HAZARD and publication.ids["area"] not in self._served_areas:
+                self._served_areas.add(publication.ids["area"])
                 self._edges.serve({ch.HAZARD: self.core.query_handlers()[ch.HAZARD]}, **publication.ids)
 
-    def _count_delta(self, delta: MapDelta) -> None:
+    def _record_delta(self, delta: MapDelta) -> None:
         DELTA_BYTES.observe(len(delta.cells))
         if delta.part > 0:
             return
         VERSION.set(delta.seq)
         for trace in delta.traces:
             metrics.observe_trace(trace, ["costmap"])
-        _log.info("version", seq=delta.seq, parts=delta.parts, causes=[f"{c.id} {c.state}" for c in delta.causes])
+        _log.info(
+            "map_version_published",
+            seq=delta.seq,
+            parts=delta.parts,
+            causes=[f"{c.id} {c.state}" for c in delta.causes],
+        )

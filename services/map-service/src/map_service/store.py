@@ -1,4 +1,4 @@
-"""Redis as the record of what operators drew: zones with optimistic versions, and who did what when."""
+"""The map-service's records in Redis: zones with optimistic versioning, and the audit log."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _ZONES: Final = Table("zones", "zone")
 
 
 class AuditEntry(Audit, frozen=True, kw_only=True):
-    """What was done to a zone; `before` and `after` are null where there was or is none."""
+    """A change of a zone; `before` and `after` are null where the zone did or does not exist."""
 
     zone: str
     before: Zone | None
@@ -26,7 +26,7 @@ class Store(RedisStore):
     """The map-service's keys."""
 
     async def zones(self) -> list[Zone]:
-        """Return all stored zones; one that can't be read is an error: a no-go zone must not be missing silently."""
+        """Return all stored zones; an unreadable one raises `StoreError`: a no-go zone must never be left out."""
         return list((await self._records(_ZONES.name, Zone)).values())
 
     async def put(self, zone: Zone, *, expected: int, audit: Audit) -> Outcome:
@@ -36,15 +36,15 @@ class Store(RedisStore):
     async def delete(self, zone: Zone, audit: Audit) -> Outcome:
         """Delete a zone durably if the stored version is this one's."""
         outcome = await self._swap(_ZONES, zone.id, None, str(zone.version), audit)
-        # Gone already is what was wanted: an attempt whose answer was lost, or somebody else's hand.
+        # The zone is deleted already: by an attempt whose reply was lost, or by somebody else.
         return "ok" if outcome == "missing" else outcome
 
     async def audit(self, limit: int) -> list[AuditEntry]:
         """Return the newest entries about zones, newest first."""
-        return [_entry(fields) for fields in await self.audit_entries(limit) if _ZONES.subject in fields]
+        return [_audit_entry(fields) for fields in await self.audit_entries(limit) if _ZONES.subject in fields]
 
 
-def _entry(fields: dict[str, str]) -> AuditEntry:
+def _audit_entry(fields: dict[str, str]) -> AuditEntry:
     before, after = (
         msgspec.json.decode(fields[name], type=Zone) if fields[name] else None for name in ("before", "after")
     )

@@ -1,4 +1,4 @@
-"""Zones checked before they are stored, in the operator's words. Pure."""
+"""Validates zones before they are stored, with errors that an operator understands. Pure."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class ZoneError(ValueError):
-    """A zone that can't be used: `field` is its path in the zone, the message says what is wrong and what to do."""
+    """A zone is invalid: `field` is the path of the field in the zone, the message names the problem and the remedy."""
 
     def __init__(self, field: str, message: str) -> None:
         super().__init__(f"{field}: {message}")
@@ -25,7 +25,7 @@ class ZoneError(ValueError):
 def validated_zone(zone: Zone, geometry: GridGeometry, stamp: float) -> Zone:
     """Return the zone as it is stored (polygons counter-clockwise); raises `ZoneError` that names field and remedy."""
     if zone.kind == "PENALTY" and zone.factor is None:
-        raise ZoneError("factor", "a PENALTY zone needs a factor of 1 or more: how much dearer its floor is")
+        raise ZoneError("factor", "a PENALTY zone needs a factor of 1 or more: how much more a free cell costs")
     if zone.kind == "SPEED_LIMIT" and zone.speed is None:
         raise ZoneError("speed", "a SPEED_LIMIT zone needs a speed in m/s")
     if zone.kind != "PENALTY" and zone.factor is not None:
@@ -33,7 +33,7 @@ def validated_zone(zone: Zone, geometry: GridGeometry, stamp: float) -> Zone:
     if zone.kind != "SPEED_LIMIT" and zone.speed is not None:
         raise ZoneError("speed", f"a {zone.kind} zone has no speed: leave it out or make the kind SPEED_LIMIT")
     if zone.expires_at is not None and zone.expires_at <= max(stamp, zone.starts_at or 0.0):
-        raise ZoneError("expires_at", "the zone would be over before it begins: give a later time, or leave it out")
+        raise ZoneError("expires_at", "the zone would end before it starts: give a later time, or leave it out")
     try:
         shape = normalized_shape(zone.shape)
         on_map = rasterize_shape(shape, geometry).mask.any()
@@ -44,6 +44,6 @@ def validated_zone(zone: Zone, geometry: GridGeometry, stamp: float) -> Zone:
         raise ZoneError(
             "shape",
             f"the zone lies off the map, which reaches from ({left:.2f}, {bottom:.2f}) to ({right:.2f}, {top:.2f}) m:"
-            " draw it there",
+            " move it onto the map",
         )
     return structs.replace(zone, shape=shape)

@@ -1,4 +1,4 @@
-"""What every cost layer does (after Nav2's `Layer`: bounds first, then costs inside a window)."""
+"""The interface of cost layers (after Nav2's `Layer`: first the updated bounds, then costs inside a window)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Grid = NDArray[np.uint8]
 
 
 class UpdatedBounds(NamedTuple):
-    """A window in which a layer's costs differ from before, and why."""
+    """A window in which a layer's costs changed, and why."""
 
     window: Window
     cause: Cause
@@ -34,43 +34,43 @@ class UpdatedBounds(NamedTuple):
 
 
 class CostLayer(ABC):
-    """One layer of the costmap; it overrides what it needs, `update_costs` always.
+    """One layer of the costmap; subclasses implement `update_costs` and override what else they need.
 
-    A layer that changed calls `mark_updated`; after every input and tick the map's windows that layers marked are
-    computed anew from all layers.
+    A layer that changes calls `mark_updated`; after every message and tick, the marked windows are recomputed from all
+    layers.
     """
 
     def __init__(self) -> None:
         self._updated: list[UpdatedBounds] = []
 
     def handlers(self) -> Mapping[Channel, Handler]:
-        """Return the handler of every channel that the layer listens to; what they return is published."""
+        """Return the handler of every channel that the layer subscribes to; what they return is published."""
         return {}
 
-    def tick(self, at: Moment) -> Sequence[Publication]:  # noqa: ARG002  # a layer without a sense of time ignores it
-        """Let time pass, ten times a second; return what is to be published now."""
+    def tick(self, at: Moment) -> Sequence[Publication]:  # noqa: ARG002  # for layers that depend on time
+        """Advance to `at`, ten times a second; return what is to be published now."""
         return []
 
     @abstractmethod
     def update_costs(self, window: Window, cost: Grid, speed: Grid) -> None:
         """Combine the layer's costs into `cost` and `speed`, both uint8 (window.height, window.width).
 
-        They hold what the layers below wrote inside the window. No layer lowers a cost or raises a speed limit:
-        `write_cost` and `write_speed_limit` see to it.
+        They hold what the layers below wrote inside the window. No layer may lower a cost or raise a speed limit:
+        `write_cost` and `write_speed_limit` guarantee that.
         """
 
     def mark_updated(self, window: Window, cause: Cause, trace: Trace | None = None) -> None:
-        """Note that the layer's costs inside a window differ from now on."""
+        """Record that the layer's costs inside a window have changed."""
         self._updated.append(UpdatedBounds(window, cause, trace))
 
     def take_updated(self) -> list[UpdatedBounds]:
-        """Return what was marked since this was last called."""
+        """Return the bounds that were marked since the last call."""
         updated, self._updated = self._updated, []
         return updated
 
 
 class FloorPlan(NamedTuple):
-    """What layers lie on: the grid, and the plan's cells, uint8 (height, width): 0 free, 254 occupied, 255 unknown."""
+    """The floor plan beneath all layers; `cells` is uint8 (height, width): 0 free, 254 occupied, 255 unknown."""
 
     geometry: GridGeometry
     cells: Grid
@@ -89,20 +89,20 @@ class LayerFactory(Generic[Options]):
 
 
 def write_cost(shape: ShapeMask, window: Window, cost: Grid, value: int) -> None:
-    """Combine one cost into `cost` (the map inside `window`) wherever the shape has cells."""
-    if (cut := _cut(shape, window, cost)) is not None:
-        mask, below = cut
+    """Combine one cost into `cost` (the map inside `window`) in the shape's cells."""
+    if (overlap := _overlap(shape, window, cost)) is not None:
+        mask, below = overlap
         below[...] = combine_costs(below, np.full(below.shape, value, dtype=np.uint8), mask)
 
 
 def write_speed_limit(shape: ShapeMask, window: Window, speed: Grid, value: int) -> None:
-    """Combine one speed limit (cm/s) into `speed` (the map inside `window`) wherever the shape has cells."""
-    if (cut := _cut(shape, window, speed)) is not None:
-        mask, below = cut
+    """Combine one speed limit (cm/s) into `speed` (the map inside `window`) in the shape's cells."""
+    if (overlap := _overlap(shape, window, speed)) is not None:
+        mask, below = overlap
         below[...] = combine_speed_limits(below, np.where(mask, value, 0).astype(np.uint8))
 
 
-def _cut(shape: ShapeMask, window: Window, grid: Grid) -> tuple[NDArray[np.bool_], Grid] | None:
+def _overlap(shape: ShapeMask, window: Window, grid: Grid) -> tuple[NDArray[np.bool_], Grid] | None:
     """Return the shape's mask and the grid's cells where shape and window overlap, or None where they don't."""
     common = shape.window.intersection(window)
     if common.empty:

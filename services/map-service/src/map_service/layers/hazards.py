@@ -1,7 +1,7 @@
-"""Hazard areas: what the aggregator says about a place, as cost and speed limit.
+"""Hazard areas: the hazards that the aggregator publishes, as cost and speed limit.
 
-Penalty 254 is lethal and gets inflated, anything lower is a graded cost as it stands. An unknown area limits the speed
-too. A defined area of which nothing has been heard yet counts as unknown by its own policy.
+Penalty 254 is lethal and gets inflated, a lower one is a graded cost. An unknown area limits the speed too. An area
+whose hazard was not received yet is unknown, with the penalty of its own policy.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from map_service.layers.base import Grid
 
 UNKNOWN_SPEED: Final = 15
-"""Speed limit (cm/s) in an area that nobody can vouch for: the robot's DEGRADED speed."""
+"""Speed limit (cm/s) in an unknown area: the robot's DEGRADED speed."""
 
 
 @dataclass
@@ -40,7 +40,7 @@ class _Area:
 
 
 class HazardsLayer(CostLayer):
-    """Holds every area's definition and hazard, in whatever order they come."""
+    """Holds every area's definition and hazard, which may arrive in any order."""
 
     def __init__(self, geometry: GridGeometry) -> None:
         super().__init__()
@@ -50,7 +50,7 @@ class HazardsLayer(CostLayer):
         self._aggregator_lost = False
 
     def handlers(self) -> Mapping[Channel, Handler]:
-        """Return the handlers of areas' definitions and hazards."""
+        """Return the handlers of area definitions and hazards."""
         return {ch.AREA_DEFINITION: self._on_definition, ch.AREA_HAZARD: self._on_hazard}
 
     def _on_definition(self, _ids: Ids, definition: AreaDefinition, _at: Moment) -> list[Publication]:
@@ -60,9 +60,9 @@ class HazardsLayer(CostLayer):
             raise RefusedMessageError(f"area {definition.id}: {error}") from error
 
     def define(self, definition: AreaDefinition) -> list[Publication]:
-        """Add, change or remove an area; raises `GeometryError` when its polygon can't be used.
+        """Add, change or remove an area; raises `GeometryError` when its polygon is invalid.
 
-        An older version than the known one is ignored.
+        A version older than the known one is ignored.
         """
         old = self._areas.get(definition.id)
         if old is not None and (definition == old.definition or definition.version < old.definition.version):
@@ -72,10 +72,10 @@ class HazardsLayer(CostLayer):
                 return []
             del self._areas[definition.id]
             self.mark_updated(old.mask.window, Cause(kind="hazard", id=definition.id, state="removed"))
-            gone = structs.replace(
+            cleared = structs.replace(
                 old.effective, state="clear", severity=0, penalty=0, cause="the area was removed", trace=None
             )
-            return [_published(old.definition, gone)]
+            return [_hazard_publication(old.definition, cleared)]
         mask = rasterize(normalized_polygon(definition.polygon), self._geometry)
         area = _Area(definition, mask, self._effective(definition))
         self._areas[definition.id] = area
@@ -83,13 +83,13 @@ class HazardsLayer(CostLayer):
         if old is not None:
             self.mark_updated(old.mask.window, cause)
         self.mark_updated(mask.window, cause, area.effective.trace)
-        return [_published(definition, area.effective)]
+        return [_hazard_publication(definition, area.effective)]
 
     def _on_hazard(self, _ids: Ids, hazard: AreaHazard, _at: Moment) -> list[Publication]:
-        """Take an area's hazard.
+        """Apply an area's hazard.
 
-        Duplicates and overtaken ones of the same epoch are ignored; of an older epoch, only what raises the cost is
-        taken (a clock that went back must not hide a danger).
+        Duplicate and outdated ones of the same epoch are ignored; one of an older epoch is applied only if it raises
+        the cost (a clock that went back must not hide a danger).
         """
         old = self._received.get(hazard.area)
         if old is not None:
@@ -100,7 +100,7 @@ class HazardsLayer(CostLayer):
         self._received[hazard.area] = hazard
         return self._refresh(hazard.area)
 
-    def set_aggregator_lost(self, lost: bool) -> list[Publication]:  # noqa: FBT001  # the one thing it sets
+    def set_aggregator_lost(self, lost: bool) -> list[Publication]:  # noqa: FBT001  # a setter
         """Set whether the aggregator is lost; while it is, no area counts as clear."""
         if lost == self._aggregator_lost:
             return []
@@ -108,11 +108,11 @@ class HazardsLayer(CostLayer):
         return [publication for area in list(self._areas) for publication in self._refresh(area)]
 
     def publications(self) -> list[Publication]:
-        """Return every area with its hazard, as it is published."""
-        return [_published(area.definition, area.effective) for area in self._areas.values()]
+        """Return the publications of all areas with their hazards."""
+        return [_hazard_publication(area.definition, area.effective) for area in self._areas.values()]
 
-    def unheard(self) -> list[str]:
-        """Return the defined areas of which no hazard has come yet."""
+    def areas_without_hazard(self) -> list[str]:
+        """Return the defined areas whose hazard was not received yet."""
         return sorted(set(self._areas) - set(self._received))
 
     def update_costs(self, window: Window, cost: Grid, speed: Grid) -> None:
@@ -133,10 +133,10 @@ class HazardsLayer(CostLayer):
         if (before.penalty, before.state) != (area.effective.penalty, area.effective.state):
             cause = Cause(kind="hazard", id=name, state=area.effective.state)
             self.mark_updated(area.mask.window, cause, area.effective.trace)
-        return [_published(area.definition, area.effective)]
+        return [_hazard_publication(area.definition, area.effective)]
 
     def _effective(self, definition: AreaDefinition) -> AreaHazard:
-        """Return the hazard that counts: what was received, or unknown where nothing vouches for the area."""
+        """Return the hazard in force: the received one, or unknown when there is none or the aggregator is lost."""
         received = self._received.get(definition.id)
         if received is not None and (not self._aggregator_lost or received.state != "clear"):
             return received
@@ -148,13 +148,13 @@ class HazardsLayer(CostLayer):
             since=received.since if received else 0.0,
             seq=received.seq if received else 0,
             epoch=received.epoch if received else 0,
-            cause="the hazard aggregator is gone, or the broker between"
+            cause="the hazard aggregator or the broker is not connected"
             if received
-            else "the hazard aggregator has not spoken of it yet",
+            else "no hazard received from the hazard aggregator yet",
         )
 
 
-def _published(definition: AreaDefinition, hazard: AreaHazard) -> Publication:
+def _hazard_publication(definition: AreaDefinition, hazard: AreaHazard) -> Publication:
     described = HazardArea(hazard=hazard, polygon=definition.polygon, label=definition.label)
     return Publication(ch.HAZARD, described, {"area": hazard.area})
 

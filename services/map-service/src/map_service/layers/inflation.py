@@ -1,4 +1,4 @@
-"""Inflation of what all layers wrote: the last step, recomputed only around what changed."""
+"""Inflates the combined layers, as the last step; recomputed only around changes."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ if TYPE_CHECKING:
 
 
 class InflationLayer:
-    """Keeps the inflated map of a grid of this resolution (m per cell)."""
+    """Holds the inflated map of a grid of this resolution (m per cell)."""
 
     def __init__(self, raw: Grid, resolution: float, inflation: Inflation) -> None:
         self._table = inflation_table(resolution, inflation)
         self.cost = inflate(raw, self._table)
 
     def update(self, raw: Grid, windows: Iterable[Window]) -> list[Window]:
-        """Inflate anew around these windows, in which `raw` changed; return the windows of `cost` that it rewrote."""
+        """Update the inflation around windows in which `raw` changed; return the windows of `cost` that it rewrote."""
         rewritten = (Window(*inflate_window(raw, self._table, *window, self.cost)) for window in windows)
         return [window for window in rewritten if not window.empty]
 
-    def whole(self, raw: Grid) -> Grid:
+    def inflate_all(self, raw: Grid) -> Grid:
         """Return the inflation of a whole map, computed from scratch."""
         return inflate(raw, self._table)

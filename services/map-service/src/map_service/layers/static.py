@@ -1,4 +1,4 @@
-"""The floor plan: the bottom of the costmap, the same for the life of the process."""
+"""The floor plan: the bottom layer, constant for the lifetime of the process."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Operators' zones: no-go, penalty and speed limit, each while it is enabled and its time has come.
+"""Operators' zones: no-go, penalty and speed limit, each while it is enabled and between its start and expiry.
 
-A PENALTY of factor f makes a free cell as expensive as f cells of free floor, as far as costs go (252 makes it five).
-Where something costs more already, the higher cost stays.
+A PENALTY of factor f makes a free cell cost as much as f free cells, up to the highest graded cost (252, a factor of
+five). Where a cell costs more already, the higher cost stays.
 """
 
 from __future__ import annotations
@@ -29,109 +29,109 @@ def penalty_cost(factor: float) -> int:
     return min(PENALTY_MAX, round(COST_PER_FACTOR * (factor - 1.0)))
 
 
-def speed_value(speed: float) -> int:
+def speed_layer_value(speed: float) -> int:
     """Return a speed limit (m/s) as a value of the speed layer (cm/s, rounded down, at least 1)."""
     return max(1, min(254, int(speed * 100.0 + 1e-6)))
 
 
 def is_active(zone: Zone, stamp: float) -> bool:
-    """Whether a zone holds at a time: from `starts_at` on, until just before `expires_at`."""
-    begun = zone.starts_at is None or zone.starts_at <= stamp
-    over = zone.expires_at is not None and zone.expires_at <= stamp
-    return zone.enabled and begun and not over
+    """Whether a zone is in force at a time (s since the epoch): from `starts_at` on, until before `expires_at`."""
+    started = zone.starts_at is None or zone.starts_at <= stamp
+    expired = zone.expires_at is not None and zone.expires_at <= stamp
+    return zone.enabled and started and not expired
 
 
 @dataclass
-class _Held:
+class _ZoneEntry:
     zone: Zone
     mask: ShapeMask
     active: bool
 
 
 class ZonesLayer(CostLayer):
-    """Holds all zones; only active ones count."""
+    """Holds all zones; only active ones change costs."""
 
     def __init__(self, geometry: GridGeometry) -> None:
         super().__init__()
         self._geometry = geometry
-        self._held: dict[str, _Held] = {}
+        self._entries: dict[str, _ZoneEntry] = {}
         self._changed = False
 
     def put(self, zone: Zone, stamp: float) -> None:
-        """Add or replace a zone; raises `ShapeError` for a shape that can't be used."""
+        """Add or replace a zone; raises `ShapeError` for an invalid shape."""
         self._put(zone, rasterize_shape(zone.shape, self._geometry), stamp)
 
     def remove(self, zone_id: str) -> None:
-        """Forget a zone, if there is one."""
-        old = self._held.pop(zone_id, None)
+        """Remove a zone, if it exists."""
+        old = self._entries.pop(zone_id, None)
         if old is not None:
             self._changed = True
             if old.active:
                 self._mark(old, "removed")
 
     def replace_all(self, zones: Iterable[Zone], stamp: float) -> None:
-        """Hold exactly these zones; raises `ShapeError`, which names it, and changes nothing for an unusable one."""
+        """Replace all zones; for an invalid one, raises `ShapeError`, which names it, and changes nothing."""
         masks: dict[str, tuple[Zone, ShapeMask]] = {}
         for zone in zones:
             try:
                 masks[zone.id] = zone, rasterize_shape(zone.shape, self._geometry)
             except ShapeError as error:
                 raise ShapeError(f"{zone.id}.shape.{error.field}", error.problem) from error
-        for name in [name for name in self._held if name not in masks]:
+        for name in [name for name in self._entries if name not in masks]:
             self.remove(name)
         for zone, mask in masks.values():
             self._put(zone, mask, stamp)
 
     def zones(self) -> list[Zone]:
         """Return all zones, active or not, by id."""
-        return [self._held[name].zone for name in sorted(self._held)]
+        return [self._entries[name].zone for name in sorted(self._entries)]
 
     def active(self) -> list[str]:
-        """Return the ids of the zones that count."""
-        return sorted(name for name, held in self._held.items() if held.active)
+        """Return the ids of the active zones."""
+        return sorted(name for name, entry in self._entries.items() if entry.active)
 
     def take_changed(self) -> bool:
-        """Return whether a zone came, went, began or ended since this was last called."""
+        """Return whether a zone was added, changed, removed, activated or ended since the last call."""
         changed, self._changed = self._changed, False
         return changed
 
     def tick(self, at: Moment) -> list[Publication]:
-        """Let zones begin and end."""
-        for held in self._held.values():
-            active = is_active(held.zone, at.stamp)
-            if active != held.active:
-                held.active = active
+        """Activate and end zones by their times."""
+        for entry in self._entries.values():
+            active = is_active(entry.zone, at.stamp)
+            if active != entry.active:
+                entry.active = active
                 self._changed = True
-                self._mark(held, "active" if active else "inactive")
+                self._mark(entry, "active" if active else "inactive")
         return []
 
     def update_costs(self, window: Window, cost: Grid, speed: Grid) -> None:
         """Write the active zones."""
-        for held in self._held.values():
-            zone = held.zone
-            if not held.active:
+        for entry in self._entries.values():
+            zone = entry.zone
+            if not entry.active:
                 continue
             if zone.kind == "BLOCKED":
-                write_cost(held.mask, window, cost, LETHAL)
+                write_cost(entry.mask, window, cost, LETHAL)
             elif zone.kind == "PENALTY" and zone.factor is not None:
-                write_cost(held.mask, window, cost, penalty_cost(zone.factor))
+                write_cost(entry.mask, window, cost, penalty_cost(zone.factor))
             elif zone.kind == "SPEED_LIMIT" and zone.speed is not None:
-                write_speed_limit(held.mask, window, speed, speed_value(zone.speed))
+                write_speed_limit(entry.mask, window, speed, speed_layer_value(zone.speed))
 
     def _put(self, zone: Zone, mask: ShapeMask, stamp: float) -> None:
-        old = self._held.get(zone.id)
+        old = self._entries.get(zone.id)
         if old is not None and old.zone == zone:
             return
-        held = _Held(zone, mask, is_active(zone, stamp))
-        self._held[zone.id] = held
+        entry = _ZoneEntry(zone, mask, is_active(zone, stamp))
+        self._entries[zone.id] = entry
         self._changed = True
         if old is not None and old.active:
-            self._mark(old, "active" if held.active else "inactive")
-        if held.active:
-            self._mark(held, "active")
+            self._mark(old, "active" if entry.active else "inactive")
+        if entry.active:
+            self._mark(entry, "active")
 
-    def _mark(self, held: _Held, state: str) -> None:
-        self.mark_updated(held.mask.window, Cause(kind="zone", id=held.zone.id, state=state))
+    def _mark(self, entry: _ZoneEntry, state: str) -> None:
+        self.mark_updated(entry.mask.window, Cause(kind="zone", id=entry.zone.id, state=state))
 
 
 LAYER = LayerFactory(options=NoOptions, make=lambda plan, _options: ZonesLayer(plan.geometry))

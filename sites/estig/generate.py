@@ -1,7 +1,7 @@
-"""Draw the site's map from its vector description, and check that site.toml fits it.
+"""Draw the site's map from its vector description, and check that site.toml matches it.
 
 `python sites/estig/generate.py` reads floor.toml and writes map.pgm and map.yaml (map_server's format, trinary) beside
-it; the same description always gives the same bytes. `--check` writes nothing and fails when the files differ.
+it; the same description always gives the same bytes. `--check` writes nothing and fails if the files differ.
 """
 
 import argparse
@@ -27,14 +27,14 @@ FREE, OCCUPIED, UNKNOWN = 254, 0, 205
 HALF_CONE = math.radians(7.5)
 """Half the opening of an HC-SR04's cone."""
 LIMIT_GAP = (0.2, 0.5)
-"""How far (m) a sonar's range limit must end before the nearest thing that always echoes."""
+"""Range (m) of the distance from a sonar's range limit to the nearest permanent echo behind it."""
 
 Positive = Annotated[float, Meta(gt=0.0)]
 Point = tuple[float, float]
 
 
 class FloorError(ValueError):
-    """The description or site.toml can't be right; the message names the place and what is wrong there."""
+    """The description or site.toml is wrong; the message names the place and the error."""
 
 
 class Building(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -47,21 +47,21 @@ class Building(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Doors(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Size (m) of the recess that a closed door lies in."""
+    """Size (m) of the recess of a closed door."""
 
     width: Positive
     depth: Positive
 
 
 class Box(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """An upright rectangle by two opposite corners (m)."""
+    """An axis-aligned rectangle, given by two opposite corners (m)."""
 
     id: str
     corners: tuple[Point, Point]
 
 
 class Corridor(msgspec.Struct, frozen=True, forbid_unknown_fields=True, rename={"start": "from", "end": "to"}):
-    """An upright stretch of corridor along its middle line; doors by their distance (m) from the start."""
+    """An axis-aligned corridor, given by its middle line; doors by their distance (m) from the start."""
 
     id: str
     start: Point
@@ -71,7 +71,7 @@ class Corridor(msgspec.Struct, frozen=True, forbid_unknown_fields=True, rename={
     doors_right: list[float] = []
 
     def boxes(self, doors: Doors) -> list[tuple[Point, Point]]:
-        """Return the corridor (its ends lie half a width beyond the line) and its recesses as rectangles."""
+        """Return the corridor (it ends half a width beyond the line) and its recesses as rectangles."""
         (x0, y0), (x1, y1) = self.start, self.end
         length = math.hypot(x1 - x0, y1 - y0)
         if length == 0.0 or (x0 != x1 and y0 != y1):
@@ -85,18 +85,19 @@ class Corridor(msgspec.Struct, frozen=True, forbid_unknown_fields=True, rename={
                 (x0 + along1 * ux - left1 * uy, y0 + along1 * uy + left1 * ux),
             )
 
-        carved = [box(-half, length + half, -half, half)]
-        for side, places in ((1.0, self.doors_left), (-1.0, self.doors_right)):
-            for place in places:
-                if not 0.0 <= place <= length:
-                    raise FloorError(f"floor.toml: corridor {self.id} is {length} m long; no door can be at {place}")
+        boxes = [box(-half, length + half, -half, half)]
+        for side, distances in ((1.0, self.doors_left), (-1.0, self.doors_right)):
+            for distance in distances:
+                if not 0.0 <= distance <= length:
+                    raise FloorError(f"floor.toml: corridor {self.id} is {length} m long; no door can be at {distance}")
                 edge = side * half
-                carved.append(box(place - doors.width / 2, place + doors.width / 2, edge, edge + side * doors.depth))
-        return carved
+                along0, along1 = distance - doors.width / 2, distance + doors.width / 2
+                boxes.append(box(along0, along1, edge, edge + side * doors.depth))
+        return boxes
 
 
 class Floor(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The whole description."""
+    """The description of the floor (floor.toml)."""
 
     building: Building
     doors: Doors
@@ -116,12 +117,12 @@ Image = NDArray[np.uint8]
 
 
 def _fill(image: Image, geometry: GridGeometry, corners: tuple[Point, Point], value: int) -> None:
-    """Set all cells whose middle lies in the rectangle; corners are on the grid's lines within a millimetre."""
+    """Set all cells whose centre is in the rectangle."""
     (xa, ya), (xb, yb) = corners
-    cells = geometry.resolution
 
     def line(value: float, origin: float) -> int:
-        return math.ceil((value - origin) / cells - 0.5 - 1e-6)
+        # A corner on the boundary of two cells must not depend on rounding errors.
+        return math.ceil((value - origin) / geometry.resolution - 0.5 - 1e-6)
 
     left, right = line(min(xa, xb), geometry.origin_x), line(max(xa, xb), geometry.origin_x)
     bottom, top = line(min(ya, yb), geometry.origin_y), line(max(ya, yb), geometry.origin_y)
@@ -139,7 +140,7 @@ def draw(floor: Floor) -> Image:
             _fill(image, geometry, box, FREE)
     for hall in floor.halls:
         _fill(image, geometry, hall.corners, FREE)
-    walls = _near(image == FREE, round(floor.building.wall / geometry.resolution)) & (image != FREE)
+    walls = _dilate(image == FREE, round(floor.building.wall / geometry.resolution)) & (image != FREE)
     image[walls] = OCCUPIED
     _outer_walls(image, floor)
     for obstacle in floor.obstacles:
@@ -160,12 +161,12 @@ def _outer_walls(image: Image, floor: Floor) -> None:
         _fill(image, floor.geometry, side, OCCUPIED)
 
 
-def _near(mask: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
-    """Grow a mask by `reach` cells along both axes."""
+def _dilate(mask: NDArray[np.bool_], cells: int) -> NDArray[np.bool_]:
+    """Dilate a mask by a number of cells along both axes."""
     grown = mask.copy()
     for axis in (0, 1):
         source = grown.copy()
-        for shift in range(1, reach + 1):
+        for shift in range(1, cells + 1):
             for sign in (shift, -shift):
                 grown |= np.roll(source, sign, axis=axis)
     return grown
@@ -201,11 +202,11 @@ def ray(image: Image, geometry: GridGeometry, x: float, y: float, angle: float, 
 
 
 def check_site(site: Site, image: Image, geometry: GridGeometry) -> None:
-    """Raise `FloorError` when a place, robot, area or node of site.toml does not fit the map."""
-    clear = ~_near(image != FREE, round(0.2 / geometry.resolution))
-    stands = {f"places.{name}": (place.x, place.y) for name, place in site.places.items()}
-    stands |= {f"robots {robot.id}": (robot.start.x, robot.start.y) for robot in site.robots}
-    for name, (x, y) in stands.items():
+    """Raise `FloorError` if a place, robot, area or node of site.toml does not match the map."""
+    clear = ~_dilate(image != FREE, round(0.2 / geometry.resolution))
+    positions = {f"places.{name}": (place.x, place.y) for name, place in site.places.items()}
+    positions |= {f"robots {robot.id}": (robot.start.x, robot.start.y) for robot in site.robots}
+    for name, (x, y) in positions.items():
         column, row = geometry.cell(x, y)
         if not geometry.contains_cell(column, row) or not clear[row, column]:
             raise FloorError(f"site.toml: {name} at ({x}, {y}) has no 0.2 m of free floor around it")
@@ -216,10 +217,12 @@ def check_site(site: Site, image: Image, geometry: GridGeometry) -> None:
         if free < 0.9:
             raise FloorError(f"site.toml: only {free:.0%} of area {area.id} is free floor")
         if not any(node.area == area.id for node in site.nodes):
-            raise FloorError(f"site.toml: nobody watches area {area.id}; add a node with area = {area.id!r}")
+            raise FloorError(f"site.toml: no node watches area {area.id}; add one with area = {area.id!r}")
     for node in site.nodes:
         if node.area not in areas:
-            raise FloorError(f"site.toml: node {node.id} watches {node.area!r}, which is no area")
+            raise FloorError(
+                f"site.toml: node {node.id} watches {node.area!r}, which is not an area; add it to [[areas]]"
+            )
         for sonar in node.sonars:
             _check_sonar(node, sonar, image, geometry)
 
@@ -231,7 +234,7 @@ def _check_sonar(node: NodeSite, sonar: Sonar, image: Image, geometry: GridGeome
     gap = wall - sonar.range_limit
     if not LIMIT_GAP[0] <= gap <= LIMIT_GAP[1]:
         raise FloorError(
-            f"site.toml: node {node.id}, sonar at {sonar.angle} rad: the nearest echo of the empty corridor comes from"
+            f"site.toml: node {node.id}, sonar at {sonar.angle} rad: the nearest echo of the empty corridor is at"
             f" {wall:.2f} m, so range_limit should be about {wall - 0.3:.2f} m, not {sonar.range_limit}"
         )
 
@@ -254,7 +257,7 @@ def load_site_file(path: Path) -> Site:
 
 
 def generate(directory: Path = HERE) -> dict[Literal["map.pgm", "map.yaml"], bytes]:
-    """Return the generated files of a site's directory; raises `FloorError` when anything does not fit."""
+    """Return the generated files of a site's directory; raises `FloorError` if the description is inconsistent."""
     floor = load_floor(directory / "floor.toml")
     image = draw(floor)
     check_site(load_site_file(directory / "site.toml"), image, floor.geometry)
@@ -262,9 +265,9 @@ def generate(directory: Path = HERE) -> dict[Literal["map.pgm", "map.yaml"], byt
 
 
 def main() -> int:
-    """Write the files, or with --check compare them with what is there."""
+    """Write the files, or with --check compare them with the existing ones."""
     parser = argparse.ArgumentParser(description="Draw map.pgm and map.yaml from floor.toml")
-    parser.add_argument("--check", action="store_true", help="write nothing; fail when a file differs")
+    parser.add_argument("--check", action="store_true", help="write nothing; fail if a file differs")
     check = parser.parse_args().check
     try:
         files = generate()
@@ -277,7 +280,7 @@ def main() -> int:
             path.write_bytes(data)
             print(f"wrote {path.name}, {len(data)} bytes")
         elif not path.exists() or path.read_bytes() != data:
-            print(f"{path.name} is not what floor.toml gives: run {Path(__file__).name}", file=sys.stderr)
+            print(f"{path.name} does not match floor.toml: run {Path(__file__).name}", file=sys.stderr)
             return 1
     return 0
 

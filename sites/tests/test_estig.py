@@ -1,4 +1,4 @@
-"""The floor keeps what the experiment needs: two ways everywhere, and a price for meeting a barrier unwarned."""
+"""The floor has what the experiment needs: two routes between all places, and a detour for an unwarned robot."""
 
 import importlib.util
 import itertools
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from fog_contracts.grid import GridGeometry
 
 HERE = Path(__file__).parents[1] / "estig"
-SIGHT = 12.0
-"""Range (m) of the robot's lidar: nearer than this a barrier on the way ahead is certainly seen."""
+LIDAR_RANGE_M = 12.0
+"""Range of the robot's lidar: it certainly sees a barrier ahead that is nearer than this."""
 
 
 def _generator() -> ModuleType:
@@ -37,19 +37,19 @@ def _generator() -> ModuleType:
 generate = _generator()
 
 
-class Way:
-    """Points (m) 5 or 7 cm apart, and their length."""
+class PlannedPath:
+    """A path's points (m), 5 or 7 cm apart, with their distances from its start."""
 
     def __init__(self, points: NDArray[np.float64]) -> None:
         self.points = points
         steps = np.hypot(*np.diff(points, axis=0).T)
-        self.along = np.concatenate(([0.0], np.cumsum(steps)))
-        self.length = float(self.along[-1])
+        self.distances = np.concatenate(([0.0], np.cumsum(steps)))
+        self.length = float(self.distances[-1])
 
     def crosses(self, area: AreaSite) -> bool:
         return any(contains_point(area.polygon, x, y) for x, y in self.points)
 
-    def zones(self, areas: dict[str, AreaSite]) -> set[str]:
+    def crossed_areas(self, areas: dict[str, AreaSite]) -> set[str]:
         return {name for name, area in areas.items() if self.crosses(area)}
 
 
@@ -64,11 +64,11 @@ class Floor:
         self.raw = raw
         self.table = inflation_table(self.geometry.resolution, DEFAULT_INFLATION)
         self.planner = Planner(self.geometry.width, self.geometry.height)
-        self._known: dict[tuple[object, ...], Way | None] = {}
+        self._paths: dict[tuple[object, ...], PlannedPath | None] = {}
 
-    def way(self, start: tuple[float, float], goal: tuple[float, float], *blocked: str) -> Way | None:
+    def plan_path(self, start: tuple[float, float], goal: tuple[float, float], *blocked: str) -> PlannedPath | None:
         key = (start, goal, *sorted(blocked))
-        if key not in self._known:
+        if key not in self._paths:
             raw = self.raw.copy()
             for name in blocked:
                 window, mask = rasterize(self.areas[name].polygon, self.geometry)
@@ -77,14 +77,14 @@ class Floor:
             result = self.planner.plan(costs, self.geometry.cell(*start), self.geometry.cell(*goal))
             points = (result.cells.astype(np.float64) + 0.5) * self.geometry.resolution
             points += (self.geometry.origin_x, self.geometry.origin_y)
-            self._known[key] = Way(points) if result.found else None
-        return self._known[key]
+            self._paths[key] = PlannedPath(points) if result.found else None
+        return self._paths[key]
 
-    def route(self, names: str, *blocked: str) -> Way:
+    def route(self, names: str, *blocked: str) -> PlannedPath:
         a, b = (self.site.places[name] for name in names)
-        way = self.way((a.x, a.y), (b.x, b.y), *blocked)
-        assert way, f"no way {names} with {blocked} blocked"
-        return way
+        path = self.plan_path((a.x, a.y), (b.x, b.y), *blocked)
+        assert path, f"no path {names} with {blocked} blocked"
+        return path
 
 
 @pytest.fixture(scope="module")
@@ -95,16 +95,16 @@ def floor() -> Floor:
 ROUTES = {"ab": ("z1", "z4"), "bc": ("z4", "z7"), "cd": ("z5", "z1", "z3")}
 
 
-def test_the_committed_map_is_what_the_description_gives() -> None:
+def test_committed_map_matches_its_description() -> None:
     for name, data in generate.generate().items():
         assert (HERE / name).read_bytes() == data, f"{name}: run generate.py"
 
 
-def test_drawing_twice_gives_the_same_bytes() -> None:
+def test_generated_files_are_repeatable() -> None:
     assert generate.generate() == generate.generate()
 
 
-def test_a_range_limit_that_reaches_the_wall_is_refused(floor: Floor, tmp_path: Path) -> None:
+def test_range_limit_that_reaches_the_wall_is_refused(floor: Floor, tmp_path: Path) -> None:
     text = (HERE / "site.toml").read_text("utf-8").replace("range_limit = 2.65", "range_limit = 2.99", 1)
     (tmp_path / "site.toml").write_text(text, "utf-8")
     site = generate.load_site_file(tmp_path / "site.toml")
@@ -112,7 +112,7 @@ def test_a_range_limit_that_reaches_the_wall_is_refused(floor: Floor, tmp_path: 
         generate.check_site(site, floor.image, floor.geometry)
 
 
-def test_it_has_seven_areas_numbered_as_in_the_thesis_each_with_one_node_of_two_sonars(floor: Floor) -> None:
+def test_site_has_the_seven_areas_of_the_thesis_each_with_one_node_of_two_sonars(floor: Floor) -> None:
     assert {area.id: area.number for area in floor.site.areas} == {f"z{n}": n for n in range(1, 8)}
     assert sorted(node.area for node in floor.site.nodes) == [f"z{n}" for n in range(1, 8)]
     assert all(len(node.sonars) == 2 for node in floor.site.nodes)
@@ -120,32 +120,32 @@ def test_it_has_seven_areas_numbered_as_in_the_thesis_each_with_one_node_of_two_
 
 
 @pytest.mark.parametrize("names", ROUTES)
-def test_the_shortest_way_crosses_one_zone_of_its_route_and_no_other(floor: Floor, names: str) -> None:
-    crossed = floor.route(names).zones(floor.areas)
+def test_shortest_path_crosses_one_area_of_its_route_and_no_other(floor: Floor, names: str) -> None:
+    crossed = floor.route(names).crossed_areas(floor.areas)
     assert len(crossed) == 1
     assert crossed <= set(ROUTES[names])
 
 
 @pytest.mark.parametrize("names", ROUTES)
-def test_with_its_zone_blocked_the_way_leads_by_another_zone_of_the_route(floor: Floor, names: str) -> None:
+def test_path_around_a_blocked_area_crosses_another_area_of_its_route(floor: Floor, names: str) -> None:
     shortest = floor.route(names)
-    (zone,) = shortest.zones(floor.areas)
-    other = floor.route(names, zone)
-    assert other.zones(floor.areas) & set(ROUTES[names]) - {zone}
+    (area,) = shortest.crossed_areas(floor.areas)
+    other = floor.route(names, area)
+    assert other.crossed_areas(floor.areas) & set(ROUTES[names]) - {area}
     assert 5.0 <= other.length - shortest.length <= 30.0
 
 
-def test_z3_is_the_last_of_the_ways_from_c_to_d(floor: Floor) -> None:
-    assert floor.route("cd", "z5", "z1", "z4", "z7").zones(floor.areas) == {"z3"}
+def test_with_all_other_areas_blocked_the_path_from_c_to_d_crosses_z3(floor: Floor) -> None:
+    assert floor.route("cd", "z5", "z1", "z4", "z7").crossed_areas(floor.areas) == {"z3"}
 
 
 @pytest.mark.parametrize("names", ["".join(pair) for pair in itertools.permutations("abcd", 2)])
-def test_any_one_blocked_zone_leaves_a_way_between_any_two_places(floor: Floor, names: str) -> None:
-    for zone in floor.route(names).zones(floor.areas):
-        assert not floor.route(names, zone).crosses(floor.areas[zone])
+def test_one_blocked_area_leaves_a_path_between_any_two_places(floor: Floor, names: str) -> None:
+    for area in floor.route(names).crossed_areas(floor.areas):
+        assert not floor.route(names, area).crosses(floor.areas[area])
 
 
-def test_the_demo_route_takes_minutes_rather_than_an_hour(floor: Floor) -> None:
+def test_demo_route_is_45_to_75_metres_long(floor: Floor) -> None:
     demo = floor.site.demo
     assert demo
     assert set(demo.areas) == set(ROUTES["ab"])
@@ -153,34 +153,34 @@ def test_the_demo_route_takes_minutes_rather_than_an_hour(floor: Floor) -> None:
 
 
 @pytest.mark.parametrize("names", ROUTES)
-def test_meeting_the_barrier_unwarned_costs_thirty_to_seventy_metres(floor: Floor, names: str) -> None:
+def test_detour_without_a_warning_is_30_to_70_metres_longer(floor: Floor, names: str) -> None:
     shortest = floor.route(names)
-    (zone,) = shortest.zones(floor.areas)
-    centre = tuple(np.mean(floor.areas[zone].polygon, axis=0))
-    away = np.hypot(*(shortest.points - centre).T)
-    seen = int(np.argmax(away < SIGHT))
+    (area,) = shortest.crossed_areas(floor.areas)
+    centre = tuple(np.mean(floor.areas[area].polygon, axis=0))
+    distances = np.hypot(*(shortest.points - centre).T)
+    seen = int(np.argmax(distances < LIDAR_RANGE_M))
     x, y = (float(v) for v in shortest.points[seen])
     end = floor.site.places[names[1]]
-    back = floor.way((x, y), (end.x, end.y), zone)
+    back = floor.plan_path((x, y), (end.x, end.y), area)
     assert back
-    unwarned = float(shortest.along[seen]) + back.length
-    assert 30.0 <= unwarned - floor.route(names, zone).length <= 70.0
+    unwarned = float(shortest.distances[seen]) + back.length
+    assert 30.0 <= unwarned - floor.route(names, area).length <= 70.0
 
 
 @pytest.mark.parametrize("names", ROUTES)
-def test_the_zone_lies_25_to_45_metres_beyond_the_branching(floor: Floor, names: str) -> None:
+def test_area_lies_23_to_45_metres_beyond_the_branching(floor: Floor, names: str) -> None:
     shortest = floor.route(names)
-    (zone,) = shortest.zones(floor.areas)
-    other = floor.route(names, zone)
+    (area,) = shortest.crossed_areas(floor.areas)
+    other = floor.route(names, area)
     count = min(len(shortest.points), len(other.points))
     apart = np.hypot(*(shortest.points[:count] - other.points[:count]).T) > 2.0
-    branching = float(shortest.along[int(np.argmax(apart))])
-    inside = [contains_point(floor.areas[zone].polygon, x, y) for x, y in shortest.points]
-    assert 23.0 <= float(shortest.along[int(np.argmax(inside))]) - branching <= 45.0
+    branching = float(shortest.distances[int(np.argmax(apart))])
+    inside = [contains_point(floor.areas[area].polygon, x, y) for x, y in shortest.points]
+    assert 23.0 <= float(shortest.distances[int(np.argmax(inside))]) - branching <= 45.0
 
 
-def test_no_place_in_a_corridor_looks_like_another_five_metres_along(floor: Floor) -> None:
-    # A scan that fits a wrong place as well as the right one misleads any particle filter: ranges must differ.
+def test_scans_at_different_places_of_the_corridors_differ(floor: Floor) -> None:
+    # A scan that fits a wrong place as well as the right one misleads any particle filter.
     angles = np.linspace(-math.pi, math.pi, 72, endpoint=False)
     spots = [(x, y) for y in (4.2, 15.0, 28.4, 39.4, 50.6) for x in np.arange(12.0, 53.0, 5.0)]
     scans = [
@@ -191,7 +191,7 @@ def test_no_place_in_a_corridor_looks_like_another_five_metres_along(floor: Floo
             assert float(np.mean(np.abs(one - seen) > 0.3)) > 0.05, f"{spots[i]} looks like {spots[j]}"
 
 
-def test_every_area_is_a_stretch_of_four_metres_and_its_node_looks_into_it(floor: Floor) -> None:
+def test_every_area_is_four_metres_long_and_its_node_faces_it(floor: Floor) -> None:
     for node in floor.site.nodes:
         polygon = floor.areas[node.area].polygon
         (left, bottom), (right, top) = np.min(polygon, axis=0), np.max(polygon, axis=0)

@@ -1,12 +1,12 @@
 #!/bin/sh
-# Build local images that can take the places of the third-party images of docker-compose.yml, for engines that reach no
-# image registry. They hold Debian's packages of the same programs, and are like the originals in what the compose file
-# and the mounted configuration rely on: the user and its number, the entry point, the folders and their owners. They
-# have names of their own, so that they can't be taken for the originals.
+# Build local images that replace the third-party images of docker-compose.yml, for engines that can't reach an image
+# registry. They contain Debian's packages of the same programs, and match the originals in what the compose file and
+# the mounted configuration rely on: user and uid, entry point, folders and their owners. Their names differ, so that
+# nobody mistakes them for the originals.
 #
-#     tests/compose/stand_ins.sh          builds those of fognav-stand-in/mosquitto, /redis and /prometheus that miss
+#     tests/compose/stand_ins.sh          builds the missing ones of fognav-stand-in/mosquitto, /redis and /prometheus
 #
-# Needs a Debian base image of the name below, and Debian's package servers by the host's network.
+# Needs a Debian base image of the name below, and Debian's package servers through the host's network.
 set -eu
 base=${FOGNAV_STAND_IN_BASE:-debian:bookworm-slim}
 
@@ -39,7 +39,7 @@ EXPOSE 6379
 CMD ["redis-server"]
 DOCKERFILE
 
-# Busybox gives the same wget for healthchecks as the original has.
+# Busybox provides the wget that the original has for healthchecks.
 stand_in fognav-stand-in/prometheus <<DOCKERFILE
 FROM $base
 RUN apt-get update -qq \\

@@ -1,8 +1,8 @@
-"""The fog node as people run it: `docker compose up`, on a real engine, and what it does when things are killed.
+"""The fog node as users run it: `docker compose up` on a real engine, also when processes are killed.
 
-The test uses a project and images of its own, publishes free ports on the loopback address only, and removes all but
-the images (the next run builds on them). Third-party images that neither the engine nor a registry has are replaced by
-those of `stand_ins.sh`.
+The tests use a project and images of their own, publish free ports on the loopback address only, and remove everything
+but the images (the next run reuses their layers). Third-party images that neither the engine nor a registry has are
+replaced by those of `stand_ins.sh`.
 """
 
 from __future__ import annotations
@@ -45,58 +45,58 @@ PORTS: Final = {
 HEALTHY_S: Final = 180.0
 """On a busy machine of two cores; an idle one needs 20 s, most of it for compiling the kernels."""
 STOP_S: Final = 10.0
-"""After this time an engine kills what has not ended."""
+"""After this time an engine kills a container that has not stopped."""
 ZONE: Final = {"kind": "BLOCKED", "shape": {"type": "circle", "centre": [9.0, 42.6], "radius": 0.5}, "reason": "wet"}
 
 
 def base_images() -> list[str]:
-    """Return the images that ours are built from."""
+    """Return the base images of our Dockerfiles."""
     files = (ROOT / "deploy" / "images").glob("*.Dockerfile")
     found = {line.split()[1] for file in files for line in file.read_text("utf-8").splitlines() if line[:5] == "FROM "}
     return sorted(found)
 
 
-def why_not() -> str | None:
-    """Say what these tests miss here and how to get it, or None.
+def skip_reason() -> str | None:
+    """Return what these tests lack on this machine and the remedy, or None if they can run.
 
-    They run where an engine answers and has the base images; FOGNAV_COMPOSE=1 lets it get those, FOGNAV_COMPOSE=0
-    leaves these tests out.
+    They need an engine that responds and has the base images; FOGNAV_COMPOSE=1 lets it pull those, FOGNAV_COMPOSE=0
+    skips these tests.
     """
-    wanted = os.environ.get("FOGNAV_COMPOSE", "")
-    if wanted == "0":
-        return "FOGNAV_COMPOSE=0 says so: unset it"
+    choice = os.environ.get("FOGNAV_COMPOSE", "")
+    if choice == "0":
+        return "FOGNAV_COMPOSE=0 is set: unset it to run them"
     if shutil.which("docker") is None:
         return "needs a Docker engine: install docker with its compose plugin"
     commands = [
-        (("info", "--format", "{{.ServerVersion}}"), "needs a Docker engine, and none answers"),
+        (("info", "--format", "{{.ServerVersion}}"), "needs a Docker engine, and none responds"),
         (("compose", "version"), "needs docker's compose plugin"),
     ]
-    if wanted != "1":
+    if choice != "1":
         remedy = f"FOGNAV_COMPOSE=1 ./fognav test tests/compose, or docker pull {' '.join(base_images())}"
         commands += [
             (("image", "inspect", image), f"needs the base image {image} ({remedy})") for image in base_images()
         ]
-    for command, what in commands:
+    for command, requirement in commands:
         try:
             done = subprocess.run(["docker", *command], capture_output=True, text=True, timeout=20, check=False)
         except subprocess.TimeoutExpired:
-            return f"{what} within 20 s"
+            return f"{requirement} within 20 s"
         if done.returncode != 0:
-            return f"{what}: {(done.stderr.strip() or 'it says nothing').splitlines()[-1]}"
+            return f"{requirement}: {(done.stderr.strip() or 'no error output').splitlines()[-1]}"
     return None
 
 
-MISSING: Final = why_not()
+SKIP_REASON: Final = skip_reason()
 pytestmark = [
     pytest.mark.compose,
     # The first run installs the packages of five images.
     pytest.mark.timeout(1800),
-    pytest.mark.skipif(MISSING is not None, reason=MISSING or ""),
+    pytest.mark.skipif(SKIP_REASON is not None, reason=SKIP_REASON or ""),
 ]
 
 
 def run(command: list[str], timeout_s: float, env: dict[str, str] | None = None) -> str:
-    """Run a command and return its output; raises AssertionError with all that it said when it fails."""
+    """Run a command and return its output; raises AssertionError with all its output if it fails."""
     done = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False, env=env, cwd=ROOT)
     assert done.returncode == 0, f"{' '.join(command)} ended with {done.returncode}:\n{done.stdout}\n{done.stderr}"
     return done.stdout
@@ -111,7 +111,7 @@ def has(kind: str, name: str) -> bool:
 
 
 def third_party(image: str) -> str:
-    """Return the image, got if need be, or the name of its stand-in."""
+    """Return the name of the image, pulled if necessary, or that of its stand-in."""
     if has("image", image):
         return image
     pulled = subprocess.run(["docker", "pull", "--quiet", image], capture_output=True, timeout=600, check=False)
@@ -122,7 +122,7 @@ def third_party(image: str) -> str:
 
 
 class Project:
-    """One project of compose with a name, images and ports of its own."""
+    """A compose project with a name, images and ports of its own."""
 
     def __init__(self, folder: Path) -> None:
         self.name = f"fognav-test-{secrets.token_hex(4)}"
@@ -145,54 +145,54 @@ class Project:
         self._command += ["--file", str(file)]
 
     def __call__(self, *arguments: str, profile: str = "sim", timeout_s: float = 120.0) -> str:
-        """Run compose; with the profile `sim` unless told otherwise, so that its container is never forgotten."""
+        """Run compose, by default with the profile `sim`, so that its container is always included."""
         return run([*self._command, "--profile", profile, *arguments], timeout_s, self._env)
 
     def containers(self) -> dict[str, dict[str, Any]]:
-        """Return what the engine knows of each service's container."""
+        """Return the engine's description of each service's container."""
         label = f"label=com.docker.compose.project={self.name}"
         ids = docker("ps", "--all", "--quiet", "--filter", label).split()
         found = json.loads(docker("inspect", *ids)) if ids else []
         return {container["Config"]["Labels"]["com.docker.compose.service"]: container for container in found}
 
     def address(self, service: str) -> str:
-        """Return where a service's port is published now; a restart changes it."""
+        """Return the address at which a service's port is published now; a restart changes it."""
         return self("port", service, str(PORTS[service][1])).strip()
 
     def url(self, service: str, path: str) -> str:
         return f"http://{self.address(service)}{path}"
 
     def inside(self, service: str, script: str) -> str:
-        """Run a line of shell inside a service's container."""
+        """Run a shell command inside a service's container."""
         return self("exec", "--no-TTY", service, "sh", "-c", script)
 
-    def wait_healthy(self, wanted: set[str], restarts: dict[str, int] | None = None) -> None:
-        """Wait until these services, and no others, run and are healthy, each restarted so often if asked for."""
+    def wait_healthy(self, services: set[str], restarts: dict[str, int] | None = None) -> None:
+        """Wait until these services run and are healthy, each after this number of restarts (default 0)."""
 
-        def look() -> str | None:
+        def missing() -> str | None:
             containers = self.containers()
-            wrong = {
+            unhealthy = {
                 service: state.get("Health", {}).get("Status", state["Status"])
-                for service in wanted
+                for service in services
                 if (state := containers[service]["State"]).get("Health", {}).get("Status") != "healthy"
                 or state["Status"] != "running"
                 or containers[service]["RestartCount"] != (restarts or {}).get(service, 0)
             }
-            return f"not healthy yet: {wrong}" if wrong else None
+            return f"not healthy yet: {unhealthy}" if unhealthy else None
 
         try:
-            wait(look, HEALTHY_S)
+            wait(missing, HEALTHY_S)
         except TimeoutError as error:
             log = self("logs", "--no-color", "--tail", "30")
             raise AssertionError(f"{error}\n{self('ps', '--all')}\n{log}") from error
 
 
-def wait(look: Callable[[], str | None], timeout_s: float) -> None:
-    """Look twice a second until nothing is missing any more; raises TimeoutError with what still is."""
+def wait(missing: Callable[[], str | None], timeout_s: float) -> None:
+    """Wait until `missing` returns None, checking twice a second; raises TimeoutError with what is still missing."""
     deadline = time.monotonic() + timeout_s
-    while (missing := look()) is not None:
+    while (problem := missing()) is not None:
         if time.monotonic() > deadline:
-            raise TimeoutError(f"after {timeout_s:.0f} s: {missing}")
+            raise TimeoutError(f"after {timeout_s:.0f} s: {problem}")
         time.sleep(0.5)
 
 
@@ -236,26 +236,26 @@ def token(fog: Project) -> dict[str, str]:
     return {"Authorization": f"Bearer {fog.inside('map-service', 'cat /run/fognav/admin.token').strip()}"}
 
 
-def test_one_up_brings_every_service_to_health_and_makes_the_secrets(fog: Project) -> None:
+def test_one_up_makes_every_service_healthy_and_creates_the_secrets(fog: Project) -> None:
     containers = fog.containers()
     assert set(containers) == FOG | {"keys"}
     assert containers["keys"]["State"]["ExitCode"] == 0
     assert {name: fog.containers()[name]["State"]["Health"]["Status"] for name in FOG} == dict.fromkeys(FOG, "healthy")
 
 
-def test_a_first_start_logs_no_warning(fog: Project) -> None:
+def test_first_start_logs_no_warning(fog: Project) -> None:
     lines = fog.start_log.splitlines()
     events = [json.loads(line) for line in lines if line.startswith("{")]
     listening = {event["process"] for event in events if event["event"] == "listening"}
     assert listening >= {*SERVICES, "router"}, "the log is not complete"
-    troubles = [event for event in events if event["level"] not in {"info", "debug"}]
-    # Redis says of a host that has not been told otherwise that it may refuse to fork.
-    foreign = [line for line in lines if not line.startswith("{") and "Memory overcommit" not in line]
-    troubles += [line for line in foreign if re.search(r"warn|error|denied|fail", line, re.IGNORECASE)]
-    assert troubles == []
+    problems = [event for event in events if event["level"] not in {"info", "debug"}]
+    # With the default settings of a host Redis warns that it may be unable to fork.
+    plain_lines = [line for line in lines if not line.startswith("{") and "Memory overcommit" not in line]
+    problems += [line for line in plain_lines if re.search(r"warn|error|denied|fail", line, re.IGNORECASE)]
+    assert problems == []
 
 
-def test_ports_are_published_on_the_address_that_was_asked_for_and_nowhere_else(fog: Project) -> None:
+def test_ports_are_published_only_on_the_configured_address(fog: Project) -> None:
     published = {
         name: [(port, binding["HostIp"]) for port, bindings in ports.items() for binding in bindings or []]
         for name, container in fog.containers().items()
@@ -265,56 +265,56 @@ def test_ports_are_published_on_the_address_that_was_asked_for_and_nowhere_else(
 
 
 def test_prometheus_sees_every_service_up(fog: Project) -> None:
-    def look() -> str | None:
+    def missing() -> str | None:
         answer = httpx.get(fog.url("prometheus", "/api/v1/query"), params={"query": 'up{job="fog"}'})
         up = {sample["metric"]["process"]: sample["value"][1] for sample in answer.json()["data"]["result"]}
         return None if up == dict.fromkeys(SERVICES, "1") else f"up: {up}"
 
-    wait(look, 30)
+    wait(missing, 30)
 
 
-def test_a_zone_drawn_with_the_made_token_outlives_a_restart_of_the_map_service(fog: Project) -> None:
+def test_zone_created_with_the_admin_token_survives_a_restart_of_the_map_service(fog: Project) -> None:
     assert httpx.post(fog.url("map-service", "/api/v1/zones"), json=ZONE).status_code == 401
-    drawn = httpx.post(fog.url("map-service", "/api/v1/zones"), json=ZONE, headers=token(fog))
-    assert drawn.status_code == 201, drawn.text
-    zone = drawn.json()
+    created = httpx.post(fog.url("map-service", "/api/v1/zones"), json=ZONE, headers=token(fog))
+    assert created.status_code == 201, created.text
+    zone = created.json()
 
     fog("restart", "map-service")
     wait(lambda: None if health(fog, "map-service") == "healthy" else "the map-service is not healthy", HEALTHY_S)
 
-    seen = httpx.get(fog.url("map-service", "/api/v1/zones")).json()
-    assert zone in seen["zones"]
-    assert zone["id"] in seen["active"]
-    gone = httpx.delete(fog.url("map-service", f"/api/v1/zones/{zone['id']}"), headers=token(fog))
-    assert gone.status_code == 204, gone.text
+    listed = httpx.get(fog.url("map-service", "/api/v1/zones")).json()
+    assert zone in listed["zones"]
+    assert zone["id"] in listed["active"]
+    deleted = httpx.delete(fog.url("map-service", f"/api/v1/zones/{zone['id']}"), headers=token(fog))
+    assert deleted.status_code == 204, deleted.text
 
 
-async def test_the_simulated_robot_is_enabled_and_drives(sim: Project) -> None:
+async def test_simulated_robot_is_enabled_and_drives(sim: Project) -> None:
     clock = SystemClock()
     async with ZenohEdge.open(
         connect=[f"tcp/{sim.address('zenoh')}"], clock=clock, role="test", id="compose", site="estig"
     ) as edge:
         states = edge.latest(ch.ROBOT_STATE, RobotState, robot="r1")
         poses = edge.latest(ch.ROBOT_POSE, RobotPose, robot="r1")
-        begin: RobotPose | None = None
+        start: RobotPose | None = None
 
-        def look() -> str | None:
-            nonlocal begin
+        def missing() -> str | None:
+            nonlocal start
             state, pose = states.get(), poses.get()
             if state is None or pose is None:
-                return "the robot says nothing"
-            begin = begin or pose
-            moved = math.hypot(pose.x - begin.x, pose.y - begin.y)
+                return "the robot publishes nothing"
+            start = start or pose
+            moved = math.hypot(pose.x - start.x, pose.y - start.y)
             if state.mode == "NORMAL" and state.enabled and pose.v > 0.0 and moved > 1.0:
                 return None
             return f"{state.mode} {state.reasons}, moved {moved:.2f} m"
 
-        await asyncio.to_thread(wait, look, 90)
+        await asyncio.to_thread(wait, missing, 90)
 
 
-def test_no_process_is_root_has_a_capability_or_can_write_to_its_image(sim: Project) -> None:
+def test_no_process_is_root_or_has_a_capability_or_can_write_to_its_image(sim: Project) -> None:
     for service, container in sim.containers().items():
-        if service == "keys":  # it has ended
+        if service == "keys":  # it has finished
             continue
         users = docker("top", container["Id"], "-eo", "uid,pid").split()[2::2]
         assert users, service
@@ -338,18 +338,18 @@ def test_prometheus_records_the_robots_cpu_time(sim: Project) -> None:
     wait(lambda: None if (seconds() or 0.0) > before else f"stays at {before} s", 30)
 
 
-def test_whatever_is_killed_comes_back(sim: Project) -> None:
-    everything = {*FOG, "sim-robot"}
+def test_killed_containers_are_restarted(sim: Project) -> None:
+    services = {*FOG, "sim-robot"}
     before = {name: container["RestartCount"] for name, container in sim.containers().items()}
     for name, container in sim.containers().items():
-        if name in everything:
-            # Nothing inside a container can kill its first process; the engine's init or a server's own handler is it.
+        if name in services:
+            # A container's first process can't be killed from inside, unless it handles the signal: kill init's child.
             init = container["HostConfig"].get("Init")
             sim.inside(name, "kill -9 $(cat /proc/1/task/1/children)" if init else "kill 1")
-    sim.wait_healthy(everything, {name: before[name] + 1 for name in everything})
+    sim.wait_healthy(services, {name: before[name] + 1 for name in services})
 
 
-def test_a_fog_node_needs_less_than_a_gigabyte(sim: Project, record_property: Callable[[str, object], None]) -> None:
+def test_fog_node_needs_less_than_a_gigabyte(sim: Project, record_property: Callable[[str, object], None]) -> None:
     unit = {"B": 2**-20, "KiB": 2**-10, "MiB": 1.0, "GiB": 2.0**10}
     services = {c["Name"].lstrip("/"): name for name, c in sim.containers().items() if c["State"]["Running"]}
     used = {}
@@ -359,32 +359,32 @@ def test_a_fog_node_needs_less_than_a_gigabyte(sim: Project, record_property: Ca
         used[services[found[1]]] = float(found[2]) * unit[found[3]]
     for name, mebibytes in used.items():
         record_property(f"{name} MiB", round(mebibytes))
-    print({name: f"{mebibytes:.0f} MiB" for name, mebibytes in sorted(used.items())})  # noqa: T201  # what `pytest -s` is asked for
+    print({name: f"{mebibytes:.0f} MiB" for name, mebibytes in sorted(used.items())})  # noqa: T201  # shown by `pytest -s`
     assert set(used) == {*FOG, "sim-robot"}
     assert sum(used[name] for name in FOG) < 1024
 
 
-def test_stop_ends_everything_in_good_order_and_up_brings_it_back(sim: Project) -> None:
-    begin = time.monotonic()
+def test_stop_ends_every_container_cleanly_and_up_restarts_them(sim: Project) -> None:
+    started = time.monotonic()
     sim("stop")
-    took = time.monotonic() - begin
-    ended = {name: container["State"]["ExitCode"] for name, container in sim.containers().items()}
-    assert ended == dict.fromkeys([*FOG, "keys", "sim-robot"], 0)
-    assert took < STOP_S
+    duration = time.monotonic() - started
+    exit_codes = {name: container["State"]["ExitCode"] for name, container in sim.containers().items()}
+    assert exit_codes == dict.fromkeys([*FOG, "keys", "sim-robot"], 0)
+    assert duration < STOP_S
     sim("up", "--detach", "--no-build", timeout_s=300)
     restarts = {name: container["RestartCount"] for name, container in sim.containers().items()}
     sim.wait_healthy({*FOG, "sim-robot"}, restarts)
 
 
-def test_a_stop_while_the_kernels_are_compiled_is_obeyed(fog: Project) -> None:
+def test_container_stops_while_it_compiles_its_kernels(fog: Project) -> None:
     name = f"{fog.name}-cold"
     fog("run", "--detach", "--no-deps", "--name", name, "--env", "NUMBA_CACHE_DIR=/tmp/numba", "planner")
     try:
         wait(lambda: None if "fog_kernels.warm" in docker("top", name) else "it does not compile yet", 10)
-        begin = time.monotonic()
+        started = time.monotonic()
         docker("stop", name)
-        took = time.monotonic() - begin
+        duration = time.monotonic() - started
         assert "kernels and helpers ready" not in docker("logs", name), "it was ready before the stop"
     finally:
         docker("rm", "--force", name)
-    assert took < STOP_S / 2
+    assert duration < STOP_S / 2

@@ -1,8 +1,8 @@
 """What `docs/architecture.md` says under "Adding to it", done: in a copy of the sources, in the files that it names.
 
 The additions are made as a person would make them, then a check of each (`fixtures/adding`) runs on the copy with the
-fixtures of the services' own tests: real brokers and real processes. Debounce rules and cost layers are
-proven by the package in `fixtures/foreign-parts`, bases and lidars by those that there are (`wire/test_every_part.py`).
+fixtures of the services' own tests: real brokers and real processes. Debounce rules and cost layers are proven by the
+package in `fixtures/external-parts`, bases and lidars by the existing ones (`wire/test_every_part.py`).
 """
 
 import os
@@ -120,10 +120,12 @@ class Extension(Message, frozen=True, kw_only=True):
 
 '''),
     Edit(MAP_API, r'^    @routes\.get\("/api/v1/audit"', before='''\
-    @routes.post("/api/v1/zones/{zone_id}/extension", raises=[ZoneError, ConflictError, StoreError], problems=_UNKNOWN)
+    @routes.post(
+        "/api/v1/zones/{zone_id}/extension", raises=[ZoneError, ConflictError, StoreError], problems=_NO_SUCH_ZONE
+    )
     async def extend_zone(zone_id: str, body: Body[Extension], caller: Operator) -> Answer[Zone]:
         """Let a zone hold for so many more minutes."""
-        old = _known(service, zone_id)
+        old = _find_zone(service, zone_id)
         longer = msgspec.structs.replace(old, expires_at=clock.stamp() + 60.0 * body.minutes)
         zone = await service.replace(longer, old.version, caller.name)
         return Answer(zone, etag(zone.version))

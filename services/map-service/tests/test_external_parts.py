@@ -1,4 +1,4 @@
-"""A package that is not ours brings a debounce rule by time and a cost layer; the real processes use both by name."""
+"""An external package registers a debounce rule and a cost layer; the real processes use both by name."""
 
 import asyncio
 import os
@@ -18,7 +18,7 @@ from fog_contracts.replica import Replica
 pytest.importorskip("hazard_aggregator")
 pytestmark = pytest.mark.live
 
-PACKAGE = Path(__file__).parents[3] / "tests" / "fixtures" / "foreign-parts"
+PACKAGE = Path(__file__).parents[3] / "tests" / "fixtures" / "external-parts"
 SECONDS = 0.4
 COST = 80
 LAYERS = f'layers = ["static", "hazards", "zones", "obstacles", {{ name = "visited", cost = {COST}, seconds = 1.5 }}]'
@@ -26,8 +26,8 @@ LAYERS = f'layers = ["static", "hazards", "zones", "obstacles", {{ name = "visit
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory) -> Path:
-    """Build the package as its author would, and install it into a folder of its own."""
-    source = tmp_path_factory.mktemp("source") / "foreign-parts"
+    """Build the package as its author would, and install it into a folder."""
+    source = tmp_path_factory.mktemp("source") / "external-parts"
     shutil.copytree(PACKAGE, source)
     command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(source / "dist")]
     subprocess.run(command, cwd=source, check=True, capture_output=True, timeout=120)
@@ -40,15 +40,15 @@ def installed(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def fog_with_parts(fog, installed: Path):
-    """A fog whose processes find the package, at a site that chooses its parts."""
+    """A fog whose processes can import the package, at a site that is configured to use its parts."""
     fog.environment["PYTHONPATH"] = os.pathsep.join(
         part for part in (str(installed), os.environ.get("PYTHONPATH", "")) if part
     )
-    choose(fog, f'number = 7\ndebounce = {{ rule = "sustained", seconds = {SECONDS} }}', LAYERS)
+    configure(fog, f'number = 7\ndebounce = {{ rule = "sustained", seconds = {SECONDS} }}', LAYERS)
     return fog
 
 
-def choose(fog, area: str, layers: str) -> None:
+def configure(fog, area: str, layers: str) -> None:
     file = fog.site / "site.toml"
     text = file.read_text().replace("number = 7", area).replace('map = "map.yaml"', f'map = "map.yaml"\n{layers}')
     file.write_text(text)
@@ -59,7 +59,7 @@ def pose(x: float, y: float) -> RobotPose:
 
 
 async def cost(zenoh, x: float, y: float) -> int | None:
-    """Return the cost of a place on the map as the map-service serves it, or None before it does."""
+    """Return the cost of a point (m) on the served map, or None before the map-service serves it."""
     snapshot = await zenoh.query(ch.MAP_SNAPSHOT, None, MapSnapshot, 1.0)
     if snapshot is None:
         return None
@@ -69,7 +69,7 @@ async def cost(zenoh, x: float, y: float) -> int | None:
     return int(replica.cost[row, column])
 
 
-async def test_a_foreign_rule_and_a_foreign_layer_work_in_the_running_services(fog_with_parts):
+async def test_debounce_rule_and_cost_layer_of_an_external_package_work_in_the_running_services(fog_with_parts):
     fog = fog_with_parts
     for module in ("hazard_aggregator", "map_service"):
         fog.start(module)
@@ -106,7 +106,7 @@ async def test_a_foreign_rule_and_a_foreign_layer_work_in_the_running_services(f
 
 
 @pytest.mark.parametrize(
-    ("module", "area", "layers", "words"),
+    ("module", "area", "layers", "expected"),
     [
         ("hazard_aggregator", 'debounce = { rule = "sustaned" }', "", ("area hall", "debounce.rule", "sustained")),
         ("hazard_aggregator", 'debounce = { rule = "sustained", seconds = 0 }', "", ("area hall", "debounce.seconds")),
@@ -114,13 +114,13 @@ async def test_a_foreign_rule_and_a_foreign_layer_work_in_the_running_services(f
         ("map_service", "", LAYERS.replace("seconds = 1.5", "seconds = 0"), ("layers[4] (visited)", "seconds")),
     ],
 )
-async def test_a_part_that_cannot_be_used_ends_the_start_with_its_place_and_what_there_is(
-    fog, installed, module, area, layers, words
+async def test_invalid_choice_of_a_part_ends_the_start_naming_its_place_and_the_known_parts(
+    fog, installed, module, area, layers, expected
 ):
     fog.environment["PYTHONPATH"] = str(installed)
-    choose(fog, f"number = 7\n{area}", layers)
+    configure(fog, f"number = 7\n{area}", layers)
     fog.start(module)
     status = await asyncio.to_thread(fog.processes[module].wait, 30)
     assert status != 0
-    for word in words:
-        assert word in fog.log(module)
+    for text in expected:
+        assert text in fog.log(module)

@@ -59,3 +59,24 @@ def test_all_members_have_the_one_version() -> None:
             [sys.executable, "-m", "fognav", "--version"], capture_output=True, text=True, check=True
         ).stdout.strip()
     )
+
+
+def test_the_steps_of_a_hazard_name_files_that_define_what_they_name() -> None:
+    text = (ROOT / "docs/architecture.md").read_text("utf-8")
+    section = text.partition("## One hazard, step by step")[2].partition("\n## ")[0]
+    rows = [row.split(" | ") for row in section.splitlines() if row.startswith("| ")]
+    steps = [row for row in rows if len(row) == 4 and ".py" in row[1]]
+    assert len(steps) > 15
+    missing = []
+    for step, files, names, _ in steps:
+        sources = [(ROOT / "docs" / link).read_text("utf-8") for link in LINK.findall(files)]
+        for name in re.findall(r"`([\w.]+)`", names):
+            owner, _, member = name.rpartition(".")
+            found = any(
+                re.search(rf"^ *(async )?(def|class) {member}\b", source, re.MULTILINE)
+                and (not owner or f"class {owner}" in source)
+                for source in sources
+            )
+            if not found:
+                missing.append(f"{step}: {name}")
+    assert missing == []

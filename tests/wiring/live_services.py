@@ -278,7 +278,7 @@ class LiveServices:
             "map tick": self.map.tick_loop(),
             "planner tick": self.planner.tick_loop(),
             "agent publish": self.agent.publish_loop(),
-            "planner map": self.planner.map_loop(),
+            "planner map": self.planner.snapshot_loop(),
             "agent housekeeping": self.agent.housekeeping_loop(self.link),
         }
         for name, loop in loops.items():

@@ -105,10 +105,10 @@ class PlannerProcess:
         """
         self.due = False
         self._bus.publish(self.core.tick(at))
-        self.core.take_reached()
+        self.core.pop_reached()
         for job in self.core.field_jobs():
             job.run()
-            self.core.take_field(job)
+            self.core.add_field(job)
         if self.core.wants_snapshot(at.now):
             snapshot = self._bus.query(ch.MAP_SNAPSHOT, None, MapSnapshot, at)
             if snapshot is not None:

@@ -1,4 +1,4 @@
-"""Lets the tests of this member import the ring of corridors that lies beside them."""
+"""Lets the tests of this member import `ring_map` beside them."""
 
 from __future__ import annotations
 

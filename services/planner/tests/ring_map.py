@@ -1,4 +1,4 @@
-"""A map to plan on: a ring of corridors with an upper and a lower way from left to right."""
+"""A map for tests: a ring of corridors with an upper and a lower path from left to right."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +26,8 @@ Box = tuple[float, float, float, float]
 RES = 0.1
 
 
-class Map:
-    """A ring of corridors 2 m wide, 20 x 12 m: an upper and a lower way from left to right."""
+class RingMap:
+    """A ring of corridors 2 m wide, 20 x 12 m: an upper and a lower path from left to right."""
 
     def __init__(self, epoch: int = 1, walls: tuple[Box, ...] = ((2.0, 2.0, 18.0, 10.0),)) -> None:
         self.geometry = GridGeometry(200, 120, RES, 0.0, 0.0)
@@ -35,14 +35,14 @@ class Map:
         self.static[[0, -1], :] = 254
         self.static[:, [0, -1]] = 254
         for wall in walls:
-            self.paint(self.static, wall, 254)
+            self.raise_costs(self.static, wall, 254)
         self.table = inflation_table(RES, DEFAULT_INFLATION)
         self.areas: dict[str, Box] = {}
         self.penalties: dict[str, int] = {}
         self.master = MasterMap("test", self.geometry, self.static, inflate(self.static, self.table), epoch)
         self.epoch = epoch
 
-    def paint(self, grid: Grid, box: Box, value: int) -> None:
+    def raise_costs(self, grid: Grid, box: Box, value: int) -> None:
         window = self.geometry.window_around(box[0], box[1], box[2] - 1e-6, box[3] - 1e-6)
         cells = grid[window.rows, window.columns]
         cells[:] = np.maximum(cells, value)
@@ -50,7 +50,7 @@ class Map:
     def cost(self) -> Grid:
         raw = self.static.copy()
         for name, box in self.areas.items():
-            self.paint(raw, box, self.penalties[name])
+            self.raise_costs(raw, box, self.penalties[name])
         return inflate(raw, self.table)
 
     def put(self, name: str, box: Box, penalty: int = 254, trace: Trace | None = None) -> list[MapDelta]:
@@ -72,7 +72,7 @@ class Map:
         cells = np.ascontiguousarray(new[window.rows, window.columns])
         return self.master.write([("cost", window, cells)], causes, [trace] if trace else [])
 
-    def told(self, name: str, state: AreaState = "blocked") -> HazardArea:
+    def hazard_area(self, name: str, state: AreaState = "blocked") -> HazardArea:
         x0, y0, x1, y1 = self.areas[name]
         hazard = AreaHazard(area=name, state=state, severity=2, penalty=254, since=0.0, seq=1, epoch=1, cause="test")
         return HazardArea(hazard=hazard, polygon=[(x0, y0), (x1, y0), (x1, y1), (x0, y1)])

@@ -1,4 +1,4 @@
-"""The planner's core: when it plans, what it publishes, how it refuses."""
+"""The planner's core: when it plans, what it publishes, what it refuses."""
 
 import itertools
 import math
@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from ring_map import LEFT, LOWER, RES, RIGHT, UPPER, Grid, Map, goal, pose, via
+from ring_map import LEFT, LOWER, RES, RIGHT, UPPER, Grid, RingMap, goal, pose, via
 
 from fog_contracts import channels as ch
 from fog_contracts.grid import GridGeometry
@@ -36,7 +36,7 @@ from planner.route import Route
 
 
 def crosses(points: NDArray[np.float64], cost: Grid, geometry: GridGeometry) -> bool:
-    """Whether a point on the path's lines lies by more than a millimetre in an impassable cell."""
+    """Whether a point of the path lies in an impassable cell, by more than a millimetre."""
     for (x0, y0), (x1, y1) in itertools.pairwise(points.tolist()):
         count = max(1, math.ceil(math.hypot(x1 - x0, y1 - y0) / 0.02))
         for step in range(count + 1):
@@ -54,8 +54,8 @@ def length(path: RobotPath) -> float:
 class Drive:
     """A core with one robot, time in steps of 0.1 s with heartbeats."""
 
-    def __init__(self, the_map: Map | None = None, start: tuple[float, float] = (1.0, 6.0)) -> None:
-        self.map = the_map or Map()
+    def __init__(self, ring_map: RingMap | None = None, start: tuple[float, float] = (1.0, 6.0)) -> None:
+        self.map = ring_map or RingMap()
         self.core = PlannerCore(epoch=7)
         self.now = 100.0
         self.core.load(self.map.master.snapshot(), self.now)
@@ -67,7 +67,7 @@ class Drive:
     def moment(self) -> Moment:
         return Moment(self.now, self.now + 1000.0)
 
-    def hear(self, channel: ch.Channel, message: Message, **ids: str) -> None:
+    def deliver(self, channel: ch.Channel, message: Message, **ids: str) -> None:
         self.core.handlers()[channel](ids, message, self.moment)
 
     def query(self, channel: ch.Channel, request: Message) -> PlanReply:
@@ -79,9 +79,9 @@ class Drive:
         for _ in range(round(seconds / 0.1)):
             self.now += 0.1
             if heartbeat:
-                self.hear(ch.MAP_HEARTBEAT, self.map.master.heartbeat(self.now))
+                self.deliver(ch.MAP_HEARTBEAT, self.map.master.heartbeat(self.now))
             if posed:
-                self.hear(ch.ROBOT_POSE, pose(*self.at), robot="r1")
+                self.deliver(ch.ROBOT_POSE, pose(*self.at), robot="r1")
             self.publish(self.core.tick(self.moment))
 
     def publish(self, publications: Sequence[Publication]) -> None:
@@ -94,7 +94,7 @@ class Drive:
 
     def send(self, deltas: list[MapDelta]) -> None:
         for delta in deltas:
-            self.hear(ch.MAP_DELTA, delta)
+            self.deliver(ch.MAP_DELTA, delta)
 
     def go(self, x: float, y: float, name: str = "g1") -> RobotPath:
         self.core.set_goal("r1", goal(x, y, name))
@@ -102,7 +102,7 @@ class Drive:
         return self.paths[-1]
 
 
-def test_a_path_leads_from_the_robot_to_the_goal_with_points_ten_centimetres_apart() -> None:
+def test_path_leads_from_the_robot_to_the_goal_with_points_ten_centimetres_apart() -> None:
     path = Drive(start=LEFT).go(*RIGHT)
     assert path.points[0] == LEFT
     assert path.points[-1] == RIGHT
@@ -112,7 +112,7 @@ def test_a_path_leads_from_the_robot_to_the_goal_with_points_ten_centimetres_apa
     assert (path.planner_epoch, path.goal_id, path.goal_theta) == (7, "g1", 0.0)
 
 
-def test_a_hazard_on_the_way_leads_to_the_other_way_at_once_and_carries_its_trace() -> None:
+def test_hazard_on_the_path_is_replanned_around_at_once_and_the_path_carries_its_trace() -> None:
     drive = Drive(start=LEFT)
     first = drive.go(*RIGHT)
     trace = Trace(area="z1", epoch=1, seq=5, first_reading=1.0, confirmed=2.0, costmap_published=3.0)
@@ -126,7 +126,7 @@ def test_a_hazard_on_the_way_leads_to_the_other_way_at_once_and_carries_its_trac
     assert (carried.area, carried.seq, carried.costmap_published, carried.plan_published) == ("z1", 5, 3.0, path.stamp)
 
 
-def test_a_change_elsewhere_keeps_the_plan_and_is_not_even_computed() -> None:
+def test_change_far_from_the_path_triggers_no_search() -> None:
     drive = Drive(start=LEFT)
     first = drive.go(*RIGHT)
     drive.send(drive.map.put("z2", LOWER))
@@ -136,8 +136,8 @@ def test_a_change_elsewhere_keeps_the_plan_and_is_not_even_computed() -> None:
     assert drive.paths[-1].map_seq == 1
 
 
-def test_a_clearing_that_saves_more_than_the_share_is_taken_and_a_smaller_one_is_not() -> None:
-    drive = Drive(start=(1.0, 9.0))  # the upper way is far shorter
+def test_clearing_that_saves_enough_changes_the_path_and_a_smaller_saving_does_not() -> None:
+    drive = Drive(start=(1.0, 9.0))  # the upper path is far shorter
     drive.send(drive.map.put("z1", UPPER))
     assert via(drive.go(19.0, 9.0)) == "lower"
     drive.send(drive.map.clear("z1"))
@@ -145,7 +145,7 @@ def test_a_clearing_that_saves_more_than_the_share_is_taken_and_a_smaller_one_is
     assert via(drive.paths[-1]) == "upper"
     assert drive.core.plans["clearing"] == 1
 
-    drive = Drive(start=(1.0, 6.1))  # both ways are about as long
+    drive = Drive(start=(1.0, 6.1))  # both paths are about as long
     drive.send(drive.map.put("z1", UPPER))
     first = drive.go(19.0, 6.1)
     drive.send(drive.map.clear("z1"))
@@ -153,7 +153,7 @@ def test_a_clearing_that_saves_more_than_the_share_is_taken_and_a_smaller_one_is
     assert drive.paths[-1].plan_id == first.plan_id
 
 
-def test_no_dithering_between_two_ways_that_cost_nearly_the_same() -> None:
+def test_plan_does_not_oscillate_between_two_paths_of_nearly_the_same_cost() -> None:
     drive = Drive(start=(1.0, 6.02))
     first = drive.go(19.0, 6.0)
     narrow = (9.0, 11.6, 9.4, 12.0) if via(first) == "upper" else (9.0, 0.0, 9.4, 0.4)
@@ -166,20 +166,20 @@ def test_no_dithering_between_two_ways_that_cost_nearly_the_same() -> None:
     assert drive.core.plans["map"] >= 4
 
 
-def test_the_plan_is_repeated_twice_a_second_and_more_of_it_released_as_the_robot_drives() -> None:
+def test_path_is_republished_twice_a_second_with_a_released_length_that_grows_with_progress() -> None:
     drive = Drive(start=LEFT)
     first = drive.go(*RIGHT)
     assert first.released_length == pytest.approx(15.0)
     drive.step(2.0)
     assert len(drive.paths) in (4, 5)
     ahead = Route(np.array(first.points), 0.1)
-    drive.at = tuple(float(v) for v in ahead.rest(3.0)[0])
+    drive.at = tuple(float(v) for v in ahead.remaining(3.0)[0])
     drive.step(0.6)
     assert drive.paths[-1].plan_id == first.plan_id
     assert drive.paths[-1].released_length == pytest.approx(18.0, abs=0.15)
 
 
-def test_nothing_is_released_on_a_map_that_went_stale() -> None:
+def test_nothing_is_released_on_an_outdated_map() -> None:
     drive = Drive(start=LEFT)
     drive.go(*RIGHT)
     drive.step(1.5, heartbeat=False)
@@ -190,29 +190,29 @@ def test_nothing_is_released_on_a_map_that_went_stale() -> None:
     assert len(drive.paths) > count
 
 
-def test_nothing_is_planned_for_a_robot_that_is_silent_or_lost() -> None:
+def test_nothing_is_planned_for_a_robot_that_is_silent_or_not_localized() -> None:
     drive = Drive(start=LEFT)
     drive.core.set_goal("r1", goal(*RIGHT))
     drive.step(1.0, posed=False)
     assert drive.paths == []
-    drive.hear(ch.ROBOT_POSE, pose(*LEFT, localized=False), robot="r1")
+    drive.deliver(ch.ROBOT_POSE, pose(*LEFT, localized=False), robot="r1")
     drive.step(1.0, posed=False)
     assert drive.paths == []
     drive.step()
     assert len(drive.paths) == 1
 
 
-def test_a_robot_that_strays_more_than_a_metre_gets_a_new_path_from_where_it_is() -> None:
+def test_robot_more_than_a_metre_off_its_path_gets_a_new_one_from_its_position() -> None:
     drive = Drive(start=LEFT)
     first = drive.go(*RIGHT)
     drive.at = (1.0, 5.0)
     drive.step()
     assert drive.paths[-1].points[0] == (1.0, 5.0)
     assert drive.paths[-1].plan_id > first.plan_id
-    assert drive.core.plans["strayed"] == 1
+    assert drive.core.plans["off_path"] == 1
 
 
-def test_lost_deltas_need_a_snapshot_and_the_ones_that_came_meanwhile_are_not_lost() -> None:
+def test_lost_delta_requires_a_snapshot_and_deltas_received_meanwhile_are_applied() -> None:
     drive = Drive(start=LEFT)
     drive.go(*RIGHT)
     drive.map.put("lost", (5.0, 0.0, 6.0, 1.0))
@@ -226,7 +226,7 @@ def test_lost_deltas_need_a_snapshot_and_the_ones_that_came_meanwhile_are_not_lo
     assert drive.paths[-1].map_seq == 2
 
 
-def test_a_heartbeat_that_stays_ahead_makes_a_snapshot_necessary() -> None:
+def test_heartbeat_that_stays_ahead_of_the_deltas_requires_a_snapshot() -> None:
     drive = Drive(start=LEFT)
     drive.map.put("z1", UPPER)
     drive.step(0.4)
@@ -235,10 +235,10 @@ def test_a_heartbeat_that_stays_ahead_makes_a_snapshot_necessary() -> None:
     assert drive.core.wants_snapshot(drive.now)
 
 
-def test_a_new_epoch_of_the_map_is_planned_on_afresh() -> None:
+def test_new_epoch_of_the_map_triggers_a_new_plan() -> None:
     drive = Drive(start=LEFT)
     drive.go(*RIGHT)
-    drive.map = Map(epoch=2)
+    drive.map = RingMap(epoch=2)
     drive.map.put("z1", UPPER)
     drive.step()
     assert drive.core.wants_snapshot(drive.now)
@@ -248,11 +248,11 @@ def test_a_new_epoch_of_the_map_is_planned_on_afresh() -> None:
     assert drive.core.plans["epoch"] == 1
 
 
-def test_a_cut_way_is_refused_naming_each_area_whose_end_would_open_it_and_the_nearest_point() -> None:
+def test_blocked_goal_is_refused_naming_each_decisive_area_and_the_nearest_point() -> None:
     drive = Drive(start=LEFT)
     for name, box in (("z1", UPPER), ("z2", LOWER), ("aside", (5.0, 5.0, 6.0, 6.0))):
         drive.send(drive.map.put(name, box))
-        drive.hear(ch.HAZARD, drive.map.told(name))
+        drive.deliver(ch.HAZARD, drive.map.hazard_area(name))
     path = drive.go(*RIGHT)
     assert path.points == []
     assert path.refusal
@@ -266,46 +266,46 @@ def test_a_cut_way_is_refused_naming_each_area_whose_end_would_open_it_and_the_n
     assert via(drive.paths[-1]) == "lower"
 
 
-def test_areas_that_cut_only_together_are_named_together() -> None:
+def test_areas_that_block_only_together_are_named_together() -> None:
     drive = Drive(start=LEFT)
     boxes = {"z1": UPPER, "z2": (5.0, 10.0, 6.0, 12.0), "z3": LOWER, "z4": (5.0, 0.0, 6.0, 2.0)}
     for name, box in boxes.items():
         drive.send(drive.map.put(name, box))
-        drive.hear(ch.HAZARD, drive.map.told(name))
+        drive.deliver(ch.HAZARD, drive.map.hazard_area(name))
     refusal = drive.go(*RIGHT).refusal
     assert refusal
     assert len(refusal.causes) == 2
     assert {cause.id for cause in refusal.causes} in ({"z1", "z2"}, {"z3", "z4"})
-    assert "only together" in refusal.reason
+    assert "which must all end" in refusal.reason
 
 
-def test_a_way_cut_by_what_lidars_see_or_by_walls_says_so() -> None:
+def test_refusal_names_lidar_obstacles_or_walls_as_the_cause() -> None:
     drive = Drive(start=LEFT)
     drive.send(drive.map.put("boxes", UPPER) + drive.map.put("crates", LOWER))
     refusal = drive.go(*RIGHT).refusal
     assert refusal
     assert [cause.kind for cause in refusal.causes] == ["obstacle"]
-    drive = Drive(Map(walls=((9.0, 0.0, 11.0, 12.0),)), start=LEFT)
+    drive = Drive(RingMap(walls=((9.0, 0.0, 11.0, 12.0),)), start=LEFT)
     refusal = drive.go(*RIGHT).refusal
     assert refusal
     assert [cause.kind for cause in refusal.causes] == ["map"]
 
 
 @pytest.mark.parametrize(
-    ("x", "y", "code", "word"),
+    ("x", "y", "code", "reason"),
     [(10.0, 6.0, 206, "in a wall"), (30.0, 6.0, 204, "outside the map"), (0.15, 6.0, 206, "too near a wall")],
 )
-def test_a_goal_that_can_never_be_reached_is_known_at_once(x: float, y: float, code: int, word: str) -> None:
+def test_goal_that_can_never_be_reached_is_refused_at_once(x: float, y: float, code: int, reason: str) -> None:
     refusal = Drive().core.check_goal(x, y)
     assert refusal
     assert refusal.code == code
-    assert word in refusal.reason
+    assert reason in refusal.reason
 
 
-def test_a_goal_inside_a_hazard_is_refused_by_the_path_until_the_hazard_ends() -> None:
+def test_goal_inside_a_hazard_is_refused_until_the_hazard_ends() -> None:
     drive = Drive(start=LEFT)
     drive.send(drive.map.put("z1", UPPER))
-    drive.hear(ch.HAZARD, drive.map.told("z1"))
+    drive.deliver(ch.HAZARD, drive.map.hazard_area("z1"))
     assert drive.core.check_goal(10.0, 11.0) is None
     refusal = drive.go(10.0, 11.0).refusal
     assert refusal
@@ -315,40 +315,40 @@ def test_a_goal_inside_a_hazard_is_refused_by_the_path_until_the_hazard_ends() -
     assert drive.paths[-1].points
 
 
-def test_a_no_go_zone_is_a_cause_like_a_hazard() -> None:
+def test_no_go_zones_are_named_as_causes() -> None:
     drive = Drive(start=LEFT)
     drive.send(drive.map.put("circle", (9.2, 10.2, 10.8, 11.8)) + drive.map.put("strip", LOWER))
     circle = Zone(id="circle", kind="BLOCKED", shape=CircleShape(centre=(10.0, 11.0), radius=0.85), reason="wet floor")
     strip = Zone(id="strip", kind="BLOCKED", shape=CorridorShape(line=[(10.0, 0.0), (10.0, 2.0)], width=2.0))
-    drive.hear(ch.ZONES, ZoneSet(epoch=1, seq=2, zones=[circle, strip]))
+    drive.deliver(ch.ZONES, ZoneSet(epoch=1, seq=2, zones=[circle, strip]))
     refusal = drive.go(*RIGHT).refusal
     assert refusal
     assert [(cause.kind, cause.id) for cause in refusal.causes] == [("zone", "circle"), ("zone", "strip")]
     assert "wet floor" in refusal.reason
 
 
-def test_a_start_inside_the_inscribed_band_is_led_out_and_one_inside_a_hazard_is_refused() -> None:
+def test_start_on_an_inscribed_cell_gets_an_escape_and_one_inside_a_hazard_is_refused() -> None:
     path = Drive(start=(0.2, 6.0)).go(*RIGHT)
     assert path.points[0] == (0.2, 6.0)
     assert path.refusal is None
     drive = Drive(start=(10.0, 11.0))
     drive.send(drive.map.put("z1", UPPER))
-    drive.hear(ch.HAZARD, drive.map.told("z1"))
+    drive.deliver(ch.HAZARD, drive.map.hazard_area("z1"))
     refusal = drive.go(*RIGHT).refusal
     assert refusal
     assert (refusal.code, [cause.id for cause in refusal.causes]) == (205, ["z1"])
 
 
-def test_a_start_outside_the_map_is_refused() -> None:
+def test_start_outside_the_map_is_refused() -> None:
     refusal = Drive(start=(-1.0, 6.0)).go(*RIGHT).refusal
     assert refusal
     assert refusal.code == 203
 
 
-def test_egress_leads_out_of_a_blocked_area_by_the_nearer_end_and_not_through_walls() -> None:
+def test_egress_leads_out_of_a_blocked_area_at_its_nearer_end_and_not_through_walls() -> None:
     drive = Drive()
     drive.send(drive.map.put("z1", UPPER))
-    drive.hear(ch.HAZARD, drive.map.told("z1"))
+    drive.deliver(ch.HAZARD, drive.map.hazard_area("z1"))
     reply = drive.query(ch.PLANNER_EGRESS, EgressRequest(robot="r1", pose=Pose(x=9.63, y=11.02, theta=0.0)))
     assert reply.refusal is None
     assert reply.points[0] == pytest.approx((9.65, 11.05))
@@ -359,11 +359,11 @@ def test_egress_leads_out_of_a_blocked_area_by_the_nearer_end_and_not_through_wa
     assert all(drive.map.static[drive.map.geometry.cell(*p)[::-1]] == 0 for p in reply.points)
 
 
-def test_egress_is_refused_when_another_area_blocks_the_way_out() -> None:
-    drive = Drive(Map(walls=((2.0, 2.0, 18.0, 10.0), (11.0, 10.0, 12.0, 12.0))))
+def test_egress_is_refused_when_another_area_blocks_it() -> None:
+    drive = Drive(RingMap(walls=((2.0, 2.0, 18.0, 10.0), (11.0, 10.0, 12.0, 12.0))))
     for name, box in (("z1", UPPER), ("z2", (2.0, 10.0, 7.0, 12.0))):
         drive.send(drive.map.put(name, box))
-        drive.hear(ch.HAZARD, drive.map.told(name))
+        drive.deliver(ch.HAZARD, drive.map.hazard_area(name))
     drive.send(drive.map.put("boxes", (8.0, 10.0, 8.9, 12.0)))
     reply = drive.query(ch.PLANNER_EGRESS, EgressRequest(robot="r1", pose=Pose(x=10.5, y=11.0, theta=0.0)))
     assert reply.refusal
@@ -377,13 +377,13 @@ def reached(goal_id: str) -> RobotState:
     )  # fmt: skip
 
 
-def test_a_reached_goal_ends_and_the_robot_is_told_until_it_gets_another() -> None:
+def test_reached_goal_ends_and_its_end_is_published_until_the_next_goal() -> None:
     drive = Drive(start=LEFT)
     drive.go(*RIGHT)
 
-    drive.hear(ch.ROBOT_STATE, reached("another"), robot="r1")
+    drive.deliver(ch.ROBOT_STATE, reached("another"), robot="r1")
     assert drive.core.goal("r1")
-    drive.hear(ch.ROBOT_STATE, reached("g1"), robot="r1")
+    drive.deliver(ch.ROBOT_STATE, reached("g1"), robot="r1")
     count = len(drive.paths)
     drive.step(1.2)
     assert drive.core.goal("r1") is None
@@ -392,15 +392,15 @@ def test_a_reached_goal_ends_and_the_robot_is_told_until_it_gets_another() -> No
     assert drive.go(*LEFT, name="g2").goal_id == "g2"
 
 
-def test_a_goal_that_changes_between_planning_and_publishing_gets_no_outdated_path() -> None:
+def test_goal_set_between_planning_and_publishing_gets_no_outdated_path() -> None:
     drive = Drive(start=LEFT)
     drive.go(*RIGHT)
     drive.step(0.4)
     for change in (lambda: drive.core.set_goal("r1", goal(*LEFT, name="g2")), lambda: drive.core.cancel("r1")):
         count = len(drive.paths)
         drive.now += 1.0
-        drive.hear(ch.MAP_HEARTBEAT, drive.map.master.heartbeat(drive.now))
-        drive.hear(ch.ROBOT_POSE, pose(*LEFT), robot="r1")
+        drive.deliver(ch.MAP_HEARTBEAT, drive.map.master.heartbeat(drive.now))
+        drive.deliver(ch.ROBOT_POSE, pose(*LEFT), robot="r1")
         drive.core.plan(drive.moment)
         change()
         drive.publish(drive.core.publish(drive.moment))
@@ -408,20 +408,20 @@ def test_a_goal_that_changes_between_planning_and_publishing_gets_no_outdated_pa
     assert drive.goals[-1].pose is None
 
 
-def test_a_reached_goal_is_handed_over_once() -> None:
+def test_reached_goal_is_returned_once() -> None:
     drive = Drive(start=LEFT)
     drive.go(*RIGHT)
-    assert drive.core.take_reached() == []
-    drive.hear(ch.ROBOT_STATE, reached("g1"), robot="r1")
-    drive.hear(ch.ROBOT_STATE, reached("g1"), robot="r1")
-    assert drive.core.take_reached() == [("r1", "g1")]
-    assert drive.core.take_reached() == []
+    assert drive.core.pop_reached() == []
+    drive.deliver(ch.ROBOT_STATE, reached("g1"), robot="r1")
+    drive.deliver(ch.ROBOT_STATE, reached("g1"), robot="r1")
+    assert drive.core.pop_reached() == [("r1", "g1")]
+    assert drive.core.pop_reached() == []
     drive.go(*LEFT, name="g2")
     drive.core.cancel("r1")
-    assert drive.core.take_reached() == []
+    assert drive.core.pop_reached() == []
 
 
-def test_what_counts_is_when_a_message_arrived_and_not_when_its_turn_came() -> None:
+def test_ages_count_from_the_arrival_of_a_message_not_from_its_handling() -> None:
     drive = Drive(start=LEFT)
     drive.core.set_goal("r1", goal(*RIGHT))
     arrived = drive.moment
@@ -432,7 +432,7 @@ def test_what_counts_is_when_a_message_arrived_and_not_when_its_turn_came() -> N
     assert drive.paths == []
 
 
-def test_a_preview_answers_without_touching_any_mission() -> None:
+def test_plan_query_changes_no_mission() -> None:
     drive = Drive(start=LEFT)
     first = drive.go(*RIGHT)
     reply = drive.query(
@@ -444,13 +444,13 @@ def test_a_preview_answers_without_touching_any_mission() -> None:
     assert drive.paths[-1].plan_id == first.plan_id
 
 
-def test_a_goal_field_changes_no_cost_and_is_dropped_when_the_map_falls_below_it() -> None:
+def test_goal_field_keeps_the_path_length_and_is_discarded_when_costs_fall_below_it() -> None:
     drive = Drive(start=LEFT)
     drive.core.set_goal("r1", goal(*RIGHT))
     (job,) = drive.core.field_jobs()
     assert drive.core.field_jobs() == []
     job.run()
-    drive.core.take_field(job)
+    drive.core.add_field(job)
     guided = drive.go(*RIGHT)
     assert length(guided) == pytest.approx(length(Drive(start=LEFT).go(*RIGHT)), rel=0.01)
     # A door in the static wall opens: the map-service got another floor plan under the same epoch.
@@ -474,7 +474,7 @@ CHANGES = st.lists(
 
 @settings(max_examples=60, deadline=None)
 @given(CHANGES)
-def test_whatever_changes_the_path_is_passable_and_no_much_better_one_is_missed(
+def test_path_stays_passable_and_near_optimal_after_any_changes(
     changes: list[tuple[str, tuple[float, float, float, float] | None, int, float]],
 ) -> None:
     drive = Drive(start=(1.0, 7.0))
@@ -493,18 +493,18 @@ def test_whatever_changes_the_path_is_passable_and_no_much_better_one_is_missed(
         path = drive.paths[-1]
         begin, end = geometry.cell(*drive.at), geometry.cell(19.0, 7.0)
         if cost[begin[1], begin[0]] >= 253:
-            return  # the robot stands in it: what happens then has its own tests
+            return  # the robot stands inside: other tests cover that
         full = fresh.plan(cost, begin, end)
         assert (path.refusal is None) == full.found
         if not full.found:
             continue
         assert path.map_seq == drive.map.master.version.seq
         route = Route(np.array(path.points), 0.1)
-        at, _ = route.nearest(*drive.at)
-        assert not crosses(route.rest(at), cost, geometry)  # what is driven already may be blocked behind the robot
+        along, _ = route.nearest(*drive.at)
+        assert not crosses(route.remaining(along), cost, geometry)  # the driven part may be blocked
         best = Route((fresh.shortcut(cost, full.cells) + 0.5) * RES, 0.1).cost(cost, geometry)
-        # Kept within the share that a clearing must save; 2 % more for what shortcuts and the robot's place differ.
-        assert route.cost(cost, geometry, at) <= best / 0.9 * 1.02 + 100.0
+        # Within the share that a clearing must save, plus 2 % for shortcuts and the robot's exact position.
+        assert route.cost(cost, geometry, along) <= best / 0.9 * 1.02 + 100.0
         if math.hypot(19.0 - drive.at[0], 7.0 - drive.at[1]) > 4.0:
-            drive.at = tuple(float(v) for v in route.rest(at + ahead)[0])
+            drive.at = tuple(float(v) for v in route.remaining(along + ahead)[0])
             drive.step(0.2)

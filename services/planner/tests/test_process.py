@@ -1,4 +1,4 @@
-"""The planner as a process, between a real router, a real Redis, a map-service and a robot made of edges."""
+"""The planner as a process, with a real router and Redis, and a test in the roles of map-service and robot."""
 
 import asyncio
 import os
@@ -90,7 +90,7 @@ def write_site(folder: Path) -> None:
 
 
 class World:
-    """What stands around the planner."""
+    """The planner's environment: servers, a map-service and a robot."""
 
     def __init__(self, folder: Path, router: Server, redis: Server, edge: ZenohEdge, clock: SystemClock) -> None:
         self.folder, self.router, self.redis, self.edge, self.clock = folder, router, redis, edge, clock
@@ -135,14 +135,14 @@ class World:
                 await asyncio.sleep(0.05)
             yield client
 
-    async def until(self, what: Callable[[], object], seconds: float = 15.0) -> None:
+    async def until(self, condition: Callable[[], object], seconds: float = 15.0) -> None:
         deadline = time.monotonic() + seconds
-        while not what():
+        while not condition():
             assert time.monotonic() < deadline, (self.folder / "planner.log").read_text()[-3000:]
             assert self.process is None or self.process.poll() is None, (self.folder / "planner.log").read_text()
             await asyncio.sleep(0.01)
 
-    async def beat(self) -> None:
+    async def publish_heartbeats_and_poses(self) -> None:
         async for _ in ticker(self.clock, 0.1):
             stamp = self.clock.stamp()
             self.edge.publish(ch.MAP_HEARTBEAT, self.master.heartbeat(stamp))
@@ -151,7 +151,7 @@ class World:
             )
             self.edge.publish(ch.ROBOT_POSE, pose, robot="r1")
 
-    def block(self) -> None:
+    def block_upper_corridor(self) -> None:
         raw = self.static.copy()
         raw[100:, 90:110] = 254
         whole = Window(0, 0, 200, 120)
@@ -164,7 +164,7 @@ class World:
         )
         self.edge.publish(ch.HAZARD, HazardArea(hazard=hazard, polygon=UPPER), area="z1")
 
-    def reached(self, goal_id: str) -> None:
+    def report_reached(self, goal_id: str) -> None:
         state = RobotState(
             mode="NORMAL", reasons=[], enabled=True, battery=None, goal_id=goal_id, map_epoch=5, map_seq=0, plan_id=1,
             goal_reached=True,
@@ -180,12 +180,12 @@ async def world(folder: Path) -> AsyncIterator[World]:
         async with ZenohEdge.open(connect=[router.endpoint], clock=clock, role="test", id="test", site="test") as edge:
             made = World(folder / "site", router, redis, edge, clock)
             made.start()
-            beat = asyncio.create_task(made.beat())
+            publishing = asyncio.create_task(made.publish_heartbeats_and_poses())
             try:
                 yield made
             finally:
-                beat.cancel()
-                await asyncio.gather(beat, return_exceptions=True)
+                publishing.cancel()
+                await asyncio.gather(publishing, return_exceptions=True)
                 if made.process and made.process.poll() is None:
                     made.stop(kill=True)
 
@@ -194,20 +194,22 @@ def via(path: RobotPath) -> str:
     return "upper" if max(y for _, y in path.points) > 10.0 else "lower"
 
 
-async def test_a_mission_is_planned_led_round_a_hazard_survives_a_crash_and_ends_when_reached(tmp_path: Path) -> None:
-    async with world(tmp_path) as here:
-        async with here.ready() as client:
+async def test_mission_is_replanned_around_a_hazard_survives_a_kill_and_ends_when_reached(
+    tmp_path: Path,
+) -> None:
+    async with world(tmp_path) as env:
+        async with env.ready() as client:
             answer = await client.put("/api/v1/robots/r1/goal", json={"place": "right"}, headers=OPERATOR)
             assert answer.status_code == 200
             goal_id = answer.json()["goal_id"]
-            await here.until(lambda: here.paths and here.goals)
-            assert (here.paths[-1].goal_id, here.goals[-1].goal_id) == (goal_id, goal_id)
-            assert here.paths[-1].goal_theta == 1.5
-            assert via(here.paths[-1]) == "upper"
+            await env.until(lambda: env.paths and env.goals)
+            assert (env.paths[-1].goal_id, env.goals[-1].goal_id) == (goal_id, goal_id)
+            assert env.paths[-1].goal_theta == 1.5
+            assert via(env.paths[-1]) == "upper"
 
-            here.block()
-            await here.until(lambda: via(here.paths[-1]) == "lower")
-            path = here.paths[-1]
+            env.block_upper_corridor()
+            await env.until(lambda: via(env.paths[-1]) == "lower")
+            path = env.paths[-1]
             assert [trace.area for trace in path.traces] == ["z1"]
             assert path.traces[0].plan_published >= path.traces[0].costmap_published > 0.0
             (robot,) = (await client.get("/api/v1/robots")).json()
@@ -216,23 +218,25 @@ async def test_a_mission_is_planned_led_round_a_hazard_survives_a_crash_and_ends
             assert 'fognav_plans_total{reason="map"} 1.0' in metrics
             assert 'fognav_stage_seconds_count{stage="plan"} 1.0' in metrics
 
-        here.stop(kill=True)
-        here.paths.clear()
-        here.start()
-        await here.until(lambda: here.paths)
-        assert here.paths[-1].goal_id == goal_id
-        assert here.paths[-1].planner_epoch > path.planner_epoch
-        assert via(here.paths[-1]) == "lower"
+        env.stop(kill=True)
+        env.paths.clear()
+        env.start()
+        await env.until(lambda: env.paths)
+        assert env.paths[-1].goal_id == goal_id
+        assert env.paths[-1].planner_epoch > path.planner_epoch
+        assert via(env.paths[-1]) == "lower"
 
-        async with here.ready() as client:
-            here.reached(goal_id)
-            await here.until(lambda: here.goals[-1].pose is None)
+        async with env.ready() as client:
+            env.report_reached(goal_id)
+            await env.until(lambda: env.goals[-1].pose is None)
             assert (await client.get("/api/v1/robots/r1/goal")).status_code == 404
-            assert here.stop() == 0
+            assert env.stop() == 0
 
 
-async def test_what_cannot_be_is_refused_with_a_reason_and_nothing_is_promised_without_a_store(tmp_path: Path) -> None:
-    async with world(tmp_path) as here, here.ready() as client:
+async def test_invalid_goals_are_refused_with_a_reason_and_all_goals_without_the_store(
+    tmp_path: Path,
+) -> None:
+    async with world(tmp_path) as env, env.ready() as client:
         url = "/api/v1/robots/r1/goal"
 
         async def put(body: object, headers: dict[str, str] = OPERATOR, url: str = url) -> httpx.Response:
@@ -251,41 +255,41 @@ async def test_what_cannot_be_is_refused_with_a_reason_and_nothing_is_promised_w
         assert (await put({"place": "right"}, VIEWER)).status_code == 403
         assert (await client.delete(url, headers=OPERATOR)).status_code == 404
 
-        here.redis.stop()
+        env.redis.stop()
         unstored = await put({"place": "right"})
         assert unstored.status_code == 503
         assert "retry-after" in unstored.headers
         assert (await client.get(url)).status_code == 404
-        here.redis.start()
+        env.redis.start()
         assert (await put({"place": "right"})).status_code == 200
-        await here.until(lambda: here.paths)
+        await env.until(lambda: env.paths)
         assert (await client.delete(url, headers=OPERATOR)).status_code == 204
-        await here.until(lambda: here.goals[-1].pose is None)
+        await env.until(lambda: env.goals[-1].pose is None)
 
 
-async def test_questions_are_answered_without_side_effects_over_both_transports(tmp_path: Path) -> None:
-    async with world(tmp_path) as here, here.ready() as client:
+async def test_queries_are_answered_over_zenoh_and_http_without_side_effects(tmp_path: Path) -> None:
+    async with world(tmp_path) as env, env.ready() as client:
         request = PlanRequest(start=Pose(x=1.0, y=7.0, theta=0.0), goal=Pose(x=19.0, y=7.0, theta=0.0))
-        reply = await here.edge.query(ch.PLANNER_PLAN, request, PlanReply, 5.0)
+        reply = await env.edge.query(ch.PLANNER_PLAN, request, PlanReply, 5.0)
         assert reply
         assert reply.refusal is None
         body = {"start": {"x": 1.0, "y": 7.0, "theta": 0.0}, "goal": {"x": 10.0, "y": 6.0, "theta": 0.0}}
         refused = (await client.post("/api/v1/plan", json=body)).json()
         assert refused["refusal"]["code"] == 206
 
-        here.block()
+        env.block_upper_corridor()
 
-        async def way_out() -> PlanReply | None:
-            asked = EgressRequest(robot="r1", pose=Pose(x=9.5, y=11.0, theta=0.0))
-            return await here.edge.query(ch.PLANNER_EGRESS, asked, PlanReply, 5.0)
+        async def query_egress() -> PlanReply | None:
+            request = EgressRequest(robot="r1", pose=Pose(x=9.5, y=11.0, theta=0.0))
+            return await env.edge.query(ch.PLANNER_EGRESS, request, PlanReply, 5.0)
 
         deadline = time.monotonic() + 10.0
-        while not (out := await way_out()) or len(out.points) < 5:
+        while not (out := await query_egress()) or len(out.points) < 5:
             assert time.monotonic() < deadline, out
             await asyncio.sleep(0.05)
         assert out.points[-1][0] < 9.0
-        assert here.paths == []
+        assert env.paths == []
         assert (await client.get("/openapi.json")).status_code == 200
-        snapshot = await here.edge.query(ch.MAP_SNAPSHOT, None, MapSnapshot, 5.0)
+        snapshot = await env.edge.query(ch.MAP_SNAPSHOT, None, MapSnapshot, 5.0)
         assert snapshot
         assert snapshot.seq == out.map_seq

@@ -1,11 +1,11 @@
-"""What stands between the core and the world: messages are dated when they arrive, urgent ones wake the core."""
+"""The planner's service: messages keep their time of arrival, urgent ones start a cycle at once."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, cast
 
 import pytest
-from ring_map import Map, pose
+from ring_map import RingMap, pose
 
 from fog_contracts import channels as ch
 from fog_contracts.handlers import Publication, RefusedMessageError
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class Session:
-    """Keeps what was subscribed to and served."""
+    """Records subscriptions, served queries and refused messages."""
 
     def __init__(self) -> None:
         self.subscribed: dict[ch.Channel, Callable[[dict[str, str], Any], None]] = {}
@@ -40,7 +40,7 @@ class Session:
 
 
 class RecordingCore(PlannerCore):
-    """Writes down when each message arrived."""
+    """Records the moment of each handled message."""
 
     def __init__(self) -> None:
         super().__init__(epoch=1)
@@ -69,57 +69,57 @@ def rig() -> Rig:
     return Rig(RecordingCore())
 
 
-def test_every_channel_of_the_core_is_subscribed_to_and_every_query_served(rig: Rig) -> None:
+def test_service_subscribes_to_every_channel_and_serves_every_query_of_the_core(rig: Rig) -> None:
     assert rig.session.subscribed.keys() == rig.core.handlers().keys()
     assert rig.session.served == rig.core.query_handlers().keys()
 
 
-def test_messages_are_dated_when_they_arrive_however_late_the_core_gets_round_to_them(rig: Rig) -> None:
-    rig.session.subscribed[ch.MAP_HEARTBEAT]({}, Map().master.heartbeat(0.0))
+def test_messages_keep_their_time_of_arrival_until_the_core_handles_them(rig: Rig) -> None:
+    rig.session.subscribed[ch.MAP_HEARTBEAT]({}, RingMap().master.heartbeat(0.0))
     rig.clock.advance(1.0)
     rig.session.subscribed[ch.ROBOT_POSE]({"robot": "r1"}, pose(1.0, 7.0))
     assert rig.core.handled == []
     rig.clock.advance(8.0)
-    rig.service._turn()
+    rig.service._run_cycle()
     assert [(channel.name, at.now) for channel, at in rig.core.handled] == [
         (ch.MAP_HEARTBEAT.name, 10.0),
         (ch.ROBOT_POSE.name, 11.0),
     ]
-    rig.service._turn()
+    rig.service._run_cycle()
     assert len(rig.core.handled) == 2
 
 
-def test_only_urgent_messages_wake_the_core(rig: Rig) -> None:
-    the_map = Map()
-    rig.session.subscribed[ch.MAP_HEARTBEAT]({}, the_map.master.heartbeat(0.0))
+def test_only_urgent_messages_start_a_cycle_at_once(rig: Rig) -> None:
+    ring_map = RingMap()
+    rig.session.subscribed[ch.MAP_HEARTBEAT]({}, ring_map.master.heartbeat(0.0))
     assert not rig.service._wake.is_set()
-    for delta in the_map.put("z1", (9.0, 10.0, 11.0, 12.0)):
+    for delta in ring_map.put("z1", (9.0, 10.0, 11.0, 12.0)):
         rig.session.subscribed[ch.MAP_DELTA]({}, delta)
     assert rig.service._wake.is_set()
 
 
 class ReplyingCore(PlannerCore):
-    """Answers a pose with a goal, and refuses another robot's."""
+    """Replies to poses of the robot r1 with a goal, and refuses those of other robots."""
 
     def handlers(self) -> Mapping[ch.Channel, Handler]:
         def answer(ids: Ids, _pose: Any, _at: Moment) -> list[Publication]:
             if ids["robot"] != "r1":
-                raise RefusedMessageError("nobody knows it")
+                raise RefusedMessageError("unknown robot")
             return [Publication(ch.ROBOT_GOAL, RobotGoal(goal_id="g", pose=None), ids)]
 
         return {ch.ROBOT_POSE: answer}
 
 
-def test_what_handlers_return_is_published_by_the_turn_that_runs_them() -> None:
+def test_publications_of_handlers_are_published_by_their_cycle() -> None:
     rig = Rig(ReplyingCore(epoch=1))
     rig.session.subscribed[ch.ROBOT_POSE]({"robot": "r1"}, pose(1.0, 7.0))
-    assert [(p.channel.name, p.ids) for p in rig.service._turn().publications] == [("robot_goal", {"robot": "r1"})]
-    assert rig.service._turn().publications == []
+    assert [(p.channel.name, p.ids) for p in rig.service._run_cycle().publications] == [("robot_goal", {"robot": "r1"})]
+    assert rig.service._run_cycle().publications == []
 
 
-def test_what_a_handler_refuses_is_reported_and_the_turn_goes_on() -> None:
+def test_message_refused_by_a_handler_is_reported_and_the_cycle_continues() -> None:
     rig = Rig(ReplyingCore(epoch=1))
     for robot in ("r2", "r1"):
         rig.session.subscribed[ch.ROBOT_POSE]({"robot": robot}, pose(1.0, 7.0))
-    assert [p.ids for p in rig.service._turn().publications] == [{"robot": "r1"}]
-    assert rig.session.refused == [(ch.ROBOT_POSE, "fog/*/robots/r2/pose", "nobody knows it")]
+    assert [p.ids for p in rig.service._run_cycle().publications] == [{"robot": "r1"}]
+    assert rig.session.refused == [(ch.ROBOT_POSE, "fog/*/robots/r2/pose", "unknown robot")]

@@ -1,4 +1,4 @@
-"""The planner: `python -m planner`, told by FOGNAV_* in the environment. Safe to kill and start at any time."""
+"""The planner: `python -m planner`, configured by FOGNAV_* variables. Safe to kill and restart at any time."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _log = logs.get("planner")
 
 
 async def main() -> None:
-    """Connect, read the missions, then plan until cancelled."""
+    """Connect, load the missions, then plan until cancelled."""
     settings = load(Settings, environ=os.environ)
     logs.configure("planner", settings.log_level, settings.log_format)
     _log.info("settings_loaded", **describe(settings))
@@ -31,10 +31,7 @@ async def main() -> None:
     site = settings.site or loaded.site.id
     clock = SystemClock(settings.speed)
     health = Health("store", "goals", "map", "zenoh")
-    config = PlannerConfig(
-        inflation=settings.inflation,
-        release=settings.release_m,
-    )
+    config = PlannerConfig(inflation=settings.inflation, release_length=settings.release_m)
     async with (
         Store(settings.redis_url, site) as store,
         ZenohEdge.open(connect=settings.zenoh_endpoints, clock=clock, role="planner", id=site, site=site) as zenoh,
@@ -46,7 +43,7 @@ async def main() -> None:
         try:
             async with asyncio.TaskGroup() as tasks:
                 tasks.create_task(service.store_loop(), name="store")
-                tasks.create_task(service.map_loop(), name="map")
+                tasks.create_task(service.snapshot_loop(), name="snapshot")
                 tasks.create_task(service.tick_loop(), name="tick")
                 tasks.create_task(service.plan_loop(), name="plan")
                 tasks.create_task(serve(app, settings.http_host, settings.http_port, settings.port_file), name="http")

@@ -1,4 +1,4 @@
-"""REST under /api/v1: robots with their missions, and previews of ways. Reading needs no token, writing an operator."""
+"""REST under /api/v1: robots with their missions, and plans on request. Reading needs no token, writing needs one."""
 
 from fastapi import FastAPI
 
@@ -24,7 +24,7 @@ from planner.store import StoredGoal, StoreError
 
 
 class GoalPose(Message, frozen=True, kw_only=True):
-    """A position in m, frame `map`; without `theta` (rad) any heading will do."""
+    """A position in m, frame `map`; without `theta` (rad) any heading is accepted."""
 
     x: Metres
     y: Metres
@@ -32,14 +32,14 @@ class GoalPose(Message, frozen=True, kw_only=True):
 
 
 class GoalBody(Message, frozen=True, kw_only=True):
-    """Where to: the id of a place of the site, or a pose; exactly one of the two."""
+    """A goal: the id of a place of the site, or a pose; exactly one of the two."""
 
     place: Id | None = None
     pose: GoalPose | None = None
 
 
 class GoalView(Message, frozen=True, kw_only=True):
-    """A mission; `any_heading`: the robot may arrive as it likes."""
+    """A mission; `any_heading`: the robot may arrive with any heading."""
 
     robot: str
     goal_id: str
@@ -50,7 +50,7 @@ class GoalView(Message, frozen=True, kw_only=True):
 
 
 class PlanView(Message, frozen=True, kw_only=True):
-    """The way in force: its version, how long it is, how much of it is released (m), or the refusal."""
+    """The current path: its map version, number of points and released length (m), or the refusal."""
 
     plan_id: int
     map_epoch: int
@@ -103,23 +103,23 @@ def make_api(service: Service, site: Site, health: Health, tokens: Tokens) -> Fa
     return app
 
 
-def _add_robots(routes: Routes, service: Service, site: Site) -> None:  # noqa: C901  # every route counts, though each is a function of its own
+def _add_robots(routes: Routes, service: Service, site: Site) -> None:  # noqa: C901  # the complexity of all routes is added up
     configured = {robot.id for robot in site.robots}
     routes.raises(
         StoreError,
-        {503: "The mission is as it was: the store does not answer"},
-        lambda error: ProblemError(503, f"the mission is as it was: {error}", headers={"Retry-After": "1"}),
+        {503: "The mission is unchanged: the store does not answer"},
+        lambda error: ProblemError(503, f"the mission is unchanged: {error}; try again", headers={"Retry-After": "1"}),
     )
 
     def robots() -> list[str]:
         return sorted({*configured, *service.poses, *service.states, *service.goals})
 
-    def known(robot: str) -> str:
+    def checked(robot: str) -> str:
         if robot not in robots():
-            raise ProblemError(404, f"there is no robot {robot}: known are {', '.join(robots()) or 'none'}")
+            raise ProblemError(404, f"there is no robot {robot}; known robots: {', '.join(robots()) or 'none'}")
         return robot
 
-    def wanted(body: GoalBody) -> tuple[Pose, bool]:
+    def goal_pose(body: GoalBody) -> tuple[Pose, bool]:
         if (body.place is None) == (body.pose is None):
             raise ProblemError(422, "give either a place or a pose, and not both", field="body")
         if body.pose is not None:
@@ -128,7 +128,7 @@ def _add_robots(routes: Routes, service: Service, site: Site) -> None:  # noqa: 
         place = site.places.get(body.place or "")
         if place is None:
             names = ", ".join(sorted(site.places)) or "none"
-            raise ProblemError(422, f"there is no place {body.place}: known are {names}", field="body.place")
+            raise ProblemError(422, f"there is no place {body.place}; known places: {names}", field="body.place")
         return Pose(x=place.x, y=place.y, theta=place.theta or 0.0), place.theta is None
 
     @routes.get("/api/v1/robots")
@@ -146,10 +146,10 @@ def _add_robots(routes: Routes, service: Service, site: Site) -> None:  # noqa: 
             for robot in robots()
         ]
 
-    @routes.get("/api/v1/robots/{robot}/goal", problems={404: "There is no such robot, or it has no mission"})
+    @routes.get("/api/v1/robots/{robot}/goal", problems={404: "No robot has this id, or it has no mission"})
     async def get_goal(robot: str) -> GoalView:
         """Return a robot's mission."""
-        stored = service.goals.get(known(robot))
+        stored = service.goals.get(checked(robot))
         if stored is None:
             raise ProblemError(404, f"robot {robot} has no mission")
         return _goal_view(robot, stored)
@@ -158,15 +158,15 @@ def _add_robots(routes: Routes, service: Service, site: Site) -> None:  # noqa: 
         "/api/v1/robots/{robot}/goal",
         raises=[StoreError],
         problems={
-            404: "There is no such robot",
-            422: "The body can't be used, or the goal can never be reached: then with Nav2's `code` and `name`, and"
-            " the `nearest` point that can",
+            404: "No robot has this id",
+            422: "The body is invalid, or the goal can never be reached: then with Nav2's `code` and `name`, and the"
+            " `nearest` reachable point",
         },
     )
     async def put_goal(robot: str, body: Body[GoalBody], caller: Operator) -> GoalView:
         """Send a robot to a place or pose."""
-        known(robot)
-        pose, any_heading = wanted(body)
+        checked(robot)
+        pose, any_heading = goal_pose(body)
         answer = await service.send(robot, pose, caller.name, place=body.place, any_heading=any_heading)
         if isinstance(answer, Refusal):
             field = "body.place" if body.place else "body.pose"
@@ -178,16 +178,16 @@ def _add_robots(routes: Routes, service: Service, site: Site) -> None:  # noqa: 
     @routes.delete(
         "/api/v1/robots/{robot}/goal",
         raises=[StoreError],
-        problems={404: "There is no such robot, or it has no mission"},
+        problems={404: "No robot has this id, or it has no mission"},
     )
     async def delete_goal(robot: str, caller: Operator) -> None:
         """Cancel a robot's mission."""
-        if not await service.cancel(known(robot), caller.name):
+        if not await service.cancel(checked(robot), caller.name):
             raise ProblemError(404, f"robot {robot} has no mission")
 
 
 def _add_plan(routes: Routes, service: Service) -> None:
     @routes.post("/api/v1/plan")
     async def preview(body: Body[PlanRequest]) -> PlanReply:
-        """Preview a path; a refusal is an answer, too."""
+        """Plan a path without side effects; the reply may be a refusal."""
         return await service.preview(body)

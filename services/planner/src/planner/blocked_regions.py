@@ -1,4 +1,4 @@
-"""The hazards and zones behind the costmap's cells, kept as regions for refusals that name them."""
+"""The hazards and zones behind the costmap's cells, as regions, so that refusals can name them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class BlockedRegions:
-    """All hazards and zones that were published; `inflation_radius` in m is how far their costs reach."""
+    """All published hazards and zones; `inflation_radius` (m) is how far their costs reach."""
 
     def __init__(self, inflation_radius: float) -> None:
         self._inflation_radius = inflation_radius
@@ -26,11 +26,11 @@ class BlockedRegions:
         self._regions: tuple[GridGeometry, list[Region]] | None = None
 
     def handlers(self) -> Mapping[ch.Channel, Handler]:
-        """Return the handlers of the channels that tell the reasons behind cells."""
+        """Return the handlers of hazards and zones."""
         return {ch.HAZARD: self._on_hazard, ch.ZONES: self._on_zones}
 
     def blocking(self, planning_map: PlanningMap) -> list[Region]:
-        """Return those that have lethal cells right now."""
+        """Return the regions that have lethal cells on the map."""
         geometry = planning_map.geometry
         if self._regions is None or self._regions[0] != geometry:
             self._regions = (geometry, self._rasterized(geometry))

@@ -1,4 +1,4 @@
-"""What the planner's core can be told."""
+"""The parameters of the planner's core."""
 
 from dataclasses import dataclass
 
@@ -8,30 +8,31 @@ from fog_contracts.costs import DEFAULT_INFLATION, Inflation
 
 @dataclass(frozen=True)
 class PlannerConfig:
-    """Lengths in m, times in s. The inflation is the map-service's; it only makes the search faster."""
+    """Lengths in m, times in s. `inflation` should equal the map-service's, which makes the search faster."""
 
     inflation: Inflation = DEFAULT_INFLATION
-    corridor: float = 0.72
+    corridor_half_width: float = 0.72
     """Half the width of the swept corridor: the robot's radius and the inflation band."""
-    saving: float = 0.10
-    """A cheaper path elsewhere is taken when it saves this share of the remaining cost."""
+    min_saving: float = 0.10
+    """After a clearing, a path is replaced when another saves this share of the remaining cost."""
     hysteresis: float = 0.03
-    """A path that is still passable is kept unless another saves this share, so that no robot dithers between two."""
-    stray: float = 1.0
-    escape: float = 0.5
-    """How far a robot inside the inscribed band may be from the nearest cell where it could be."""
-    spacing: float = 0.10
-    release: float = 15.0
-    """How much of the path ahead of the robot it may drive without hearing from the planner again."""
+    """A passable path is replaced only when another saves this share, so that plans don't oscillate."""
+    max_deviation: float = 1.0
+    """Farther from its path, a robot gets a new one."""
+    escape_distance: float = 0.5
+    """How far a robot on an impassable cell may be from the nearest traversable one."""
+    point_spacing: float = 0.10
+    release_length: float = 15.0
+    """How far ahead the path is released: the robot may drive this far without a message from the planner."""
     republish_s: float = ROBOT_PATH.period_s
     goal_republish_s: float = ROBOT_GOAL.period_s
-    robot_silent_s: float = ROBOT_STATE.max_age_s
-    """Nothing is planned for a robot whose last pose is older: it is away, and hears nothing either."""
-    map_age_s: float = MAP_HEARTBEAT.max_age_s
-    gap_s: float = 0.5
-    """How long a heartbeat may run ahead of the deltas before the map is fetched whole."""
+    max_pose_age_s: float = ROBOT_STATE.max_age_s
+    """Nothing is planned for a robot whose last pose is older: it is disconnected."""
+    max_map_age_s: float = MAP_HEARTBEAT.max_age_s
+    delta_grace_s: float = 0.5
+    """How long a heartbeat may be ahead of the deltas before a snapshot is fetched."""
     max_expansions: int = 50_000_000
-    goal_fields: int = 8
-    """Goals for which a distance field is kept (20 to 30 MB each on 2000 x 1200 cells)."""
-    egress_cells: int = 40_000
-    """Cells (100 m2 at 5 cm) that a search for a way out of a blocked area looks at."""
+    max_goal_fields: int = 8
+    """For how many goals a distance field is kept (20 to 30 MB each on 2000 x 1200 cells)."""
+    max_egress_cells: int = 40_000
+    """How many cells (100 m2 at 5 cm) an egress search expands at most."""

@@ -1,12 +1,11 @@
-"""Decides every robot's path: plans on the master costmap, and plans again when a change of the map matters.
+"""Plans every robot's path on the master costmap, and replans when a change of the map matters.
 
-Pure: inputs are values, time is an argument, nothing here waits or computes in the background. What is decided lies in
-rooms of its own, this file says what happens when:
+Pure: inputs are values, time is an argument, no I/O and no background work. This module coordinates the others:
 
-- a delta of the map (`planning_map`) that touches a path, or could shorten it, marks the robot (`path_monitor`);
-- a new goal, a pose off the path, a whole new map mark it, too (`mission`);
-- `tick` searches a path for every marked robot (`path_search`, helped by `goal_fields`), keeps the path in force unless
-  the new one is clearly better (`replan_policy`), and publishes goals, paths and refusals (`refusals`).
+- a map delta (`planning_map`) that affects a path, or could shorten it, requests a replan (`path_monitor`);
+- so do a new goal, a pose off the path and a new snapshot of the map (`mission`);
+- `tick` searches a path for every robot that needs one (`path_search`, guided by `goal_fields`), keeps the current path
+  unless the new one is clearly better (`replan_policy`), and publishes goals, paths and refusals (`refusals`).
 """
 
 from __future__ import annotations
@@ -53,29 +52,31 @@ class PlannerCore:
     """Goals, poses and map versions in; paths, refusals and ended goals out."""
 
     URGENT: Final = frozenset({ch.MAP_DELTA})
-    """Channels whose messages are worth a `tick` at once."""
+    """Channels whose messages call for an immediate `tick`."""
 
     def __init__(self, epoch: int, config: PlannerConfig | None = None) -> None:
         self.epoch = epoch
         self.config = config or PlannerConfig()
-        self._map = MapTracker(self.config.inflation, grace_s=self.config.gap_s, max_age_s=self.config.map_age_s)
+        self._map = MapTracker(
+            self.config.inflation, grace_s=self.config.delta_grace_s, max_age_s=self.config.max_map_age_s
+        )
         self._regions = BlockedRegions(self.config.inflation.inflation_radius)
-        self._fields = GoalFields(self.config.goal_fields)
+        self._fields = GoalFields(self.config.max_goal_fields)
         self._search: tuple[GridGeometry, PathSearch] | None = None
         self._missions: dict[str, Mission] = {}
         self._served: set[str] = set()
-        """The robots to which paths may be released in this tick."""
+        """The robots to which `publish` may release paths."""
         self._reached: list[tuple[str, str]] = []
         self._next_id = 1
         self.plans: dict[ReplanReason, int] = {}
-        """How many times a path was searched, by reason."""
+        """Number of path searches, by reason."""
         self.refusals: dict[PlanCode, int] = {}
-        """How many of the searches ended in a refusal, by code."""
+        """Number of path searches that ended in a refusal, by code."""
 
-    # --- What comes in ----------------------------------------------------------------------------------------------
+    # --- Inputs -----------------------------------------------------------------------------------------------------
 
     def handlers(self) -> Mapping[ch.Channel, Handler]:
-        """Return the handler of every channel that the planner listens to."""
+        """Return the handler of every channel that the planner subscribes to."""
         return {
             ch.MAP_DELTA: self._on_delta,
             ch.MAP_HEARTBEAT: self._on_heartbeat,
@@ -89,7 +90,7 @@ class PlannerCore:
         planning_map = self._map.current
         if planning_map is None:
             return ()
-        self._fields.use(planning_map.lower_bound)
+        self._fields.set_lower_bound(planning_map.lower_bound)
         for change in changes:
             for mission in self._missions.values():
                 reason = reason_from_change(mission, change, planning_map, self.config)
@@ -106,7 +107,7 @@ class PlannerCore:
         if not pose.localized:
             mission.pose = None
             return ()
-        mission.pose, mission.pose_at = pose, at.now
+        mission.pose, mission.pose_received = pose, at.now
         if mission.plan is not None and mission.replan is None:
             mission.replan = reason_from_pose(mission.plan, pose, self.config)
         return ()
@@ -122,15 +123,15 @@ class PlannerCore:
     # --- The map ----------------------------------------------------------------------------------------------------
 
     def wants_snapshot(self, now: float) -> bool:
-        """Whether deltas were lost, or there is no map yet."""
+        """Whether a snapshot is needed: deltas were lost, or there is no map yet."""
         return self._map.wants_snapshot(now)
 
     def load(self, snapshot: MapSnapshot, now: float) -> None:
-        """Take a snapshot; raises `MapError` and changes nothing when it is damaged or outdated."""
+        """Load a snapshot of the map; raises `MapError` and changes nothing when it is damaged or outdated."""
         loaded = self._map.load(snapshot, now)
         planning_map = self._map.current
         assert planning_map is not None
-        self._fields.use(planning_map.lower_bound)
+        self._fields.set_lower_bound(planning_map.lower_bound)
         for mission in self._missions.values():
             if mission.target is not None:
                 reason: ReplanReason = "epoch" if loaded.restarted else "map"
@@ -142,20 +143,20 @@ class PlannerCore:
     def check_goal(self, x: float, y: float) -> Refusal | None:
         """Return why a goal (m, frame `map`) can never be reached: off the map, in a wall or unknown space; else None.
 
-        Hazards and zones come and go: a goal inside one is accepted, and refused by its path as long as that lasts.
+        A goal inside a hazard or zone is accepted, because those end; until then its path is a refusal.
         """
         planning_map = self._map.current
         return None if planning_map is None else goal_out_of_reach(planning_map, (x, y))
 
     def set_goal(self, robot: str, goal: RobotGoal, *, any_heading: bool = False) -> None:
-        """Give a robot a mission; the same goal again changes nothing. `any_heading`: the goal's theta is no wish."""
+        """Give a robot a mission; the same goal again changes nothing. `any_heading`: ignore the goal's theta."""
         if goal.pose is None:
             self.cancel(robot)
         else:
             self._mission(robot).begin(goal, any_heading=any_heading)
 
     def cancel(self, robot: str) -> None:
-        """End a robot's mission; the next `tick` says so to the robot."""
+        """End a robot's mission; the next `tick` publishes that."""
         self._mission(robot).end()
 
     def goal(self, robot: str) -> RobotGoal | None:
@@ -163,25 +164,25 @@ class PlannerCore:
         mission = self._missions.get(robot)
         return mission.goal if mission and mission.target else None
 
-    def take_reached(self) -> list[tuple[str, str]]:
-        """Return robots with the ids of the goals that they have reached since the last call, each once."""
+    def pop_reached(self) -> list[tuple[str, str]]:
+        """Return (robot, goal id) of the goals that were reached since the last call."""
         reached, self._reached = self._reached, []
         return reached
 
     def _mission(self, robot: str) -> Mission:
         return self._missions.setdefault(robot, Mission())
 
-    # --- What goes out ----------------------------------------------------------------------------------------------
+    # --- Planning and publishing------------------------------------------------------------------------------------
 
     def tick(self, at: Moment) -> Sequence[Publication]:
-        """Let time pass: `plan`, then `publish`. Call it ten times a second, and at once after an urgent message."""
+        """Run `plan`, then `publish`. Call it ten times a second, and at once after an urgent message."""
         self.plan(at)
         return self.publish(at)
 
     def plan(self, at: Moment) -> None:
         """Search paths for the robots that need one; goals may be set and cancelled between this and `publish`.
 
-        While the map is stale or a robot's pose old, nothing is released to it: it slows down by itself.
+        While the map or a robot's pose is outdated, nothing is released to the robot: it slows down by itself.
         """
         self._served = set()
         planning_map = self._map.current
@@ -189,14 +190,14 @@ class PlannerCore:
             return
         for robot, mission in self._missions.items():
             pose, target = mission.pose, mission.target
-            if target is None or pose is None or at.now - mission.pose_at > self.config.robot_silent_s:
+            if target is None or pose is None or at.now - mission.pose_received > self.config.max_pose_age_s:
                 continue
             if mission.replan is not None or mission.plan is None:
                 self._replan(mission, target, pose, planning_map)
             self._served.add(robot)
 
     def publish(self, at: Moment) -> Sequence[Publication]:
-        """Return goals, paths and refusals that are due; a goal that was replaced since `plan` has no path yet."""
+        """Return the goals, paths and refusals that are due; a goal that was set since `plan` has no path yet."""
         publications: list[Publication] = []
         planning_map = self._map.current
         for robot, mission in self._missions.items():
@@ -227,16 +228,16 @@ class PlannerCore:
             self._search = planning_map.geometry, PathSearch(self.config, planning_map.geometry, self._fields)
         return self._search[1].find(planning_map, self._regions.blocking(planning_map), start, goal)
 
-    # --- Distance fields: computed elsewhere, used when they are there ----------------------------------------------
+    # --- Distance fields: computed on other threads -----------------------------------------------------------------
 
     def field_jobs(self) -> list[FieldJob]:
-        """Return distance fields to be computed, each once: run them on any thread, then hand them to `take_field`."""
+        """Return the distance fields to compute, each once: run them on any thread, then pass them to `add_field`."""
         planning_map = self._map.current
         return [] if planning_map is None else self._fields.jobs(self._goal_cells(planning_map.geometry))
 
-    def take_field(self, job: FieldJob) -> None:
-        """Use a computed field from now on; one over costs that no longer hold is dropped."""
-        self._fields.take(job)
+    def add_field(self, job: FieldJob) -> None:
+        """Use a computed field from now on; one over an outdated lower bound is dropped."""
+        self._fields.add(job)
 
     def _goal_cells(self, geometry: GridGeometry) -> Iterator[Cell]:
         for mission in self._missions.values():
@@ -245,10 +246,10 @@ class PlannerCore:
                 if geometry.contains_cell(*cell):
                     yield cell
 
-    # --- Questions: answered without side effects -------------------------------------------------------------------
+    # --- Queries: answered without side effects ---------------------------------------------------------------------
 
     def query_handlers(self) -> Mapping[ch.Channel, QueryHandler]:
-        """Return what answers every query that the planner serves."""
+        """Return the handler of every query that the planner answers."""
         return {ch.PLANNER_PLAN: self._answer_plan, ch.PLANNER_EGRESS: self._answer_egress}
 
     def _answer_plan(self, _ids: Ids, request: PlanRequest, _at: Moment) -> PlanReply:

@@ -1,4 +1,4 @@
-"""The way out of a blocked area, for a robot that stands inside one."""
+"""Plans a path out of a blocked area for a robot inside it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from fog_contracts.costs import COST_WEIGHT, INSCRIBED, NEUTRAL_WEIGHT
 from planner.path_search import SearchResult, refused
-from planner.reasons import Region, lifted
+from planner.reasons import Region, remove_regions
 from planner.refusals import start_occupied, start_outside
 from planner.route import Route
 
@@ -27,25 +27,26 @@ _NEIGHBOURS: Final = tuple((dx, dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1) if
 def find_egress(
     planning_map: PlanningMap, blocking: Sequence[Region], start: PointXY, config: PlannerConfig
 ) -> SearchResult:
-    """Return the cheapest way from a point (m, frame `map`) to where a robot may be again.
+    """Return the cheapest path from a point (m, frame `map`) to a traversable cell.
 
-    Inside the areas that reach over the robot the static map's costs count; everything else stays in force.
+    Inside the regions that influence the robot's cell the static map's costs apply; elsewhere the costmap's.
     """
     geometry, cost = planning_map.geometry, planning_map.cost
     cell = geometry.cell(*start)
     if not geometry.contains_cell(*cell):
         return refused(start_outside(geometry, start))
-    over = [region for region in blocking if region.reaches(*cell)]
-    free = lifted(cost, planning_map.lower_bound, over, [region for region in blocking if region not in over])
-    cells = _way_out(free, cost, cell, config.egress_cells)
+    around_robot = [region for region in blocking if region.influences(*cell)]
+    others = [region for region in blocking if region not in around_robot]
+    without_regions = remove_regions(cost, planning_map.lower_bound, around_robot, others)
+    cells = _search_exit(without_regions, cost, cell, config.max_egress_cells)
     if cells is None:
         return refused(start_occupied(blocking, cell, start))
     corners = geometry.centres(np.array(cells))
-    return SearchResult(Route(corners, config.spacing, escape=len(corners) - 1), 0.0, None)
+    return SearchResult(Route(corners, config.point_spacing, escape_lines=len(corners) - 1), 0.0, None)
 
 
-def _way_out(free: Grid, cost: Grid, start: Cell, max_cells: int) -> list[Cell] | None:
-    """Dijkstra over `free` from a cell to the first one that is traversable on `cost` (Dijkstra 1959)."""
+def _search_exit(free: Grid, cost: Grid, start: Cell, max_cells: int) -> list[Cell] | None:
+    """Search over `free` from a cell to the first one that is traversable on `cost` (Dijkstra 1959)."""
     height, width = cost.shape
     came_from: dict[Cell, Cell] = {}
     queue: list[tuple[float, Cell, Cell]] = [(0.0, start, start)]

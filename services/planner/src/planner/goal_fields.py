@@ -1,4 +1,4 @@
-"""Distance fields that guide the search: computed once per goal on any thread, used when they are there."""
+"""Distance fields that guide the search: computed once per goal on any thread, used once they are available."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ class FieldJob:
         self.goal = goal
         self.lower_bound = lower_bound
         self.planner: Planner | None = None
-        """The search that the field guides; None until `run` has ended."""
+        """The search that the field guides; None until `run` returns."""
 
     def run(self) -> None:
-        """Compute it (some 50 ms on 2000 x 1200 cells, without the GIL)."""
+        """Compute the field (some 50 ms on 2000 x 1200 cells, without the GIL)."""
         height, width = self.lower_bound.shape
         planner = Planner(width, height)
         planner.set_goal_field(self.lower_bound, self.goal)
@@ -34,7 +34,7 @@ class FieldJob:
 
 
 class GoalFields:
-    """The fields of at most `capacity` goals; those used longest ago give way."""
+    """The fields of at most `capacity` goals; the least recently used ones are dropped."""
 
     def __init__(self, capacity: int) -> None:
         self._capacity = capacity
@@ -42,17 +42,17 @@ class GoalFields:
         self._guides: OrderedDict[Cell, Planner] = OrderedDict()
         self._running: dict[Cell, FieldJob] = {}
 
-    def use(self, lower_bound: Grid) -> None:
-        """Use this lower bound; another one than before makes all fields void, for they would mislead the search."""
+    def set_lower_bound(self, lower_bound: Grid) -> None:
+        """Set the lower bound; a new one discards all fields, because they would mislead the search."""
         if lower_bound is not self._lower_bound:
             self._lower_bound = lower_bound
             self._guides.clear()
             self._running.clear()
 
     def jobs(self, goals: Iterable[Cell]) -> list[FieldJob]:
-        """Return the fields to be computed for the goals in force, each once; hand them to `take` when they have run.
+        """Return the fields to compute for the current goals, each once; pass them to `add` when they have run.
 
-        When there are more goals than room, the first ones get a field.
+        With more goals than the capacity, the first ones get a field.
         """
         jobs = []
         for goal in list(dict.fromkeys(goals))[: self._capacity]:
@@ -62,8 +62,8 @@ class GoalFields:
             jobs.append(self._running[goal])
         return jobs
 
-    def take(self, job: FieldJob) -> None:
-        """Use a computed field from now on; one over a lower bound that no longer holds is dropped."""
+    def add(self, job: FieldJob) -> None:
+        """Use a computed field from now on; one over an outdated lower bound is dropped."""
         if self._running.get(job.goal) is job:
             del self._running[job.goal]
         if job.planner is None or job.lower_bound is not self._lower_bound:
@@ -74,7 +74,7 @@ class GoalFields:
             self._guides.popitem(last=False)
 
     def guide(self, goal: Cell) -> Planner | None:
-        """Return the search that the goal's field guides, None while there is no field."""
+        """Return the search that the goal's field guides; None without a field."""
         guide = self._guides.get(goal)
         if guide is not None:
             self._guides.move_to_end(goal)

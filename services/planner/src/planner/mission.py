@@ -1,4 +1,4 @@
-"""What the planner knows of one robot: its pose, its goal, and the plan in force."""
+"""The planner's state of one robot: its pose, its goal, and its current plan."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ if TYPE_CHECKING:
     from planner.config import PlannerConfig
     from planner.route import Route
 
-ReplanReason = Literal["goal", "map", "epoch", "strayed", "clearing", "refused"]
-"""Why a path is planned again; `map` is a change within the swept corridor of what remains of it."""
+ReplanReason = Literal["goal", "map", "epoch", "off_path", "clearing", "refused"]
+"""Why a path is replanned; `map` is a change of costs within the swept corridor of the remaining path."""
 
 
 @dataclass
 class Plan:
-    """The path in force, or the refusal; `progress` is how far along it (m) the robot is."""
+    """The current path, or the refusal; `progress` is how far along it (m) the robot is."""
 
     plan_id: int
     route: Route | None
@@ -36,37 +36,37 @@ class Plan:
 
 @dataclass
 class Mission:
-    """One robot's. Times are seconds of the planner's monotonic clock."""
+    """One robot's state. Times are seconds of the planner's monotonic clock."""
 
     pose: RobotPose | None = None
-    pose_at: float = -math.inf
+    pose_received: float = -math.inf
     goal: RobotGoal | None = None
-    """The last goal; its pose is None when it is over."""
+    """The last goal; its pose is None once it has ended."""
     any_heading: bool = False
-    """Whether the robot may arrive as it likes: the goal's theta is no wish."""
+    """Whether the robot may arrive with any heading: the goal's theta is ignored."""
     plan: Plan | None = None
     replan: ReplanReason | None = None
     traces: list[Trace] = field(default_factory=list)
-    """Of the hazards for which it is planned again."""
+    """Traces of the hazards that caused the replan."""
     goal_due: float = math.inf
     path_due: float = -math.inf
 
     @property
     def target(self) -> Pose | None:
-        """Where the robot is to go; None when it has no goal, or its goal is over."""
+        """The pose to drive to; None when the robot has no goal, or its goal has ended."""
         return self.goal.pose if self.goal else None
 
     def begin(self, goal: RobotGoal, *, any_heading: bool) -> None:
-        """Take another goal; the same one again changes nothing."""
-        known = self.goal
-        if known is not None and known.goal_id == goal.goal_id and known.pose == goal.pose:
+        """Set a goal; the same one again changes nothing."""
+        current = self.goal
+        if current is not None and current.goal_id == goal.goal_id and current.pose == goal.pose:
             return
         self.goal, self.any_heading = goal, any_heading
         self.plan, self.replan, self.traces = None, "goal", []
         self.goal_due = -math.inf
 
     def end(self) -> None:
-        """End the goal, if there is one; its next publication says so to the robot."""
+        """End the goal, if there is one; its next publication has no pose."""
         if self.goal is None or self.goal.pose is None:
             return
         self.goal = structs.replace(self.goal, pose=None)
@@ -74,26 +74,26 @@ class Mission:
         self.goal_due = -math.inf
 
     def request_replan(self, reason: ReplanReason, traces: list[Trace]) -> None:
-        """Have the path planned again; a first reason stays, unless the map cut the path meanwhile."""
+        """Request a replan; the first reason is kept, except that `map` replaces it."""
         if self.replan is None or reason == "map":
             self.replan = reason
         self.traces += [trace for trace in traces if trace not in self.traces]
 
     def publish_path_now(self) -> None:
-        """Have the path published at once, new or kept: it was compared with the newest map."""
+        """Make the path due, new or kept: it was compared with the newest map."""
         self.path_due = -math.inf
 
     def due_goal(self, at: Moment, config: PlannerConfig) -> RobotGoal | None:
-        """Return the goal when it is time to publish it (again)."""
+        """Return the goal when it is due for publication."""
         if self.goal is None or at.now < self.goal_due:
             return None
         self.goal_due = at.now + config.goal_republish_s
         return structs.replace(self.goal, stamp=at.stamp)
 
     def due_path(self, at: Moment, config: PlannerConfig, epoch: int, version: Version) -> RobotPath | None:
-        """Return the path, its release or the refusal when it is time to publish it (again), as of a map version.
+        """Return the path or refusal, with the released length, when it is due for publication; `version` is the map's.
 
-        With the first publication the plan's traces are stamped; they stay the same when it is published again.
+        The first publication stamps the plan's traces; later ones leave them unchanged.
         """
         goal, plan, target = self.goal, self.plan, self.target
         if goal is None or plan is None or target is None or at.now < self.path_due:
@@ -110,7 +110,7 @@ class Mission:
             points=[(round(float(x), 4), round(float(y), 4)) for x, y in route.points] if route else [],
             map_epoch=version.epoch,
             map_seq=version.seq,
-            released_length=min(route.length, plan.progress + config.release) if route else 0.0,
+            released_length=min(route.length, plan.progress + config.release_length) if route else 0.0,
             goal_theta=None if self.any_heading else target.theta,
             refusal=plan.refusal,
             traces=plan.traces,

@@ -1,4 +1,4 @@
-"""Whether something happened that a robot's path must be planned again for: a change of the map, or where it drove."""
+"""Detects what requires a replan: a change of the map, or a robot that left its path."""
 
 from __future__ import annotations
 
@@ -16,56 +16,58 @@ if TYPE_CHECKING:
     from planner.route import Route
 
 _PROGRESS_WINDOW_M: Final = 5.0
-"""How far ahead of its last place a robot is looked for on its path, so that a loop is not cut short."""
+"""How far ahead of its last progress a robot is searched on its path, so that a loop is not cut short."""
 
 
 def reason_from_change(
     mission: Mission, change: CostChange, planning_map: PlanningMap, config: PlannerConfig
 ) -> ReplanReason | None:
-    """Return why a change of the map calls for planning again; None when it does not matter to the mission."""
+    """Return why a change of the map requires a replan; None when it does not matter to the mission."""
     plan = mission.plan
     if plan is None or mission.target is None:
         return None
     if plan.route is None:
         return "refused"
-    if touches_corridor(plan, plan.route, change, planning_map, config.corridor):
+    if affects_corridor(plan, plan.route, change, planning_map, config.corridor_half_width):
         return "map"
-    if change.fell.any():
+    if change.decreased.any():
         robot = (mission.pose.x, mission.pose.y) if mission.pose else _point_at(plan.route, plan.progress)
-        if may_save(plan, plan.route, change.window, planning_map, robot, config.saving):
+        if may_save(plan, plan.route, change.window, planning_map, robot, config.min_saving):
             return "clearing"
     return None
 
 
-def touches_corridor(
+def affects_corridor(
     plan: Plan, route: Route, change: CostChange, planning_map: PlanningMap, half_width: float
 ) -> bool:
-    """Whether a changed cell lies within `half_width` (m) of what remains of the path."""
-    return route.touched(change.changed, change.window, planning_map.geometry, half_width, plan.progress)
+    """Whether a changed cell lies within `half_width` (m) of the remaining path."""
+    return route.passes_near(change.changed, change.window, planning_map.geometry, half_width, plan.progress)
 
 
 def may_save(
     plan: Plan, route: Route, window: Window, planning_map: PlanningMap, robot: PointXY, saving: float
 ) -> bool:
-    """Whether a path through the window, were everything on it free, could save the share `saving` of what remains."""
+    """Whether a path through the window, if all its cells were free, could save the share `saving` of the cost."""
     geometry = planning_map.geometry
     end_x, end_y = route.corners[-1]
-    cells = _cells_away(geometry.cell(*robot), window) + _cells_away(geometry.cell(float(end_x), float(end_y)), window)
+    distance = _cell_distance(geometry.cell(*robot), window) + _cell_distance(
+        geometry.cell(float(end_x), float(end_y)), window
+    )
     remaining = route.cost(planning_map.cost, geometry, plan.progress)
-    return cells * NEUTRAL_WEIGHT < (1.0 - saving) * remaining
+    return distance * NEUTRAL_WEIGHT < (1.0 - saving) * remaining
 
 
 def reason_from_pose(plan: Plan, pose: RobotPose, config: PlannerConfig) -> ReplanReason | None:
-    """Note how far the robot has come; return why it must be planned again from here, None when it is on its path."""
+    """Update the robot's progress; return why its pose requires a replan, None when it is on its path."""
     if plan.route is None:
         moved = math.hypot(pose.x - plan.planned_from[0], pose.y - plan.planned_from[1])
-        return "refused" if moved > config.stray else None
-    along, away = plan.route.nearest(pose.x, pose.y, plan.progress, window=_PROGRESS_WINDOW_M)
+        return "refused" if moved > config.max_deviation else None
+    along, deviation = plan.route.nearest(pose.x, pose.y, plan.progress, window=_PROGRESS_WINDOW_M)
     plan.progress = max(plan.progress, along)
-    return "strayed" if away > config.stray else None
+    return "off_path" if deviation > config.max_deviation else None
 
 
-def _cells_away(cell: Cell, window: Window) -> float:
+def _cell_distance(cell: Cell, window: Window) -> float:
     """Return the distance (cells) from a cell to a window; 0 inside."""
     dx = max(window.x - cell[0], 0, cell[0] - window.x - window.width + 1)
     dy = max(window.y - cell[1], 0, cell[1] - window.y - window.height + 1)
@@ -73,5 +75,5 @@ def _cells_away(cell: Cell, window: Window) -> float:
 
 
 def _point_at(route: Route, along: float) -> PointXY:
-    x, y = route.rest(along)[0]
+    x, y = route.remaining(along)[0]
     return float(x), float(y)

@@ -1,4 +1,4 @@
-"""One search for a path: from a robot's point to a goal's, both in metres, through the cells of the costmap."""
+"""Searches a path on the costmap from a robot's position to a goal, both in metres."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SearchResult:
-    """A route with its cost, as the kernels integrate it, or the refusal."""
+    """A route with its cost, as the kernels integrate it, or a refusal."""
 
     route: Route | None
     cost: float
@@ -34,12 +34,12 @@ class SearchResult:
 
 
 def refused(refusal: Refusal) -> SearchResult:
-    """Return the result of a search that found nothing."""
+    """Return the result of a search without a path."""
     return SearchResult(None, math.inf, refusal)
 
 
 class PathSearch:
-    """Searches on maps of one geometry; owns the memory that A* needs."""
+    """Searches paths on maps of one geometry; owns the memory that A* needs."""
 
     def __init__(self, config: PlannerConfig, geometry: GridGeometry, fields: GoalFields) -> None:
         self._config = config
@@ -55,8 +55,8 @@ class PathSearch:
         first, last = geometry.cell(*start), geometry.cell(*goal)
         if not geometry.contains_cell(*first):
             return refused(start_outside(geometry, start))
-        if (never := goal_out_of_reach(planning_map, goal)) is not None:
-            return refused(never)
+        if (unreachable := goal_out_of_reach(planning_map, goal)) is not None:
+            return refused(unreachable)
         free = self._free_start(planning_map, blocking, first)
         if free is None:
             return refused(start_occupied(blocking, first, start))
@@ -65,19 +65,19 @@ class PathSearch:
             return refused(refusals.goal_occupied(last, goal))
         found = (self._fields.guide(last) or self._planner).plan(cost, free, last, self._config.max_expansions)
         if found.timed_out:
-            return refused(refuse(207, f"no way was found within {self._config.max_expansions} steps of the search"))
+            return refused(refuse(207, f"no path was found within {self._config.max_expansions} expanded cells"))
         if not found.found:
             return refused(refusals.no_path(last))
         corners = self._planner.shortcut(cost, found.cells)
         points = self._points(cost, corners, start, goal, escaping=free != first)
-        route = Route(points, self._config.spacing, escape=int(free != first))
+        route = Route(points, self._config.point_spacing, escape_lines=int(free != first))
         return SearchResult(route, route.cost(cost, geometry), None)
 
     def _points(self, cost: Grid, corners: Floats, start: PointXY, goal: PointXY, *, escaping: bool) -> Floats:
-        """Return corners ((n, 2), columns and rows) as points (m) that begin at the robot and end at the goal exactly.
+        """Return corners ((n, 2), columns and rows) as points (m) that start at the robot and end at the goal exactly.
 
-        Where the line between the exact point and the next corner would touch an impassable cell, the middle of the
-        point's cell stays: at most 4 cm away.
+        Where the line between the exact point and the next corner crosses an impassable cell, the centre of the point's
+        cell is used: at most 4 cm away.
         """
         geometry = self._geometry
         cells = corners.astype(np.float64)
@@ -95,14 +95,14 @@ class PathSearch:
     def _free_start(self, planning_map: PlanningMap, blocking: Sequence[Region], start: Cell) -> Cell | None:
         """Return the start's cell, or the nearest one where a robot may be; None when it is in a hazard, zone or wall.
 
-        The way there may lead over the inscribed band and what lidars saw, never through a wall or a blocked region.
+        The line to it may cross inscribed cells and lidar obstacles, but no wall and no blocked region.
         """
         column, row = start
         if planning_map.cost[row, column] < INSCRIBED:
             return start
         if any(region.covers(column, row) for region in blocking):
             return None
-        reach = math.floor(self._config.escape / self._geometry.resolution)
+        reach = math.floor(self._config.escape_distance / self._geometry.resolution)
         free = nearest_traversable(planning_map.cost, start, reach)
         if free is None:
             return None

@@ -1,4 +1,4 @@
-"""The map that paths are planned on: the followed master costmap, and a lower bound that its costs never fall below."""
+"""The map that paths are planned on: a replica of the master costmap, and a lower bound of its costs."""
 
 from __future__ import annotations
 
@@ -34,29 +34,29 @@ class PlanningMap:
     """The master costmap."""
     static: Grid
     lower_bound: Grid
-    """The static map with its inflation: what remains of the costs when no hazard, zone or obstacle is there."""
+    """The inflated static map: the costs without any hazard, zone or obstacle."""
 
 
 @dataclass(frozen=True)
 class CostChange:
-    """Cells of the master costmap that changed: masks over a window, and what caused it."""
+    """Changed cells of the master costmap: masks over a window, and the traces of the hazards that caused them."""
 
     window: Window
     changed: Mask
-    fell: Mask
+    decreased: Mask
     traces: list[Trace]
 
 
 @dataclass(frozen=True)
 class Loaded:
-    """A whole map was loaded; `restarted`: its version belongs to another epoch than the one before."""
+    """A snapshot was loaded; `restarted`: its epoch differs from that of the map before."""
 
     restarted: bool
     traces: list[Trace]
 
 
 class MapTracker:
-    """Follows the map-service, and tells which costs changed."""
+    """Follows the map-service's map, and reports which costs changed."""
 
     def __init__(self, inflation: Inflation, *, grace_s: float, max_age_s: float) -> None:
         self._inflation = inflation
@@ -67,22 +67,22 @@ class MapTracker:
 
     @property
     def current(self) -> PlanningMap | None:
-        """The newest version that is known whole; None before the first snapshot."""
+        """The newest complete version; None before the first snapshot."""
         replica = self._follower.replica
         if replica.geometry is None or replica.version is None:
             return None
         return PlanningMap(replica.geometry, replica.version, replica.cost, replica.static, self._lower_bound)
 
     def wants_snapshot(self, now: float) -> bool:
-        """Whether only a snapshot of the map-service helps."""
+        """Whether a snapshot is needed to follow the map."""
         return self._follower.wants_snapshot(now)
 
     def is_fresh(self, now: float) -> bool:
-        """Whether the copy is known to be recent enough to release paths on."""
+        """Whether the replica is confirmed to be recent enough to release paths on it."""
         return not self.wants_snapshot(now) and self._follower.age(now) <= self._max_age_s
 
     def load(self, snapshot: MapSnapshot, now: float) -> Loaded:
-        """Take a snapshot; raises `MapError` and changes nothing when it is damaged or outdated."""
+        """Load a snapshot; raises `MapError` and changes nothing when it is damaged or outdated."""
         before = self._follower.version
         applied = self._follower.on_snapshot(snapshot, now)
         replica = self._follower.replica
@@ -94,11 +94,11 @@ class MapTracker:
         return Loaded(before is None or before.epoch != snapshot.epoch, applied.traces)
 
     def on_heartbeat(self, heartbeat: MapHeartbeat, now: float) -> None:
-        """Compare with the map-service's version; deltas that stay away make a snapshot necessary."""
+        """Compare with the map-service's version; if deltas are missing, a snapshot is needed."""
         self._follower.on_heartbeat(heartbeat, now)
 
     def on_delta(self, delta: MapDelta, now: float) -> list[CostChange]:
-        """Take a delta; return which costs it changed."""
+        """Apply a delta; return which costs it changed."""
         applied = self._follower.on_delta(delta, now)
         return [] if applied is None else self._differences(applied)
 
@@ -109,15 +109,15 @@ class MapTracker:
                 continue
             previous = self._previous[window.rows, window.columns]
             cost = self._follower.replica.cost[window.rows, window.columns]
-            self._keep_lower_bound(window, cost)
-            changed, fell = cost != previous, cost < previous
+            self._adjust_lower_bound(window, cost)
+            changed, decreased = cost != previous, cost < previous
             if changed.any():
-                changes.append(CostChange(window, changed, fell, applied.traces))
+                changes.append(CostChange(window, changed, decreased, applied.traces))
             self._previous[window.rows, window.columns] = cost
         return changes
 
-    def _keep_lower_bound(self, window: Window, cost: Grid) -> None:
-        """Replace the lower bound when traversable cells fall below it; a new array tells that it is another one."""
+    def _adjust_lower_bound(self, window: Window, cost: Grid) -> None:
+        """Lower the bound where traversable cells fall below it, in a new array, so that users notice the change."""
         bound = self._lower_bound[window.rows, window.columns]
         if np.any((cost < bound) & (cost < INSCRIBED)):
             self._lower_bound = self._lower_bound.copy()

@@ -1,4 +1,4 @@
-"""Why a way is cut: the areas behind the cells of the costmap, and which of them, taken away, would open the way."""
+"""Why there is no path: the hazards and zones behind the costmap's cells, and which of them to remove for a path."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -20,55 +20,55 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Region:
-    """A hazard or zone as cells: its own (`core`) and those that its inflation can reach (`reach`), in one window."""
+    """A hazard or zone as masks over a window: its own cells, and those that its inflation can reach (`inflated`)."""
 
     cause: Cause
-    words: str
+    description: str
     window: Window
-    core: Mask
-    reach: Mask
+    cells: Mask
+    inflated: Mask
 
     def blocks(self, cost: Grid) -> bool:
         """Whether cells of this region are lethal on the costmap."""
-        return bool(np.any(cost[self.window.rows, self.window.columns][self.core] == LETHAL))
+        return bool(np.any(cost[self.window.rows, self.window.columns][self.cells] == LETHAL))
 
     def covers(self, column: int, row: int) -> bool:
         """Whether the cell is one of the region's own."""
         x, y = column - self.window.x, row - self.window.y
-        return 0 <= x < self.window.width and 0 <= y < self.window.height and bool(self.core[y, x])
+        return 0 <= x < self.window.width and 0 <= y < self.window.height and bool(self.cells[y, x])
 
-    def reaches(self, column: int, row: int) -> bool:
-        """Whether the region's inflation can make the cell impassable or dear."""
+    def influences(self, column: int, row: int) -> bool:
+        """Whether the region or its inflation can raise the cell's cost."""
         x, y = column - self.window.x, row - self.window.y
-        return 0 <= x < self.window.width and 0 <= y < self.window.height and bool(self.reach[y, x])
+        return 0 <= x < self.window.width and 0 <= y < self.window.height and bool(self.inflated[y, x])
 
 
-def _region(cause: Cause, words: str, window: Window, mask: Mask, geometry: GridGeometry, reach: float) -> Region:
+def _region(cause: Cause, description: str, window: Window, mask: Mask, geometry: GridGeometry, reach: float) -> Region:
     cells = max(1, math.ceil(reach / geometry.resolution))
     grown = geometry.clip(window.grown(cells))
-    core = np.zeros((grown.height, grown.width), dtype=np.bool_)
+    own = np.zeros((grown.height, grown.width), dtype=np.bool_)
     x, y = window.x - grown.x, window.y - grown.y
-    core[y : y + window.height, x : x + window.width] = mask
-    near = squared_distance_capped(core, cells + 1) <= cells * cells
-    return Region(cause, words, grown, core, near)
+    own[y : y + window.height, x : x + window.width] = mask
+    inflated = squared_distance_capped(own, cells + 1) <= cells * cells
+    return Region(cause, description, grown, own, inflated)
 
 
-def hazard_region(told: HazardArea, geometry: GridGeometry, reach: float) -> Region | None:
-    """Return a hazard's region with its inflation `reach` (m); None when it lies off the map or is no polygon."""
+def hazard_region(area: HazardArea, geometry: GridGeometry, reach: float) -> Region | None:
+    """Return a hazard's region with its inflation `reach` (m); None off the map, or for an invalid polygon."""
     try:
-        window, mask = rasterize(normalized_polygon(told.polygon), geometry)
+        window, mask = rasterize(normalized_polygon(area.polygon), geometry)
     except GeometryError:
-        # The map-service refuses such an area too: it has no cells that could cut a way.
+        # The map-service refuses such an area too: it has no cells on the costmap.
         return None
     if window.empty:
         return None
-    name = told.hazard.area + (f" ({told.label})" if told.label else "")
-    cause = Cause(kind="hazard", id=told.hazard.area, state=told.hazard.state)
-    return _region(cause, f"hazard {name}, {told.hazard.state}", window, mask, geometry, reach)
+    name = area.hazard.area + (f" ({area.label})" if area.label else "")
+    cause = Cause(kind="hazard", id=area.hazard.area, state=area.hazard.state)
+    return _region(cause, f"hazard {name}, {area.hazard.state}", window, mask, geometry, reach)
 
 
 def zone_region(zone: Zone, geometry: GridGeometry, reach: float) -> Region | None:
-    """Return a BLOCKED zone's region; None for another kind, off the map, or for a shape that can't be used."""
+    """Return a BLOCKED zone's region; None for another kind, off the map, or for an invalid shape."""
     if zone.kind != "BLOCKED":
         return None
     try:
@@ -82,34 +82,37 @@ def zone_region(zone: Zone, geometry: GridGeometry, reach: float) -> Region | No
     return _region(cause, f"no-go zone {zone.id}{reason}", window, mask, geometry, reach)
 
 
-def lifted(cost: Grid, floor: Grid, lift: Sequence[Region], keep: Sequence[Region]) -> Grid:
-    """Return the costmap without the regions `lift`: `floor` (static, inflated) where none of `keep` reaches."""
-    free = cost.copy()
-    for region in lift:
+def remove_regions(cost: Grid, lower_bound: Grid, removed: Sequence[Region], kept: Sequence[Region]) -> Grid:
+    """Return the costmap without some regions: their cells get the lower bound, except those that `kept` influence."""
+    result = cost.copy()
+    for region in removed:
         rows, columns = region.window.rows, region.window.columns
-        free[rows, columns][region.reach] = floor[rows, columns][region.reach]
-    for region in keep:
+        result[rows, columns][region.inflated] = lower_bound[rows, columns][region.inflated]
+    for region in kept:
         rows, columns = region.window.rows, region.window.columns
-        free[rows, columns][region.reach] = cost[rows, columns][region.reach]
-    return free
+        result[rows, columns][region.inflated] = cost[rows, columns][region.inflated]
+    return result
 
 
-def cutting(cost: Grid, floor: Grid, regions: Sequence[Region], opens: Callable[[Grid], bool]) -> list[Region]:
-    """Return the regions that cut a way: each that alone would open it, else a smallest set that together would.
+def decisive_regions(
+    cost: Grid, lower_bound: Grid, regions: Sequence[Region], has_path: Callable[[Grid], bool]
+) -> list[Region]:
+    """Return the regions that block all paths: those of which removing one suffices, else a minimal set to remove.
 
-    `opens(costmap)` says whether there is a way. Empty when not even all of them together are the reason.
+    `has_path(costmap)` returns whether there is a path. Empty when removing all regions gives no path either.
     """
     blocking = [region for region in regions if region.blocks(cost)]
 
-    def without(lift: Sequence[Region]) -> bool:
-        return opens(lifted(cost, floor, lift, [region for region in blocking if region not in lift]))
+    def has_path_without(removed: Sequence[Region]) -> bool:
+        kept = [region for region in blocking if region not in removed]
+        return has_path(remove_regions(cost, lower_bound, removed, kept))
 
-    alone = [region for region in blocking if without([region])]
-    if alone or not blocking or not without(blocking):
-        return alone
-    needed = list(blocking)
+    sufficient = [region for region in blocking if has_path_without([region])]
+    if sufficient or not blocking or not has_path_without(blocking):
+        return sufficient
+    minimal = list(blocking)
     for region in blocking:
-        fewer = [other for other in needed if other is not region]
-        if without(fewer):
-            needed = fewer
-    return needed
+        fewer = [other for other in minimal if other is not region]
+        if has_path_without(fewer):
+            minimal = fewer
+    return minimal

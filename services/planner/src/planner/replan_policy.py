@@ -1,4 +1,4 @@
-"""Which of two plans holds: the one in force, or the one just found."""
+"""Chooses between the current plan and a search's result."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ if TYPE_CHECKING:
 def is_kept(
     plan: Plan, found: SearchResult, reason: ReplanReason, planning_map: PlanningMap, config: PlannerConfig
 ) -> bool:
-    """Whether the plan in force stays: the same refusal, or a passable path that nothing found beats clearly."""
+    """Whether the current plan is kept: the same refusal, or a passable path that is not clearly worse."""
     if found.refusal is not None:
         return plan.refusal == found.refusal
-    if plan.route is None or reason in ("goal", "strayed"):
+    if plan.route is None or reason in ("goal", "off_path"):
         return False
     remaining = plan.route.cost(planning_map.cost, planning_map.geometry, plan.progress)
-    share = config.saving if reason == "clearing" else config.hysteresis
+    share = config.min_saving if reason == "clearing" else config.hysteresis
     return not math.isinf(remaining) and found.cost >= (1.0 - share) * remaining

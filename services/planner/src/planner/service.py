@@ -1,7 +1,7 @@
-"""Between the core and the world: messages to the core's thread, what it returns to the robots, missions to the store.
+"""Runs the core: passes messages to its thread, publishes what it returns, and stores missions.
 
-The core runs on one thread of its own, one turn after another, so that a long search never keeps the event loop from
-its heartbeats; the kernels release the GIL. Inputs are dated when they arrive, however long the turn before takes.
+The core runs on a thread of its own, one cycle after another, so that a long search never delays the event loop; the
+kernels release the GIL. Messages get their time of arrival, however long the cycle before takes.
 """
 
 from __future__ import annotations
@@ -51,25 +51,25 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 TICK_S = 0.1
-RETRY_S = 0.5
+STORE_PERIOD_S = 0.5
 SNAPSHOT_TIMEOUT_S = 3.0
 
-PLANS = Counter("fognav_plans_total", "Paths that were searched, by reason", ["reason"])
-REFUSALS = Counter("fognav_plan_refusals_total", "Searches that ended in a refusal, by Nav2's code", ["code"])
-TURN_SECONDS = Histogram(
-    "fognav_plan_turn_seconds",
-    "One turn of the planner: its inputs, all searches that they lead to",
+PLANS = Counter("fognav_plans_total", "Path searches, by reason", ["reason"])
+REFUSALS = Counter("fognav_plan_refusals_total", "Path searches that ended in a refusal, by Nav2's code", ["code"])
+CYCLE_SECONDS = Histogram(
+    "fognav_plan_cycle_seconds",
+    "Duration of one planning cycle: its messages and all path searches",
     buckets=(0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0),
 )
 ROBOTS = Gauge("fognav_planner_robots", "Robots with a mission")
-SNAPSHOTS = Counter("fognav_planner_snapshots_total", "Whole maps that were fetched", ["outcome"])
+SNAPSHOTS = Counter("fognav_planner_snapshots_total", "Queries for a snapshot of the map, by outcome", ["outcome"])
 
 _log = logs.get("planner")
 
 
 @dataclass(frozen=True)
-class _TurnResult:
-    """What one turn of the core leads to."""
+class _CycleResult:
+    """The results of one cycle of the core."""
 
     publications: Sequence[Publication]
     reached: list[tuple[str, str]]
@@ -92,117 +92,117 @@ class Service:
         self._inputs: deque[Callable[[], Sequence[Publication]]] = deque()
         self._goal_changes: deque[Callable[[], object]] = deque()
         self._wake = asyncio.Event()
-        self._wants_map = asyncio.Event()
-        self._wants_map.set()
-        self._fields: set[asyncio.Task[None]] = set()
-        self._goals_read = asyncio.Event()
-        self._writing = asyncio.Lock()
+        self._snapshot_needed = asyncio.Event()
+        self._snapshot_needed.set()
+        self._field_tasks: set[asyncio.Task[None]] = set()
+        self._goals_loaded = asyncio.Event()
+        self._goal_lock = asyncio.Lock()
         self._reached: dict[str, str] = {}
-        self._counted: dict[tuple[int, object], int] = {}
+        self._exported_counts: dict[tuple[int, object], int] = {}
         self.poses: dict[str, RobotPose] = {}
         self.states: dict[str, RobotState] = {}
         self.goals: dict[str, StoredGoal] = {}
         self._paths: dict[str, RobotPath] = {}
 
     def path(self, robot: str) -> RobotPath | None:
-        """Return the path or refusal that was published last for the robot's present goal."""
+        """Return the last published path or refusal for the robot's current goal."""
         path, stored = self._paths.get(robot), self.goals.get(robot)
         return path if path and stored and path.goal_id == stored.goal.goal_id else None
 
-    # --- What comes in ----------------------------------------------------------------------------------------------
+    # --- Inputs -----------------------------------------------------------------------------------------------------
 
     def subscribe(self) -> None:
         """Register subscriptions and queries."""
-        handlers = {channel: self._dated(channel, handler) for channel, handler in self._core.handlers().items()}
+        handlers = {channel: self._queued(channel, handler) for channel, handler in self._core.handlers().items()}
         self._edges.subscribe(handlers, self._publish)
         for channel, query_handler in self._core.query_handlers().items():
             self._zenoh.serve(channel, partial(self._answer, query_handler))
 
-    def _dated(self, channel: ch.Channel, handler: Handler) -> Handler:
-        """Return a handler that leaves its message, dated now, for the core's next turn, in order of arrival."""
+    def _queued(self, channel: ch.Channel, handler: Handler) -> Handler:
+        """Return a handler that queues its message, with its time of arrival, for the core's next cycle."""
 
-        def leave(ids: Ids, message: object, at: Moment) -> Sequence[Publication]:
-            self._note(ids, message)
+        def enqueue(ids: Ids, message: object, at: Moment) -> Sequence[Publication]:
+            self._record(ids, message)
             self._inputs.append(partial(self._handle, channel, handler, ids, message, at))
             if channel in self._core.URGENT:
                 self._wake.set()
             return ()
 
-        return leave
+        return enqueue
 
     def _handle(
         self, channel: ch.Channel, handler: Handler, ids: Ids, message: object, at: Moment
     ) -> Sequence[Publication]:
-        """Run a handler on the core's thread; what it refuses is counted and logged, as by the edge itself."""
+        """Run a handler on the core's thread; a refused message is counted and logged as by the edge."""
         try:
             return handler(ids, message, at)
         except RefusedMessageError as error:
             self._zenoh.refuse(channel, channel.pattern(**ids), str(error))
             return ()
 
-    def _note(self, ids: Ids, message: object) -> None:
-        """Keep what the API shows."""
+    def _record(self, ids: Ids, message: object) -> None:
+        """Record what the API shows."""
         if isinstance(message, RobotPose):
             self.poses[ids["robot"]] = message
         elif isinstance(message, RobotState):
             self.states[ids["robot"]] = message
 
-    # --- Questions --------------------------------------------------------------------------------------------------
+    # --- Queries ----------------------------------------------------------------------------------------------------
 
-    async def _in_core(self, function: Callable[[], T]) -> T:
+    async def _run_in_core(self, function: Callable[[], T]) -> T:
         return await asyncio.get_running_loop().run_in_executor(self._thread, function)
 
     async def _answer(self, query_handler: QueryHandler, ids: Ids, request: object) -> Message:
-        return await self._in_core(partial(query_handler, ids, request, self._edges.now()))
+        return await self._run_in_core(partial(query_handler, ids, request, self._edges.now()))
 
     async def preview(self, request: PlanRequest) -> PlanReply:
-        """Plan without side effects."""
+        """Plan a path without side effects."""
         reply = await self._answer(self._core.query_handlers()[ch.PLANNER_PLAN], {}, request)
         assert isinstance(reply, PlanReply)
         return reply
 
-    # --- Missions: stored first, then they count --------------------------------------------------------------------
+    # --- Missions: stored first, then in force ----------------------------------------------------------------------
 
     async def send(
         self, robot: str, pose: Pose, who: str, *, place: str | None, any_heading: bool
     ) -> StoredGoal | Refusal:
-        """Give a robot a mission; returns why not when it can never be reached. Raises `StoreError`."""
-        refusal = await self._in_core(lambda: self._core.check_goal(pose.x, pose.y))
+        """Give a robot a mission; returns a refusal for an unreachable goal. Raises `StoreError`."""
+        refusal = await self._run_in_core(lambda: self._core.check_goal(pose.x, pose.y))
         if refusal is not None:
             return refusal
-        async with self._writing:
+        async with self._goal_lock:
             stamp = self._clock.stamp()
             goal = RobotGoal(goal_id=secrets.token_hex(8), pose=pose, place=place, stamp=stamp)
             stored = StoredGoal(goal=goal, any_heading=any_heading)
-            await self._stored(lambda: self._store.put(robot, stored, who, stamp))
-            self._begin(robot, stored)
-        _log.info("goal", robot=robot, goal=goal.goal_id, x=pose.x, y=pose.y, place=place, who=who)
+            await self._write(lambda: self._store.put(robot, stored, who, stamp))
+            self._begin_mission(robot, stored)
+        _log.info("goal_accepted", robot=robot, goal=goal.goal_id, x=pose.x, y=pose.y, place=place, who=who)
         return stored
 
     async def cancel(self, robot: str, who: str) -> bool:
         """End a robot's mission; False when it has none. Raises `StoreError`."""
-        async with self._writing:
+        async with self._goal_lock:
             stored = self.goals.get(robot)
             if stored is None:
                 return False
             stamp = self._clock.stamp()
             goal_id = stored.goal.goal_id
-            await self._stored(lambda: self._store.delete(robot, goal_id, who, "cancel", stamp))
+            await self._write(lambda: self._store.delete(robot, goal_id, who, "cancel", stamp))
             del self.goals[robot]
             self._change_goal(partial(self._core.cancel, robot))
         _log.info("goal_cancelled", robot=robot, goal=stored.goal.goal_id, who=who)
         return True
 
-    async def _stored(self, write: Callable[[], Awaitable[None]]) -> None:
-        if not self._goals_read.is_set():
-            raise StoreError("the stored missions are not read yet")
+    async def _write(self, write: Callable[[], Awaitable[None]]) -> None:
+        if not self._goals_loaded.is_set():
+            raise StoreError("the stored missions are not loaded yet")
         try:
             await write()
         except StoreError as error:
             self._health.set("store", ok=False, detail=str(error))
             raise
 
-    def _begin(self, robot: str, stored: StoredGoal) -> None:
+    def _begin_mission(self, robot: str, stored: StoredGoal) -> None:
         self.goals[robot] = stored
         self._change_goal(partial(self._core.set_goal, robot, stored.goal, any_heading=stored.any_heading))
 
@@ -211,14 +211,14 @@ class Service:
         self._wake.set()
 
     async def store_loop(self) -> None:
-        """Read the missions, however long it takes; afterwards delete those that are over, and watch the store."""
+        """Load the missions, retrying until the store answers; then delete ended ones, and monitor the store."""
         while True:
             try:
-                if not self._goals_read.is_set():
+                if not self._goals_loaded.is_set():
                     for robot, stored in (await self._store.goals()).items():
-                        self._begin(robot, stored)
-                    self._goals_read.set()
-                    self._health.set("goals", ok=True, detail=f"{len(self.goals)} read")
+                        self._begin_mission(robot, stored)
+                    self._goals_loaded.set()
+                    self._health.set("goals", ok=True, detail=f"{len(self.goals)} loaded")
                 for robot, goal_id in list(self._reached.items()):
                     await self._store.delete(robot, goal_id, robot, "reached", self._clock.stamp())
                     if self._reached.get(robot) == goal_id:
@@ -227,28 +227,28 @@ class Service:
                 self._health.set("store", ok=True)
             except StoreError as error:
                 self._health.set("store", ok=False, detail=str(error))
-                if not self._goals_read.is_set():
-                    self._health.set("goals", ok=False, detail=f"not read yet: {error}")
-            await asyncio.sleep(RETRY_S)
+                if not self._goals_loaded.is_set():
+                    self._health.set("goals", ok=False, detail=f"not loaded yet: {error}")
+            await asyncio.sleep(STORE_PERIOD_S)
 
     # --- The map ----------------------------------------------------------------------------------------------------
 
-    async def map_loop(self) -> None:
-        """Fetch the whole map whenever the core needs it."""
+    async def snapshot_loop(self) -> None:
+        """Fetch a snapshot of the map whenever the core needs one."""
         while True:
-            await self._wants_map.wait()
-            if not await self._in_core(self._wants_snapshot):
-                self._wants_map.clear()
+            await self._snapshot_needed.wait()
+            if not await self._run_in_core(self._wants_snapshot):
+                self._snapshot_needed.clear()
                 continue
             try:
                 snapshot = await self._zenoh.query(ch.MAP_SNAPSHOT, None, MapSnapshot, SNAPSHOT_TIMEOUT_S)
                 if snapshot is not None:
-                    await self._in_core(partial(self._core.load, snapshot, self._clock.now()))
-                    self._wants_map.clear()
+                    await self._run_in_core(partial(self._core.load, snapshot, self._clock.now()))
+                    self._snapshot_needed.clear()
                     self._wake.set()
-                    SNAPSHOTS.labels("taken").inc()
+                    SNAPSHOTS.labels("loaded").inc()
                     self._health.set("map", ok=True)
-                    _log.info("map", epoch=snapshot.epoch, seq=snapshot.seq)
+                    _log.info("map_loaded", epoch=snapshot.epoch, seq=snapshot.seq)
                     continue
                 SNAPSHOTS.labels("unanswered").inc()
                 self._health.set("map", ok=False, detail="the map-service does not answer")
@@ -260,61 +260,63 @@ class Service:
     def _wants_snapshot(self) -> bool:
         return self._core.wants_snapshot(self._clock.now())
 
-    # --- What goes out ----------------------------------------------------------------------------------------------
+    # --- Planning and publishing------------------------------------------------------------------------------------
 
     async def tick_loop(self) -> None:
-        """Have the core take a turn ten times a second."""
+        """Start a planning cycle ten times a second."""
         async for _ in ticker(self._clock, TICK_S):
             self._wake.set()
 
     async def plan_loop(self) -> None:
-        """Run the core's turns and publish what they return: at every tick, and at once after an urgent message."""
+        """Run planning cycles and publish their results: at every tick, and at once after an urgent message."""
         while True:
             await self._wake.wait()
             self._wake.clear()
-            with TURN_SECONDS.time():
-                result = await self._in_core(self._turn)
+            with CYCLE_SECONDS.time():
+                result = await self._run_in_core(self._run_cycle)
             self._publish(result.publications)
             for robot, goal_id in result.reached:
-                self._end(robot, goal_id)
+                self._end_goal(robot, goal_id)
             for job in result.field_jobs:
-                self._compute(job)
+                self._start_field_job(job)
             if result.wants_snapshot:
-                self._wants_map.set()
-            self._health.set("zenoh", ok=self._zenoh.connected, detail="" if self._zenoh.connected else "no router")
-            self._measure()
+                self._snapshot_needed.set()
+            self._health.set(
+                "zenoh", ok=self._zenoh.connected, detail="" if self._zenoh.connected else "not connected to the router"
+            )
+            self._update_metrics()
 
-    def _turn(self) -> _TurnResult:
-        """Run one turn on the core's thread; goals that change while it searches count before it publishes."""
+    def _run_cycle(self) -> _CycleResult:
+        """Run one cycle on the core's thread; goals that change during the search take effect before it publishes."""
         core = self._core
-        answers = [publication for answer in _run_all(self._inputs) for publication in answer]
+        replies = [publication for reply in _run_all(self._inputs) for publication in reply]
         _run_all(self._goal_changes)
         core.plan(self._edges.now())
         _run_all(self._goal_changes)
-        publications = [*answers, *core.publish(self._edges.now())]
-        return _TurnResult(publications, core.take_reached(), core.field_jobs(), self._wants_snapshot())
+        publications = [*replies, *core.publish(self._edges.now())]
+        return _CycleResult(publications, core.pop_reached(), core.field_jobs(), self._wants_snapshot())
 
-    def _compute(self, job: FieldJob) -> None:
+    def _start_field_job(self, job: FieldJob) -> None:
         async def work() -> None:
             await asyncio.get_running_loop().run_in_executor(self._field_thread, job.run)
-            self._inputs.append(partial(self._take_field, job))
+            self._inputs.append(partial(self._add_field, job))
 
         task = asyncio.get_running_loop().create_task(work(), name="field")
-        self._fields.add(task)
-        task.add_done_callback(self._fields.discard)
+        self._field_tasks.add(task)
+        task.add_done_callback(self._field_tasks.discard)
 
-    def _take_field(self, job: FieldJob) -> Sequence[Publication]:
-        self._core.take_field(job)
+    def _add_field(self, job: FieldJob) -> Sequence[Publication]:
+        self._core.add_field(job)
         return ()
 
     def _publish(self, publications: Sequence[Publication]) -> None:
         for publication in publications:
             if isinstance(path := publication.message, RobotPath):
-                self._note_path(publication.ids["robot"], path)
+                self._record_path(publication.ids["robot"], path)
             self._edges.publish(publication)
 
-    def _note_path(self, robot: str, path: RobotPath) -> None:
-        """Keep what the API shows, and report a plan that is published for the first time."""
+    def _record_path(self, robot: str, path: RobotPath) -> None:
+        """Record what the API shows, and report a plan when it is first published."""
         before = self._paths.get(robot)
         self._paths[robot] = path
         if before is not None and before.plan_id == path.plan_id:
@@ -322,36 +324,36 @@ class Service:
         for trace in path.traces:
             metrics.observe_trace(trace, ["plan"])
         if path.refusal is not None:
-            _log.warning("refused", robot=robot, plan=path.plan_id, reason=path.refusal.reason)
+            _log.warning("plan_refused", robot=robot, plan=path.plan_id, reason=path.refusal.reason)
         else:
-            _log.info("plan", robot=robot, plan=path.plan_id, points=len(path.points), map_seq=path.map_seq,
-                      because=[trace.area for trace in path.traces])  # fmt: skip
+            _log.info("plan_published", robot=robot, plan=path.plan_id, points=len(path.points), map_seq=path.map_seq,
+                      hazards=[trace.area for trace in path.traces])  # fmt: skip
 
-    def _end(self, robot: str, goal_id: str) -> None:
-        """Have a goal that was reached deleted, unless the robot has another one by now."""
+    def _end_goal(self, robot: str, goal_id: str) -> None:
+        """Mark a reached goal for deletion, unless the robot has another one by now."""
         stored = self.goals.get(robot)
         if stored is not None and stored.goal.goal_id == goal_id:
             del self.goals[robot]
             self._reached[robot] = goal_id
             _log.info("goal_reached", robot=robot, goal=goal_id)
 
-    def _measure(self) -> None:
+    def _update_metrics(self) -> None:
         ROBOTS.set(len(self.goals))
         for counter, values in ((PLANS, self._core.plans), (REFUSALS, self._core.refusals)):
             for label, count in dict(values).items():
                 key = (id(counter), label)
-                counter.labels(str(label)).inc(count - self._counted.get(key, 0))
-                self._counted[key] = count
+                counter.labels(str(label)).inc(count - self._exported_counts.get(key, 0))
+                self._exported_counts[key] = count
 
     def close(self) -> None:
-        """Let the threads end when their work is done."""
+        """Shut the threads down once their current work is done."""
         for thread in (self._thread, self._field_thread):
             thread.shutdown(wait=False, cancel_futures=True)
 
 
-def _run_all(waiting: deque[Callable[[], T]]) -> list[T]:
-    """Run what waits, oldest first, and return its results; the event loop may append meanwhile: a deque allows it."""
+def _run_all(queued: deque[Callable[[], T]]) -> list[T]:
+    """Run all queued functions, oldest first, and return their results; the event loop may append meanwhile."""
     results: list[T] = []
-    while waiting:
-        results.append(waiting.popleft()())
+    while queued:
+        results.append(queued.popleft()())
     return results

@@ -1,4 +1,4 @@
-"""Redis as the record of the robots' missions, so that a planner that starts again goes on with them."""
+"""The robots' missions in Redis, so that a restarted planner continues them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _GOALS: Final = Table("goals", "robot", version="goal.goal_id")
 
 
 class StoredGoal(Message, frozen=True, kw_only=True):
-    """A mission as it is kept; `any_heading`: the goal's theta is no wish."""
+    """A mission as it is stored; `any_heading`: ignore the goal's theta."""
 
     goal: RobotGoal
     any_heading: bool = False
@@ -23,16 +23,16 @@ class Store(RedisStore):
     """The planner's keys."""
 
     async def goals(self) -> dict[str, StoredGoal]:
-        """Return all stored missions by robot; one that can't be read is left out and reported.
+        """Return all stored missions by robot; an unreadable one is left out and logged.
 
-        Without a mission a robot stands: safe, and no reason to withhold the others' missions.
+        A robot without a mission stands still, which is safe, and no reason to withhold the others' missions.
         """
         return await self._readable_records(_GOALS.name, StoredGoal)
 
-    async def put(self, robot: str, goal: StoredGoal, who: str, at: float) -> None:
+    async def put(self, robot: str, goal: StoredGoal, who: str, stamp: float) -> None:
         """Write a mission durably, with its audit entry."""
-        await self._swap(_GOALS, robot, goal, ANY, Audit(at=at, who=who, action="goal"))
+        await self._swap(_GOALS, robot, goal, ANY, Audit(at=stamp, who=who, action="goal"))
 
-    async def delete(self, robot: str, goal_id: str, who: str, action: str, at: float) -> None:
+    async def delete(self, robot: str, goal_id: str, who: str, action: str, stamp: float) -> None:
         """Delete a mission durably if it is still this one (`action`: cancel or reached): a newer one stays."""
-        await self._swap(_GOALS, robot, None, goal_id, Audit(at=at, who=who, action=action))
+        await self._swap(_GOALS, robot, None, goal_id, Audit(at=stamp, who=who, action=action))

@@ -1,4 +1,4 @@
-"""The parts of the planner's core, each by itself."""
+"""The modules of the planner's core, each on its own."""
 
 import math
 
@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec import structs
-from ring_map import LEFT, LOWER, RIGHT, UPPER, Box, Map, goal, pose
+from ring_map import LEFT, LOWER, RIGHT, UPPER, Box, RingMap, goal, pose
 
 from fog_contracts import channels as ch
 from fog_contracts.costs import DEFAULT_INFLATION
@@ -19,7 +19,7 @@ from planner.config import PlannerConfig
 from planner.egress import find_egress
 from planner.goal_fields import GoalFields
 from planner.mission import Mission, Plan
-from planner.path_monitor import may_save, reason_from_change, reason_from_pose, touches_corridor
+from planner.path_monitor import affects_corridor, may_save, reason_from_change, reason_from_pose
 from planner.path_search import PathSearch, SearchResult
 from planner.planning_map import CostChange, MapTracker, PlanningMap
 from planner.refusals import refuse
@@ -31,9 +31,9 @@ TRACE = Trace(area="z1", epoch=1, seq=5)
 NOW = Moment(100.0, 5000.0)
 
 
-def tracker(the_map: Map) -> MapTracker:
+def tracker(ring_map: RingMap) -> MapTracker:
     made = MapTracker(DEFAULT_INFLATION, grace_s=0.5, max_age_s=1.0)
-    made.load(the_map.master.snapshot(), 0.0)
+    made.load(ring_map.master.snapshot(), 0.0)
     return made
 
 
@@ -47,107 +47,107 @@ def plan(*corners: PointXY, progress: float = 0.0) -> Plan:
     return Plan(1, route, None, [], planned_from=corners[0], progress=progress)
 
 
-def straight(the_plan: Plan) -> Route:
-    assert the_plan.route is not None
-    return the_plan.route
+def straight(plan_with_route: Plan) -> Route:
+    assert plan_with_route.route is not None
+    return plan_with_route.route
 
 
-def change(box: Box, *, fell: bool = False) -> CostChange:
-    window = Map().geometry.window_around(*box[:2], box[2] - 1e-6, box[3] - 1e-6)
+def change(box: Box, *, decreased: bool = False) -> CostChange:
+    window = RingMap().geometry.window_around(*box[:2], box[2] - 1e-6, box[3] - 1e-6)
     cells = np.ones((window.height, window.width), dtype=np.bool_)
-    return CostChange(window, cells, cells & fell, [TRACE])
+    return CostChange(window, cells, cells & decreased, [TRACE])
 
 
 # --- The map ---
 
 
-def test_delta_tells_which_costs_changed_and_which_fell() -> None:
-    the_map = Map()
-    made = tracker(the_map)
-    (delta,) = the_map.put("z1", UPPER, trace=TRACE)
+def test_delta_reports_which_costs_changed_and_which_decreased() -> None:
+    ring_map = RingMap()
+    made = tracker(ring_map)
+    (delta,) = ring_map.put("z1", UPPER, trace=TRACE)
     (rise,) = made.on_delta(delta, 1.0)
     assert rise.changed.any()
-    assert not rise.fell.any()
+    assert not rise.decreased.any()
     assert rise.traces == [TRACE]
-    x, y = the_map.geometry.cell(10.0, 11.0)
+    x, y = ring_map.geometry.cell(10.0, 11.0)
     assert rise.changed[y - rise.window.y, x - rise.window.x]
-    (delta,) = the_map.clear("z1")
+    (delta,) = ring_map.clear("z1")
     (fall,) = made.on_delta(delta, 1.1)
-    assert np.array_equal(fall.fell, fall.changed)
+    assert np.array_equal(fall.decreased, fall.changed)
     assert made.on_delta(delta, 1.2) == []
 
 
 def test_map_is_fresh_only_while_heartbeats_confirm_it() -> None:
-    the_map = Map()
-    made = tracker(the_map)
+    ring_map = RingMap()
+    made = tracker(ring_map)
     assert not made.is_fresh(0.0)
-    made.on_heartbeat(the_map.master.heartbeat(0.0), 1.0)
+    made.on_heartbeat(ring_map.master.heartbeat(0.0), 1.0)
     assert made.is_fresh(2.0)
     assert not made.is_fresh(2.1)
 
 
-def test_lower_bound_is_replaced_when_costs_fall_below_it_and_kept_otherwise() -> None:
-    the_map = Map()
-    made = tracker(the_map)
+def test_lower_bound_is_replaced_only_when_costs_fall_below_it() -> None:
+    ring_map = RingMap()
+    made = tracker(ring_map)
     bound = current(made).lower_bound
-    for delta in the_map.put("z1", UPPER):
+    for delta in ring_map.put("z1", UPPER):
         made.on_delta(delta, 1.0)
     assert current(made).lower_bound is bound
-    the_map.static[:, :] = 0
-    for delta in the_map.put("z2", LOWER):
+    ring_map.static[:, :] = 0
+    for delta in ring_map.put("z2", LOWER):
         made.on_delta(delta, 1.0)
     planning_map = current(made)
     assert planning_map.lower_bound is not bound
     assert np.all(planning_map.lower_bound <= planning_map.cost)
 
 
-def test_loading_tells_a_restart_and_a_damaged_snapshot_changes_nothing() -> None:
-    the_map = Map()
+def test_snapshot_of_a_new_epoch_is_a_restart_and_a_damaged_one_changes_nothing() -> None:
+    ring_map = RingMap()
     made = MapTracker(DEFAULT_INFLATION, grace_s=0.5, max_age_s=1.0)
     assert made.current is None
-    assert made.load(the_map.master.snapshot(), 0.0).restarted
-    assert not made.load(the_map.master.snapshot(), 0.0).restarted
+    assert made.load(ring_map.master.snapshot(), 0.0).restarted
+    assert not made.load(ring_map.master.snapshot(), 0.0).restarted
     with pytest.raises(MapError):
-        made.load(structs.replace(the_map.master.snapshot(), hash=1), 0.0)
-    assert current(made).version == the_map.master.version
-    assert made.load(Map(epoch=2).master.snapshot(), 0.0).restarted
+        made.load(structs.replace(ring_map.master.snapshot(), hash=1), 0.0)
+    assert current(made).version == ring_map.master.version
+    assert made.load(RingMap(epoch=2).master.snapshot(), 0.0).restarted
 
 
 # --- Path monitor ---
 
 
-@pytest.mark.parametrize(("side", "touched"), [(0.6, True), (1.0, False)])
-def test_change_beside_the_path_touches_it_within_the_corridor(side: float, touched: bool) -> None:  # noqa: FBT001  # a parameter of pytest
+@pytest.mark.parametrize(("side", "affected"), [(0.6, True), (1.0, False)])
+def test_change_beside_the_path_affects_it_within_the_corridor(side: float, affected: bool) -> None:  # noqa: FBT001  # a parameter of pytest
     along = plan((1.0, 1.0), (9.0, 1.0))
-    planning_map = current(tracker(Map()))
+    planning_map = current(tracker(RingMap()))
     beside = change((4.0, 1.0 + side, 4.2, 1.2 + side))
-    assert touches_corridor(along, straight(along), beside, planning_map, CONFIG.corridor) == touched
+    assert affects_corridor(along, straight(along), beside, planning_map, CONFIG.corridor_half_width) == affected
 
 
-def test_change_behind_the_robot_does_not_touch_its_path() -> None:
-    planning_map = current(tracker(Map()))
+def test_change_behind_the_robot_does_not_affect_its_path() -> None:
+    planning_map = current(tracker(RingMap()))
     behind = change((2.0, 0.9, 2.2, 1.1))
-    for progress, touched in ((0.0, True), (3.0, False)):
+    for progress, affected in ((0.0, True), (3.0, False)):
         driven = plan((1.0, 1.0), (9.0, 1.0), progress=progress)
-        assert touches_corridor(driven, straight(driven), behind, planning_map, CONFIG.corridor) == touched
+        assert affects_corridor(driven, straight(driven), behind, planning_map, CONFIG.corridor_half_width) == affected
 
 
-def test_clearing_may_save_only_where_the_detour_over_it_could_be_shorter() -> None:
-    planning_map = current(tracker(Map()))
-    # Round the ring's upper side, 1 m from the walls: over the middle of the ring it would be far shorter.
+def test_clearing_may_save_only_where_a_path_through_it_could_be_shorter() -> None:
+    planning_map = current(tracker(RingMap()))
+    # Around the ring's upper side, 1 m from the walls: through the middle of the ring it would be far shorter.
     around = plan((1.0, 6.0), (1.0, 11.0), (19.0, 11.0), (19.0, 6.0))
     direct = plan((1.0, 11.0), (19.0, 11.0))
     geometry = planning_map.geometry
     middle, far = geometry.window_around(9.0, 5.5, 11.0, 6.5), geometry.window_around(9.0, 0.2, 11.0, 0.4)
-    assert may_save(around, straight(around), middle, planning_map, (1.0, 6.0), CONFIG.saving)
+    assert may_save(around, straight(around), middle, planning_map, (1.0, 6.0), CONFIG.min_saving)
     assert not may_save(around, straight(around), middle, planning_map, (1.0, 6.0), 0.5)
-    assert not may_save(direct, straight(direct), far, planning_map, (1.0, 11.0), CONFIG.saving)
+    assert not may_save(direct, straight(direct), far, planning_map, (1.0, 11.0), CONFIG.min_saving)
 
 
-def test_each_change_gives_the_most_pressing_reason() -> None:
-    planning_map = current(tracker(Map()))
+def test_change_near_the_path_is_a_stronger_reason_than_a_clearing() -> None:
+    planning_map = current(tracker(RingMap()))
     mission = Mission()
-    on_path, inside = change((4.0, 0.9, 4.2, 1.1), fell=True), change((9.0, 5.5, 11.0, 6.5), fell=True)
+    on_path, inside = change((4.0, 0.9, 4.2, 1.1), decreased=True), change((9.0, 5.5, 11.0, 6.5), decreased=True)
     assert reason_from_change(mission, on_path, planning_map, CONFIG) is None
     mission.begin(goal(*RIGHT), any_heading=False)
     assert reason_from_change(mission, on_path, planning_map, CONFIG) is None
@@ -159,16 +159,16 @@ def test_each_change_gives_the_most_pressing_reason() -> None:
     assert reason_from_change(mission, inside, planning_map, CONFIG) == "refused"
 
 
-def test_pose_moves_progress_forward_only_and_tells_when_it_strayed() -> None:
+def test_pose_advances_progress_and_requests_a_replan_off_the_path() -> None:
     along = plan((1.0, 1.0), (9.0, 1.0))
     assert reason_from_pose(along, pose(3.0, 1.5), CONFIG) is None
     assert along.progress == pytest.approx(2.0)
     assert reason_from_pose(along, pose(2.8, 1.0), CONFIG) is None
     assert along.progress == pytest.approx(2.0)
-    assert reason_from_pose(along, pose(3.0, 2.1), CONFIG) == "strayed"
+    assert reason_from_pose(along, pose(3.0, 2.1), CONFIG) == "off_path"
 
 
-def test_refused_robot_is_planned_again_once_it_stands_elsewhere() -> None:
+def test_refused_robot_is_replanned_once_it_has_moved() -> None:
     refused = Plan(1, None, refuse(208, "cut"), [], planned_from=(1.0, 1.0))
     assert reason_from_pose(refused, pose(1.9, 1.0), CONFIG) is None
     assert reason_from_pose(refused, pose(2.1, 1.0), CONFIG) == "refused"
@@ -181,8 +181,8 @@ def found(cost: float = math.inf, refusal: Refusal | None = None) -> SearchResul
     return SearchResult(None, cost, refusal)
 
 
-def test_path_is_kept_unless_another_saves_the_share_that_its_reason_asks() -> None:
-    planning_map = current(tracker(Map()))
+def test_path_is_kept_unless_another_saves_the_share_that_the_reason_requires() -> None:
+    planning_map = current(tracker(RingMap()))
     kept = plan((1.0, 1.0), (9.0, 1.0))
     cost = straight(kept).cost(planning_map.cost, planning_map.geometry)
 
@@ -194,11 +194,11 @@ def test_path_is_kept_unless_another_saves_the_share_that_its_reason_asks() -> N
     assert keeps(0.91, "clearing")
     assert not keeps(0.89, "clearing")
     assert not keeps(1.0, "goal")
-    assert not keeps(1.0, "strayed")
+    assert not keeps(1.0, "off_path")
 
 
-def test_blocked_path_is_never_kept_and_a_refusal_only_while_it_is_the_same() -> None:
-    planning_map = current(tracker(Map()))
+def test_blocked_path_is_replaced_and_a_refusal_is_kept_while_it_is_the_same() -> None:
+    planning_map = current(tracker(RingMap()))
     through_the_wall = plan((1.0, 6.0), (19.0, 6.0))
     assert not is_kept(through_the_wall, found(1e9), "map", planning_map, CONFIG)
     refused = Plan(1, None, refuse(208, "cut by z1"), [], planned_from=LEFT)
@@ -219,10 +219,10 @@ def test_goal_and_path_are_published_at_once_and_again_after_their_periods() -> 
     assert published(mission, NOW) == (None, None)
     mission.begin(goal(*RIGHT), any_heading=True)
     mission.plan = plan(LEFT, (1.0, 9.0), (9.0, 9.0))
-    told, path = mission.due_goal(NOW, CONFIG), mission.due_path(NOW, CONFIG, 7, Version(1, 2, 3))
-    assert told
+    sent, path = mission.due_goal(NOW, CONFIG), mission.due_path(NOW, CONFIG, 7, Version(1, 2, 3))
+    assert sent
     assert path
-    assert (told.goal_id, told.stamp) == ("g1", 5000.0)
+    assert (sent.goal_id, sent.stamp) == ("g1", 5000.0)
     assert (path.planner_epoch, path.map_epoch, path.map_seq, path.goal_theta) == (7, 1, 2, None)
     assert path.released_length == pytest.approx(10.0)
     soon, later = Moment(100.4, 5000.4), Moment(101.01, 5001.01)
@@ -241,19 +241,19 @@ def test_traces_are_stamped_when_the_path_is_first_published_and_never_again() -
     assert [path.traces[0].plan_published for path in paths if path] == [5001.0, 5001.0]
 
 
-def test_goal_that_is_over_is_published_without_a_pose_and_has_no_path() -> None:
+def test_ended_goal_is_published_without_a_pose_and_has_no_path() -> None:
     mission = Mission()
     mission.begin(goal(*RIGHT), any_heading=False)
     mission.plan = plan(LEFT, (1.0, 9.0))
     mission.end()
-    told = mission.due_goal(NOW, CONFIG)
-    assert told
-    assert (told.goal_id, told.pose) == ("g1", None)
+    sent = mission.due_goal(NOW, CONFIG)
+    assert sent
+    assert (sent.goal_id, sent.pose) == ("g1", None)
     assert mission.due_path(NOW, CONFIG, 7, Version(1, 2, 3)) is None
     assert mission.target is None
 
 
-def test_reasons_to_replan_gather_traces_once_and_the_map_outranks_the_first() -> None:
+def test_replan_requests_collect_traces_once_and_map_replaces_the_first_reason() -> None:
     mission = Mission()
     mission.request_replan("clearing", [TRACE])
     mission.request_replan("refused", [TRACE])
@@ -267,47 +267,47 @@ def test_reasons_to_replan_gather_traces_once_and_the_map_outranks_the_first() -
 BOUND = np.zeros((12, 20), dtype=np.uint8)
 
 
-def test_field_is_computed_once_per_goal_and_void_on_another_lower_bound() -> None:
+def test_field_is_computed_once_per_goal_and_discarded_with_its_lower_bound() -> None:
     fields = GoalFields(2)
-    fields.use(BOUND)
+    fields.set_lower_bound(BOUND)
     (job,) = fields.jobs([(3, 3), (3, 3)])
     assert fields.jobs([(3, 3)]) == []
     assert fields.guide((3, 3)) is None
     job.run()
-    fields.take(job)
+    fields.add(job)
     guide = fields.guide((3, 3))
     assert guide is not None
     assert guide.plan(BOUND, (10, 3), (3, 3)).found
     assert fields.jobs([(3, 3)]) == []
-    fields.use(BOUND)
+    fields.set_lower_bound(BOUND)
     assert fields.guide((3, 3)) is guide
-    fields.use(BOUND.copy())
+    fields.set_lower_bound(BOUND.copy())
     assert fields.guide((3, 3)) is None
     (again,) = fields.jobs([(3, 3)])
     assert again.lower_bound is not BOUND
 
 
-def test_field_that_was_computed_over_a_former_lower_bound_is_dropped() -> None:
+def test_field_over_an_outdated_lower_bound_is_dropped() -> None:
     fields = GoalFields(2)
-    fields.use(BOUND)
+    fields.set_lower_bound(BOUND)
     (job,) = fields.jobs([(3, 3)])
     job.run()
-    fields.use(BOUND.copy())
-    fields.take(job)
+    fields.set_lower_bound(BOUND.copy())
+    fields.add(job)
     assert fields.guide((3, 3)) is None
 
 
-def test_fields_have_room_for_so_many_goals_and_none_for_one_in_a_wall() -> None:
+def test_fields_are_limited_to_their_capacity_and_a_goal_in_a_wall_gets_none() -> None:
     fields = GoalFields(2)
     walled = BOUND.copy()
     walled[5, 5] = 254
-    fields.use(walled)
+    fields.set_lower_bound(walled)
     jobs = fields.jobs([(5, 5), (1, 1), (2, 2)])
     assert [job.goal for job in jobs] == [(1, 1)]
     for goals in ([(1, 1), (2, 2)], [(7, 7)]):
         for job in [*jobs, *fields.jobs(goals)]:
             job.run()
-            fields.take(job)
+            fields.add(job)
         jobs = []
     assert fields.guide((7, 7)) is not None
     assert [fields.guide(cell) is None for cell in ((1, 1), (2, 2))].count(True) == 1
@@ -316,41 +316,41 @@ def test_fields_have_room_for_so_many_goals_and_none_for_one_in_a_wall() -> None
 # --- Regions, search, egress ---
 
 
-def regions(the_map: Map, *names: str) -> BlockedRegions:
+def regions(ring_map: RingMap, *names: str) -> BlockedRegions:
     made = BlockedRegions(DEFAULT_INFLATION.inflation_radius)
     for name in names:
-        made.handlers()[ch.HAZARD]({"area": name}, the_map.told(name), NOW)
+        made.handlers()[ch.HAZARD]({"area": name}, ring_map.hazard_area(name), NOW)
     return made
 
 
 def test_region_blocks_only_while_its_cells_are_lethal() -> None:
-    the_map = Map()
-    the_map.put("z1", (9.0, 10.2, 11.0, 11.8))
-    known = regions(the_map, "z1")
-    assert [region.cause.id for region in known.blocking(current(tracker(the_map)))] == ["z1"]
-    the_map.clear("z1")
-    assert known.blocking(current(tracker(the_map))) == []
+    ring_map = RingMap()
+    ring_map.put("z1", (9.0, 10.2, 11.0, 11.8))
+    known = regions(ring_map, "z1")
+    assert [region.cause.id for region in known.blocking(current(tracker(ring_map)))] == ["z1"]
+    ring_map.clear("z1")
+    assert known.blocking(current(tracker(ring_map))) == []
 
 
 @pytest.mark.parametrize(
     ("start", "end", "code"),
     [((-1.0, 6.0), RIGHT, 203), (LEFT, (30.0, 6.0), 204), ((10.0, 11.0), RIGHT, 205), (LEFT, (10.0, 11.0), 206)],
 )
-def test_search_refuses_what_no_path_can_serve(start: PointXY, end: PointXY, code: int) -> None:
-    the_map = Map()
-    the_map.put("z1", UPPER)
-    planning_map = current(tracker(the_map))
-    blocking = regions(the_map, "z1").blocking(planning_map)
-    result = PathSearch(CONFIG, the_map.geometry, GoalFields(1)).find(planning_map, blocking, start, end)
+def test_search_refuses_start_and_goal_outside_the_map_or_occupied(start: PointXY, end: PointXY, code: int) -> None:
+    ring_map = RingMap()
+    ring_map.put("z1", UPPER)
+    planning_map = current(tracker(ring_map))
+    blocking = regions(ring_map, "z1").blocking(planning_map)
+    result = PathSearch(CONFIG, ring_map.geometry, GoalFields(1)).find(planning_map, blocking, start, end)
     assert result.route is None
     assert result.refusal
     assert result.refusal.code == code
 
 
-def test_search_that_takes_too_long_is_refused() -> None:
-    the_map = Map()
-    search = PathSearch(PlannerConfig(max_expansions=10), the_map.geometry, GoalFields(1))
-    result = search.find(current(tracker(the_map)), [], LEFT, RIGHT)
+def test_search_beyond_its_limit_of_expansions_is_refused() -> None:
+    ring_map = RingMap()
+    search = PathSearch(PlannerConfig(max_expansions=10), ring_map.geometry, GoalFields(1))
+    result = search.find(current(tracker(ring_map)), [], LEFT, RIGHT)
     assert result.refusal
     assert result.refusal.code == 207
 
@@ -361,7 +361,7 @@ def test_search_that_takes_too_long_is_refused() -> None:
     end=st.tuples(st.floats(18.4, 19.6), st.floats(0.4, 11.6)),
 )
 def test_path_begins_and_ends_at_the_exact_points_and_its_cost_is_finite(start: PointXY, end: PointXY) -> None:
-    planning_map = current(tracker(Map()))
+    planning_map = current(tracker(RingMap()))
     result = PathSearch(CONFIG, planning_map.geometry, GoalFields(1)).find(planning_map, [], start, end)
     assert result.route is not None
     assert math.hypot(*(result.route.points[0] - start)) <= 0.08
@@ -369,13 +369,13 @@ def test_path_begins_and_ends_at_the_exact_points_and_its_cost_is_finite(start: 
     assert math.isfinite(result.cost)
 
 
-def test_egress_search_gives_up_beyond_its_limit() -> None:
-    the_map = Map()
-    the_map.put("z1", UPPER)
-    planning_map = current(tracker(the_map))
-    blocking = regions(the_map, "z1").blocking(planning_map)
+def test_egress_search_beyond_its_limit_of_cells_is_refused() -> None:
+    ring_map = RingMap()
+    ring_map.put("z1", UPPER)
+    planning_map = current(tracker(ring_map))
+    blocking = regions(ring_map, "z1").blocking(planning_map)
     out = find_egress(planning_map, blocking, (10.0, 11.0), CONFIG)
     assert out.route is not None
-    lost = find_egress(planning_map, blocking, (10.0, 11.0), PlannerConfig(egress_cells=5))
+    lost = find_egress(planning_map, blocking, (10.0, 11.0), PlannerConfig(max_egress_cells=5))
     assert lost.refusal
     assert lost.refusal.code == 205

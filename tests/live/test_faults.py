@@ -225,7 +225,7 @@ async def test_a_goal_in_a_wall_is_refused_with_reason_remedy_and_field(floor: F
     answer = await floor.goal(40.0, 29.97)
     assert (answer.status, answer.body["name"]) == (422, "GOAL_OCCUPIED")
     assert "the goal (40.00, 29.97)" in answer.reason
-    assert "the nearest point that can be reached is" in answer.reason
+    assert "the nearest reachable point is" in answer.reason
     assert [error["field"] for error in answer.body["errors"]] == ["body.pose"]
     again = await floor.goal(*answer.body["nearest"])
     assert again.status == 200, "the remedy that it names helps"

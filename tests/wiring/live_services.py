@@ -44,7 +44,7 @@ _EARLY_S: Final = 1e-6
 class InlineExecutor(ThreadPoolExecutor):
     """Runs everything at once, on the thread that submits it."""
 
-    def submit(self, fn, /, *args, **kwargs):  # type: ignore[override]
+    def submit(self, fn, /, *args, **kwargs):  # type: ignore[override]  # a test double without the type parameters
         future: Future[Any] = Future()
         try:
             future.set_result(fn(*args, **kwargs))

@@ -31,15 +31,15 @@ TRACE = Trace(area="z1", epoch=1, seq=5)
 NOW = Moment(100.0, 5000.0)
 
 
-def tracker(ring_map: RingMap) -> MapTracker:
-    made = MapTracker(DEFAULT_INFLATION, grace_s=0.5, max_age_s=1.0)
-    made.load(ring_map.master.snapshot(), 0.0)
-    return made
+def make_tracker(ring_map: RingMap) -> MapTracker:
+    tracker = MapTracker(DEFAULT_INFLATION, grace_s=0.5, max_age_s=1.0)
+    tracker.load(ring_map.master.snapshot(), 0.0)
+    return tracker
 
 
-def current(made: MapTracker) -> PlanningMap:
-    assert made.current is not None
-    return made.current
+def current(tracker: MapTracker) -> PlanningMap:
+    assert tracker.current is not None
+    return tracker.current
 
 
 def plan(*corners: PointXY, progress: float = 0.0) -> Plan:
@@ -63,54 +63,54 @@ def change(box: Box, *, decreased: bool = False) -> CostChange:
 
 def test_delta_reports_which_costs_changed_and_which_decreased() -> None:
     ring_map = RingMap()
-    made = tracker(ring_map)
+    tracker = make_tracker(ring_map)
     (delta,) = ring_map.put("z1", UPPER, trace=TRACE)
-    (rise,) = made.on_delta(delta, 1.0)
+    (rise,) = tracker.on_delta(delta, 1.0)
     assert rise.changed.any()
     assert not rise.decreased.any()
     assert rise.traces == [TRACE]
     x, y = ring_map.geometry.cell(10.0, 11.0)
     assert rise.changed[y - rise.window.y, x - rise.window.x]
     (delta,) = ring_map.clear("z1")
-    (fall,) = made.on_delta(delta, 1.1)
+    (fall,) = tracker.on_delta(delta, 1.1)
     assert np.array_equal(fall.decreased, fall.changed)
-    assert made.on_delta(delta, 1.2) == []
+    assert tracker.on_delta(delta, 1.2) == []
 
 
 def test_map_is_fresh_only_while_heartbeats_confirm_it() -> None:
     ring_map = RingMap()
-    made = tracker(ring_map)
-    assert not made.is_fresh(0.0)
-    made.on_heartbeat(ring_map.master.heartbeat(0.0), 1.0)
-    assert made.is_fresh(2.0)
-    assert not made.is_fresh(2.1)
+    tracker = make_tracker(ring_map)
+    assert not tracker.is_fresh(0.0)
+    tracker.on_heartbeat(ring_map.master.heartbeat(0.0), 1.0)
+    assert tracker.is_fresh(2.0)
+    assert not tracker.is_fresh(2.1)
 
 
 def test_lower_bound_is_replaced_only_when_costs_fall_below_it() -> None:
     ring_map = RingMap()
-    made = tracker(ring_map)
-    bound = current(made).lower_bound
+    tracker = make_tracker(ring_map)
+    bound = current(tracker).lower_bound
     for delta in ring_map.put("z1", UPPER):
-        made.on_delta(delta, 1.0)
-    assert current(made).lower_bound is bound
+        tracker.on_delta(delta, 1.0)
+    assert current(tracker).lower_bound is bound
     ring_map.static[:, :] = 0
     for delta in ring_map.put("z2", LOWER):
-        made.on_delta(delta, 1.0)
-    planning_map = current(made)
+        tracker.on_delta(delta, 1.0)
+    planning_map = current(tracker)
     assert planning_map.lower_bound is not bound
     assert np.all(planning_map.lower_bound <= planning_map.cost)
 
 
 def test_snapshot_of_a_new_epoch_is_a_restart_and_a_damaged_one_changes_nothing() -> None:
     ring_map = RingMap()
-    made = MapTracker(DEFAULT_INFLATION, grace_s=0.5, max_age_s=1.0)
-    assert made.current is None
-    assert made.load(ring_map.master.snapshot(), 0.0).restarted
-    assert not made.load(ring_map.master.snapshot(), 0.0).restarted
+    tracker = MapTracker(DEFAULT_INFLATION, grace_s=0.5, max_age_s=1.0)
+    assert tracker.current is None
+    assert tracker.load(ring_map.master.snapshot(), 0.0).restarted
+    assert not tracker.load(ring_map.master.snapshot(), 0.0).restarted
     with pytest.raises(MapError):
-        made.load(structs.replace(ring_map.master.snapshot(), hash=1), 0.0)
-    assert current(made).version == ring_map.master.version
-    assert made.load(RingMap(epoch=2).master.snapshot(), 0.0).restarted
+        tracker.load(structs.replace(ring_map.master.snapshot(), hash=1), 0.0)
+    assert current(tracker).version == ring_map.master.version
+    assert tracker.load(RingMap(epoch=2).master.snapshot(), 0.0).restarted
 
 
 # --- Path monitor ---
@@ -119,13 +119,13 @@ def test_snapshot_of_a_new_epoch_is_a_restart_and_a_damaged_one_changes_nothing(
 @pytest.mark.parametrize(("side", "affected"), [(0.6, True), (1.0, False)])
 def test_change_beside_the_path_affects_it_within_the_corridor(side: float, affected: bool) -> None:  # noqa: FBT001  # a parameter of pytest
     along = plan((1.0, 1.0), (9.0, 1.0))
-    planning_map = current(tracker(RingMap()))
+    planning_map = current(make_tracker(RingMap()))
     beside = change((4.0, 1.0 + side, 4.2, 1.2 + side))
     assert affects_corridor(along, straight(along), beside, planning_map, CONFIG.corridor_half_width) == affected
 
 
 def test_change_behind_the_robot_does_not_affect_its_path() -> None:
-    planning_map = current(tracker(RingMap()))
+    planning_map = current(make_tracker(RingMap()))
     behind = change((2.0, 0.9, 2.2, 1.1))
     for progress, affected in ((0.0, True), (3.0, False)):
         driven = plan((1.0, 1.0), (9.0, 1.0), progress=progress)
@@ -133,7 +133,7 @@ def test_change_behind_the_robot_does_not_affect_its_path() -> None:
 
 
 def test_clearing_may_save_only_where_a_path_through_it_could_be_shorter() -> None:
-    planning_map = current(tracker(RingMap()))
+    planning_map = current(make_tracker(RingMap()))
     # Around the ring's upper side, 1 m from the walls: through the middle of the ring it would be far shorter.
     around = plan((1.0, 6.0), (1.0, 11.0), (19.0, 11.0), (19.0, 6.0))
     direct = plan((1.0, 11.0), (19.0, 11.0))
@@ -145,7 +145,7 @@ def test_clearing_may_save_only_where_a_path_through_it_could_be_shorter() -> No
 
 
 def test_change_near_the_path_is_a_stronger_reason_than_a_clearing() -> None:
-    planning_map = current(tracker(RingMap()))
+    planning_map = current(make_tracker(RingMap()))
     mission = Mission()
     on_path, inside = change((4.0, 0.9, 4.2, 1.1), decreased=True), change((9.0, 5.5, 11.0, 6.5), decreased=True)
     assert reason_from_change(mission, on_path, planning_map, CONFIG) is None
@@ -182,7 +182,7 @@ def found(cost: float = math.inf, refusal: Refusal | None = None) -> SearchResul
 
 
 def test_path_is_kept_unless_another_saves_the_share_that_the_reason_requires() -> None:
-    planning_map = current(tracker(RingMap()))
+    planning_map = current(make_tracker(RingMap()))
     kept = plan((1.0, 1.0), (9.0, 1.0))
     cost = straight(kept).cost(planning_map.cost, planning_map.geometry)
 
@@ -198,7 +198,7 @@ def test_path_is_kept_unless_another_saves_the_share_that_the_reason_requires() 
 
 
 def test_blocked_path_is_replaced_and_a_refusal_is_kept_while_it_is_the_same() -> None:
-    planning_map = current(tracker(RingMap()))
+    planning_map = current(make_tracker(RingMap()))
     through_the_wall = plan((1.0, 6.0), (19.0, 6.0))
     assert not is_kept(through_the_wall, found(1e9), "map", planning_map, CONFIG)
     refused = Plan(1, None, refuse(208, "cut by z1"), [], planned_from=LEFT)
@@ -317,19 +317,19 @@ def test_fields_are_limited_to_their_capacity_and_a_goal_in_a_wall_gets_none() -
 
 
 def regions(ring_map: RingMap, *names: str) -> BlockedRegions:
-    made = BlockedRegions(DEFAULT_INFLATION.inflation_radius)
+    known = BlockedRegions(DEFAULT_INFLATION.inflation_radius)
     for name in names:
-        made.handlers()[ch.HAZARD]({"area": name}, ring_map.hazard_area(name), NOW)
-    return made
+        known.handlers()[ch.HAZARD]({"area": name}, ring_map.hazard_area(name), NOW)
+    return known
 
 
 def test_region_blocks_only_while_its_cells_are_lethal() -> None:
     ring_map = RingMap()
     ring_map.put("z1", (9.0, 10.2, 11.0, 11.8))
     known = regions(ring_map, "z1")
-    assert [region.cause.id for region in known.blocking(current(tracker(ring_map)))] == ["z1"]
+    assert [region.cause.id for region in known.blocking(current(make_tracker(ring_map)))] == ["z1"]
     ring_map.clear("z1")
-    assert known.blocking(current(tracker(ring_map))) == []
+    assert known.blocking(current(make_tracker(ring_map))) == []
 
 
 @pytest.mark.parametrize(
@@ -339,7 +339,7 @@ def test_region_blocks_only_while_its_cells_are_lethal() -> None:
 def test_search_refuses_start_and_goal_outside_the_map_or_occupied(start: PointXY, end: PointXY, code: int) -> None:
     ring_map = RingMap()
     ring_map.put("z1", UPPER)
-    planning_map = current(tracker(ring_map))
+    planning_map = current(make_tracker(ring_map))
     blocking = regions(ring_map, "z1").blocking(planning_map)
     result = PathSearch(CONFIG, ring_map.geometry, GoalFields(1)).find(planning_map, blocking, start, end)
     assert result.route is None
@@ -350,7 +350,7 @@ def test_search_refuses_start_and_goal_outside_the_map_or_occupied(start: PointX
 def test_search_beyond_its_limit_of_expansions_is_refused() -> None:
     ring_map = RingMap()
     search = PathSearch(PlannerConfig(max_expansions=10), ring_map.geometry, GoalFields(1))
-    result = search.find(current(tracker(ring_map)), [], LEFT, RIGHT)
+    result = search.find(current(make_tracker(ring_map)), [], LEFT, RIGHT)
     assert result.refusal
     assert result.refusal.code == 207
 
@@ -361,7 +361,7 @@ def test_search_beyond_its_limit_of_expansions_is_refused() -> None:
     end=st.tuples(st.floats(18.4, 19.6), st.floats(0.4, 11.6)),
 )
 def test_path_begins_and_ends_at_the_exact_points_and_its_cost_is_finite(start: PointXY, end: PointXY) -> None:
-    planning_map = current(tracker(RingMap()))
+    planning_map = current(make_tracker(RingMap()))
     result = PathSearch(CONFIG, planning_map.geometry, GoalFields(1)).find(planning_map, [], start, end)
     assert result.route is not None
     assert math.hypot(*(result.route.points[0] - start)) <= 0.08
@@ -372,7 +372,7 @@ def test_path_begins_and_ends_at_the_exact_points_and_its_cost_is_finite(start: 
 def test_egress_search_beyond_its_limit_of_cells_is_refused() -> None:
     ring_map = RingMap()
     ring_map.put("z1", UPPER)
-    planning_map = current(tracker(ring_map))
+    planning_map = current(make_tracker(ring_map))
     blocking = regions(ring_map, "z1").blocking(planning_map)
     out = find_egress(planning_map, blocking, (10.0, 11.0), CONFIG)
     assert out.route is not None

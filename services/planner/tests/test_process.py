@@ -89,7 +89,7 @@ def write_site(folder: Path) -> None:
     (folder / "tokens.toml").write_text(tokens)
 
 
-class World:
+class Environment:
     """The planner's environment: servers, a map-service and a robot."""
 
     def __init__(self, folder: Path, router: Server, redis: Server, edge: ZenohEdge, clock: SystemClock) -> None:
@@ -173,21 +173,21 @@ class World:
 
 
 @asynccontextmanager
-async def world(folder: Path) -> AsyncIterator[World]:
+async def running_planner(folder: Path) -> AsyncIterator[Environment]:
     write_site(folder / "site")
     clock = SystemClock()
     with start_router(folder / "router") as router, start_redis(folder / "redis") as redis:
         async with ZenohEdge.open(connect=[router.endpoint], clock=clock, role="test", id="test", site="test") as edge:
-            made = World(folder / "site", router, redis, edge, clock)
-            made.start()
-            publishing = asyncio.create_task(made.publish_heartbeats_and_poses())
+            env = Environment(folder / "site", router, redis, edge, clock)
+            env.start()
+            publishing = asyncio.create_task(env.publish_heartbeats_and_poses())
             try:
-                yield made
+                yield env
             finally:
                 publishing.cancel()
                 await asyncio.gather(publishing, return_exceptions=True)
-                if made.process and made.process.poll() is None:
-                    made.stop(kill=True)
+                if env.process and env.process.poll() is None:
+                    env.stop(kill=True)
 
 
 def via(path: RobotPath) -> str:
@@ -197,7 +197,7 @@ def via(path: RobotPath) -> str:
 async def test_mission_is_replanned_around_a_hazard_survives_a_kill_and_ends_when_reached(
     tmp_path: Path,
 ) -> None:
-    async with world(tmp_path) as env:
+    async with running_planner(tmp_path) as env:
         async with env.ready() as client:
             answer = await client.put("/api/v1/robots/r1/goal", json={"place": "right"}, headers=OPERATOR)
             assert answer.status_code == 200
@@ -236,7 +236,7 @@ async def test_mission_is_replanned_around_a_hazard_survives_a_kill_and_ends_whe
 async def test_invalid_goals_are_refused_with_a_reason_and_all_goals_without_the_store(
     tmp_path: Path,
 ) -> None:
-    async with world(tmp_path) as env, env.ready() as client:
+    async with running_planner(tmp_path) as env, env.ready() as client:
         url = "/api/v1/robots/r1/goal"
 
         async def put(body: object, headers: dict[str, str] = OPERATOR, url: str = url) -> httpx.Response:
@@ -268,7 +268,7 @@ async def test_invalid_goals_are_refused_with_a_reason_and_all_goals_without_the
 
 
 async def test_queries_are_answered_over_zenoh_and_http_without_side_effects(tmp_path: Path) -> None:
-    async with world(tmp_path) as env, env.ready() as client:
+    async with running_planner(tmp_path) as env, env.ready() as client:
         request = PlanRequest(start=Pose(x=1.0, y=7.0, theta=0.0), goal=Pose(x=19.0, y=7.0, theta=0.0))
         reply = await env.edge.query(ch.PLANNER_PLAN, request, PlanReply, 5.0)
         assert reply

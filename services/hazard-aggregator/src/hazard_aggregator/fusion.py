@@ -388,9 +388,9 @@ def _cause(area: _Area, state: AreaState, deciding: _NodeState | None) -> str:
     """Return a sentence on why the area is in its state."""
     if deciding is None:
         return "no node watches this area"
-    words = f"node {deciding.id}: {deciding.reason}"
+    sentence = f"node {deciding.id}: {deciding.reason}"
     if state == "clear" and len(area.nodes) > 1:
-        words = f"all {len(area.nodes)} nodes agree; {words}"
+        sentence = f"all {len(area.nodes)} nodes agree; {sentence}"
     if state == "unknown":
-        words += "; it was blocked before and stays impassable" if area.last_known_blocked else ""
-    return words[:500]
+        sentence += "; it was blocked before and stays impassable" if area.last_known_blocked else ""
+    return sentence[:500]

@@ -66,6 +66,6 @@ class Outbox:
         return sorted(area for area, hazard in self._unstored.items() if self._announced.get(area) is not hazard)
 
     def forget(self, area: str) -> None:
-        """Forget a removed area."""
+        """Discard a removed area's hazards."""
         self._announced.pop(area, None)
         self._unstored.pop(area, None)

@@ -171,7 +171,7 @@ class MapCore:
     def _commit(self, publications: list[Publication], at: Moment) -> list[Publication]:
         """Make a version of the layers' changes; return its deltas and all publications, once the map is served."""
         deltas = [Publication(ch.MAP_DELTA, delta) for delta in self.costmap.update(at.stamp)]
-        zones = [Publication(ch.ZONES, self.zone_set())] if self._zones.take_changed() else []
+        zones = [Publication(ch.ZONES, self.zone_set())] if self._zones.pop_changed() else []
         return [*deltas, *publications, *zones] if self._serving else []
 
     def _check_aggregator_liveness(self, at: Moment) -> list[Publication]:

@@ -42,7 +42,7 @@ class LayeredCostmap:
         self.geometry = static.geometry
         self._layers = layers
         for layer in layers:
-            layer.take_updated()  # everything is computed below
+            layer.pop_updated_bounds()  # everything is computed below
         self._raw, speed = self._combine_layers(self.geometry.whole)
         self._inflation = InflationLayer(self._raw, static.geometry.resolution, inflation)
         self._master = MasterMap(site, static.geometry, static.cells, self._inflation.cost, epoch)
@@ -86,7 +86,7 @@ class LayeredCostmap:
 
         `stamp` (s since the epoch) is added to the traces of the hazards that caused it.
         """
-        updated = [bounds for layer in self._layers for bounds in layer.take_updated()]
+        updated = [bounds for layer in self._layers for bounds in layer.pop_updated_bounds()]
         if not updated:
             return []
         windows = merge_overlapping([bounds.window for bounds in updated])

@@ -1,1 +1,1 @@
-"""Finds ways by A* on the master costmap and replans when a change matters."""
+"""Plans paths by A* on the master costmap and replans when a change matters."""

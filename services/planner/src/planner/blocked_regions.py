@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from fog_contracts import channels as ch
-from planner.reasons import Region, hazard_region, zone_region
+from planner.regions import Region, hazard_region, zone_region
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -10,8 +10,8 @@ import numpy as np
 
 from fog_contracts.costs import COST_WEIGHT, INSCRIBED, NEUTRAL_WEIGHT
 from planner.path_search import SearchResult, refused
-from planner.reasons import Region, remove_regions
 from planner.refusals import start_occupied, start_outside
+from planner.regions import Region, remove_regions
 from planner.route import Route
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from planner.config import PlannerConfig
     from planner.goal_fields import GoalFields
     from planner.planning_map import Cell, Grid, PlanningMap
-    from planner.reasons import Region
+    from planner.regions import Region
 
 
 @dataclass(frozen=True)

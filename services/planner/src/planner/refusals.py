@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 from fog_contracts.costs import INSCRIBED, LETHAL, UNKNOWN
 from fog_contracts.messages import PLAN_CODES, Cause, PlanCode, PointXY, Refusal
 from fog_kernels.astar import Planner, nearest_traversable
-from planner.reasons import Region, decisive_regions, remove_regions
+from planner.regions import Region, decisive_regions, remove_regions
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

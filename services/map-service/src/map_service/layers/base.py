@@ -63,7 +63,7 @@ class CostLayer(ABC):
         """Record that the layer's costs inside a window have changed."""
         self._updated.append(UpdatedBounds(window, cause, trace))
 
-    def take_updated(self) -> list[UpdatedBounds]:
+    def pop_updated_bounds(self) -> list[UpdatedBounds]:
         """Return the bounds that were marked since the last call."""
         updated, self._updated = self._updated, []
         return updated

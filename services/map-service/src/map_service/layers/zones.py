@@ -90,7 +90,7 @@ class ZonesLayer(CostLayer):
         """Return the ids of the active zones."""
         return sorted(name for name, entry in self._entries.items() if entry.active)
 
-    def take_changed(self) -> bool:
+    def pop_changed(self) -> bool:
         """Return whether a zone was added, changed, removed, activated or ended since the last call."""
         changed, self._changed = self._changed, False
         return changed

@@ -1,4 +1,4 @@
-"""Why there is no path: the hazards and zones behind the costmap's cells, and which of them to remove for a path."""
+"""Hazards and zones as regions of the costmap, and which of them block all paths to a goal."""
 
 import math
 from collections.abc import Callable, Sequence

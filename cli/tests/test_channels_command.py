@@ -19,8 +19,8 @@ runner = CliRunner()
 
 @pytest.mark.parametrize("name", generated.FILES)
 def test_generated_file_is_up_to_date(name: str) -> None:
-    held = (checkout.root() / name).read_text("utf-8")
-    assert held == generated.FILES[name](), f"{name} is out of date. Run: {generated.WRITE}"
+    committed = (checkout.root() / name).read_text("utf-8")
+    assert committed == generated.FILES[name](), f"{name} is out of date. Run: {generated.WRITE}"
 
 
 def test_routes_of_all_services_are_in_the_document() -> None:
@@ -29,7 +29,7 @@ def test_routes_of_all_services_are_in_the_document() -> None:
         assert text.count(f"| `{route}` |") == 1
 
 
-def test_formats_are_printed_as_they_are_written() -> None:
+def test_printed_formats_equal_the_generated_files() -> None:
     assert runner.invoke(app, ["channels", "--format", "header"]).stdout == firmware_header()
     assert runner.invoke(app, ["channels", "--format", "acl"]).stdout == mqtt_acl() + zenoh_acl()
     assert runner.invoke(app, ["channels", "--format", "acl", "--broker", "mqtt"]).stdout == mqtt_acl()
@@ -45,11 +45,11 @@ def test_lists_for_a_site_name_it_and_its_robots() -> None:
 @pytest.mark.parametrize(
     "arguments", [["--broker", "mqtt"], ["--format", "header", "--site", "estig"], ["--format", "acl", "--site", "x/y"]]
 )
-def test_options_that_do_not_fit_are_wrong_use(arguments: list[str]) -> None:
+def test_options_that_do_not_match_the_format_are_wrong_use(arguments: list[str]) -> None:
     assert runner.invoke(app, ["channels", *arguments]).exit_code == 2
 
 
-def test_a_stale_file_is_found_and_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stale_file_is_listed_by_check_and_updated_by_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(checkout, "root", lambda: tmp_path)
     monkeypatch.setattr(generated, "FILES", {"a/acl": mqtt_acl, "b/header.h": firmware_header})
     assert runner.invoke(app, ["channels", "--check"]).exit_code == 1
@@ -65,7 +65,7 @@ def test_a_stale_file_is_found_and_written(tmp_path: Path, monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize("seed", ["1", "2"])
-def test_what_is_generated_does_not_hang_on_the_order_of_sets(seed: str) -> None:
+def test_generated_files_do_not_depend_on_the_hash_seed(seed: str) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "fognav", "channels", "--check"],
         env={**os.environ, "PYTHONHASHSEED": seed}, capture_output=True, text=True, check=False,

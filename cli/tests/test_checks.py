@@ -7,7 +7,7 @@ from fognav.checks import CHECKS, Check, CheckResult, run_checks
 
 
 def python(name: str, code: str) -> Check:
-    return Check(name, (sys.executable, "-S", "-c", code), f"mend {name}")
+    return Check(name, (sys.executable, "-S", "-c", code), f"correct {name}")
 
 
 def run(folder: Path, *checks: Check, cores: int = 2) -> tuple[list[CheckResult], list[str]]:
@@ -16,7 +16,7 @@ def run(folder: Path, *checks: Check, cores: int = 2) -> tuple[list[CheckResult]
     return results, ended
 
 
-def test_a_check_that_fails_keeps_none_from_running(tmp_path: Path) -> None:
+def test_failed_check_does_not_stop_the_others(tmp_path: Path) -> None:
     bad = python("bad", "print('line 3 is wrong'); raise SystemExit(2)")
     results, ended = run(tmp_path, bad, Check("missing", ("/nowhere/tool",), ""), python("good", "print('fine')"))
     assert [(r.check.name, r.ok, r.output) for r in results] == [
@@ -27,15 +27,15 @@ def test_a_check_that_fails_keeps_none_from_running(tmp_path: Path) -> None:
     assert sorted(ended) == ["bad", "good", "missing"]
 
 
-def test_checks_run_beside_one_another_in_the_checkout(tmp_path: Path) -> None:
+def test_checks_run_in_parallel_in_the_checkout(tmp_path: Path) -> None:
     wait = "import pathlib, time\npathlib.Path('{0}').touch()\nwhile not pathlib.Path('{1}').exists(): time.sleep(0.01)"
     results, _ = run(tmp_path, python("one", wait.format("a", "b")), python("two", wait.format("b", "a")))
     assert all(result.ok for result in results)
 
 
-def test_no_more_checks_run_at_once_than_there_are_cores(tmp_path: Path) -> None:
-    alone = "import pathlib\np = pathlib.Path('busy')\np.touch(exist_ok=False)\np.unlink()"
-    results, ended = run(tmp_path, *(python(name, alone) for name in "abc"), cores=1)
+def test_at_most_one_check_per_core_runs_at_once(tmp_path: Path) -> None:
+    exclusive = "import pathlib\np = pathlib.Path('busy')\np.touch(exist_ok=False)\np.unlink()"
+    results, ended = run(tmp_path, *(python(name, exclusive) for name in "abc"), cores=1)
     assert all(result.ok for result in results)
     assert ended == ["a", "b", "c"]
 

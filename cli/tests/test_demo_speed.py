@@ -1,4 +1,4 @@
-"""What a demo makes of lateness and of stops at a speed above 1: docs/adr/0008-what-excuses-a-demo.md."""
+"""When late processes and stops lower a demo's speed: docs/adr/0008-what-excuses-a-demo.md."""
 
 import pytest
 
@@ -14,11 +14,11 @@ from fognav_sim.drive.evaluation import DriveEvaluation, DriveOutcome
 
 REACHED = DriveOutcome("reached", "the robot stands 0.08 m from its goal")
 TIMEOUT = DriveOutcome("timeout", "the goal was not reached within 600 s")
-SILENT = "no message from the guardian for 0.6 s"
+REASON = "no message from the guardian for 0.6 s"
 
 
 class Drive:
-    """An attempt in the midst of its drive; nothing runs."""
+    """An attempt during its drive, without any process."""
 
     def __init__(self, speed: float) -> None:
         site = load_site(checkout.root() / "sites" / "estig")
@@ -27,18 +27,18 @@ class Drive:
         self.evaluation = self.attempt.evaluation = DriveEvaluation(
             goal=(59.0, 44.0), goal_id="g", areas=site.site.areas, started_at=0.0, timeout_s=600.0
         )
-        self.hazard_done = True
-        self.is_at(5.0, 25.4)
-        self.robot_is("NORMAL")
+        self.hazard_placed = True
+        self.set_position(5.0, 25.4)
+        self.set_mode("NORMAL")
 
-    def is_at(self, x: float, y: float) -> None:
+    def set_position(self, x: float, y: float) -> None:
         self.truth = SimTruth(
             robot="r1", x=x, y=y, theta=0.0, left=0.0, right=0.0, distance=1.0, clearance=1.0, min_clearance=0.5,
             contacts=0, sustained_speed=self.attempt.scene.speed,
         )  # fmt: skip
         self.evaluation.on_truth(self.truth)
 
-    def robot_is(self, mode: Mode, *reasons: str, late: int = 0) -> None:
+    def set_mode(self, mode: Mode, *reasons: str, late: int = 0) -> None:
         self.state = RobotState(
             mode=mode, reasons=list(reasons), enabled=True, battery=None, goal_id="g", map_epoch=1, map_seq=1,
             plan_id=1, loop=LoopHealth(late=late),
@@ -56,101 +56,101 @@ class Drive:
     def end(self, outcome: DriveOutcome) -> None:
         stops = self.attempt.unexplained_stops()
         entered = self.evaluation.entered_blocked
-        self.watch.check_outcome(outcome, self.truth, stops, entered_blocked=entered, hazard_done=self.hazard_done)
+        self.watch.check_outcome(outcome, self.truth, stops, entered_blocked=entered, hazard_placed=self.hazard_placed)
 
 
-def test_arriving_after_a_stop_that_nothing_asked_for_keeps_no_speed_above_1() -> None:
+def test_drive_with_an_unexplained_stop_lowers_a_speed_above_1() -> None:
     drive = Drive(3.0)
-    drive.robot_is("PROTECTIVE_STOP", SILENT)
-    drive.robot_is("NORMAL")
-    drive.check()  # no beat was late: the drive goes on, and whatever it touches is seen
-    with pytest.raises(TooFastError, match=f"stopped on its way: PROTECTIVE_STOP: {SILENT}"):
+    drive.set_mode("PROTECTIVE_STOP", REASON)
+    drive.set_mode("NORMAL")
+    drive.check()  # no cycle was late: the drive continues, so that a contact would be noticed
+    with pytest.raises(TooFastError, match=f"but stopped before: PROTECTIVE_STOP: {REASON}"):
         drive.end(REACHED)
     assert modes(drive.attempt) == {"NORMAL": 2, "PROTECTIVE_STOP": 1}
 
 
-def test_at_speed_1_a_stop_changes_nothing() -> None:
+def test_stop_at_speed_1_changes_nothing() -> None:
     drive = Drive(1.0)
-    drive.robot_is("FAULT", SILENT, late=50)
+    drive.set_mode("FAULT", REASON, late=50)
     drive.check()
     drive.end(REACHED)
 
 
-def test_arriving_without_a_stop_keeps_the_speed() -> None:
+def test_drive_without_a_stop_keeps_the_speed() -> None:
     drive = Drive(3.0)
-    drive.robot_is("DEGRADED", "the map is 1.2 s old")
-    drive.robot_is("HOLD", "the map is 3.2 s old")
+    drive.set_mode("DEGRADED", "the map is 1.2 s old")
+    drive.set_mode("HOLD", "the map is 3.2 s old")
     drive.check()
     drive.end(REACHED)
     assert drive.watch.sustained == 3.0
 
 
-def test_a_stop_beside_late_beats_ends_the_attempt_at_once() -> None:
+def test_stop_with_late_cycles_ends_the_attempt_at_once() -> None:
     drive = Drive(3.0)
-    drive.robot_is("FAULT", SILENT, late=1)
-    with pytest.raises(TooFastError, match=f"1 of the agent's beats late in 6 s; FAULT: {SILENT}"):
+    drive.set_mode("FAULT", REASON, late=1)
+    with pytest.raises(TooFastError, match=f"1 of the agent's cycles late in 6 s; FAULT: {REASON}"):
         drive.check()
 
 
-def test_the_next_attempt_is_slower_than_what_was_sustained_and_never_slower_than_the_clock() -> None:
+def test_next_speed_is_at_most_the_sustained_one_and_at_least_1() -> None:
     assert TooFastError(2.4, "late").lower(3.0) == 2.1
     assert TooFastError(1.6, "late").lower(3.0) == 1.6
     assert TooFastError(0.8, "late").lower(3.0) == 1.0
 
 
-def test_each_stop_is_weighed_against_the_beats_of_its_own_stretch() -> None:
+def test_stop_counts_only_with_late_cycles_since_the_last_check() -> None:
     drive = Drive(3.0)
-    drive.robot_is("PROTECTIVE_STOP", SILENT)
+    drive.set_mode("PROTECTIVE_STOP", REASON)
     drive.check()
-    drive.robot_is("NORMAL", late=1)
+    drive.set_mode("NORMAL", late=1)
     drive.check()
 
 
-def test_a_stop_excuses_no_run_that_failed() -> None:
+def test_stop_does_not_excuse_a_failed_drive() -> None:
     drive = Drive(3.0)
-    drive.robot_is("PROTECTIVE_STOP", "the pose is lost")
+    drive.set_mode("PROTECTIVE_STOP", "the pose is lost")
     drive.check()
     drive.end(TIMEOUT)
 
 
-def test_a_run_in_which_nothing_was_blocked_failed_and_is_not_excused() -> None:
+def test_stop_does_not_excuse_a_drive_without_its_hazard() -> None:
     drive = Drive(3.0)
-    drive.hazard_done = False
-    drive.robot_is("PROTECTIVE_STOP", SILENT)
+    drive.hazard_placed = False
+    drive.set_mode("PROTECTIVE_STOP", REASON)
     drive.end(REACHED)
 
 
-def test_a_stop_after_a_process_died_is_as_it_should_be() -> None:
+def test_stop_after_a_process_died_is_expected() -> None:
     drive = Drive(3.0)
     drive.attempt.restarts["robot-agent"] = 1
-    drive.robot_is("PROTECTIVE_STOP", SILENT, late=1)
+    drive.set_mode("PROTECTIVE_STOP", REASON, late=1)
     drive.check()
     drive.end(REACHED)
 
 
 @pytest.mark.parametrize("late", [0, 500])
-def test_neither_a_touch_nor_a_blocked_area_entered_is_ever_excused(late: int) -> None:
-    touched = Drive(3.0)
-    touched.robot_is("NORMAL", late=late)
-    touched.check()
-    touched.robot_is("FAULT", "the bumper is pressed", late=late)
-    touched.end(DriveOutcome("contact", "the robot made contact with an obstacle"))
+def test_contact_and_entering_a_blocked_area_are_never_excused(late: int) -> None:
+    contact = Drive(3.0)
+    contact.set_mode("NORMAL", late=late)
+    contact.check()
+    contact.set_mode("FAULT", "the bumper is pressed", late=late)
+    contact.end(DriveOutcome("contact", "the robot made contact with an obstacle"))
 
     entered = Drive(3.0)
     z1 = next(area for area in entered.attempt.plan.site.site.areas if area.id == "z1")
     entered.evaluation.block(z1)
-    entered.is_at(40.0, 28.0)
-    entered.robot_is("PROTECTIVE_STOP", "the robot is in z1", late=late)
+    entered.set_position(40.0, 28.0)
+    entered.set_mode("PROTECTIVE_STOP", "the robot is in z1", late=late)
     for _ in range(3):
         entered.check()
-        entered.robot_is("NORMAL", late=2 * late)
+        entered.set_mode("NORMAL", late=2 * late)
     entered.end(REACHED)
     entered.end(TIMEOUT)
 
 
-def test_a_failure_while_beats_were_late_is_tried_again_more_slowly() -> None:
+def test_failed_drive_with_late_cycles_is_repeated_more_slowly() -> None:
     drive = Drive(3.0)
-    drive.robot_is("NORMAL", late=100)
+    drive.set_mode("NORMAL", late=100)
     drive.check()
     with pytest.raises(TooFastError, match="timeout: the goal was not reached"):
         drive.end(TIMEOUT)

@@ -1,4 +1,4 @@
-"""Whether the kernels are warm is seen without importing them, and compiling them shows how far it is."""
+"""The cache of compiled kernels is checked without importing them, and compiling shows its progress."""
 
 import os
 from pathlib import Path
@@ -6,15 +6,15 @@ from pathlib import Path
 from fognav import kernels
 
 
-def test_kernels_that_are_warm_are_found_so_and_not_announced() -> None:
-    kernels.make_warm(lambda _: None)
+def test_complete_cache_is_detected_and_prints_nothing() -> None:
+    kernels.warm_cache(lambda _: None)
     assert kernels.is_warm()
-    said: list[str] = []
-    kernels.make_warm(said.append)
-    assert said == []
+    printed: list[str] = []
+    kernels.warm_cache(printed.append)
+    assert printed == []
 
 
-def test_a_module_is_stale_whose_source_is_younger_than_its_cache(tmp_path: Path) -> None:
+def test_module_newer_than_its_cache_is_stale(tmp_path: Path) -> None:
     (tmp_path / "__pycache__").mkdir()
     (tmp_path / "plain.py").write_text('"""Mentions njit only."""\n')
     (tmp_path / "ray.py").write_text("@njit(cache=True)\ndef cast(): ...\n")
@@ -26,8 +26,8 @@ def test_a_module_is_stale_whose_source_is_younger_than_its_cache(tmp_path: Path
     assert kernels._stale(tmp_path) == ["ray"]
 
 
-def test_without_a_terminal_each_step_of_the_compilation_is_a_line() -> None:
-    said: list[str] = []
-    with kernels._showing(said.append) as show:
+def test_progress_without_a_terminal_is_one_line_per_kernel() -> None:
+    printed: list[str] = []
+    with kernels._progress_display(printed.append) as show:
         show("3 of 9 kernels ready: astar.search\n")
-    assert said == ["3 of 9 kernels ready: astar.search"]
+    assert printed == ["3 of 9 kernels ready: astar.search"]

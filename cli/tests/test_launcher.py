@@ -10,7 +10,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 @pytest.fixture
 def checkout(tmp_path: Path) -> Path:
-    """A checkout whose uv and python only tell what they are asked to do."""
+    """A checkout whose uv and python only record their arguments."""
     folder = tmp_path / "check out"
     (folder / "requirements").mkdir(parents=True)
     (folder / "requirements" / "dev.txt").write_text("pinned==1 --hash=sha256:0\n")
@@ -44,7 +44,7 @@ def uv_log(checkout: Path) -> list[str]:
     return log.read_text().splitlines() if log.exists() else []
 
 
-def test_the_first_start_installs_pins_with_hashes_then_the_members(checkout: Path) -> None:
+def test_first_start_installs_pins_with_hashes_then_the_members(checkout: Path) -> None:
     done = start(checkout / "fognav", checkout, "doctor", "--json")
     assert done.returncode == 0, done.stderr
     assert done.stdout == "ran: -m fognav doctor --json\n"
@@ -62,7 +62,7 @@ def test_the_first_start_installs_pins_with_hashes_then_the_members(checkout: Pa
         assert f"--editable {checkout}/{member}" in members
 
 
-def test_the_second_start_installs_nothing_and_says_nothing(checkout: Path) -> None:
+def test_second_start_installs_and_prints_nothing(checkout: Path) -> None:
     start(checkout / "fognav", checkout)
     calls = len(uv_log(checkout))
     done = start(checkout / "fognav", checkout, "a b", "c")
@@ -70,7 +70,7 @@ def test_the_second_start_installs_nothing_and_says_nothing(checkout: Path) -> N
     assert len(uv_log(checkout)) == calls
 
 
-def test_it_works_through_a_relative_symlink_from_another_folder(checkout: Path, tmp_path: Path) -> None:
+def test_launcher_works_through_a_relative_symlink(checkout: Path, tmp_path: Path) -> None:
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     (elsewhere / "link").symlink_to("../check out/fognav")
@@ -81,7 +81,7 @@ def test_it_works_through_a_relative_symlink_from_another_folder(checkout: Path,
 
 
 @pytest.mark.parametrize("changed", ["requirements/dev.txt", "cli/build.txt", "VERSION", "libs/one/pyproject.toml"])
-def test_a_change_of_what_it_was_made_from_sets_it_up_again(checkout: Path, changed: str) -> None:
+def test_changed_pins_version_or_members_trigger_the_set_up_again(checkout: Path, changed: str) -> None:
     start(checkout / "fognav", checkout)
     calls = len(uv_log(checkout))
     with (checkout / changed).open("a") as file:
@@ -90,7 +90,7 @@ def test_a_change_of_what_it_was_made_from_sets_it_up_again(checkout: Path, chan
     assert len(uv_log(checkout)) > calls
 
 
-def test_a_lock_of_a_process_that_is_gone_is_taken_over(checkout: Path) -> None:
+def test_lock_of_a_dead_process_is_removed(checkout: Path) -> None:
     ended = subprocess.Popen(["true"])
     ended.wait()
     (checkout / ".fognav" / "lock").mkdir(parents=True)
@@ -100,7 +100,7 @@ def test_a_lock_of_a_process_that_is_gone_is_taken_over(checkout: Path) -> None:
     assert not (checkout / ".fognav" / "lock").exists()
 
 
-def test_a_failing_step_shows_what_it_said_and_leaves_no_stamp(checkout: Path) -> None:
+def test_failed_step_shows_its_output_and_leaves_no_stamp(checkout: Path) -> None:
     uv = checkout.parent / "tools" / "uv"
     uv.write_text('#!/bin/sh\n[ "$1" = --version ] && echo "uv 0.13.0" && exit\necho "no route to the index"; exit 2\n')
     (checkout / ".venv" / "bin").mkdir(parents=True)

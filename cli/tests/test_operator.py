@@ -18,60 +18,60 @@ from fognav.stack import ROUTER, Stack, StackConfig
 pytestmark = pytest.mark.live
 TIMEOUT_S = 15.0
 SPEED = 10.0
-"""The operator's seconds pass ten times as fast."""
-ASKS = "waiting for an operator to enable"
+"""The operator's clock runs ten times as fast."""
+WAITING = "waiting for an operator to enable"
 
 
-async def until(condition: Callable[[], bool], what: str) -> None:
+async def until(condition: Callable[[], bool], description: str) -> None:
     deadline = time.monotonic() + TIMEOUT_S
     while not condition():
-        assert time.monotonic() < deadline, f"{TIMEOUT_S:.0f} s passed before {what}"
+        assert time.monotonic() < deadline, f"{TIMEOUT_S:.0f} s passed before {description}"
         await asyncio.sleep(0.01)
 
 
-class Floor:
-    """An operator, and what a robot and the nodes tell him over a real router."""
+class RouterRig:
+    """An operator connected by a real router to a simulated robot and aggregator."""
 
     def __init__(self, robot: ZenohEdge, operator: Operator, scene: Scene) -> None:
         self._robot = robot
         self.operator = operator
         self.scene = scene
-        self.asked: list[str] = []
+        self.commands: list[str] = []
         self.reply = CommandReply(accepted=True, reason="")
         robot.serve(ch.ROBOT_COMMAND, self._on_command, robot="r1")
 
     def _on_command(self, _ids: dict[str, str], command: RobotCommand) -> CommandReply:
-        self.asked.append(command.kind)
+        self.commands.append(command.kind)
         return self.reply
 
     @property
-    def told(self) -> list[str]:
+    def event_texts(self) -> list[str]:
         return [text for _, text in self.scene.events]
 
-    async def robot_says(self, mode: str, *reasons: str, goal: str | None = None) -> None:
-        """Tell it, again and again until it is heard: nobody says when a subscription has reached the router."""
+    async def publish_state(self, mode: str, *reasons: str, goal: str | None = None) -> None:
+        """Publish a robot state until the operator has received it: subscriptions reach the router with a delay."""
         state = RobotState(
             mode=mode, reasons=list(reasons), enabled=mode != "INIT", battery=None, goal_id=goal, map_epoch=1,
             map_seq=1, plan_id=None,
         )  # fmt: skip
         deadline = time.monotonic() + TIMEOUT_S
         while self.scene.state is None or (self.scene.state.mode, self.scene.state.reasons) != (mode, [*reasons]):
-            assert time.monotonic() < deadline, f"{mode} was not heard"
+            assert time.monotonic() < deadline, f"{mode} was not received"
             self._robot.publish(ch.ROBOT_STATE, state, robot="r1")
             await asyncio.sleep(0.02)
 
-    async def area_is(self, area: str, state: str, cause: str) -> None:
+    async def publish_hazard(self, area: str, state: str, cause: str) -> None:
         hazard = AreaHazard(area=area, state=state, severity=0, penalty=0, since=1.0, seq=1, epoch=1, cause=cause)
-        told = HazardArea(hazard=hazard, polygon=[(0.0, 0.0), (1.0, 0.0), (1.0, 1.0)])
+        message = HazardArea(hazard=hazard, polygon=[(0.0, 0.0), (1.0, 0.0), (1.0, 1.0)])
         deadline = time.monotonic() + TIMEOUT_S
         while area not in self.scene.hazards or self.scene.hazards[area].hazard.state != state:
-            assert time.monotonic() < deadline, f"{area} was not heard"
-            self._robot.publish(ch.HAZARD, told, area=area)
+            assert time.monotonic() < deadline, f"{area} was not received"
+            self._robot.publish(ch.HAZARD, message, area=area)
             await asyncio.sleep(0.02)
 
 
 @pytest.fixture
-async def floor() -> AsyncIterator[Floor]:
+async def rig() -> AsyncIterator[RouterRig]:
     site = load_site(checkout.root() / "sites" / "estig")
     clock = SystemClock(SPEED)
     async with Stack(StackConfig(site_dir=site.directory, robot="r1")) as stack, contextlib.AsyncExitStack() as ends:
@@ -85,57 +85,57 @@ async def floor() -> AsyncIterator[Floor]:
             return await ends.enter_async_context(opened)
 
         scene = Scene(site, "r1", 1, SPEED)
-        made = Floor(await edge("robot"), Operator(await edge("operator"), stack, scene, clock), scene)
+        made = RouterRig(await edge("robot"), Operator(await edge("operator"), stack, scene, clock), scene)
         enabling = asyncio.create_task(made.operator.keep_enabled())
         yield made
         enabling.cancel()
         await asyncio.gather(enabling, return_exceptions=True)
 
 
-async def test_a_robot_that_starts_as_it_should_makes_a_calm_story(floor: Floor) -> None:
-    floor.operator.held_back = True
-    await floor.area_is("z1", "unknown", "not heard yet")
-    await floor.robot_says("INIT", "no message from the guardian for as long as the agent runs", ASKS)
-    await floor.area_is("z1", "clear", "node n1: 5 in a row")
-    await floor.robot_says("INIT", "the pose is not known yet: checking the saved pose", ASKS)
-    await floor.robot_says("INIT", ASKS)
-    floor.operator.held_back = False
-    await until(lambda: bool(floor.asked), "it is enabled")
-    await floor.robot_says("NORMAL")
-    assert [text for text in floor.told if text != "operator: enable again"] == [
-        "robot: INIT, it has just started, looks for where it is, and stands until somebody enables it",
+async def test_normal_start_of_a_robot_gives_three_events(rig: RouterRig) -> None:
+    rig.operator.enabling_paused = True
+    await rig.publish_hazard("z1", "unknown", "not heard yet")
+    await rig.publish_state("INIT", "no message from the guardian for as long as the agent runs", WAITING)
+    await rig.publish_hazard("z1", "clear", "node n1: 5 in a row")
+    await rig.publish_state("INIT", "the pose is not known yet: checking the saved pose", WAITING)
+    await rig.publish_state("INIT", WAITING)
+    rig.operator.enabling_paused = False
+    await until(lambda: bool(rig.commands), "it is enabled")
+    await rig.publish_state("NORMAL")
+    assert [text for text in rig.event_texts if text != "operator: enable again"] == [
+        "robot: INIT (just started: it localizes, then waits to be enabled)",
         "operator: enable",
         "robot: NORMAL",
     ]
 
 
-async def test_nobody_enables_a_robot_that_is_held_back_however_long_it_asks(floor: Floor) -> None:
-    floor.operator.held_back = True
-    await floor.robot_says("INIT", ASKS)
-    await until(lambda: floor.operator.ready_s > 20.0, "20 s passed on its clock")
-    assert floor.asked == []
+async def test_robot_is_not_enabled_while_enabling_is_paused(rig: RouterRig) -> None:
+    rig.operator.enabling_paused = True
+    await rig.publish_state("INIT", WAITING)
+    await until(lambda: rig.operator.ready_s > 20.0, "20 s passed on its clock")
+    assert rig.commands == []
 
 
-async def test_what_keeps_a_robot_from_being_enabled_is_told_when_it_does_not_pass(floor: Floor) -> None:
-    floor.reply = CommandReply(accepted=False, reason="the cause is still there: the lidar has been silent for 9.0 s")
-    await floor.robot_says("INIT", "the lidar has been silent for 1.0 s", ASKS)
-    assert floor.operator.ready_s == 0.0
-    await until(lambda: len(floor.asked) >= 2, "it is asked all the same")
-    complaints = [text for text in floor.told if text.startswith("operator: ")]
-    assert complaints == ["operator: enable: the robot refuses, " + floor.reply.reason]  # told once
+async def test_refused_enable_is_reported_once_with_its_reason(rig: RouterRig) -> None:
+    rig.reply = CommandReply(accepted=False, reason="the cause is still there: the lidar has been silent for 9.0 s")
+    await rig.publish_state("INIT", "the lidar has been silent for 1.0 s", WAITING)
+    assert rig.operator.ready_s == 0.0
+    await until(lambda: len(rig.commands) >= 2, "the command was sent twice")
+    refusals = [text for text in rig.event_texts if text.startswith("operator: ")]
+    assert refusals == ["operator: enable: refused by the robot, " + rig.reply.reason]
 
 
-async def test_trouble_that_comes_later_is_told_with_its_reasons(floor: Floor) -> None:
-    await floor.area_is("z1", "clear", "node n1: 5 in a row")
-    await floor.area_is("z1", "unknown", "node n1 is silent")
-    await floor.area_is("z2", "blocked", "node n2: something at 0.20 m")
-    await floor.robot_says("NORMAL")
-    await floor.robot_says("PROTECTIVE_STOP", "the lidar has been silent for 0.4 s")
-    await floor.robot_says("INIT", "no message from the guardian for as long as the agent runs", ASKS)
-    assert [text for text in floor.told if not text.startswith("operator")] == [
+async def test_later_hazards_and_stops_are_reported_with_their_reasons(rig: RouterRig) -> None:
+    await rig.publish_hazard("z1", "clear", "node n1: 5 in a row")
+    await rig.publish_hazard("z1", "unknown", "node n1 is silent")
+    await rig.publish_hazard("z2", "blocked", "node n2: something at 0.20 m")
+    await rig.publish_state("NORMAL")
+    await rig.publish_state("PROTECTIVE_STOP", "the lidar has been silent for 0.4 s")
+    await rig.publish_state("INIT", "no message from the guardian for as long as the agent runs", WAITING)
+    assert [text for text in rig.event_texts if not text.startswith("operator")] == [
         "area z1: unknown (node n1 is silent)",
         "area z2: blocked (node n2: something at 0.20 m)",
         "robot: NORMAL",
         "robot: PROTECTIVE_STOP (the lidar has been silent for 0.4 s)",
-        f"robot: INIT (no message from the guardian for as long as the agent runs; {ASKS})",
+        f"robot: INIT (no message from the guardian for as long as the agent runs; {WAITING})",
     ]

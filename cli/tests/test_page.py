@@ -67,14 +67,14 @@ def loaded_site() -> LoadedSite:
 
 @pytest.fixture
 def demo() -> Demo:
-    made = Demo(loaded_site(), Options(seed=7))
-    scene = made.scene
+    demo = Demo(loaded_site(), Options(seed=7))
+    scene = demo.scene
     scene.phase = "driving"
     scene.pose = RobotPose(
         x=3.0, y=1.5, theta=0.3, covariance=[0.0] * 9, v=0.3, w=0.0, radius=0.17, height=0.35, stamp=1.0
     )
     barrier = SimObstacle(id="barrier", polygon=[(7, 0.5), (8, 0.5), (8, 2.5)])
-    scene.take_truth(
+    scene.on_truth(
         SimTruth(
             robot="r1", x=3.0, y=1.5, theta=0.3, left=0.3, right=0.3, distance=3.25, clearance=0.8, min_clearance=0.5,
             contacts=0, obstacles=[barrier],
@@ -98,11 +98,11 @@ def demo() -> Demo:
         path_received=10.504,
     )  # fmt: skip
     scene.usage = {"planner": (12.3, 150.0)}
-    scene.say("planner: plan 4, 12.0 m")
-    return made
+    scene.log_event("planner: plan 4, 12.0 m")
+    return demo
 
 
-def test_the_picture_tells_free_occupied_and_unknown_with_the_top_row_first(demo: Demo) -> None:
+def test_map_image_encodes_free_occupied_and_unknown_with_the_top_row_first(demo: Demo) -> None:
     static = demo.site.map
     with Image.open(io.BytesIO(map_png(static))) as image:
         kinds = np.asarray(image)
@@ -112,7 +112,7 @@ def test_the_picture_tells_free_occupied_and_unknown_with_the_top_row_first(demo
     assert kinds[static.geometry.height - 1 - row, column] == 0
 
 
-async def test_the_page_serves_its_files_and_no_others(demo: Demo) -> None:
+async def test_page_serves_only_its_own_files(demo: Demo) -> None:
     async with serve(demo) as url:
         port = int(url.rstrip("/").rsplit(":", 1)[1])
         for path, status in (("/", 200), ("/app.js", 200), ("/style.css", 200), ("/map.png", 200), ("/app.py", 404)):
@@ -121,7 +121,7 @@ async def test_the_page_serves_its_files_and_no_others(demo: Demo) -> None:
         assert outside.status == 404
 
 
-async def test_a_port_that_somebody_else_has_is_refused_with_the_way_out(demo: Demo) -> None:
+async def test_port_in_use_is_refused_with_the_remedy(demo: Demo) -> None:
     async with serve(demo) as url:
         port = int(url.rstrip("/").rsplit(":", 1)[1])
         with pytest.raises(
@@ -131,13 +131,13 @@ async def test_a_port_that_somebody_else_has_is_refused_with_the_way_out(demo: D
                 pass
 
 
-def test_the_scene_is_valid_json_before_anything_is_known() -> None:
+def test_scene_is_valid_json_before_any_message() -> None:
     scene = Demo(loaded_site(), Options()).scene
-    json.dumps(scene.still(), allow_nan=False)
-    json.dumps(scene.moving(), allow_nan=False)
+    json.dumps(scene.static_view(), allow_nan=False)
+    json.dumps(scene.live_view(), allow_nan=False)
 
 
-def test_the_terminal_shows_mode_reason_hazard_and_latency(demo: Demo) -> None:
+def test_terminal_shows_mode_reason_hazard_and_latency(demo: Demo) -> None:
     console = Console(width=140, record=True, file=io.StringIO())
     console.print(render(demo.scene, 40))
     text = console.export_text()
@@ -149,7 +149,7 @@ def test_the_terminal_shows_mode_reason_hazard_and_latency(demo: Demo) -> None:
 async def page(demo: Demo) -> AsyncIterator[Page]:
     chromium = system.find(system.CHROMIUM)
     if chromium is None:
-        pytest.skip(f"no Chromium: {system.how_to_get([system.CHROMIUM])}, or ./fognav test --yes as root")
+        pytest.skip(f"no Chromium: {system.install_command([system.CHROMIUM])}, or ./fognav test --yes as root")
     async with serve(demo) as url, async_playwright() as playwright:
         browser = await playwright.chromium.launch(executable_path=str(chromium), args=FLAGS)
         opened = await browser.new_page(viewport={"width": 1200, "height": 800})
@@ -174,14 +174,14 @@ async def pixel(page: Page, x: float, y: float) -> list[int]:
 
 
 @pytest.mark.browser
-async def test_a_browser_shows_the_robot_the_hazard_and_the_numbers(page: Page) -> None:
+async def test_browser_shows_robot_hazard_and_latency(page: Page) -> None:
     await page.wait_for_selector("#events li")
     assert await page.inner_text("#mode") == "HOLD"
     assert await page.inner_text("#reasons") == "the map is 3.2 s old"
     assert "plan 4, 12.0 m" in await page.inner_text("#events")
     assert "504 ms" in await page.inner_text("#total")
     assert "planner" in await page.inner_text("#processes")
-    await page.wait_for_function("() => now && floor && !drawn")
+    await page.wait_for_function("() => latest && floorImage && !drawPending")
     free, wall, hazard, barrier = [await pixel(page, *at) for at in ((1.0, 1.0), (-1.8, 5.0), (6.3, 0.6), (7.7, 1.0))]
     assert free == [255, 255, 255]
     assert sum(wall) < 300
@@ -191,20 +191,20 @@ async def test_a_browser_shows_the_robot_the_hazard_and_the_numbers(page: Page) 
 
 
 @pytest.mark.browser
-async def test_the_page_follows_what_happens(page: Page, demo: Demo) -> None:
+async def test_page_updates_mode_and_events(page: Page, demo: Demo) -> None:
     await page.wait_for_selector("#events li")
     state = demo.scene.state
     assert state is not None
     demo.scene.state = RobotState(
         mode="NORMAL", reasons=[], enabled=True, battery=None, goal_id="g", map_epoch=1, map_seq=2, plan_id=4
     )
-    demo.scene.say("it goes on")
+    demo.scene.log_event("a new event")
     await page.wait_for_function("() => document.getElementById('mode').textContent === 'NORMAL'")
-    await page.wait_for_function("() => document.getElementById('events').textContent.includes('it goes on')")
+    await page.wait_for_function("() => document.getElementById('events').textContent.includes('a new event')")
 
 
 @pytest.mark.browser
-async def test_the_map_can_be_zoomed_and_fitted_again(page: Page) -> None:
+async def test_map_can_be_zoomed_and_fitted_again(page: Page) -> None:
     await page.wait_for_function("() => view !== null")
     before = await page.evaluate("view.scale")
     await page.mouse.move(400, 300)

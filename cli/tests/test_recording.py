@@ -20,50 +20,50 @@ POSE = RobotPose(x=1.0, y=2.0, theta=0.5, covariance=[0.0] * 9, v=0.1, w=0.0, ra
 
 
 async def record_some(file: Path, mqtt: MqttEdge, zenoh: ZenohEdge, mqtt_url: str) -> dict[str, int]:
-    """Record until both kinds are in the file: nobody says when a subscription has reached the router."""
+    """Record until both messages are in the file: subscriptions reach the router with a delay."""
     while True:
         async with recording.recording(file, mqtt_url=mqtt_url, zenoh=zenoh, clock=SystemClock()):
             for _ in range(10):
                 await mqtt.publish(ch.AREA_HAZARD, HAZARD, area="z1")
                 zenoh.publish(ch.ROBOT_POSE, POSE, robot="r1")
                 await asyncio.sleep(0.05)
-        held = recording.summary(file)["messages"]
-        assert isinstance(held, dict)
-        if set(held) == {"area_hazard", "robot_pose"}:
-            return held
+        counts = recording.summary(file)["messages"]
+        assert isinstance(counts, dict)
+        if set(counts) == {"area_hazard", "robot_pose"}:
+            return counts
 
 
-async def test_what_crosses_both_transports_is_recorded_and_sent_again(tmp_path: Path) -> None:
+async def test_messages_of_both_transports_are_recorded_and_replayed(tmp_path: Path) -> None:
     file = tmp_path / "run.mcap"
     clock = SystemClock()
     async with Stack(StackConfig(site_dir=tmp_path, robot="r1")) as stack, asyncio.timeout(3 * TIMEOUT_S):
         for name in (BROKER, ROUTER):
             stack.supervisor.start(name)
         await stack.supervisor.wait_ready([BROKER, ROUTER], TIMEOUT_S)
-        heard: asyncio.Queue[object] = asyncio.Queue()
+        received: asyncio.Queue[object] = asyncio.Queue()
         mqtt = MqttEdge(stack.mqtt_url, "test", clock, site="here")
-        mqtt.on(ch.AREA_HAZARD, lambda _, hazard: heard.put_nowait(hazard), AreaHazard)
+        mqtt.on(ch.AREA_HAZARD, lambda _, hazard: received.put_nowait(hazard), AreaHazard)
         opened = ZenohEdge.open(connect=[stack.zenoh_endpoint], clock=clock, role="console", id="test", site="here")
         async with opened as zenoh:
             task = asyncio.create_task(mqtt.run())
             await mqtt.wait_connected()
-            held = await record_some(file, mqtt, zenoh, stack.mqtt_url)
-            while not heard.empty():
-                heard.get_nowait()
-            zenoh.subscribe(ch.ROBOT_POSE, RobotPose, lambda _, pose: heard.put_nowait(pose))
-            told = await recording.play(
+            counts = await record_some(file, mqtt, zenoh, stack.mqtt_url)
+            while not received.empty():
+                received.get_nowait()
+            zenoh.subscribe(ch.ROBOT_POSE, RobotPose, lambda _, pose: received.put_nowait(pose))
+            played = await recording.play(
                 file, mqtt_url=stack.mqtt_url, zenoh_endpoint=stack.zenoh_endpoint, site="here", speed=2.0
             )
-            assert told["sent"] == sum(held.values())
-            again = set()
-            while len(again) < 2:
-                again.add(type(await heard.get()))
+            assert played["sent"] == sum(counts.values())
+            kinds = set()
+            while len(kinds) < 2:
+                kinds.add(type(await received.get()))
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)
-    assert again == {AreaHazard, RobotPose}
+    assert kinds == {AreaHazard, RobotPose}
 
 
-def test_a_file_that_is_no_recording_is_refused(tmp_path: Path) -> None:
+def test_file_that_is_not_a_recording_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "notes.mcap"
     file.write_text("not a recording, but long enough to be one")
     with pytest.raises(WrongUseError, match=r"notes\.mcap"):

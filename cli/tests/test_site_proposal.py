@@ -25,7 +25,7 @@ RESOLUTION = 0.05
 
 
 def ring_of_corridors(width: float = 2.0) -> tuple[GridGeometry, NDArray[np.uint8]]:
-    """24 m x 16 m of corridors around two blocks: every way has another one."""
+    """24 m x 16 m of corridors around two blocks: every path has an alternative."""
     geometry = GridGeometry(480, 320, RESOLUTION, -3.0, 4.0)
     cells = np.full(geometry.shape, 254, dtype=np.uint8)
     wide = round(width / RESOLUTION)
@@ -36,7 +36,7 @@ def ring_of_corridors(width: float = 2.0) -> tuple[GridGeometry, NDArray[np.uint
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_proposal_can_be_driven_and_each_area_can_be_driven_around(seed: int) -> None:
+def test_proposed_site_has_a_path_and_a_detour_around_each_area(seed: int) -> None:
     geometry, cells = ring_of_corridors()
     site = propose("ring", "map.yaml", geometry, cells, seed)
     assert site.demo is not None
@@ -51,16 +51,16 @@ def test_a_proposal_can_be_driven_and_each_area_can_be_driven_around(seed: int) 
         raw = cells.copy()
         window, mask = rasterize(area.polygon, geometry)
         raw[window.rows, window.columns][mask] = 254
-        assert planner.plan(inflate(raw, table), *ends).found, f"{area.id} leaves no way"
+        assert planner.plan(inflate(raw, table), *ends).found, f"{area.id} leaves no path"
 
-    def barrier_in(area: AreaSite) -> SimObstacle:
+    def make_barrier(area: AreaSite) -> SimObstacle:
         return barrier_across(area, site, StaticMap(geometry, cells), seed)
 
-    assert draw_hazard(site, path, seed, barrier_in).area.id in site.demo.areas
+    assert draw_hazard(site, path, seed, make_barrier).area.id in site.demo.areas
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_nodes_hang_on_a_wall_and_their_limits_end_before_the_other_wall(seed: int) -> None:
+def test_nodes_are_on_a_wall_and_their_limits_end_before_the_opposite_wall(seed: int) -> None:
     geometry, cells = ring_of_corridors()
     site = propose("ring", "map.yaml", geometry, cells, seed)
     walls = (cells == 254).astype(np.uint8)
@@ -77,7 +77,7 @@ def test_nodes_hang_on_a_wall_and_their_limits_end_before_the_other_wall(seed: i
             assert sonar.range_limit < echoes.min()
 
 
-def test_a_map_without_a_second_way_gets_a_demo_without_areas() -> None:
+def test_map_without_a_second_path_gets_a_demo_without_areas() -> None:
     geometry = GridGeometry(600, 48, RESOLUTION, 0.0, 0.0)
     cells = np.full(geometry.shape, 254, dtype=np.uint8)
     cells[4:-4, 4:-4] = 0
@@ -86,13 +86,13 @@ def test_a_map_without_a_second_way_gets_a_demo_without_areas() -> None:
     assert site.demo.areas == []
 
 
-def test_a_map_without_floor_is_refused() -> None:
+def test_map_without_free_floor_is_refused() -> None:
     geometry = GridGeometry(100, 100, RESOLUTION, 0.0, 0.0)
-    with pytest.raises(NoSiteError, match="no way of 15 m"):
+    with pytest.raises(NoSiteError, match="no path of 15 m"):
         propose("dark", "map.yaml", geometry, np.full(geometry.shape, 255, dtype=np.uint8))
 
 
-def test_what_is_written_is_read_back_as_a_valid_site(tmp_path: Path) -> None:
+def test_written_site_is_valid_and_equals_the_proposal(tmp_path: Path) -> None:
     geometry, cells = ring_of_corridors()
     save_map(tmp_path / "maps" / "floor", StaticMap(geometry, cells))
     made = new_site(tmp_path / "maps" / "floor.yaml", tmp_path / "sites" / "My Floor (2)", seed=1)
@@ -105,20 +105,20 @@ def test_what_is_written_is_read_back_as_a_valid_site(tmp_path: Path) -> None:
     assert check_site(tmp_path / "sites" / "My Floor (2)")["ok"] is True
 
 
-def test_an_existing_site_is_not_overwritten(tmp_path: Path) -> None:
+def test_existing_site_is_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / "site.toml").write_text("# mine\n")
-    with pytest.raises(WrongUseError, match="exists already"):
+    with pytest.raises(WrongUseError, match="already exists"):
         new_site(tmp_path / "map.yaml", tmp_path, seed=1)
     assert (tmp_path / "site.toml").read_text() == "# mine\n"
 
 
-def test_an_unreadable_map_is_named(tmp_path: Path) -> None:
+def test_unreadable_map_is_named_in_the_error(tmp_path: Path) -> None:
     with pytest.raises(WrongUseError, match=r"nowhere\.yaml"):
         new_site(tmp_path / "nowhere.yaml", tmp_path / "site", seed=1)
     assert not (tmp_path / "site").exists()
 
 
-def test_a_broken_site_is_told_with_its_field(tmp_path: Path) -> None:
+def test_problem_of_an_invalid_site_names_its_field(tmp_path: Path) -> None:
     (tmp_path / "site.toml").write_text('id = "x"\n[[areas]]\nid = "z1"\npolygon = [[0, 0], [1, 0]]\n')
     found = check_site(tmp_path)
     assert found["ok"] is False
@@ -128,5 +128,5 @@ def test_a_broken_site_is_told_with_its_field(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "expected"), [("Level 2", "level-2"), ("__", "site"), ("Ä" + "x" * 50, "x" * 32), ("a--b", "a-b")]
 )
-def test_any_folder_name_makes_an_id(name: str, expected: str) -> None:
+def test_any_folder_name_gives_a_valid_id(name: str, expected: str) -> None:
     assert identifier(name) == expected

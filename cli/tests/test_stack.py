@@ -21,9 +21,9 @@ TIMEOUT_S = 20.0
 
 @pytest.fixture
 async def stack(tmp_path: Path) -> AsyncIterator[Stack]:
-    """A stack of which only the servers run; its site is not read by them."""
-    async with Stack(StackConfig(site_dir=tmp_path, robot="r1")) as made:
-        yield made
+    """A stack without running processes; the servers started by the tests do not read its site."""
+    async with Stack(StackConfig(site_dir=tmp_path, robot="r1")) as stack:
+        yield stack
 
 
 async def start_servers(stack: Stack) -> None:
@@ -32,14 +32,14 @@ async def start_servers(stack: Stack) -> None:
     await stack.supervisor.wait_ready(SERVERS, TIMEOUT_S)
 
 
-async def restarted(stack: Stack, name: str) -> None:
+async def wait_restarted(stack: Stack, name: str) -> None:
     deadline = time.monotonic() + TIMEOUT_S
     while stack.supervisor.starts(name) < 2:
-        assert time.monotonic() < deadline, f"{name} was not started again"
+        assert time.monotonic() < deadline, f"{name} was not restarted"
         await asyncio.sleep(0.02)
 
 
-async def test_two_stacks_run_side_by_side_and_leave_nothing_behind(tmp_path: Path) -> None:
+async def test_two_stacks_run_side_by_side_and_remove_everything(tmp_path: Path) -> None:
     config = StackConfig(site_dir=tmp_path, robot="r1")
     async with Stack(config) as one, Stack(config) as two:
         await asyncio.gather(start_servers(one), start_servers(two))
@@ -54,29 +54,29 @@ async def test_two_stacks_run_side_by_side_and_leave_nothing_behind(tmp_path: Pa
 
 
 @pytest.mark.parametrize("name", SERVERS)
-async def test_a_killed_server_comes_back_on_its_port(tmp_path: Path, name: str) -> None:
+async def test_killed_server_restarts_on_its_port(tmp_path: Path, name: str) -> None:
     events: list[Event] = []
     async with Stack(StackConfig(site_dir=tmp_path, robot="r1"), events.append) as stack:
         stack.supervisor.start(name)
         await stack.supervisor.wait_ready([name], TIMEOUT_S)
         first = stack.supervisor.kill(name)
-        await restarted(stack, name)
+        await wait_restarted(stack, name)
         await stack.supervisor.wait_ready([name], TIMEOUT_S)
         assert stack.supervisor.pid(name) != first
     assert [event.kind for event in events] == ["started", "killed", "exited", "started", "stopped"]
 
 
-async def test_redis_keeps_over_a_kill_what_it_acknowledged(stack: Stack) -> None:
+async def test_redis_keeps_acknowledged_writes_when_killed(stack: Stack) -> None:
     stack.supervisor.start(REDIS)
     await stack.supervisor.wait_ready([REDIS], TIMEOUT_S)
     assert await net.server_problem(stack.redis_port, b"SET zone kept\r\n", b"+OK") is None
     stack.supervisor.kill(REDIS)
-    await restarted(stack, REDIS)
+    await wait_restarted(stack, REDIS)
     await stack.supervisor.wait_ready([REDIS], TIMEOUT_S)
     assert await net.server_problem(stack.redis_port, b"GET zone\r\n", b"$4\r\nkept") is None
 
 
-async def test_the_servers_are_not_to_be_had_from_other_machines(stack: Stack) -> None:
+async def test_servers_listen_only_on_the_loopback_address(stack: Stack) -> None:
     await start_servers(stack)
     for name in (BROKER, REDIS, ROUTER):
         pid = stack.pids()[name]
@@ -84,7 +84,7 @@ async def test_the_servers_are_not_to_be_had_from_other_machines(stack: Stack) -
         assert listening == ["127.0.0.1"], name
 
 
-async def test_keys_and_tokens_are_private_and_of_this_run_only(tmp_path: Path) -> None:
+async def test_keys_and_tokens_are_private_and_differ_between_stacks(tmp_path: Path) -> None:
     config = StackConfig(site_dir=tmp_path, robot="r1")
     async with Stack(config) as one, Stack(config) as two:
         for name in ("operator.key", "tokens.toml"):
@@ -94,7 +94,9 @@ async def test_keys_and_tokens_are_private_and_of_this_run_only(tmp_path: Path) 
         assert stat.S_IMODE(one.folder.stat().st_mode) == 0o700
 
 
-async def test_settings_of_this_shell_do_not_leak_into_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_settings_of_the_shell_do_not_reach_the_processes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("FOGNAV_HTTP_PORT", "80")
     async with Stack(StackConfig(site_dir=tmp_path, robot="r1")) as stack:
         stack.supervisor.start(ROUTER)

@@ -9,10 +9,10 @@ from fognav.system import AptProvider, MissingToolsError, Tool, ensure
 GHOST = Tool("ghost", ("fognav-ghost",), "ghost-package", "nothing")
 
 
-class Helper:
+class FakeProvider:
     """A provider that writes the program into a folder of the PATH."""
 
-    name = "helper"
+    name = "fake"
 
     def __init__(self, folder: Path, *, works: bool = True) -> None:
         self.folder = folder
@@ -23,7 +23,7 @@ class Helper:
         return self.works
 
     def command(self, tools: Sequence[Tool]) -> str:
-        return "help me with " + " ".join(tool.package for tool in tools)
+        return "fake install " + " ".join(tool.package for tool in tools)
 
     def install(self, tools: Sequence[Tool]) -> None:
         for tool in tools:
@@ -34,53 +34,56 @@ class Helper:
 
 
 @pytest.fixture
-def helper(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Helper:
+def provider(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FakeProvider:
     monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
     monkeypatch.delenv("CI", raising=False)
-    return Helper(tmp_path)
+    return FakeProvider(tmp_path)
 
 
-def never(question: str) -> bool:
-    raise AssertionError(f"asked: {question}")
+def never_ask(question: str) -> bool:
+    raise AssertionError(f"unexpected question: {question}")
 
 
-def quiet(_: str) -> None:
+def ignore(_: str) -> None:
     pass
 
 
-def test_what_is_there_is_neither_installed_nor_asked_about(helper: Helper) -> None:
-    helper.install([GHOST])
-    found = ensure([GHOST], yes=False, say=quiet, ask=never, providers=[])
-    assert found == {"ghost": helper.folder / "fognav-ghost"}
+def test_installed_program_is_found_without_asking(provider: FakeProvider) -> None:
+    provider.install([GHOST])
+    found = ensure([GHOST], yes=False, print_line=ignore, ask=never_ask, providers=[])
+    assert found == {"ghost": provider.folder / "fognav-ghost"}
 
 
-def test_without_consent_nothing_is_installed_and_the_remedy_is_told(helper: Helper) -> None:
-    with pytest.raises(MissingToolsError, match=r"missing: ghost.*help me with ghost-package.*--yes"):
-        ensure([GHOST], yes=False, say=quiet, ask=lambda _: False, providers=[helper])
-    assert helper.installed == []
+def test_without_consent_nothing_is_installed_and_the_error_names_the_command(provider: FakeProvider) -> None:
+    with pytest.raises(MissingToolsError, match=r"missing: ghost.*fake install ghost-package.*--yes"):
+        ensure([GHOST], yes=False, print_line=ignore, ask=lambda _: False, providers=[provider])
+    assert provider.installed == []
 
 
-def test_yes_and_ci_are_consent(helper: Helper, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert ensure([GHOST], yes=True, say=quiet, ask=never, providers=[helper])["ghost"].name == "fognav-ghost"
-    (helper.folder / "fognav-ghost").unlink()
+def test_yes_and_ci_are_consent(provider: FakeProvider, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert (
+        ensure([GHOST], yes=True, print_line=ignore, ask=never_ask, providers=[provider])["ghost"].name
+        == "fognav-ghost"
+    )
+    (provider.folder / "fognav-ghost").unlink()
     monkeypatch.setenv("CI", "true")
-    ensure([GHOST], yes=False, say=quiet, ask=never, providers=[helper])
-    assert helper.installed == ["ghost", "ghost"]
+    ensure([GHOST], yes=False, print_line=ignore, ask=never_ask, providers=[provider])
+    assert provider.installed == ["ghost", "ghost"]
 
 
-def test_the_first_provider_that_works_is_taken(helper: Helper, tmp_path: Path) -> None:
-    broken = Helper(tmp_path, works=False)
-    ensure([GHOST], yes=True, say=quiet, ask=never, providers=[broken, helper])
-    assert (broken.installed, helper.installed) == ([], ["ghost"])
+def test_first_available_provider_is_used(provider: FakeProvider, tmp_path: Path) -> None:
+    broken = FakeProvider(tmp_path, works=False)
+    ensure([GHOST], yes=True, print_line=ignore, ask=never_ask, providers=[broken, provider])
+    assert (broken.installed, provider.installed) == ([], ["ghost"])
 
 
-def test_without_any_provider_the_message_says_what_to_type(helper: Helper) -> None:
+def test_without_a_provider_the_error_names_the_command(provider: FakeProvider) -> None:
     with pytest.raises(MissingToolsError, match=r"sudo apt-get install .*ghost-package"):
-        ensure([GHOST], yes=True, say=quiet, ask=never, providers=[])
-    assert helper.installed == []
+        ensure([GHOST], yes=True, print_line=ignore, ask=never_ask, providers=[])
+    assert provider.installed == []
 
 
-def test_apt_brings_its_lists_up_to_date_first_and_tells_what_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_apt_updates_its_lists_first_and_reports_its_error(monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[list[str]] = []
 
     def run(arguments: Sequence[str], environment: Mapping[str, str]) -> tuple[int, str]:
@@ -96,7 +99,7 @@ def test_apt_brings_its_lists_up_to_date_first_and_tells_what_failed(monkeypatch
     assert calls[1][-1] == "ghost-package"
 
 
-def test_apt_without_root_wants_a_sudo_that_does_not_ask(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_apt_without_root_needs_sudo_without_a_password(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(system.shutil, "which", lambda name: f"/usr/bin/{name}")
     monkeypatch.setattr(system.os, "geteuid", lambda: 1000)
     assert not AptProvider(lambda *_: (1, "a password is required")).available()

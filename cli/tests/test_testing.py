@@ -1,4 +1,4 @@
-"""How `fognav test` calls pytest, which tests share a worker, and what it says at the end."""
+"""How `fognav test` calls pytest, which tests share a worker, and its summary."""
 
 import importlib.util
 import os
@@ -19,10 +19,10 @@ import pytest
 def test_without_a_sonar(n):
     pytest.skip("no sonar: plug one in")
 
-def test_well():
+def test_that_passes():
     pass
 
-def test_ill():
+def test_that_fails():
     assert False
 """
 
@@ -38,7 +38,7 @@ def command(*, terminal: bool = False) -> list[str]:
     return testing.pytest_command(["-n", "0", "test_some.py"], terminal=terminal)
 
 
-def test_what_was_skipped_is_told_once_with_the_way_to_get_it(folder: Path) -> None:
+def test_skipped_tests_are_summarized_once_per_reason(folder: Path) -> None:
     done = subprocess.run(command(), cwd=folder, capture_output=True, text=True, check=False)
     assert done.returncode == 1
     assert done.stdout.count("no sonar") == 1
@@ -47,32 +47,32 @@ def test_what_was_skipped_is_told_once_with_the_way_to_get_it(folder: Path) -> N
     assert done.stderr == ""
 
 
-def test_on_a_terminal_a_bar_shows_how_far_it_is_and_names_what_failed_at_once(folder: Path) -> None:
-    own, theirs = pty.openpty()
+def test_bar_on_a_terminal_shows_progress_and_failures_at_once(folder: Path) -> None:
+    master, slave = pty.openpty()
     environment = {**os.environ, "TERM": "xterm", "COLUMNS": "100"}
-    process = subprocess.Popen(command(terminal=True), cwd=folder, stdout=theirs, stderr=theirs, env=environment)
-    os.close(theirs)
-    shown = b""
+    process = subprocess.Popen(command(terminal=True), cwd=folder, stdout=slave, stderr=slave, env=environment)
+    os.close(slave)
+    output = b""
     try:
-        while chunk := os.read(own, 4096):
-            shown += chunk
-    except OSError:  # Linux says so when the other end is closed
+        while chunk := os.read(master, 4096):
+            output += chunk
+    except OSError:  # on Linux: the other end is closed
         pass
     assert process.wait() == 1
-    text = shown.decode()
+    text = output.decode()
     assert "5/5" in text
-    assert text.index("test_some.py::test_ill") < text.index("FAILURES")
+    assert text.index("test_some.py::test_that_fails") < text.index("FAILURES")
     assert "sss" not in text
     assert "3 skipped: no sonar: plug one in" in text
 
 
-def test_tests_run_on_all_cores_unless_somebody_asks_for_another_way() -> None:
+def test_tests_run_on_all_cores_unless_the_arguments_choose_otherwise() -> None:
     command = testing.pytest_command(["-k", "replica"], terminal=False)
     assert command[:3] == [sys.executable, "-m", "pytest"]
     assert command[command.index("-n") + 1] == str((os.cpu_count() or 1) + 1)
     assert command[-2:] == ["-k", "replica"]
-    for own in (["-n", "0"], ["-n4"], ["--pdb"], ["-s"], ["--collect-only"]):
-        assert "--dist" not in testing.pytest_command(own, terminal=False)
+    for arguments in (["-n", "0"], ["-n4"], ["--pdb"], ["-s"], ["--collect-only"]):
+        assert "--dist" not in testing.pytest_command(arguments, terminal=False)
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +85,7 @@ def grouping() -> ModuleType:
     return module
 
 
-def test_tests_that_measure_reactions_share_one_worker(grouping: ModuleType) -> None:
+def test_tests_of_reaction_times_share_one_worker(grouping: ModuleType) -> None:
     faults = grouping.group_of("tests/live/test_faults.py")
     assert faults == grouping.group_of("robot-agent/tests/guardian/test_processes.py")
     assert faults[0] == grouping.REACTION
@@ -93,7 +93,7 @@ def test_tests_that_measure_reactions_share_one_worker(grouping: ModuleType) -> 
     assert grouping.group_of("tests/replay/test_replay.py")[0] == grouping.SYSTEM
 
 
-def test_tests_that_compute_leave_a_core_free(grouping: ModuleType) -> None:
+def test_computing_tests_leave_one_core_free(grouping: ModuleType) -> None:
     modules = [path.relative_to(checkout.root()) for path in checkout.root().glob("*/*/tests/test_*.py")]
     groups = {grouping.group_of(str(module)) for module in modules}
     computing = {group for group in groups if group[0] == grouping.COMPUTING}

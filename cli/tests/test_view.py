@@ -1,4 +1,4 @@
-"""What the terminal shows of a demonstration."""
+"""The terminal view of a demonstration."""
 
 import io
 from pathlib import Path
@@ -15,17 +15,17 @@ ESTIG = Path(__file__).parents[2] / "sites" / "estig"
 
 
 @pytest.mark.parametrize("width", [80, 100, 130, 200])
-def test_no_terminal_is_so_narrow_that_an_areas_state_is_cut(width):
+def test_states_of_areas_are_never_truncated(width):
     site = load_site(ESTIG)
     scene = Scene(site, "r1", 1, 1.0)
     states = dict(zip((area.id for area in site.site.areas), ("clear", "blocked", "unknown"), strict=False))
     for area in site.site.areas[:3]:
-        told = AreaHazard(
+        hazard = AreaHazard(
             area=area.id, state=states[area.id], severity=0, penalty=0, since=0.0, seq=1, epoch=1, cause=""
         )
-        scene.hazards[area.id] = HazardArea(hazard=told, polygon=area.polygon, label=area.label or "")
+        scene.hazards[area.id] = HazardArea(hazard=hazard, polygon=area.polygon, label=area.label or "")
     console = Console(width=width, height=40, record=True, file=io.StringIO())
     console.print(render(scene, 40))
-    shown = console.export_text()
-    for state in ("clear", "blocked", "unknown", "no word"):
-        assert state in shown
+    text = console.export_text()
+    for state in ("clear", "blocked", "unknown", "no state"):
+        assert state in text

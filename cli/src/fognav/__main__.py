@@ -1,4 +1,4 @@
-"""The command line: each command reads its options, calls what does the work, and turns the outcome into a code."""
+"""The command line: each command reads its options, runs the function that does the work, and sets the exit code."""
 
 import asyncio
 import signal
@@ -23,17 +23,15 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
-site_app = typer.Typer(help="Make and check sites.", no_args_is_help=True)
+site_app = typer.Typer(help="Create and check sites.", no_args_is_help=True)
 app.add_typer(site_app, name="site")
 app.command("channels", epilog="Example: fognav channels --format acl --broker mqtt")(channels_command)
 
-Yes = Annotated[
-    bool, typer.Option("--yes", help="Install missing system packages without asking (CI=true says so too).")
-]
+Yes = Annotated[bool, typer.Option("--yes", help="Install missing system packages without asking (as does CI=true).")]
 Json = Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")]
 
 
-def _say(text: str) -> None:
+def _print_line(text: str) -> None:
     console.print(text, markup=False)
 
 
@@ -42,7 +40,7 @@ def _fail(message: str, code: int = NOT_TRUE) -> NoReturn:
     raise typer.Exit(code)
 
 
-def _version(show: bool) -> None:  # noqa: FBT001  # Typer calls it with its value alone
+def _version(show: bool) -> None:  # noqa: FBT001  # Typer passes only its value
     if show:
         typer.echo(f"fognav {__version__}")
         raise typer.Exit(OK)
@@ -55,12 +53,12 @@ def _main(
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version and exit.")
     ] = False,
 ) -> None:
-    del version  # its callback has done all
+    del version  # handled by its callback
 
 
 @app.command("doctor", epilog="Example: fognav doctor --json")
 def doctor_command(*, json: Json = False) -> None:
-    """Say what is installed, what is missing and how to get it."""
+    """Show what is installed, what is missing and how to install it."""
     found = list(doctor.checks())
     if json:
         print_json(doctor.as_json(found))
@@ -70,15 +68,15 @@ def doctor_command(*, json: Json = False) -> None:
         for check in found:
             table.add_row(marks[check.state], check.name, check.found)
             if check.remedy:
-                table.add_row("", "", f"[dim]to do: {check.remedy}[/]")
+                table.add_row("", "", f"[dim]remedy: {check.remedy}[/]")
         console.print(table)
     raise typer.Exit(NOT_TRUE if any(check.state == "missing" for check in found) else OK)
 
 
 def _prepare(*, yes: bool) -> None:
     try:
-        system.ensure([system.MOSQUITTO, system.REDIS], yes=yes, say=_say)
-        kernels.make_warm(_say)
+        system.ensure([system.MOSQUITTO, system.REDIS], yes=yes, print_line=_print_line)
+        kernels.warm_cache(_print_line)
     except (system.MissingToolsError, kernels.KernelsError) as error:
         _fail(str(error))
 
@@ -91,69 +89,69 @@ def _prepare(*, yes: bool) -> None:
 def run_tests(context: typer.Context, *, yes: Yes = False) -> None:
     """Set up what is missing, then run every test on all cores.
 
-    Those with real brokers are among them; further arguments go to pytest (`-n 0` runs them one after the other).
+    This includes the tests with real brokers. Further arguments go to pytest (`-n 0` runs one test at a time).
     """
-    from fognav import testing  # noqa: PLC0415  # the other commands need not wait for its imports
+    from fognav import testing  # noqa: PLC0415  # keeps the other commands fast
 
     _prepare(yes=yes)
-    testing.get_browser(yes=yes, say=_say)
+    testing.get_browser(yes=yes, print_line=_print_line)
     done = subprocess.run(testing.pytest_command(context.args), check=False, cwd=checkout.root())
     raise typer.Exit(done.returncode)
 
 
 @app.command("check", epilog="Example: fognav check --json")
 def check_command(*, json: Json = False) -> None:
-    """Check everything that needs no running.
+    """Run all static checks.
 
-    Format, lint, types, import contracts, dead code and generated files: all of them run, and the exit code is 1 if one
-    fails.
+    These are format, lint, types, import contracts, dead code and generated files. All of them run; the exit code is 1
+    if one fails.
     """
-    from fognav import checks  # noqa: PLC0415  # the other commands need not wait for its imports
+    from fognav import checks  # noqa: PLC0415  # keeps the other commands fast
 
     def show(result: checks.CheckResult) -> None:
         mark = "[green]ok[/]    " if result.ok else "[red]failed[/]"
         console.print(f"{mark} {result.seconds:5.1f} s  {result.check.name}")
         if not result.ok:
-            _say(result.output)
+            _print_line(result.output)
 
-    begun = time.monotonic()
+    started = time.monotonic()
     try:
         results = asyncio.run(checks.run_checks(checks.CHECKS, checkout.root(), show))
     except WrongUseError as error:
         _fail(str(error), WRONG_USE)
-    seconds, failed = time.monotonic() - begun, [result for result in results if not result.ok]
+    seconds, failed = time.monotonic() - started, [result for result in results if not result.ok]
     if json:
         shown = [{"check": r.check.name, "ok": r.ok, "seconds": round(r.seconds, 1)} for r in results]
         print_json({"ok": not failed, "seconds": round(seconds, 1), "checks": shown})
     if failed:
-        todo = "\n".join(f"  {result.check.name}: {result.check.remedy}" for result in failed)
-        _fail(f"{len(failed)} of {len(results)} checks failed in {seconds:.0f} s:\n{todo}")
-    _say(f"all {len(results)} checks hold ({seconds:.0f} s)")
+        remedies = "\n".join(f"  {result.check.name}: {result.check.remedy}" for result in failed)
+        _fail(f"{len(failed)} of {len(results)} checks failed in {seconds:.0f} s:\n{remedies}")
+    _print_line(f"all {len(results)} checks passed ({seconds:.0f} s)")
 
 
 @app.command("demo", epilog="Example: fognav demo --headless --report report.json --seed 7")
 def demo_command(  # noqa: PLR0913  # each option is an argument
     *,
-    headless: Annotated[bool, typer.Option("--headless", help="No terminal view and no page: for machines.")] = False,
+    headless: Annotated[bool, typer.Option("--headless", help="No terminal view and no page: for scripts.")] = False,
     report: Annotated[Path | None, typer.Option("--report", metavar="F", help="Write the report (JSON) here.")] = None,
     site: Annotated[
         Path | None,
-        typer.Option("--site", metavar="D", help="Folder of a site, or a name in sites/; estig without it."),
+        typer.Option("--site", metavar="D", help="Folder of a site, or a name in sites/; default: estig."),
     ] = None,
-    seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of noise, area and moment.")] = 1,
+    seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of the noise and of the hazard.")] = 1,
     speed: Annotated[
         float,
-        typer.Option("--speed", metavar="K", min=0.1, max=50.0, help="Simulated time against wall time."),
+        typer.Option("--speed", metavar="K", min=0.1, max=50.0, help="Simulated seconds per second."),
     ] = 1.0,
-    no_hazard: Annotated[bool, typer.Option("--no-hazard", help="Block nothing on the way.")] = False,
+    no_hazard: Annotated[bool, typer.Option("--no-hazard", help="Place no barrier on the path.")] = False,
     base: Annotated[
-        str, typer.Option("--base", metavar="NAME", help="What the robot drives on: roomba600 or diffdrive.")
+        str, typer.Option("--base", metavar="NAME", help="The robot's base: roomba600 or diffdrive.")
     ] = "roomba600",
     lidar: Annotated[
-        str, typer.Option("--lidar", metavar="NAME", help="What the robot sees with: rplidar-a1 or ld19.")
+        str, typer.Option("--lidar", metavar="NAME", help="The robot's lidar: rplidar-a1 or ld19.")
     ] = "rplidar-a1",
     keep_running: Annotated[
-        bool, typer.Option("--keep-running", help="Leave everything running after the drive, until Ctrl-C.")
+        bool, typer.Option("--keep-running", help="Keep the system running after the drive, until Ctrl-C.")
     ] = False,
     record: Annotated[
         Path | None, typer.Option("--record", metavar="F", help="Record every channel to this MCAP file.")
@@ -164,18 +162,18 @@ def demo_command(  # noqa: PLR0913  # each option is an argument
     yes: Yes = False,
     json: Json = False,
 ) -> None:
-    """Run the whole system with simulated hardware, and block its way.
+    """Run the system with simulated hardware; block the robot's path.
 
-    Exit code 0 only if the goal was reached without touching anything, by a way that avoids the blocked area; 1 if it
-    was not, or was interrupted (the report says which); 2 if what was asked for can't be used.
+    The exit code is 0 if the robot reached the goal without contact and avoided the blocked area; 1 if it did not, or
+    the demo was interrupted (see the report); 2 if an option or file can't be used.
     """
-    from fog_runtime.site import SiteError, load_site  # noqa: PLC0415  # the other commands need not wait for imports
+    from fog_runtime.site import SiteError, load_site  # noqa: PLC0415  # keeps the other commands fast
     from fognav.demo.command import run_demo  # noqa: PLC0415  # same
     from fognav.demo.options import Options  # noqa: PLC0415  # same
 
     try:
         folder = checkout.site_folder(site)
-        load_site(folder)  # what can't be used is refused before anything is installed or compiled for it
+        load_site(folder)  # a site that can't be used is refused before anything is installed or compiled
         for file in (report, record):
             check_writable(file)
     except (WrongUseError, SiteError) as error:
@@ -191,7 +189,7 @@ def demo_command(  # noqa: PLR0913  # each option is an argument
         record=record,
     )
     try:
-        values = asyncio.run(run_demo(folder, options, headless=headless, page_port=page_port, say=_say))
+        values = asyncio.run(run_demo(folder, options, headless=headless, page_port=page_port, print_line=_print_line))
         if report is not None:
             write_report(report, values)
     except WrongUseError as error:
@@ -201,8 +199,8 @@ def demo_command(  # noqa: PLR0913  # each option is an argument
     raise typer.Exit(OK if values["success"] else NOT_TRUE)
 
 
-Broker = Annotated[str, typer.Option("--mqtt", metavar="URL", help="The broker.")]
-Router = Annotated[str, typer.Option("--zenoh", metavar="ENDPOINT", help="The zenoh router.")]
+Broker = Annotated[str, typer.Option("--mqtt", metavar="URL", help="MQTT broker.")]
+Router = Annotated[str, typer.Option("--zenoh", metavar="ENDPOINT", help="zenoh router.")]
 SiteId = Annotated[str, typer.Option("--site", metavar="ID", help="Id of the site, the second part of every key.")]
 
 
@@ -213,46 +211,46 @@ def record_command(
     mqtt: Broker = "mqtt://127.0.0.1:1883",
     zenoh: Router = "tcp/127.0.0.1:7447",
     site: SiteId = "estig",
-    seconds: Annotated[float, typer.Option("--seconds", min=0.0, help="How long; 0: until Ctrl-C.")] = 0.0,
+    seconds: Annotated[float, typer.Option("--seconds", min=0.0, help="Duration; 0: until Ctrl-C.")] = 0.0,
     json: Json = False,
 ) -> None:
     """Record every channel of a running system to an MCAP file.
 
-    Foxglove opens such files, and fognav replay sends them again.
+    Foxglove opens such files; fognav replay publishes their messages again.
     """
-    from fog_runtime import logs  # noqa: PLC0415  # the other commands need not wait for its imports
+    from fog_runtime import logs  # noqa: PLC0415  # keeps the other commands fast
     from fognav import recording  # noqa: PLC0415  # same
 
     logs.configure("record", "error", "text")
     try:
         check_writable(file)
-        made = asyncio.run(recording.record(file, mqtt_url=mqtt, zenoh_endpoint=zenoh, site=site, seconds=seconds))
+        recorded = asyncio.run(recording.record(file, mqtt_url=mqtt, zenoh_endpoint=zenoh, site=site, seconds=seconds))
     except WrongUseError as error:
         _fail(str(error), WRONG_USE)
     if json:
-        print_json(made)
+        print_json(recorded)
     else:
-        _say(f"wrote {file}: {made['seconds']} s, {made['messages']}")
+        _print_line(f"wrote {file}: {recorded['seconds']} s, {recorded['messages']}")
 
 
 @app.command("replay", epilog="Example: fognav replay drive.mcap --speed 2")
 def replay_command(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="MCAP file that was recorded.")],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="MCAP file of a recording.")],
     *,
     mqtt: Broker = "mqtt://127.0.0.1:1883",
     zenoh: Router = "tcp/127.0.0.1:7447",
     site: SiteId = "estig",
-    speed: Annotated[float, typer.Option("--speed", min=0.1, max=50.0, help="How many times as fast.")] = 1.0,
+    speed: Annotated[float, typer.Option("--speed", min=0.1, max=50.0, help="Speed factor.")] = 1.0,
     json: Json = False,
 ) -> None:
-    """Send a recording's messages again, at their times.
+    """Publish a recording's messages again, with their timing.
 
-    They go to a broker and a router; services that listen there take them for the real thing.
+    They go to a broker and a router; services connected there process them like live messages.
     """
-    from fog_runtime import logs  # noqa: PLC0415  # the other commands need not wait for its imports
+    from fog_runtime import logs  # noqa: PLC0415  # keeps the other commands fast
     from fognav import recording  # noqa: PLC0415  # same
 
-    logs.configure("replay", "error", "text")  # what went wrong is told by the command itself
+    logs.configure("replay", "error", "text")  # the command itself reports errors
     try:
         sent = asyncio.run(recording.play(file, mqtt_url=mqtt, zenoh_endpoint=zenoh, site=site, speed=speed))
     except WrongUseError as error:
@@ -260,8 +258,10 @@ def replay_command(
     if json:
         print_json(sent)
     else:
-        lost = f"; its end is missing: {sent['bytes_lost']} bytes are no whole record" if sent["bytes_lost"] else ""
-        _say(f"sent {sent['sent']} messages of {file}{lost}")
+        lost = (
+            f"; the file is cut off: {sent['bytes_lost']} bytes at its end are incomplete" if sent["bytes_lost"] else ""
+        )
+        _print_line(f"published {sent['sent']} messages of {file}{lost}")
 
 
 @site_app.command(
@@ -269,19 +269,19 @@ def replay_command(
 )
 def site_new(
     *,
-    map_file: Annotated[Path, typer.Option("--map", metavar="MAP.yaml", help="map_server YAML; it stays where it is.")],
-    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to make; it must not hold a site yet.")],
-    seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Another seed proposes other places.")] = 1,
+    map_file: Annotated[Path, typer.Option("--map", metavar="MAP.yaml", help="map_server YAML; it is not copied.")],
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to create, without a site in it.")],
+    seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Each seed proposes other places.")] = 1,
     json: Json = False,
 ) -> None:
     """Propose a site on any map_server map, ready for a demo.
 
-    Writes DIR/site.toml, commented, as a starting point: places, a robot and watched areas.
+    This writes a commented DIR/site.toml with places, a robot and watched areas, as a starting point.
     """
-    from fognav.site_command import new_site  # noqa: PLC0415  # the other commands need not wait for its imports
+    from fognav.site_command import new_site  # noqa: PLC0415  # keeps the other commands fast
 
     try:
-        kernels.make_warm(_say)
+        kernels.warm_cache(_print_line)
         made = new_site(map_file, out, seed)
     except WrongUseError as error:
         _fail(str(error), WRONG_USE)
@@ -290,7 +290,7 @@ def site_new(
     if json:
         print_json(made)
     else:
-        _say(f"wrote {made['file']}: {made['areas']} watched areas. Try it: fognav demo --site {out}")
+        _print_line(f"wrote {made['file']}: {made['areas']} watched areas. Try it: fognav demo --site {out}")
 
 
 @site_app.command("check", epilog="Example: fognav site check sites/estig")
@@ -299,8 +299,8 @@ def site_check(
     *,
     json: Json = False,
 ) -> None:
-    """Check a site: map, ids, and that everything lies on free floor."""
-    from fognav.site_command import check_site  # noqa: PLC0415  # same
+    """Check a site: map, ids, and that everything is on free floor."""
+    from fognav.site_command import check_site  # noqa: PLC0415  # keeps the other commands fast
 
     try:
         found = check_site(checkout.site_folder(folder))
@@ -309,7 +309,7 @@ def site_check(
     if json:
         print_json(found)
     elif found["ok"]:
-        _say(f"{folder}: all is well ({found['areas']} areas, {found['nodes']} nodes, {found['places']} places)")
+        _print_line(f"{folder}: ok ({found['areas']} areas, {found['nodes']} nodes, {found['places']} places)")
     else:
         _fail(str(found["problem"]))
     raise typer.Exit(OK if found["ok"] else NOT_TRUE)
@@ -318,7 +318,7 @@ def site_check(
 def main() -> None:
     """Run the command."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
-    # Whoever started it by `python -m` or by the launcher reads the one name that all documents use.
+    # Help texts show the documented name, also when started by `python -m` or by the launcher.
     app(prog_name="fognav")
 
 

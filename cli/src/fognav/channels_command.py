@@ -1,4 +1,4 @@
-"""`fognav channels`: print what the channel table generates, or bring the files of the checkout up to date."""
+"""`fognav channels`: print what the channel table generates, or update the generated files of the checkout."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ def channels_command(
         Literal["markdown", "acl", "header"], typer.Option("--format", help="What to print.")
     ] = "markdown",
     broker: Annotated[
-        Literal["mqtt", "zenoh"] | None, typer.Option("--broker", help="Of acl: only this one's list.")
+        Literal["mqtt", "zenoh"] | None, typer.Option("--broker", help="For acl: only this broker's list.")
     ] = None,
     site: Annotated[
         Path | None,
-        typer.Option("--site", metavar="D", help="Of acl: for this site only, its robots known by their ids."),
+        typer.Option("--site", metavar="D", help="For acl: only this site, its robots listed by id."),
     ] = None,
-    write: Annotated[bool, typer.Option("--write", help="Write all generated files of the checkout instead.")] = False,
-    check: Annotated[bool, typer.Option("--check", help="Say which generated files are stale instead.")] = False,
+    write: Annotated[bool, typer.Option("--write", help="Write all generated files of the checkout.")] = False,
+    check: Annotated[bool, typer.Option("--check", help="List the generated files that are out of date.")] = False,
 ) -> None:
     """Print what the channel table generates.
 
-    That is its document with all messages and routes, the brokers' access control lists, and the firmware's header.
+    This is the document of all messages and routes, the brokers' access control lists, or the firmware's header.
     """
     try:
         _run(format, broker, site, write=write, check=check)
@@ -38,12 +38,12 @@ def channels_command(
 
 
 def _run(format: str, broker: str | None, site: Path | None, *, write: bool, check: bool) -> None:  # noqa: A002  # same
-    from fog_contracts.generate.header import firmware_header  # noqa: PLC0415  # the others need not wait for it
+    from fog_contracts.generate.header import firmware_header  # noqa: PLC0415  # keeps the other commands fast
     from fog_runtime.site import SiteError  # noqa: PLC0415  # same
     from fognav import generated  # noqa: PLC0415  # same
 
     if format != "acl" and (broker or site):
-        raise WrongUseError(f"--broker and --site belong to --format acl, not to {format}")
+        raise WrongUseError(f"--broker and --site apply only to --format acl, not to {format}")
     if write:
         names = generated.write(checkout.root())
         console.print(f"wrote {', '.join(names)}" if names else "all generated files are up to date", markup=False)

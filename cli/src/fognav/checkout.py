@@ -1,4 +1,4 @@
-"""Where the checkout is: sites and tests live there, not in an installed package."""
+"""Finds the checkout: sites and tests are there, not in an installed package."""
 
 from functools import cache
 from pathlib import Path
@@ -8,15 +8,15 @@ from fognav.output import WrongUseError
 
 @cache
 def root() -> Path:
-    """Return the checkout's folder; raises `WrongUseError` when this package was installed without one."""
+    """Return the checkout's folder; raises `WrongUseError` if this package was installed without one."""
     for folder in Path(__file__).resolve().parents:
         if (folder / "fognav").is_file() and (folder / "requirements").is_dir():
             return folder
-    raise WrongUseError("this command works in a checkout of Fognav only: clone the repository and run ./fognav there")
+    raise WrongUseError("this command works only in a checkout of Fognav: clone the repository and run ./fognav there")
 
 
 def site_folder(name: Path | None) -> Path:
-    """Return the folder of a site: a folder as given, or the name of one in `sites/`; `estig` when none is named."""
+    """Return the folder of a site: `name` is a folder or the name of one in `sites/`; None means `estig`."""
     if name is None:
         return root() / "sites" / "estig"
     if (name / "site.toml").is_file():
@@ -24,9 +24,9 @@ def site_folder(name: Path | None) -> Path:
     if len(name.parts) == 1 and (root() / "sites" / name / "site.toml").is_file():
         return root() / "sites" / name
     if name.is_file():
-        raise WrongUseError(f"{name} is a file, and a site is a folder with site.toml and a map: name its folder")
+        raise WrongUseError(f"{name} is a file, but a site is a folder with site.toml and a map: name its folder")
     known = ", ".join(sorted(file.parent.name for file in (root() / "sites").glob("*/site.toml")))
     raise WrongUseError(
-        f"{name} is no site: there is no {name / 'site.toml'}. Use one of sites/ ({known}), "
-        "or make one with: fognav site new --map MAP.yaml --out DIR"
+        f"{name} is not a site: there is no {name / 'site.toml'}. Use one of sites/ ({known}), "
+        "or create one with: fognav site new --map MAP.yaml --out DIR"
     )

@@ -1,6 +1,6 @@
-"""What must hold of the code without running it: format, lint, types, import contracts, dead code, generated files.
+"""The static checks: format, lint, types, import contracts, dead code, generated files.
 
-Each check is a program that ends with 0 when it holds. All of them run, as many at once as there are cores.
+Each check is a program whose exit code is 0 if it passes. All of them run, as many at once as there are cores.
 """
 
 import asyncio
@@ -15,7 +15,7 @@ from typing import Final
 
 @dataclass(frozen=True)
 class Check:
-    """A check: its name, the program and its arguments, and what a person does about a failure."""
+    """A check: its name, the program and its arguments, and the remedy for a failure."""
 
     name: str
     command: tuple[str, ...]
@@ -24,7 +24,7 @@ class Check:
 
 @dataclass(frozen=True)
 class CheckResult:
-    """How a check went, how long it took, and all that it printed."""
+    """The result of a check, its duration and its output."""
 
     check: Check
     ok: bool
@@ -34,13 +34,13 @@ class CheckResult:
 
 _TOOLS: Final = Path(sys.executable).parent
 CHECKS: Final = (
-    # The longest first: the others fit in beside it.
-    Check("types", (str(_TOOLS / "mypy"),), "correct the types that it names"),
+    # The longest first: the others run beside it.
+    Check("types", (str(_TOOLS / "mypy"),), "correct the types listed above"),
     Check("import contracts", (str(_TOOLS / "lint-imports"),), "import inwards only: [tool.importlinter]"),
-    Check("lint", (str(_TOOLS / "ruff"), "check", "."), "ruff check --fix . mends what can be mended by itself"),
+    Check("lint", (str(_TOOLS / "ruff"), "check", "."), "ruff check --fix . applies the automatic corrections"),
     Check("format", (str(_TOOLS / "ruff"), "format", "--check", "."), "ruff format ."),
     Check(
-        "dead code", (str(_TOOLS / "vulture"),), "remove it, or name it with its reason in .ci/dead-code-allowlist.py"
+        "dead code", (str(_TOOLS / "vulture"),), "remove it, or list it with its reason in .ci/dead-code-allowlist.py"
     ),
     Check(
         "generated files: servers",
@@ -56,7 +56,7 @@ CHECKS: Final = (
 
 
 async def _run(check: Check, folder: Path, environment: Mapping[str, str]) -> CheckResult:
-    begun = time.monotonic()
+    started = time.monotonic()
     try:
         process = await asyncio.create_subprocess_exec(
             *check.command,
@@ -67,11 +67,11 @@ async def _run(check: Check, folder: Path, environment: Mapping[str, str]) -> Ch
             stderr=asyncio.subprocess.STDOUT,
         )
     except OSError as error:
-        said = f"{check.command[0]} can't be started: {error.strerror}"
-        return CheckResult(check, ok=False, seconds=time.monotonic() - begun, output=said)
+        message = f"{check.command[0]} can't be started: {error.strerror}"
+        return CheckResult(check, ok=False, seconds=time.monotonic() - started, output=message)
     output, _ = await process.communicate()
     ok = process.returncode == 0
-    return CheckResult(check, ok, time.monotonic() - begun, output.decode("utf-8", "replace").strip())
+    return CheckResult(check, ok, time.monotonic() - started, output.decode("utf-8", "replace").strip())
 
 
 async def run_checks(
@@ -79,15 +79,15 @@ async def run_checks(
 ) -> list[CheckResult]:
     """Run all checks in `folder`, as many at once as there are `cores`; return them in their order.
 
-    `on_result` is called as each ends. None stops another.
+    `on_result` is called when each ends. A failure does not stop the others.
     """
-    places = asyncio.Semaphore(cores or os.cpu_count() or 1)
+    slots = asyncio.Semaphore(cores or os.cpu_count() or 1)
     environment = {**os.environ, "NO_COLOR": "1"}
 
-    async def one(check: Check) -> CheckResult:
-        async with places:
+    async def run_one(check: Check) -> CheckResult:
+        async with slots:
             result = await _run(check, folder, environment)
         on_result(result)
         return result
 
-    return list(await asyncio.gather(*(one(check) for check in checks)))
+    return list(await asyncio.gather(*(run_one(check) for check in checks)))

@@ -1,6 +1,6 @@
-"""The files that the channel table generates, each with its place in the checkout; the REST routes are the services'.
+"""The files that the channel table generates, each with its path in the checkout; the REST routes come from OpenAPI.
 
-The services' apps are built over no service at all: describing their routes calls none of them.
+The services' apps are created without a service behind them: describing the routes calls no service.
 """
 
 from collections.abc import Callable, Mapping
@@ -18,28 +18,28 @@ from fog_runtime.site import load_site
 from fognav import checkout
 
 WRITE: Final = "./fognav channels --write"
-"""What brings all generated files up to date."""
+"""The command that updates all generated files."""
 
 
 def rest_routes() -> dict[str, OpenApi]:
     """Return each service's OpenAPI description by the service's name."""
-    # The services bring kernels and web frameworks with them: only who asks for the routes waits for these.
+    # The services import kernels and web frameworks, which takes time: only this function needs them.
     from hazard_aggregator.api import make_api as make_aggregator  # noqa: PLC0415  # see above
     from map_service.api import make_api as make_map  # noqa: PLC0415  # same
     from planner.api import make_api as make_planner  # noqa: PLC0415  # same
 
     loaded = load_site(checkout.site_folder(None))
     clock, health, tokens = SystemClock(), Health(), Tokens()
-    nothing: Any = _NoService()
+    unused: Any = _UnusedService()
     return {
-        "hazard-aggregator": make_aggregator(nothing, loaded.map.geometry, clock, health, tokens).openapi(),
-        "map-service": make_map(nothing, loaded.site, clock, health, tokens).openapi(),
-        "planner": make_planner(nothing, loaded.site, health, tokens).openapi(),
+        "hazard-aggregator": make_aggregator(unused, loaded.map.geometry, clock, health, tokens).openapi(),
+        "map-service": make_map(unused, loaded.site, clock, health, tokens).openapi(),
+        "planner": make_planner(unused, loaded.site, health, tokens).openapi(),
     }
 
 
-class _NoService:
-    """Stands where a service would: an app may look into it when it is built, but nothing is ever called."""
+class _UnusedService:
+    """A placeholder for a service: an app may read its attributes on creation, but never calls it."""
 
     def __getattr__(self, name: str) -> Self:
         return self
@@ -56,13 +56,13 @@ FILES: Final[Mapping[str, Callable[[], str]]] = {
     "deploy/zenoh/acl.json5": zenoh_acl,
     "firmware/include/fognav_contract.h": firmware_header,
 }
-"""What generates each file, by its path in the checkout."""
+"""The generator of each file, by its path in the checkout."""
 
 
 def acls(folder: Path | None) -> tuple[str, str]:
-    """Return the lists of the MQTT broker and of the zenoh router: for the site in `folder` only, or for any.
+    """Return the access lists of the MQTT broker and of the zenoh router, for the site in `folder` or for any site.
 
-    Those of a site know its robots by their ids. Raises `SiteError`.
+    Those of a site list its robots by id. Raises `SiteError`.
     """
     if folder is None:
         return mqtt_acl(), zenoh_acl()
@@ -71,21 +71,21 @@ def acls(folder: Path | None) -> tuple[str, str]:
 
 
 def stale(folder: Path) -> list[str]:
-    """Return which of the files in a checkout are not what would be generated now, or are missing."""
-    return [name for name, make in FILES.items() if not _is(folder / name, make())]
+    """Return the names of the files in a checkout that are out of date or missing."""
+    return [name for name, make in FILES.items() if not _is_current(folder / name, make())]
 
 
 def write(folder: Path) -> list[str]:
-    """Write the files that are stale in a checkout; return their names."""
+    """Write the files in a checkout that are out of date or missing; return their names."""
     written = []
     for name, make in FILES.items():
         text = make()
-        if not _is(folder / name, text):
+        if not _is_current(folder / name, text):
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).write_text(text, "utf-8")
             written.append(name)
     return written
 
 
-def _is(file: Path, text: str) -> bool:
+def _is_current(file: Path, text: str) -> bool:
     return file.is_file() and file.read_text("utf-8") == text

@@ -1,4 +1,4 @@
-"""The compiled kernels' cache: whether it is warm, and warming it, in a process of its own."""
+"""The cache of compiled kernels: checks whether it is complete, and fills it in a process of its own."""
 
 import contextlib
 import importlib.util
@@ -20,11 +20,11 @@ _PROGRESS: Final = re.compile(r"(\d+) of (\d+) kernels ready: (.*)")
 
 
 class KernelsError(RuntimeError):
-    """The kernels could not be compiled; the message holds what the compiler said."""
+    """The kernels could not be compiled; the message contains the compiler's output."""
 
 
 def _stale(folder: Path) -> list[str]:
-    """Return the kernel modules that have no cache index as young as their source, in the folder of the package."""
+    """Return the kernel modules in the package's folder whose cache index is missing or older than their source."""
     sources = [path for path in folder.glob("*.py") if _COMPILES.search(path.read_text("utf-8"))]
     indices = list((folder / "__pycache__").glob("*.nbi"))
     return sorted(
@@ -38,18 +38,18 @@ def _stale(folder: Path) -> list[str]:
 
 
 def is_warm() -> bool:
-    """Whether every kernel module lies compiled beside the sources; a look, which compiles and imports nothing."""
+    """Whether every kernel module is compiled and cached; this check compiles and imports nothing."""
     spec = importlib.util.find_spec("fog_kernels")
     return spec is not None and spec.origin is not None and not _stale(Path(spec.origin).parent)
 
 
-def make_warm(say: Callable[[str], None]) -> None:
-    """Compile what is missing, for this CPU, and show how far it is; raises `KernelsError`."""
+def warm_cache(print_line: Callable[[str], None]) -> None:
+    """Compile the missing kernels for this CPU, showing the progress; raises `KernelsError`."""
     if is_warm():
         _run(lambda _line: None)
     else:
-        say("compiling the kernels (once, about a minute)")
-        with _showing(say) as show:
+        print_line("compiling the kernels (once, about a minute)")
+        with _progress_display(print_line) as show:
             _run(show)
 
 
@@ -61,24 +61,24 @@ def _run(on_line: Callable[[str], None]) -> None:
         stderr=subprocess.STDOUT,
         text=True,
     )
-    overdue = threading.Timer(_WARM_TIMEOUT_S, process.kill)
-    overdue.start()
-    said: list[str] = []
+    timeout = threading.Timer(_WARM_TIMEOUT_S, process.kill)
+    timeout.start()
+    output: list[str] = []
     with process:
         assert process.stdout is not None
         for line in process.stdout:
-            said.append(line)
+            output.append(line)
             on_line(line)
-    overdue.cancel()
+    timeout.cancel()
     if process.returncode != 0:
-        raise KernelsError(f"the kernels could not be compiled:\n{''.join(said).strip()[-2000:]}")
+        raise KernelsError(f"the kernels could not be compiled:\n{''.join(output).strip()[-2000:]}")
 
 
 @contextlib.contextmanager
-def _showing(say: Callable[[str], None]) -> Iterator[Callable[[str], None]]:
-    """Give what shows a line of progress: a bar on a terminal, and otherwise the line itself."""
+def _progress_display(print_line: Callable[[str], None]) -> Iterator[Callable[[str], None]]:
+    """Yield a function that shows a line of progress: as a bar on a terminal, otherwise as the line itself."""
     if not console.is_terminal:
-        yield lambda line: say(line.strip())
+        yield lambda line: print_line(line.strip())
         return
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
     with Progress(*columns, console=console, transient=True) as progress:

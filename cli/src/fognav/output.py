@@ -1,4 +1,4 @@
-"""What the command says: people read standard error, machines read one JSON object on standard output."""
+"""Output of the command: text for people on standard error, one JSON object for scripts on standard output."""
 
 import json
 import os
@@ -12,38 +12,38 @@ from rich.console import Console
 from fognav import __version__
 
 SCHEMA: Final = 1
-"""Version of the JSON objects' keys; grows when a key changes its meaning or goes."""
+"""Version of the JSON objects; incremented when a key changes its meaning or is removed."""
 
 OK: Final = 0
 NOT_TRUE: Final = 1
-"""The thing that was asked for did not come true."""
+"""The command worked, but its result is negative: a failed check or drive."""
 WRONG_USE: Final = 2
 
 console = Console(stderr=True, highlight=False, width=None if sys.stderr.isatty() else 200)
 
 
 class WrongUseError(ValueError):
-    """The command was called with something that can't be used; the message names it, and the remedy."""
+    """An option, argument or file can't be used; the message names it and the remedy."""
 
 
 def envelope(values: Mapping[str, object]) -> dict[str, object]:
-    """Return the values with what every JSON object of this command carries."""
+    """Return the values with the keys that every JSON object of this command has."""
     return {"schema": SCHEMA, "fognav": __version__, **values}
 
 
 def to_json(values: Mapping[str, object]) -> str:
-    """Spell an object as indented JSON with its envelope; NaN and infinity are refused, for JSON has none."""
+    """Encode an object as indented JSON with its envelope; raises `ValueError` for NaN and infinity."""
     return json.dumps(envelope(values), indent=2, ensure_ascii=False, allow_nan=False)
 
 
 def print_json(values: Mapping[str, object]) -> None:
-    """Write the one object of this command to standard output."""
+    """Write the JSON object of this command to standard output."""
     sys.stdout.write(to_json(values) + "\n")
     sys.stdout.flush()
 
 
 def write_report(path: Path, values: Mapping[str, object]) -> None:
-    """Write the object to a file; raises `WrongUseError` when the file can't be written."""
+    """Write the JSON object to a file; raises `WrongUseError` if the file can't be written."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(to_json(values) + "\n", encoding="utf-8")
@@ -52,10 +52,12 @@ def write_report(path: Path, values: Mapping[str, object]) -> None:
 
 
 def check_writable(path: Path | None) -> None:
-    """Refuse a file that can't be written before the work whose outcome it is to hold; None is no file."""
+    """Raise `WrongUseError` if a file can't be written, before the work whose result it shall hold; None is allowed."""
     if path is None:
         return
     if not path.parent.is_dir():
-        raise WrongUseError(f"{path} can't be written: there is no folder {path.parent}. Make it, or name another file")
+        raise WrongUseError(
+            f"{path} can't be written: there is no folder {path.parent}. Create it or name another file"
+        )
     if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
         raise WrongUseError(f"{path} can't be written: it is a folder, or you may not write there. Name another file")

@@ -1,6 +1,6 @@
-"""A pytest plugin: a progress bar on a terminal instead of dots, and at the end what was skipped and how to get it.
+"""A pytest plugin: a progress bar on a terminal instead of dots, and at the end a summary of the skipped tests.
 
-`fognav test` loads it; with pytest-xdist it runs in the process that hands out the tests.
+`fognav test` loads it; with pytest-xdist it runs in the process that distributes the tests.
 """
 
 from collections import Counter
@@ -8,7 +8,7 @@ from collections.abc import Generator
 from typing import Final
 
 import pytest
-from _pytest.terminal import TerminalReporter  # pytest gives its reporter's type no public name
+from _pytest.terminal import TerminalReporter  # pytest has no public name for it
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -17,7 +17,7 @@ _SKIPPED: Final = "Skipped: "
 
 
 class ProgressBar:
-    """Counts the tests that have ended; failures are named when they happen."""
+    """Counts the tests that have ended, and prints failures at once."""
 
     def __init__(self, console: Console) -> None:
         self._progress = Progress(
@@ -33,24 +33,24 @@ class ProgressBar:
         self._failed = 0
 
     def pytest_collection_finish(self, session: pytest.Session) -> None:
-        """Count the tests, when one process runs them all."""
-        # The process that hands tests out to others collects none itself.
+        """Set the number of tests if one process runs them all."""
+        # The process that distributes tests to others collects none itself.
         if session.items:
             self._progress.update(self._task, total=len(session.items))
 
     @pytest.hookimpl(optionalhook=True)
     def pytest_xdist_node_collection_finished(self, ids: list[str]) -> None:
-        """Count the tests, when several processes run them; each has collected them all."""
+        """Set the number of tests if several processes run them; each has collected all of them."""
         self._progress.update(self._task, total=len(ids))
 
     def pytest_runtest_logstart(self) -> None:
-        """Show the bar when the first test begins: pytest writes its own lines until then."""
+        """Show the bar at the first test: before that pytest prints its own lines."""
         if not self._running:
             self._running = True
             self._progress.start()
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
-        """Count a test when all of it is over."""
+        """Count a test after its teardown."""
         if report.failed:
             self._failed += 1
             self._progress.update(self._task, description=f"tests, [red]{self._failed} failed[/]")
@@ -60,18 +60,18 @@ class ProgressBar:
 
     @pytest.hookimpl(wrapper=True)
     def pytest_report_teststatus(self) -> Generator[None, tuple[str, object, object], tuple[str, str, str]]:
-        """Keep the outcome's category, and let nothing be written for a single test."""
+        """Keep the outcome's category, but print nothing for a single test."""
         category, _, _ = yield
         return category, "", ""
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_sessionfinish(self) -> None:
-        """Remove the bar before pytest writes its summary."""
+        """Remove the bar before pytest prints its summary."""
         self._progress.stop()
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Show the bar where it can be seen: on a terminal, unless details are asked for."""
+    """Use the bar on a terminal, unless verbose or uncaptured output is requested."""
     console = Console(stderr=True)
     worker = hasattr(config, "workerinput")
     if console.is_terminal and not worker and config.get_verbosity() == 0 and config.getoption("capture") != "no":
@@ -79,7 +79,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_terminal_summary(terminalreporter: TerminalReporter) -> None:
-    """Tell once for each reason how many tests were skipped for it; reasons say how to get them."""
+    """Print for each reason how many tests were skipped; reasons include the remedy."""
     reasons: Counter[str] = Counter()
     for report in terminalreporter.stats.get("skipped", []):
         reason = report.longrepr[2] if isinstance(report.longrepr, tuple) else str(report.longrepr)

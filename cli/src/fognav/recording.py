@@ -1,4 +1,4 @@
-"""`fognav record` and `fognav replay`: the channels of a running system to an MCAP file, and back."""
+"""`fognav record` and `fognav replay`: channels of a running system to an MCAP file, and back."""
 
 import asyncio
 import contextlib
@@ -25,9 +25,9 @@ _POLL_S: Final = 0.05
 async def recording(
     path: Path, *, mqtt_url: str, zenoh: ZenohEdge, clock: Clock, numbers: Sequence[int] = ()
 ) -> AsyncIterator[None]:
-    """Record every channel beside the body, which begins when the broker is heard.
+    """Record every channel while the context is open, which begins when the broker is connected.
 
-    Raises `WrongUseError` when the file can't be written or the broker can't be reached.
+    Raises `WrongUseError` if the file can't be written or the broker can't be reached.
     """
     mqtt = _mqtt(mqtt_url, "fognav-record", clock, zenoh.site)
     try:
@@ -38,7 +38,7 @@ async def recording(
         record_all(mqtt, zenoh, recorder, clock, numbers=numbers)
         task = asyncio.create_task(mqtt.run())
         try:
-            await _connected(mqtt, mqtt_url)
+            await _wait_for_broker(mqtt, mqtt_url)
             yield
         finally:
             task.cancel()
@@ -46,14 +46,14 @@ async def recording(
 
 
 async def record(path: Path, *, mqtt_url: str, zenoh_endpoint: str, site: str, seconds: float) -> dict[str, object]:
-    """Record for a time (0: until a signal); return what was recorded, by channel.
+    """Record for some seconds (0: until a signal); return a summary of the recording.
 
-    Raises `WrongUseError` without broker or router, and then leaves a file that was there before as it is.
+    Raises `WrongUseError` without broker or router; an existing file then stays unchanged.
     """
     clock = SystemClock()
     opened = ZenohEdge.open(connect=[zenoh_endpoint], clock=clock, role="console", id="record", site=site)
     async with opened as zenoh:
-        await _look(zenoh, zenoh_endpoint, mqtt_url, clock)
+        await _check_reachable(zenoh, zenoh_endpoint, mqtt_url, clock)
         stop = asyncio.Event()
         for number in _SIGNALS:
             asyncio.get_running_loop().add_signal_handler(number, stop.set)
@@ -64,7 +64,7 @@ async def record(path: Path, *, mqtt_url: str, zenoh_endpoint: str, site: str, s
 
 
 def summary(path: Path) -> dict[str, object]:
-    """Return what a recording holds, and what it lost at its end; raises `WrongUseError` for a file that is none."""
+    """Return a recording's message counts, duration and bytes lost at its end; raises `WrongUseError`."""
     counts: dict[str, int] = {}
     first = last = 0
     try:
@@ -74,7 +74,7 @@ def summary(path: Path) -> dict[str, object]:
             last = time_ns
         lost = bytes_lost(path)
     except OSError as error:
-        raise WrongUseError(f"{path} can't be read: {error.strerror}. Name a file that was recorded") from error
+        raise WrongUseError(f"{path} can't be read: {error.strerror}. Name the file of a recording") from error
     except RecordError as error:
         raise WrongUseError(f"{error}. Name a file that fognav recorded") from error
     return {
@@ -86,19 +86,19 @@ def summary(path: Path) -> dict[str, object]:
 
 
 async def play(path: Path, *, mqtt_url: str, zenoh_endpoint: str, site: str, speed: float) -> dict[str, object]:
-    """Send a recording's messages at their times; return how many.
+    """Publish a recording's messages with their timing; return how many.
 
-    Raises `WrongUseError` for a file that is no recording or an empty one, before anything is sent, and without broker
-    or router.
+    Raises `WrongUseError` without broker or router, and for a file that is not a recording or empty, before anything is
+    published.
     """
-    held = summary(path)
-    if not held["messages"]:
-        raise WrongUseError(f"{path} holds no whole message: there is nothing to send. Record it anew")
+    contents = summary(path)
+    if not contents["messages"]:
+        raise WrongUseError(f"{path} contains no complete message. Record it again")
     clock = SystemClock(speed)
     mqtt = _mqtt(mqtt_url, "fognav-replay", clock, site)
     opened = ZenohEdge.open(connect=[zenoh_endpoint], clock=clock, role="console", id="replay", site=site)
     async with opened as zenoh:
-        await _router(zenoh, zenoh_endpoint)
+        await _wait_for_router(zenoh, zenoh_endpoint)
 
         async def send(channel: Channel, ids: dict[str, str], message: Message | str) -> None:
             if channel.transport == "mqtt":
@@ -108,8 +108,8 @@ async def play(path: Path, *, mqtt_url: str, zenoh_endpoint: str, site: str, spe
 
         task = asyncio.create_task(mqtt.run())
         try:
-            await _connected(mqtt, mqtt_url)
-            return {"file": str(path), "sent": await replay(path, clock, send), "bytes_lost": held["bytes_lost"]}
+            await _wait_for_broker(mqtt, mqtt_url)
+            return {"file": str(path), "sent": await replay(path, clock, send), "bytes_lost": contents["bytes_lost"]}
         finally:
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)
@@ -119,22 +119,22 @@ def _mqtt(url: str, client: str, clock: Clock, site: str) -> MqttEdge:
     try:
         return MqttEdge(url, client, clock, site=site)
     except ValueError as error:
-        raise WrongUseError(f"{url!r} names no broker ({error}). Correct --mqtt") from error
+        raise WrongUseError(f"{url!r} is not a broker's URL ({error}). Correct --mqtt") from error
 
 
-async def _look(zenoh: ZenohEdge, zenoh_endpoint: str, mqtt_url: str, clock: Clock) -> None:
-    """See whether there is a system, before a file is written over; raises `WrongUseError`."""
-    mqtt = _mqtt(mqtt_url, "fognav-look", clock, zenoh.site)
-    looking = asyncio.create_task(mqtt.run())
+async def _check_reachable(zenoh: ZenohEdge, zenoh_endpoint: str, mqtt_url: str, clock: Clock) -> None:
+    """Check that broker and router can be reached, before a file is overwritten; raises `WrongUseError`."""
+    mqtt = _mqtt(mqtt_url, "fognav-check", clock, zenoh.site)
+    connection = asyncio.create_task(mqtt.run())
     try:
-        await _connected(mqtt, mqtt_url)
+        await _wait_for_broker(mqtt, mqtt_url)
     finally:
-        looking.cancel()
-        await asyncio.gather(looking, return_exceptions=True)
-    await _router(zenoh, zenoh_endpoint)
+        connection.cancel()
+        await asyncio.gather(connection, return_exceptions=True)
+    await _wait_for_router(zenoh, zenoh_endpoint)
 
 
-async def _connected(mqtt: MqttEdge, url: str) -> None:
+async def _wait_for_broker(mqtt: MqttEdge, url: str) -> None:
     try:
         await asyncio.wait_for(mqtt.wait_connected(), _CONNECT_S)
     except TimeoutError as error:
@@ -143,7 +143,7 @@ async def _connected(mqtt: MqttEdge, url: str) -> None:
         ) from error
 
 
-async def _router(zenoh: ZenohEdge, endpoint: str) -> None:
+async def _wait_for_router(zenoh: ZenohEdge, endpoint: str) -> None:
     deadline = time.monotonic() + _CONNECT_S
     while not zenoh.connected:
         if time.monotonic() > deadline:

@@ -1,4 +1,4 @@
-"""`fognav site`: the files around the proposal and the check."""
+"""`fognav site`: reads and writes the files of a proposed or checked site."""
 
 import os
 import re
@@ -13,19 +13,19 @@ _ID_LENGTH = 32
 
 
 def identifier(name: str) -> str:
-    """Return an id made of a name: small letters, digits and hyphens."""
+    """Return an id for a name: lower-case letters, digits and hyphens."""
     plain = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
     return plain[:_ID_LENGTH].strip("-") or "site"
 
 
 def new_site(map_file: Path, out: Path, seed: int) -> dict[str, object]:
-    """Write `out`/site.toml on a map; raises `WrongUseError`, and then writes nothing."""
-    # A check must not wait for the kernels that a proposal needs.
+    """Write `out`/site.toml for a map; raises `WrongUseError`, and then writes nothing."""
+    # Checking a site must not wait for the kernels, which only a proposal needs.
     from fognav.site_proposal import NoSiteError, propose, to_toml  # noqa: PLC0415  # see above
 
     target = out / SITE_FILE
     if target.exists():
-        raise WrongUseError(f"{target} exists already: name another folder with --out, or remove it")
+        raise WrongUseError(f"{target} already exists: name another folder with --out, or remove it")
     try:
         static = load_map(map_file)
         relative = os.path.relpath(map_file.resolve(), out.resolve())
@@ -50,7 +50,7 @@ def new_site(map_file: Path, out: Path, seed: int) -> dict[str, object]:
 
 
 def check_site(folder: Path) -> dict[str, object]:
-    """Return what a site holds, or what is wrong with it."""
+    """Return the contents of a site, or the problem with it."""
     try:
         loaded = load_site(folder)
     except SiteError as error:

@@ -1,6 +1,6 @@
-"""Proposes a site on any map: where to start and end, which corridors to watch, and from where. Pure, seeded.
+"""Proposes a site on any map: start, goal, areas to watch, and sensor nodes. Pure, seeded.
 
-A proposal is a starting point: it knows walls, not what people do between them.
+A proposal is a starting point: it considers walls, not how people use the floor.
 """
 
 import math
@@ -27,15 +27,15 @@ from fognav_sim.scenario import ScenarioError, barrier_across
 
 PLACE_CLEARANCE_M: Final = 0.45
 DRIVE_M: Final = (15.0, 60.0)
-"""Length of a good demonstration: long enough to see a danger coming, short enough to watch."""
+"""Length of the demo's path: long enough for a hazard ahead, short enough to watch."""
 _ENDS_M: Final = (8.0, 3.0)
-"""No area nearer than this to the start and the goal."""
+"""Minimum distances along the path from the start to an area and from an area to the goal."""
 _CORRIDOR_M: Final = (0.9, 4.2)
 _AREA_LENGTH_M: Final = 2.4
 _SONAR_ANGLES: Final = (-0.13, 0.13)
 _HALF_CONE: Final = math.radians(7.5)
 _SONAR_MAX_M: Final = 3.8
-"""A little less than what the sonar specifies (4 m): the far wall must echo reliably."""
+"""A little less than the sonar's specified range (4 m): the opposite wall must echo reliably."""
 _WALL_MARGIN_M: Final = 0.35
 _MOUNT_GAP_M: Final = 0.06
 _NODE_HEIGHT_M: Final = 0.3
@@ -49,12 +49,12 @@ _BARRIERS: Final = 8
 
 
 class NoSiteError(ValueError):
-    """The map offers no floor on which a robot could drive; the message says what was looked for."""
+    """The map has no path that is long enough for a robot; the message gives the criteria."""
 
 
 @dataclass(frozen=True)
 class _Floor:
-    """The map with what the proposal needs of it."""
+    """The map, and the grids that a proposal needs."""
 
     geometry: GridGeometry
     raw: NDArray[np.uint8]
@@ -67,7 +67,7 @@ class _Floor:
         return inflate(raw, table)
 
     def ranges(self, at: Point, angles: NDArray[np.float64], reach: float) -> NDArray[np.float64]:
-        """Return the distance (m) to the nearest wall in each direction, at most `reach`."""
+        """Return the distance (m) to the first wall in each direction, at most `reach`."""
         g = self.geometry
         found = cast(self.walls, g.resolution, g.origin_x, g.origin_y, *at, angles, reach)
         return np.minimum(found, reach)
@@ -75,7 +75,7 @@ class _Floor:
 
 @dataclass(frozen=True)
 class _Drive:
-    """A way with areas on it that can be driven around."""
+    """A path with areas on it that the robot can drive around."""
 
     start: Pose
     goal: Point
@@ -86,20 +86,19 @@ class _Drive:
 def propose(name: str, map_path: str, geometry: GridGeometry, cells: NDArray[np.uint8], seed: int = 1) -> Site:
     """Return a site on the map (`cells`: 0 free, 254 occupied, 255 unknown); raises `NoSiteError`.
 
-    The demo's areas are such that one of them blocked always leaves another way. A map without such places gets a
-    demo without areas.
+    With any one of the demo's areas blocked there is another path. A map without such areas gets a demo without areas.
     """
     floor = _floor(geometry, cells)
     best: _Drive | None = None
-    for drive in _drives(floor, random.Random(seed)):  # noqa: S311  # drawn by a seed, no secret
+    for drive in _drives(floor, random.Random(seed)):  # noqa: S311  # repeatable, not a secret
         if best is None or _rank(drive) > _rank(best):
             best = drive
-        if len(best.areas) >= 2:  # two make a choice
+        if len(best.areas) >= 2:  # enough for the demo to choose from
             break
     if best is None:
         raise NoSiteError(
-            f"no way of {DRIVE_M[0]:.0f} m or more was found between two points with {PLACE_CLEARANCE_M} m around "
-            "them. Check the map's resolution and thresholds"
+            f"no path of {DRIVE_M[0]:.0f} m or more was found between two points with {PLACE_CLEARANCE_M} m of "
+            "clearance. Check the map's resolution and thresholds"
         )
     places = {
         "a": Place(x=best.start.x, y=best.start.y, label="A"),
@@ -123,7 +122,7 @@ def _rank(drive: _Drive) -> tuple[int, float]:
 
 
 def _floor(geometry: GridGeometry, cells: NDArray[np.uint8]) -> _Floor:
-    # What nobody has looked at may be a wall: a proposal keeps away from it.
+    # Unknown cells may be walls: a proposal avoids them.
     raw = np.where(cells == FREE, np.uint8(FREE), np.uint8(LETHAL))
     walls = (raw == LETHAL).astype(np.uint8)
     cap = max(1, math.ceil(2.0 / geometry.resolution))
@@ -164,17 +163,17 @@ def _length(path: list[Point]) -> float:
 def _areas(
     floor: _Floor, planner: Planner, path: list[Point], length: float, start: tuple[int, int], goal: tuple[int, int]
 ) -> list[tuple[AreaSite, NodeSite]]:
-    """Return watched areas along the path, each of which can be driven around when it is blocked."""
+    """Return watched areas along the path, each of which has a detour."""
     found: list[tuple[AreaSite, NodeSite]] = []
     travelled, last, next_at = 0.0, -math.inf, _ENDS_M[0]
-    for here, there in pairwise(path):
-        travelled += math.dist(here, there)
+    for previous, point in pairwise(path):
+        travelled += math.dist(previous, point)
         if travelled < next_at:
             continue
         next_at = travelled + _CANDIDATE_STEP_M
         if travelled > length - _ENDS_M[1] or travelled - last < _AREA_SPACING_M:
             continue
-        candidate = _area_at(floor, there, len(found) + 1)
+        candidate = _area_at(floor, point, len(found) + 1)
         if candidate is None or not _can_be_closed(floor, *candidate):
             continue
         detour = _detour(floor, planner, candidate[0].polygon, start, goal)
@@ -188,7 +187,7 @@ def _areas(
 
 
 def _area_at(floor: _Floor, spot: Point, number: int) -> tuple[AreaSite, NodeSite] | None:
-    """Return an area across the corridor at a spot with a node on its nearer wall, or None when it is no corridor."""
+    """Return an area across the corridor at a spot with a node on its nearer wall, or None if it is not a corridor."""
     headings = np.linspace(0.0, math.pi, _HEADINGS, endpoint=False, dtype=np.float64)
     reach = _CORRIDOR_M[1]
     one, other = floor.ranges(spot, headings, reach), floor.ranges(spot, headings + math.pi, reach)
@@ -200,7 +199,7 @@ def _area_at(floor: _Floor, spot: Point, number: int) -> tuple[AreaSite, NodeSit
     near, far = float(other[narrowest]), float(one[narrowest])
     if near > far:
         across, near, far = across + math.pi, far, near
-    # The same width half an area ahead and behind, or it is a door or a corner.
+    # A different width half an area ahead or behind means a door or a corner.
     dx, dy = math.cos(across), math.sin(across)
     half = _AREA_LENGTH_M / 2
     for side in (-half, half):
@@ -240,7 +239,7 @@ def _area_at(floor: _Floor, spot: Point, number: int) -> tuple[AreaSite, NodeSit
 
 
 def _can_be_closed(floor: _Floor, area: AreaSite, node: NodeSite) -> bool:
-    """Whether a barrier that the node sees fits in, whatever the demo's seed: walls may be too ragged for one."""
+    """Whether a barrier that the node sees fits in for several seeds: walls may be too irregular."""
     alone = Site(id="site", areas=[area], nodes=[node])
     static = StaticMap(floor.geometry, floor.raw)
     try:
@@ -254,7 +253,7 @@ def _can_be_closed(floor: _Floor, area: AreaSite, node: NodeSite) -> bool:
 def _detour(
     floor: _Floor, planner: Planner, polygon: list[Point], start: tuple[int, int], goal: tuple[int, int]
 ) -> float | None:
-    """Return the length (m) of the way around a blocked area, or None when there is none."""
+    """Return the length (m) of the path around a blocked area, or None if there is none."""
     raw = floor.raw.copy()
     window, mask = rasterize(polygon, floor.geometry)
     raw[window.rows, window.columns][mask] = LETHAL
@@ -269,10 +268,10 @@ def _number(value: float) -> str:
 
 
 def to_toml(site: Site) -> str:
-    """Spell a site as a commented `site.toml`."""
+    """Return a site as a commented `site.toml`."""
     lines = [
         "# A site: a map, named places, watched areas with their sensor nodes, robots, and a demonstration.",
-        "# Metres, radians; frame of the map: x right, y up. Check a change with: fognav site check DIR",
+        "# Metres, radians; map frame: x right, y up. After a change run: fognav site check DIR",
         "",
         f'id = "{site.id}"',
         f'name = "{site.name}"',
@@ -286,11 +285,11 @@ def to_toml(site: Site) -> str:
             f'label = "{place.label}"',
             f"x = {_number(place.x)}",
             f"y = {_number(place.y)}",
-            "# theta = 0.0   # without it any heading will do",
+            "# theta = 0.0   # without it any heading is accepted",
             "",
         ]
-    lines.append("# A watched area: `number` is its name on the topics of older nodes; `debounce` (5 readings either")
-    lines.append("# way) and `unknown` (what silence costs) may be added as tables.")
+    lines.append("# A watched area: `number` is its number in the topics of the thesis's nodes. Optional tables:")
+    lines.append("# `debounce` (default: 5 readings for a change) and `unknown` (cost while its nodes are silent).")
     for area in site.areas:
         corners = ", ".join(f"[{_number(x)}, {_number(y)}]" for x, y in area.polygon)
         lines += [
@@ -301,8 +300,8 @@ def to_toml(site: Site) -> str:
             f"polygon = [{corners}]",
             "",
         ]
-    lines.append("# A sensor node on a wall: `range_limit` is the calibrated distance below which an echo means that")
-    lines.append("# something stands there; `no_echo_is_clear` only where no opposite wall is in range.")
+    lines.append("# A sensor node on a wall: `range_limit` is the calibrated distance below which an echo means an")
+    lines.append("# obstacle; set `no_echo_is_clear` only if no opposite wall is in range.")
     for node in site.nodes:
         lines += [
             "[[nodes]]",
@@ -333,8 +332,8 @@ def to_toml(site: Site) -> str:
     if site.demo is not None:
         areas = ", ".join(f'"{area}"' for area in site.demo.areas)
         lines += [
-            "# `fognav demo` drives from start to goal and blocks one of these areas on the way. Without any it drives",
-            "# without a hazard.",
+            "# `fognav demo` drives from start to goal and blocks one of these areas on the path. Without areas there",
+            "# is no hazard.",
             "[demo]",
             f'start = "{site.demo.start}"',
             f'goal = "{site.demo.goal}"',

@@ -33,7 +33,7 @@ SERVICES: Final = (AGGREGATOR, MAP_SERVICE, PLANNER)
 ROBOT: Final = (WATCHDOG, AGENT)
 
 _SOCKET_PATH_LIMIT: Final = 80
-"""Unix socket paths end at 108 bytes; folders this long leave room for the file's name."""
+"""Unix socket paths are limited to 108 bytes; folders up to this length leave room for the file's name."""
 _KEY_BYTES: Final = 32
 
 Ready = Callable[[], Awaitable[str | None]]
@@ -41,10 +41,10 @@ Ready = Callable[[], Awaitable[str | None]]
 
 @dataclass(frozen=True, kw_only=True)
 class StackConfig:
-    """What to run.
+    """Configuration of a stack.
 
-    `robot` is the id of the site's robot, `base` and `lidar` name its hardware; `extra` are further FOGNAV_ settings
-    for every process.
+    `robot` is the id of the site's robot, `base` and `lidar` name its hardware; `extra` contains further FOGNAV_
+    settings for every process.
     """
 
     site_dir: Path
@@ -71,8 +71,8 @@ def _new_folder() -> Path:
 
 
 async def _exists(path: Path) -> str | None:
-    there = await asyncio.to_thread(path.exists)
-    return None if there else f"{path} is not there yet"
+    exists = await asyncio.to_thread(path.exists)
+    return None if exists else f"{path} does not exist yet"
 
 
 def _nothing() -> None:
@@ -80,9 +80,9 @@ def _nothing() -> None:
 
 
 class Stack:
-    """Every process of one demonstration, by name; leaving the context ends them and removes their files.
+    """All processes of one demonstration, by name; leaving the context ends them and removes their files.
 
-    Ports, keys, tokens and files are this run's own, so that several stacks run side by side.
+    Each stack has its own ports, keys, tokens and files, so that several can run side by side.
     """
 
     def __init__(self, config: StackConfig, on_event: Callable[[Event], None] = lambda _: None) -> None:
@@ -121,26 +121,26 @@ class Stack:
         await self.close()
 
     async def start(self, timeout_s: float = 90.0) -> None:
-        """Start everything and wait until each process says that it is ready; raises `NotReadyError`."""
+        """Start everything and wait until each process is ready; raises `NotReadyError`."""
         await self.start_servers(timeout_s)
         await self.start_system(timeout_s)
 
     async def start_servers(self, timeout_s: float = 90.0) -> None:
-        """Start what carries and keeps messages: whoever listens from here on hears all; raises `NotReadyError`."""
+        """Start broker, store and router; whoever subscribes now receives every message. Raises `NotReadyError`."""
         await self._start(SERVERS, SERVERS, timeout_s)
 
     async def start_system(self, timeout_s: float = 90.0) -> None:
-        """Start all else, when the servers are ready; raises `NotReadyError`."""
-        # Before there are nodes and robots the services stand at their beginning: nothing is said that none hears.
+        """Start all other processes, after the servers; raises `NotReadyError`."""
+        # The services must be ready before nodes and robots publish, so that no message is missed.
         await self._start(SERVICES, SERVICES, timeout_s)
-        # The simulator makes the robot's serial ports, so it comes before the robot.
+        # The simulator provides the robot's serial ports, so it starts before the robot.
         await self._start([SIMULATOR], [SIMULATOR], timeout_s)
         await self._start(ROBOT, [WATCHDOG], timeout_s)
 
-    async def _start(self, names: Iterable[str], until_ready: Iterable[str], timeout_s: float) -> None:
+    async def _start(self, names: Iterable[str], wait_for: Iterable[str], timeout_s: float) -> None:
         for name in names:
             self.supervisor.start(name)
-        await self.supervisor.wait_ready(until_ready, timeout_s)
+        await self.supervisor.wait_ready(wait_for, timeout_s)
 
     async def close(self) -> None:
         """End every process and, unless `keep_files`, remove the run's folder."""
@@ -149,19 +149,19 @@ class Stack:
             shutil.rmtree(self.folder, ignore_errors=True)
 
     def log(self, name: str) -> Path:
-        """Where a process logs."""
+        """Return the log file of a process."""
         return self.folder / "logs" / f"{name}.log"
 
     def port_file(self, name: str) -> Path:
-        """Where a process writes the port of its HTTP server."""
+        """Return the file to which a process writes the port of its HTTP server."""
         return self.folder / "ports" / name
 
     def port(self, name: str) -> int | None:
-        """Port of a process's HTTP server, or None while it has none."""
+        """Return the port of a process's HTTP server, or None before it listens."""
         return net.read_port(self.port_file(name))
 
     def pids(self) -> dict[str, int]:
-        """Process ids of all that run."""
+        """Return the process ids of all running processes."""
         found = ((name, self.supervisor.pid(name)) for name in self.supervisor.names)
         return {name: pid for name, pid in found if pid is not None}
 
@@ -245,7 +245,7 @@ class Stack:
         before: Callable[[], None] = _nothing,
         rank: int = 0,
     ) -> None:
-        # Settings of this shell must not leak into a run.
+        # Settings of this shell must not affect the processes.
         inherited = {key: value for key, value in os.environ.items() if not key.startswith("FOGNAV_")}
         self.supervisor.add(
             Program(

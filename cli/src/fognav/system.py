@@ -1,4 +1,4 @@
-"""Programs that no Python package brings: where they are, and how to get the ones that are missing."""
+"""Programs that no Python package provides: finds them, and installs the missing ones."""
 
 import os
 import shutil
@@ -16,7 +16,7 @@ _INSTALL_TIMEOUT_S: Final = 600.0
 
 @dataclass(frozen=True)
 class Tool:
-    """A program: its possible names, Debian's package that brings it, and what it is for."""
+    """A program: its possible names, the Debian package that contains it, and its purpose."""
 
     name: str
     executables: tuple[str, ...]
@@ -34,11 +34,11 @@ TOOLS: Final = (MOSQUITTO, REDIS, CHROMIUM)
 
 
 class MissingToolsError(RuntimeError):
-    """Programs are missing and were not installed; the message says which and how to get them."""
+    """Programs are missing and were not installed; the message names them and how to install them."""
 
 
 class Provider(Protocol):
-    """A way to get programs that are missing; tried in the order of `PROVIDERS`."""
+    """A way to install missing programs; tried in the order of `PROVIDERS`."""
 
     name: str
 
@@ -46,10 +46,10 @@ class Provider(Protocol):
         """Whether it works on this system, for this user."""
 
     def command(self, tools: Sequence[Tool]) -> str:
-        """Return what a person would type to get them."""
+        """Return the command that installs them, for the user."""
 
     def install(self, tools: Sequence[Tool]) -> None:
-        """Get them; raises `MissingToolsError` with what went wrong."""
+        """Install them; raises `MissingToolsError` with the reason."""
 
 
 def _run(arguments: Sequence[str], environment: Mapping[str, str]) -> tuple[int, str]:
@@ -67,7 +67,7 @@ def _run(arguments: Sequence[str], environment: Mapping[str, str]) -> tuple[int,
 
 
 class AptProvider:
-    """The distribution's packages by apt-get, as root or by a sudo that asks for no password."""
+    """The distribution's packages by apt-get, as root or by sudo without a password."""
 
     name = "apt-get"
 
@@ -84,25 +84,25 @@ class AptProvider:
         return None
 
     def available(self) -> bool:
-        """Whether apt-get is here and this user may use it."""
+        """Whether apt-get is installed and this user may use it."""
         return self._prefix() is not None
 
     def command(self, tools: Sequence[Tool]) -> str:
-        """Return the line to type."""
+        """Return the command line."""
         return "apt-get install --no-install-recommends " + " ".join(tool.package for tool in tools)
 
     def install(self, tools: Sequence[Tool]) -> None:
-        """Install the packages; a stale package list is brought up to date first."""
+        """Update the package lists, then install the packages."""
         prefix = self._prefix()
         if prefix is None:
             raise MissingToolsError("apt-get can't be used here: it needs root, or sudo without a password")
-        quiet = {"DEBIAN_FRONTEND": "noninteractive"}
+        environment = {"DEBIAN_FRONTEND": "noninteractive"}
         install = [*prefix, "apt-get", "install", "-y", "-q", "--no-install-recommends"]
-        code, said = self._run([*prefix, "apt-get", "update", "-q"], quiet)
+        code, output = self._run([*prefix, "apt-get", "update", "-q"], environment)
         if code == 0:
-            code, said = self._run([*install, *(tool.package for tool in tools)], quiet)
+            code, output = self._run([*install, *(tool.package for tool in tools)], environment)
         if code != 0:
-            last = "\n".join(said.strip().splitlines()[-8:])
+            last = "\n".join(output.strip().splitlines()[-8:])
             raise MissingToolsError(f"{self.command(tools)} failed with code {code}:\n{last}")
 
 
@@ -110,21 +110,21 @@ PROVIDERS: Final[list[Provider]] = [AptProvider()]
 
 
 def find(tool: Tool) -> Path | None:
-    """Return where the program is, on the PATH or where systems keep their servers."""
+    """Return the path of the program, from PATH or from the system's folders for servers."""
     return find_program(*tool.executables)
 
 
-def how_to_get(tools: Sequence[Tool]) -> str:
-    """Return a line to type that gets them."""
+def install_command(tools: Sequence[Tool]) -> str:
+    """Return the command that installs the programs."""
     return AptProvider().command(tools)
 
 
-def agreed(yes: bool) -> bool:  # noqa: FBT001  # the only argument, and it is what the function is about
-    """Whether system packages may be installed without asking: `--yes`, or CI=true."""
+def has_consent(yes: bool) -> bool:  # noqa: FBT001  # its only argument
+    """Whether system packages may be installed without asking: `--yes` or CI=true."""
     return yes or os.environ.get("CI", "").lower() == "true"
 
 
-def _ask(question: str) -> bool:
+def _ask_user(question: str) -> bool:
     if not (sys.stdin.isatty() and sys.stderr.isatty()):
         return False
     sys.stderr.write(f"{question} [y/N] ")
@@ -136,27 +136,27 @@ def ensure(
     tools: Sequence[Tool],
     *,
     yes: bool,
-    say: Callable[[str], None],
-    ask: Callable[[str], bool] = _ask,
+    print_line: Callable[[str], None],
+    ask: Callable[[str], bool] = _ask_user,
     providers: Sequence[Provider] | None = None,
 ) -> dict[str, Path]:
-    """Return the path of each program, after getting those that are missing from the first provider that can.
+    """Return the path of each program, after installing the missing ones with the first available provider.
 
-    Raises `MissingToolsError` naming what is missing and what to type, when nobody agreed or nothing could be done.
+    Raises `MissingToolsError` with the missing programs and the command to install them, without consent or provider.
     """
     missing = [tool for tool in tools if find(tool) is None]
     if missing:
         names = " and ".join(tool.name for tool in missing)
         provider = next((p for p in (PROVIDERS if providers is None else providers) if p.available()), None)
         if provider is None:
-            raise MissingToolsError(f"missing: {names}. Install with: sudo {how_to_get(missing)}")
-        if not (agreed(yes) or ask(f"Missing: {names}. Run '{provider.command(missing)}' now?")):
+            raise MissingToolsError(f"missing: {names}. Install with: sudo {install_command(missing)}")
+        if not (has_consent(yes) or ask(f"Missing: {names}. Run '{provider.command(missing)}' now?")):
             raise MissingToolsError(
                 f"missing: {names}. Install with: {provider.command(missing)}  (or run again with --yes)"
             )
-        say(f"installing {names} ({provider.name})")
+        print_line(f"installing {names} ({provider.name})")
         provider.install(missing)
     paths = {tool.name: find(tool) for tool in tools}
     if still := [name for name, path in paths.items() if path is None]:
-        raise MissingToolsError(f"{' and '.join(still)} can't be found although the installation went well")
+        raise MissingToolsError(f"{' and '.join(still)} can't be found although the installation succeeded")
     return {name: path for name, path in paths.items() if path is not None}

@@ -1,4 +1,4 @@
-"""How `fognav test` runs pytest: on all cores, with progress, and with a browser where one can be had."""
+"""How `fognav test` runs pytest: on all cores, with progress, and with a browser if one can be installed."""
 
 import os
 import sys
@@ -7,30 +7,40 @@ from typing import Final
 
 from fognav import system
 
-_OWN_WAY: Final = ("-n", "--numprocesses", "--dist", "--pdb", "--trace", "--collect-only", "--co", "-s", "--capture=no")
-"""Arguments of people who want pytest to run in another way, or in one process."""
+_OVERRIDES: Final = (
+    "-n",
+    "--numprocesses",
+    "--dist",
+    "--pdb",
+    "--trace",
+    "--collect-only",
+    "--co",
+    "-s",
+    "--capture=no",
+)
+"""Arguments that choose another distribution of the tests, or need a single process."""
 
 
 def workers() -> int:
-    """Return how many tests run at once: one for each core, and one more, for most tests of processes wait."""
+    """Return how many tests run at once: one more than there are cores, because most tests of processes wait."""
     return (os.cpu_count() or 1) + 1
 
 
 def pytest_command(arguments: Sequence[str], *, terminal: bool | None = None) -> list[str]:
-    """Return the command line of pytest, with a person's own arguments last."""
+    """Return the command line of pytest, with the user's arguments last."""
     command = [sys.executable, "-m", "pytest", "-p", "fognav.pytest_progress", "-r", "fE"]
     if sys.stderr.isatty() if terminal is None else terminal:
-        command += ["-o", "console_output_style=classic"]  # the bar says how far it is
-    if not any(argument.startswith(_OWN_WAY) for argument in arguments):
+        command += ["-o", "console_output_style=classic"]  # the bar shows the progress
+    if not any(argument.startswith(_OVERRIDES) for argument in arguments):
         command += ["-n", str(workers()), "--dist", "loadgroup", "--no-loadscope-reorder"]
     return [*command, *arguments]
 
 
-def get_browser(*, yes: bool, say: Callable[[str], None]) -> None:
-    """Install a browser for the tests of the page if it is missing and that is agreed; they are skipped without it."""
-    if system.find(system.CHROMIUM) is not None or not system.agreed(yes):
+def get_browser(*, yes: bool, print_line: Callable[[str], None]) -> None:
+    """Install a missing browser for the tests of the page, given consent; without a browser they are skipped."""
+    if system.find(system.CHROMIUM) is not None or not system.has_consent(yes):
         return
     try:
-        system.ensure([system.CHROMIUM], yes=yes, say=say)
+        system.ensure([system.CHROMIUM], yes=yes, print_line=print_line)
     except system.MissingToolsError as error:
-        say(f"no tests of the page: {error}")
+        print_line(f"the tests of the page are skipped: {error}")

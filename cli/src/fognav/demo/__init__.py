@@ -1,1 +1,1 @@
-"""The demonstration: it starts everything, sends the robot on its way, blocks that way, and evaluates the drive."""
+"""The demonstration: it starts the system, sends the robot to a goal, blocks its path, and evaluates the drive."""

@@ -1,4 +1,4 @@
-"""One attempt of a demonstration, at one speed: the whole system started, one drive, everything ended."""
+"""One attempt of a demonstration at one speed: start the whole system, drive once, end everything."""
 
 import asyncio
 import contextlib
@@ -27,13 +27,13 @@ _TICK_S: Final = 0.1
 _USAGE_S: Final = 1.0
 _SPEED_CHECK_S: Final = 2.0
 _SLOWEST_MPS: Final = 0.08
-"""Mean speed (way, standing and detours together) below which a drive is given up."""
+"""Mean speed, stops and detours included, below which a drive times out."""
 _DETOUR: Final = 3.0
 _TIMEOUT_BASE_S: Final = 180.0
 
 
 class Attempt:
-    """One attempt; what it found out is there for the report while it runs and afterwards."""
+    """One attempt; its results are available while it runs and afterwards."""
 
     def __init__(self, plan: DrivePlan, scene: Scene) -> None:
         self.plan = plan
@@ -43,16 +43,16 @@ class Attempt:
         self.speed_watch = SpeedWatch(scene.speed)
         self.usage = Usage()
         self.restarts: dict[str, int] = {}
-        """How often each process died and was started again."""
+        """How often each process died and was restarted."""
         self.ended_at: float | None = None
 
     # --- the system ---
 
     async def run(self, stop: asyncio.Event) -> None:
-        """Start everything, drive, and end everything; with `keep_running` only when `stop` is set.
+        """Start everything, drive, and end everything; with `keep_running` wait for `stop` before the end.
 
-        Raises `NotReadyError` or `TimeoutError` when something does not come about, `TooFastError`, and `WrongUseError`
-        when the site can't be used so.
+        Raises `NotReadyError` or `TimeoutError` if the system or the robot does not become ready, `TooFastError` if
+        the machine can't sustain the speed, and `WrongUseError` if the site is not suitable.
         """
         options = self.plan.options
         clock = SystemClock(self.scene.speed)
@@ -67,12 +67,11 @@ class Attempt:
         )
         async with Stack(config, self._on_process) as stack, self._keeping_logs(stack):
             if options.hazard and not self.plan.hazard:
-                self.scene.say("the site's [demo] lists no areas: nothing will be blocked")
-            self.scene.say(f"starting {len(stack.supervisor.names)} processes, logs in {stack.folder / 'logs'}")
+                self.scene.log_event("scenario: no barrier, because [demo] of site.toml lists no areas")
+            self.scene.log_event(f"starting {len(stack.supervisor.names)} processes, logs in {stack.folder / 'logs'}")
             await stack.start_servers(READY_S)
             async with contextlib.AsyncExitStack() as ends:
-                # From before the first word of any service: a file that lacks the map's first versions is no input for
-                # a replay.
+                # Recording begins before the first service publishes: a replay needs the map's first versions.
                 await ends.enter_async_context(self._recording(stack, clock))
                 await stack.start_system(READY_S)
                 edge = await ends.enter_async_context(self._open(stack, clock, "demo"))
@@ -80,12 +79,12 @@ class Attempt:
                 async with Background(operator.keep_enabled(), self._sample_usage(stack)) as background:
                     await self.drive(operator, clock, background)
                     if options.keep_running:
-                        self.scene.say("still running: Ctrl-C ends everything")
+                        self.scene.log_event("the system keeps running: end it with Ctrl-C")
                         await stop.wait()
 
     @contextlib.asynccontextmanager
     async def _recording(self, stack: Stack, clock: SystemClock) -> AsyncIterator[None]:
-        """Record every channel if that was asked for; by a session of its own, for any listener hears the same."""
+        """Record every channel if requested, by a zenoh session of its own."""
         path = self.plan.options.record
         if path is None:
             yield
@@ -99,7 +98,7 @@ class Attempt:
 
     @contextlib.asynccontextmanager
     async def _keeping_logs(self, stack: Stack) -> AsyncIterator[None]:
-        """Keep the logs of an attempt that went wrong by itself."""
+        """Keep the logs of an attempt that failed, unless it was interrupted or is repeated more slowly."""
         try:
             yield
         except (asyncio.CancelledError, TooFastError, WrongUseError):
@@ -111,7 +110,7 @@ class Attempt:
             stack.keep_files = not self.success()
         finally:
             if stack.keep_files:
-                self.scene.say(f"its logs are kept in {stack.folder / 'logs'}")
+                self.scene.log_event(f"logs kept in {stack.folder / 'logs'}")
 
     def _open(self, stack: Stack, clock: SystemClock, name: str) -> contextlib.AbstractAsyncContextManager[ZenohEdge]:
         site = self.plan.site.site.id
@@ -120,9 +119,9 @@ class Attempt:
     def _on_process(self, event: Event) -> None:
         if event.kind == "exited":
             self.restarts[event.program] = self.restarts.get(event.program, 0) + 1
-            self.scene.say(f"{event.program} died ({event.detail})")
+            self.scene.log_event(f"{event.program} died ({event.detail})")
         elif event.kind == "started" and event.program in self.restarts:
-            self.scene.say(f"{event.program} was started again")
+            self.scene.log_event(f"{event.program} was restarted")
 
     async def _sample_usage(self, stack: Stack) -> None:
         while True:
@@ -147,14 +146,14 @@ class Attempt:
         assert goal is not None
         assert truth is not None
         place = self.plan.goal
-        # Rough length (m) of the way: right angles from where the robot is.
-        span = abs(truth.x - place.x) + abs(truth.y - place.y)
+        # Rough length (m) of the path: the Manhattan distance to the goal.
+        distance = abs(truth.x - place.x) + abs(truth.y - place.y)
         self.evaluation = operator.evaluation = DriveEvaluation(
             goal=(place.x, place.y),
             goal_id=goal.goal_id,
             areas=self.plan.site.site.areas,
             started_at=clock.now(),
-            timeout_s=_TIMEOUT_BASE_S + _DETOUR * span / _SLOWEST_MPS,
+            timeout_s=_TIMEOUT_BASE_S + _DETOUR * distance / _SLOWEST_MPS,
         )
         self.scene.phase = "driving"
         self.usage.restart()
@@ -178,7 +177,7 @@ class Attempt:
             self.scene.truth,
             self.unexplained_stops(),
             entered_blocked=evaluation.entered_blocked,
-            hazard_done=self.hazard.placed_at is not None or not self.plan.hazard,
+            hazard_placed=self.hazard.placed_at is not None or not self.plan.hazard,
         )
         self.end(outcome)
         self.ended_at = clock.now()
@@ -190,21 +189,21 @@ class Attempt:
             self.speed_watch.check(elapsed_s, truth, state, stops, entered_blocked=evaluation.entered_blocked)
 
     def unexplained_stops(self) -> list[str]:
-        """Return the stops of this drive that nothing in its scene asks for.
+        """Return the stops of this drive without a cause in its scenario.
 
-        The barrier stands where no robot is, and who touches something has failed anyway; but after a process died, a
-        stop is what should follow.
+        The barrier is never placed near the robot, and a drive with contact has failed anyway. After a process died a
+        stop is expected.
         """
         return [] if self.evaluation is None or self.restarts else self.evaluation.stops
 
     def end(self, outcome: DriveOutcome) -> None:
-        """Show the outcome."""
+        """Record and show the outcome."""
         self.scene.outcome = outcome
         self.scene.phase = outcome.kind
-        self.scene.say(f"{outcome.kind}: {outcome.reason}")
+        self.scene.log_event(f"{outcome.kind}: {outcome.reason}")
 
     def success(self) -> bool:
-        """Whether all that was asked for came true."""
+        """Whether the drive succeeded and, if a hazard was requested, met one."""
         evaluation, outcome = self.evaluation, self.scene.outcome
         if evaluation is None or outcome is None or not evaluation.success(outcome.kind):
             return False

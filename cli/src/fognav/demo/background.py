@@ -1,4 +1,4 @@
-"""Works that go on beside a drive, and waiting that notices when one of them has failed."""
+"""Background tasks of a drive, and waiting that notices when one of them has failed."""
 
 import asyncio
 import time
@@ -10,14 +10,14 @@ _PERIOD_S: Final = 0.05
 
 
 class Background:
-    """Runs works beside the body of its context, and ends them with it."""
+    """Runs coroutines as tasks beside the body of its context, and cancels them at its end."""
 
-    def __init__(self, *works: Coroutine[Any, Any, None]) -> None:
-        self._works = works
+    def __init__(self, *coroutines: Coroutine[Any, Any, None]) -> None:
+        self._coroutines = coroutines
         self._tasks: list[asyncio.Task[None]] = []
 
     async def __aenter__(self) -> Self:
-        self._tasks = [asyncio.create_task(work) for work in self._works]
+        self._tasks = [asyncio.create_task(coroutine) for coroutine in self._coroutines]
         return self
 
     async def __aexit__(
@@ -28,18 +28,18 @@ class Background:
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
     def check(self) -> None:
-        """Raise the exception of a work that failed."""
+        """Raise the exception of a task that has failed."""
         for task in self._tasks:
             if task.done():
                 task.result()
 
     async def until(
-        self, condition: Callable[[], bool], timeout_s: float, what: str, situation: Callable[[], str]
+        self, condition: Callable[[], bool], timeout_s: float, description: str, situation: Callable[[], str]
     ) -> None:
         """Wait until the condition holds; raises `TimeoutError` with the situation after `timeout_s` real seconds."""
         deadline = time.monotonic() + timeout_s
         while not condition():
             self.check()
             if time.monotonic() > deadline:
-                raise TimeoutError(f"{timeout_s:.0f} s passed before {what}; {situation()}")
+                raise TimeoutError(f"timeout after {timeout_s:.0f} s: not {description}; {situation()}")
             await asyncio.sleep(_PERIOD_S)

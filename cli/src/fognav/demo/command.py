@@ -1,4 +1,4 @@
-"""Joins the demonstration with its audience: the terminal view, the page, or nobody."""
+"""Connects the demonstration with its views: the terminal, the page, or none."""
 
 import asyncio
 import contextlib
@@ -20,11 +20,11 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 async def run_demo(
-    folder: Path, options: Options, *, headless: bool, page_port: int, say: Callable[[str], None]
+    folder: Path, options: Options, *, headless: bool, page_port: int, print_line: Callable[[str], None]
 ) -> dict[str, object]:
     """Run a demonstration on a site's folder until its outcome or a signal; return the report.
 
-    Raises `WrongUseError` for a site that can't be used.
+    Raises `WrongUseError` for a site that is not suitable.
     """
     logs.configure("demo", "warning", "text")
     stop = asyncio.Event()
@@ -35,19 +35,19 @@ async def run_demo(
         site = load_site(folder)
     except SiteError as error:
         raise WrongUseError(str(error)) from error
-    shown = not headless and console.is_terminal
-    demo = Demo(site, options, None if shown else say)
+    in_terminal = not headless and console.is_terminal
+    demo = Demo(site, options, None if in_terminal else print_line)
     try:
-        async with contextlib.AsyncExitStack() as audience:
+        async with contextlib.AsyncExitStack() as views:
             if not headless:
-                demo.page_url = demo.scene.page_url = await audience.enter_async_context(serve(demo, page_port))
-                say(f"watch it at {demo.page_url}")
-            if shown:
+                demo.page_url = demo.scene.page_url = await views.enter_async_context(serve(demo, page_port))
+                print_line(f"watch the demo at {demo.page_url}")
+            if in_terminal:
                 view = asyncio.create_task(show(demo, console))
-                audience.push_async_callback(_end, view)
+                views.push_async_callback(_end, view)
             return await demo.run(stop)
     except (NotReadyError, TimeoutError) as error:
-        say(str(error))
+        print_line(str(error))
         demo.scene.outcome = DriveOutcome("stopped", str(error))
         return demo.report()
 

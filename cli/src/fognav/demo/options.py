@@ -1,4 +1,4 @@
-"""What a demonstration was asked for, and what that means on a site."""
+"""The options of a demonstration, and the drive that they give on a site."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +12,7 @@ from fognav_sim import devices
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """What `fognav demo` was asked for."""
+    """The options of `fognav demo`."""
 
     seed: int = 1
     speed: float = 1.0
@@ -25,7 +25,7 @@ class Options:
 
 @dataclass(frozen=True, kw_only=True)
 class DrivePlan:
-    """A drive of a site's first robot to the goal of its `[demo]`; with `hazard` its way gets blocked."""
+    """A drive of a site's first robot to the goal of its `[demo]`; with `hazard` its path becomes blocked."""
 
     site: LoadedSite
     options: Options
@@ -44,12 +44,12 @@ class DrivePlan:
         ):
             known = parts.names(group)
             if name not in known:
-                raise WrongUseError(f"{option}: there is no {name!r} to simulate; use one of: {', '.join(known)}")
+                raise WrongUseError(f"{option}: unknown name {name!r}; use one of: {', '.join(known)}")
         demo = site.site.demo
         if demo is None:
-            raise WrongUseError(f"{site.directory}/site.toml has no [demo]: name a start, a goal and areas there")
+            raise WrongUseError(f"{site.directory}/site.toml has no [demo]: add it with a start, a goal and areas")
         if not site.site.robots:
-            raise WrongUseError(f"{site.directory}/site.toml has no [[robots]]: say where the robot starts")
+            raise WrongUseError(f"{site.directory}/site.toml has no [[robots]]: add one with its start")
         return cls(
             site=site,
             options=options,

@@ -13,7 +13,7 @@ def modes(attempt: Attempt) -> dict[str, int]:
 
 
 def report(attempt: Attempt, given_up: Sequence[dict[str, object]]) -> dict[str, object]:
-    """Sum up the last attempt; `given_up` are those before it whose speed was not kept."""
+    """Summarize the last attempt; `given_up` lists the attempts before it that could not sustain their speed."""
     return {
         **_outcome(attempt),
         **_drive(attempt),
@@ -33,7 +33,7 @@ def _outcome(attempt: Attempt) -> dict[str, object]:
     return {
         "outcome": outcome.kind if outcome else "stopped",
         "success": attempt.success(),
-        "reason": outcome.reason if outcome else "it ended before there was an outcome",
+        "reason": outcome.reason if outcome else "the demo ended before the drive had an outcome",
         "site": attempt.plan.site.site.id,
         "base": attempt.plan.options.base,
         "lidar": attempt.plan.options.lidar,
@@ -43,10 +43,10 @@ def _outcome(attempt: Attempt) -> dict[str, object]:
 
 def _drive(attempt: Attempt) -> dict[str, object]:
     evaluation, trace = attempt.evaluation, attempt.hazard.trace()
-    begun, ended = (evaluation.started_at if evaluation else 0.0), attempt.ended_at
+    started, ended = (evaluation.started_at if evaluation else 0.0), attempt.ended_at
     return {
         "distance_m": round(evaluation.distance_m, 2) if evaluation else 0.0,
-        "time_s": round(ended - begun, 2) if evaluation and ended else None,
+        "time_s": round(ended - started, 2) if evaluation and ended else None,
         "min_clearance_m": _finite(evaluation.min_clearance_m) if evaluation else None,
         "hazard": attempt.plan.hazard,
         "area": attempt.hazard.area,

@@ -1,4 +1,4 @@
-"""A demonstration from start to outcome: attempts, each slower than the last, until the machine keeps the speed."""
+"""A demonstration from start to outcome: attempts, each slower than the last, until the machine sustains the speed."""
 
 import asyncio
 from collections.abc import Callable
@@ -13,10 +13,10 @@ from fognav_sim.drive.evaluation import DriveOutcome
 
 
 class Demo:
-    """A demonstration; `scene` always shows the attempt that runs."""
+    """A demonstration; `scene` is that of the current attempt."""
 
     def __init__(self, site: LoadedSite, options: Options, on_event: Callable[[str], None] | None = None) -> None:
-        """Plan the drive; raises `WrongUseError` for a site that has none."""
+        """Plan the drive; raises `WrongUseError` for a site without a demo."""
         self.site = site
         self.plan = DrivePlan.of(site, options)
         self.page_url = ""
@@ -26,7 +26,7 @@ class Demo:
 
     @property
     def scene(self) -> Scene:
-        """What is going on in the attempt that runs."""
+        """The scene of the current attempt."""
         return self.attempt.scene
 
     def _new_attempt(self, speed: float) -> Attempt:
@@ -35,9 +35,9 @@ class Demo:
         return Attempt(self.plan, scene)
 
     async def run(self, stop: asyncio.Event) -> dict[str, object]:
-        """Run until the outcome, or until `stop` is set; return the report. Everything is ended on return.
+        """Run until the outcome, or until `stop` is set; return the report. All processes have ended on return.
 
-        Raises `NotReadyError` when a process does not start, and `WrongUseError` when the site can't be used so.
+        Raises `NotReadyError` if a process does not start, and `WrongUseError` if the site is not suitable.
         """
         speed = self.plan.options.speed
         self._given_up.clear()
@@ -47,8 +47,10 @@ class Demo:
                 await self._until_stop(self.attempt, stop)
             except TooFastError as slow:
                 slower = slow.lower(speed)
-                self._given_up.append({"speed": speed, "why": str(slow), "modes": modes(self.attempt)})
-                self.scene.say(f"speed {speed:g} is too much for this machine ({slow}): once more at {slower:g}")
+                self._given_up.append({"speed": speed, "reason": str(slow), "modes": modes(self.attempt)})
+                self.scene.log_event(
+                    f"this machine can't sustain speed {speed:g} ({slow}): starting again at speed {slower:g}"
+                )
                 speed = slower
                 continue
             return self.report()
@@ -58,9 +60,9 @@ class Demo:
         stopped = asyncio.create_task(stop.wait())
         try:
             await asyncio.wait({running, stopped}, return_when=asyncio.FIRST_COMPLETED)
-            # An attempt that keeps running sees the stop itself.
+            # An attempt that keeps running handles the stop itself.
             if not running.done() and attempt.scene.outcome is None:
-                attempt.end(DriveOutcome("stopped", "interrupted; all processes are being ended"))
+                attempt.end(DriveOutcome("stopped", "interrupted; ending all processes"))
                 running.cancel()
             await asyncio.wait({running})
             if not running.cancelled():
@@ -71,5 +73,5 @@ class Demo:
             await asyncio.gather(running, stopped, return_exceptions=True)
 
     def report(self) -> dict[str, object]:
-        """Return the report of the last attempt and of those that were given up."""
+        """Return the report of the last attempt, with those that were given up."""
         return report(self.attempt, self._given_up)

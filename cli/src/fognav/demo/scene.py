@@ -1,4 +1,4 @@
-"""What is going on, gathered from all channels: the terminal and the page show it, the report sums it up."""
+"""The latest state of the system, collected from all channels for the terminal, the page and the report."""
 
 import time
 from collections import deque
@@ -31,7 +31,7 @@ _TRAIL_STEP_M: Final = 0.1
 
 @dataclass
 class Scene:
-    """The newest of everything; written and read on the loop's thread only."""
+    """The latest message of each channel and the log of events; used on the event loop's thread only."""
 
     site: LoadedSite
     robot: str
@@ -52,37 +52,37 @@ class Scene:
     outcome: DriveOutcome | None = None
     events: deque[tuple[float, str]] = field(default_factory=lambda: deque(maxlen=_EVENTS))
     trail: deque[tuple[float, float]] = field(default_factory=lambda: deque(maxlen=_TRAIL))
-    told: int = 0
-    """How many events there were in all."""
+    event_count: int = 0
+    """Number of all events so far."""
     on_event: Callable[[str], None] | None = None
-    begun: float = field(default_factory=time.monotonic)
+    started_at: float = field(default_factory=time.monotonic)
 
-    def say(self, text: str) -> None:
-        """Add a line to the log of events."""
-        self.events.append((time.monotonic() - self.begun, text))
-        self.told += 1
+    def log_event(self, text: str) -> None:
+        """Append a line to the log of events."""
+        self.events.append((time.monotonic() - self.started_at, text))
+        self.event_count += 1
         if self.on_event is not None:
             self.on_event(text)
 
-    def take_truth(self, truth: SimTruth) -> None:
-        """Take the truth, and lengthen the trail."""
+    def on_truth(self, truth: SimTruth) -> None:
+        """Record the ground truth, and extend the trail."""
         self.truth = truth
         last = self.trail[-1] if self.trail else None
         if last is None or abs(last[0] - truth.x) + abs(last[1] - truth.y) >= _TRAIL_STEP_M:
             self.trail.append((round(truth.x, 2), round(truth.y, 2)))
 
     def situation(self) -> str:
-        """Return what the robot and the fog said last, for the message of a failure."""
-        heard = (
-            f"the robot says {self.state.mode}: {'; '.join(self.state.reasons)}"
+        """Return the last states of robot and areas, for error messages."""
+        robot = (
+            f"the robot is in {self.state.mode}: {'; '.join(self.state.reasons)}"
             if self.state
-            else "no word of the robot"
+            else "no state received from the robot"
         )
         areas = ", ".join(f"{area} {hazard.hazard.state}" for area, hazard in self.hazards.items())
-        return f"{heard}; areas: {areas or 'none heard of'}"
+        return f"{robot}; areas: {areas or 'no state received'}"
 
-    def still(self) -> dict[str, Any]:
-        """Return what does not change during a run, as plain values for the page."""
+    def static_view(self) -> dict[str, Any]:
+        """Return the static part of the scene (map, areas, nodes, places) as JSON values for the page."""
         geometry = self.site.map.geometry
         site = self.site.site
         return {
@@ -106,8 +106,8 @@ class Scene:
             "places": [{"id": i, "label": p.label or i, "x": p.x, "y": p.y} for i, p in site.places.items()],
         }
 
-    def moving(self) -> dict[str, Any]:
-        """Return what changes, as plain values for the page."""
+    def live_view(self) -> dict[str, Any]:
+        """Return the changing part of the scene as JSON values for the page."""
         pose, truth, state, path = self.pose, self.truth, self.state, self.path
         return {
             "phase": self.phase,
@@ -127,18 +127,18 @@ class Scene:
             "released": path.released_length if path else 0.0,
             "refusal": path.refusal.reason if path and path.refusal else "",
             "hazards": {area: hazard.hazard.state for area, hazard in self.hazards.items()},
-            "seen": [[round(x, 2), round(y, 2)] for x, y in self.obstacles.points] if self.obstacles else [],
+            "obstacles": [[round(x, 2), round(y, 2)] for x, y in self.obstacles.points] if self.obstacles else [],
             "stages": durations_ms(self.trace),
             "hazard_to_path": hazard_to_path_ms(self.trace),
             "processes": {name: [round(cpu, 1), round(rss, 1)] for name, (cpu, rss) in self.usage.items()},
             "outcome": self.outcome and [self.outcome.kind, self.outcome.reason],
-            "told": self.told,
+            "event_count": self.event_count,
             "events": [[round(at, 1), text] for at, text in list(self.events)[-30:]],
         }
 
 
 def _extent(static: StaticMap) -> list[float]:
-    """Return left, bottom, right and top (m) of what is known of the map: some have wide unknown margins."""
+    """Return left, bottom, right and top (m) of the known part of the map: some maps have wide unknown margins."""
     known = static.cells != UNKNOWN
     rows, columns = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
     g = static.geometry

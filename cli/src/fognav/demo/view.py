@@ -1,4 +1,4 @@
-"""The demonstration in a terminal: what the robot does and why, what it costs, and what happened."""
+"""The demonstration in a terminal: robot, watched areas, processes and events."""
 
 import asyncio
 import math
@@ -28,7 +28,7 @@ _STATE_STYLES = {"blocked": "bold red", "clear": "green", "unknown": "yellow"}
 
 
 _VALUE_WIDTH: Final = 8
-"""Of the widest state and of a time in ms: narrower terminals cut names, never values."""
+"""Width of the longest state or time: narrow terminals truncate names, never values."""
 
 
 def _pairs() -> Table:
@@ -41,21 +41,22 @@ def _pairs() -> Table:
 def _robot(scene: Scene) -> Panel:
     table = _pairs()
     state, pose, truth, path = scene.state, scene.pose, scene.truth, scene.path
-    mode = state.mode if state else "no word yet"
+    mode = state.mode if state else "no state yet"
     table.add_row("mode", Text(mode, style=_MODE_STYLES.get(mode, "bold red")))
     if state is not None:
-        table.add_row("because", "; ".join(state.reasons[:3]) or "all is well")
+        table.add_row("reasons", "; ".join(state.reasons[:3]) or "none")
     if pose is not None:
         table.add_row("pose", f"{pose.x:7.2f} m {pose.y:7.2f} m {math.degrees(pose.theta):6.0f}°   {pose.v:4.2f} m/s")
     if truth is not None:
-        off = f"{math.hypot(truth.x - pose.x, truth.y - pose.y):.2f} m off its belief" if pose else ""
-        table.add_row("truth", f"{truth.x:7.2f} m {truth.y:7.2f} m   {off}")
-        table.add_row("driven", f"{truth.distance:.1f} m, {truth.clearance:.2f} m to the nearest thing")
+        error = f"error {math.hypot(truth.x - pose.x, truth.y - pose.y):.2f} m" if pose else ""
+        table.add_row("ground truth", f"{truth.x:7.2f} m {truth.y:7.2f} m   {error}")
+        table.add_row("driven", f"{truth.distance:.1f} m")
+        table.add_row("clearance", f"{truth.clearance:.2f} m")
     if path is not None:
         length = path_length(path.points)
         table.add_row("path", path.refusal.reason if path.refusal else f"plan {path.plan_id}, {length:.1f} m")
     if state is not None and state.goal_distance is not None:
-        table.add_row("to go", f"{state.goal_distance:.1f} m")
+        table.add_row("remaining", f"{state.goal_distance:.1f} m")
     return Panel(table, title=f"Robot {scene.robot}", title_align="left")
 
 
@@ -65,14 +66,14 @@ def _hazards(scene: Scene) -> Panel:
     table.add_column(no_wrap=True, justify="right", width=_VALUE_WIDTH)
     for area in scene.site.site.areas:
         hazard = scene.hazards.get(area.id)
-        state = hazard.hazard.state if hazard else "no word"
+        state = hazard.hazard.state if hazard else "no state"
         table.add_row(area.label or area.id, Text(state, style=_STATE_STYLES.get(state, "dim")))
     trace = scene.trace
-    took = durations_ms(trace)
-    if took:
+    durations = durations_ms(trace)
+    if durations:
         table.add_row("", "")
         for stage in STAGES:
-            table.add_row(stage, f"{took[stage]:.0f} ms" if stage in took else "...")
+            table.add_row(stage, f"{durations[stage]:.0f} ms" if stage in durations else "...")
         total = hazard_to_path_ms(trace)
         if total is not None:
             table.add_row(Text("reading to path", style="bold"), Text(f"{total:.0f} ms", style="bold"))
@@ -97,24 +98,24 @@ def _events(scene: Scene, lines: int) -> Panel:
 
 
 def render(scene: Scene, height: int) -> RenderableType:
-    """Lay the scene out for a terminal of `height` lines."""
-    speed = f", {scene.speed:g} times as fast" if scene.speed != 1.0 else ""
-    head = Text.assemble(
+    """Render the scene for a terminal of `height` lines."""
+    speed = f", speed {scene.speed:g}" if scene.speed != 1.0 else ""
+    header = Text.assemble(
         ("Fognav ", "bold"), f"{scene.site.site.name or scene.site.site.id}, seed {scene.seed}{speed}: "
     )
-    head.append(scene.phase, style="bold cyan")
+    header.append(scene.phase, style="bold cyan")
     if scene.page_url:
-        head.append(f"    {scene.page_url}", style="underline")
+        header.append(f"    {scene.page_url}", style="underline")
     columns = Table.grid(expand=True)
     for ratio in (5, 3, 4):
         columns.add_column(ratio=ratio)
     columns.add_row(_robot(scene), _hazards(scene), _processes(scene))
     used = 4 + max(len(scene.usage) + 3, len(scene.site.site.areas) + 9)
-    return Group(head, columns, _events(scene, max(5, height - used)))
+    return Group(header, columns, _events(scene, max(5, height - used)))
 
 
 async def show(demo: Demo, console: Console) -> None:
-    """Keep the terminal up to date until cancelled."""
+    """Update the terminal until cancelled."""
     with Live(render(demo.scene, console.height), console=console, auto_refresh=False, screen=False) as live:
         try:
             while True:

@@ -1,4 +1,4 @@
-"""Serves the page, the map as a picture, and the scene as a stream of events, on the loopback address."""
+"""Serves the page, the map as an image, and the scene as a stream of events, on the loopback address."""
 
 import asyncio
 import contextlib
@@ -28,9 +28,9 @@ _POLICY: Final = "default-src 'self'; img-src 'self' data:; style-src 'self'; sc
 
 
 def map_png(static: StaticMap) -> bytes:
-    """Draw the map as a PNG with one channel that says what a cell is: 0 free, 1 occupied, 2 unknown; row 0 on top.
+    """Encode the map as a PNG with one channel, 0 free, 1 occupied, 2 unknown; the image's first row is the map's top.
 
-    The page gives it its colours, so that it fits a light and a dark page.
+    The page adds the colours, for its light and dark themes.
     """
     kinds = np.ones(static.cells.shape, dtype=np.uint8)
     kinds[static.cells == FREE] = 0
@@ -41,17 +41,17 @@ def map_png(static: StaticMap) -> bytes:
 
 
 def make_app(demo: Demo, closing: asyncio.Event) -> FastAPI:
-    """Return the page's application; it shows whatever attempt the demo is at, until `closing` is set."""
+    """Return the page's application; it shows the demo's current attempt until `closing` is set."""
     app = FastAPI(title="Fognav demo", docs_url=None, redoc_url=None, openapi_url=None)
-    picture = map_png(demo.site.map)
+    png = map_png(demo.site.map)
 
     @app.get("/map.png")
-    async def map_picture() -> Response:
-        return Response(picture, media_type="image/png")
+    async def map_image() -> Response:
+        return Response(png, media_type="image/png")
 
     @app.get("/scene.json")
-    async def still() -> dict[str, object]:
-        return demo.scene.still()
+    async def static_scene() -> dict[str, object]:
+        return demo.scene.static_view()
 
     @app.get("/events")
     async def events() -> StreamingResponse:
@@ -63,38 +63,38 @@ def make_app(demo: Demo, closing: asyncio.Event) -> FastAPI:
     async def static(name: str) -> Response:
         file = _FILES.get(name)
         if file is None:
-            return Response(f"there is no {name} here", status_code=404, media_type="text/plain")
+            return Response(f"there is no page {name}", status_code=404, media_type="text/plain")
         return FileResponse(_STATIC / file, headers={"Content-Security-Policy": _POLICY, "Cache-Control": "no-cache"})
 
     return app
 
 
 async def _stream(demo: Demo, closing: asyncio.Event) -> AsyncIterator[str]:
-    """Send the whole moving scene again and again: a browser that lost some needs no history."""
+    """Send the whole changing part of the scene periodically; only the trail is sent incrementally."""
     trail_from = 0
     scene = demo.scene
     while not closing.is_set():
         if scene is not demo.scene:
             scene, trail_from = demo.scene, 0
-        moving = scene.moving()
+        view = scene.live_view()
         trail = list(scene.trail)
-        # The deque forgets its oldest points; a browser that has seen them keeps them.
-        moving["trail_from"] = trail_from
-        moving["trail"] = trail[trail_from:]
+        # The deque drops its oldest points; a browser that has received them keeps them.
+        view["trail_from"] = trail_from
+        view["trail"] = trail[trail_from:]
         trail_from = len(trail)
-        yield f"data: {json.dumps(moving, separators=(',', ':'))}\n\n"
+        yield f"data: {json.dumps(view, separators=(',', ':'))}\n\n"
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(closing.wait(), _PERIOD_S)
 
 
 @contextlib.asynccontextmanager
 async def serve(demo: Demo, port: int = 0) -> AsyncIterator[str]:
-    """Serve the page beside the body; yields its address. Port 0 takes a free one.
+    """Serve the page while the context is open; yields its address. Port 0 chooses a free port.
 
-    Raises `WrongUseError` for a port that can't be had.
+    Raises `WrongUseError` for a port that is not available.
     """
     chosen = port or net.free_port()
-    # Bound here: uvicorn would end the whole process when it can't.
+    # Bound here, because uvicorn ends the whole process if it can't bind.
     listening = socket.socket()
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
@@ -103,7 +103,7 @@ async def serve(demo: Demo, port: int = 0) -> AsyncIterator[str]:
         listening.close()
         raise WrongUseError(
             f"the page can't be served on port {chosen} ({error.strerror}): choose another with --page-port, "
-            "or leave it out for any that is free"
+            "or omit the option to use any free port"
         ) from error
     closing = asyncio.Event()
     config = uvicorn.Config(
@@ -111,18 +111,18 @@ async def serve(demo: Demo, port: int = 0) -> AsyncIterator[str]:
     )
     config.timeout_graceful_shutdown = 2
     server = uvicorn.Server(config)
-    # The command handles its signals itself.
+    # The command handles signals itself.
     server.capture_signals = contextlib.nullcontext  # type: ignore[method-assign,assignment]  # a context manager too
     task = asyncio.create_task(server.serve([listening]))
     try:
         while not server.started:
             if task.done():
                 task.result()
-                raise OSError(f"the server of the page on port {chosen} ended before it had begun")
+                raise OSError(f"the page's server on port {chosen} ended during its start")
             await asyncio.sleep(0.02)
         yield f"http://{net.LOOPBACK}:{chosen}/"
     finally:
-        # A stream that ends by itself; uvicorn would cancel one that goes on, and complain.
+        # Ends the streams: uvicorn would cancel open ones with a warning.
         closing.set()
         server.should_exit = True
         await asyncio.gather(task, return_exceptions=True)

@@ -114,7 +114,7 @@ class DriveEvaluation:
         if truth is not None and self._arrival_claimed_at is not None:
             distance = math.hypot(truth.x - self.goal[0], truth.y - self.goal[1])
             if distance <= GOAL_TOLERANCE_M:
-                return DriveOutcome("reached", f"the robot stands {distance:.2f} m from its goal")
+                return DriveOutcome("reached", f"the robot stands {distance:.2f} m from its goal, without contact")
             if now - self._arrival_claimed_at > FALSE_ARRIVAL_S:
                 return DriveOutcome(
                     "stopped", f"the robot reports that it has arrived, but it is {distance:.2f} m from its goal"

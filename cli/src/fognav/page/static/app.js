@@ -1,24 +1,24 @@
-// The page of a running demo: draws the scene that the server streams. Metres everywhere, y up; pixels only at the end.
+// The page of a running demo: draws the scene that the server streams. Coordinates are in metres, y up, until drawn.
 "use strict";
 
 const canvas = document.getElementById("map");
 const context = canvas.getContext("2d");
-const by = (id) => document.getElementById(id);
+const byId = (id) => document.getElementById(id);
 
-let still = null; // what does not change
-let now = null; // the newest of what moves
+let layout = null; // the static part of the scene: map, areas, nodes, places
+let latest = null; // the latest changing part of the scene
 let trail = [];
-let floor = null; // the map, coloured
-let picture = null;
+let floorImage = null; // the coloured map
+let mapImage = null;
 let view = null; // {x, y: the middle in metres, scale: pixels per metre}
 let follow = false;
-let drawn = false;
+let drawPending = false;
 
 const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
 let colours = {};
 function readColours() {
   for (const name of ["floor", "wall", "unknown-cell", "robot", "path", "trail", "goal", "blocked", "unknown", "clear",
-    "seen", "barrier", "text", "card", "quiet"]) colours[name] = css(name);
+    "obstacle", "barrier", "text", "card", "muted"]) colours[name] = css(name);
 }
 
 function rgb(colour) {
@@ -28,21 +28,21 @@ function rgb(colour) {
   return probe.getImageData(0, 0, 1, 1).data;
 }
 
-// The picture says what each cell is: 0 free, 1 occupied, 2 unknown.
-function colourFloor() {
-  floor = document.createElement("canvas");
-  floor.width = picture.width;
-  floor.height = picture.height;
-  const surface = floor.getContext("2d", { willReadFrequently: true });
-  surface.drawImage(picture, 0, 0);
-  const image = surface.getImageData(0, 0, floor.width, floor.height);
+// Each pixel of the map's image is a cell: 0 free, 1 occupied, 2 unknown.
+function colourMap() {
+  floorImage = document.createElement("canvas");
+  floorImage.width = mapImage.width;
+  floorImage.height = mapImage.height;
+  const surface = floorImage.getContext("2d", { willReadFrequently: true });
+  surface.drawImage(mapImage, 0, 0);
+  const image = surface.getImageData(0, 0, floorImage.width, floorImage.height);
   const kinds = [rgb(colours.floor), rgb(colours.wall), rgb(colours["unknown-cell"])];
   for (let i = 0; i < image.data.length; i += 4) image.data.set(kinds[image.data[i]] || kinds[1], i);
   surface.putImageData(image, 0, 0);
 }
 
 function fit() {
-  const [left, bottom, right, top] = still.extent;
+  const [left, bottom, right, top] = layout.extent;
   const scale = 0.94 * Math.min(canvas.clientWidth / (right - left), canvas.clientHeight / (top - bottom));
   view = { x: (left + right) / 2, y: (bottom + top) / 2, scale };
 }
@@ -57,9 +57,9 @@ function line(points, close) {
 }
 
 function drawAreas() {
-  for (const area of still.areas) {
-    const state = (now && now.hazards[area.id]) || "none";
-    const colour = { blocked: colours.blocked, unknown: colours.unknown, clear: colours.clear }[state] || colours.quiet;
+  for (const area of layout.areas) {
+    const state = (latest && latest.hazards[area.id]) || "none";
+    const colour = { blocked: colours.blocked, unknown: colours.unknown, clear: colours.clear }[state] || colours.muted;
     line(area.polygon, true);
     context.fillStyle = colour;
     context.globalAlpha = state === "blocked" ? 0.4 : state === "unknown" ? 0.28 : 0.14;
@@ -71,16 +71,16 @@ function drawAreas() {
   }
 }
 
-// Last, so that nothing hides the words; above an area, so that they hide nothing of it; ids where space is short.
+// Drawn last and above the areas, so that labels are visible and hide nothing; ids when zoomed out.
 function drawLabels() {
-  for (const area of still.areas) {
-    const state = (now && now.hazards[area.id]) || "none";
+  for (const area of layout.areas) {
+    const state = (latest && latest.hazards[area.id]) || "none";
     const xs = area.polygon.map(([x]) => x);
     const top = Math.max(...area.polygon.map(([, y]) => y));
-    const colour = { blocked: colours.blocked, unknown: colours.unknown, clear: colours.clear }[state] || colours.quiet;
+    const colour = { blocked: colours.blocked, unknown: colours.unknown, clear: colours.clear }[state] || colours.muted;
     label(view.scale < 6 ? area.id : area.label, px((Math.min(...xs) + Math.max(...xs)) / 2), py(top) - 11, colour);
   }
-  for (const place of still.places) label(view.scale < 6 ? place.id : place.label, px(place.x), py(place.y) - 17, colours.text);
+  for (const place of layout.places) label(view.scale < 6 ? place.id : place.label, px(place.x), py(place.y) - 17, colours.text);
 }
 
 function label(text, x, y, colour) {
@@ -95,8 +95,8 @@ function label(text, x, y, colour) {
 }
 
 function drawNodes() {
-  for (const node of still.nodes) {
-    context.strokeStyle = colours.quiet;
+  for (const node of layout.nodes) {
+    context.strokeStyle = colours.muted;
     context.lineWidth = 1;
     context.globalAlpha = 0.5;
     for (const [direction, range] of node.beams) {
@@ -104,7 +104,7 @@ function drawNodes() {
       context.stroke();
     }
     context.globalAlpha = 1;
-    context.fillStyle = colours.quiet;
+    context.fillStyle = colours.muted;
     context.fillRect(px(node.x) - 3, py(node.y) - 3, 6, 6);
   }
 }
@@ -116,28 +116,28 @@ function drawPath() {
     context.lineWidth = 2.5;
     context.stroke();
   }
-  if (now.path.length > 1) {
-    line(now.path);
+  if (latest.path.length > 1) {
+    line(latest.path);
     context.strokeStyle = colours.path;
     context.lineWidth = 2.5;
     context.setLineDash([7, 5]);
     context.stroke();
     context.setLineDash([]);
   }
-  if (now.goal) {
+  if (latest.goal) {
     context.strokeStyle = colours.goal;
     context.lineWidth = 3;
     context.beginPath();
-    context.arc(px(now.goal[0]), py(now.goal[1]), 9, 0, 2 * Math.PI);
+    context.arc(px(latest.goal[0]), py(latest.goal[1]), 9, 0, 2 * Math.PI);
     context.stroke();
   }
 }
 
 function drawRobot() {
-  const at = now.pose || now.truth;
-  if (!at) return;
-  const [x, y, heading] = at;
-  const size = Math.max(8, still.radius * view.scale);
+  const pose = latest.pose || latest.truth;
+  if (!pose) return;
+  const [x, y, heading] = pose;
+  const size = Math.max(8, layout.radius * view.scale);
   context.save();
   context.translate(px(x), py(y));
   context.rotate(-heading);
@@ -159,8 +159,8 @@ function drawRobot() {
 }
 
 function draw() {
-  drawn = false;
-  if (!still || !floor || !view) return;
+  drawPending = false;
+  if (!layout || !floorImage || !view) return;
   const ratio = window.devicePixelRatio || 1;
   const width = Math.round(canvas.clientWidth * ratio);
   const height = Math.round(canvas.clientHeight * ratio);
@@ -171,82 +171,82 @@ function draw() {
   context.setTransform(ratio, 0, 0, ratio, 0, 0);
   context.fillStyle = colours["unknown-cell"];
   context.fillRect(0, 0, canvas.clientWidth, canvas.clientHeight);
-  if (follow && now && now.pose) {
-    view.x = now.pose[0];
-    view.y = now.pose[1];
+  if (follow && latest && latest.pose) {
+    view.x = latest.pose[0];
+    view.y = latest.pose[1];
   }
-  const m = still.map;
+  const m = layout.map;
   const w = m.width * m.resolution * view.scale;
   const h = m.height * m.resolution * view.scale;
   context.imageSmoothingEnabled = view.scale * m.resolution < 1;
-  context.drawImage(floor, px(m.x), py(m.y + m.height * m.resolution), w, h);
+  context.drawImage(floorImage, px(m.x), py(m.y + m.height * m.resolution), w, h);
   drawAreas();
   drawNodes();
-  for (const place of still.places) {
+  for (const place of layout.places) {
     context.fillStyle = colours.text;
     context.beginPath();
     context.arc(px(place.x), py(place.y), 3.5, 0, 2 * Math.PI);
     context.fill();
   }
-  if (now) drawMoving();
+  if (latest) drawLive();
   drawLabels();
 }
 
-function drawMoving() {
-  for (const barrier of now.barriers) {
+function drawLive() {
+  for (const barrier of latest.barriers) {
     line(barrier, true);
     context.fillStyle = colours.barrier;
     context.fill();
   }
   drawPath();
-  context.fillStyle = colours.seen;
-  for (const [x, y] of now.seen) context.fillRect(px(x) - 1.5, py(y) - 1.5, 3, 3);
+  context.fillStyle = colours.obstacle;
+  for (const [x, y] of latest.obstacles) context.fillRect(px(x) - 1.5, py(y) - 1.5, 3, 3);
   drawRobot();
 }
 
 function redraw() {
-  if (drawn) return;
-  drawn = true;
+  if (drawPending) return;
+  drawPending = true;
   requestAnimationFrame(draw);
 }
 
-// --- beside the map ------------------------------------------------------------------------------------------------
+// --- panels beside the map -----------------------------------------------------------------------------------------
 
 function put(id, text) {
-  const element = by(id);
+  const element = byId(id);
   if (element.textContent !== text) element.textContent = text;
 }
 
 const metres = (value, digits = 1) => (value === null || value === undefined ? "–" : `${value.toFixed(digits)} m`);
-const TONES = { NORMAL: "good", DEGRADED: "careful", INIT: "careful", HOLD: "careful", EGRESS: "careful", DOCK: "careful" };
+const TONES = { NORMAL: "good", DEGRADED: "caution", INIT: "caution", HOLD: "caution", EGRESS: "caution", DOCK: "caution" };
 
 function bars() {
-  const most = Math.max(1, ...Object.values(now.stages));
-  const rows = Object.entries(now.stages).map(([stage, took]) => {
+  const longest = Math.max(1, ...Object.values(latest.stages));
+  const rows = Object.entries(latest.stages).map(([stage, duration]) => {
     const row = document.createElement("div");
     row.className = "bar";
     const name = document.createElement("b");
     name.textContent = stage;
     const bar = document.createElement("progress");
-    bar.max = most;
-    bar.value = Math.max(0, took);
+    bar.max = longest;
+    bar.value = Math.max(0, duration);
     bar.setAttribute("aria-label", stage);
     const value = document.createElement("span");
-    value.textContent = `${took.toFixed(0)} ms`;
+    value.textContent = `${duration.toFixed(0)} ms`;
     row.append(name, bar, value);
     return row;
   });
-  by("stages").replaceChildren(...rows);
-  const total = by("total");
-  if (now.hazard_to_path !== null) {
+  byId("stages").replaceChildren(...rows);
+  const total = byId("total");
+  if (latest.hazard_to_path !== null) {
     const strong = document.createElement("strong");
-    strong.textContent = `${now.hazard_to_path.toFixed(0)} ms`;
-    total.replaceChildren("altogether, to the robot: ", strong);
-  } else total.textContent = rows.length ? "under way" : "no hazard yet";
+    strong.textContent = `${latest.hazard_to_path.toFixed(0)} ms`;
+    total.replaceChildren("total, until the robot received the path: ", strong);
+  } else total.textContent = rows.length ? "in progress" : "no hazard yet";
 }
 
 function processes() {
-  const rows = Object.entries(now.processes).map(([name, [cpu, rss]]) => {
+  const rows = Object.entries(latest.processes).map(([name, [cpu, rss]]) => {
     const row = document.createElement("tr");
     for (const text of [name, `${cpu.toFixed(0)} %`, `${rss.toFixed(0)} MB`]) {
       const cell = document.createElement("td");
@@ -255,38 +255,38 @@ function processes() {
     }
     return row;
   });
-  by("processes").replaceChildren(...rows);
+  byId("processes").replaceChildren(...rows);
 }
 
-let told = -1;
+let shownEvents = -1;
 function events() {
-  if (told === now.told) return;
-  told = now.told;
-  const rows = [...now.events].reverse().map(([at, text]) => {
+  if (shownEvents === latest.event_count) return;
+  shownEvents = latest.event_count;
+  const rows = [...latest.events].reverse().map(([at, text]) => {
     const row = document.createElement("li");
     const time = document.createElement("time");
     time.textContent = `${at.toFixed(1)} s`;
-    const words = document.createElement("span");
-    words.textContent = text;
-    row.append(time, words);
+    const description = document.createElement("span");
+    description.textContent = text;
+    row.append(time, description);
     return row;
   });
-  by("events").replaceChildren(...rows);
+  byId("events").replaceChildren(...rows);
 }
 
-let listed = -Infinity;
+let listsUpdatedAt = -Infinity;
 function panel() {
-  put("phase", now.outcome ? `${now.outcome[0]}: ${now.outcome[1]}` : now.phase);
-  put("mode", now.mode || "no word yet");
-  by("mode").dataset.tone = now.mode ? TONES[now.mode] || "stopped" : "";
-  put("reasons", now.refusal || now.reasons.join("; ") || (now.mode === "NORMAL" ? "all is well" : ""));
-  put("v", now.pose ? `${now.pose[3].toFixed(2)} m/s` : "–");
-  put("distance", metres(now.distance));
-  put("togo", metres(now.goal_distance));
-  put("clearance", metres(now.clearance, 2));
+  put("phase", latest.outcome ? `${latest.outcome[0]}: ${latest.outcome[1]}` : latest.phase);
+  put("mode", latest.mode || "no state yet");
+  byId("mode").dataset.tone = latest.mode ? TONES[latest.mode] || "stopped" : "";
+  put("reasons", latest.refusal || latest.reasons.join("; "));
+  put("v", latest.pose ? `${latest.pose[3].toFixed(2)} m/s` : "–");
+  put("distance", metres(latest.distance));
+  put("togo", metres(latest.goal_distance));
+  put("clearance", metres(latest.clearance, 2));
   events();
-  if (performance.now() - listed > 900) {
-    listed = performance.now();
+  if (performance.now() - listsUpdatedAt > 900) {
+    listsUpdatedAt = performance.now();
     bars();
     processes();
   }
@@ -296,8 +296,8 @@ function panel() {
 
 function setFollow(on) {
   follow = on;
-  by("follow").setAttribute("aria-pressed", String(on));
-  if (on && view && still) view.scale = Math.max(view.scale, 30);
+  byId("follow").setAttribute("aria-pressed", String(on));
+  if (on && view && layout) view.scale = Math.max(view.scale, 30);
   redraw();
 }
 
@@ -339,30 +339,30 @@ canvas.addEventListener("keydown", (event) => {
   else return;
   event.preventDefault();
 });
-by("follow").addEventListener("click", () => setFollow(!follow));
-by("fit").addEventListener("click", () => { setFollow(false); fit(); redraw(); });
-new ResizeObserver(() => { if (still && !follow) fit(); redraw(); }).observe(canvas);
-matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { readColours(); colourFloor(); redraw(); });
+byId("follow").addEventListener("click", () => setFollow(!follow));
+byId("fit").addEventListener("click", () => { setFollow(false); fit(); redraw(); });
+new ResizeObserver(() => { if (layout && !follow) fit(); redraw(); }).observe(canvas);
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { readColours(); colourMap(); redraw(); });
 
 // --- start ---------------------------------------------------------------------------------------------------------
 
 async function start() {
   readColours();
-  still = await (await fetch("scene.json")).json();
-  put("site", `${still.site}, robot ${still.robot}, seed ${still.seed}`);
-  picture = new Image();
-  picture.src = "map.png";
-  await picture.decode();
-  colourFloor();
+  layout = await (await fetch("scene.json")).json();
+  put("site", `${layout.site}, robot ${layout.robot}, seed ${layout.seed}`);
+  mapImage = new Image();
+  mapImage.src = "map.png";
+  await mapImage.decode();
+  colourMap();
   fit();
   redraw();
   const source = new EventSource("events");
-  source.onopen = () => { by("link").hidden = true; };
-  source.onerror = () => { by("link").hidden = false; };
+  source.onopen = () => { byId("link").hidden = true; };
+  source.onerror = () => { byId("link").hidden = false; };
   source.onmessage = (message) => {
-    now = JSON.parse(message.data);
-    if (now.trail_from === 0) trail = [];
-    trail.push(...now.trail);
+    latest = JSON.parse(message.data);
+    if (latest.trail_from === 0) trail = [];
+    trail.push(...latest.trail);
     panel();
     redraw();
   };

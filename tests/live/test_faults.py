@@ -139,7 +139,7 @@ async def test_a_killed_guardian_leaves_no_wheel_turning(floor: Floor) -> None:
 
 
 MISSED_BY = {
-    BROKER: [(AGGREGATOR, "mqtt (no broker)"), (MAP_SERVICE, "mqtt (no broker)")],
+    BROKER: [(AGGREGATOR, "mqtt (not connected to the broker)"), (MAP_SERVICE, "mqtt (not connected to the broker)")],
     REDIS: [(AGGREGATOR, "store (Redis"), (MAP_SERVICE, "store (Redis"), (PLANNER, "store (Redis")],
     ROUTER: [(PLANNER, "zenoh")],
 }

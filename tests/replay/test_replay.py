@@ -73,7 +73,7 @@ pytestmark = [pytest.mark.live, pytest.mark.timeout(300)]
 
 HERE = Path(__file__).parent
 SITE = HERE.parents[1] / "sites" / "estig"
-SPEED = 3.0
+SPEED = 1.0
 READY_S = 60.0
 DRIVE_S = 120.0
 BOX = SimObstacle(id="box", polygon=[(4.8, 23.4), (5.2, 23.4), (5.2, 23.8), (4.8, 23.8)])

@@ -1,4 +1,4 @@
-"""The loop closes: nodes to aggregator to map to planner to robot to wheels, judged by the simulated truth."""
+"""Whole drives in lockstep, from the sensor nodes to the wheels, evaluated by the simulator's ground truth."""
 
 import importlib.util
 import math
@@ -13,13 +13,13 @@ from fognav_experiments.lockstep import run_lockstep
 from fognav_sim.scenario import ScenarioError
 
 ESTIG = Path(__file__).parents[2] / "sites" / "estig"
-_spec = importlib.util.spec_from_file_location("little_site", Path(__file__).parent / "little_site.py")
-little = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(little)
+_spec = importlib.util.spec_from_file_location("ring_site", Path(__file__).parent / "ring_site.py")
+ring = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(ring)
 
 
 def drive(seed, area=None, **more):
-    return run_lockstep(little.little_site(), little.START, little.GOAL, seed, area, timeout_s=200.0, **more)
+    return run_lockstep(ring.ring_site(), ring.START, ring.GOAL, seed, area, timeout_s=200.0, **more)
 
 
 @pytest.fixture(scope="module")
@@ -32,28 +32,28 @@ def warned():
     return drive(3, "z1", hazard_at_m=0.5)
 
 
-def test_without_a_hazard_the_robot_takes_the_short_way_through_the_watched_area(free):
-    assert (free.outcome, free.contacts, free.crossed) == ("reached", 0, ["z1"]), free.detail
+def test_robot_without_a_hazard_takes_the_short_path_through_the_watched_area(free):
+    assert (free.outcome, free.contacts, free.crossed) == ("reached", 0, ["z1"]), free.reason
     assert free.min_clearance_m > 0.1
     assert free.distance_m == pytest.approx(free.planned_m, abs=1.0)
 
 
-def test_another_base_and_another_lidar_drive_as_well(free):
+def test_robot_with_another_base_and_lidar_reaches_its_goal(free):
     other = drive(3, base="diffdrive", lidar="ld19")
-    assert (other.outcome, other.contacts) == ("reached", 0), other.detail
+    assert (other.outcome, other.contacts) == ("reached", 0), other.reason
     assert other.pose_error_m < 0.15
     assert other.operator_commands == 1
     assert other.distance_m == pytest.approx(free.distance_m, rel=0.03)
 
 
-def test_a_robot_that_crosses_a_watched_area_raises_no_hazard(free):
-    assert not [event for event in free.events if event.what.startswith("area z1: blocked")]
+def test_robot_in_a_watched_area_raises_no_hazard(free):
+    assert not [event for event in free.events if event.description.startswith("area z1: blocked")]
     assert free.replans == 0
 
 
-def test_a_blocked_area_sends_the_robot_around_before_its_lidar_could_know(warned, free):
-    assert (warned.outcome, warned.contacts, warned.crossed) == ("reached", 0, []), warned.detail
-    area = little.little_site().site.areas[0]
+def test_robot_drives_around_a_blocked_area_before_its_lidar_can_see_it(warned, free):
+    assert (warned.outcome, warned.contacts, warned.crossed) == ("reached", 0, []), warned.reason
+    area = ring.ring_site().site.areas[0]
     assert not any(contains_point(area.polygon, *point) for point in warned.track)
     assert warned.replans >= 1
     assert warned.distance_m > free.distance_m
@@ -61,7 +61,7 @@ def test_a_blocked_area_sends_the_robot_around_before_its_lidar_could_know(warne
     assert warned.hazard_clearance_m > 1.0
 
 
-def test_the_hazard_reaches_the_wheels_within_three_seconds_and_every_stage_is_stamped(warned):
+def test_hazard_reaches_the_wheels_within_a_second_and_every_stage_is_stamped(warned):
     stages = warned.stages_ms
     assert set(stages) == {"debounce", "costmap", "plan", "deliver", "command", "total"}
     assert stages["total"] == pytest.approx(sum(v for k, v in stages.items() if k != "total"), abs=0.5)
@@ -70,25 +70,25 @@ def test_the_hazard_reaches_the_wheels_within_three_seconds_and_every_stage_is_s
     assert stages["total"] < 1000.0
 
 
-def test_a_barrier_that_no_node_sees_turns_the_robot_back_once_and_is_not_forgotten():
+def test_robot_without_nodes_meets_the_barrier_once_and_remembers_it():
     site = load_site(ESTIG)
     start, goal = site.site.places["a"], site.site.places["b"]
     begin = msgspec.structs.replace(site.site.robots[0].start, x=start.x, y=start.y)
     met = run_lockstep(site, begin, goal, 1, "z4", hazard_at_m=0.5, watched=False)
-    assert (met.outcome, met.contacts) == ("reached", 0), met.detail
+    assert (met.outcome, met.contacts) == ("reached", 0), met.reason
     barrier = next(area.polygon for area in site.site.areas if area.id == "z4")
-    away = [math.dist(point, barrier[0]) for point in met.track]
-    nearest = away.index(min(away))
-    assert min(away) < 8.0, "it must have come near enough to see it"
-    assert min(away[nearest + 60 :]) > 8.0, "it comes back to it"
+    distances = [math.dist(point, barrier[0]) for point in met.track]
+    nearest = distances.index(min(distances))
+    assert min(distances) < 8.0, "the robot must come near enough to see the barrier"
+    assert min(distances[nearest + 60 :]) > 8.0, "the robot must not come back to the barrier"
     assert met.distance_m < 140.0
 
 
-def test_the_same_seed_gives_the_same_run_bit_for_bit_and_another_seed_another(warned, free):
+def test_same_seed_repeats_the_drive_exactly_and_another_seed_changes_it(warned, free):
     assert msgspec.json.encode(drive(3, "z1", hazard_at_m=0.5)) == msgspec.json.encode(warned)
     assert drive(4).track != free.track
 
 
-def test_an_area_that_the_site_does_not_have_is_named():
+def test_unknown_area_is_refused_with_the_known_ones():
     with pytest.raises(ScenarioError, match="no area 'z9'; it has: z1"):
         drive(1, "z9")

@@ -1,4 +1,4 @@
-"""Makes `driver` importable (pytest imports by path), and runs one stack for all tests of a module."""
+"""Makes `driver` importable: pytest imports tests by path."""
 
 from __future__ import annotations
 

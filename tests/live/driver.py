@@ -1,4 +1,4 @@
-"""The whole stack on the site `estig`, driven by the demo's operator, with what these tests need to watch and break."""
+"""The whole stack on the site `estig` with the demo's operator, and what the tests need to monitor and to break it."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ ESTIG = Path(__file__).parents[2] / "sites" / "estig"
 ROBOT = "r1"
 START = (36.0, 28.4)
 """In the middle corridor, two metres before the area z1."""
-MOVING = 0.15
-"""A robot whose both wheels together make more than this (m/s) drives."""
+MIN_WHEEL_SPEED = 0.15
+"""Mean wheel speed (m/s) above which the robot counts as driving."""
 
 
 def site_that_starts_at(folder: Path, x: float, y: float) -> Path:
-    """Copy the site, with its robot elsewhere."""
+    """Copy the site, with another start of its robot."""
     shutil.copytree(ESTIG, folder, ignore=shutil.ignore_patterns("__pycache__"))
     file = folder / "site.toml"
     text, changes = re.subn(r"start = \{.*\}", f"start = {{ x = {x}, y = {y}, theta = 0.0 }}", file.read_text("utf-8"))
@@ -51,8 +51,8 @@ def site_that_starts_at(folder: Path, x: float, y: float) -> Path:
 
 
 @dataclass(frozen=True)
-class Line:
-    """One line of the truth log."""
+class TruthLine:
+    """One line of the simulator's truth log."""
 
     at: float
     left: float
@@ -62,8 +62,8 @@ class Line:
     contacts: int
 
     @property
-    def stands(self) -> bool:
-        """Whether both wheels are commanded to stand."""
+    def stopped(self) -> bool:
+        """Whether both wheels are commanded to stop."""
         return self.left == 0.0 and self.right == 0.0
 
     @property
@@ -72,8 +72,8 @@ class Line:
         return abs(self.left + self.right) / 2
 
 
-class Floor:
-    """A running stack and its only operator."""
+class LiveSystem:
+    """A running stack and its operator."""
 
     def __init__(self, folder: Path, *, base: str = DEFAULT_BASE, lidar: str = DEFAULT_LIDAR) -> None:
         self.events: list[Event] = []
@@ -90,14 +90,14 @@ class Floor:
         self.stack = Stack(config, self.events.append)
         self.clock = SystemClock()
         self.scene = Scene(self._site, ROBOT, 1, 1.0)
-        self._ends = AsyncExitStack()
+        self._contexts = AsyncExitStack()
         self._enabling: asyncio.Task[None] | None = None
 
     async def __aenter__(self) -> Self:
         try:
-            await self._ends.enter_async_context(self.stack)
+            await self._contexts.enter_async_context(self.stack)
             await self.stack.start()
-            edge = await self._ends.enter_async_context(
+            edge = await self._contexts.enter_async_context(
                 ZenohEdge.open(
                     connect=[self.stack.zenoh_endpoint],
                     clock=self.clock,
@@ -110,19 +110,19 @@ class Floor:
             mqtt = MqttEdge(self.stack.mqtt_url, "live-test", self.clock, site=self._site.site.id)
             mqtt.on(ch.NODE_READING, self._on_reading, NodeReading)
             listening = asyncio.create_task(mqtt.run())
-            self._ends.push_async_callback(_end, listening)
-            self.attend()
-            await self.until(lambda: self.scene.truth is not None, 10, "the simulator says what is so")
-            await self.until(lambda: bool(self.scene.pose and self.scene.pose.localized), 30, "it knows its place")
-            await self.all_clear(20)
+            self._contexts.push_async_callback(_end, listening)
+            self.start_operator()
+            await self.until(lambda: self.scene.truth is not None, 10, "the ground truth is received")
+            await self.until(lambda: bool(self.scene.pose and self.scene.pose.localized), 30, "the robot is localized")
+            await self.wait_all_clear(20)
         except BaseException:
             await self.__aexit__(None, None, None)
             raise
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        await self.leave()
-        await self._ends.aclose()
+        await self.stop_operator()
+        await self._contexts.aclose()
 
     def _on_reading(self, ids: dict[str, str], reading: NodeReading) -> None:
         if ids["node"] == "n1":
@@ -130,31 +130,31 @@ class Floor:
 
     # --- the operator ---
 
-    def attend(self) -> None:
-        """Let the operator enable the robot whenever it asks for it."""
+    def start_operator(self) -> None:
+        """Start the operator, who enables the robot whenever it waits for that."""
         if self._enabling is None:
             self._enabling = asyncio.create_task(self.operator.keep_enabled())
 
-    async def leave(self) -> None:
-        """Leave the robot without an operator."""
+    async def stop_operator(self) -> None:
+        """Stop the operator: nobody enables the robot any more."""
         if self._enabling is not None:
             await _end(self._enabling)
             self._enabling = None
 
-    async def goal(self, x: float, y: float) -> net.Response:
-        """Send the robot somewhere; any heading will do."""
+    async def send_goal(self, x: float, y: float) -> net.Response:
+        """Send the robot to a position, with any heading."""
         body = {"pose": {"x": x, "y": y}}
-        return await self.rest(PLANNER, "PUT", f"/api/v1/robots/{ROBOT}/goal", body)
+        return await self.request(PLANNER, "PUT", f"/api/v1/robots/{ROBOT}/goal", body)
 
-    async def rest(self, service: str, method: str, path: str, body: object) -> net.Response:
-        """Ask a service over HTTP as the administrator."""
+    async def request(self, service: str, method: str, path: str, body: object) -> net.Response:
+        """Send an HTTP request to a service, with the administrator's token."""
         port = self.stack.port(service)
         assert port is not None
         return await asyncio.to_thread(net.request, method, port, path, body=body, token=self.stack.token)
 
-    async def zone(self, body: object) -> net.Response:
-        """Draw a zone."""
-        return await self.rest(MAP_SERVICE, "POST", "/api/v1/zones", body)
+    async def create_zone(self, body: object) -> net.Response:
+        """Create a zone."""
+        return await self.request(MAP_SERVICE, "POST", "/api/v1/zones", body)
 
     async def simulate(self, command: SimCommand) -> None:
         """Change the simulated world."""
@@ -162,31 +162,31 @@ class Floor:
         assert reply is not None
         assert reply.accepted, reply.reason
 
-    # --- watching ---
+    # --- monitoring ---
 
     @property
     def truth(self) -> SimTruth:
-        """What is so."""
+        """The latest ground truth."""
         assert self.scene.truth is not None
         return self.scene.truth
 
     @property
     def state(self) -> RobotState:
-        """What the robot said last."""
+        """The robot's latest state."""
         assert self.scene.state is not None
         return self.scene.state
 
     @property
-    def off(self) -> float:
-        """How far (m) the robot's belief is from the truth."""
+    def localization_error(self) -> float:
+        """Distance (m) between the robot's estimated and true position."""
         pose = self.scene.pose
         assert pose is not None
         return math.hypot(pose.x - self.truth.x, pose.y - self.truth.y)
 
     def hazard(self, area: str) -> str:
-        """Return an area's state as the fog tells it."""
+        """Return an area's published state."""
         known = self.scene.hazards.get(area)
-        return known.hazard.state if known else "no word"
+        return known.hazard.state if known else "not published"
 
     @property
     def guardian(self) -> int | None:
@@ -198,78 +198,83 @@ class Floor:
         """How often each process was started."""
         return {name: self.stack.supervisor.starts(name) for name in self.stack.supervisor.names}
 
-    def log_lines(self, since: float) -> list[Line]:
-        """Return the truth since a moment (monotonic s)."""
+    def log_lines(self, since: float) -> list[TruthLine]:
+        """Return the lines of the truth log since a moment (monotonic s)."""
         found = []
         with self._truth_log.open("rb") as file:
             # 100 lines a second of at most some 300 bytes.
             file.seek(0, 2)
             file.seek(max(0, file.tell() - int((time.monotonic() - since + 1.0) * 100 * 300)))
-            rows = file.read().split(b"\n")[1:-1]
-        for row in rows:
-            line = json.loads(row)
+            texts = file.read().split(b"\n")[1:-1]
+        for text in texts:
+            line = json.loads(text)
             if line["t_mono"] >= since:
-                found.append(Line(line["t_mono"], line["left"], line["right"], line["x"], line["y"], line["contacts"]))
+                found.append(
+                    TruthLine(line["t_mono"], line["left"], line["right"], line["x"], line["y"], line["contacts"])
+                )
         return found
 
-    def stood_after(self, moment: float) -> float:
-        """Return after how many seconds the wheels stood, and stood from then on until now."""
+    def stopping_time(self, moment: float) -> float:
+        """Return the time (s) from a moment until the wheels stopped for good; fails if they still turn."""
         lines = self.log_lines(moment)
         assert lines
-        assert lines[-1].stands, "the wheels turn"
-        last = max((line.at for line in lines if not line.stands), default=moment)
+        assert lines[-1].stopped, "the wheels still turn"
+        last = max((line.at for line in lines if not line.stopped), default=moment)
         return last - moment
 
     # --- waiting ---
 
-    async def until(self, condition: Callable[[], bool], timeout_s: float, what: str) -> None:
+    async def until(self, condition: Callable[[], bool], timeout_s: float, description: str) -> None:
         """Wait until the condition holds."""
         deadline = time.monotonic() + timeout_s
         while not condition():
             if time.monotonic() > deadline:
-                raise AssertionError(f"{timeout_s:.0f} s passed before {what}; {self.story()}")
+                raise AssertionError(
+                    f"timeout after {timeout_s:.0f} s, waiting until {description}; {self.situation()}"
+                )
             await asyncio.sleep(0.02)
 
-    def story(self) -> str:
-        """Return what was going on, for the message of a failure."""
-        told = "\n".join(f"{at:7.1f} {text}" for at, text in list(self.scene.events)[-25:])
-        return (
-            f"the robot is {self.state.mode} at ({self.truth.x:.2f}, {self.truth.y:.2f}): {self.state.reasons}\n{told}"
-        )
+    def situation(self) -> str:
+        """Return the robot's state and the last events, for the message of a failure."""
+        events = "\n".join(f"{at:7.1f} {text}" for at, text in list(self.scene.events)[-25:])
+        position = f"({self.truth.x:.2f}, {self.truth.y:.2f})"
+        return f"the robot is in {self.state.mode} at {position}: {self.state.reasons}\n{events}"
 
-    async def all_clear(self, timeout_s: float) -> None:
-        """Wait until every watched area is known to be clear."""
+    async def wait_all_clear(self, timeout_s: float) -> None:
+        """Wait until every watched area is clear."""
         areas = {node.area for node in self._site.site.nodes}
         await self.until(lambda: all(self.hazard(area) == "clear" for area in areas), timeout_s, "all areas are clear")
 
     async def drive_to(self, x: float, y: float, timeout_s: float = 30) -> None:
-        """Send the robot somewhere, and wait until it drives in NORMAL mode."""
-        answer = await self.goal(x, y)
+        """Send the robot to a position, and wait until it drives in NORMAL mode."""
+        answer = await self.send_goal(x, y)
         assert answer.status == 200, answer
-        await self.drives(timeout_s)
+        await self.wait_driving(timeout_s)
 
-    async def drives(self, timeout_s: float = 30) -> None:
-        """Wait until the robot drives on in NORMAL mode."""
+    async def wait_driving(self, timeout_s: float = 30) -> None:
+        """Wait until the robot drives in NORMAL mode."""
         await self.until(
-            lambda: self.state.mode == "NORMAL" and self.truth.left + self.truth.right > 2 * MOVING,
+            lambda: self.state.mode == "NORMAL" and self.truth.left + self.truth.right > 2 * MIN_WHEEL_SPEED,
             timeout_s,
-            "it drives",
+            "the robot drives",
         )
 
-    async def goes_on(self, timeout_s: float = 40) -> None:
-        """Wait until the robot has come a metre nearer to its goal (by its way)."""
-        await self.until(lambda: self.state.goal_distance is not None, timeout_s, "it has a way again")
-        begun = self.state.goal_distance or 0.0
+    async def wait_progress(self, timeout_s: float = 40) -> None:
+        """Wait until the robot's path to its goal is one metre shorter."""
+        await self.until(lambda: self.state.goal_distance is not None, timeout_s, "the robot has a path")
+        before = self.state.goal_distance or 0.0
         await self.until(
-            lambda: (self.state.goal_distance or math.inf) < begun - 1.0, timeout_s, f"it is 1 m nearer ({begun:.1f} m)"
+            lambda: (self.state.goal_distance or math.inf) < before - 1.0,
+            timeout_s,
+            f"the remaining path is 1 m shorter than {before:.1f} m",
         )
 
-    async def agent_is_back(self, starts: int, timeout_s: float = 30) -> None:
-        """Wait until the agent was started again and talks."""
+    async def wait_agent_restarted(self, starts: int, timeout_s: float = 30) -> None:
+        """Wait until the agent was restarted and publishes."""
         supervisor = self.stack.supervisor
-        await self.until(lambda: supervisor.starts(AGENT) > starts, timeout_s, "the agent was started again")
+        await self.until(lambda: supervisor.starts(AGENT) > starts, timeout_s, "the agent is restarted")
         stamp = self.clock.stamp()
-        await self.until(lambda: self.state.stamp > stamp, timeout_s, "the new agent speaks")
+        await self.until(lambda: self.state.stamp > stamp, timeout_s, "the new agent publishes")
 
 
 async def _end(task: asyncio.Task[None]) -> None:

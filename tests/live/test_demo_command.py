@@ -1,4 +1,4 @@
-"""The command as its users start and end it: demos side by side, Ctrl-C, a request to end, and a kill."""
+"""The demo as users start and end it: two demos side by side, Ctrl-C, SIGTERM and SIGKILL."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ if TYPE_CHECKING:
 
 pytestmark = [pytest.mark.live, pytest.mark.timeout(120)]
 
-DRIVES_S = 60.0
-"""For everything to start, twice at the same time on a small machine."""
-ENDS_S = 15.0
-"""For everything to end; the supervisor gives each rank of programs 5 s before it uses force."""
+START_TIMEOUT_S = 60.0
+"""For two demos that start at the same time on a small machine."""
+END_TIMEOUT_S = 15.0
+"""For all processes to end; the supervisor gives each rank of programs 5 s before it kills them."""
 PROCESSES = 10
-"""Nine programs, and the guardian under its watchdog."""
-NOT_TRUE = 1
+"""Nine programs, and the guardian started by its watchdog."""
+FAILED = 1
 ESTIG = Path(__file__).parents[2] / "sites" / "estig"
 CORES = Path(__file__).parents[1] / "replay" / "cores.py"
 
@@ -53,10 +53,10 @@ def listens(port: int) -> bool:
         return probe.connect_ex(("127.0.0.1", port)) == 0
 
 
-async def until(condition: Callable[[], bool], timeout_s: float, what: Callable[[], str]) -> None:
+async def until(condition: Callable[[], bool], timeout_s: float, description: Callable[[], str]) -> None:
     deadline = time.monotonic() + timeout_s
     while not condition():
-        assert time.monotonic() < deadline, f"{timeout_s:.0f} s passed before {what()}"
+        assert time.monotonic() < deadline, f"timeout after {timeout_s:.0f} s, waiting until {description()}"
         await asyncio.sleep(0.05)
 
 
@@ -65,36 +65,36 @@ class Command:
 
     def __init__(self, folder: Path, name: str, *options: str) -> None:
         self.report = folder / f"{name}.json"
-        self._said = folder / f"{name}.txt"
+        self._output = folder / f"{name}.txt"
         command = [sys.executable, "-m", "fognav", "demo", "--headless", "--report", str(self.report), *options]
-        with self._said.open("wb") as said:
+        with self._output.open("wb") as output:
             self.process = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=said, stderr=said, process_group=0
+                command, stdin=subprocess.DEVNULL, stdout=output, stderr=output, process_group=0
             )
 
     @property
-    def said(self) -> str:
-        return self._said.read_text("utf-8")
+    def output(self) -> str:
+        return self._output.read_text("utf-8")
 
     @property
     def folder(self) -> Path | None:
-        """The folder of the attempt that runs, once it is told."""
-        found = re.findall(r"^starting .* logs in (\S+)/logs$", self.said, re.MULTILINE)
+        """The folder of the current attempt, once it is printed."""
+        found = re.findall(r"^starting .* logs in (\S+)/logs$", self.output, re.MULTILINE)
         return Path(found[-1]) if found else None
 
     async def wait_for(self, pattern: str, timeout_s: float) -> None:
-        def told() -> bool:
-            assert self.process.poll() is None, f"it ended with {self.process.returncode}:\n{self.said}"
-            return re.search(pattern, self.said, re.MULTILINE) is not None
+        def printed() -> bool:
+            assert self.process.poll() is None, f"it ended with {self.process.returncode}:\n{self.output}"
+            return re.search(pattern, self.output, re.MULTILINE) is not None
 
-        await until(told, timeout_s, lambda: f"it said {pattern!r}:\n{self.said}")
+        await until(printed, timeout_s, lambda: f"it prints {pattern!r}:\n{self.output}")
 
     def children(self) -> list[psutil.Process]:
         return psutil.Process(self.process.pid).children(recursive=True)
 
-    async def ends(self, timeout_s: float) -> int:
-        """Return the exit code."""
-        await until(lambda: self.process.poll() is not None, timeout_s, lambda: f"its end:\n{self.said}")
+    async def wait_end(self, timeout_s: float) -> int:
+        """Wait until the command has ended; return its exit code."""
+        await until(lambda: self.process.poll() is not None, timeout_s, lambda: f"it ends:\n{self.output}")
         return self.process.returncode
 
 
@@ -107,76 +107,76 @@ def ports_of(processes: list[psutil.Process]) -> set[int]:
     }
 
 
-def those_of(folder: Path) -> list[psutil.Process]:
-    """Return every process of this machine that was told of the folder, whoever its parent is by now."""
+def processes_of(folder: Path) -> list[psutil.Process]:
+    """Return every process with the folder in its arguments or environment, whatever its parent is by now."""
     found = []
     for process in psutil.process_iter():
         try:
-            told = [*process.cmdline(), *process.environ().values()]
+            texts = [*process.cmdline(), *process.environ().values()]
         except (psutil.NoSuchProcess, psutil.AccessDenied):
             continue
-        if any(str(folder) in text for text in told) and alive(process):
+        if any(str(folder) in text for text in texts) and alive(process):
             found.append(process)
     return found
 
 
 @pytest.fixture
-def begin(tmp_path: Path) -> Iterator[Callable[..., Command]]:
+def start_demo(tmp_path: Path) -> Iterator[Callable[..., Command]]:
     """Start demos; whatever a failed test leaves of them is removed."""
-    begun: list[Command] = []
+    started: list[Command] = []
 
     def start(name: str, *options: str) -> Command:
-        begun.append(Command(tmp_path, name, *options))
-        return begun[-1]
+        started.append(Command(tmp_path, name, *options))
+        return started[-1]
 
     yield start
-    for command in begun:
+    for command in started:
         if command.process.poll() is None:
-            command.process.kill()  # its programs die with it
+            command.process.kill()  # its programs end with it
             command.process.wait()
         if command.folder is not None:
             shutil.rmtree(command.folder, ignore_errors=True)
 
 
-def has_left_nothing(command: Command, folder: Path, children: list[psutil.Process], ports: set[int]) -> None:
+def assert_nothing_left(command: Command, folder: Path, children: list[psutil.Process], ports: set[int]) -> None:
     assert [child for child in children if alive(child)] == []
-    assert those_of(folder) == []
+    assert processes_of(folder) == []
     assert not folder.exists()
     assert [port for port in sorted(ports) if listens(port)] == []
     report = json.loads(command.report.read_text("utf-8"))
     assert (report["outcome"], report["success"]) == ("stopped", False)
 
 
-def leads_fresh_cores_to_the_recorded_maps(recording: Path, out: Path) -> None:
-    """Replay a file as tests/replay does: that needs the first word of every service, and a whole end."""
-    heard = list(read(recording))
-    first = {channel.name: at_ns for at_ns, channel, _, _ in reversed(heard)}
-    # The services beat while the simulator still starts, which takes longer than this: the file begins before both.
+def assert_replay_gives_the_recorded_maps(recording: Path, out: Path) -> None:
+    """Replay a file as tests/replay does, which needs the first message of every service and a complete end."""
+    messages = list(read(recording))
+    first = {channel.name: at_ns for at_ns, channel, _, _ in reversed(messages)}
+    # The services publish heartbeats while the simulator starts, which takes longer: the recording begins before both.
     assert first["sim_truth"] - first["map_heartbeat"] > 1e9
     out.mkdir()
     command = [sys.executable, str(CORES), str(recording), str(ESTIG), str(out)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stderr
-    drawn = [
+    versions = [
         msgspec.json.decode(line, type=MapHeartbeat) for line in (out / "versions.jsonl").read_bytes().splitlines()
     ]
-    hashes = {version.seq: version.hash for version in drawn}
-    # Version 1 is the site's map as it is; a replay begins with it.
-    told = {m.seq: m.hash for _, _, _, m in heard if isinstance(m, MapHeartbeat) and m.seq > 1}
-    assert told
-    assert told == {seq: hashes.get(seq) for seq in told}
-    assert (out / "again.jsonl").read_bytes().count(b"\n") >= 1
+    hashes = {version.seq: version.hash for version in versions}
+    # Version 1 is the site's static map, with which a replay begins.
+    recorded = {m.seq: m.hash for _, _, _, m in messages if isinstance(m, MapHeartbeat) and m.seq > 1}
+    assert recorded
+    assert recorded == {seq: hashes.get(seq) for seq in recorded}
+    assert (out / "plans.jsonl").read_bytes().count(b"\n") >= 1
 
 
-async def test_of_two_demos_side_by_side_one_is_interrupted_and_the_other_drives_on(
-    begin: Callable[..., Command], tmp_path: Path
+async def test_interrupting_one_of_two_demos_leaves_the_other_driving(
+    start_demo: Callable[..., Command], tmp_path: Path
 ) -> None:
-    # At speed 1 a demo never begins anew because the machine is busy: it is the one that must go on.
+    # The demo that must keep driving has speed 1: it never restarts more slowly on a busy machine.
     recording = tmp_path / "one.mcap"
-    one = begin("one", "--seed", "7", "--speed", "3", "--record", str(recording))
-    other = begin("other", "--seed", "8")
+    one = start_demo("one", "--seed", "7", "--speed", "3", "--record", str(recording))
+    other = start_demo("other", "--seed", "8")
     for command in (one, other):
-        await command.wait_for("^planner: plan 1", DRIVES_S)
+        await command.wait_for("^planner: plan 1", START_TIMEOUT_S)
     folders = [one.folder, other.folder]
     assert folders[0] is not None
     assert folders[1] is not None
@@ -187,9 +187,9 @@ async def test_of_two_demos_side_by_side_one_is_interrupted_and_the_other_drives
     assert ports[0].isdisjoint(ports[1])
 
     os.killpg(one.process.pid, signal.SIGINT)  # what a terminal does at Ctrl-C
-    assert await one.ends(ENDS_S) == NOT_TRUE
-    has_left_nothing(one, folders[0], families[0], ports[0])
-    leads_fresh_cores_to_the_recorded_maps(recording, tmp_path / "replayed")
+    assert await one.wait_end(END_TIMEOUT_S) == FAILED
+    assert_nothing_left(one, folders[0], families[0], ports[0])
+    assert_replay_gives_the_recorded_maps(recording, tmp_path / "replayed")
 
     (router,) = {p.environ()["FOGNAV_ZENOH_CONNECT"] for p in families[1] if "FOGNAV_ZENOH_CONNECT" in p.environ()}
     opened = ZenohEdge.open(connect=[router], clock=SystemClock(), role="console", id="test", site="estig")
@@ -197,43 +197,45 @@ async def test_of_two_demos_side_by_side_one_is_interrupted_and_the_other_drives
         truth = edge.latest(ch.SIM_TRUTH, SimTruth, robot="r1")
 
         def driven() -> float:
-            told = truth.get()
-            return told.distance if told is not None else 0.0
+            latest = truth.get()
+            return latest.distance if latest is not None else 0.0
 
-        await until(lambda: truth.get() is not None, 5, lambda: "the simulator of the other said what is so")
+        await until(lambda: truth.get() is not None, 5, lambda: "the other's ground truth is received")
         before = driven()
-        await until(lambda: driven() > before + 0.5, 15, lambda: f"the other drove on: {other.said}")
+        await until(lambda: driven() > before + 0.5, 15, lambda: f"the other drives on: {other.output}")
     assert [child for child in families[1] if not alive(child)] == []
 
     os.kill(other.process.pid, signal.SIGTERM)
-    assert await other.ends(ENDS_S) == NOT_TRUE
-    has_left_nothing(other, folders[1], families[1], ports[1])
+    assert await other.wait_end(END_TIMEOUT_S) == FAILED
+    assert_nothing_left(other, folders[1], families[1], ports[1])
 
 
-async def test_a_demo_that_is_interrupted_while_it_starts_ends_what_it_has_started(
-    begin: Callable[..., Command], tmp_path: Path
+async def test_demo_interrupted_during_its_start_ends_all_its_processes(
+    start_demo: Callable[..., Command], tmp_path: Path
 ) -> None:
-    command = begin("early", "--speed", "3")
-    await until(lambda: command.folder is not None, DRIVES_S, lambda: f"it began: {command.said}")
+    command = start_demo("early", "--speed", "3")
+    await until(lambda: command.folder is not None, START_TIMEOUT_S, lambda: f"it starts: {command.output}")
     assert command.folder is not None
-    await until(lambda: len(command.children()) > 3, DRIVES_S, lambda: "its services were started")
+    await until(lambda: len(command.children()) > 3, START_TIMEOUT_S, lambda: "its services are started")
     children = command.children()
-    os.kill(command.process.pid, signal.SIGINT)  # not its group: the programs end because it ends them
-    assert await command.ends(ENDS_S) == NOT_TRUE
-    has_left_nothing(command, command.folder, children, set())
+    os.kill(command.process.pid, signal.SIGINT)  # not its process group: the demo itself must end its programs
+    assert await command.wait_end(END_TIMEOUT_S) == FAILED
+    assert_nothing_left(command, command.folder, children, set())
 
 
-async def test_nothing_of_a_demo_outlives_its_kill_but_files(begin: Callable[..., Command]) -> None:
-    command = begin("killed", "--speed", "3")
-    await command.wait_for("^operator: enable$", DRIVES_S)
+async def test_killed_demo_leaves_files_but_no_process(start_demo: Callable[..., Command]) -> None:
+    command = start_demo("killed", "--speed", "3")
+    await command.wait_for("^operator: enable$", START_TIMEOUT_S)
     folder, children = command.folder, command.children()
     assert folder is not None
     assert len(children) >= PROCESSES
     ports = ports_of(children)
     command.process.kill()
-    assert await command.ends(ENDS_S) == -signal.SIGKILL
-    # A guardian whose watchdog is gone stops the wheels first, then ends by itself.
-    await until(lambda: not any(alive(child) for child in children), 5, lambda: f"the end of {those_of(folder)}")
-    assert those_of(folder) == []
-    # The last thread of a killed process closes its sockets, which may be after the process counts as dead.
-    await until(lambda: not any(listens(port) for port in ports), 5, lambda: f"none of {sorted(ports)} listened")
+    assert await command.wait_end(END_TIMEOUT_S) == -signal.SIGKILL
+    # A guardian without its watchdog stops the wheels first, then ends.
+    await until(
+        lambda: not any(alive(child) for child in children), 5, lambda: f"these have ended: {processes_of(folder)}"
+    )
+    assert processes_of(folder) == []
+    # The last thread of a killed process may close its sockets after the process counts as dead.
+    await until(lambda: not any(listens(port) for port in ports), 5, lambda: f"none of {sorted(ports)} is open")

@@ -1,7 +1,7 @@
-"""Feed a recording to fresh cores and write down all that they say: `python cores.py RECORDING SITE OUT`.
+"""Feed a recording to fresh cores and write what they publish: `python cores.py RECORDING SITE OUT`.
 
-Time is the recording's: an input is taken when it was recorded, and every core ticks each 0.1 s of recorded time.
-A program of its own, so that a test can run it twice with other hash seeds.
+Time is the recording's: an input is handled at its recorded time, and every core ticks each 0.1 s of recorded time.
+It is a program of its own, so that a test can run it with different hash seeds.
 """
 
 from __future__ import annotations
@@ -43,42 +43,42 @@ if TYPE_CHECKING:
 
     from fog_contracts.handlers import Ids
 
-Heard = tuple[float, ch.Channel, dict[str, str], Message | str]
+RecordedMessage = tuple[float, ch.Channel, dict[str, str], Message | str]
 
 TICK_S: Final = 0.1
 
 
 class ReplayError(Exception):
-    """The recording lacks what a replay needs, or contradicts itself."""
+    """The recording lacks messages that a replay needs, or is inconsistent."""
 
 
-def hear(recording: Path) -> list[Heard]:
-    """Return all messages in the order of recording, with their times in seconds."""
+def load_recording(recording: Path) -> list[RecordedMessage]:
+    """Return all messages in the order of recording, with their times (s)."""
     return [(time_ns * 1e-9, channel, ids, message) for time_ns, channel, ids, message in read(recording)]
 
 
-def first(heard: list[Heard], channel: ch.Channel) -> tuple[float, Message]:
-    """Return time and content of a channel's first message."""
-    for at, told_on, _, message in heard:
-        if told_on is channel and isinstance(message, Message):
+def first(messages: list[RecordedMessage], channel: ch.Channel) -> tuple[float, Message]:
+    """Return a channel's first message, with its time (s)."""
+    for at, recorded_channel, _, message in messages:
+        if recorded_channel is channel and isinstance(message, Message):
             return at, message
     raise ReplayError(f"no message of {channel.name} was recorded")
 
 
 class Replay:
-    """One core on a bus of its own, which hears what the other parts of the system published in a recording."""
+    """One core on a bus of its own, which receives what the other processes published in a recording."""
 
-    def __init__(self, heard: list[Heard], site: LoadedSite, role: ch.Role, begin: float) -> None:
+    def __init__(self, messages: list[RecordedMessage], site: LoadedSite, role: ch.Role, start: float) -> None:
         self.bus = Bus(site.site.id)
         self.published: list[Message] = []
-        """What the core has published, without text."""
-        self._heard = [event for event in heard if event[0] >= begin]
+        """The messages that the core has published, except text."""
+        self._messages = [event for event in messages if event[0] >= start]
         self._role = role
-        self._begin = begin
+        self._start = start
         own = [c for c in ch.CHANNELS.values() if c.kind == "pub" and role in c.publishers and c.message is not None]
-        self.bus.subscribe(dict.fromkeys(own, self._note))
+        self.bus.subscribe(dict.fromkeys(own, self._record))
 
-    def _note(self, _ids: Ids, message: Message, _at: Moment) -> Sequence[Publication]:
+    def _record(self, _ids: Ids, message: Message, _at: Moment) -> Sequence[Publication]:
         self.published.append(message)
         return ()
 
@@ -87,15 +87,15 @@ class Replay:
         tick: Callable[[Moment], object],
         deliver: Callable[[Moment], object] | None = None,
         *,
-        own: Callable[[Heard, Moment], object] | None = None,
+        own: Callable[[RecordedMessage, Moment], object] | None = None,
     ) -> None:
-        """Deliver every message when it was recorded, and tick each 0.1 s of recorded time.
+        """Deliver every message at its recorded time, and tick each 0.1 s of recorded time.
 
-        What the core itself had published is handed to `own`: it tells of inputs that cross no channel.
+        `own` receives what the live process had published itself: this reveals inputs that cross no channel.
         """
         deliver = deliver or self.bus.deliver
-        due = self._begin
-        for event in self._heard:
+        due = self._start
+        for event in self._messages:
             at = Moment(event[0], event[0])
             while due <= at.now:
                 tick(Moment(due, due))
@@ -109,19 +109,19 @@ class Replay:
             deliver(at)
 
 
-def aggregate(heard: list[Heard], site: LoadedSite) -> list[AreaHazard]:
-    """Return the hazards that an aggregator announces, with a store that answers at once."""
-    begin, hazard = first(heard, ch.AREA_HAZARD)
+def replay_aggregator(messages: list[RecordedMessage], site: LoadedSite) -> list[AreaHazard]:
+    """Return the hazards that an aggregator publishes, with a store without delay."""
+    start, hazard = first(messages, ch.AREA_HAZARD)
     assert isinstance(hazard, AreaHazard)
-    replay = Replay(heard, site, "hazard-aggregator", begin)
+    replay = Replay(messages, site, "hazard-aggregator", start)
     core = Aggregator(site.site.definitions(), site.site.nodes, hazard.epoch, registry=find_rule)
     replay.run(AggregatorProcess(core, replay.bus).tick)
     return [message for message in replay.published if isinstance(message, AreaHazard)]
 
 
-def empty_map(heard: list[Heard], site: LoadedSite) -> MapCore:
-    """Return a map-service's core as it stands at its start: what no recording holds comes from the site."""
-    _, heartbeat = first(heard, ch.MAP_HEARTBEAT)
+def empty_map(messages: list[RecordedMessage], site: LoadedSite) -> MapCore:
+    """Return a map-service's core in its initial state: what no recording contains comes from the site."""
+    _, heartbeat = first(messages, ch.MAP_HEARTBEAT)
     assert isinstance(heartbeat, MapHeartbeat)
     return MapCore(
         site.site.id,
@@ -132,68 +132,68 @@ def empty_map(heard: list[Heard], site: LoadedSite) -> MapCore:
     )
 
 
-def draw(heard: list[Heard], site: LoadedSite) -> tuple[list[MapDelta], MapSnapshot]:
-    """Return the deltas that a map-service publishes, and its last map."""
-    replay = Replay(heard, site, "map-service", heard[0][0])
-    process = MapProcess(empty_map(heard, site), replay.bus)
-    begin = Moment(heard[0][0], heard[0][0])
-    process.load_zones([], begin)
-    process.connect(begin)
+def replay_map(messages: list[RecordedMessage], site: LoadedSite) -> tuple[list[MapDelta], MapSnapshot]:
+    """Return the deltas that a map-service publishes, and its final map."""
+    replay = Replay(messages, site, "map-service", messages[0][0])
+    process = MapProcess(empty_map(messages, site), replay.bus)
+    start = Moment(messages[0][0], messages[0][0])
+    process.load_zones([], start)
+    process.connect(start)
 
-    def take_stored_zones(event: Heard, at: Moment) -> None:
+    def load_stored_zones(event: RecordedMessage, at: Moment) -> None:
         if isinstance(zones := event[3], ZoneSet):
             process.load_zones(zones.zones, at)
 
-    replay.run(process.tick, own=take_stored_zones)
+    replay.run(process.tick, own=load_stored_zones)
     return [m for m in replay.published if isinstance(m, MapDelta)], process.core.costmap.snapshot()
 
 
-def copy(heard: list[Heard], site: LoadedSite) -> list[MapHeartbeat]:
-    """Return every version that a copy reaches by the recorded deltas; raises `ReplayError` if one does not fit."""
+def replay_deltas(messages: list[RecordedMessage], site: LoadedSite) -> list[MapHeartbeat]:
+    """Return every version that a replica reaches by the recorded deltas; raises `ReplayError` for one that fails."""
     follower, versions = MapFollower(), []
-    follower.on_snapshot(empty_map(heard, site).costmap.snapshot(), heard[0][0])
-    for at, _, _, message in heard:
+    follower.on_snapshot(empty_map(messages, site).costmap.snapshot(), messages[0][0])
+    for at, _, _, message in messages:
         if isinstance(message, MapDelta):
             applied = follower.on_delta(message, at)
             if follower.wants_snapshot(at):
-                raise ReplayError(f"recorded delta {message.seq} part {message.part} does not fit {follower.version}")
+                delta = f"recorded delta {message.seq} part {message.part}"
+                raise ReplayError(f"{delta} does not continue {follower.version}")
             if applied is not None:
                 version = applied.version
                 versions.append(MapHeartbeat(epoch=version.epoch, seq=version.seq, hash=version.hash, stamp=at))
     return versions
 
 
-def new_planner(heard: list[Heard], site: LoadedSite, replay: Replay) -> PlannerProcess:
-    """Return a planner that knows the first map."""
-    _, path = first(heard, ch.ROBOT_PATH)
+def new_planner(messages: list[RecordedMessage], site: LoadedSite, replay: Replay) -> PlannerProcess:
+    """Return a planner that has loaded the first map."""
+    _, path = first(messages, ch.ROBOT_PATH)
     assert isinstance(path, RobotPath)
     core = PlannerCore(path.planner_epoch)
-    core.load(empty_map(heard, site).costmap.snapshot(), heard[0][0])
+    core.load(empty_map(messages, site).costmap.snapshot(), messages[0][0])
     return PlannerProcess(core, replay.bus)
 
 
-def decide(heard: list[Heard], site: LoadedSite) -> list[RobotPath | RobotGoal]:
-    """Return what a planner tells the robots."""
-    replay = Replay(heard, site, "planner", heard[0][0])
-    planner = new_planner(heard, site, replay)
+def replay_planner(messages: list[RecordedMessage], site: LoadedSite) -> list[RobotPath | RobotGoal]:
+    """Return the paths and goals that a planner publishes."""
+    replay = Replay(messages, site, "planner", messages[0][0])
+    planner = new_planner(messages, site, replay)
 
-    def take_mission(event: Heard, _at: Moment) -> None:
+    def set_recorded_goal(event: RecordedMessage, _at: Moment) -> None:
         _, _, ids, goal = event
         if isinstance(goal, RobotGoal):
-            # The recorded goal is what the planner made of a person's wish: a place that asks for no heading is not
-            # in it.
+            # The recorded goal does not show whether the operator asked for a heading.
             planner.set_goal(ids["robot"], goal, any_heading=True)
 
-    replay.run(planner.tick, planner.deliver, own=take_mission)
+    replay.run(planner.tick, planner.deliver, own=set_recorded_goal)
     return [message for message in replay.published if isinstance(message, (RobotPath, RobotGoal))]
 
 
-def plan_again(heard: list[Heard], site: LoadedSite) -> list[RobotPath]:
-    """Return each recorded plan anew: from where it begins, on the map version that it names."""
-    replay = Replay(heard, site, "planner", heard[0][0])
-    planner, again, known, goal = new_planner(heard, site, replay), [], 0, None
+def recompute_plans(messages: list[RecordedMessage], site: LoadedSite) -> list[RobotPath]:
+    """Return each recorded plan computed again, from its first point on its map version."""
+    replay = Replay(messages, site, "planner", messages[0][0])
+    planner, plans, known, goal = new_planner(messages, site, replay), [], 0, None
 
-    def plan(event: Heard, at: Moment) -> None:
+    def plan(event: RecordedMessage, at: Moment) -> None:
         nonlocal known, goal
         message = event[3]
         if isinstance(message, RobotGoal):
@@ -204,7 +204,7 @@ def plan_again(heard: list[Heard], site: LoadedSite) -> list[RobotPath]:
             request = PlanRequest(start=Pose(x=x, y=y, theta=0.0), goal=goal)
             reply = replay.bus.query(ch.PLANNER_PLAN, request, PlanReply, at)
             assert reply is not None
-            again.append(
+            plans.append(
                 msgspec.structs.replace(
                     message,
                     points=reply.points,
@@ -213,28 +213,28 @@ def plan_again(heard: list[Heard], site: LoadedSite) -> list[RobotPath]:
                     refusal=reply.refusal,
                 )
             )
-            # Its distance field speeds up the search for the next plan, as it does in the planner.
+            # As in the planner, the goal's distance field speeds up the next search.
             planner.set_goal("r", RobotGoal(goal_id="again", pose=goal))
 
     replay.run(planner.tick, planner.deliver, own=plan)
-    return again
+    return plans
 
 
 def main() -> None:
-    """Replay, and write one file of JSON lines per core."""
+    """Replay, and write one file of JSON lines per output."""
     recording, folder, out = (Path(argument) for argument in sys.argv[1:])
-    heard, site = hear(recording), load_site(folder)
-    deltas, snapshot = draw(heard, site)
-    said: dict[str, list[Message]] = {
-        "hazards": [*aggregate(heard, site)],
+    messages, site = load_recording(recording), load_site(folder)
+    deltas, snapshot = replay_map(messages, site)
+    outputs: dict[str, list[Message]] = {
+        "hazards": [*replay_aggregator(messages, site)],
         "deltas": [*deltas],
         "snapshot": [snapshot],
-        "versions": [*copy(heard, site)],
-        "told": [*decide(heard, site)],
-        "again": [*plan_again(heard, site)],
+        "versions": [*replay_deltas(messages, site)],
+        "paths": [*replay_planner(messages, site)],
+        "plans": [*recompute_plans(messages, site)],
     }
-    for name, messages in said.items():
-        (out / f"{name}.jsonl").write_bytes(b"".join(msgspec.json.encode(message) + b"\n" for message in messages))
+    for name, published in outputs.items():
+        (out / f"{name}.jsonl").write_bytes(b"".join(msgspec.json.encode(message) + b"\n" for message in published))
 
 
 if __name__ == "__main__":

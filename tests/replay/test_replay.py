@@ -1,20 +1,20 @@
-"""Traffic recorded from a demo, fed to fresh cores, gives what the live processes said.
+"""The recorded messages of a demo, fed to fresh cores, give what the live processes published.
 
 A real demo (real brokers, all processes, emulated hardware) is recorded from before its first service starts, so that
-every input of aggregator, map-service and planner is in the file; what is no message (floor plan, nodes, areas) comes
-from the site. Two replays in processes of their own, with different hash seeds, must give the same bytes.
+every input of aggregator, map-service and planner is in the file; floor plan, nodes and areas come from the site. Two
+replays in processes of their own, with different hash seeds, must give the same bytes.
 
-What a replay can't know in principle is when a live process took an input between two others, and the phase of its
-0.1 s beats: MQTT and zenoh are two streams, and the recorder is a third listener. So of the live outputs exactly that
-is compared which this can't touch:
+A replay can't reproduce in which order a live process handled inputs of different transports, nor the phase of its
+0.1 s ticks: MQTT and zenoh are two streams, and the recorder is a third subscriber. So the tests compare those live
+outputs that do not depend on this:
 
-- per area the states in order, with the reading that decided each (its cause names it), and the last hazard;
-- the map at the end, cell for cell by its hash, after obstacles have faded (a robot that moved 3 cm between a pose and
-  an obstacle leaves out another cell beside it); the versions between must be those of the recorded deltas;
-- each plan, computed again on the map version that it names and from the point where it begins, point for point;
-- which way the replayed planner goes, by where it leads.
+- per area the sequence of states, with the reading that decided each (its cause names it), and the last hazard;
+- the final map, cell by cell through its hash, after obstacles have faded (a robot that moved 3 cm between a pose and
+  an obstacle omits another cell beside it); the versions before it must be those of the recorded deltas;
+- each plan, computed again on its map version and from its first point, point by point;
+- whether the replayed planner's paths cross the blocked area.
 
-The robot-agent is replayed from a log of its own, for what its base and lidar send crosses no channel
+The robot-agent is replayed from a log of its own, because the data of its base and lidar cross no channel
 (robot-agent/tests/test_replay.py).
 """
 
@@ -74,14 +74,14 @@ pytestmark = [pytest.mark.live, pytest.mark.timeout(300)]
 HERE = Path(__file__).parent
 SITE = HERE.parents[1] / "sites" / "estig"
 SPEED = 1.0
-READY_S = 60.0
-DRIVE_S = 120.0
+READY_TIMEOUT_S = 60.0
+DRIVE_TIMEOUT_S = 120.0
 BOX = SimObstacle(id="box", polygon=[(4.8, 23.4), (5.2, 23.4), (5.2, 23.8), (4.8, 23.8)])
-"""Behind the robot's back at its start: lidars see it, and no way leads over it."""
+"""Behind the robot at its start: the lidar sees it, and no path leads over it."""
 AFTER_M = 1.5
-"""How far the robot drives on after its new path."""
-FADED_S = 3.0
-"""How long (s of the clock) after the last obstacle's end the map is looked at."""
+"""Distance (m) that the robot drives on its new path."""
+FADE_MARGIN_S = 3.0
+"""Time (s of the clock) between the last obstacle's end and the final snapshot."""
 ZONES: tuple[dict[str, Any], ...] = (
     {"id": "wet", "kind": "BLOCKED", "shape": {"type": "circle", "centre": [48.5, 15.0], "radius": 1.0}},
     {"id": "slow", "kind": "SPEED_LIMIT", "speed": 0.2,
@@ -89,8 +89,8 @@ ZONES: tuple[dict[str, Any], ...] = (
 )  # fmt: skip
 
 
-class UnhurriedWatch(SpeedWatch):
-    """Takes a machine too slow for the speed: nobody evaluates how well the robot drives here."""
+class NoSpeedWatch(SpeedWatch):
+    """Accepts a machine that is too slow for the speed: the quality of the drive does not matter here."""
 
     def check(self, *_, **__):
         pass
@@ -101,29 +101,29 @@ class UnhurriedWatch(SpeedWatch):
 
 @dataclass(frozen=True)
 class Recording:
-    """A recorded demo; `last` is the map that the live map-service gave at the end."""
+    """A recorded demo; `last` is the live map-service's snapshot at the end."""
 
     path: Path
     last: MapSnapshot
     blocked: str
-    heard: list[tuple[int, ch.Channel, dict[str, str], Any]]
+    messages: list[tuple[int, ch.Channel, dict[str, str], Any]]
 
     def of(self, channel: ch.Channel) -> list[Any]:
-        return [message for _, told_on, _, message in self.heard if told_on is channel]
+        return [message for _, recorded_channel, _, message in self.messages if recorded_channel is channel]
 
 
-async def until(condition: Callable[[], bool], what: str, timeout_s: float) -> None:
+async def until(condition: Callable[[], bool], description: str, timeout_s: float) -> None:
     deadline = time.monotonic() + timeout_s
     while not condition():
-        assert time.monotonic() < deadline, f"{timeout_s:.0f} s passed before {what}"
+        assert time.monotonic() < deadline, f"timeout after {timeout_s:.0f} s, waiting until {description}"
         await asyncio.sleep(0.05)
 
 
-async def ask_map_service(stack: Stack, method: str, path: str, body: dict[str, Any] | None = None) -> None:
+async def request_map_service(stack: Stack, method: str, path: str, body: dict[str, Any] | None = None) -> None:
     port = stack.port(MAP_SERVICE)
     assert port is not None
-    answer = await asyncio.to_thread(net.request, method, port, path, body=body, token=stack.token)
-    assert answer.status < 300, answer.reason
+    response = await asyncio.to_thread(net.request, method, port, path, body=body, token=stack.token)
+    assert response.status < 300, response.reason
 
 
 async def drive(attempt: Attempt, stack: Stack, edge: ZenohEdge, clock: SystemClock) -> None:
@@ -134,26 +134,26 @@ async def drive(attempt: Attempt, stack: Stack, edge: ZenohEdge, clock: SystemCl
     async with Background(operator.keep_enabled()) as background:
         driving = asyncio.create_task(attempt.drive(operator, clock, background))
 
-        def beyond(distance: float) -> bool:
+        def has_driven(distance: float) -> bool:
             assert not driving.done(), (scene.outcome, list(scene.events))
             return attempt.evaluation is not None and attempt.evaluation.distance_m >= distance
 
-        def avoids() -> bool:
+        def has_new_path() -> bool:
             evaluation = attempt.evaluation
-            return beyond(0.0) and attempt.hazard.placed_at is not None and evaluation and evaluation.plans >= 2
+            return has_driven(0.0) and attempt.hazard.placed_at is not None and evaluation and evaluation.plans >= 2
 
         try:
-            await until(avoids, f"the way was blocked and planned anew: {list(scene.events)}", DRIVE_S)
+            await until(has_new_path, f"the planner has replanned: {list(scene.events)}", DRIVE_TIMEOUT_S)
             assert attempt.evaluation is not None
-            there = attempt.evaluation.distance_m + AFTER_M
-            await until(lambda: beyond(there), "the robot followed its new path", DRIVE_S)
+            distance_m = attempt.evaluation.distance_m + AFTER_M
+            await until(lambda: has_driven(distance_m), "the robot has followed its new path", DRIVE_TIMEOUT_S)
         finally:
             driving.cancel()
             await asyncio.gather(driving, return_exceptions=True)
 
 
 def input_log(recording: Path) -> Path:
-    """Return where the agent of a recorded demo logs all that reaches its core."""
+    """Return the input log of the agent of a recorded demo."""
     return recording.with_name("agent.mcap")
 
 
@@ -163,40 +163,40 @@ async def record(path: Path) -> tuple[MapSnapshot, str]:
     clock = SystemClock(SPEED)
     plan = DrivePlan.of(site, Options(seed=1, speed=SPEED))
     attempt = Attempt(plan, Scene(site, plan.robot, 1, SPEED))
-    attempt.speed_watch = UnhurriedWatch(SPEED)
+    attempt.speed_watch = NoSpeedWatch(SPEED)
     faded_at = 0.0
 
     def on_obstacles(_: dict[str, str], seen: RobotObstacles) -> None:
         nonlocal faded_at
-        faded_at = clock.now() + seen.ttl + FADED_S
+        faded_at = clock.now() + seen.ttl + FADE_MARGIN_S
 
-    # So long a memory as robots have by themselves would make the recording long too.
+    # The default memory for obstacles would make the recording too long.
     extra = {"OBSTACLE_MEMORY_S": "30", "INPUT_LOG": str(input_log(path))}
     async with Stack(StackConfig(site_dir=SITE, robot=plan.robot, seed=1, speed=SPEED, extra=extra)) as stack:
-        keeper = stack.supervisor
+        supervisor = stack.supervisor
         for name in SERVERS:
-            keeper.start(name)
-        await keeper.wait_ready(SERVERS, READY_S)
+            supervisor.start(name)
+        await supervisor.wait_ready(SERVERS, READY_TIMEOUT_S)
         opened = ZenohEdge.open(
             connect=[stack.zenoh_endpoint], clock=clock, role="console", id="replay", site=site.site.id
         )
         async with opened as edge, recording(path, mqtt_url=stack.mqtt_url, zenoh=edge, clock=clock):
-            # Before there are nodes and robots, the services stand at their beginning.
+            # The services must be ready before nodes and robots publish.
             for names in (SERVICES, [SIMULATOR], [WATCHDOG, AGENT]):
                 for name in names:
-                    keeper.start(name)
-                await keeper.wait_ready([name for name in names if name != AGENT], READY_S)
+                    supervisor.start(name)
+                await supervisor.wait_ready([name for name in names if name != AGENT], READY_TIMEOUT_S)
             edge.subscribe(ch.ROBOT_OBSTACLES, RobotObstacles, on_obstacles)
-            stood = await edge.query(ch.SIM_COMMAND, SimCommand(place=[BOX]), CommandReply, 10.0, robot=plan.robot)
-            assert stood is not None
-            assert stood.accepted, stood.reason
+            reply = await edge.query(ch.SIM_COMMAND, SimCommand(place=[BOX]), CommandReply, 10.0, robot=plan.robot)
+            assert reply is not None
+            assert reply.accepted, reply.reason
             for zone in ZONES:
-                await ask_map_service(stack, "POST", "/api/v1/zones", zone)
+                await request_map_service(stack, "POST", "/api/v1/zones", zone)
             await drive(attempt, stack, edge, clock)
             for name in (AGENT, WATCHDOG):
-                await keeper.stop(name)
-            await ask_map_service(stack, "DELETE", "/api/v1/zones/wet")
-            await until(lambda: clock.now() > faded_at, "all obstacles had faded", READY_S)
+                await supervisor.stop(name)
+            await request_map_service(stack, "DELETE", "/api/v1/zones/wet")
+            await until(lambda: clock.now() > faded_at, "all obstacles have faded", READY_TIMEOUT_S)
             last = await edge.query(ch.MAP_SNAPSHOT, None, MapSnapshot, 10.0)
             assert last is not None
     assert attempt.hazard.area is not None
@@ -224,7 +224,7 @@ def replayed(recorded: Recording, tmp_path_factory: pytest.TempPathFactory) -> P
     return run_cores(recorded.path, tmp_path_factory.mktemp("replay") / "first", 1)
 
 
-def said(replayed: Path, name: str, kind: Any) -> list[Any]:
+def read_output(replayed: Path, name: str, kind: Any) -> list[Any]:
     return [msgspec.json.decode(line, type=kind) for line in (replayed / f"{name}.jsonl").read_bytes().splitlines()]
 
 
@@ -235,8 +235,8 @@ def by_area(hazards: list[AreaHazard]) -> dict[str, list[AreaHazard]]:
     return found
 
 
-def turns(hazards: list[AreaHazard]) -> list[tuple[str, int, str]]:
-    """Return the states in order, each with its cost and the cause that brought it."""
+def transitions(hazards: list[AreaHazard]) -> list[tuple[str, int, str]]:
+    """Return the sequence of states, each with its cost and cause."""
     grouped = itertools.groupby(hazards, key=lambda hazard: (hazard.state, hazard.penalty))
     return [(state, penalty, next(group).cause) for (state, penalty), group in grouped]
 
@@ -244,7 +244,7 @@ def turns(hazards: list[AreaHazard]) -> list[tuple[str, int, str]]:
 # --- The replays ---
 
 
-def test_the_recording_holds_a_demo_worth_replaying(recorded):
+def test_recording_contains_all_kinds_of_inputs(recorded):
     assert {"blocked", "clear", "unknown"} == {hazard.state for hazard in recorded.of(ch.AREA_HAZARD)}
     assert len(recorded.of(ch.NODE_READING)) > 500
     assert len({path.plan_id for path in recorded.of(ch.ROBOT_PATH)}) >= 2
@@ -253,38 +253,39 @@ def test_the_recording_holds_a_demo_worth_replaying(recorded):
 
 
 def test_two_replays_give_the_same_bytes(recorded, replayed, tmp_path):
-    again = run_cores(recorded.path, tmp_path / "second", 2)
+    second = run_cores(recorded.path, tmp_path / "second", 2)
     names = sorted(path.name for path in replayed.iterdir())
-    assert names == ["again.jsonl", "deltas.jsonl", "hazards.jsonl", "snapshot.jsonl", "told.jsonl", "versions.jsonl"]
+    assert names == ["deltas.jsonl", "hazards.jsonl", "paths.jsonl", "plans.jsonl", "snapshot.jsonl", "versions.jsonl"]
     for name in names:
         first = (replayed / name).read_bytes()
         assert first, name
-        assert first == (again / name).read_bytes(), name
+        assert first == (second / name).read_bytes(), name
 
 
-def test_recorded_readings_bring_every_area_through_the_recorded_states(recorded, replayed):
-    live, replay = by_area(recorded.of(ch.AREA_HAZARD)), by_area(said(replayed, "hazards", AreaHazard))
+def test_replayed_readings_give_the_recorded_states_of_every_area(recorded, replayed):
+    live, replay = by_area(recorded.of(ch.AREA_HAZARD)), by_area(read_output(replayed, "hazards", AreaHazard))
     assert live.keys() == replay.keys()
     for area, hazards in live.items():
-        assert turns(hazards) == turns(replay[area]), area
+        assert transitions(hazards) == transitions(replay[area]), area
         assert hazards[-1].nodes == replay[area][-1].nodes
 
 
-def test_recorded_deltas_lead_a_replica_to_the_last_live_map(recorded, replayed):
-    reached = said(replayed, "versions", MapHeartbeat)[-1]
+def test_recorded_deltas_bring_a_replica_to_the_last_live_map(recorded, replayed):
+    reached = read_output(replayed, "versions", MapHeartbeat)[-1]
     heartbeat = recorded.of(ch.MAP_HEARTBEAT)[-1]
     for version in (heartbeat, recorded.last):
         assert (reached.epoch, reached.seq, reached.hash) == (version.epoch, version.seq, version.hash)
 
 
-def test_recorded_inputs_draw_the_last_live_map(recorded, replayed):
-    (drawn,) = said(replayed, "snapshot", MapSnapshot)
-    assert drawn.hash == recorded.last.hash
-    assert (drawn.cost, drawn.speed, drawn.static) == (recorded.last.cost, recorded.last.speed, recorded.last.static)
+def test_replayed_inputs_give_the_last_live_map(recorded, replayed):
+    (snapshot,) = read_output(replayed, "snapshot", MapSnapshot)
+    assert snapshot.hash == recorded.last.hash
+    last = recorded.last
+    assert (snapshot.cost, snapshot.speed, snapshot.static) == (last.cost, last.speed, last.static)
 
 
-def test_recorded_inputs_close_the_blocked_area_with_the_recorded_cells(recorded, replayed):
-    def closing(deltas: list[MapDelta]) -> list[tuple[int, int, int, int]]:
+def test_replayed_inputs_block_the_area_with_the_recorded_deltas(recorded, replayed):
+    def blocking(deltas: list[MapDelta]) -> list[tuple[int, int, int, int]]:
         return [
             (delta.x, delta.y, delta.w, delta.h)
             for delta in deltas
@@ -292,42 +293,44 @@ def test_recorded_inputs_close_the_blocked_area_with_the_recorded_cells(recorded
             and delta.layer == "cost"
         ]
 
-    live = closing(recorded.of(ch.MAP_DELTA))
+    live = blocking(recorded.of(ch.MAP_DELTA))
     assert live
-    assert live == closing(said(replayed, "deltas", MapDelta))
+    assert live == blocking(read_output(replayed, "deltas", MapDelta))
 
 
-def test_every_recorded_plan_is_found_again_point_for_point(recorded, replayed):
+def test_every_recorded_plan_is_recomputed_point_by_point(recorded, replayed):
     plans = {path.plan_id: path for path in reversed(recorded.of(ch.ROBOT_PATH)) if path.points}
-    again = said(replayed, "again", RobotPath)
-    assert [path.plan_id for path in again] == sorted(plans)
-    for path in again:
+    recomputed = read_output(replayed, "plans", RobotPath)
+    assert [path.plan_id for path in recomputed] == sorted(plans)
+    for path in recomputed:
         live = plans[path.plan_id]
         assert (path.map_epoch, path.map_seq, path.refusal) == (live.map_epoch, live.map_seq, None)
         assert len(path.points) == len(live.points)
-        # Recorded points are rounded to 0.1 mm, the first one too, from which all is planned again.
-        off = max(math.dist(a, b) for a, b in zip(path.points, live.points, strict=True))
-        assert off < 0.001, path.plan_id
+        # Recorded points are rounded to 0.1 mm, including the first one, from which the plan is recomputed.
+        deviation = max(math.dist(a, b) for a, b in zip(path.points, live.points, strict=True))
+        assert deviation < 0.001, path.plan_id
 
 
-def test_the_replayed_planner_leads_around_the_area_for_the_recorded_reason(recorded, replayed):
+def test_replayed_planner_replans_around_the_blocked_area_for_the_recorded_hazard(recorded, replayed):
     area = next(area for area in load_site(SITE).site.areas if area.id == recorded.blocked)
 
     def crosses(path: RobotPath) -> bool:
         return any(contains_point(area.polygon, *point) for point in path.points)
 
     live = recorded.of(ch.ROBOT_PATH)
-    told = [msgspec.convert(path, RobotPath) for path in said(replayed, "told", dict) if "plan_id" in path]
-    for paths in (live, told):
+    replay_paths = [
+        msgspec.convert(path, RobotPath) for path in read_output(replayed, "paths", dict) if "plan_id" in path
+    ]
+    for paths in (live, replay_paths):
         assert crosses(paths[0])
         assert not crosses(paths[-1])
-        turn = next(path for path in paths if not crosses(path))
-        assert [trace.area for trace in turn.traces] == [area.id]
+        detour = next(path for path in paths if not crosses(path))
+        assert [trace.area for trace in detour.traces] == [area.id]
         assert all(path.refusal is None for path in paths)
-    assert told[-1].points[-1] == live[-1].points[-1]
+    assert replay_paths[-1].points[-1] == live[-1].points[-1]
 
 
-def test_the_agent_replayed_from_its_log_decides_the_same_to_the_last_bit(recorded):
+def test_agent_replayed_from_its_input_log_decides_exactly_the_same(recorded):
     result = replay(input_log(recorded.path))
     assert result.differences == []
     paths = {path.plan_id for path in recorded.of(ch.ROBOT_PATH)}
@@ -340,7 +343,7 @@ def test_the_agent_replayed_from_its_log_decides_the_same_to_the_last_bit(record
 # --- The file ---
 
 
-def test_any_reader_finds_a_schema_for_every_channel_and_json_that_fits_it(recorded):
+def test_recording_has_a_schema_for_every_channel_and_matching_json(recorded):
     with recorded.path.open("rb") as file:
         reader = make_reader(file)
         found = reader.get_summary()
@@ -357,12 +360,12 @@ def test_any_reader_finds_a_schema_for_every_channel_and_json_that_fits_it(recor
             assert schema is not None
             assert set(json.loads(message.data)) <= set(json.loads(schema.data)["properties"]), channel.topic
             count += 1
-    assert count == len(recorded.heard)
-    kinds = {type(message) for *_, message in recorded.heard}
+    assert count == len(recorded.messages)
+    kinds = {type(message) for *_, message in recorded.messages}
     assert {NodeReading, AreaHazard, MapDelta, RobotPath} <= kinds
 
 
-def test_damaged_bytes_inside_a_recording_are_told_with_its_name(recorded, tmp_path):
+def test_damaged_recording_is_refused_with_its_name(recorded, tmp_path):
     data = bytearray(recorded.path.read_bytes())
     with recorded.path.open("rb") as file:
         found = make_reader(file).get_summary()
@@ -378,17 +381,17 @@ def test_damaged_bytes_inside_a_recording_are_told_with_its_name(recorded, tmp_p
         summary(damaged)
 
 
-def test_a_recording_that_lost_its_beginning_is_told_with_its_name(recorded, tmp_path):
-    beheaded = tmp_path / "beheaded.mcap"
-    beheaded.write_bytes(recorded.path.read_bytes()[4096:])
-    with pytest.raises(RecordError, match=r"beheaded\.mcap"):
-        list(read(beheaded))
+def test_recording_without_its_beginning_is_refused_with_its_name(recorded, tmp_path):
+    headless = tmp_path / "headless.mcap"
+    headless.write_bytes(recorded.path.read_bytes()[4096:])
+    with pytest.raises(RecordError, match=r"headless\.mcap"):
+        list(read(headless))
 
 
-def test_a_recording_that_lost_its_end_gives_what_is_whole(recorded, tmp_path):
+def test_recording_without_its_end_gives_all_complete_messages(recorded, tmp_path):
     data = recorded.path.read_bytes()
     short = tmp_path / "short.mcap"
     short.write_bytes(data[: len(data) * 2 // 3])
     got = list(read(short))
-    assert len(recorded.heard) // 3 < len(got) < len(recorded.heard)
-    assert got == recorded.heard[: len(got)]
+    assert len(recorded.messages) // 3 < len(got) < len(recorded.messages)
+    assert got == recorded.messages[: len(got)]

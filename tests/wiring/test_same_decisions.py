@@ -66,7 +66,7 @@ def module(path: Path) -> Any:
 
 
 live_services = module(HERE / "live_services.py")
-little = module(HERE.parents[1] / "experiments" / "tests" / "little_site.py")
+ring = module(HERE.parents[1] / "experiments" / "tests" / "ring_site.py")
 
 SEED = 3
 STEPS = 1500
@@ -184,8 +184,8 @@ def strangers(step: int, readings: list[Any]) -> list[Publication]:
 
 
 def site_with_two_areas() -> Any:
-    """Return the little site with one more area, which only a node of the thesis watches."""
-    loaded = little.little_site()
+    """Return the ring site with one more area, which only a node of the thesis watches."""
+    loaded = ring.ring_site()
     around_start = AreaSite(id="z2", label="West", polygon=[(0.5, 2.6), (2.5, 2.6), (2.5, 5.0), (0.5, 5.0)], number=2)
     return replace(loaded, site=msgspec.structs.replace(loaded.site, areas=[*loaded.site.areas, around_start]))
 
@@ -241,7 +241,7 @@ def zone_around(x: float, y: float) -> Zone:
 
 
 def goal(stamp: float) -> RobotGoal:
-    pose = Pose(x=little.GOAL.x, y=little.GOAL.y, theta=0.0)
+    pose = Pose(x=ring.GOAL.x, y=ring.GOAL.y, theta=0.0)
     return RobotGoal(goal_id=GOAL_ID, pose=pose, place=None, stamp=stamp)
 
 

@@ -1,8 +1,8 @@
-"""One drive with every real core in one process, on an emulated clock: faster than real time, the same for one seed.
+"""One drive with every real core in one process, on an emulated clock: faster than real time, repeatable by its seed.
 
-What is real: aggregator, map-service, planner, agent and guardian; every message as the bytes of its channel; base
-and lidar as bytes on their lines, at the lines' pace, through the robot's own parsers. What is not: brokers, sockets,
-threads, and the time that computing and networks take (`stages_ms` therefore holds the waiting, not the computing).
+Real are aggregator, map-service, planner, agent and guardian, every message as the bytes of its channel, and base and
+lidar as bytes at their lines' rate through the robot's own parsers. Left out are brokers, sockets, threads, and the
+time that computation and networks take (`stages_ms` therefore contains waiting times only).
 """
 
 from __future__ import annotations
@@ -40,35 +40,35 @@ if TYPE_CHECKING:
     from fog_contracts.site import AreaSite, Place
 
 WARM_UP_S: Final = 12.0
-"""Time in which areas must be judged, the pose found and the robot enabled."""
+"""Time within which all areas must be known, the robot localized and enabled."""
 TRACK_M: Final = 0.25
 """Spacing of the recorded track."""
-OPERATE_STEPS: Final = 50
-"""Steps of 10 ms between two looks of the operator."""
-_LOOK_STEPS: Final = 200
+OPERATOR_STEPS: Final = 50
+"""Steps of 10 ms between two decisions of the operator."""
+_CLEAR_STEPS: Final = 200
 """Steps of 10 ms after which all areas are known to be clear."""
 TRUTH_STEPS: Final = 10
-"""Steps of 10 ms between two looks of the evaluation, as the simulator publishes the truth."""
+"""Steps of 10 ms between two evaluations, the period of the simulator's ground truth."""
 
 
-class Happening(msgspec.Struct, frozen=True, kw_only=True):
-    """Something worth telling, with its time (s) and the way driven (m) since the goal was given."""
+class DriveEvent(msgspec.Struct, frozen=True, kw_only=True):
+    """An event of a drive, with the time (s) and the distance driven (m) since the goal was given."""
 
     time_s: float
     distance_m: float
-    what: str
+    description: str
 
 
 class LockstepResult(msgspec.Struct, frozen=True, kw_only=True):
-    """How a drive went, judged by the simulated truth; lengths in m, times in s of the emulated clock.
+    """The result of a drive, by the simulator's ground truth; lengths in m, times in s of the emulated clock.
 
-    `operator_commands` counts the commands that were accepted, the first enable included.
-    `crossed` lists the areas that the robot really entered, `hazard_clearance_m` how near its rim came to the
-    barrier, `stages_ms` the blocked hazard's way, `track` the true way every 0.25 m.
+    `operator_commands` counts the accepted commands, the first enable included. `crossed` lists the areas that the
+    robot really entered, `hazard_clearance_m` is the smallest distance from its rim to the barrier, `stages_ms` the
+    durations of the hazard's stages, `track` the true positions every 0.25 m.
     """
 
     outcome: OutcomeKind
-    detail: str
+    reason: str
     seed: int
     distance_m: float
     time_s: float
@@ -83,14 +83,14 @@ class LockstepResult(msgspec.Struct, frozen=True, kw_only=True):
     stages_ms: dict[str, float]
     pose_error_m: float
     operator_commands: int
-    events: list[Happening]
+    events: list[DriveEvent]
     track: list[tuple[float, float]]
 
 
 class _Drive:
-    """One run: rigs, scenario and what is written down about it."""
+    """One drive: system, scenario and the records of it."""
 
-    def __init__(  # noqa: PLR0913  # each is a part that it is put together from
+    def __init__(  # noqa: PLR0913  # the parts of a drive
         self,
         site: LoadedSite,
         start: Pose,
@@ -107,7 +107,7 @@ class _Drive:
         self.world = self.system.world
         self.robot = self.system.robot
         self.scenario = Scenario((), start=0.0)
-        self.events: list[Happening] = []
+        self.events: list[DriveEvent] = []
         self.track: list[tuple[float, float]] = []
         self.planned_m = 0.0
         self.path: RobotPath | None = None
@@ -120,8 +120,8 @@ class _Drive:
         self.pose_error = 0.0
         self.traces: list[Trace] = []
         self.commands = 0
-        self.begun_at = 0.0
-        self.began_m = 0.0
+        self.started_at = 0.0
+        self.start_distance_m = 0.0
         self.operator = OperatorPolicy(self.now)
         self.evaluation: DriveEvaluation | None = None
         self._steps = 0
@@ -143,33 +143,32 @@ class _Drive:
 
     @property
     def driven(self) -> float:
-        """Way since the goal was given, m."""
-        return self.world.distance - self.began_m
+        """Distance driven since the goal was given, m."""
+        return self.world.distance - self.start_distance_m
 
-    def say(self, what: str) -> None:
-        """Write down an event."""
-        self.events.append(
-            Happening(time_s=round(self.now - self.begun_at, 2), distance_m=round(self.driven, 2), what=what)
-        )
+    def log_event(self, description: str) -> None:
+        """Record an event."""
+        time_s, distance_m = round(self.now - self.started_at, 2), round(self.driven, 2)
+        self.events.append(DriveEvent(time_s=time_s, distance_m=distance_m, description=description))
 
     def step(self) -> None:
-        """Let 10 ms pass everywhere."""
+        """Simulate 10 ms."""
         self._steps += 1
-        for happened in self.scenario.step(self.world, self.now):
+        for occurrence in self.scenario.step(self.world, self.now):
             self.barrier_since = self.now
-            self.say(happened.name)
+            self.log_event(occurrence.name)
         self.system.step()
         if refused := self.system.bus.refused:
-            raise RuntimeError(f"messages of the system's own were refused: {'; '.join(refused)}")
+            raise RuntimeError(f"the system refused messages of its own: {'; '.join(refused)}")
         self.traces += self.robot.agent.finished_traces()
-        self._watch()
+        self._record()
 
     def _on_hazard(self, ids: Ids, message: HazardArea, at: Moment) -> Sequence[Publication]:
         del at
         area, hazard = ids["area"], message.hazard
         if self.hazards.get(area) != hazard.state:
             self.hazards[area] = hazard.state
-            self.say(f"area {area}: {hazard.state} ({hazard.cause})")
+            self.log_event(f"area {area}: {hazard.state} ({hazard.cause})")
         return ()
 
     def _on_pose(self, ids: Ids, pose: RobotPose, at: Moment) -> Sequence[Publication]:
@@ -193,13 +192,13 @@ class _Drive:
 
     def _on_plan(self, path: RobotPath) -> None:
         if path.refusal is not None:
-            self.say(f"no way: {path.refusal.reason}")
+            self.log_event(f"no path: {path.refusal.reason}")
             return
         length = sum(math.dist(a, b) for a, b in zip(path.points, path.points[1:], strict=False))
         self.planned_m = self.planned_m or length
-        self.say(f"plan {path.plan_id}: {length:.1f} m")
+        self.log_event(f"plan {path.plan_id}: {length:.1f} m")
 
-    def _watch(self) -> None:
+    def _record(self) -> None:
         x, y, _ = self.world.pose
         if not self.track or math.dist(self.track[-1], (x, y)) >= TRACK_M:
             self.track.append((round(float(x), 3), round(float(y), 3)))
@@ -214,8 +213,8 @@ class _Drive:
             self.operator.on_state(state, self.now)
             if state.mode != self._mode:
                 self._mode = state.mode
-                self.say(f"robot: {state.mode} ({'; '.join(state.reasons[:2])})")
-        if self._steps % OPERATE_STEPS == 0:
+                self.log_event(f"robot: {state.mode} ({'; '.join(state.reasons[:2])})")
+        if self._steps % OPERATOR_STEPS == 0:
             self._operate()
         if self.evaluation is not None and self._steps % TRUTH_STEPS == 0:
             self._evaluate(self.evaluation)
@@ -224,20 +223,20 @@ class _Drive:
         command = self.operator.command_due(self.now)
         if command is not None and self.robot.command(command).accepted:
             self.commands += 1
-            self.say(f"operator: {command}")
+            self.log_event(f"operator: {command}")
 
     def _evaluate(self, evaluation: DriveEvaluation) -> None:
         evaluation.on_truth(self.world.truth(STAMP + self.now))
         if self.state is not None:
             evaluation.on_state(self.state, self.now)
         for area in evaluation.route_areas[self._crossed :]:
-            self.say(f"enters {area}")
+            self.log_event(f"enters {area}")
         self._crossed = len(evaluation.route_areas)
 
-    def begin(self, timeout_s: float) -> None:
-        """Let the drive to the goal begin now."""
+    def start(self, timeout_s: float) -> None:
+        """Start the drive to the goal."""
         assert self.goal.pose is not None
-        self.begun_at, self.began_m = self.now, self.world.distance
+        self.started_at, self.start_distance_m = self.now, self.world.distance
         self.evaluation = DriveEvaluation(
             goal=(self.goal.pose.x, self.goal.pose.y),
             goal_id=self.goal.goal_id,
@@ -248,35 +247,35 @@ class _Drive:
         self._evaluate(self.evaluation)
 
     def warm_up(self) -> str | None:
-        """Run until the robot may drive; returns why it never could, or None."""
+        """Run until the robot is ready to drive; return None, or the reason if it does not become ready."""
         until = self.now + WARM_UP_S
         while self.now < until:
             self.step()
             state = self.state
-            judged = "unknown" not in self.hazards.values()
-            if state is not None and state.mode == "NORMAL" and judged:
+            areas_known = "unknown" not in self.hazards.values()
+            if state is not None and state.mode == "NORMAL" and areas_known:
                 return None
         unknown = [area for area, state in self.hazards.items() if state == "unknown"]
         reasons = self.state.reasons if self.state else []
         return f"not ready after {WARM_UP_S:.0f} s: {'; '.join(reasons)}; unknown areas: {unknown}"
 
     def result(self, outcome: DriveOutcome, area: str | None) -> LockstepResult:
-        """Put together what is known."""
+        """Return the result of the drive."""
         evaluation = self.evaluation
-        happened = next((event for event in self.events if event.what.startswith("barrier appears")), None)
+        hazard_event = next((event for event in self.events if event.description.startswith("barrier appears")), None)
         return LockstepResult(
             outcome=outcome.kind,
-            detail=outcome.reason,
+            reason=outcome.reason,
             seed=self.seed,
             distance_m=round(self.driven, 3),
-            time_s=round(self.now - self.begun_at, 2),
+            time_s=round(self.now - self.started_at, 2),
             min_clearance_m=round(self.world.truth(0.0).min_clearance, 3),
             contacts=self.world.contacts,
             planned_m=round(self.planned_m, 2),
             replans=max(0, evaluation.plans - 1) if evaluation is not None else 0,
             hazard_area=area,
-            hazard_at_m=happened.distance_m if happened else None,
-            hazard_clearance_m=round(self.hazard_clearance, 3) if happened else None,
+            hazard_at_m=hazard_event.distance_m if hazard_event else None,
+            hazard_clearance_m=round(self.hazard_clearance, 3) if hazard_event else None,
             crossed=list(dict.fromkeys(evaluation.route_areas)) if evaluation is not None else [],
             stages_ms=durations_ms(next((t for t in self.traces if t.area == area), None), SPANS),
             pose_error_m=round(self.pose_error, 3),
@@ -302,30 +301,36 @@ def run_lockstep(  # noqa: PLR0913  # the options of a run
 ) -> LockstepResult:
     """Drive the site's first robot from `start` to `goal`; the result is the same for the same arguments.
 
-    With `hazard_area` a barrier appears in that area after `hazard_at_m` metres (drawn between 3 and 8 by the seed
-    if not given), never within 3 m of the robot. Without `watched` the floor has neither areas nor nodes: the robot's
-    own lidar must find the barrier. `base` and `lidar` name the robot's hardware. Raises `ScenarioError` for an area
-    that the site does not have or that can't be barred, `ValueError` for a start inside something.
+    With `hazard_area` a barrier appears in that area after `hazard_at_m` metres (default: drawn from 3 to 8 by the
+    seed), never within 3 m of the robot. Without `watched` the site has neither areas nor nodes: the robot's own lidar
+    must find the barrier. `base` and `lidar` name the robot's hardware. Raises `ScenarioError` for an unknown area or
+    one that no barrier can close, `ValueError` for a start inside an obstacle.
     """
     pose = msgspec.convert(
         {"x": goal.x, "y": goal.y, "theta": goal.theta if goal.theta is not None else 0.0}, type(start)
     )
     mission = RobotGoal(goal_id="lockstep-1", pose=pose)
-    bare = msgspec.structs.replace(site.site, areas=[], nodes=[])
+    unwatched = msgspec.structs.replace(site.site, areas=[], nodes=[])
     drive = _Drive(
-        site if watched else dataclasses.replace(site, site=bare), start, mission, seed, noise, base=base, lidar=lidar
+        site if watched else dataclasses.replace(site, site=unwatched),
+        start,
+        mission,
+        seed,
+        noise,
+        base=base,
+        lidar=lidar,
     )
     barrier = None
     if hazard_area is not None:
         barrier = barrier_across(_area(site, hazard_area), site.site, site.map, seed)
-    why = drive.warm_up()
-    drive.begin(timeout_s)
-    if why is not None:
-        return drive.result(DriveOutcome("stopped", why), hazard_area)
+    problem = drive.warm_up()
+    drive.start(timeout_s)
+    if problem is not None:
+        return drive.result(DriveOutcome("stopped", problem), hazard_area)
     if barrier is not None:
         drive.barrier = barrier
-        at = hazard_at_m if hazard_at_m is not None else draw_trigger(seed)
-        event = Event(name=f"barrier appears in {hazard_area}", place=(barrier,), at_distance=at)
+        trigger_m = hazard_at_m if hazard_at_m is not None else draw_trigger(seed)
+        event = Event(name=f"barrier appears in {hazard_area}", place=(barrier,), at_distance=trigger_m)
         drive.scenario = Scenario([event], start=drive.now, distance=drive.world.distance)
     drive.system.fog.planner.set_goal(drive.robot.id, mission, any_heading=goal.theta is None)
     evaluation = drive.evaluation
@@ -342,13 +347,13 @@ def _area(site: LoadedSite, area_id: str) -> AreaSite:
     raise ScenarioError(f"the site has no area {area_id!r}; it has: {', '.join(a.id for a in site.site.areas)}")
 
 
-def _free_way(site: LoadedSite, start: Pose, goal: Place, seed: int) -> list[tuple[float, float]]:
-    """Plan the way on the empty floor, without driving it."""
-    mission = RobotGoal(goal_id="look", pose=msgspec.structs.replace(start, x=goal.x, y=goal.y))
+def _free_path(site: LoadedSite, start: Pose, goal: Place, seed: int) -> list[tuple[float, float]]:
+    """Return the path on the empty floor, without driving it."""
+    mission = RobotGoal(goal_id="preview", pose=msgspec.structs.replace(start, x=goal.x, y=goal.y))
     robot = msgspec.structs.replace(site.site.robots[0], start=start)
     fog = FogRig(site, World(site.map.geometry, site.map.cells, robot, seed), Bus(site.site.id), seed, start=0.0)
     now = 0.0
-    for step in range(_LOOK_STEPS):
+    for step in range(_CLEAR_STEPS):
         now = (step + 1) * STEP_S
         fog.measure(now)
         fog.deliver(moment(now))
@@ -357,7 +362,7 @@ def _free_way(site: LoadedSite, start: Pose, goal: Place, seed: int) -> list[tup
     assert mission.pose is not None
     reply = fog.preview(PlanRequest(start=start, goal=mission.pose), now)
     if reply.refusal is not None:
-        raise ScenarioError(f"there is no way even without a hazard: {reply.refusal.reason}")
+        raise ScenarioError(f"there is no path even without a hazard: {reply.refusal.reason}")
     return list(reply.points)
 
 
@@ -372,10 +377,10 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--start", help="place to start from (default: the demo's)")
     parser.add_argument("--goal", help="place to drive to (default: the demo's)")
-    parser.add_argument("--area", help="area that becomes blocked (default: drawn among the demo's on the way)")
+    parser.add_argument("--area", help="area that becomes blocked (default: one of the demo's on the path)")
     parser.add_argument("--no-hazard", action="store_true")
     parser.add_argument("--timeout", type=float, default=900.0, help="seconds of the emulated clock")
-    parser.add_argument("--track", action="store_true", help="print the true track too")
+    parser.add_argument("--track", action="store_true", help="include the true track in the result")
     arguments = parser.parse_args()
     site = load_site(arguments.site)
     demo = site.site.demo
@@ -383,10 +388,10 @@ def main() -> None:
     for name in names:
         if name not in site.site.places:
             parser.error(f"no place {name!r}; the site has: {', '.join(site.site.places)}")
-    begin, goal = (site.site.places[str(name)] for name in names)
+    origin, goal = (site.site.places[str(name)] for name in names)
     robot = site.site.robots[0].start
     start = msgspec.structs.replace(
-        robot, x=begin.x, y=begin.y, theta=begin.theta if begin.theta is not None else robot.theta
+        robot, x=origin.x, y=origin.y, theta=origin.theta if origin.theta is not None else robot.theta
     )
     area, trigger_m = arguments.area, None
     try:
@@ -395,9 +400,9 @@ def main() -> None:
         elif area is None:
             hazard = draw_hazard(
                 site.site,
-                _free_way(site, start, goal, arguments.seed),
+                _free_path(site, start, goal, arguments.seed),
                 arguments.seed,
-                lambda closed: barrier_across(closed, site.site, site.map, arguments.seed),
+                lambda blocked: barrier_across(blocked, site.site, site.map, arguments.seed),
             )
             area, trigger_m = hazard.area.id, hazard.trigger_m
         result = run_lockstep(
@@ -405,10 +410,10 @@ def main() -> None:
         )
     except ScenarioError as error:
         parser.error(str(error))
-    shown = msgspec.to_builtins(result)
+    printed = msgspec.to_builtins(result)
     if not arguments.track:
-        del shown["track"]
-    sys.stdout.write(json.dumps(shown, indent=2) + "\n")
+        del printed["track"]
+    sys.stdout.write(json.dumps(printed, indent=2) + "\n")
     raise SystemExit(0 if result.outcome == "reached" else 1)
 
 

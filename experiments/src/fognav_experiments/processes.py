@@ -1,7 +1,7 @@
-"""The cores as their processes run them, on a bus in place of brokers: wired from their tables, one turn after another.
+"""The cores as their processes run them, on a bus instead of brokers, wired from their tables of handlers.
 
-Each class stands for one service and adds to its core what no channel carries: a store that answers at once, the
-connection to the broker, the fetching of snapshots, distance fields. Lockstep and replays share them.
+Each class represents one process and adds to its core what no channel carries: a store without delay, the connection
+to the broker, fetching snapshots, distance fields. Lockstep and replays share them.
 """
 
 from __future__ import annotations
@@ -26,34 +26,34 @@ if TYPE_CHECKING:
 
 
 class AggregatorProcess:
-    """The hazard aggregator, with a store that answers at once."""
+    """The hazard-aggregator, with a store without delay."""
 
     def __init__(self, core: Aggregator, bus: Bus) -> None:
         self.core = core
         self._bus = bus
-        bus.subscribe({channel: self._storing(handler) for channel, handler in core.handlers().items()})
+        bus.subscribe({channel: self._with_store(handler) for channel, handler in core.handlers().items()})
 
     def connect(self) -> None:
-        """Publish what a broker must hear after each connection."""
+        """Publish everything again, as after each connection to the broker."""
         self._bus.publish(self.core.republish_all())
 
     def tick(self, at: Moment) -> None:
-        """Let time pass; call it ten times a second."""
+        """Tick the core; call it ten times a second."""
         self._bus.publish(self._store(self.core.tick(at)))
 
-    def _storing(self, handler: Handler) -> Handler:
+    def _with_store(self, handler: Handler) -> Handler:
         def handle(ids: Ids, message: Message | str, at: Moment) -> Sequence[Publication]:
             return self._store(handler(ids, message, at))
 
         return handle
 
     def _store(self, publications: Sequence[Publication]) -> Sequence[Publication]:
-        """Return these publications, and those that waited for the store."""
+        """Return these publications, and those that were withheld until stored."""
         return [*publications, *self.core.mark_stored(self.core.to_store())]
 
 
 class MapProcess:
-    """The map-service; operators' zones reach it by `load_zones` and `put_zone`, as if they were stored."""
+    """The map-service; `load_zones` and `put_zone` replace its store and REST API."""
 
     def __init__(self, core: MapCore, bus: Bus) -> None:
         self.core = core
@@ -62,20 +62,20 @@ class MapProcess:
         bus.subscribe(core.handlers())
 
     def connect(self, at: Moment) -> None:
-        """Take that the broker is connected and the aggregator alive."""
+        """Report to the core that the broker is connected and the aggregator alive."""
         self._bus.publish(self.core.on_broker(at, connected=True))
         self._bus.publish(self.core.on_aggregator("bus", at, alive=True))
 
     def load_zones(self, zones: Iterable[Zone], at: Moment) -> None:
-        """Take the stored zones; the map is not served before."""
+        """Load the stored zones; the map is not served before."""
         self._bus.publish(self.core.load_zones(zones, at))
 
     def put_zone(self, zone: Zone, at: Moment) -> None:
-        """Take a zone that an operator has added or changed."""
+        """Add or replace an operator's zone."""
         self._bus.publish(self.core.put_zone(zone, at))
 
     def tick(self, at: Moment) -> None:
-        """Let time pass, and answer queries once the map is whole; call it ten times a second."""
+        """Tick the core, and serve queries once the map is complete; call it ten times a second."""
         self._bus.publish(self.core.tick(at))
         if self.core.serving and not self._serving:
             self._serving = True
@@ -83,23 +83,23 @@ class MapProcess:
 
 
 class PlannerProcess:
-    """The planner; what arrives waits for its next turn, and some of it makes that turn due at once."""
+    """The planner; messages wait for its next cycle, and urgent ones make the next cycle due at once."""
 
     def __init__(self, core: PlannerCore, bus: Bus) -> None:
         self.core = core
         self._bus = bus
         self.due = False
-        """Whether `tick` is due before its time."""
-        bus.subscribe({channel: self._waking(channel, handler) for channel, handler in core.handlers().items()})
+        """Whether `tick` is due before its regular time."""
+        bus.subscribe({channel: self._with_wake_up(channel, handler) for channel, handler in core.handlers().items()})
         bus.serve(core.query_handlers())
 
     def set_goal(self, robot: str, goal: RobotGoal, *, any_heading: bool = False) -> None:
-        """Give a robot a mission, as an operator does."""
+        """Give a robot a goal, as an operator does."""
         self.core.set_goal(robot, goal, any_heading=any_heading)
         self.due = True
 
     def tick(self, at: Moment) -> None:
-        """Take a turn, then compute the distance fields and fetch the map that the core asks for.
+        """Tick the core, then compute the distance fields and fetch the snapshot that it requests.
 
         Call it ten times a second, and when it is `due`.
         """
@@ -116,13 +116,13 @@ class PlannerProcess:
                 self.due = True
 
     def deliver(self, at: Moment) -> None:
-        """Deliver what is on the bus to all, and take turns as long as they are due."""
+        """Deliver all messages on the bus, and run the cycles that become due."""
         self._bus.deliver(at)
         while self.due:
             self.tick(at)
             self._bus.deliver(at)
 
-    def _waking(self, channel: ch.Channel, handler: Handler) -> Handler:
+    def _with_wake_up(self, channel: ch.Channel, handler: Handler) -> Handler:
         def handle(ids: Ids, message: Message, at: Moment) -> Sequence[Publication]:
             self.due = self.due or channel in self.core.URGENT
             return handler(ids, message, at)
@@ -131,7 +131,7 @@ class PlannerProcess:
 
 
 class AgentProcess:
-    """A robot's agent; whoever runs it hands the core what base and lidar send."""
+    """A robot's agent; its caller passes the data of base and lidar to the core."""
 
     def __init__(self, core: AgentCore, robot: str, bus: Bus) -> None:
         self.core = core
@@ -140,14 +140,14 @@ class AgentProcess:
         bus.serve(core.query_handlers(), only={"robot": robot})
 
     def fetch_map(self, at: Moment) -> None:
-        """Load a snapshot if the core wants one and the map is served; call it 20 times a second."""
+        """Load a snapshot if the core requests one and the map is served; call it 20 times a second."""
         if self.core.wants_snapshot(at.now):
             snapshot = self._bus.query(ch.MAP_SNAPSHOT, None, MapSnapshot, at)
             if snapshot is not None:
                 self.core.load(snapshot, at.now)
 
     def control(self, at: Moment) -> None:
-        """Decide how to drive; call it 5 times a second."""
+        """Run the local planner; call it 5 times a second."""
         job = self.core.control_job(at.now)
         if job is not None:
             self.core.accept(decide(job))
@@ -157,7 +157,7 @@ class AgentProcess:
         return self.core.stream(at.now, at.stamp)
 
     def tick(self, at: Moment) -> None:
-        """Let time pass; call it ten times a second."""
+        """Tick the core; call it ten times a second."""
         self._bus.publish(self.core.tick(at))
 
 
@@ -177,11 +177,11 @@ class Fog:
         self.deliver(at)
 
     def deliver(self, at: Moment) -> None:
-        """Deliver what is on the bus, to the last message that comes of it."""
+        """Deliver all messages on the bus, including those that result from them."""
         self.planner.deliver(at)
 
     def tick(self, at: Moment) -> None:
-        """Let time pass in all three; call it ten times a second."""
+        """Tick all three; call it ten times a second."""
         for process in (self.aggregator, self.map, self.planner):
             process.tick(at)
             self.deliver(at)

@@ -1,8 +1,7 @@
-"""The system for one thread and one emulated clock: all real cores on one bus, real encoders, decoders and parsers.
+"""The system in one thread on an emulated clock: all real cores on one bus, with real encoders, decoders and parsers.
 
-What its processes do beside their cores stands in `processes`; here are the things that they stand among: sensor
-nodes, base, lidar and guardian as bytes on their lines, and an operator. What lockstep leaves out is what it cannot
-have: sockets, threads and the time that computing takes.
+`processes` has what each process does around its core; this module has their surroundings: sensor nodes, base, lidar
+and guardian as bytes on their lines, and an operator. Lockstep leaves out sockets, threads and the time of computation.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ if TYPE_CHECKING:
     from robot_agent.config import AgentConfig
 
 STAMP: Final = 1_700_000_000.0
-"""Where the emulated wall clock stands at time zero: runs must not depend on when they are made."""
+"""The emulated wall clock at time zero: results must not depend on the date of a run."""
 OPERATOR_KEY: Final = b"lockstep operator key, no secret"
 _INITIAL_WHEEL_TRAVEL_M: Final = (28.9, 0.04)
 """How far (m) the wheels have rolled before the start: a 16-bit encoder counter wraps during the drive."""
@@ -54,14 +53,14 @@ _CONTROL_STEPS: Final = 20
 
 
 def moment(now: float) -> Moment:
-    """Return a time (s) of the emulated clock, by both of a process's clocks."""
+    """Return a time (s) of the emulated clock as the readings of a process's two clocks."""
     return Moment(now, STAMP + now)
 
 
 class RobotRig:
     """Simulated hardware, guardian and agent of one robot, as its three processes connect them."""
 
-    def __init__(  # noqa: PLR0913  # each is a part that it is put together from
+    def __init__(  # noqa: PLR0913  # the parts of the system
         self,
         site: LoadedSite,
         robot: RobotSite,
@@ -74,19 +73,21 @@ class RobotRig:
         lidar: str = devices.DEFAULT_LIDAR,
         make_agent: Callable[[AgentConfig, int], AgentCore] = AgentCore,
     ) -> None:
-        """Put the robot together; `base` and `lidar` name its drivers and their emulators."""
+        """Assemble the robot; `base` and `lidar` name its drivers and their emulators."""
         self.id = robot.id
         self._bus = bus
-        driver, self._scan = make_base(base), make_lidar(lidar)
+        driver, self._lidar_driver = make_base(base), make_lidar(lidar)
         emulators = devices.make_base(base), devices.make_lidar(lidar, world.lidar)
         self.hardware = Hardware(world, *emulators, start, initial_wheel_travel_m=_INITIAL_WHEEL_TRAVEL_M)
         self.guardian = GuardianCore(driver)
-        config = agent_config(robot.id, OPERATOR_KEY, robot).with_hardware(driver.drive_train, self._scan.traits)
+        config = agent_config(robot.id, OPERATOR_KEY, robot).with_hardware(
+            driver.drive_train, self._lidar_driver.traits
+        )
         self.agent = make_agent(config, seed)
         self.agent.restore(start_pose(site.site.id, robot))
         self.process = AgentProcess(self.agent, robot.id, bus)
         self._to_base = b""
-        self._to_lidar = self._scan.begin(start)
+        self._to_lidar = self._lidar_driver.begin(start)
         self._from_lidar = b""
         self._steps = 0
         self._nonce = 0
@@ -97,26 +98,26 @@ class RobotRig:
         return self.hardware.now
 
     def sense(self) -> None:
-        """Let 10 ms pass, and hand the agent what base and lidar sent meanwhile."""
+        """Simulate 10 ms, and pass to the agent what base and lidar sent meanwhile."""
         self._steps += 1
         self.hardware.receive(self._to_base, self._to_lidar)
         self._to_base = self._to_lidar = b""
         base, lidar = self.hardware.step(STEP_S)
-        self._guard(base, self.now)
-        self._look(lidar, self.now)
+        self._run_guardian(base, self.now)
+        self._run_lidar(lidar, self.now)
 
     def act(self) -> None:
         """Run the agent's loops that are due: as those of its process, all of them in the first step."""
-        at, passed = moment(self.now), self._steps - 1
-        if passed % _STREAM_STEPS == 0:
+        at, step = moment(self.now), self._steps - 1
+        if step % _STREAM_STEPS == 0:
             self.process.fetch_map(at)
-        if passed % _CONTROL_STEPS == 0:
+        if step % _CONTROL_STEPS == 0:
             self.process.control(at)
-        if passed % _STREAM_STEPS == 0:
+        if step % _STREAM_STEPS == 0:
             command = link.decode_command(link.encode(self.process.stream(at)))
             self._to_base += self.guardian.on_command(command, at.now).data
 
-    def _guard(self, data: bytes, now: float) -> None:
+    def _run_guardian(self, data: bytes, now: float) -> None:
         output = self.guardian.on_bytes(data, now)
         received = list(output.feedback)
         self._to_base += output.data
@@ -127,20 +128,20 @@ class RobotRig:
         for feedback in received:
             self.agent.on_base(link.decode_feedback(link.encode(feedback)), now)
 
-    def _look(self, data: bytes, now: float) -> None:
+    def _run_lidar(self, data: bytes, now: float) -> None:
         self._from_lidar += data
         if self._steps % _LIDAR_STEPS:
             return
-        received = self._scan.receive(self._from_lidar, now)
+        received = self._lidar_driver.receive(self._from_lidar, now)
         self._from_lidar = b""
         if received.samples:
             self.agent.on_lidar_samples(now)
         for scan in received.scans:
             self.agent.on_scan(scan, now)
-        self._to_lidar += received.data + self._scan.tick(now)
+        self._to_lidar += received.data + self._lidar_driver.tick(now)
 
     def command(self, kind: CommandKind) -> CommandReply:
-        """Give an operator's signed command."""
+        """Send an operator's signed command; return the reply."""
         self._nonce += 1
         unsigned = RobotCommand(
             kind=kind,
@@ -156,7 +157,7 @@ class RobotRig:
 
 
 class FogRig(Fog):
-    """The fog of a site, and its sensor nodes."""
+    """The fog node of a site, with its sensor nodes."""
 
     def __init__(self, site: LoadedSite, world: World, bus: Bus, seed: int, start: float) -> None:
         definitions = site.site.definitions()
@@ -174,7 +175,7 @@ class FogRig(Fog):
         )
         self._bus = bus
         self._world = world
-        # Each node was switched on at a time of its own.
+        # The nodes were switched on at different times.
         self._nodes = [
             SonarNode(node, boot=seed + index, start=start + 0.013 * (index % 8))
             for index, node in enumerate(site.site.nodes)
@@ -195,9 +196,9 @@ class FogRig(Fog):
 
 
 class System:
-    """A site with its fog, its nodes and one robot, from time zero on."""
+    """A site with its fog node, its sensor nodes and one robot, from time zero on."""
 
-    def __init__(  # noqa: PLR0913  # each is a part that it is put together from
+    def __init__(  # noqa: PLR0913  # the parts of the system
         self,
         site: LoadedSite,
         robot: RobotSite,
@@ -209,7 +210,7 @@ class System:
         bus: Bus | None = None,
         make_agent: Callable[[AgentConfig, int], AgentCore] = AgentCore,
     ) -> None:
-        """Put the system together; `base` and `lidar` name the robot's hardware."""
+        """Assemble the system; `base` and `lidar` name the robot's hardware."""
         self.bus = bus or Bus(site.site.id)
         self.world = World(site.map.geometry, site.map.cells, robot, seed, noise=noise)
         self.fog = FogRig(site, self.world, self.bus, seed, 0.0)
@@ -224,7 +225,7 @@ class System:
         return self.robot.now
 
     def step(self, inputs: Iterable[Publication] = ()) -> None:
-        """Let 10 ms pass everywhere; `inputs` come from outside, after the nodes' readings."""
+        """Simulate 10 ms; publish further `inputs` after the nodes' readings."""
         self.robot.sense()
         at = moment(self.now)
         self.fog.measure(at.now)

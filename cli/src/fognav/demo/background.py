@@ -41,5 +41,5 @@ class Background:
         while not condition():
             self.check()
             if time.monotonic() > deadline:
-                raise TimeoutError(f"timeout after {timeout_s:.0f} s: not {description}; {situation()}")
+                raise TimeoutError(f"timeout after {timeout_s:.0f} s, waiting until {description}; {situation()}")
             await asyncio.sleep(_PERIOD_S)

@@ -43,20 +43,24 @@ class Preparation:
         scene, clock, operator = self._scene, self._clock, self._operator
         operator.enabling_paused = True
         scene.phase = "localizing"
-        await self._until(lambda: scene.truth is not None, TRUTH_S, "received the ground truth")
-        await self._until(lambda: scene.pose is not None and scene.pose.localized, LOCALIZED_S, "localized")
+        await self._until(lambda: scene.truth is not None, TRUTH_S, "the ground truth is received")
+        await self._until(
+            lambda: scene.pose is not None and scene.pose.localized, LOCALIZED_S, "the robot is localized"
+        )
         scene.log_event("robot: localized")
         # An area is unknown until its node has published, and the planner avoids it.
         scene.phase = "waiting for the sensor nodes"
-        await self._until(self._all_clear, AREAS_S, "all watched areas clear")
+        await self._until(self._all_clear, AREAS_S, "all watched areas are clear")
         scene.log_event(f"nodes: all {len(self._plan.watched_areas)} watched areas are clear")
         scene.phase = "enabling"
         deadline = clock.now() + _READY_TIMEOUT_S
         await self._until(
-            lambda: operator.ready_s >= _READY_FOR_S or clock.now() > deadline, ENABLED_S, "ready to be enabled"
+            lambda: operator.ready_s >= _READY_FOR_S or clock.now() > deadline,
+            ENABLED_S,
+            "the robot is ready to be enabled",
         )
         operator.enabling_paused = False
-        await self._until(self._is_enabled, ENABLED_S, "enabled")
+        await self._until(self._is_enabled, ENABLED_S, "the robot is enabled")
 
     async def send_goal(self) -> DriveOutcome | None:
         """Send the goal to the planner, again while it is unavailable; return the outcome if it is not accepted."""
@@ -78,7 +82,7 @@ class Preparation:
         scene = self._scene
         scene.log_event(f"operator: drive to {self._plan.goal.label or self._plan.place}")
         await self._until(
-            lambda: scene.goal is not None and scene.goal.pose is not None, GOAL_S, "received the goal from the planner"
+            lambda: scene.goal is not None and scene.goal.pose is not None, GOAL_S, "the planner publishes the goal"
         )
         return None
 

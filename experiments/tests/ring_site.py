@@ -1,4 +1,4 @@
-"""A site of 15 x 8 m: a ring of corridors around a block, with two ways from west to east, the southern one watched."""
+"""A site of 15 x 8 m: a ring of corridors around a block, with two routes west to east, the southern one watched."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from fog_runtime.maps import StaticMap
 from fog_runtime.site import LoadedSite
 
 RESOLUTION = 0.05
-FREE = [  # left, bottom, right, top (m): the ring, and niches so that no two places look alike
+FREE = [  # left, bottom, right, top (m): the ring, and niches that make every place look different
     (0.5, 0.5, 14.5, 2.5), (0.5, 5.5, 14.5, 7.5), (0.5, 0.5, 2.5, 7.5), (12.5, 0.5, 14.5, 7.5),
     (3.6, 2.5, 4.6, 3.2), (9.9, 2.5, 10.5, 3.6), (5.2, 5.0, 6.9, 5.5), (10.8, 4.7, 11.6, 5.5), (2.5, 3.9, 3.1, 4.7),
 ]  # fmt: skip
@@ -19,7 +19,7 @@ START = Pose(x=1.5, y=3.0, theta=-1.5707963)
 GOAL = Place(x=13.5, y=3.2, theta=None)
 
 
-def little_site():
+def ring_site():
     geometry = GridGeometry(300, 160, RESOLUTION, 0.0, 0.0)
     cells = np.full(geometry.shape, 254, np.uint8)
     for box in FREE:
@@ -29,7 +29,7 @@ def little_site():
     sonars = [Sonar(angle=angle, range_limit=1.65) for angle in (-0.22, 0.22)]
     node = NodeSite(id="n1", area="z1", x=7.5, y=0.55, theta=1.5707963, sonars=sonars)
     site = Site(
-        id="little",
+        id="ring",
         places={"west": Place(x=START.x, y=START.y, theta=START.theta), "east": GOAL},
         areas=[area],
         nodes=[node],

@@ -1,4 +1,4 @@
-"""What all tests share: how hypothesis looks for examples, where recordings lie, and which tests may run at once."""
+"""Shared by all tests: hypothesis profiles, the folder of recordings, and which tests may run in parallel."""
 
 import os
 from functools import cache
@@ -13,7 +13,7 @@ from fog_supervisor import net
 if TYPE_CHECKING:
     from xdist.scheduler import LoadScopeScheduling
 
-# A run that judges a change must come out the same twice; on a developer's machine every run looks further.
+# In CI the examples are the same in every run; on a developer's machine each run tries new ones.
 settings.register_profile("repeatable", derandomize=True)
 if os.environ.get("CI", "").lower() in {"1", "true"}:
     settings.load_profile("repeatable")
@@ -22,22 +22,22 @@ WORKER: Final = os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw")
 WORKERS: Final = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
 ROOT: Final = Path(__file__).parent
 REACTION, COMPUTING, SYSTEM, LIVE, COMPOSE = range(5)
-"""Kinds of test modules, in the order in which they are begun."""
+"""Kinds of test modules, in the order in which they are started."""
 
 
 def pytest_configure() -> None:
-    """Give each worker ports of its own: two that look for a free one at the same moment would find the same."""
+    """Give each worker its own range of ports: two that search at the same moment would find the same free port."""
     share = len(net.PORTS) // WORKERS
     net.PORTS = net.PORTS[int(WORKER) * share : (int(WORKER) + 1) * share]
 
 
 @cache
 def group_of(module: str) -> tuple[int, int]:
-    """Return which tests run one after the other, on one worker, with those of a module: its kind, and a number.
+    """Return the group of a test module, as its kind and a number; a group runs on one worker, one test after another.
 
-    Tests of how fast real processes react never run beside one another. Modules that compute without waiting share one
-    worker for each core but one, so that a core is left for all that wait. Other modules with real processes stay
-    whole, for they share their servers; those of the whole system take longest, and begin first.
+    Tests that measure the reaction time of real processes never run in parallel. Modules that only compute share one
+    worker per core except one; that core is left for the tests that wait. The tests of any other module with real
+    processes stay together, because they share its servers; tests of the whole system take longest and start first.
     """
     text = (ROOT / module).read_text("utf-8")
     number = sum(module.encode())
@@ -57,10 +57,10 @@ def module_of(nodeid: str) -> str:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> "LoadScopeScheduling | None":
-    """Hand out the tests in the groups above, for `--dist loadgroup`."""
+    """Distribute the tests by group, for `--dist loadgroup`."""
     if config.getoption("dist") != "loadgroup":
         return None
-    from xdist.scheduler import LoadScopeScheduling  # noqa: PLC0415  # not there when pytest runs without it
+    from xdist.scheduler import LoadScopeScheduling  # noqa: PLC0415  # absent when pytest runs without xdist
 
     class GroupScheduling(LoadScopeScheduling):
         def _split_scope(self, nodeid: str) -> str:
@@ -70,17 +70,17 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> "LoadScop
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with the tests that take longest, where several workers share them."""
+    """Start with the tests that take longest, if several workers share them."""
     if "PYTEST_XDIST_WORKER" in os.environ:
         items.sort(key=lambda item: group_of(module_of(item.nodeid)))
 
 
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
-    """Return the folder of recordings and maps: FOGNAV_DATA, or `shared/data` beside the checkout; skip without it."""
+    """Return the folder of recordings and maps: FOGNAV_DATA, or a default beside the checkout; skip without it."""
     folder = Path(os.environ.get("FOGNAV_DATA") or Path(__file__).resolve().parent.parent / "shared" / "data")
     if not folder.is_dir():
-        pytest.skip(f"no recordings in {folder}: set FOGNAV_DATA to their folder")
+        pytest.skip(f"{folder} does not exist: set FOGNAV_DATA to the folder of recordings and maps")
     return folder
 
 

@@ -50,7 +50,7 @@ class GoalView(Message, frozen=True, kw_only=True):
 
 
 class PlanView(Message, frozen=True, kw_only=True):
-    """The current path: its map version, number of points and released length (m), or the refusal."""
+    """The current plan: version, number of points, released length (m), or refusal."""
 
     plan_id: int
     map_epoch: int

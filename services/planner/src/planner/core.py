@@ -172,7 +172,7 @@ class PlannerCore:
     def _mission(self, robot: str) -> Mission:
         return self._missions.setdefault(robot, Mission())
 
-    # --- Planning and publishing------------------------------------------------------------------------------------
+    # --- Planning and publishing -----------------------------------------------------------------------------------
 
     def tick(self, at: Moment) -> Sequence[Publication]:
         """Run `plan`, then `publish`. Call it ten times a second, and at once after an urgent message."""

@@ -36,7 +36,7 @@ class Plan:
 
 @dataclass
 class Mission:
-    """One robot's state. Times are seconds of the planner's monotonic clock."""
+    """The mission of one robot. Times are seconds of the planner's monotonic clock."""
 
     pose: RobotPose | None = None
     pose_received: float = -math.inf

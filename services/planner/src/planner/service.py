@@ -1,7 +1,7 @@
 """Runs the core: passes messages to its thread, publishes what it returns, and stores missions.
 
 The core runs on a thread of its own, one cycle after another, so that a long search never delays the event loop; the
-kernels release the GIL. Messages get their time of arrival, however long the cycle before takes.
+kernels release the GIL. Inputs are timestamped on arrival, even while the previous cycle runs.
 """
 
 from __future__ import annotations
@@ -260,7 +260,7 @@ class Service:
     def _wants_snapshot(self) -> bool:
         return self._core.wants_snapshot(self._clock.now())
 
-    # --- Planning and publishing------------------------------------------------------------------------------------
+    # --- Planning and publishing -----------------------------------------------------------------------------------
 
     async def tick_loop(self) -> None:
         """Start a planning cycle ten times a second."""

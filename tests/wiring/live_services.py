@@ -10,6 +10,7 @@ import inspect
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, Final
 
+from fog_contracts import channels as ch
 from fog_contracts.bus import Bus, roundtrip
 from fog_contracts.handlers import Moment, Publication
 from fog_runtime.health import Health
@@ -138,18 +139,15 @@ class BusEdge:
 
     async def query(self, channel: Channel, request: Any, kind: type[Message], _timeout_s: float, **ids: str) -> Any:
         assert self._role in channel.subscribers, channel.name
-        handler, served = self._live.answering.get(channel.key(site=self._live.site, **ids), (None, {}))
-        if handler is None:
-            return None
-        reply = handler(served, None if request is None else roundtrip(channel, request))
-        reply = await reply if inspect.isawaitable(reply) else reply
-        assert isinstance(reply, kind)
-        return roundtrip(channel, reply, reply=channel.kind == "query")
+        self._live.queried.add((self._role, channel))
+        return await self._live.query(channel, request, kind, **ids)
 
     def refuse(self, _channel: Channel, key: str, reason: str) -> None:
         self._live.bus.refused.append(f"{key}: {reason}")
 
     def subscribe_liveliness(self, handler: Any) -> None:
+        assert self._role in ch.LIVE.subscribers
+        self._live.subscribed.add((self._role, ch.LIVE))
         self._live.watching.append(handler)
 
     def on_connect(self, callback: Callable[[], Awaitable[None]]) -> None:
@@ -226,13 +224,13 @@ class LiveServices:
         self.subscribed: set[tuple[Role, Channel]] = set()
         self.published: set[tuple[Role, Channel]] = set()
         self.served: set[tuple[Role, Channel]] = set()
+        self.queried: set[tuple[Role, Channel]] = set()
         self.link = Link()
         self._tasks: list[asyncio.Task[None]] = []
         definitions, clock = loaded.site.definitions(), self.clock
         self._loaded, self._robot = loaded, config.robot
         self.edges = edges = {
-            role: BusEdge(self, role)
-            for role in ("hazard-aggregator", "map-service", "planner", "robot-agent", "console")
+            role: BusEdge(self, role) for role in ("hazard-aggregator", "map-service", "planner", "robot-agent")
         }
         self.aggregator = AggregatorService(
             Aggregator(definitions, loaded.site.nodes, 1, registry=find_rule),
@@ -302,6 +300,16 @@ class LiveServices:
                 await asyncio.sleep(0)
             if not self.bus.deliver(Moment(self.clock.now(), self.clock.stamp())):
                 return
+
+    async def query(self, channel: Channel, request: Any, kind: type[Message], **ids: str) -> Any:
+        """Send a query as a client of any role; return the reply, or None when no service answers it."""
+        handler, served = self.answering.get(channel.key(site=self.site, **ids), (None, {}))
+        if handler is None:
+            return None
+        reply = handler(served, None if request is None else roundtrip(channel, request))
+        reply = await reply if inspect.isawaitable(reply) else reply
+        assert isinstance(reply, kind)
+        return roundtrip(channel, reply, reply=channel.kind == "query")
 
     async def run(self, work: Coroutine[Any, Any, Any]) -> Any:
         """Run what somebody asks of a service to its end; return its result."""

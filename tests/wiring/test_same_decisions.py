@@ -66,6 +66,7 @@ def module(path: Path) -> Any:
 
 
 live_services = module(HERE / "live_services.py")
+usage = module(HERE / "channel_usage.py")
 ring = module(HERE.parents[1] / "experiments" / "tests" / "ring_site.py")
 
 SEED = 3
@@ -263,7 +264,6 @@ async def drive_live(recorded: Run) -> tuple[Run, Any]:
     bus = RecordingBus(site.site.id)
     run = Run(bus, recorded.config)
     live = live_services.LiveServices(site, recorded.config, SEED, bus)
-    console = live.edges["console"]
     await live.start()
     for step, now in enumerate(recorded.times, 1):
         bus.step = step
@@ -277,7 +277,7 @@ async def drive_live(recorded: Run) -> tuple[Run, Any]:
             await live.clock.wake(live.settle)
         if step == ENABLE:
             asked = enable(now)
-            run.answers.append(await live.run(console.query(ch.ROBOT_COMMAND, asked, CommandReply, 1.0, robot="r1")))
+            run.answers.append(await live.run(live.query(ch.ROBOT_COMMAND, asked, CommandReply, robot="r1")))
         if step == GOAL:
             pose = goal(0.0).pose
             assert pose is not None
@@ -289,10 +289,9 @@ async def drive_live(recorded: Run) -> tuple[Run, Any]:
         if step == CLOSED_IN:
             await live.run(live.map.create(recorded.last_zone, "tester"))
         if step == QUESTIONS:
-            run.answers.append(await live.run(console.query(ch.PLANNER_PLAN, PLAN, PlanReply, 1.0)))
-            egress = live.edges["robot-agent"].query(ch.PLANNER_EGRESS, EGRESS, PlanReply, 1.0)
-            run.answers.append(await live.run(egress))
-            run.answers.append(await live.run(console.query(ch.ZONES, None, ZoneSet, 1.0)))
+            run.answers.append(await live.run(live.query(ch.PLANNER_PLAN, PLAN, PlanReply)))
+            run.answers.append(await live.run(live.query(ch.PLANNER_EGRESS, EGRESS, PlanReply)))
+            run.answers.append(await live.run(live.query(ch.ZONES, None, ZoneSet)))
         await live.settle()
     run.wheels = live.link.sent
     await live.stop()
@@ -346,18 +345,15 @@ def test_live_services_answer_refuse_and_drive_as_in_lockstep(lockstep, live):
 
 # --- The channel table is the source of who publishes and who subscribes ---
 
-NOT_YET = {
-    ("hazard-aggregator", ch.NODE_VALUE),
-    ("hazard-aggregator", ch.HOME_ASSISTANT),
-}
-"""What the table allows and no service does so far; whoever makes it true takes it out of here."""
-
 
 def of_table(live: Any, kind: str, side: str) -> set[Any]:
     """Return the pairs of role and channel that the table has on one side, for the roles that run here."""
-    roles = set(live.edges) - {"console"}
-    pairs = {(role, c) for c in ch.CHANNELS.values() if c.kind == kind for role in getattr(c, side) if role in roles}
-    return pairs - NOT_YET
+    rows = [row for row in ch.CHANNELS.values() if row.kind == kind]
+    return {(role, row) for row in rows for role in getattr(row, side) if role in live.edges} - usage.NOT_YET
+
+
+def of_kind(pairs: set[Any], kind: str) -> set[Any]:
+    return {(role, channel) for role, channel in pairs if channel.kind == kind}
 
 
 def named(pairs: set[Any]) -> list[str]:
@@ -366,7 +362,8 @@ def named(pairs: set[Any]) -> list[str]:
 
 def test_services_subscribe_to_exactly_the_channels_that_the_table_gives_them(live):
     _, services = live
-    assert named(services.subscribed) == named(of_table(services, "pub", "subscribers"))
+    for kind in ("pub", "liveliness"):
+        assert named(of_kind(services.subscribed, kind)) == named(of_table(services, kind, "subscribers"))
 
 
 def test_services_publish_exactly_the_channels_that_the_table_gives_them(live):
@@ -376,10 +373,14 @@ def test_services_publish_exactly_the_channels_that_the_table_gives_them(live):
 
 def test_services_answer_exactly_the_queries_that_the_table_gives_them(live):
     _, services = live
-    served = {(role, channel) for role, channel in services.served if channel.kind == "query"}
-    assert named(served) == named(of_table(services, "query", "publishers"))
+    assert named(of_kind(services.served, "query")) == named(of_table(services, "query", "publishers"))
     # Of published channels only those may be asked that have a latest message.
     assert all(c.durability == "latest" for _, c in services.served if c.kind == "pub")
+
+
+def test_services_send_exactly_the_queries_that_the_table_gives_them(live):
+    _, services = live
+    assert named(services.queried) == named(of_table(services, "query", "subscribers"))
 
 
 def cores(loaded: Any, config: AgentConfig) -> dict[str, Any]:

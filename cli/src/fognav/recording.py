@@ -51,7 +51,7 @@ async def record(path: Path, *, mqtt_url: str, zenoh_endpoint: str, site: str, s
     Raises `WrongUseError` without broker or router; an existing file then stays unchanged.
     """
     clock = SystemClock()
-    opened = ZenohEdge.open(connect=[zenoh_endpoint], clock=clock, role="console", id="record", site=site)
+    opened = ZenohEdge.open(connect=[zenoh_endpoint], clock=clock, role="recorder", id="record", site=site)
     async with opened as zenoh:
         await _check_reachable(zenoh, zenoh_endpoint, mqtt_url, clock)
         stop = asyncio.Event()

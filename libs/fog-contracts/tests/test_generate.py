@@ -107,7 +107,7 @@ def test_every_table_row_has_as_many_cells_as_its_header():
 def test_document_row_shows_the_channels_properties():
     line = next(line for line in channels_markdown({}).splitlines() if "map/heartbeat`" in line)
     assert line == (
-        "| `fog/<site>/map/heartbeat` | [MapHeartbeat](#mapheartbeat) | map-service → planner, robot-agent, console "
+        "| `fog/<site>/map/heartbeat` | [MapHeartbeat](#mapheartbeat) | map-service → planner, robot-agent "
         "| `volatile` | 10 Hz | 1 s | 256 B |"
     )
 
@@ -236,6 +236,16 @@ def test_recorder_may_subscribe_and_not_publish():
     assert not {kind for name, flow, kind in rights if name == "recorder" and flow == "ingress"} & {"put", "reply"}
     assert "fog/*/robots/*/pose" in rights["recorder", "ingress", "declare_subscriber"]
     assert ("recorder", "ingress", "declare_queryable") not in rights
+
+
+def test_map_service_watches_the_liveliness_of_all_roles_and_declares_only_its_own():
+    rights = rules(zenoh_acl())
+    for flow, message in (
+        ("ingress", "declare_liveliness_subscriber"), ("ingress", "liveliness_query"), ("egress", "liveliness_token"),
+    ):  # fmt: skip
+        assert "fog/*/live/*/*" in rights["map-service", flow, message]
+    declared = {key for key in rights["map-service", "ingress", "liveliness_token"] if "/live/" in key}
+    assert declared == {"fog/*/live/map-service/*"}
 
 
 def test_named_robots_may_publish_only_as_themselves():

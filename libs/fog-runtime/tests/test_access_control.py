@@ -238,20 +238,18 @@ async def test_acl_allows_publishing_queries_recovery_and_liveliness(tmp_path, o
             map_service.publish(ch.ZONES, ZONES)
             map_service.serve(ch.ZONES, lambda *_: ZONES)
             planner.serve(ch.PLANNER_PLAN, lambda _, request: m.PlanReply(length=request.goal.x))
-            map_service.declare_liveliness("map-service", "lab")
+            planner.declare_liveliness("planner", "lab")
             robot.declare_liveliness("robot-agent", "r1")
             planner.subscribe(ch.MAP_DELTA, m.MapDelta, lambda _, message: deltas.append(message.seq))
             robot.subscribe(ch.ZONES, m.ZoneSet, lambda _, message: zones.append(message))
             planner.subscribe(ch.ROBOT_POSE, m.RobotPose, lambda ids, message: poses.append((ids["robot"], message.x)))
             recorder.subscribe(ch.ROBOT_POSE, m.RobotPose, lambda ids, _: recorded.append(ids["robot"]))
-            console.subscribe_liveliness(lambda role, name, alive: present.add((role, name, alive)))
+            map_service.subscribe_liveliness(lambda role, name, alive: present.add((role, name, alive)))
             await until(lambda: deltas == [1] and zones == [ZONES], "late subscribers get earlier messages")
             map_service.publish(ch.MAP_DELTA, delta(2))
             await until(lambda: deltas == [1, 2], "deltas arrive")
             await publish_until(robot, ch.ROBOT_POSE, pose(1.0), lambda: poses and recorded, "poses arrive", robot="r1")
-            await until(
-                lambda: present == {("map-service", "lab", True), ("robot-agent", "r1", True)}, "presence is seen"
-            )
+            await until(lambda: present == {("planner", "lab", True), ("robot-agent", "r1", True)}, "presence is seen")
             assert await console.query(ch.PLANNER_PLAN, PLAN, m.PlanReply, 5.0) == m.PlanReply(length=1.0)
             assert await robot.query(ch.ZONES, None, m.ZoneSet, 5.0) == ZONES
 
@@ -266,10 +264,10 @@ async def test_acl_blocks_messages_and_queries_of_a_role_without_the_right(tmp_p
             opened(endpoint, "console") as console,
         ):
             deltas, goals, poses, present = [], [], [], set()
-            console.subscribe(ch.MAP_DELTA, m.MapDelta, lambda _, message: deltas.append(message.seq))
+            r1.subscribe(ch.MAP_DELTA, m.MapDelta, lambda _, message: deltas.append(message.seq))
             console.subscribe(ch.ROBOT_GOAL, m.RobotGoal, lambda ids, _: goals.append(ids["robot"]))
             console.subscribe(ch.ROBOT_POSE, m.RobotPose, lambda ids, _: poses.append(ids["robot"]))
-            console.subscribe_liveliness(lambda role, name, alive: present.add((role, name, alive)))
+            map_service.subscribe_liveliness(lambda role, name, alive: present.add((role, name, alive)))
             planner.serve(ch.MAP_SNAPSHOT, lambda *_: None)
             planner.declare_liveliness("map-service", "lab")
             r1.declare_liveliness("robot-agent", "r2")
@@ -285,7 +283,7 @@ async def test_acl_blocks_messages_and_queries_of_a_role_without_the_right(tmp_p
                 assert set(deltas) == {1}
                 assert set(goals) == {"r1"}
                 goals.clear()
-            assert await console.query(ch.MAP_SNAPSHOT, None, m.MapSnapshot, 1.0) is None
+            assert await r1.query(ch.MAP_SNAPSHOT, None, m.MapSnapshot, 1.0) is None
             r2.declare_liveliness("robot-agent", "r2")
             await until(lambda: ("robot-agent", "r2", True) in present, "presence is seen")
             assert present == {("robot-agent", "r2", True)}

@@ -162,7 +162,7 @@ async def main() -> None:
         ZenohEdge.open(
             connect=settings.zenoh_endpoints,
             clock=SystemClock(settings.speed),
-            role="sim-robot",
+            role="console",
             id=robot,
             site=settings.site or site.id,
         ) as edge,

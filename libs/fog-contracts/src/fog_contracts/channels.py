@@ -31,7 +31,7 @@ ROLES: Final[Mapping[Role, str]] = {
     "map-service": "maintains the costmap",
     "planner": "plans paths and stores missions",
     "robot-agent": "a robot's agent",
-    "console": "operators' tools: the `fognav` command, the demo and its page",
+    "console": "operators' tools: the `fognav` command, the demo and its page, the simulated robot's operator",
     "sim": "the simulated world",
     "recorder": "`fognav record`: subscribes to everything and publishes nothing",
 }
@@ -182,19 +182,19 @@ HOME_ASSISTANT    = _text( "home_assistant",    "homeassistant/device/{node}/con
 
 # The map, and the hazards and zones in it: zenoh, msgpack
 MAP_DELTA         = _pub(  "map_delta",         FOG + "map/delta",      m.MapDelta,     limit=DELTA_LIMIT,
-    publishers=(MAP,), subscribers=(PLANNER, ROBOT, CONSOLE), durability=RECOVERED)
+    publishers=(MAP,), subscribers=(PLANNER, ROBOT), durability=RECOVERED)
 MAP_HEARTBEAT     = _pub(  "map_heartbeat",     FOG + "map/heartbeat",  m.MapHeartbeat, limit=256,
-    publishers=(MAP,), subscribers=(PLANNER, ROBOT, CONSOLE), durability=VOLATILE, rate_hz=10, max_age_s=1)
+    publishers=(MAP,), subscribers=(PLANNER, ROBOT), durability=VOLATILE, rate_hz=10, max_age_s=1)
 MAP_SNAPSHOT      = _query("map_snapshot",      FOG + "map/snapshot",   None,           limit=0,
-    publishers=(MAP,), subscribers=(PLANNER, ROBOT, CONSOLE), reply=m.MapSnapshot, reply_limit=64 * MIB)
+    publishers=(MAP,), subscribers=(PLANNER, ROBOT), reply=m.MapSnapshot, reply_limit=64 * MIB)
 HAZARD            = _pub(  "hazard",            FOG + "hazards/{area}", m.HazardArea,   limit=64 * KIB,
     publishers=(MAP,), subscribers=(PLANNER, ROBOT, CONSOLE), durability=LATEST)
 ZONES             = _pub(  "zones",             FOG + "zones",          m.ZoneSet,      limit=4 * MIB,
-    publishers=(MAP,), subscribers=(PLANNER, ROBOT, CONSOLE), durability=LATEST)
+    publishers=(MAP,), subscribers=(PLANNER, ROBOT), durability=LATEST)
 
 # Planner and robots: zenoh, msgpack
 PLANNER_PLAN      = _query("planner_plan",      FOG + "planner/plan",             m.PlanRequest,    limit=KIB,
-    publishers=(PLANNER,), subscribers=(ROBOT, CONSOLE),   reply=m.PlanReply, reply_limit=4 * MIB)
+    publishers=(PLANNER,), subscribers=(CONSOLE,),         reply=m.PlanReply, reply_limit=4 * MIB)
 PLANNER_EGRESS    = _query("planner_egress",    FOG + "planner/egress",           m.EgressRequest,  limit=KIB,
     publishers=(PLANNER,), subscribers=(ROBOT,),           reply=m.PlanReply, reply_limit=4 * MIB)
 ROBOT_GOAL        = _pub(  "robot_goal",        FOG + "robots/{robot}/goal",      m.RobotGoal,      limit=KIB,
@@ -210,7 +210,7 @@ ROBOT_OBSTACLES   = _pub(  "robot_obstacles",   FOG + "robots/{robot}/obstacles"
 ROBOT_COMMAND     = _query("robot_command",     FOG + "robots/{robot}/command",   m.RobotCommand,   limit=KIB,
     publishers=(ROBOT,),   subscribers=(CONSOLE,),         reply=m.CommandReply, reply_limit=2 * KIB)
 LIVE              = _live( "live",              FOG + "live/{role}/{id}", about="presence, no safety signal",
-    publishers=(AGGREGATOR, MAP, PLANNER, ROBOT), subscribers=(CONSOLE,))
+    publishers=(AGGREGATOR, MAP, PLANNER, ROBOT), subscribers=(MAP,))
 
 # The simulated world: zenoh, msgpack
 SIM_TRUTH         = _pub(  "sim_truth",         FOG + "sim/{robot}/truth",   m.SimTruth,   limit=256 * KIB,

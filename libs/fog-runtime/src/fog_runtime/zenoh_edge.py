@@ -20,7 +20,7 @@ from typing import Any, Final, Generic, Literal, TypeVar
 import zenoh
 from zenoh import ext
 
-from fog_contracts.channels import LIVE, Channel, Durability
+from fog_contracts.channels import LIVE, Channel, Durability, Role
 from fog_contracts.codec import ContractError, decode, encode
 from fog_contracts.handlers import RefusedMessageError
 from fog_contracts.messages import Message
@@ -263,7 +263,7 @@ class _Queryable:
 class ZenohEdge:
     """The zenoh session of a process. All handlers run on the thread of the event loop that opened it."""
 
-    def __init__(self, clock: Clock, *, site: str, role: str, name: str) -> None:
+    def __init__(self, clock: Clock, *, site: str, role: Role, name: str) -> None:
         """Prepare a session; use `ZenohEdge.open`."""
         self._clock = clock
         self._site = site
@@ -286,7 +286,7 @@ class ZenohEdge:
         *,
         connect: Sequence[str],
         clock: Clock,
-        role: str,
+        role: Role,
         id: str,  # noqa: A002  # as in the channel `live`
         site: str,
     ) -> AsyncIterator["ZenohEdge"]:
@@ -396,7 +396,7 @@ class ZenohEdge:
         """Answer queries with `handler(ids, request)`, plain or async; `request` is None where the channel has none."""
         self._declare(_Queryable(self, channel, handler, self._key(channel, ids)).declare)
 
-    def declare_liveliness(self, role: str, id: str) -> None:  # noqa: A002  # as in the channel `live`
+    def declare_liveliness(self, role: Role, id: str) -> None:  # noqa: A002  # as in the channel `live`
         """Declare that this process is present, for as long as its session is open."""
         key = LIVE.key(site=self._site, role=role, id=id)
         self._declare(lambda session: session.liveliness().declare_token(key))

@@ -110,12 +110,13 @@ def _rights(role: Role, site: str, robot: str) -> _Rights:
     for row in CHANNELS.values():
         if row.transport != "zenoh":
             continue
-        key = _key(row, site, robot, role)
+        key = _key(row, site, robot)
         publishes = role in row.publishers
         subscribes = role in row.subscribers or (role == "recorder" and row.kind == "pub")
         if row.kind == "liveliness":
             if publishes:
-                rights.allow("ingress", "liveliness_token", key)
+                # A process declares its own presence only, even if it may watch that of all.
+                rights.allow("ingress", "liveliness_token", _key(row, site, robot, role=role, id=robot))
             if subscribes:
                 rights.allow("ingress", "declare_liveliness_subscriber liveliness_query", key)
                 rights.allow("egress", "liveliness_token", key)
@@ -157,8 +158,6 @@ def _allow_subscribing(rights: _Rights, row: Channel, key: str) -> None:
         rights.allow("egress", "declare_queryable reply", key, cache)
 
 
-def _key(row: Channel, site: str, robot: str, role: Role) -> str:
-    ids = {"site": site, "robot": robot}
-    if row.kind == "liveliness" and role in row.publishers:
-        ids |= {"role": role, "id": robot}
+def _key(row: Channel, site: str, robot: str, **other_ids: str) -> str:
+    ids = {"site": site, "robot": robot, **other_ids}
     return row.template.format(**{name: ids.get(name, "*") for name in row.fields})

@@ -1,4 +1,4 @@
-"""What the documents point at must be there."""
+"""The documents' links, names and versions must be valid."""
 
 import re
 import subprocess
@@ -19,13 +19,13 @@ def documents() -> list[Path]:
 
 
 @pytest.mark.parametrize("document", documents(), ids=lambda path: str(path.relative_to(ROOT)))
-def test_every_relative_link_leads_somewhere(document: Path) -> None:
+def test_relative_links_point_to_existing_files(document: Path) -> None:
     targets = [link.partition("#")[0] for link in LINK.findall(document.read_text("utf-8"))]
     missing = [t for t in targets if t and "://" not in t and not (document.parent / t).exists()]
     assert not missing, f"{document.relative_to(ROOT)} points at {', '.join(missing)}"
 
 
-def test_the_readme_names_only_test_folders_that_exist() -> None:
+def test_test_folders_in_the_readme_exist() -> None:
     named = re.findall(r"\./fognav test ((?:[\w./-]+ ?)+)", (ROOT / "README.md").read_text("utf-8"))
     folders = [folder for group in named for folder in group.split() if "/" in folder]
     assert folders
@@ -33,7 +33,7 @@ def test_the_readme_names_only_test_folders_that_exist() -> None:
 
 
 @pytest.mark.parametrize("record", sorted((ROOT / "docs" / "adr").glob("0*.md")), ids=lambda path: path.stem)
-def test_every_decision_has_its_number_and_a_status_with_a_date(record: Path) -> None:
+def test_decision_records_have_a_number_and_a_dated_status(record: Path) -> None:
     title, empty, status, *_ = record.read_text("utf-8").splitlines()
     assert title.startswith(f"# {int(record.stem[:4])}. ")
     assert empty == ""
@@ -42,7 +42,7 @@ def test_every_decision_has_its_number_and_a_status_with_a_date(record: Path) ->
     )
 
 
-def test_all_members_have_the_one_version() -> None:
+def test_all_members_have_the_same_version() -> None:
     version = (ROOT / "VERSION").read_text("utf-8").strip()
     members = [ROOT / line for line in ("robot-agent", "sim", "experiments", "cli")]
     members += [*(ROOT / "libs").iterdir(), *(ROOT / "services").glob("*/")]

@@ -109,7 +109,7 @@ PLANTED = {
 
 
 @pytest.mark.parametrize(("file", "imported", "named"), PLANTED.values(), ids=PLANTED.keys())
-def test_a_planted_import_breaks_a_contract(copied_sources: Path, file: str, imported: str, named: str) -> None:
+def test_forbidden_import_breaks_a_contract(copied_sources: Path, file: str, imported: str, named: str) -> None:
     target = copied_sources / file
     target.write_text(f"{target.read_text('utf-8')}\nimport {imported} as _planted\n", "utf-8")
     result = checked(copied_sources)
@@ -118,7 +118,7 @@ def test_a_planted_import_breaks_a_contract(copied_sources: Path, file: str, imp
     assert named in result.stdout.split("Broken contracts")[-1]
 
 
-def test_a_world_imported_by_way_of_another_module_breaks_a_contract(copied_sources: Path) -> None:
+def test_forbidden_indirect_import_breaks_a_contract(copied_sources: Path) -> None:
     helper = copied_sources / "services/map-service/src/map_service/costmap.py"
     helper.write_text(f"{helper.read_text('utf-8')}\nimport fog_runtime.clock as _planted\n", "utf-8")
     result = checked(copied_sources)
@@ -126,6 +126,6 @@ def test_a_world_imported_by_way_of_another_module_breaks_a_contract(copied_sour
     assert "map_service.core" in result.stdout.split("Broken contracts")[-1]
 
 
-def test_the_sources_as_they_are_keep_every_contract(copied_sources: Path) -> None:
+def test_unchanged_sources_keep_every_contract(copied_sources: Path) -> None:
     result = checked(copied_sources)
     assert result.returncode == 0, result.stdout + result.stderr

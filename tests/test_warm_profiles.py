@@ -1,4 +1,4 @@
-"""What an install step warms must be all that a process uses: a start that compiles is a start that can be late."""
+"""The kernels that an install step compiles must be all that a process uses: no process compiles at its start."""
 
 import subprocess
 import sys
@@ -23,7 +23,7 @@ print(*sorted(name.removeprefix("fog_kernels.") for name in sys.modules if name.
         ("sim", "fognav_sim.__main__"),
     ],
 )
-def test_a_profile_holds_every_kernel_that_its_process_imports(profile: str, module: str) -> None:
+def test_profile_contains_every_kernel_that_its_process_imports(profile: str, module: str) -> None:
     done = subprocess.run([sys.executable, "-c", CODE, module], capture_output=True, text=True, check=True, timeout=60)
     used = {name for name in done.stdout.split() if name in PROFILES["all"]}
     assert used

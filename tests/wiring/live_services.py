@@ -1,6 +1,6 @@
-"""The services' own `Service` classes with all their loops in one process: edges over a bus, a clock that tests move.
+"""The services' own `Service` classes with all their loops in one process: edges over a bus, a clock moved by tests.
 
-Everything between a service's loops and its core is the real code; brokers, databases, threads and ports are not there.
+Everything between a service's loops and its core is the real code; there are no brokers, databases, threads or ports.
 """
 
 from __future__ import annotations
@@ -39,23 +39,23 @@ AGENT_LOOPS: Final = ("agent map", "agent control", "agent stream")
 TICKS: Final = ("aggregator tick", "map tick", "planner tick", "agent publish")
 OTHERS: Final = ("planner map", "agent housekeeping")
 _EARLY_S: Final = 1e-6
-"""Sums of periods are no exact multiples of a step: who is due within this is due now."""
+"""Sums of periods are not exact multiples of a step: a task that is due within this time is due now."""
 
 
 class InlineExecutor(ThreadPoolExecutor):
-    """Runs everything at once, on the thread that submits it."""
+    """Runs each call immediately, on the submitting thread."""
 
     def submit(self, fn, /, *args, **kwargs):  # type: ignore[override]  # a test double without the type parameters
         future: Future[Any] = Future()
         try:
             future.set_result(fn(*args, **kwargs))
-        except BaseException as error:  # noqa: BLE001  # it belongs to whoever waits for the future
+        except BaseException as error:  # noqa: BLE001  # the future's waiter raises it
             future.set_exception(error)
         return future
 
 
 class SteppedClock:
-    """A clock that stands still while woken tasks run, and wakes them one after another, by the names of the tasks."""
+    """A clock that stands still while tasks run, and wakes sleeping tasks one by one, in the order of their names."""
 
     speed = 1.0
 
@@ -80,17 +80,17 @@ class SteppedClock:
         self._sleepers.append((self.time + seconds, task.get_name(), woken))
         await woken
 
-    async def wake(self, settle: Callable[[], Awaitable[None]]) -> None:
-        """Wake all whose time has come, in order; each one's doings are settled before the next."""
+    async def wake(self, run_until_idle: Callable[[], Awaitable[None]]) -> None:
+        """Wake all tasks that are due, in order; all work of one is completed before the next is woken."""
         due = [sleeper for sleeper in self._sleepers if sleeper[0] <= self.time + _EARLY_S]
         self._sleepers = [sleeper for sleeper in self._sleepers if sleeper not in due]
         for _, _, woken in sorted(due, key=lambda sleeper: self._order.index(sleeper[1])):
             woken.set_result(None)
-            await settle()
+            await run_until_idle()
 
 
 class BusEdge:
-    """What `MqttEdge` and `ZenohEdge` offer to a service, over a bus; it lets a role do what the channel table says."""
+    """The interfaces of `MqttEdge` and `ZenohEdge` over a bus; it enforces the roles of the channel table."""
 
     connected = True
 
@@ -135,7 +135,7 @@ class BusEdge:
     def serve(self, channel: Channel, handler: Any, **ids: str) -> None:
         assert self._role in channel.publishers, channel.name
         self._live.served.add((self._role, channel))
-        self._live.answering[channel.key(site=self._live.site, **ids)] = handler, ids
+        self._live.query_handlers[channel.key(site=self._live.site, **ids)] = handler, ids
 
     async def query(self, channel: Channel, request: Any, kind: type[Message], _timeout_s: float, **ids: str) -> Any:
         assert self._role in channel.subscribers, channel.name
@@ -148,7 +148,7 @@ class BusEdge:
     def subscribe_liveliness(self, handler: Any) -> None:
         assert self._role in ch.LIVE.subscribers
         self._live.subscribed.add((self._role, ch.LIVE))
-        self._live.watching.append(handler)
+        self._live.liveliness_handlers.append(handler)
 
     def on_connect(self, callback: Callable[[], Awaitable[None]]) -> None:
         self._on_connect.append(callback)
@@ -159,7 +159,7 @@ class BusEdge:
 
 
 class MemoryStore:
-    """Takes whatever a service stores, at once; nothing was stored before."""
+    """A store without delay that is empty at the start."""
 
     def __init__(self) -> None:
         self.writes: list[tuple[Any, ...]] = []
@@ -201,7 +201,7 @@ class MemoryStore:
 
 
 class Link:
-    """Stands for the guardian and the lidar's port."""
+    """A stand-in for the guardian and for the lidar's port."""
 
     problem = ""
 
@@ -213,14 +213,14 @@ class Link:
 
 
 class LiveServices:
-    """Aggregator, map-service, planner and one robot's agent, as their `__main__` put them together."""
+    """Aggregator, map-service, planner and one robot's agent, assembled as in their `__main__`."""
 
     def __init__(self, loaded: LoadedSite, config: AgentConfig, seed: int, bus: Bus) -> None:
         self.bus = bus
         self.site = loaded.site.id
         self.clock = SteppedClock((*AGENT_LOOPS, *TICKS, *OTHERS))
-        self.answering: dict[str, tuple[Any, dict[str, str]]] = {}
-        self.watching: list[Any] = []
+        self.query_handlers: dict[str, tuple[Any, dict[str, str]]] = {}
+        self.liveliness_handlers: list[Any] = []
         self.subscribed: set[tuple[Role, Channel]] = set()
         self.published: set[tuple[Role, Channel]] = set()
         self.served: set[tuple[Role, Channel]] = set()
@@ -248,7 +248,7 @@ class LiveServices:
         self.agent = AgentService(self.agent_core, edges["robot-agent"], MemoryStore(), clock, Health(), site=self.site)
 
     async def start(self) -> None:
-        """Subscribe, read what is stored and connect, at time 0; no loop of the clock runs yet."""
+        """Subscribe, load the stores and connect, at time 0; periodic loops do not run yet."""
         body = next(robot for robot in self._loaded.site.robots if robot.id == self._robot)
         self.agent.restore(body)
         for service in (self.aggregator, self.map, self.planner, self.agent):
@@ -261,13 +261,13 @@ class LiveServices:
             ("planner plan", self.planner.plan_loop()),
         ):
             await self._begin(name, loop)
-        for watching in self.watching:
-            watching("hazard-aggregator", "live", True)  # noqa: FBT003  # as the edge calls it
+        for handler in self.liveliness_handlers:
+            handler("hazard-aggregator", "live", True)  # noqa: FBT003  # as the edge calls it
         await self.edges["hazard-aggregator"].connect()
-        await self.settle()
+        await self.run_until_idle()
 
     async def begin_loops(self) -> None:
-        """Start all loops that the clock paces; each ticks at once."""
+        """Start all periodic loops; each ticks at once."""
         loops = {
             "agent map": self.agent.snapshot_loop(),
             "agent control": self.agent.control_loop(),
@@ -283,7 +283,7 @@ class LiveServices:
             await self._begin(name, loop)
 
     async def stop(self) -> None:
-        """End everything; raises what a loop has died of."""
+        """End everything; fails if a loop has died of an exception."""
         for task in self._tasks:
             task.cancel()
         ends = await asyncio.gather(*self._tasks, return_exceptions=True)
@@ -291,19 +291,19 @@ class LiveServices:
         for end in ends:
             assert isinstance(end, asyncio.CancelledError), end
 
-    async def settle(self) -> None:
-        """Run until every task waits for the clock, and no message is on its way."""
+    async def run_until_idle(self) -> None:
+        """Run until every task waits for the clock, and no message is undelivered."""
         loop: Any = asyncio.get_running_loop()
         while True:
             await asyncio.sleep(0)
-            while loop._ready:  # noqa: ASYNC110  # no event tells that nothing is left to do
+            while loop._ready:  # noqa: ASYNC110  # asyncio has no event for an idle loop
                 await asyncio.sleep(0)
             if not self.bus.deliver(Moment(self.clock.now(), self.clock.stamp())):
                 return
 
     async def query(self, channel: Channel, request: Any, kind: type[Message], **ids: str) -> Any:
-        """Send a query as a client of any role; return the reply, or None when no service answers it."""
-        handler, served = self.answering.get(channel.key(site=self.site, **ids), (None, {}))
+        """Send a query as a client of any role; return the reply, or None when no service replies it."""
+        handler, served = self.query_handlers.get(channel.key(site=self.site, **ids), (None, {}))
         if handler is None:
             return None
         reply = handler(served, None if request is None else roundtrip(channel, request))
@@ -312,11 +312,11 @@ class LiveServices:
         return roundtrip(channel, reply, reply=channel.kind == "query")
 
     async def run(self, work: Coroutine[Any, Any, Any]) -> Any:
-        """Run what somebody asks of a service to its end; return its result."""
+        """Run a coroutine to its end; return its result."""
         task = asyncio.create_task(work)
-        await self.settle()
+        await self.run_until_idle()
         return task.result()
 
     async def _begin(self, name: str, loop: Coroutine[Any, Any, None]) -> None:
         self._tasks.append(asyncio.create_task(loop, name=name))
-        await self.settle()
+        await self.run_until_idle()

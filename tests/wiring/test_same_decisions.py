@@ -1,8 +1,8 @@
 """Lockstep and the live services decide the same: one recorded drive goes through both wirings.
 
-Lockstep drives a robot around a barrier; what came from outside (nodes, other robots, operators, base and lidar) is
-recorded and given to the services' own `Service` classes. All that is decided in between must come out again: every
-publication of every channel, every answer and every wheel command.
+Lockstep drives a robot around a barrier; all external inputs (nodes, other robots, operators, base and lidar) are
+recorded and passed to the services' own `Service` classes. These must make the same decisions: every publication of
+every channel, every reply and every wheel command.
 """
 
 from __future__ import annotations
@@ -60,9 +60,9 @@ def module(path: Path) -> Any:
     spec = importlib.util.spec_from_file_location(path.stem, path)
     assert spec is not None
     assert spec.loader is not None
-    made = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(made)
-    return made
+    loaded = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(loaded)
+    return loaded
 
 
 live_services = module(HERE / "live_services.py")
@@ -71,12 +71,12 @@ ring = module(HERE.parents[1] / "experiments" / "tests" / "ring_site.py")
 
 SEED = 3
 STEPS = 1500
-ENABLE, GOAL, BARRIER, STRANGERS = 350, 400, 500, 620
-ZONES, QUESTIONS, ARRIVAL, CLOSED_IN = 900, 1000, 1100, 1250
+ENABLE, GOAL, BARRIER, EXTERNAL = 350, 400, 500, 620
+ZONES, QUERIES, ARRIVAL, ZONE_AROUND_ROBOT = 900, 1000, 1100, 1250
 GOAL_ID = "goal-of-the-drive"
-OUTSIDE = {ch.NODE_READING, ch.NODE_AVAILABILITY, ch.THESIS_AREA}
-OF_ROBOTS = {ch.ROBOT_POSE, ch.ROBOT_STATE, ch.ROBOT_OBSTACLES}
-STRANGER = "r2"
+EXTERNAL_CHANNELS = {ch.NODE_READING, ch.NODE_AVAILABILITY, ch.THESIS_AREA}
+ROBOT_CHANNELS = {ch.ROBOT_POSE, ch.ROBOT_STATE, ch.ROBOT_OBSTACLES}
+OTHER_ROBOT = "r2"
 HARDWARE = (log.BaseReceived, log.LidarSamplesReceived, log.ScanReceived)
 ZONE_SLOW = Zone(
     id="slow",
@@ -92,7 +92,7 @@ EGRESS = EgressRequest(robot="r1", pose=Pose(x=7.5, y=1.5, theta=0.0))
 
 
 class RecordingBus(Bus):
-    """Keeps every publication with its step, and loses the first version of the map in which an area is blocked."""
+    """Records every publication with its step, and loses the first map version in which an area is blocked."""
 
     def __init__(self, site: str) -> None:
         super().__init__(site)
@@ -116,35 +116,36 @@ class RecordingBus(Bus):
 
 @dataclass
 class Run:
-    """A drive: what came from outside in each step, and what was decided."""
+    """A drive: the external inputs of each step, and the decisions."""
 
     bus: RecordingBus
     config: AgentConfig
     times: list[float] = field(default_factory=list)
     hardware: list[list[log.Entry]] = field(default_factory=list)
-    answers: list[Any] = field(default_factory=list)
+    replies: list[Any] = field(default_factory=list)
     wheels: list[Any] = field(default_factory=list)
     last_zone: Zone = ZONE_WET
 
-    def outside(self, step: int) -> list[Publication]:
-        return [p for at, p in self.bus.published if at == step and from_outside(p)]
+    def external(self, step: int) -> list[Publication]:
+        return [p for at, p in self.bus.published if at == step and is_external(p)]
 
     def decisions(self) -> dict[str, list[Any]]:
-        """Return what was published inside, by channel: step, ids and content."""
+        """Return what the system published by itself, by channel: step, ids and content."""
         found: dict[str, list[Any]] = {}
         for step, publication in self.bus.published:
-            if not from_outside(publication):
+            if not is_external(publication):
                 entry = step, dict(publication.ids), comparable(publication.message)
                 found.setdefault(publication.channel.name, []).append(entry)
         return found
 
 
-def from_outside(publication: Publication) -> bool:
-    return publication.channel in OUTSIDE or (publication.channel in OF_ROBOTS and publication.ids["robot"] == STRANGER)
+def is_external(publication: Publication) -> bool:
+    from_other_robot = publication.channel in ROBOT_CHANNELS and publication.ids["robot"] == OTHER_ROBOT
+    return publication.channel in EXTERNAL_CHANNELS or from_other_robot
 
 
 def comparable(message: Any) -> Any:
-    # How punctual its loops are is no decision.
+    # The timing of its loops is not a decision.
     return msgspec.structs.replace(message, loop=LoopHealth()) if isinstance(message, RobotState) else message
 
 
@@ -153,14 +154,14 @@ def enable(now: float) -> RobotCommand:
     return sign(unsigned, OPERATOR_KEY)
 
 
-def strangers(step: int, readings: list[Any]) -> list[Publication]:
-    """Return what another robot, old and broken nodes send in a step, and a reading that is delivered twice."""
+def external_messages(step: int, readings: list[Any]) -> list[Publication]:
+    """Return a step's messages of another robot and of thesis nodes, invalid ones, and a reading delivered twice."""
     at = moment(step * 0.01)
-    robot = {"robot": STRANGER}
+    robot = {"robot": OTHER_ROBOT}
     found: list[Publication] = []
     if step % 100 == 50 and readings:
         found.append(Publication(ch.NODE_READING, readings[-1], {"node": "n1"}))
-    if step == STRANGERS:
+    if step == EXTERNAL:
         seen = RobotObstacles(points=[(4.0, 7.0), (4.05, 7.0)], stamp=at.stamp, ttl=3.0)
         found += [
             Publication(ch.NODE_AVAILABILITY, "online", {"node": "n1"}),
@@ -168,9 +169,9 @@ def strangers(step: int, readings: list[Any]) -> list[Publication]:
             Publication(ch.THESIS_AREA, "blocked", {"number": "7"}),
             Publication(ch.ROBOT_OBSTACLES, seen, robot),
         ]
-    if STRANGERS <= step < STRANGERS + 400 and step % 20 == 0:
+    if EXTERNAL <= step < EXTERNAL + 400 and step % 20 == 0:
         found.append(Publication(ch.THESIS_AREA, "clear", {"number": "2"}))
-    if step >= STRANGERS and step % 20 == 0:
+    if step >= EXTERNAL and step % 20 == 0:
         pose = RobotPose(
             x=7.5, y=0.85, theta=0.0, covariance=[0.0] * 9, v=0.0, w=0.0, radius=0.17, height=0.5, stamp=at.stamp
         )
@@ -207,36 +208,36 @@ def drive_in_lockstep() -> Run:
     for step in range(1, STEPS + 1):
         bus.step = step
         entries.clear()
-        system.step(strangers(step, readings))
+        system.step(external_messages(step, readings))
         run.hardware.append([e for e in entries if isinstance(e, HARDWARE)])
         run.wheels += [entry.command for entry in entries if isinstance(entry, log.WheelsCommanded)]
         run.times.append(system.now)
         at = moment(system.now)
         if step == ENABLE:
-            asked = enable(at.now)
-            run.answers.append(bus.query(ch.ROBOT_COMMAND, asked, CommandReply, at, robot="r1"))
+            command = enable(at.now)
+            run.replies.append(bus.query(ch.ROBOT_COMMAND, command, CommandReply, at, robot="r1"))
         if step == BARRIER:
             system.world.place(barrier_across(site.site.areas[0], site.site, site.map, SEED))
         if step == GOAL:
-            for robot in ("r1", STRANGER):
+            for robot in ("r1", OTHER_ROBOT):
                 fog.planner.set_goal(robot, goal(at.stamp), any_heading=True)
                 fog.deliver(at)
         if step == ZONES:
             fog.map.put_zone(ZONE_SLOW, at)
             fog.map.put_zone(ZONE_WET, at)
-        if step == CLOSED_IN:
+        if step == ZONE_AROUND_ROBOT:
             run.last_zone = zone_around(*system.world.pose[:2])
             fog.map.put_zone(run.last_zone, at)
-        if step == QUESTIONS:
-            run.answers.append(bus.query(ch.PLANNER_PLAN, PLAN, PlanReply, at))
-            run.answers.append(bus.query(ch.PLANNER_EGRESS, EGRESS, PlanReply, at))
-            run.answers.append(bus.query(ch.ZONES, None, ZoneSet, at))
+        if step == QUERIES:
+            run.replies.append(bus.query(ch.PLANNER_PLAN, PLAN, PlanReply, at))
+            run.replies.append(bus.query(ch.PLANNER_EGRESS, EGRESS, PlanReply, at))
+            run.replies.append(bus.query(ch.ZONES, None, ZoneSet, at))
         fog.deliver(at)
     return run
 
 
 def zone_around(x: float, y: float) -> Zone:
-    """Return a no-go zone that a robot at (x, y) finds itself in."""
+    """Return a no-go zone around a robot at (x, y)."""
     shape = CircleShape(centre=(round(float(x), 2), round(float(y), 2)), radius=0.5)
     return Zone(id="here", kind="BLOCKED", shape=shape, reason="gas", version=1)
 
@@ -247,7 +248,7 @@ def goal(stamp: float) -> RobotGoal:
 
 
 def feed(live: Any, entries: list[log.Entry]) -> None:
-    """Hand the agent's service what base and lidar sent in a step."""
+    """Pass to the agent's service what base and lidar sent in a step."""
     for entry in entries:
         match entry:
             case log.BaseReceived():
@@ -269,30 +270,30 @@ async def drive_live(recorded: Run) -> tuple[Run, Any]:
         bus.step = step
         live.clock.time = now
         feed(live, recorded.hardware[step - 1])
-        bus.publish(recorded.outside(step))
-        await live.settle()
+        bus.publish(recorded.external(step))
+        await live.run_until_idle()
         if step == 1:
             await live.begin_loops()
         else:
-            await live.clock.wake(live.settle)
+            await live.clock.wake(live.run_until_idle)
         if step == ENABLE:
-            asked = enable(now)
-            run.answers.append(await live.run(live.query(ch.ROBOT_COMMAND, asked, CommandReply, robot="r1")))
+            command = enable(now)
+            run.replies.append(await live.run(live.query(ch.ROBOT_COMMAND, command, CommandReply, robot="r1")))
         if step == GOAL:
             pose = goal(0.0).pose
             assert pose is not None
-            for robot in ("r1", STRANGER):
+            for robot in ("r1", OTHER_ROBOT):
                 await live.run(live.planner.send(robot, pose, "tester", place=None, any_heading=True))
         if step == ZONES:
             for zone in (ZONE_SLOW, ZONE_WET):
                 await live.run(live.map.create(zone, "tester"))
-        if step == CLOSED_IN:
+        if step == ZONE_AROUND_ROBOT:
             await live.run(live.map.create(recorded.last_zone, "tester"))
-        if step == QUESTIONS:
-            run.answers.append(await live.run(live.query(ch.PLANNER_PLAN, PLAN, PlanReply)))
-            run.answers.append(await live.run(live.query(ch.PLANNER_EGRESS, EGRESS, PlanReply)))
-            run.answers.append(await live.run(live.query(ch.ZONES, None, ZoneSet)))
-        await live.settle()
+        if step == QUERIES:
+            run.replies.append(await live.run(live.query(ch.PLANNER_PLAN, PLAN, PlanReply)))
+            run.replies.append(await live.run(live.query(ch.PLANNER_EGRESS, EGRESS, PlanReply)))
+            run.replies.append(await live.run(live.query(ch.ZONES, None, ZoneSet)))
+        await live.run_until_idle()
     run.wheels = live.link.sent
     await live.stop()
     return run, live
@@ -312,16 +313,16 @@ def live(lockstep: Run) -> tuple[Run, Any]:
         return asyncio.run(drive_live(lockstep))
 
 
-def test_the_recorded_drive_is_worth_comparing(lockstep):
+def test_recorded_drive_contains_all_kinds_of_decisions(lockstep):
     decisions = lockstep.decisions()
     modes = {state.mode for _, _, state in decisions["robot_state"]}
     assert {"INIT", "NORMAL", "DEGRADED", "PROTECTIVE_STOP"} <= modes
     assert {"clear", "blocked", "unknown"} <= {hazard.state for _, _, hazard in decisions["area_hazard"]}
-    assert STRANGER in {hazard.explained_by for _, _, hazard in decisions["area_hazard"]}
+    assert OTHER_ROBOT in {hazard.explained_by for _, _, hazard in decisions["area_hazard"]}
     assert len({path.plan_id for _, _, path in decisions["robot_path"]}) >= 3
     assert {delta.layer for _, _, delta in decisions["map_delta"]} == {"cost", "speed"}
     assert lockstep.bus.lost is not None
-    assert [accepted.accepted for accepted in lockstep.answers[:1]] == [True]
+    assert [accepted.accepted for accepted in lockstep.replies[:1]] == [True]
 
 
 def test_live_services_publish_what_lockstep_publishes(lockstep, live):
@@ -329,14 +330,14 @@ def test_live_services_publish_what_lockstep_publishes(lockstep, live):
     expected, found = lockstep.decisions(), run.decisions()
     assert found.keys() == expected.keys()
     for channel, decisions in expected.items():
-        for theirs, ours in zip(found[channel], decisions, strict=False):
-            assert theirs == ours, channel
+        for live_decision, decision in zip(found[channel], decisions, strict=False):
+            assert live_decision == decision, channel
         assert len(found[channel]) == len(decisions), channel
 
 
-def test_live_services_answer_refuse_and_drive_as_in_lockstep(lockstep, live):
+def test_live_services_reply_refuse_and_drive_as_in_lockstep(lockstep, live):
     run, _ = live
-    assert run.answers == lockstep.answers
+    assert run.replies == lockstep.replies
     assert run.bus.refused == lockstep.bus.refused
     assert len(run.bus.refused) == 1
     assert run.wheels == lockstep.wheels
@@ -346,8 +347,8 @@ def test_live_services_answer_refuse_and_drive_as_in_lockstep(lockstep, live):
 # --- The channel table is the source of who publishes and who subscribes ---
 
 
-def of_table(live: Any, kind: str, side: str) -> set[Any]:
-    """Return the pairs of role and channel that the table has on one side, for the roles that run here."""
+def table_pairs(live: Any, kind: str, side: str) -> set[Any]:
+    """Return the table's pairs of role and channel on one side, for the roles that run here."""
     rows = [row for row in ch.CHANNELS.values() if row.kind == kind]
     return {(role, row) for row in rows for role in getattr(row, side) if role in live.edges} - usage.NOT_YET
 
@@ -356,40 +357,40 @@ def of_kind(pairs: set[Any], kind: str) -> set[Any]:
     return {(role, channel) for role, channel in pairs if channel.kind == kind}
 
 
-def named(pairs: set[Any]) -> list[str]:
+def names_of(pairs: set[Any]) -> list[str]:
     return sorted(f"{role}: {channel.name}" for role, channel in pairs)
 
 
 def test_services_subscribe_to_exactly_the_channels_that_the_table_gives_them(live):
     _, services = live
     for kind in ("pub", "liveliness"):
-        assert named(of_kind(services.subscribed, kind)) == named(of_table(services, kind, "subscribers"))
+        assert names_of(of_kind(services.subscribed, kind)) == names_of(table_pairs(services, kind, "subscribers"))
 
 
 def test_services_publish_exactly_the_channels_that_the_table_gives_them(live):
     _, services = live
-    assert named(services.published) == named(of_table(services, "pub", "publishers"))
+    assert names_of(services.published) == names_of(table_pairs(services, "pub", "publishers"))
 
 
 def test_services_answer_exactly_the_queries_that_the_table_gives_them(live):
     _, services = live
-    assert named(of_kind(services.served, "query")) == named(of_table(services, "query", "publishers"))
-    # Of published channels only those may be asked that have a latest message.
+    assert names_of(of_kind(services.served, "query")) == names_of(table_pairs(services, "query", "publishers"))
+    # Only published channels with a latest message can be queried.
     assert all(c.durability == "latest" for _, c in services.served if c.kind == "pub")
 
 
 def test_services_send_exactly_the_queries_that_the_table_gives_them(live):
     _, services = live
-    assert named(services.queried) == named(of_table(services, "query", "subscribers"))
+    assert names_of(services.queried) == names_of(table_pairs(services, "query", "subscribers"))
 
 
 def cores(loaded: Any, config: AgentConfig) -> dict[str, Any]:
-    """Return what offers tables of handlers or query handlers, by name."""
+    """Return everything with a table of handlers or query handlers, by name."""
     definitions, layers = loaded.site.definitions(), make_layers(loaded.map, loaded.site.layers)
     return {
         "aggregator": Aggregator(definitions, loaded.site.nodes, 1, registry=find_rule),
         "map": MapCore(loaded.site.id, loaded.map, 1, layers=layers, definitions=definitions),
-        # The map's handlers join those of its layers, and take whatever these take.
+        # The map combines its layers' handlers; their message types are those of the layers.
         **{f"map layer {type(layer).__name__}": layer for layer in layers},
         "planner": PlannerCore(1),
         "agent": AgentCore(config),
@@ -414,8 +415,8 @@ def test_every_query_handler_takes_the_request_type_of_its_channel_and_gives_its
     checked = 0
     for name, core in cores(site_with_two_areas(), lockstep.config).items():
         for channel, query_handler in core.query_handlers().items() if hasattr(core, "query_handlers") else ():
-            asked, reply = (channel.message, channel.reply) if channel.kind == "query" else (None, channel.message)
-            expected = "None" if asked is None else asked.__name__
+            request, reply = (channel.message, channel.reply) if channel.kind == "query" else (None, channel.message)
+            expected = "None" if request is None else request.__name__
             assert annotations(query_handler) == ["Ids", expected, "Moment"], f"{name}: {channel.name}"
             assert reply is not None
             assert inspect.signature(query_handler).return_annotation == reply.__name__, f"{name}: {channel.name}"

@@ -83,7 +83,7 @@ class MapProcess:
 
 
 class PlannerProcess:
-    """The planner; messages wait for its next cycle, and urgent ones make the next cycle due at once."""
+    """The planner: messages wait for its next tick; urgent ones trigger it at once."""
 
     def __init__(self, core: PlannerCore, bus: Bus) -> None:
         self.core = core
@@ -116,7 +116,7 @@ class PlannerProcess:
                 self.due = True
 
     def deliver(self, at: Moment) -> None:
-        """Deliver all messages on the bus, and run the cycles that become due."""
+        """Deliver all messages on the bus, and tick as long as a tick is due."""
         self._bus.deliver(at)
         while self.due:
             self.tick(at)

@@ -1,4 +1,4 @@
-"""The planner as a process, with a real router and Redis, and a test in the roles of map-service and robot."""
+"""The planner as a process, with a real router and Redis; the test acts as map-service and robot."""
 
 import asyncio
 import os

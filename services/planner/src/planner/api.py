@@ -61,7 +61,7 @@ class PlanView(Message, frozen=True, kw_only=True):
 
 
 class RobotView(Message, frozen=True, kw_only=True):
-    """A robot as the planner knows it."""
+    """A robot with its latest pose, state, goal and plan."""
 
     id: str
     configured: bool

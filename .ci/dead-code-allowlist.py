@@ -15,10 +15,11 @@ _.uptime_ms  # messages: of a sensor node
 _.rssi
 _.fw
 _.after_input  # robot_agent.agent.replay: where a replay differs
-_.hazard_clearance_m  # lockstep: fields of its result
-_.operator_commands
+_.area_entered  # the demo's report and lockstep's result
+_.area_clearance_m
+_.operator_commands  # lockstep: fields of its result
+_.hazard_at_m
 _.pose_error_m
-_.replans
 _.stages_ms
 _.time_s
 _.costmap_published  # messages: stamps of a trace, read by their names in fog_contracts.stages
@@ -85,7 +86,6 @@ _.start_redis
 _.start_router
 _.save_map
 _.find_channel
-_.person_at
 _.ticks  # counters and views that tests assert on
 _.frames
 _.lost_bytes

@@ -10,25 +10,27 @@ from fognav.demo.options import DrivePlan, Options
 from fognav.demo.report import modes
 from fognav.demo.scene import Scene
 from fognav.demo.speed import SpeedWatch, TooFastError
-from fognav_sim.drive.evaluation import DriveEvaluation, DriveOutcome
+from fognav_sim.drive.drive import Drive
+from fognav_sim.drive.evaluation import DriveOutcome
 
 REACHED = DriveOutcome("reached", "the robot stands 0.08 m from its goal")
 TIMEOUT = DriveOutcome("timeout", "the goal was not reached within 600 s")
 REASON = "no message from the guardian for 0.6 s"
 
 
-class Drive:
+class DriveRig:
     """An attempt during its drive, without any process."""
 
     def __init__(self, speed: float) -> None:
         site = load_site(checkout.root() / "sites" / "estig")
         plan = DrivePlan.of(site, Options(speed=speed))
         self.attempt = Attempt(plan, Scene(site, plan.robot, 1, speed))
-        self.evaluation = self.attempt.evaluation = DriveEvaluation(
-            goal=(59.0, 44.0), goal_id="g", areas=site.site.areas, started_at=0.0, timeout_s=600.0
-        )
         self.hazard_placed = True
         self.set_position(5.0, 25.4)
+        self.drive = self.attempt.drive = Drive(
+            goal=(59.0, 44.0), goal_id="g", areas=site.site.areas, truth=self.truth, now=0.0, hazard=None
+        )
+        self.evaluation = self.drive.evaluation
         self.set_mode("NORMAL")
 
     def set_position(self, x: float, y: float) -> None:
@@ -36,14 +38,15 @@ class Drive:
             robot="r1", x=x, y=y, theta=0.0, left=0.0, right=0.0, distance=1.0, clearance=1.0, min_clearance=0.5,
             contacts=0, sustained_speed=self.attempt.scene.speed,
         )  # fmt: skip
-        self.evaluation.on_truth(self.truth)
+        if self.attempt.drive is not None:
+            self.attempt.drive.on_truth(self.truth)
 
     def set_mode(self, mode: Mode, *reasons: str, late: int = 0) -> None:
         self.state = RobotState(
             mode=mode, reasons=list(reasons), enabled=True, battery=None, goal_id="g", map_epoch=1, map_seq=1,
             plan_id=1, loop=LoopHealth(late=late),
         )  # fmt: skip
-        self.evaluation.on_state(self.state, 0.0)
+        self.drive.on_state(self.state, 0.0)
 
     @property
     def watch(self) -> SpeedWatch:
@@ -60,7 +63,7 @@ class Drive:
 
 
 def test_drive_with_an_unexplained_stop_lowers_a_speed_above_1() -> None:
-    drive = Drive(3.0)
+    drive = DriveRig(3.0)
     drive.set_mode("PROTECTIVE_STOP", REASON)
     drive.set_mode("NORMAL")
     drive.check()  # no cycle was late: the drive continues, so that a contact would be noticed
@@ -70,14 +73,14 @@ def test_drive_with_an_unexplained_stop_lowers_a_speed_above_1() -> None:
 
 
 def test_stop_at_speed_1_changes_nothing() -> None:
-    drive = Drive(1.0)
+    drive = DriveRig(1.0)
     drive.set_mode("FAULT", REASON, late=50)
     drive.check()
     drive.end(REACHED)
 
 
 def test_drive_without_a_stop_keeps_the_speed() -> None:
-    drive = Drive(3.0)
+    drive = DriveRig(3.0)
     drive.set_mode("DEGRADED", "the map is 1.2 s old")
     drive.set_mode("HOLD", "the map is 3.2 s old")
     drive.check()
@@ -86,7 +89,7 @@ def test_drive_without_a_stop_keeps_the_speed() -> None:
 
 
 def test_stop_with_late_cycles_ends_the_attempt_at_once() -> None:
-    drive = Drive(3.0)
+    drive = DriveRig(3.0)
     drive.set_mode("FAULT", REASON, late=1)
     with pytest.raises(TooFastError, match=f"1 of the agent's cycles late in 6 s; FAULT: {REASON}"):
         drive.check()
@@ -99,7 +102,7 @@ def test_next_speed_is_at_most_the_sustained_one_and_at_least_1() -> None:
 
 
 def test_stop_counts_only_with_late_cycles_since_the_last_check() -> None:
-    drive = Drive(3.0)
+    drive = DriveRig(3.0)
     drive.set_mode("PROTECTIVE_STOP", REASON)
     drive.check()
     drive.set_mode("NORMAL", late=1)
@@ -107,21 +110,21 @@ def test_stop_counts_only_with_late_cycles_since_the_last_check() -> None:
 
 
 def test_stop_does_not_excuse_a_failed_drive() -> None:
-    drive = Drive(3.0)
+    drive = DriveRig(3.0)
     drive.set_mode("PROTECTIVE_STOP", "the pose is lost")
     drive.check()
     drive.end(TIMEOUT)
 
 
 def test_stop_does_not_excuse_a_drive_without_its_hazard() -> None:
-    drive = Drive(3.0)
+    drive = DriveRig(3.0)
     drive.hazard_placed = False
     drive.set_mode("PROTECTIVE_STOP", REASON)
     drive.end(REACHED)
 
 
 def test_stop_after_a_process_died_is_expected() -> None:
-    drive = Drive(3.0)
+    drive = DriveRig(3.0)
     drive.attempt.restarts["robot-agent"] = 1
     drive.set_mode("PROTECTIVE_STOP", REASON, late=1)
     drive.check()
@@ -130,13 +133,13 @@ def test_stop_after_a_process_died_is_expected() -> None:
 
 @pytest.mark.parametrize("late", [0, 500])
 def test_contact_and_entering_a_blocked_area_are_never_excused(late: int) -> None:
-    contact = Drive(3.0)
+    contact = DriveRig(3.0)
     contact.set_mode("NORMAL", late=late)
     contact.check()
     contact.set_mode("FAULT", "the bumper is pressed", late=late)
     contact.end(DriveOutcome("contact", "the robot made contact with an obstacle"))
 
-    entered = Drive(3.0)
+    entered = DriveRig(3.0)
     z1 = next(area for area in entered.attempt.plan.site.site.areas if area.id == "z1")
     entered.evaluation.block(z1)
     entered.set_position(40.0, 28.0)
@@ -149,7 +152,7 @@ def test_contact_and_entering_a_blocked_area_are_never_excused(late: int) -> Non
 
 
 def test_failed_drive_with_late_cycles_is_repeated_more_slowly() -> None:
-    drive = Drive(3.0)
+    drive = DriveRig(3.0)
     drive.set_mode("NORMAL", late=100)
     drive.check()
     with pytest.raises(TooFastError, match="timeout: the goal was not reached"):

@@ -10,6 +10,7 @@ import pytest
 from fog_contracts.geometry import contains_point
 from fog_runtime.site import load_site
 from fognav_experiments.lockstep import run_lockstep
+from fognav_sim.drive.hazard import HazardRequest
 from fognav_sim.scenario import ScenarioError
 
 ESTIG = Path(__file__).parents[2] / "sites" / "estig"
@@ -18,8 +19,11 @@ ring = importlib.util.module_from_spec(_spec)
 _spec.loader.exec_module(ring)
 
 
-def drive(seed, area=None, **more):
-    return run_lockstep(ring.ring_site(), ring.START, ring.GOAL, seed, area, timeout_s=200.0, **more)
+BLOCKED = HazardRequest(area="z1", trigger_m=0.5)
+
+
+def drive(seed, hazard=None, **more):
+    return run_lockstep(ring.ring_site(), ring.START, ring.GOAL, seed, hazard, **more)
 
 
 @pytest.fixture(scope="module")
@@ -29,11 +33,11 @@ def free():
 
 @pytest.fixture(scope="module")
 def warned():
-    return drive(3, "z1", hazard_at_m=0.5)
+    return drive(3, BLOCKED)
 
 
 def test_robot_without_a_hazard_takes_the_short_path_through_the_watched_area(free):
-    assert (free.outcome, free.contacts, free.crossed) == ("reached", 0, ["z1"]), free.reason
+    assert (free.outcome, free.contacts, free.route_areas) == ("reached", 0, ["z1"]), free.reason
     assert free.min_clearance_m > 0.1
     assert free.distance_m == pytest.approx(free.planned_m, abs=1.0)
 
@@ -48,17 +52,18 @@ def test_robot_with_another_base_and_lidar_reaches_its_goal(free):
 
 def test_robot_in_a_watched_area_raises_no_hazard(free):
     assert not [event for event in free.events if event.description.startswith("area z1: blocked")]
-    assert free.replans == 0
+    assert free.plans == 1
 
 
 def test_robot_drives_around_a_blocked_area_before_its_lidar_can_see_it(warned, free):
-    assert (warned.outcome, warned.contacts, warned.crossed) == ("reached", 0, []), warned.reason
+    assert (warned.outcome, warned.contacts, warned.route_areas) == ("reached", 0, []), warned.reason
     area = ring.ring_site().site.areas[0]
     assert not any(contains_point(area.polygon, *point) for point in warned.track)
-    assert warned.replans >= 1
+    assert warned.plans >= 2
     assert warned.distance_m > free.distance_m
     assert warned.min_clearance_m > 0.1
-    assert warned.hazard_clearance_m > 1.0
+    assert warned.area_clearance_m > 1.0
+    assert warned.success
 
 
 def test_hazard_reaches_the_wheels_within_a_second_and_every_stage_is_stamped(warned):
@@ -74,7 +79,7 @@ def test_robot_without_nodes_meets_the_barrier_once_and_remembers_it():
     site = load_site(ESTIG)
     start, goal = site.site.places["a"], site.site.places["b"]
     begin = msgspec.structs.replace(site.site.robots[0].start, x=start.x, y=start.y)
-    met = run_lockstep(site, begin, goal, 1, "z4", hazard_at_m=0.5, watched=False)
+    met = run_lockstep(site, begin, goal, 1, HazardRequest(area="z4", trigger_m=0.5), watched=False)
     assert (met.outcome, met.contacts) == ("reached", 0), met.reason
     barrier = next(area.polygon for area in site.site.areas if area.id == "z4")
     distances = [math.dist(point, barrier[0]) for point in met.track]
@@ -85,10 +90,10 @@ def test_robot_without_nodes_meets_the_barrier_once_and_remembers_it():
 
 
 def test_same_seed_repeats_the_drive_exactly_and_another_seed_changes_it(warned, free):
-    assert msgspec.json.encode(drive(3, "z1", hazard_at_m=0.5)) == msgspec.json.encode(warned)
+    assert msgspec.json.encode(drive(3, BLOCKED)) == msgspec.json.encode(warned)
     assert drive(4).track != free.track
 
 
 def test_unknown_area_is_refused_with_the_known_ones():
     with pytest.raises(ScenarioError, match="no area 'z9'; it has: z1"):
-        drive(1, "z9")
+        drive(1, HazardRequest(area="z9"))

@@ -1,4 +1,4 @@
-"""Barriers close corridors, nodes see them, and events happen once they are due and the robot is far enough away."""
+"""Barriers close corridors, and nodes see them."""
 
 import math
 
@@ -8,14 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fog_contracts.costs import Inflation
-from fog_contracts.geometry import contains_point, rasterize
+from fog_contracts.geometry import rasterize
 from fog_contracts.grid import GridGeometry
 from fog_contracts.messages import Pose
 from fog_contracts.site import AreaSite, NodeSite, RobotSite, Site, Sonar
 from fog_kernels.astar import Planner
 from fog_kernels.inflation import inflate, inflation_table
 from fog_runtime.maps import StaticMap
-from fognav_sim.scenario import Event, Scenario, ScenarioError, barrier_across, person_at
+from fognav_sim.scenario import ScenarioError, barrier_across
 from fognav_sim.world import World
 
 RES = 0.05
@@ -86,50 +86,3 @@ def test_area_without_room_for_a_barrier_is_named_in_the_error():
     static, floor = corridor(2.4, door=1.5), site(2.4)
     with pytest.raises(ScenarioError, match="area z1: no barrier fits"):
         barrier_across(floor.areas[0], floor, static, seed=1)
-
-
-def test_person_has_the_width_and_height_of_a_human():
-    person = person_at(3.0, 2.0)
-    xs, _ = zip(*person.polygon, strict=True)
-    assert 0.4 < max(xs) - min(xs) < 0.5
-    assert contains_point(person.polygon, 3.0, 2.0)
-    assert person.height > 1.5
-
-
-def drive(scenario, world, seconds):
-    occurred = []
-    for step in range(round(seconds / 0.01)):
-        world.step(0.01)
-        occurred += scenario.step(world, 100.0 + step * 0.01)
-    return occurred
-
-
-def moving_world():
-    static, floor = corridor(2.4), site(2.4)
-    world = World(static.geometry, static.cells, floor.robots[0], seed=1)
-    world.set_wheels(0.3, 0.3)
-    return world
-
-
-def test_event_happens_once_after_its_distance_or_time():
-    world = moving_world()
-    by_distance = Event(name="by distance", place=(person_at(10.0, 2.0),), at_distance=0.6)
-    by_time = Event(name="by time", remove=("person",), at_time=4.0)
-    scenario = Scenario([by_distance, by_time], start=100.0)
-    occurred = drive(scenario, world, 6.0)
-    assert [event.name for event in occurred] == ["by distance", "by time"]
-    assert occurred[0].distance == pytest.approx(0.6, abs=0.01)
-    assert occurred[1].time == pytest.approx(4.0, abs=0.011)
-    assert world.obstacles == []
-    assert scenario.pending == []
-
-
-def test_event_waits_for_its_signal_and_for_the_robot_to_be_far_away():
-    world = moving_world()
-    near = Event(name="near", place=(person_at(3.0, 2.2),))
-    signalled = Event(name="signalled", place=(person_at(11.0, 2.2, name="late"),), on_signal="now")
-    scenario = Scenario([near, signalled], start=100.0)
-    assert drive(scenario, world, 1.0) == []
-    scenario.signal("now")
-    assert [event.name for event in drive(scenario, world, 0.1)] == ["signalled"]
-    assert [event.name for event in scenario.pending] == ["near"]

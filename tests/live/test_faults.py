@@ -21,10 +21,9 @@ import pytest_asyncio
 from driver import START, LiveSystem
 
 from fog_contracts.geometry import contains_point
-from fog_contracts.messages import Pose, SimCommand
+from fog_contracts.messages import Pose, SimCommand, SimObstacle
 from fog_supervisor import net
 from fognav.stack import AGENT, AGGREGATOR, BROKER, MAP_SERVICE, PLANNER, REDIS, ROUTER
-from fognav_sim.scenario import person_at
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -46,6 +45,14 @@ EAST = (58.0, 28.4)
 WEST = (15.0, 28.4)
 NODE_X, NODE_Y = 40.0, 29.85
 Z1 = [(38.0, 26.9), (42.0, 26.9), (42.0, 29.9), (38.0, 29.9)]
+
+
+def person_at(x: float, y: float) -> SimObstacle:
+    """Return a person standing at (x, y) in metres: an octagonal prism, 0.44 m wide and 1.7 m high."""
+    corners = [(k + 0.5) * math.tau / 8 for k in range(8)]
+    return SimObstacle(
+        id="person", polygon=[(x + 0.22 * math.cos(a), y + 0.22 * math.sin(a)) for a in corners], height=1.7
+    )
 
 
 @pytest_asyncio.fixture(scope="module", loop_scope="module")

@@ -132,20 +132,20 @@ async def drive(attempt: Attempt, stack: Stack, edge: ZenohEdge, clock: SystemCl
     operator = Operator(edge, stack, scene, clock)
 
     async with Background(operator.keep_enabled()) as background:
-        driving = asyncio.create_task(attempt.drive(operator, clock, background))
+        driving = asyncio.create_task(attempt.run_drive(operator, clock, background))
 
         def has_driven(distance: float) -> bool:
             assert not driving.done(), (scene.outcome, list(scene.events))
-            return attempt.evaluation is not None and attempt.evaluation.distance_m >= distance
+            return attempt.drive is not None and attempt.drive.evaluation.distance_m >= distance
 
         def has_new_path() -> bool:
-            evaluation = attempt.evaluation
-            return has_driven(0.0) and attempt.hazard.placed_at is not None and evaluation and evaluation.plans >= 2
+            drive = attempt.drive
+            return has_driven(0.0) and drive.blocked_at_m is not None and drive.evaluation.plans >= 2
 
         try:
             await until(has_new_path, f"the planner has replanned: {list(scene.events)}", DRIVE_TIMEOUT_S)
-            assert attempt.evaluation is not None
-            distance_m = attempt.evaluation.distance_m + AFTER_M
+            assert attempt.drive is not None
+            distance_m = attempt.drive.evaluation.distance_m + AFTER_M
             await until(lambda: has_driven(distance_m), "the robot has followed its new path", DRIVE_TIMEOUT_S)
         finally:
             driving.cancel()
@@ -199,8 +199,9 @@ async def record(path: Path) -> tuple[MapSnapshot, str]:
             await until(lambda: clock.now() > faded_at, "all obstacles have faded", READY_TIMEOUT_S)
             last = await edge.query(ch.MAP_SNAPSHOT, None, MapSnapshot, 10.0)
             assert last is not None
-    assert attempt.hazard.area is not None
-    return last, attempt.hazard.area
+    area = attempt.summary().area
+    assert area is not None
+    return last, area
 
 
 @pytest.fixture(scope="module")

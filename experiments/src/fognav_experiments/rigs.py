@@ -12,7 +12,7 @@ from fog_contracts import channels as ch
 from fog_contracts.bus import Bus
 from fog_contracts.commands import sign
 from fog_contracts.handlers import Moment, Publication
-from fog_contracts.messages import CommandReply, PlanReply, RobotCommand
+from fog_contracts.messages import CommandReply, RobotCommand
 from fognav_experiments.processes import AgentProcess, Fog
 from fognav_sim import devices
 from fognav_sim.hardware import STEP_S, Hardware
@@ -33,7 +33,7 @@ from robot_agent.registry import make_base, make_lidar
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from fog_contracts.messages import CommandKind, PlanRequest
+    from fog_contracts.messages import CommandKind
     from fog_contracts.site import RobotSite
     from fog_runtime.site import LoadedSite
     from fognav_sim.world import Noise
@@ -187,12 +187,6 @@ class FogRig(Fog):
         for node in self._nodes:
             ids = {"node": node.node.id}
             self._bus.publish(Publication(ch.NODE_READING, reading, ids) for reading in node.poll(self._world, now))
-
-    def preview(self, request: PlanRequest, now: float) -> PlanReply:
-        """Ask the planner for a path, without side effects."""
-        reply = self._bus.query(ch.PLANNER_PLAN, request, PlanReply, moment(now))
-        assert reply is not None
-        return reply
 
 
 class System:

@@ -1,32 +1,28 @@
-"""Scripted changes of the world: obstacles that appear and vanish at a time, a distance or a signal. Pure."""
+"""Barriers that close a corridor from wall to wall. Pure."""
 
 from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from fog_contracts.geometry import contains_point, distance_to_polygon
+from fog_contracts.geometry import contains_point
 from fog_contracts.messages import SimObstacle
 from fog_kernels.raycast import cast
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
     from fog_contracts.site import AreaSite, NodeSite, Site
     from fog_runtime.maps import StaticMap
-    from fognav_sim.world import World
 
 KEEP_AWAY_M: Final = 3.0
 """Nothing appears nearer to the robot than this."""
 BARRIER_HEIGHT_M: Final = 1.0
-PERSON_RADIUS_M: Final = 0.22
-PERSON_HEIGHT_M: Final = 1.7
 _MAX_GAP_M: Final = 0.30
 """Widest gap beside a barrier; the robot needs 0.34 m."""
 _NODE_OFFSET_M: Final = 0.20
@@ -41,82 +37,6 @@ _ATTEMPTS: Final = 40
 
 class ScenarioError(ValueError):
     """A scenario that is impossible on this site; the message gives the reason."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Event:
-    """One change of the world, which happens once: obstacles placed and removed.
-
-    It is due when the robot has driven `at_distance` (m), `at_time` (s since the start) has come and `on_signal` was
-    given, as far as these are set. It waits until every obstacle to place is at least `keep_away` (m) from the robot's
-    centre.
-    """
-
-    name: str
-    place: tuple[SimObstacle, ...] = ()
-    remove: tuple[str, ...] = ()
-    at_distance: float = 0.0
-    at_time: float = 0.0
-    on_signal: str | None = None
-    keep_away: float = KEEP_AWAY_M
-
-
-@dataclass(frozen=True, slots=True)
-class Occurrence:
-    """An event that has happened: when (s since the start) and after which distance driven (m)."""
-
-    name: str
-    time: float
-    distance: float
-
-
-class Scenario:
-    """Applies events to a world, in their order if several are due. `start` is the time (s) that counts as zero."""
-
-    def __init__(self, events: Iterable[Event], *, start: float, distance: float = 0.0) -> None:
-        self._pending = list(events)
-        self._start = start
-        self._start_distance = distance
-        self._signals: set[str] = set()
-
-    @property
-    def pending(self) -> list[Event]:
-        """The events that have not happened yet."""
-        return list(self._pending)
-
-    def signal(self, name: str) -> None:
-        """Give a signal: the events that wait for it become due."""
-        self._signals.add(name)
-
-    def step(self, world: World, now: float) -> list[Occurrence]:
-        """Apply the events that are due at `now` (s); return them."""
-        occurred: list[Occurrence] = []
-        for event in self._pending[:]:
-            if not self._due(event, world, now):
-                continue
-            for obstacle in event.place:
-                world.place(obstacle)
-            for identifier in event.remove:
-                world.remove(identifier)
-            self._pending.remove(event)
-            occurred.append(Occurrence(event.name, now - self._start, world.distance - self._start_distance))
-        return occurred
-
-    def _due(self, event: Event, world: World, now: float) -> bool:
-        x, y, _ = world.pose
-        return (
-            now - self._start >= event.at_time
-            and world.distance - self._start_distance >= event.at_distance
-            and (event.on_signal is None or event.on_signal in self._signals)
-            and all(distance_to_polygon(thing.polygon, x, y) >= event.keep_away for thing in event.place)
-        )
-
-
-def person_at(x: float, y: float, *, name: str = "person") -> SimObstacle:
-    """Return a person standing at (x, y) in metres: an octagonal prism, 0.44 m wide and 1.7 m high."""
-    corners = [(k + 0.5) * math.tau / 8 for k in range(8)]
-    ring = [(x + PERSON_RADIUS_M * math.cos(a), y + PERSON_RADIUS_M * math.sin(a)) for a in corners]
-    return SimObstacle(id=name, polygon=ring, height=PERSON_HEIGHT_M)
 
 
 def barrier_across(area: AreaSite, site: Site, static: StaticMap, seed: int, *, name: str = "barrier") -> SimObstacle:

@@ -48,7 +48,6 @@ def test_goal_is_reached_when_robot_and_ground_truth_agree() -> None:
     drive.on_state(state(reached=True), 110.0)
     assert outcome(drive, 110.0) == "reached"
     assert drive.distance_m == pytest.approx(9.9)
-    assert drive.success("reached")
 
 
 def test_robot_that_reports_arrival_away_from_its_goal_ends_as_stopped() -> None:
@@ -81,11 +80,10 @@ def test_entering_an_area_counts_only_once_it_is_blocked() -> None:
     drive.block(Z1)
     assert not drive.entered_blocked
     drive.on_truth(truth(7.0))
-    assert drive.success("reached")
+    assert not drive.entered_blocked
     assert drive.blocked_clearance_m == pytest.approx(1.0)
     drive.on_truth(truth(5.5))
     assert drive.entered_blocked
-    assert not drive.success("reached")
 
 
 def test_route_lists_the_areas_in_the_order_in_which_they_were_crossed() -> None:

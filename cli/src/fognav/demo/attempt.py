@@ -5,7 +5,7 @@ import contextlib
 from collections.abc import AsyncIterator
 from typing import Final
 
-from fog_runtime.clock import SystemClock
+from fog_runtime.clock import Clock, SystemClock
 from fog_runtime.zenoh_edge import ZenohEdge
 from fog_supervisor.supervisor import Event
 from fognav.demo.background import Background
@@ -19,17 +19,15 @@ from fognav.demo.usage import Usage, children
 from fognav.output import WrongUseError
 from fognav.recording import recording
 from fognav.stack import WATCHDOG, Stack, StackConfig
-from fognav_sim.drive.evaluation import DriveEvaluation, DriveOutcome
+from fognav_sim.drive.drive import Drive, DriveSummary
+from fognav_sim.drive.evaluation import DriveOutcome
+from fognav_sim.drive.hazard import HazardSchedule
 
 READY_S: Final = 90.0
 """Real seconds for everything to start."""
 _TICK_S: Final = 0.1
 _USAGE_S: Final = 1.0
 _SPEED_CHECK_S: Final = 2.0
-_SLOWEST_MPS: Final = 0.08
-"""Mean speed, stops and detours included, below which a drive times out."""
-_DETOUR: Final = 3.0
-_TIMEOUT_BASE_S: Final = 180.0
 
 
 class Attempt:
@@ -38,13 +36,12 @@ class Attempt:
     def __init__(self, plan: DrivePlan, scene: Scene) -> None:
         self.plan = plan
         self.scene = scene
-        self.evaluation: DriveEvaluation | None = None
-        self.hazard = HazardPlacement(plan.site, plan.options.seed, scene)
+        self.drive: Drive | None = None
+        self.placement: HazardPlacement | None = None
         self.speed_watch = SpeedWatch(scene.speed)
         self.usage = Usage()
         self.restarts: dict[str, int] = {}
         """How often each process died and was restarted."""
-        self.ended_at: float | None = None
 
     # --- the system ---
 
@@ -77,7 +74,7 @@ class Attempt:
                 edge = await ends.enter_async_context(self._open(stack, clock, "demo"))
                 operator = Operator(edge, stack, self.scene, clock)
                 async with Background(operator.keep_enabled(), self._sample_usage(stack)) as background:
-                    await self.drive(operator, clock, background)
+                    await self.run_drive(operator, clock, background)
                     if options.keep_running:
                         self.scene.log_event("the system keeps running: end it with Ctrl-C")
                         await stop.wait()
@@ -135,58 +132,62 @@ class Attempt:
 
     # --- the drive ---
 
-    async def drive(self, operator: Operator, clock: SystemClock, background: Background) -> None:
+    async def run_drive(self, operator: Operator, clock: SystemClock, background: Background) -> None:
         """Prepare the robot, send it to its goal, and watch it until the drive has an outcome."""
         preparation = Preparation(self.plan, self.scene, operator, clock, background)
         await preparation.make_ready()
         if (failed := await preparation.send_goal()) is not None:
             self.end(failed)
             return
-        goal, truth = self.scene.goal, self.scene.truth
-        assert goal is not None
-        assert truth is not None
-        place = self.plan.goal
-        # Rough length (m) of the path: the Manhattan distance to the goal.
-        distance = abs(truth.x - place.x) + abs(truth.y - place.y)
-        self.evaluation = operator.evaluation = DriveEvaluation(
-            goal=(place.x, place.y),
-            goal_id=goal.goal_id,
-            areas=self.plan.site.site.areas,
-            started_at=clock.now(),
-            timeout_s=_TIMEOUT_BASE_S + _DETOUR * distance / _SLOWEST_MPS,
-        )
-        self.scene.phase = "driving"
+        placement = self.begin_drive(operator, clock)
         self.usage.restart()
-        await self._watch(operator, clock, self.evaluation, background)
+        await self._watch(placement, clock, background)
 
-    async def _watch(
-        self, operator: Operator, clock: SystemClock, evaluation: DriveEvaluation, background: Background
-    ) -> None:
+    def begin_drive(self, operator: Operator, clock: Clock) -> HazardPlacement:
+        """Evaluate the drive to the goal from now on, by what the operator receives."""
+        scene, plan = self.scene, self.plan
+        assert scene.goal is not None
+        assert scene.truth is not None
+        self.drive = operator.drive = Drive(
+            goal=(plan.goal.x, plan.goal.y),
+            goal_id=scene.goal.goal_id,
+            areas=plan.site.site.areas,
+            truth=scene.truth,
+            now=clock.now(),
+            hazard=HazardSchedule.of(plan.site, plan.options.seed) if plan.hazard else None,
+        )
+        if scene.path is not None:
+            self.drive.on_path(scene.path, clock.now())
+        self.placement = HazardPlacement(self.drive, scene, operator, clock)
+        scene.phase = "driving"
+        return self.placement
+
+    async def _watch(self, placement: HazardPlacement, clock: SystemClock, background: Background) -> None:
+        drive = self.drive
+        assert drive is not None
         checked = clock.now()
-        while (outcome := evaluation.outcome(clock.now())) is None:
+        while (outcome := drive.outcome(clock.now())) is None:
             background.check()
-            if self.plan.hazard:
-                await self.hazard.place_if_due(operator, evaluation, clock)
+            await placement.place_if_due()
             if clock.now() - checked >= _SPEED_CHECK_S * clock.speed:
-                self._check_speed(clock.now() - checked, evaluation)
+                self._check_speed(clock.now() - checked, drive)
                 checked = clock.now()
             await asyncio.sleep(max(0.02, clock.real(_TICK_S)))
-            self.scene.trace = self.hazard.trace()
+            self.scene.trace = placement.trace()
         self.speed_watch.check_outcome(
             outcome,
             self.scene.truth,
             self.unexplained_stops(),
-            entered_blocked=evaluation.entered_blocked,
-            hazard_placed=self.hazard.placed_at is not None or not self.plan.hazard,
+            entered_blocked=drive.evaluation.entered_blocked,
+            hazard_placed=drive.hazard_met,
         )
         self.end(outcome)
-        self.ended_at = clock.now()
 
-    def _check_speed(self, elapsed_s: float, evaluation: DriveEvaluation) -> None:
+    def _check_speed(self, elapsed_s: float, drive: Drive) -> None:
         truth, state = self.scene.truth, self.scene.state
         if truth is not None and state is not None:
-            stops = self.unexplained_stops()
-            self.speed_watch.check(elapsed_s, truth, state, stops, entered_blocked=evaluation.entered_blocked)
+            entered, stops = drive.evaluation.entered_blocked, self.unexplained_stops()
+            self.speed_watch.check(elapsed_s, truth, state, stops, entered_blocked=entered)
 
     def unexplained_stops(self) -> list[str]:
         """Return the stops of this drive without a cause in its scenario.
@@ -194,7 +195,7 @@ class Attempt:
         The barrier is never placed near the robot, and a drive with contact has failed anyway. After a process died a
         stop is expected.
         """
-        return [] if self.evaluation is None or self.restarts else self.evaluation.stops
+        return [] if self.drive is None or self.restarts else self.drive.evaluation.stops
 
     def end(self, outcome: DriveOutcome) -> None:
         """Record and show the outcome."""
@@ -202,9 +203,15 @@ class Attempt:
         self.scene.phase = outcome.kind
         self.scene.log_event(f"{outcome.kind}: {outcome.reason}")
 
+    def summary(self) -> DriveSummary:
+        """Summarize the drive, as far as it came."""
+        outcome = self.scene.outcome or DriveOutcome("stopped", "the demo ended before the drive had an outcome")
+        return (
+            self.drive.summary(outcome)
+            if self.drive is not None
+            else DriveSummary(outcome=outcome.kind, reason=outcome.reason)
+        )
+
     def success(self) -> bool:
         """Whether the drive succeeded and, if a hazard was requested, met one."""
-        evaluation, outcome = self.evaluation, self.scene.outcome
-        if evaluation is None or outcome is None or not evaluation.success(outcome.kind):
-            return False
-        return not self.plan.hazard or self.hazard.placed_at is not None
+        return self.summary().success

@@ -34,7 +34,7 @@ from fognav_sim.drive.hazard import path_length
 from fognav_sim.drive.operator import OperatorPolicy
 
 if TYPE_CHECKING:
-    from fognav_sim.drive.evaluation import DriveEvaluation
+    from fognav_sim.drive.drive import Drive
 
 _QUERY_TIMEOUT_S: Final = 2.0
 _POLICY_PERIOD_S: Final = 1.0
@@ -49,7 +49,7 @@ class Operator:
         self._scene = scene
         self._clock = clock
         self._robot = scene.robot
-        self.evaluation: DriveEvaluation | None = None
+        self.drive: Drive | None = None
         self.enabling_paused = False
         """While this is true, the robot is not enabled."""
         self._policy = OperatorPolicy(clock.now())
@@ -79,8 +79,8 @@ class Operator:
 
     def _on_truth(self, _ids: Mapping[str, str], truth: SimTruth) -> None:
         self._scene.on_truth(truth)
-        if self.evaluation is not None:
-            self.evaluation.on_truth(truth)
+        if self.drive is not None:
+            self.drive.on_truth(truth)
 
     def _on_state(self, _ids: Mapping[str, str], state: RobotState) -> None:
         now = self._clock.now()
@@ -90,8 +90,8 @@ class Operator:
         self._policy.on_state(state, now)
         self._scene.state = state
         self._scene.traces.update(state.traces)
-        if self.evaluation is not None:
-            self.evaluation.on_state(state, now)
+        if self.drive is not None:
+            self.drive.on_state(state, now)
 
     def _on_path(self, _ids: Mapping[str, str], path: RobotPath) -> None:
         known = self._scene.path
@@ -99,8 +99,8 @@ class Operator:
             self._scene.log_event(_describe_path(path))
         self._scene.path = path
         self._scene.traces.update(path.traces)
-        if self.evaluation is not None:
-            self.evaluation.on_path(path, self._clock.now())
+        if self.drive is not None:
+            self.drive.on_path(path, self._clock.now())
 
     def _on_hazard(self, ids: Mapping[str, str], hazard: HazardArea) -> None:
         area, state = ids["area"], hazard.hazard.state
@@ -172,7 +172,7 @@ class Operator:
             await asyncio.sleep(self._clock.real(_POLICY_PERIOD_S))
 
     def _due(self) -> CommandKind | None:
-        drive_over = self.evaluation is None and self._scene.outcome is not None
+        drive_over = self.drive is None and self._scene.outcome is not None
         return None if self.enabling_paused or drive_over else self._policy.command_due(self._clock.now())
 
     async def _send(self, kind: CommandKind) -> None:

@@ -19,6 +19,17 @@ FALSE_ARRIVAL_S: Final = 3.0
 REFUSAL_GRACE_S: Final = 20.0
 """How long a refusal must last to end the drive: the hazard behind it may clear."""
 
+_SLOWEST_M_S: Final = 0.08
+"""Mean speed, stops included, below which a drive times out."""
+_DETOUR: Final = 3.0
+"""How many times the Manhattan distance to the goal a drive around a hazard may be."""
+_TIMEOUT_BASE_S: Final = 180.0
+
+
+def drive_timeout_s(start: Point, goal: Point) -> float:
+    """Return how long (s) a drive between two points (m) may take."""
+    return _TIMEOUT_BASE_S + _DETOUR * (abs(start[0] - goal[0]) + abs(start[1] - goal[1])) / _SLOWEST_M_S
+
 
 @dataclass(frozen=True)
 class DriveOutcome:
@@ -124,7 +135,3 @@ class DriveEvaluation:
         if now - self.started_at > self.timeout_s:
             return DriveOutcome("timeout", f"the goal was not reached within {self.timeout_s:.0f} s")
         return None
-
-    def success(self, kind: OutcomeKind) -> bool:
-        """Whether the drive succeeded: goal reached without contact, blocked area avoided."""
-        return kind == "reached" and not self.entered_blocked

@@ -1,16 +1,25 @@
 """Draws from a seed which area of a drive becomes blocked, when, and by which barrier. Pure."""
 
+from __future__ import annotations
+
 import itertools
 import math
 import random
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-from fog_contracts.geometry import Point, contains_point, distance_to_polygon
+from fog_contracts.geometry import contains_point, distance_to_polygon
 from fog_contracts.messages import SimObstacle
-from fog_contracts.site import AreaSite, Site
-from fognav_sim.scenario import KEEP_AWAY_M, ScenarioError
+from fog_contracts.site import AreaSite
+from fognav_sim.scenario import KEEP_AWAY_M, ScenarioError, barrier_across
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from fog_contracts.geometry import Point
+    from fog_contracts.site import Site
+    from fog_runtime.site import LoadedSite
 
 TRIGGER_M: Final = (3.0, 8.0)
 """Range of the travelled distance at which the path becomes blocked."""
@@ -19,6 +28,14 @@ _STEP_M: Final = 0.05
 
 MakeBarrier = Callable[[AreaSite], SimObstacle]
 """Makes a barrier that closes an area; raises `ScenarioError` if none fits."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class HazardRequest:
+    """What a drive's hazard shall be: its area, and the travelled distance (m) at which it appears; None is drawn."""
+
+    area: str | None = None
+    trigger_m: float | None = None
 
 
 @dataclass(frozen=True)
@@ -54,16 +71,19 @@ def draw_trigger(seed: int) -> float:
     return random.Random(seed).uniform(*TRIGGER_M)  # noqa: S311  # repeatable, not a secret
 
 
-def draw_hazard(site: Site, path: Sequence[Point], seed: int, make_barrier: MakeBarrier) -> PlannedHazard:
+def draw_hazard(
+    site: Site, path: Sequence[Point], seed: int, make_barrier: MakeBarrier, *, trigger_m: float | None = None
+) -> PlannedHazard:
     """Draw the area that becomes blocked, among the demo's areas that the path crosses, and when.
 
-    The barrier appears early enough that the robot is still away from the area. Raises `ScenarioError` if no area
-    qualifies; the message gives the reason for each.
+    The barrier appears early enough that the robot is still away from the area, after `trigger_m` metres at the latest
+    if that is given. Raises `ScenarioError` if no area qualifies; the message gives the reason for each.
     """
     wanted = site.demo.areas if site.demo else []
     known = {area.id: area for area in site.areas}
     generator = random.Random(seed)  # noqa: S311  # repeatable, not a secret
-    trigger = generator.uniform(*TRIGGER_M)  # as draw_trigger; the area is drawn next
+    drawn = generator.uniform(*TRIGGER_M)  # as draw_trigger; the area is drawn next
+    trigger = drawn if trigger_m is None else trigger_m
     candidates: list[PlannedHazard] = []
     reasons: list[str] = []
     for identifier in wanted:
@@ -92,17 +112,33 @@ def is_clear_of_robot(hazard: PlannedHazard, robot: Point) -> bool:
 
 
 class HazardSchedule:
-    """Draws the hazard of one drive once its first path is known, and decides when to place the barrier."""
+    """Draws the hazard of one drive once its first path is known, and decides when to place the barrier.
 
-    def __init__(self, site: Site, seed: int, make_barrier: MakeBarrier) -> None:
+    A requested area is blocked wherever the path leads; without one the area is drawn on the path.
+    """
+
+    def __init__(self, site: Site, seed: int, make_barrier: MakeBarrier, request: HazardRequest | None = None) -> None:
+        """Prepare the drawing; raises `ScenarioError` for a requested area that the site lacks or that can't be closed.
+
+        `request` asks for an area or a distance; by default both are drawn.
+        """
         self._site = site
         self._seed = seed
-        self._barrier_in = make_barrier
-        self.planned: PlannedHazard | None = None
+        self._make_barrier = make_barrier
+        self._request = request or HazardRequest()
+        self._fixed = self._requested(self._request.area) if self._request.area is not None else None
+        self.planned: PlannedHazard | None = self._fixed
+
+    @classmethod
+    def of(cls, site: LoadedSite, seed: int, request: HazardRequest | None = None) -> HazardSchedule:
+        """Return the schedule of a drive on a site, with barriers from wall to wall."""
+        return cls(site.site, seed, lambda area: barrier_across(area, site.site, site.map, seed), request)
 
     def draw(self, path: Sequence[Point]) -> PlannedHazard:
         """Draw the hazard for a path, replacing any earlier one; raises `ScenarioError`."""
-        self.planned = draw_hazard(self._site, path, self._seed, self._barrier_in)
+        self.planned = self._fixed or draw_hazard(
+            self._site, path, self._seed, self._make_barrier, trigger_m=self._request.trigger_m
+        )
         return self.planned
 
     def due(self, path: Sequence[Point], travelled_m: float, robot: Point) -> PlannedHazard | None:
@@ -114,9 +150,20 @@ class HazardSchedule:
         planned = self.planned or self.draw(path)
         if travelled_m < planned.trigger_m:
             return None
-        if entry_distance(path, planned.area.polygon) is None or not is_clear_of_robot(planned, robot):
+        left = self._fixed is None and entry_distance(path, planned.area.polygon) is None
+        if left or not is_clear_of_robot(planned, robot):
             # The path has changed (an obstacle, a service that was down): choose an area on the new one.
             planned = self.draw(path)
             if travelled_m < planned.trigger_m or not is_clear_of_robot(planned, robot):
                 return None
         return planned
+
+    def _requested(self, area_id: str) -> PlannedHazard:
+        trigger = self._request.trigger_m
+        for area in self._site.areas:
+            if area.id == area_id:
+                return PlannedHazard(
+                    area, self._make_barrier(area), draw_trigger(self._seed) if trigger is None else trigger
+                )
+        known = ", ".join(area.id for area in self._site.areas)
+        raise ScenarioError(f"the site has no area {area_id!r}; it has: {known}")

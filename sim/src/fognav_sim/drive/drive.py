@@ -1,0 +1,136 @@
+"""One drive with its hazard: what places the barrier, ends the drive and summarizes it. Pure.
+
+The demonstration and lockstep runs hand it the same messages, so the same facts end both in the same way.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from fognav_sim.drive.evaluation import DriveEvaluation, DriveOutcome, OutcomeKind, drive_timeout_s
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from fog_contracts.geometry import Point
+    from fog_contracts.messages import RobotPath, RobotState, SimTruth
+    from fog_contracts.site import AreaSite
+    from fognav_sim.drive.hazard import HazardSchedule, PlannedHazard
+
+
+class DriveSummary(msgspec.Struct, frozen=True, kw_only=True):
+    """How a drive went according to the ground truth; lengths in m, times in s of the clock.
+
+    `time_s` is None for a drive that was broken off. `area` is the area that was or would have become blocked,
+    `area_entered` and `area_clearance_m` concern the robot's centre from then on. `route_areas` lists the areas that
+    the robot crossed, in order; `plans` counts the planner's plans.
+    """
+
+    outcome: OutcomeKind
+    reason: str
+    success: bool = False
+    distance_m: float = 0.0
+    time_s: float | None = None
+    min_clearance_m: float | None = None
+    area: str | None = None
+    area_entered: bool = False
+    area_clearance_m: float | None = None
+    route_areas: list[str] = []
+    plans: int = 0
+
+
+class Drive:
+    """A drive to a goal, from the moment when the goal was given: feed it the messages of the robot's channels."""
+
+    def __init__(
+        self,
+        *,
+        goal: Point,
+        goal_id: str,
+        areas: Sequence[AreaSite],
+        truth: SimTruth,
+        now: float,
+        hazard: HazardSchedule | None,
+    ) -> None:
+        """Begin at `now` (s) where the ground truth has the robot; without `hazard` nothing blocks its path."""
+        self.evaluation = DriveEvaluation(
+            goal=goal,
+            goal_id=goal_id,
+            areas=areas,
+            started_at=now,
+            timeout_s=drive_timeout_s((truth.x, truth.y), goal),
+        )
+        self.hazard = hazard
+        self.blocked_at_m: float | None = None
+        """Distance (m) driven when the barrier was placed; None before."""
+        self.ended_at: float | None = None
+        """Time (s) at which the drive had its outcome; None before."""
+        self._truth = truth
+        self._path: Sequence[Point] = ()
+        self.evaluation.on_truth(truth)
+
+    @property
+    def hazard_met(self) -> bool:
+        """Whether the barrier was placed, if this drive is to have one."""
+        return self.hazard is None or self.blocked_at_m is not None
+
+    def on_truth(self, truth: SimTruth) -> None:
+        """Evaluate the simulator's ground truth."""
+        self._truth = truth
+        self.evaluation.on_truth(truth)
+
+    def on_state(self, state: RobotState, now: float) -> None:
+        """Evaluate the robot's reported state."""
+        self.evaluation.on_state(state, now)
+
+    def on_path(self, path: RobotPath, now: float) -> None:
+        """Evaluate a path or refusal from the planner."""
+        if path.goal_id == self.evaluation.goal_id:
+            self._path = path.points
+        self.evaluation.on_path(path, now)
+
+    def hazard_due(self) -> PlannedHazard | None:
+        """Return the hazard whose barrier is to be placed now, or None; raises `ScenarioError` if no area qualifies."""
+        if self.hazard is None or self.blocked_at_m is not None or not self._path:
+            return None
+        return self.hazard.due(self._path, self.evaluation.distance_m, (self._truth.x, self._truth.y))
+
+    def on_barrier_placed(self, hazard: PlannedHazard) -> None:
+        """Record that the barrier stands: from now on the robot must not enter the hazard's area."""
+        self.blocked_at_m = self.evaluation.distance_m
+        self.evaluation.block(hazard.area)
+
+    def outcome(self, now: float) -> DriveOutcome | None:
+        """Return how the drive ended, or None while it continues."""
+        outcome = self.evaluation.outcome(now)
+        if outcome is not None and self.ended_at is None:
+            self.ended_at = now
+        return outcome
+
+    def success(self, kind: OutcomeKind) -> bool:
+        """Whether the drive succeeded: goal reached without contact, hazard met, blocked area avoided."""
+        return kind == "reached" and self.hazard_met and not self.evaluation.entered_blocked
+
+    def summary(self, outcome: DriveOutcome) -> DriveSummary:
+        """Summarize the drive that ended with this outcome."""
+        evaluation, planned = self.evaluation, self.hazard.planned if self.hazard is not None else None
+        return DriveSummary(
+            outcome=outcome.kind,
+            reason=outcome.reason,
+            success=self.success(outcome.kind),
+            distance_m=round(evaluation.distance_m, 2),
+            time_s=round(self.ended_at - evaluation.started_at, 2) if self.ended_at is not None else None,
+            min_clearance_m=_finite(evaluation.min_clearance_m),
+            area=planned.area.id if planned is not None else None,
+            area_entered=evaluation.entered_blocked,
+            area_clearance_m=_finite(evaluation.blocked_clearance_m),
+            route_areas=list(evaluation.route_areas),
+            plans=evaluation.plans,
+        )
+
+
+def _finite(value: float) -> float | None:
+    return round(value, 3) if math.isfinite(value) else None

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Final
 
 from fog_contracts import channels as ch
 from fog_contracts.bus import Bus
-from fog_contracts.commands import sign
+from fog_contracts.commands import signed_command
 from fog_contracts.handlers import Moment, Publication
-from fog_contracts.messages import CommandReply, RobotCommand
+from fog_contracts.messages import CommandReply
 from fognav_experiments.processes import AgentProcess, Fog
 from fognav_sim import devices
 from fognav_sim.hardware import STEP_S, Hardware
@@ -143,14 +143,14 @@ class RobotRig:
     def command(self, kind: CommandKind) -> CommandReply:
         """Send an operator's signed command; return the reply."""
         self._nonce += 1
-        unsigned = RobotCommand(
-            kind=kind,
+        command = signed_command(
+            kind,
             robot=self.id,
             operator="lockstep",
             nonce=f"lockstep-{self._nonce:08d}",
             issued_at=STAMP + self.now,
+            key=OPERATOR_KEY,
         )
-        command = sign(unsigned, OPERATOR_KEY)
         reply = self._bus.query(ch.ROBOT_COMMAND, command, CommandReply, moment(self.now), robot=self.id)
         assert reply is not None
         return reply

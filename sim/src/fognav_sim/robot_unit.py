@@ -19,8 +19,8 @@ import msgspec
 
 from fog_contracts import channels as ch
 from fog_contracts.codec import ContractError
-from fog_contracts.commands import sign
-from fog_contracts.messages import CommandReply, RobotCommand, RobotState
+from fog_contracts.commands import signed_command
+from fog_contracts.messages import CommandReply, RobotState
 from fog_runtime import logs, process
 from fog_runtime.clock import SystemClock, ticker
 from fog_runtime.settings import CommonSettings, SettingsError, describe, load
@@ -75,15 +75,15 @@ class _Operator:
                 await self._send_goal(place)
 
     async def _send_command(self, kind: OperatorCommand) -> None:
-        unsigned = RobotCommand(
-            kind=kind,
-            robot=self._robot,
-            operator="sim-robot",
-            nonce=secrets.token_hex(16),
-            issued_at=self._clock.stamp(),
-        )
         try:
-            command = sign(unsigned, self._key)
+            command = signed_command(
+                kind,
+                robot=self._robot,
+                operator="sim-robot",
+                nonce=secrets.token_hex(16),
+                issued_at=self._clock.stamp(),
+                key=self._key,
+            )
             reply = await self._edge.query(ch.ROBOT_COMMAND, command, CommandReply, _TIMEOUT_S, robot=self._robot)
         except ContractError as error:
             _log.warning("command_failed", kind=kind, reason=str(error))

@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, Final
 
 from fog_contracts import channels as ch
 from fog_contracts.codec import ContractError
-from fog_contracts.commands import sign
+from fog_contracts.commands import signed_command
 from fog_contracts.messages import (
     CommandKind,
     CommandReply,
     HazardArea,
     Message,
     Pose,
-    RobotCommand,
     RobotGoal,
     RobotObstacles,
     RobotPath,
@@ -124,16 +123,16 @@ class Operator:
 
     async def command(self, kind: CommandKind, pose: Pose | None = None) -> CommandReply | None:
         """Send the robot a signed command (`initial_pose` with a pose); return None if it did not reply."""
-        unsigned = RobotCommand(
-            kind=kind,
-            pose=pose,
+        command = signed_command(
+            kind,
             robot=self._robot,
             operator="demo",
             nonce=secrets.token_hex(16),
             issued_at=self._clock.stamp(),
+            key=self._stack.operator_key,
+            pose=pose,
         )
-        signed = sign(unsigned, self._stack.operator_key)
-        return await self._query(ch.ROBOT_COMMAND, signed)
+        return await self._query(ch.ROBOT_COMMAND, command)
 
     async def simulate(self, command: SimCommand) -> CommandReply | None:
         """Change the simulated world; return None if the simulator did not reply."""

@@ -5,7 +5,7 @@ from typing import Final
 
 import msgspec
 
-from fog_contracts.messages import RobotCommand
+from fog_contracts.messages import CommandKind, Pose, RobotCommand
 
 VALID_S: Final = 5.0
 """Seconds after `issued_at` during which a command is valid."""
@@ -22,6 +22,24 @@ def _signature(command: RobotCommand, key: bytes) -> bytes:
 def sign(command: RobotCommand, key: bytes) -> RobotCommand:
     """Return the command with its signature; raises `ValueError` when the key is too short."""
     return msgspec.structs.replace(command, signature=_signature(command, key))
+
+
+def signed_command(  # noqa: PLR0913  # the fields of a command
+    kind: CommandKind,
+    *,
+    robot: str,
+    operator: str,
+    nonce: str,
+    issued_at: float,
+    key: bytes,
+    pose: Pose | None = None,
+) -> RobotCommand:
+    """Return an operator's signed command; raises `ValueError` when the key is too short.
+
+    `nonce` must never repeat, `issued_at` is in seconds since the epoch; `pose` belongs to `initial_pose` only.
+    """
+    unsigned = RobotCommand(kind=kind, pose=pose, robot=robot, operator=operator, nonce=nonce, issued_at=issued_at)
+    return sign(unsigned, key)
 
 
 class CommandGate:

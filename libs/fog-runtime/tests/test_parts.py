@@ -48,8 +48,12 @@ def test_name_that_two_packages_register_is_refused(install):
         parts.load(GROUP, "pi", float)
 
 
-@pytest.mark.parametrize(("value", "text"), [("nowhere_at_all:x", "imported"), ("math:no_such", "imported")])
-def test_part_that_cannot_be_imported_is_named(install, value, text):
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [("nowhere_at_all:x", "imported"), ("math:no_such", "imported"), ("broken_part:x", "broken on purpose")],
+)
+def test_part_that_cannot_be_imported_is_named(install, tmp_path, value, text):
+    (tmp_path / "broken_part.py").write_text("raise ValueError('broken on purpose')\n")
     install("one", f"pi = {value}")
     with pytest.raises(parts.PartError, match=text):
         parts.load(GROUP, "pi", float)

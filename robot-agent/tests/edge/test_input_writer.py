@@ -89,3 +89,11 @@ def test_slow_disk_leaves_an_entry_where_entries_are_missing(tmp_path, monkeypat
         writer.write(entry)
     kinds = [TOPIC_OF_ENTRY[kind] for kind in (BaseLost, BaseLost, BaseLost, EntriesLost, BaseLost)]
     assert topics(path) == kinds
+
+
+def test_entry_that_can_not_be_encoded_ends_the_log_with_its_reason(tmp_path, caplog):
+    before = lost()
+    with InputWriter(tmp_path / "inputs.mcap") as writer:
+        writer.write(BaseLost(reason="\ud800", now=1.0))
+    assert lost() - before == 1
+    assert "input_log_ended" in caplog.messages

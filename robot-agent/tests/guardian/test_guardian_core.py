@@ -352,3 +352,10 @@ def test_the_stop_command_stops_the_wheels():
     rig.drive(0.3)
     rig.base.receive(rig.core.stop_command(), rig.now)
     assert rig.base.wheel_speeds_m_s == (0.0, 0.0)
+
+
+def test_fault_longer_than_its_field_in_the_feedback_is_cut() -> None:
+    core = GuardianCore(Roomba600Driver(Roomba600Options()))
+    core._latch("the base left its driving mode: " + "x" * 600, now=1.0)
+    assert core.latched is not None
+    assert len(core.latched) == 500

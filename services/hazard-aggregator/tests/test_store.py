@@ -8,7 +8,9 @@ from redis.asyncio import Redis
 
 from fog_contracts.messages import AreaDefinition, AreaHazard
 from fog_supervisor.servers import Server, start_redis
-from hazard_aggregator.store import Audit, Store, StoreError
+from hazard_aggregator.debounce import make_rule
+from hazard_aggregator.registry import find_rule
+from hazard_aggregator.store import Audit, Store, StoreError, usable_areas
 
 pytestmark = pytest.mark.live
 AUDIT = Audit(at=1.0, who="anna", action="put")
@@ -49,3 +51,14 @@ async def test_unreadable_record_is_left_out_and_the_others_are_loaded(redis: Se
         await store.save_hazards([hazard(1)])
         await raw.hset("fog:test:hazards", "gate", b"nonsense")
         assert (await store.load()).hazards == [hazard(1)]
+
+
+def test_stored_area_with_an_unknown_rule_is_left_out_and_logged(caplog):
+    areas = [
+        AreaDefinition(id="hall", polygon=[(0, 0), (1, 0), (1, 1)], debounce={"rule": "of-a-removed-package"}),
+        AreaDefinition(id="foyer", polygon=[(0, 0), (1, 0), (1, 1)], debounce={"to_blocked": 3}),
+    ]
+    usable = usable_areas(areas, lambda area: make_rule(area.id, area.debounce, find_rule))
+    assert [area.id for area in usable] == ["foyer"]
+    (record,) = [record for record in caplog.records if record.message == "stored_area_unusable"]
+    assert record.levelname == "ERROR"

@@ -123,3 +123,37 @@ def test_message_refused_by_a_handler_is_reported_and_the_cycle_continues() -> N
         rig.session.subscribed[ch.ROBOT_POSE]({"robot": robot}, pose(1.0, 7.0))
     assert [p.ids for p in rig.service._run_cycle().publications] == [{"robot": "r1"}]
     assert rig.session.refused == [(ch.ROBOT_POSE, "fog/*/robots/r2/pose", "unknown robot")]
+
+
+class BrokenCore(PlannerCore):
+    """Fails on every pose."""
+
+    def handlers(self) -> Mapping[ch.Channel, Handler]:
+        def fail(_ids: Ids, _pose: Any, _at: Moment) -> list[Publication]:
+            raise ZeroDivisionError("a bug")
+
+        return {ch.ROBOT_POSE: fail}
+
+
+def test_handler_that_fails_is_logged_and_the_cycle_continues(caplog: pytest.LogCaptureFixture) -> None:
+    rig = Rig(BrokenCore(epoch=1))
+    rig.session.subscribed[ch.ROBOT_POSE]({"robot": "r1"}, pose(1.0, 7.0))
+    assert rig.service._run_cycle().publications == []
+    assert "handler_failed" in caplog.messages
+
+
+def test_messages_that_arrive_during_a_cycle_wait_for_the_next() -> None:
+    class FloodedCore(RecordingCore):
+        def handlers(self) -> Mapping[ch.Channel, Handler]:
+            def flood(ids: Ids, message: Any, at: Moment) -> list[Publication]:
+                self.handled.append((ch.ROBOT_POSE, at))
+                rig.session.subscribed[ch.ROBOT_POSE](dict(ids), message)
+                return []
+
+            return {ch.ROBOT_POSE: flood}
+
+    core = FloodedCore()
+    rig = Rig(core)
+    rig.session.subscribed[ch.ROBOT_POSE]({"robot": "r1"}, pose(1.0, 7.0))
+    rig.service._run_cycle()
+    assert len(core.handled) == 1

@@ -21,7 +21,9 @@ Stamp = Annotated[float, Meta(ge=0.0, le=1e12, extra={"unit": "s"})]
 Count = Annotated[int, Meta(ge=0, le=2**53)]
 Hash = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Cells = Annotated[int, Meta(ge=0, le=65_535, extra={"unit": "cells"})]
-Sentence = Annotated[str, Meta(max_length=500)]
+SENTENCE_MAX: Final = 500
+"""Characters of the longest sentence."""
+Sentence = Annotated[str, Meta(max_length=SENTENCE_MAX)]
 PointXY = tuple[Metres, Metres]
 Ring = Annotated[list[PointXY], Meta(min_length=3, max_length=500)]
 

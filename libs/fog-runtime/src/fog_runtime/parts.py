@@ -43,7 +43,7 @@ def load(group: str, name: str, kind: type[T]) -> T:
     (point, *_) = points
     try:
         part = point.load()
-    except (ImportError, AttributeError) as error:
+    except Exception as error:  # whatever its code raises: the user must hear which package it is
         raise PartError(f"{group}: {name!r} ({point.value}) can't be imported: {error}. Correct its package") from error
     if not isinstance(part, kind):
         raise PartError(

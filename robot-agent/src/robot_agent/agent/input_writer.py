@@ -78,7 +78,7 @@ class InputWriter:
                 continue
             try:
                 self._recorder.write_entry(TOPIC_OF_ENTRY[type(entry)], entry, log_time_ns)
-            except OSError as error:
+            except Exception as error:  # noqa: BLE001  # no entry may end the thread in silence
                 LOST.inc()
                 self._give_up(error)
         if self._recorder is not None:
@@ -87,7 +87,7 @@ class InputWriter:
             except OSError as error:
                 self._report(error)
 
-    def _give_up(self, error: OSError) -> None:
+    def _give_up(self, error: Exception) -> None:
         """Write nothing more: entries after a gap can't be replayed."""
         self._report(error)
         recorder, self._recorder = self._recorder, None
@@ -95,9 +95,11 @@ class InputWriter:
             with suppress(OSError):  # the same error again, already reported
                 recorder.close()
 
-    def _report(self, error: OSError) -> None:
-        reason = error.strerror or str(error)
-        _log.error("input_log_ended", path=str(self._path), reason=reason, remedy="make room, and restart the agent")
+    def _report(self, error: Exception) -> None:
+        no_room = isinstance(error, OSError)
+        reason = (error.strerror if isinstance(error, OSError) else None) or f"{type(error).__name__}: {error}"
+        remedy = "make room, and restart the agent" if no_room else "report this bug: the entry can't be written"
+        _log.error("input_log_ended", path=str(self._path), reason=reason, remedy=remedy)
 
     def __enter__(self) -> Self:
         return self

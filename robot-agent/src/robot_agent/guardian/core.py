@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final
 
 import msgspec
 
+from fog_contracts.messages import SENTENCE_MAX
 from robot_agent.guardian.link import WHEEL_SPEED_MAX_M_S, BaseFeedback, WheelCommand
 
 if TYPE_CHECKING:
@@ -187,7 +188,7 @@ class GuardianCore:
     def _latch(self, reason: str, now: float) -> bytes:
         first = self._latched is None
         if first:
-            self._latched = reason
+            self._latched = reason[:SENTENCE_MAX]  # a driver's own words may fill the whole field
         self._wheels, self._stepped_at = (0.0, 0.0), now
         if not first and self._sent == self._wheels and now - self._sent_at < REPEAT_S:
             return b""

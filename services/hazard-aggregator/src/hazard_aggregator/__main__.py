@@ -15,10 +15,11 @@ from fog_runtime.site import load_site
 from fog_runtime.zenoh_edge import ZenohEdge
 from hazard_aggregator.api import make_api
 from hazard_aggregator.core import Aggregator
+from hazard_aggregator.debounce import make_rule
 from hazard_aggregator.registry import find_rule
 from hazard_aggregator.service import Service
 from hazard_aggregator.settings import Settings
-from hazard_aggregator.store import Store, load_at_start
+from hazard_aggregator.store import Store, load_at_start, usable_areas
 
 _log = logs.get("aggregator")
 
@@ -34,7 +35,10 @@ async def main() -> None:
     health = Health("store", "mqtt")
     async with Store(settings.redis_url, site) as store:
         stored, loaded_from_store = await load_at_start(store)
-        definitions = {d.id: d for d in [*loaded.site.definitions(), *stored.definitions]}
+        usable = usable_areas(
+            stored.definitions, lambda area: make_rule(area.id, area.debounce, find_rule, settings.debounce)
+        )
+        definitions = {d.id: d for d in [*loaded.site.definitions(), *usable]}
         core = Aggregator(
             definitions.values(), loaded.site.nodes, stored.epoch, stored.hazards,
             registry=find_rule, default_rule=settings.debounce,

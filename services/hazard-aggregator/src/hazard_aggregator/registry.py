@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any, Final
 
 from fog_runtime import parts
@@ -10,6 +11,7 @@ from hazard_aggregator.debounce import RuleFactory
 GROUP: Final = "fognav.debounce_rules"
 
 
+@cache  # a look-up reads every installed package's metadata
 def find_rule(name: str) -> RuleFactory[Any]:
     """Return the factory of a debounce rule; raises `PartError`, which lists the known rules."""
     factory: RuleFactory[Any] = parts.load(GROUP, name, RuleFactory)

@@ -13,7 +13,7 @@ from fog_contracts.messages import AreaHazard
 from fog_runtime import logs, metrics
 from fog_runtime.clock import ticker
 from fog_runtime.edges import Edges
-from hazard_aggregator.store import Audit, StoreError
+from hazard_aggregator.store import Audit, StoreError, usable_areas
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -98,7 +98,7 @@ class Service:
         """Put stored areas into force that are newer than the known ones; raises `StoreError`."""
         async with self._area_lock:
             known = {definition.id: definition.version for definition in self.core.definitions()}
-            for definition in await self._store.areas():
+            for definition in usable_areas(await self._store.areas(), self.core.check):
                 if definition.version > known.get(definition.id, -1):
                     self._announce(self.core.put_area(definition, self._edges.now()))
             self._reload_areas = False
@@ -182,6 +182,7 @@ class Service:
             except StoreError as error:
                 self._health.set("store", ok=False, detail=str(error))
                 continue
-            self._publish(self.core.restore(stored.definitions, stored.hazards, self._edges.now()))
+            usable = usable_areas(stored.definitions, self.core.check)
+            self._publish(self.core.restore(usable, stored.hazards, self._edges.now()))
             await self._subscribe_numbers()
             self.mark_store_loaded()

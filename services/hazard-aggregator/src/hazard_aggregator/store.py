@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from fog_contracts.messages import AreaDefinition, AreaHazard
 from fog_runtime import logs
 from fog_runtime.redis_store import Audit, Outcome, RedisStore, StoreError, Table
+from hazard_aggregator.debounce import DebounceError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
 
-__all__ = ["Audit", "Outcome", "Store", "StoreError", "Stored", "load_at_start"]
+__all__ = ["Audit", "Outcome", "Store", "StoreError", "Stored", "load_at_start", "usable_areas"]
 
 _AREAS: Final = Table("areas", "area")
 _HAZARDS: Final = "hazards"
@@ -64,3 +65,22 @@ async def load_at_start(store: Store) -> tuple[Stored, bool]:
         epoch = int(time.time() * 1000)
         _log.warning("started_without_store", epoch=epoch, reason=str(error))
         return Stored(epoch, [], []), False
+
+
+def usable_areas(
+    definitions: Iterable[AreaDefinition], check: Callable[[AreaDefinition], object]
+) -> list[AreaDefinition]:
+    """Return the stored areas that `check` accepts; one with invalid debounce settings is logged and left out.
+
+    Its rule may have gone with the package that provided it. Whatever is in force without the record stays in force,
+    and the REST API stays there to repair it.
+    """
+    usable = []
+    for definition in definitions:
+        try:
+            check(definition)
+        except DebounceError as error:
+            _log.error("stored_area_unusable", area=definition.id, reason=str(error), remedy="PUT the area again")
+        else:
+            usable.append(definition)
+    return usable

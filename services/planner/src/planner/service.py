@@ -138,7 +138,10 @@ class Service:
             return handler(ids, message, at)
         except RefusedMessageError as error:
             self._zenoh.refuse(channel, channel.pattern(**ids), str(error))
-            return ()
+        except Exception as error:  # noqa: BLE001  # one message must not end the process; the bug is logged
+            metrics.HANDLER_ERRORS.labels(channel.name).inc()
+            _log.error("handler_failed", error=error, channel=channel.name, key=channel.pattern(**ids))
+        return ()
 
     def _record(self, ids: Ids, message: object) -> None:
         """Record what the API shows."""
@@ -352,8 +355,8 @@ class Service:
 
 
 def _run_all(queued: deque[Callable[[], T]]) -> list[T]:
-    """Run all queued functions, oldest first, and return their results; the event loop may append meanwhile."""
-    results: list[T] = []
-    while queued:
-        results.append(queued.popleft()())
-    return results
+    """Run the functions queued by now, oldest first, and return their results.
+
+    The event loop may append meanwhile: that waits for the next cycle, so that a flood can't put planning off.
+    """
+    return [queued.popleft()() for _ in range(len(queued))]

@@ -100,4 +100,3 @@ _.axes
 _.odom_at
 _.ABSENT  # a version that a store's writes may expect, beside ANY
 _.reveal  # the way to the value of a secret setting
-_.Core  # the protocol that every core with a table of handlers fulfils

@@ -243,7 +243,8 @@ class LiveServices:
             ),
             MemoryStore(), edges["map-service"], edges["map-service"], clock, Health(),
         )  # fmt: skip
-        self.planner = PlannerService(PlannerCore(1), MemoryStore(), edges["planner"], clock, Health())
+        self.planner_core = PlannerCore(1)
+        self.planner = PlannerService(self.planner_core, MemoryStore(), edges["planner"], clock, Health())
         self.agent_core = AgentCore(config, seed)
         self.agent = AgentService(self.agent_core, edges["robot-agent"], MemoryStore(), clock, Health(), site=self.site)
 

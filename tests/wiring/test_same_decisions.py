@@ -20,7 +20,7 @@ import pytest
 from fog_contracts import channels as ch
 from fog_contracts.bus import Bus
 from fog_contracts.commands import sign
-from fog_contracts.handlers import Publication
+from fog_contracts.handlers import Core, Publication
 from fog_contracts.messages import (
     CircleShape,
     CommandReply,
@@ -377,6 +377,19 @@ def test_services_answer_exactly_the_queries_that_the_table_gives_them(live):
     assert names_of(of_kind(services.served, "query")) == names_of(table_pairs(services, "query", "publishers"))
     # Only published channels with a latest message can be queried.
     assert all(c.durability == "latest" for _, c in services.served if c.kind == "pub")
+
+
+def test_services_answer_every_query_of_their_cores(live):
+    _, services = live
+    cores_of = {
+        "hazard-aggregator": services.aggregator.core,
+        "map-service": services.map.core,
+        "planner": services.planner_core,
+        "robot-agent": services.agent_core,
+    }
+    assert all(isinstance(core, Core) for core in cores_of.values())
+    expected = {(role, channel) for role, core in cores_of.items() for channel in core.query_handlers()}
+    assert names_of(services.served) == names_of(expected)
 
 
 def test_services_send_exactly_the_queries_that_the_table_gives_them(live):

@@ -32,6 +32,7 @@ class AggregatorProcess:
         self.core = core
         self._bus = bus
         bus.subscribe({channel: self._with_store(handler) for channel, handler in core.handlers().items()})
+        bus.serve(core.query_handlers())
 
     def connect(self) -> None:
         """Publish everything again, as after each connection to the broker."""
@@ -136,8 +137,7 @@ class AgentProcess:
     def __init__(self, core: AgentCore, robot: str, bus: Bus) -> None:
         self.core = core
         self._bus = bus
-        bus.subscribe(core.handlers(), only={"robot": robot})
-        bus.serve(core.query_handlers(), only={"robot": robot})
+        bus.connect(core, only={"robot": robot})
 
     def fetch_map(self, at: Moment) -> None:
         """Load a snapshot if the core requests one and the map is served; call it 20 times a second."""

@@ -33,7 +33,7 @@ class Zenoh:
         self.handlers[channel], self.only[channel] = handler, ids
 
     def serve(self, channel, handler, **ids):
-        self.served[channel] = (handler, ids)
+        self.served.setdefault(channel, []).append((handler, ids))
 
     def publish(self, channel, message, **ids):
         self.sent.append((channel, message, ids))
@@ -89,10 +89,27 @@ def test_robot_subscribes_and_serves_only_its_own_keys():
 
     edges.subscribe({ch.ROBOT_GOAL: ignore, ch.MAP_HEARTBEAT: ignore}, list, only={"robot": "r1"})
     assert zenoh.only == {ch.ROBOT_GOAL: {"robot": "r1"}, ch.MAP_HEARTBEAT: {}}
-    edges.serve({ch.ROBOT_COMMAND: answer}, robot="r1")
-    handler, ids = zenoh.served[ch.ROBOT_COMMAND]
+    replies = []
+    edges.serve({ch.ROBOT_COMMAND: answer}, only={"robot": "r1"}, on_reply=lambda *reply: replies.append(reply))
+    ((handler, ids),) = zenoh.served[ch.ROBOT_COMMAND]
     assert ids == {"robot": "r1"}
     command = m.RobotCommand(kind="cancel", robot="r1", operator="ann", nonce="n" * 16, issued_at=1.0)
-    assert handler({"robot": "r1"}, command).reason == "r1 cancel 5.0"
+    reply = handler({"robot": "r1"}, command)
+    assert reply.reason == "r1 cancel 5.0"
+    assert replies == [(ch.ROBOT_COMMAND, command, reply)]
     with pytest.raises(ValueError, match="robot_command"):
-        Edges(clock, mqtt=Mqtt()).serve({ch.ROBOT_COMMAND: answer}, robot="r1")
+        Edges(clock, mqtt=Mqtt()).serve({ch.ROBOT_COMMAND: answer}, only={"robot": "r1"})
+    with pytest.raises(ValueError, match=r"robot_command.*robot"):
+        edges.serve({ch.ROBOT_COMMAND: answer})
+
+
+def test_published_channel_is_served_under_each_key_from_its_first_publication():
+    zenoh = Zenoh()
+    edges = Edges(ManualClock(), zenoh=zenoh)
+    edges.serve({ch.ROBOT_GOAL: lambda _ids, _request, _at: GOAL})
+    assert zenoh.served == {}
+    for robot in ("r1", "r2", "r1"):
+        edges.publish(Publication(ch.ROBOT_GOAL, GOAL, {"robot": robot}))
+    assert [ids for _, ids in zenoh.served[ch.ROBOT_GOAL]] == [{"robot": "r1"}, {"robot": "r2"}]
+    handler, ids = zenoh.served[ch.ROBOT_GOAL][0]
+    assert handler(ids, None) == GOAL

@@ -13,7 +13,7 @@ from little_world import AGENT, LittleWorld
 from fog_contracts import channels as ch
 from fog_contracts.follower import GRACE_S
 from fog_contracts.grid import Window
-from fog_contracts.messages import MapSnapshot
+from fog_contracts.messages import MapSnapshot, RobotCommand
 from fog_runtime.clock import SystemClock
 from fog_runtime.health import Health
 from robot_agent.agent import service as service_module
@@ -29,12 +29,13 @@ class Fog:
         self.answers = asyncio.Queue()
         self.requests = 0
         self.handlers = {}
+        self.served = {}
 
     def subscribe(self, channel, _kind, handler, **_ids):
         self.handlers[channel] = handler
 
-    def serve(self, _channel, _handler, **_ids):
-        pass
+    def serve(self, channel, handler, **ids):
+        self.served[channel] = (handler, ids)
 
     async def query(self, _channel, _request, kind, _timeout):
         assert kind is MapSnapshot
@@ -100,6 +101,20 @@ async def test_changes_during_the_fetch_of_a_snapshot_are_applied_after_it(mappi
     await mapping.until(lambda: mapping.core.replica.version == mapping.master.version)
     assert mapping.fog.requests == 1
     assert not mapping.core.wants_snapshot(time.monotonic())
+
+
+def test_every_query_of_the_core_is_served_and_commands_are_logged(rig, monkeypatch):
+    assert rig.fog.served.keys() == rig.core.query_handlers().keys()
+    handler, ids = rig.fog.served[ch.ROBOT_COMMAND]
+    assert ids == {"robot": AGENT.robot}
+    command = RobotCommand(kind="enable", robot=AGENT.robot, operator="ann", nonce="n" * 16, issued_at=1.0)
+    logged = []
+    monkeypatch.setattr(service_module._log, "info", lambda event, **fields: logged.append((event, fields)))
+    reply = handler(ids, command)
+    assert not reply.accepted
+    assert logged == [
+        ("command", {"kind": "enable", "operator": "ann", "accepted": False, "reason": reply.reason}),
+    ]
 
 
 async def test_deltas_of_an_older_map_service_do_not_affect_the_new_map(mapping):

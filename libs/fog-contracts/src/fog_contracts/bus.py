@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
     from fog_contracts.channels import Channel
-    from fog_contracts.handlers import Handler, Ids, Moment, Publication, QueryHandler
+    from fog_contracts.handlers import Core, Handler, Ids, Moment, Publication, QueryHandler
 
 M = TypeVar("M", bound=Message)
 
@@ -64,6 +64,11 @@ class Bus:
     def serve(self, query_handlers: Mapping[Channel, QueryHandler], *, only: Ids | None = None) -> None:
         """Answer each channel's queries with its handler; `only` as for `subscribe`."""
         self._services += [_Service(c, query_handler, _fitting(c, only)) for c, query_handler in query_handlers.items()]
+
+    def connect(self, core: Core, *, only: Ids | None = None) -> None:
+        """Subscribe and serve all that a core's tables contain; `only` as for `subscribe`."""
+        self.subscribe(core.handlers(), only=only)
+        self.serve(core.query_handlers(), only=only)
 
     def publish(self, publications: Iterable[Publication]) -> None:
         """Queue messages for delivery; raises `ContractError` for one that violates its channel's contract."""

@@ -1,13 +1,14 @@
 """The interface of a pure core: handlers by channel with one signature, and the messages that they return to publish.
 
-A core has one table (`handlers`) and one `tick`. Services subscribe to every channel of the table and publish what
-the handlers return, lockstep delivers the messages from core to core, and a replay feeds in recorded ones. None of
-them names a handler, so all three run the same decisions.
+A core has a table of handlers for messages (`handlers`), one for queries (`query_handlers`), and one `tick`. Services
+subscribe to and serve every channel of the tables and publish what the handlers return, lockstep delivers the messages
+from core to core, and a replay feeds in recorded ones. None of them names a handler, so all three run the same
+decisions.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from fog_contracts.channels import Channel
 from fog_contracts.messages import Message
@@ -50,11 +51,15 @@ QueryHandler = Callable[[Ids, Any, Moment], Message]
 """Answers one query; its second argument is the channel's request type, or None for a query without one."""
 
 
+@runtime_checkable
 class Core(Protocol):
     """The decisions of a process, without I/O and without a clock."""
 
     def handlers(self) -> Mapping[Channel, Handler]:
         """Return the handler of every channel that this core subscribes to."""
+
+    def query_handlers(self) -> Mapping[Channel, QueryHandler]:
+        """Return the handler of every channel whose queries this core answers."""
 
     def tick(self, at: Moment) -> Sequence[Publication]:
         """Advance to `at`, at least ten times a second; return what is to be published now."""

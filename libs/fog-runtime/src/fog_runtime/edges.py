@@ -1,4 +1,4 @@
-"""Wiring of a core to a process's transports: subscribes its table of handlers and publishes what they return."""
+"""Wiring of a core to a process's transports: subscribes and serves its tables, and publishes what they return."""
 
 from __future__ import annotations
 
@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from fog_runtime.mqtt_edge import MqttEdge
     from fog_runtime.zenoh_edge import ZenohEdge
 
+    Reply = Callable[[dict[str, str], Any], Message]
+    OnReply = Callable[[Channel, Message | None, Message], object]
+
 
 class Edges:
     """The MQTT and zenoh connections of one process; each channel uses that of its transport."""
@@ -24,6 +27,8 @@ class Edges:
         self._clock = clock
         self._mqtt = mqtt
         self._zenoh = zenoh
+        self._served_when_published: dict[Channel, Reply] = {}
+        self._served: set[tuple[Channel, frozenset[tuple[str, str]]]] = set()
 
     def now(self) -> Moment:
         """Return the current moment by the process's clock."""
@@ -46,12 +51,28 @@ class Edges:
         for channel, handler in handlers.items():
             self._subscribe(channel, self._delivery(handler, publish), numbers, only or {})
 
-    def serve(self, query_handlers: Mapping[Channel, QueryHandler], **ids: str) -> None:
-        """Answer each channel's queries with its handler; `ids` are the variable parts of the keys served."""
+    def serve(
+        self,
+        query_handlers: Mapping[Channel, QueryHandler],
+        *,
+        only: Ids | None = None,
+        on_reply: OnReply | None = None,
+    ) -> None:
+        """Answer each channel's queries with its handler; `only` gives the variable parts of the keys served.
+
+        A published channel whose key has further variable parts is served under each key that this process publishes
+        from now on. `on_reply` is called with each channel, request and reply, for logs. Raises `ValueError` for
+        another channel with further variable parts, or without a zenoh session.
+        """
         for channel, query_handler in query_handlers.items():
-            if self._zenoh is None:
-                raise ValueError(f"channel {channel.name} is carried by zenoh, to which this process is not connected")
-            self._zenoh.serve(channel, self._reply(query_handler), **_ids_of(channel, ids))
+            reply, ids = self._reply(channel, query_handler, on_reply), _ids_of(channel, only or {})
+            missing = set(channel.fields) - {"site", *ids}
+            if not missing:
+                self._serve(channel, reply, ids)
+            elif channel.kind == "pub":
+                self._served_when_published[channel] = reply
+            else:
+                raise ValueError(f"channel {channel.name} can't be served without the ids {sorted(missing)}")
 
     def publish(self, publication: Publication) -> None:
         """Publish without waiting; raises `ContractError` when the message violates the channel's contract."""
@@ -64,6 +85,17 @@ class Edges:
             if self._zenoh is None or not isinstance(message, Message):
                 raise ValueError(f"channel {channel.name} is carried by zenoh: it needs a session and a typed message")
             self._zenoh.publish(channel, message, **publication.ids)
+        if (reply := self._served_when_published.get(channel)) is not None:
+            self._serve(channel, reply, publication.ids)
+
+    def _serve(self, channel: Channel, reply: Reply, ids: Ids) -> None:
+        """Serve one key, unless it is served already."""
+        if self._zenoh is None:
+            raise ValueError(f"channel {channel.name} is carried by zenoh, to which this process is not connected")
+        key = (channel, frozenset(ids.items()))
+        if key not in self._served:
+            self._served.add(key)
+            self._zenoh.serve(channel, reply, **ids)
 
     def _delivery(
         self, handler: Handler, publish: Callable[[Sequence[Publication]], object]
@@ -73,9 +105,12 @@ class Edges:
 
         return deliver
 
-    def _reply(self, query_handler: QueryHandler) -> Callable[[dict[str, str], Any], Message]:
-        def reply(ids: dict[str, str], request: object) -> Message:
-            return query_handler(ids, request, self.now())
+    def _reply(self, channel: Channel, query_handler: QueryHandler, on_reply: OnReply | None) -> Reply:
+        def reply(ids: dict[str, str], request: Any) -> Message:  # noqa: ANN401  # of the channel's type
+            answer = query_handler(ids, request, self.now())
+            if on_reply is not None:
+                on_reply(channel, request, answer)
+            return answer
 
         return reply
 

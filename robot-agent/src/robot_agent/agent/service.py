@@ -12,7 +12,7 @@ from prometheus_client import Counter, Gauge
 
 from fog_contracts import channels as ch
 from fog_contracts.codec import ContractError
-from fog_contracts.messages import CommandReply, LoopHealth, MapSnapshot, RobotState
+from fog_contracts.messages import CommandReply, LoopHealth, MapSnapshot, RobotCommand, RobotState
 from fog_contracts.replica import MapError
 from fog_runtime import logs, metrics
 from fog_runtime.clock import Ticker
@@ -23,8 +23,8 @@ from robot_agent.agent.pose_keeper import start_pose
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from fog_contracts.handlers import Ids, Moment, Publication
-    from fog_contracts.messages import RobotCommand
+    from fog_contracts.handlers import Publication
+    from fog_contracts.messages import Message
     from fog_contracts.site import RobotSite
     from fog_runtime.clock import Clock
     from fog_runtime.health import Health
@@ -155,14 +155,13 @@ class Service:
     def subscribe(self) -> None:
         """Register subscriptions and queries."""
         self._edges.subscribe(self._core.handlers(), self._publish, only={"robot": self._robot})
-        commands = {**self._core.query_handlers(), ch.ROBOT_COMMAND: self._on_command}
-        self._edges.serve(commands, robot=self._robot)
+        self._edges.serve(self._core.query_handlers(), only={"robot": self._robot}, on_reply=self._log_command)
 
-    def _on_command(self, ids: Ids, command: RobotCommand, at: Moment) -> CommandReply:
-        reply = self._core.query_handlers()[ch.ROBOT_COMMAND](ids, command, at)
-        assert isinstance(reply, CommandReply)
-        _log.info("command", kind=command.kind, operator=command.operator, accepted=reply.accepted, reason=reply.reason)
-        return reply
+    def _log_command(self, _channel: ch.Channel, request: Message | None, reply: Message) -> None:
+        if isinstance(request, RobotCommand) and isinstance(reply, CommandReply):
+            _log.info(
+                "command", kind=request.kind, operator=request.operator, accepted=reply.accepted, reason=reply.reason
+            )
 
     async def snapshot_loop(self) -> None:
         """Request a snapshot whenever the core wants one, with a growing delay after each failure."""

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
     from fog_contracts.channels import Channel
-    from fog_contracts.handlers import Handler, Ids, Moment
+    from fog_contracts.handlers import Handler, Ids, Moment, QueryHandler
     from fog_contracts.messages import AreaDefinition, AreaHazard, NodeReading, RobotPose
     from fog_contracts.site import NodeSite
     from hazard_aggregator.debounce import Registry
@@ -90,6 +90,10 @@ class Aggregator:
             ch.AREA_HAZARD: self._on_own_hazard,
             ch.ROBOT_POSE: self._on_pose,
         }
+
+    def query_handlers(self) -> Mapping[Channel, QueryHandler]:
+        """Return the handler of every query: the aggregator answers none."""
+        return {}
 
     def tick(self, at: Moment) -> list[Publication]:
         """Detect silent and flapping nodes; call ten times a second."""

@@ -63,6 +63,7 @@ class Service:
     def subscribe(self) -> None:
         """Register the core's handlers; call before the connections run."""
         self._edges.subscribe(self.core.handlers(), self._announce, numbers=self.core.thesis_numbers())
+        self._edges.serve(self.core.query_handlers())
         self._mqtt.on_connect(self._republish_all)
 
     async def put_area(self, definition: AreaDefinition, who: str, *, expected: int | None = None) -> AreaDefinition:

@@ -69,7 +69,6 @@ class Service:
         self._zone_lock = asyncio.Lock()
         self._reload_zones = False
         self._serving_queries = False
-        self._served_areas: set[str] = set()
 
     def subscribe(self) -> None:
         """Register the core's handlers; call before the connections run."""
@@ -85,11 +84,12 @@ class Service:
         async for _ in ticker(self._clock, TICK_S):
             connected, at = self._mqtt.connected, self._edges.now()
             self._publish(self.core.on_broker(at, connected=connected))
-            self._publish(self.core.tick(at))
+            publications = self.core.tick(at)
             if self.core.serving and not self._serving_queries:
+                # Before the first publication: channels with a key for each area are served as these are published.
                 self._serving_queries = True
-                query_handlers = self.core.query_handlers()
-                self._edges.serve({channel: query_handlers[channel] for channel in (ch.MAP_SNAPSHOT, ch.ZONES)})
+                self._edges.serve(self.core.query_handlers())
+            self._publish(publications)
             self._health.set("map", ok=self.core.serving, detail=self.core.missing())
             self._health.set("mqtt", ok=connected, detail="" if connected else "not connected to the broker")
 
@@ -186,9 +186,6 @@ class Service:
                 ZONES.labels("stored").set(len(publication.message.zones))
                 ZONES.labels("active").set(len(self.core.active_zones()))
             self._edges.publish(publication)
-            if publication.channel is ch.HAZARD and publication.ids["area"] not in self._served_areas:
-                self._served_areas.add(publication.ids["area"])
-                self._edges.serve({ch.HAZARD: self.core.query_handlers()[ch.HAZARD]}, **publication.ids)
 
     def _record_delta(self, delta: MapDelta) -> None:
         DELTA_BYTES.observe(len(delta.cells))

@@ -1,6 +1,6 @@
-"""What `docs/architecture.md` says under "Adding to it", done: in a copy of the sources, in the files that it names.
+"""The additions that `docs/architecture.md` describes under "Adding to it", made in a copy of the sources.
 
-The additions are made as a person would make them, then a check of each (`fixtures/adding`) runs on the copy with the
+Each addition edits only the files that the document names; then its check (`fixtures/adding`) runs on the copy with the
 fixtures of the services' own tests: real brokers and real processes. Debounce rules and cost layers are proven by the
 package in `fixtures/external-parts`, bases and lidars by the existing ones (`wire/test_every_part.py`).
 """
@@ -56,7 +56,7 @@ class Edit:
         )
         assert found == 1, (
             f"{found} lines of {self.file} match {self.anchor!r}, by which this test finds the place of its edit: "
-            "anchor it anew, and see whether 'Adding to it' in docs/architecture.md still names the right files"
+            "give a new anchor, and check whether 'Adding to it' in docs/architecture.md still names the right files"
         )
         path.write_text(text, "utf-8")
 
@@ -213,7 +213,7 @@ def check(folder: Path, name: str) -> None:
     run(folder, "-m", "pytest", "-q", "-p", "no:cacheprovider", target)
 
 
-def test_a_message_is_its_type_its_row_and_its_handler(checkout: Path) -> None:
+def test_message_is_added_by_its_type_its_row_and_its_handlers(checkout: Path) -> None:
     for file, words in {
         "docs/channels.md": ("fog/v1/<site>/nodes/<node>/battery", "### RobotApproach"),
         "deploy/mosquitto/acl": ("pattern write fog/v1/+/nodes/%u/battery",),
@@ -225,7 +225,7 @@ def test_a_message_is_its_type_its_row_and_its_handler(checkout: Path) -> None:
     check(checkout, "message")
 
 
-def test_a_route_is_one_function(checkout: Path) -> None:
+def test_route_is_added_by_one_function(checkout: Path) -> None:
     assert (
         "| `POST /api/v1/zones/{zone_id}/extension` | Let a zone hold for so many more minutes. |  | Extension "
         "| 200 Zone | 401, 403, 404, 409, 412, 413, 422, 503 | yes |"
@@ -233,12 +233,12 @@ def test_a_route_is_one_function(checkout: Path) -> None:
     check(checkout, "route")
 
 
-def test_a_zone_shape_is_its_message_and_its_class(checkout: Path) -> None:
+def test_zone_shape_is_added_by_its_message_and_its_class(checkout: Path) -> None:
     assert "### RingShape" in (checkout / "docs" / "channels.md").read_text("utf-8")
     check(checkout, "shape")
 
 
-def test_nobody_else_asks_which_shape_a_zone_has() -> None:
+def test_only_messages_and_shapes_distinguish_kinds_of_shapes() -> None:
     names = [kind.__name__ for kind in get_args(Shape)]
     tags = [str(kind.__struct_config__.tag) for kind in get_args(Shape)]
     asking = re.compile(rf"\b({'|'.join(names)})\b|\btype\b\W+({'|'.join(tags)})\b")
@@ -251,7 +251,7 @@ def test_nobody_else_asks_which_shape_a_zone_has() -> None:
 
 
 def entry(addition: str) -> str:
-    """Return what the table of "Adding to it" says about one addition."""
+    """Return the row of one addition in the table of "Adding to it"."""
     section = (ROOT / "docs" / "architecture.md").read_text("utf-8").split("## Adding to it")[1].split("\n## ")[0]
     rows = dict(re.findall(r"^\| (an? .+?) \|(.+)$", section, re.MULTILINE))
     assert addition in rows, f"docs/architecture.md, 'Adding to it', has no row for {addition!r}, only {sorted(rows)}"
@@ -261,11 +261,11 @@ def entry(addition: str) -> str:
 @pytest.mark.parametrize(
     ("addition", "edits"), [("a message", MESSAGE), ("a REST route", ROUTE), ("a zone shape", SHAPE)]
 )
-def test_the_document_links_the_files_that_an_addition_edits(addition: str, edits: Sequence[Edit]) -> None:
+def test_document_links_the_files_that_an_addition_edits(addition: str, edits: Sequence[Edit]) -> None:
     assert {edit.file for edit in edits} <= set(re.findall(r"\]\(\.\./([^)#]+)\)", entry(addition)))
 
 
-def test_the_document_names_every_group_of_entry_points_and_no_other() -> None:
+def test_document_names_exactly_the_groups_of_entry_points() -> None:
     registered = set()
     for file in [*ROOT.glob("*/pyproject.toml"), *ROOT.glob("*/*/pyproject.toml")]:
         registered |= set(tomllib.loads(file.read_text("utf-8"))["project"].get("entry-points", {}))
@@ -275,7 +275,7 @@ def test_the_document_names_every_group_of_entry_points_and_no_other() -> None:
     assert named == {group for group in registered if group.startswith("fognav.")}
 
 
-def test_the_document_shows_entry_points_as_they_are() -> None:
+def test_document_shows_the_declared_entry_points() -> None:
     text = (ROOT / "docs" / "adding-a-base-or-lidar.md").read_text("utf-8")
     ours = tomllib.loads((ROOT / "robot-agent" / "pyproject.toml").read_text("utf-8"))["project"]["entry-points"]
     shown = [

@@ -1,10 +1,12 @@
 """The import contracts in `pyproject.toml`: they know every module, and they see a forbidden import."""
 
+import ast
 import os
 import shutil
 import subprocess
 import sys
 import tomllib
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 import pytest
@@ -19,7 +21,13 @@ SOURCES = sorted({path.parent for path in ROOT.glob("*/src/*/__init__.py")} | {
 })  # fmt: skip
 
 EDGES = {
-    "fog_runtime", "fog_supervisor", "fognav", "fognav_experiments.lockstep", "fognav_experiments.rigs",
+    "fog_runtime", "fog_supervisor", "fognav_experiments.lockstep", "fognav_experiments.rigs",
+    "fognav.__main__", "fognav.channels_command", "fognav.checkout", "fognav.checks", "fognav.demo.attempt",
+    "fognav.demo.background", "fognav.demo.operator", "fognav.demo.options", "fognav.demo.placement",
+    "fognav.demo.preparation", "fognav.demo.report", "fognav.demo.run", "fognav.demo.scene", "fognav.demo.usage",
+    "fognav.demo.view", "fognav.demo_command", "fognav.doctor", "fognav.generated", "fognav.kernels", "fognav.output",
+    "fognav.page.app", "fognav.pytest_progress", "fognav.recording", "fognav.site_command", "fognav.stack",
+    "fognav.system", "fognav.testing",
     "fog_kernels.warm",
     "hazard_aggregator.__main__", "hazard_aggregator.api", "hazard_aggregator.registry", "hazard_aggregator.service",
     "hazard_aggregator.settings", "hazard_aggregator.store",
@@ -34,6 +42,23 @@ EDGES = {
     "fognav_sim.settings",
 }  # fmt: skip
 """What may touch the world: packages and modules of I/O, clocks, threads and processes."""
+
+PURE_LIBRARIES = {
+    "__future__", "abc", "binascii", "collections", "dataclasses", "enum", "functools", "hashlib", "heapq", "hmac",
+    "itertools", "json", "math", "msgspec", "numba", "numpy", "random", "re", "struct", "typing", "zlib",
+}  # fmt: skip
+"""What pure modules may import besides each other: no clock, file, process or hidden state; `random` only seeded."""
+
+GENERATORS = {"random", "np.random", "numpy.random"}
+
+CONCRETE_PARTS = {
+    "Bases and lidars are found by name only": (
+        "robot-agent", ("robot_agent.bases", "robot_agent.lidars.ld19", "robot_agent.lidars.rplidar_a1"),
+    ),
+    "Debounce rules are found by name only": ("services/hazard-aggregator", ("hazard_aggregator.debounce",)),
+    "Cost layers are found by name only": ("services/map-service", ("map_service.layers",)),
+}  # fmt: skip
+"""Each contract on concrete parts: the member that registers them, and the folders inside which they may be known."""
 
 
 def modules() -> list[str]:
@@ -61,6 +86,76 @@ def test_every_module_is_listed_as_pure_or_as_an_edge() -> None:
     )
 
 
+def sources(listed: set[str]) -> dict[str, ast.Module]:
+    """The syntax trees of all listed modules and packages, by the modules' names."""
+    found = {}
+    for package in SOURCES:
+        for file in package.rglob("*.py"):
+            module = ".".join(file.relative_to(package.parent).with_suffix("").parts).removesuffix(".__init__")
+            if covered(module, listed):
+                found[module] = ast.parse(file.read_text("utf-8"))
+    return found
+
+
+def test_pure_modules_import_only_libraries_known_to_be_pure() -> None:
+    allowed = PURE_LIBRARIES | {package.name for package in SOURCES}
+    unknown = []
+    for module, tree in sources(set(CONTRACTS["Cores touch no world"]["source_modules"])).items():
+        for node in ast.walk(tree):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            if isinstance(node, ast.ImportFrom) and node.module:
+                names = [node.module]
+            unknown += [f"{module}: {name}" for name in names if name.split(".")[0] not in allowed]
+    assert unknown == [], "forbid the library in the contract 'Cores touch no world', or add it to PURE_LIBRARIES"
+
+
+def unseeded_randomness(tree: ast.Module) -> list[str]:
+    """Every use of the shared generators of `random` and `numpy.random`, and every generator made without a seed."""
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module in GENERATORS:
+            found.append(f"line {node.lineno}: from {node.module} import")
+        used = ast.unparse(node.value) if isinstance(node, ast.Attribute) else ""
+        if used in GENERATORS and node.attr not in {"Random", "default_rng", "Generator"}:
+            found.append(f"line {node.lineno}: {ast.unparse(node)}")
+        made = ast.unparse(node.func) if isinstance(node, ast.Call) and not node.args and not node.keywords else ""
+        if made.rpartition(".")[0] in GENERATORS:
+            found.append(f"line {node.lineno}: {made} without a seed")
+    return found
+
+
+def test_pure_modules_draw_random_numbers_from_seeds_only() -> None:
+    pure = sources(set(CONTRACTS["Cores touch no world"]["source_modules"]))
+    assert {module: found for module, tree in pure.items() if (found := unseeded_randomness(tree))} == {}
+
+
+@pytest.mark.parametrize(
+    "code",
+    ["random.uniform(0, 1)", "random.Random()", "np.random.default_rng()", "np.random.rand(3)", "from random import x"],
+)
+def test_unseeded_randomness_is_found(code: str) -> None:
+    assert unseeded_randomness(ast.parse(code)) != []
+
+
+@pytest.mark.parametrize("code", ["random.Random(seed).uniform(0, 1)", "np.random.default_rng(seed).random()"])
+def test_seeded_randomness_is_accepted(code: str) -> None:
+    assert unseeded_randomness(ast.parse(code)) == []
+
+
+@pytest.mark.parametrize("name", CONCRETE_PARTS)
+def test_registered_parts_may_be_imported_by_no_module_outside_their_folder(name: str) -> None:
+    member, folders = CONCRETE_PARTS[name]
+    contract = CONTRACTS[name]
+    project = tomllib.loads((ROOT / member / "pyproject.toml").read_text("utf-8"))["project"]
+    registered = {
+        target.split(":")[0] for parts in project["entry-points"].values() for target in parts.values()
+    }  # fmt: skip
+    patterns = [pattern for module in contract["forbidden_modules"] for pattern in (module, f"{module}.*")]
+    assert [part for part in sorted(registered) if not any(fnmatchcase(part, one) for one in patterns)] == []
+    outside = [module for module in modules() if not covered(module, set(folders))]
+    assert [module for module in outside if not covered(module, set(contract["source_modules"]))] == []
+
+
 def test_every_listed_module_exists() -> None:
     known = {".".join(module.split(".")[:size]) for module in modules() for size in range(1, module.count(".") + 2)}
     known |= {package.name for package in SOURCES}
@@ -79,7 +174,7 @@ def copied_sources(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def checked(folder: Path) -> subprocess.CompletedProcess[str]:
+def check(folder: Path) -> subprocess.CompletedProcess[str]:
     """Check the contracts on the sources in a folder instead of the checkout's own."""
     paths = os.pathsep.join(str(folder / package.parent.relative_to(ROOT)) for package in SOURCES)
     command = [Path(sys.executable).parent / "lint-imports", "--no-cache"]
@@ -105,6 +200,53 @@ PLANTED = {
     "the runtime imports a service": (
         "libs/fog-runtime/src/fog_runtime/health.py", "planner.core", "fog_runtime.health",
     ),
+    "the guardian names a base": (
+        "robot-agent/src/robot_agent/guardian/core.py", "robot_agent.bases.roomba600.driver", "Bases and lidars",
+    ),
+    "the agent names a lidar": (
+        "robot-agent/src/robot_agent/agent/lidar_edge.py", "robot_agent.lidars.ld19.driver", "Bases and lidars",
+    ),
+    "the simulator names an emulator": (
+        "sim/src/fognav_sim/devices.py", "robot_agent.bases.diffdrive.emulator", "Bases and lidars",
+    ),
+    "the fusion names a debounce rule": (
+        "services/hazard-aggregator/src/hazard_aggregator/fusion.py", "hazard_aggregator.debounce.consecutive",
+        "Debounce rules",
+    ),
+    "the costmap names a layer": (
+        "services/map-service/src/map_service/costmap.py", "map_service.layers.obstacles", "Cost layers",
+    ),
+    "one base imports another": (
+        "robot-agent/src/robot_agent/bases/diffdrive/stop.py", "robot_agent.bases.roomba600.stop", "bases",
+    ),
+    "messages import the follower": (
+        "libs/fog-contracts/src/fog_contracts/messages.py", "fog_contracts.follower", "fog-contracts:",
+    ),
+    "channels import what is generated from them": (
+        "libs/fog-contracts/src/fog_contracts/channels.py", "fog_contracts.generate.header", "fog-contracts:",
+    ),
+    "the clock imports an edge": (
+        "libs/fog-runtime/src/fog_runtime/clock.py", "fog_runtime.zenoh_edge", "fog-runtime:",
+    ),
+    "ports import the supervisor": (
+        "libs/fog-supervisor/src/fog_supervisor/net.py", "fog_supervisor.supervisor", "fog-supervisor:",
+    ),
+    "array types import a kernel": (
+        "libs/fog-kernels/src/fog_kernels/_arrays.py", "fog_kernels.dwa", "fog-kernels:",
+    ),
+    "output imports the demonstration": ("cli/src/fognav/output.py", "fognav.demo.run", "fognav:"),
+    "the demonstration's scene imports its run": ("cli/src/fognav/demo/scene.py", "fognav.demo.run", "demonstration:"),
+    "processes import rigs": (
+        "experiments/src/fognav_experiments/processes.py", "fognav_experiments.rigs", "fognav-experiments:",
+    ),
+    "a pose imports the localizer": (
+        "robot-agent/src/robot_agent/localization/pose.py", "robot_agent.localization.localizer", "localization:",
+    ),
+    "the interface of layers imports one": (
+        "services/map-service/src/map_service/layers/base.py", "map_service.layers.hazards", "cost layers:",
+    ),
+    "a core loads a C library": ("services/planner/src/planner/route.py", "ctypes", "planner.route"),
+    "a proposal of a site logs": ("cli/src/fognav/site_proposal.py", "logging", "fognav.site_proposal"),
 }  # fmt: skip
 
 
@@ -112,20 +254,44 @@ PLANTED = {
 def test_forbidden_import_breaks_a_contract(copied_sources: Path, file: str, imported: str, named: str) -> None:
     target = copied_sources / file
     target.write_text(f"{target.read_text('utf-8')}\nimport {imported} as _planted\n", "utf-8")
-    result = checked(copied_sources)
+    result = check(copied_sources)
     assert result.returncode == 1, result.stdout + result.stderr
     assert "BROKEN" in result.stdout
+    assert named in result.stdout.split("Broken contracts")[-1]
+
+
+PLANTED_TYPES = {
+    "a core names its store": ("services/planner/src/planner/core.py", "planner.store", "Store", "planner:"),
+    "a pure module names a type of an edge": (
+        "sim/src/fognav_sim/scenario.py", "fog_runtime.clock", "Clock", "fognav_sim.scenario",
+    ),
+    "generic code names a concrete type": (
+        "robot-agent/src/robot_agent/guardian/process.py", "robot_agent.bases.roomba600.driver", "FACTORY",
+        "Bases and lidars",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("file", "module", "name", "named"), PLANTED_TYPES.values(), ids=PLANTED_TYPES.keys())
+def test_import_for_the_type_checker_only_breaks_a_contract(
+    copied_sources: Path, file: str, module: str, name: str, named: str
+) -> None:
+    target = copied_sources / file
+    planted = f"from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from {module} import {name}\n"
+    target.write_text(f"{target.read_text('utf-8')}\n{planted}", "utf-8")
+    result = check(copied_sources)
+    assert result.returncode == 1, result.stdout + result.stderr
     assert named in result.stdout.split("Broken contracts")[-1]
 
 
 def test_forbidden_indirect_import_breaks_a_contract(copied_sources: Path) -> None:
     helper = copied_sources / "services/map-service/src/map_service/costmap.py"
     helper.write_text(f"{helper.read_text('utf-8')}\nimport fog_runtime.clock as _planted\n", "utf-8")
-    result = checked(copied_sources)
+    result = check(copied_sources)
     assert result.returncode == 1
     assert "map_service.core" in result.stdout.split("Broken contracts")[-1]
 
 
 def test_unchanged_sources_keep_every_contract(copied_sources: Path) -> None:
-    result = checked(copied_sources)
+    result = check(copied_sources)
     assert result.returncode == 0, result.stdout + result.stderr

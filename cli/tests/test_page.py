@@ -10,7 +10,7 @@ from PIL import Image
 from playwright.async_api import Page, async_playwright
 from rich.console import Console
 
-from fog_contracts.grid import GridGeometry
+from fog_contracts.grid import GridGeometry, StaticMap
 from fog_contracts.messages import (
     AreaHazard,
     HazardArea,
@@ -24,7 +24,6 @@ from fog_contracts.messages import (
     Trace,
 )
 from fog_contracts.site import AreaSite, DemoPlan, NodeSite, Place, RobotSite, Site, Sonar
-from fog_runtime.maps import StaticMap
 from fog_runtime.site import LoadedSite
 from fog_supervisor import net
 from fognav import system

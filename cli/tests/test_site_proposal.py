@@ -7,13 +7,13 @@ from numpy.typing import NDArray
 
 from fog_contracts.costs import DEFAULT_INFLATION
 from fog_contracts.geometry import rasterize
-from fog_contracts.grid import GridGeometry
+from fog_contracts.grid import GridGeometry, StaticMap
 from fog_contracts.messages import SimObstacle
 from fog_contracts.site import AreaSite
 from fog_kernels.astar import Planner
 from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.raycast import cast
-from fog_runtime.maps import StaticMap, save_map
+from fog_runtime.maps import save_map
 from fog_runtime.site import load_site
 from fognav.output import WrongUseError
 from fognav.site_command import check_site, identifier, new_site

@@ -4,10 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
-from fog_contracts.grid import GridGeometry
+from fog_contracts.grid import GridGeometry, StaticMap
 from fog_contracts.messages import Pose
 from fog_contracts.site import AreaSite, DemoPlan, NodeSite, Place, RobotSite, Site, Sonar
-from fog_runtime.maps import StaticMap
 from fog_runtime.site import LoadedSite
 
 RESOLUTION = 0.05

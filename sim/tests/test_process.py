@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from fog_contracts import channels as ch
-from fog_contracts.grid import GridGeometry
+from fog_contracts.grid import GridGeometry, StaticMap
 from fog_contracts.messages import CommandReply, NodeReading, Pose, SimCommand, SimObstacle, SimTruth
 from fog_runtime.clock import SystemClock
-from fog_runtime.maps import StaticMap, save_map
+from fog_runtime.maps import save_map
 from fog_runtime.mqtt_edge import MqttEdge
 from fog_runtime.zenoh_edge import ZenohEdge
 from fog_supervisor.servers import start_mosquitto, start_router

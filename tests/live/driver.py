@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Self
 from fog_contracts import channels as ch
 from fog_contracts.messages import NodeReading, SimCommand
 from fog_runtime.clock import SystemClock
+from fog_runtime.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fog_runtime.mqtt_edge import MqttEdge
 from fog_runtime.site import load_site
 from fog_runtime.zenoh_edge import ZenohEdge
@@ -24,7 +25,6 @@ from fognav.demo.operator import Operator
 from fognav.demo.scene import Scene
 from fognav.demo.usage import children
 from fognav.stack import AGENT, MAP_SERVICE, PLANNER, WATCHDOG, Stack, StackConfig
-from fognav_sim.devices import DEFAULT_BASE, DEFAULT_LIDAR
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from fog_runtime import parts
 from fog_runtime.settings import SettingsError
-from fognav_sim import devices
+from fognav_sim import devices, emulators
 from robot_agent import registry
 from robot_agent.guardian.core import GuardianCore
 from robot_agent.guardian.link import WheelCommand
@@ -30,8 +30,8 @@ every_lidar = pytest.mark.parametrize("name", LIDARS)
 def test_every_base_and_lidar_has_its_stop_command_and_emulator():
     assert {"roomba600", "diffdrive"} <= set(BASES)
     assert {"rplidar-a1", "ld19"} <= set(LIDARS)
-    assert parts.names(STOPS) == parts.names(devices.BASES) == BASES
-    assert parts.names(devices.LIDARS) == LIDARS
+    assert parts.names(STOPS) == parts.names(emulators.BASES) == BASES
+    assert parts.names(emulators.LIDARS) == LIDARS
 
 
 @pytest.mark.parametrize("make", [registry.make_base, registry.make_lidar])

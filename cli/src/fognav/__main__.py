@@ -11,9 +11,12 @@ from typing import Annotated, NoReturn
 import typer
 from rich.table import Table
 
+from fog_runtime import parts
+from fog_runtime.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fognav import __version__, checkout, doctor, kernels, system
 from fognav.channels_command import channels_command
 from fognav.output import NOT_TRUE, OK, WRONG_USE, WrongUseError, check_writable, console, print_json, write_report
+from fognav_sim import emulators
 
 app = typer.Typer(
     name="fognav",
@@ -29,6 +32,10 @@ app.command("channels", epilog="Example: fognav channels --format acl --broker m
 
 Yes = Annotated[bool, typer.Option("--yes", help="Install missing system packages without asking (as does CI=true).")]
 Json = Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")]
+
+
+def _known_parts(group: str) -> str:
+    return " or ".join(parts.names(group))
 
 
 def _print_line(text: str) -> None:
@@ -145,11 +152,11 @@ def demo_command(  # noqa: PLR0913  # each option is an argument
     ] = 1.0,
     no_hazard: Annotated[bool, typer.Option("--no-hazard", help="Place no barrier on the path.")] = False,
     base: Annotated[
-        str, typer.Option("--base", metavar="NAME", help="The robot's base: roomba600 or diffdrive.")
-    ] = "roomba600",
+        str, typer.Option("--base", metavar="NAME", help=f"The robot's base: {_known_parts(emulators.BASES)}.")
+    ] = DEFAULT_BASE,
     lidar: Annotated[
-        str, typer.Option("--lidar", metavar="NAME", help="The robot's lidar: rplidar-a1 or ld19.")
-    ] = "rplidar-a1",
+        str, typer.Option("--lidar", metavar="NAME", help=f"The robot's lidar: {_known_parts(emulators.LIDARS)}.")
+    ] = DEFAULT_LIDAR,
     keep_running: Annotated[
         bool, typer.Option("--keep-running", help="Keep the system running after the drive, until Ctrl-C.")
     ] = False,
@@ -168,8 +175,8 @@ def demo_command(  # noqa: PLR0913  # each option is an argument
     the demo was interrupted (see the report); 2 if an option or file can't be used.
     """
     from fog_runtime.site import SiteError, load_site  # noqa: PLC0415  # keeps the other commands fast
-    from fognav.demo.command import run_demo  # noqa: PLC0415  # same
     from fognav.demo.options import Options  # noqa: PLC0415  # same
+    from fognav.demo_command import run_demo  # noqa: PLC0415  # same
 
     try:
         folder = checkout.site_folder(site)

@@ -15,14 +15,13 @@ from numpy.typing import NDArray
 
 from fog_contracts.costs import DEFAULT_INFLATION, FREE, LETHAL
 from fog_contracts.geometry import Point, rasterize
-from fog_contracts.grid import GridGeometry
+from fog_contracts.grid import GridGeometry, StaticMap
 from fog_contracts.messages import Pose
 from fog_contracts.site import AreaSite, DemoPlan, NodeSite, Place, RobotSite, Site, Sonar
 from fog_kernels.astar import Planner
 from fog_kernels.distance import squared_distance_capped
 from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.raycast import cast
-from fog_runtime.maps import StaticMap
 from fognav_sim.scenario import ScenarioError, barrier_across
 
 PLACE_CLEARANCE_M: Final = 0.45

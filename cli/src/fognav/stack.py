@@ -14,9 +14,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
 
+from fog_runtime.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fog_supervisor import net, servers
 from fog_supervisor.supervisor import Event, Program, Supervisor
-from fognav_sim.devices import DEFAULT_BASE, DEFAULT_LIDAR
 
 BROKER: Final = "mosquitto"
 REDIS: Final = "redis"

@@ -21,9 +21,9 @@ from fog_contracts import channels as ch
 from fog_contracts.handlers import Publication
 from fog_contracts.messages import RobotGoal
 from fog_contracts.stages import SPANS, durations_ms
+from fog_runtime.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fog_runtime.site import load_site
 from fognav_experiments.rigs import STAMP, System
-from fognav_sim.devices import DEFAULT_BASE, DEFAULT_LIDAR
 from fognav_sim.drive.drive import Drive, DriveSummary
 from fognav_sim.drive.evaluation import DriveOutcome
 from fognav_sim.drive.hazard import HazardRequest, HazardSchedule

@@ -13,6 +13,7 @@ from fog_contracts.bus import Bus
 from fog_contracts.commands import signed_command
 from fog_contracts.handlers import Moment, Publication
 from fog_contracts.messages import CommandReply
+from fog_runtime.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fognav_experiments.processes import AgentProcess, Fog
 from fognav_sim import devices
 from fognav_sim.hardware import STEP_S, Hardware
@@ -69,8 +70,8 @@ class RobotRig:
         seed: int,
         start: float,
         *,
-        base: str = devices.DEFAULT_BASE,
-        lidar: str = devices.DEFAULT_LIDAR,
+        base: str = DEFAULT_BASE,
+        lidar: str = DEFAULT_LIDAR,
         make_agent: Callable[[AgentConfig, int], AgentCore] = AgentCore,
     ) -> None:
         """Assemble the robot; `base` and `lidar` name its drivers and their emulators."""
@@ -199,8 +200,8 @@ class System:
         seed: int,
         *,
         noise: Noise | None = None,
-        base: str = devices.DEFAULT_BASE,
-        lidar: str = devices.DEFAULT_LIDAR,
+        base: str = DEFAULT_BASE,
+        lidar: str = DEFAULT_LIDAR,
         bus: Bus | None = None,
         make_agent: Callable[[AgentConfig, int], AgentCore] = AgentCore,
     ) -> None:

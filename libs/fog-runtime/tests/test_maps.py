@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from PIL import Image
 
-from fog_contracts.grid import GridGeometry
-from fog_runtime.maps import MapFileError, StaticMap, load_map, load_occupancy, save_map
+from fog_contracts.grid import GridGeometry, StaticMap
+from fog_runtime.maps import MapFileError, load_map, load_occupancy, save_map
 
 KEYS = {
     "image": "m.png", "resolution": 0.05, "origin": "[1.0, -2.0, 0.0]", "negate": 0,

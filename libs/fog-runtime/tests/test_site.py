@@ -3,8 +3,8 @@ import re
 import numpy as np
 import pytest
 
-from fog_contracts.grid import GridGeometry
-from fog_runtime.maps import StaticMap, save_map
+from fog_contracts.grid import GridGeometry, StaticMap
+from fog_runtime.maps import save_map
 from fog_runtime.site import SiteError, load_site
 
 SITE = """

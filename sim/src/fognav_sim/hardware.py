@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
-    from fognav_sim.devices import BaseEmulator, LidarEmulator
+    from fognav_sim.emulators import BaseEmulator, LidarEmulator
     from fognav_sim.world import World
 
 STEP_S: Final = 0.01

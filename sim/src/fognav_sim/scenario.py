@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from fog_contracts.grid import StaticMap
     from fog_contracts.site import AreaSite, NodeSite, Site
-    from fog_runtime.maps import StaticMap
 
 KEEP_AWAY_M: Final = 3.0
 """Nothing appears nearer to the robot than this."""

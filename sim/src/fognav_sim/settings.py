@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
+from fog_runtime.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fog_runtime.settings import CommonSettings
-from fognav_sim.devices import DEFAULT_BASE, DEFAULT_LIDAR
 
 
 class Settings(CommonSettings, frozen=True, kw_only=True):

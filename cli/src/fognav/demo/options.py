@@ -5,9 +5,10 @@ from pathlib import Path
 
 from fog_contracts.site import Place
 from fog_runtime import parts
+from fog_runtime.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fog_runtime.site import LoadedSite
 from fognav.output import WrongUseError
-from fognav_sim import devices
+from fognav_sim import emulators
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -17,8 +18,8 @@ class Options:
     seed: int = 1
     speed: float = 1.0
     hazard: bool = True
-    base: str = devices.DEFAULT_BASE
-    lidar: str = devices.DEFAULT_LIDAR
+    base: str = DEFAULT_BASE
+    lidar: str = DEFAULT_LIDAR
     keep_running: bool = False
     record: Path | None = None
 
@@ -39,8 +40,8 @@ class DrivePlan:
     def of(cls, site: LoadedSite, options: Options) -> "DrivePlan":
         """Return the plan; raises `WrongUseError` for a site without `[demo]` or robot, or for unknown hardware."""
         for option, name, group in (
-            ("--base", options.base, devices.BASES),
-            ("--lidar", options.lidar, devices.LIDARS),
+            ("--base", options.base, emulators.BASES),
+            ("--lidar", options.lidar, emulators.LIDARS),
         ):
             known = parts.names(group)
             if name not in known:

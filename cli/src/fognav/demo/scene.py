@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from fog_contracts.costs import UNKNOWN
+from fog_contracts.grid import StaticMap
 from fog_contracts.messages import (
     HazardArea,
     RobotGoal,
@@ -20,7 +21,6 @@ from fog_contracts.messages import (
     Trace,
 )
 from fog_contracts.stages import Traces, durations_ms, hazard_to_path_ms
-from fog_runtime.maps import StaticMap
 from fog_runtime.site import LoadedSite
 from fognav_sim.drive.evaluation import DriveOutcome
 

@@ -16,7 +16,7 @@ from fastapi.responses import FileResponse, StreamingResponse
 from PIL import Image
 
 from fog_contracts.costs import FREE, UNKNOWN
-from fog_runtime.maps import StaticMap
+from fog_contracts.grid import StaticMap
 from fog_supervisor import net
 from fognav.demo.run import Demo
 from fognav.output import WrongUseError

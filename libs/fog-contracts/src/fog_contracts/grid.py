@@ -1,6 +1,7 @@
 """Geometry of a grid in the frame `map`: metres on one side, cells on the other."""
 
 import math
+from dataclasses import dataclass
 from typing import NamedTuple, TypeVar
 
 import msgspec
@@ -171,3 +172,11 @@ class GridGeometry(msgspec.Struct, frozen=True):
             origin_x=self.origin_x + window.x * self.resolution,
             origin_y=self.origin_y + window.y * self.resolution,
         )
+
+
+@dataclass(frozen=True)
+class StaticMap:
+    """A site's floor plan, aligned with the frame `map`: uint8 (height, width), 0 free, 254 occupied, 255 unknown."""
+
+    geometry: GridGeometry
+    cells: NDArray[np.uint8]

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from fog_contracts.costs import FREE, LETHAL, UNKNOWN
-from fog_contracts.grid import GridGeometry
+from fog_contracts.grid import GridGeometry, StaticMap
 from fog_runtime.files import atomic_write
 
 Mode = Literal["trinary", "scale", "raw"]
@@ -59,14 +59,6 @@ class Occupancy:
     mode: Mode
     occupied_thresh: float
     free_thresh: float
-
-
-@dataclass(frozen=True)
-class StaticMap:
-    """A site's floor plan, aligned with the frame `map`: uint8 (height, width), 0 free, 254 occupied, 255 unknown."""
-
-    geometry: GridGeometry
-    cells: NDArray[np.uint8]
 
 
 @dataclass(frozen=True)

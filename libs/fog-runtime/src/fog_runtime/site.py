@@ -12,8 +12,9 @@ import msgspec
 from fog_contracts.channels import ROLES
 from fog_contracts.costs import is_traversable
 from fog_contracts.geometry import GeometryError, normalized_polygon
+from fog_contracts.grid import StaticMap
 from fog_contracts.site import AreaSite, Place, Site
-from fog_runtime.maps import MapFileError, StaticMap, load_map
+from fog_runtime.maps import MapFileError, load_map
 
 SITE_FILE: Final = "site.toml"
 _BORDER: Final = 1e-6

@@ -12,8 +12,8 @@ from msgspec import Meta
 from fog_contracts.commands import KEY_BYTES
 from fog_contracts.messages import Id
 from fog_contracts.site import Site
+from fog_runtime.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fog_runtime.settings import CommonSettings, SettingsError
-from robot_agent.guardian.watchdog import DEFAULT_BASE
 
 if TYPE_CHECKING:
     from fog_contracts.site import RobotSite
@@ -38,7 +38,7 @@ class Settings(CommonSettings, frozen=True, kw_only=True):
     robot: Id
     base: str = DEFAULT_BASE
     base_options: str = ""
-    lidar: str = "rplidar-a1"
+    lidar: str = DEFAULT_LIDAR
     lidar_options: str = ""
     lidar_port: str
     guardian_socket: Path

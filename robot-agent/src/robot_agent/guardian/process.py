@@ -19,11 +19,12 @@ import msgspec
 
 from fog_runtime import logs
 from fog_runtime.clock import SystemClock
+from fog_runtime.default_parts import DEFAULT_BASE
 from fog_runtime.logs import Level
 from fog_runtime.settings import SettingsError, load
 from robot_agent.guardian.core import GuardianCore, Output
 from robot_agent.guardian.link import PACKET_LIMIT, WheelCommand, decode_command, encode
-from robot_agent.guardian.watchdog import BAD_SETTINGS, DEFAULT_BASE, PORT_LOST
+from robot_agent.guardian.watchdog import BAD_SETTINGS, PORT_LOST
 from robot_agent.registry import make_base
 from robot_agent.serial_port import Port, PortLost
 

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from fog_runtime import parts
+from fog_runtime.default_parts import DEFAULT_BASE
 from robot_agent.serial_port import Port, PortLost, open_port
 from robot_agent.stop_command import StopCommand
 
@@ -43,7 +44,6 @@ TERMINATE_S: Final = 1.0
 
 STOPS: Final = "fognav.base_stops"
 """Entry points of the stop command of each base: plain bytes in a module separate from its driver."""
-DEFAULT_BASE: Final = "roomba600"
 
 
 class _Terminated(Exception):  # noqa: N818  # an end, not an error

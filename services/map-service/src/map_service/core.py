@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 
     from fog_contracts.channels import Channel
     from fog_contracts.costs import Inflation
+    from fog_contracts.grid import StaticMap
     from fog_contracts.handlers import Handler, Ids, Moment, QueryHandler
     from fog_contracts.messages import AreaDefinition, MapSnapshot, Zone
-    from map_service.costmap import StaticMap
     from map_service.layers.base import CostLayer
 
 L = TypeVar("L", bound="CostLayer")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from msgspec import structs
@@ -15,22 +15,10 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from fog_contracts.costs import Inflation
-    from fog_contracts.grid import GridGeometry, Window
+    from fog_contracts.grid import StaticMap, Window
     from fog_contracts.messages import Cause, Layer, MapDelta, MapHeartbeat, MapSnapshot
     from fog_contracts.replica import Version
     from map_service.layers.base import CostLayer, Grid
-
-
-class StaticMap(Protocol):
-    """A floor plan: geometry, and cells uint8 (height, width): 0 free, 254 occupied, 255 unknown."""
-
-    @property
-    def geometry(self) -> GridGeometry:
-        """Size, resolution and origin."""
-
-    @property
-    def cells(self) -> Grid:
-        """The cells of the plan."""
 
 
 class LayeredCostmap:

@@ -11,7 +11,7 @@ from map_service.layers.base import CostLayer, FloorPlan, LayerFactory
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from map_service.costmap import StaticMap
+    from fog_contracts.grid import StaticMap
 
 GROUP: Final = "fognav.cost_layers"
 DEFAULT_LAYERS: Final = ("static", "hazards", "zones", "obstacles")

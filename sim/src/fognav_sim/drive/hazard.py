@@ -7,7 +7,7 @@ import math
 import random
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Protocol
 
 from fog_contracts.geometry import contains_point, distance_to_polygon
 from fog_contracts.messages import SimObstacle
@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from fog_contracts.geometry import Point
+    from fog_contracts.grid import StaticMap
     from fog_contracts.site import Site
-    from fog_runtime.site import LoadedSite
 
 TRIGGER_M: Final = (3.0, 8.0)
 """Range of the travelled distance at which the path becomes blocked."""
@@ -28,6 +28,18 @@ _STEP_M: Final = 0.05
 
 MakeBarrier = Callable[[AreaSite], SimObstacle]
 """Makes a barrier that closes an area; raises `ScenarioError` if none fits."""
+
+
+class SiteWithMap(Protocol):
+    """A site and its floor plan, as `fog_runtime.site.load_site` returns them."""
+
+    @property
+    def site(self) -> Site:
+        """The configuration of the site."""
+
+    @property
+    def map(self) -> StaticMap:
+        """The floor plan."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,7 +142,7 @@ class HazardSchedule:
         self.planned: PlannedHazard | None = self._fixed
 
     @classmethod
-    def of(cls, site: LoadedSite, seed: int, request: HazardRequest | None = None) -> HazardSchedule:
+    def of(cls, site: SiteWithMap, seed: int, request: HazardRequest | None = None) -> HazardSchedule:
         """Return the schedule of a drive on a site, with barriers from wall to wall."""
         return cls(site.site, seed, lambda area: barrier_across(area, site.site, site.map, seed), request)
 

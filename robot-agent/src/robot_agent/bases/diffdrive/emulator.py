@@ -24,7 +24,7 @@ _WHEEL_A_PER_M_S: Final = 1.5
 
 
 class DiffDriveEmulator:
-    """The board's end of the serial line; implements `fognav_sim.devices.BaseEmulator`.
+    """The board's end of the serial line; implements `fognav_sim.emulators.BaseEmulator`.
 
     The simulation sets the public attributes at any time. `refused` counts lines that were no valid command.
     """

@@ -112,7 +112,7 @@ _TRICKLE_MA: Final = 60.0
 
 
 class RoombaEmulator:
-    """The robot's end of the serial line; implements `fognav_sim.devices.BaseEmulator`.
+    """The robot's end of the serial line; implements `fognav_sim.emulators.BaseEmulator`.
 
     The simulation calls `tick(now, dt)`, reads `wheel_speeds_m_s`, moves its robot, reports the true travel of the
     wheels by `add_wheel_travel`, and sets `world`. The port calls `receive` and `outgoing`. `now` is any monotonic

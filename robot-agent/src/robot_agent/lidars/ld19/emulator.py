@@ -32,7 +32,7 @@ _CHUNK: Final = 4
 
 
 class Ld19Emulator:
-    """The lidar's end of the serial line; implements `fognav_sim.devices.LidarEmulator`.
+    """The lidar's end of the serial line; implements `fognav_sim.emulators.LidarEmulator`.
 
     Two faults can be set at any time: `stalled` sends nothing more, `frozen` repeats the last revolution, as a stuck
     serial bridge does.

@@ -35,7 +35,7 @@ _CATCH_UP_S: Final = 0.5
 
 
 class RplidarEmulator:
-    """The lidar's end of the serial line; implements `fognav_sim.devices.LidarEmulator`.
+    """The lidar's end of the serial line; implements `fognav_sim.emulators.LidarEmulator`.
 
     The port calls `receive` and `outgoing`; `now` is any monotonic clock, seconds. `health` and `error_code` answer a
     health request. Two faults can be set at any time: `stalled` sends nothing more, `frozen` repeats the bytes of the

@@ -7,14 +7,12 @@ here. `./fognav check` runs it.
 # --- Fields of messages, reports and API answers: other programs and people read them. ---
 _.age_s  # api: age of an area's last reading
 _.after_input  # the agent's replay: where a recording and its replay differ
-_.author  # messages: of a zone
 _.control_p99_s  # messages: how regular the agent's loops are
 _.stream_p99_s
 _.severity
 _.uptime_ms  # messages: of a sensor node
 _.rssi
 _.fw
-_.after_input  # robot_agent.agent.replay: where a replay differs
 _.area_entered  # the demo's report and lockstep's result
 _.area_clearance_m
 _.operator_commands  # lockstep: fields of its result
@@ -26,8 +24,6 @@ _.costmap_published  # messages: stamps of a trace, read by their names in fog_c
 _.plan_published
 _.path_received
 _.first_command
-_.publishers  # channels: what documents and access lists are made from
-_.subscribers
 NODE_VALUE  # channels: rows of the table for other people's programs, which no service of ours uses yet
 HOME_ASSISTANT
 _.ROLES
@@ -65,7 +61,6 @@ _.voltage_v
 _.requested_wheels_m_s
 _.pause_stream
 _.resume_stream
-_.power
 _.query_list
 _.seek_dock
 _.sensors
@@ -86,17 +81,12 @@ _.start_redis
 _.start_router
 _.save_map
 _.find_channel
-_.ticks  # counters and views that tests assert on
-_.frames
-_.lost_bytes
+_.frames  # counters and views that tests assert on
 _.particles
 _.recompute
-_.refused
 _.resyncs
 _.scanning
 _.seeking_dock
 _.skipped_bytes
-_.axes
 _.odom_at
-_.ABSENT  # a version that a store's writes may expect, beside ANY
 _.reveal  # the way to the value of a secret setting

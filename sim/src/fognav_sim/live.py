@@ -179,7 +179,7 @@ class VirtualNode:
         self._world = live_world
         self._clock = clock
         self._id = sonars.node.id
-        will = Will(ch.NODE_AVAILABILITY, "offline", {"node": self._id})
+        will = Will(ch.NODE_AVAILABILITY, ch.OFFLINE, {"node": self._id})
         self._mqtt = MqttEdge(url, f"node-{self._id}", clock, site=site, will=will)
         self._mqtt.on(ch.NODE_CONFIG, self._on_config, NodeConfig)
         self._mqtt.on_connect(self._announce)
@@ -189,7 +189,7 @@ class VirtualNode:
         await self._mqtt.run()
 
     async def _announce(self) -> None:
-        await self._mqtt.publish(ch.NODE_AVAILABILITY, "online", node=self._id)
+        await self._mqtt.publish(ch.NODE_AVAILABILITY, ch.ONLINE, node=self._id)
 
     def _on_config(self, ids: Mapping[str, str], config: NodeConfig) -> None:
         if ids["node"] == self._id and not self._sonars.configure(config):

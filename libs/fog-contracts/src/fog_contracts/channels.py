@@ -149,6 +149,11 @@ VOLATILE: Final = "volatile"
 LATEST: Final = "latest"
 RECOVERED: Final = "recovered"
 
+ONLINE: Final = "online"
+OFFLINE: Final = "offline"
+BLOCKED: Final = "blocked"
+CLEAR: Final = "clear"
+
 _mqtt = partial(Channel, transport="mqtt", kind="pub", encoding="json")
 _text = partial(Channel, transport="mqtt", kind="pub", encoding="text", message=None)
 _pub = partial(Channel, transport="zenoh", kind="pub", encoding="msgpack")
@@ -159,9 +164,10 @@ _live = partial(Channel, transport="zenoh", kind="liveliness", encoding="msgpack
 # Sensor nodes and areas: MQTT, JSON or text
 NODE_AVAILABILITY = _text( "node_availability", V1 + "nodes/{node}/availability",                       limit=16,
     publishers=(NODE,),          subscribers=(AGGREGATOR,),       durability=LATEST,   qos=1,
-    values=("online", "offline"), about="whether a node is connected; `offline` is its last will")
+    values=(ONLINE, OFFLINE), about="whether a node is connected; `offline` is its last will")
 NODE_READING      = _mqtt( "node_reading",      V1 + "nodes/{node}/reading",          m.NodeReading,    limit=KIB,
-    publishers=(NODE,),          subscribers=(AGGREGATOR,),       durability=VOLATILE, qos=0, rate_hz=10, max_age_s=3)
+    publishers=(NODE,),          subscribers=(AGGREGATOR,),       durability=VOLATILE, qos=0, rate_hz=10,
+    max_age_s=m.UnknownPolicy().silent_after_s)
 NODE_VALUE        = _mqtt( "node_value",        V1 + "nodes/{node}/value",            m.NodeValue,      limit=KIB,
     publishers=(NODE,),          subscribers=(AGGREGATOR,),       durability=VOLATILE, qos=0)
 NODE_CONFIG       = _mqtt( "node_config",       V1 + "nodes/{node}/config",           m.NodeConfig,     limit=KIB,
@@ -172,7 +178,7 @@ AREA_DEFINITION   = _mqtt( "area_definition",   V1 + "areas/{area}/definition", 
     publishers=(AGGREGATOR,),    subscribers=(MAP,),              durability=LATEST,   qos=1)
 THESIS_AREA       = _text( "thesis_area",       "area {number}",                                        limit=16,
     publishers=("thesis-node",), subscribers=(AGGREGATOR,),       durability=VOLATILE, qos=0,
-    values=("blocked", "clear"), about="state of a thesis node's area")
+    values=(BLOCKED, CLEAR), about="state of a thesis node's area")
 THESIS_WSN        = _text( "thesis_wsn",        "WSN",                                                  limit=64,
     publishers=(AGGREGATOR,),    subscribers=("thesis-robot",),   durability=VOLATILE, qos=1,
     about="`n,x,y` for a blocked area, `n,-999,-999` for a clear one")

@@ -131,9 +131,10 @@ class Aggregator:
         return self._announce(self._fusion.on_reading(ids["node"], reading, at.now, at.stamp))
 
     def _on_availability(self, ids: Ids, text: str, at: Moment) -> list[Publication]:
-        if text not in ("online", "offline"):
-            raise RefusedMessageError(f"availability is `online` or `offline`, not {text!r}")
-        return self._announce(self._fusion.on_availability(ids["node"], text == "online", at.now, at.stamp))
+        if text not in ch.NODE_AVAILABILITY.values:
+            choices = " or ".join(f"`{value}`" for value in ch.NODE_AVAILABILITY.values)
+            raise RefusedMessageError(f"availability is {choices}, not {text!r}")
+        return self._announce(self._fusion.on_availability(ids["node"], text == ch.ONLINE, at.now, at.stamp))
 
     def _on_thesis_state(self, ids: Ids, text: str, at: Moment) -> list[Publication]:
         return self._announce(self._fusion.on_thesis_state(int(ids["number"]), text.strip(), at.now, at.stamp))

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from fog_contracts.channels import ROBOT_POSE
+from fog_contracts.channels import BLOCKED, CLEAR, ROBOT_POSE
 from fog_contracts.costs import LETHAL
 from fog_contracts.messages import AreaDefinition, AreaHazard, Trace
 from hazard_aggregator.debounce import DEFAULT_RULE, make_rule
@@ -187,8 +187,8 @@ class AreaFusion:
             node = area.nodes.get(name)
             if node is None:
                 node = area.nodes[name] = _NodeState(name, None, self.new_rule(area.definition))
-            reported: AreaState = "blocked" if state == "blocked" else "clear" if state == "clear" else "unknown"
-            reason = f"it reports {reported}" if reported != "unknown" else "it reports neither blocked nor clear"
+            reported: AreaState = BLOCKED if state == BLOCKED else CLEAR if state == CLEAR else "unknown"
+            reason = f"it reports {reported}" if reported != "unknown" else f"it reports neither {BLOCKED} nor {CLEAR}"
             self._apply(node, Classification(reported, reason), now, stamp)
             changed += self._evaluate(area, stamp)
         return changed

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from fog_contracts.channels import MAP_HEARTBEAT, ROBOT_GOAL, ROBOT_PATH, ROBOT_STATE
+from fog_contracts.channels import MAP_HEARTBEAT, ROBOT_GOAL, ROBOT_PATH, ROBOT_POSE
 from fog_contracts.costs import DEFAULT_INFLATION, Inflation
 
 
@@ -26,8 +26,12 @@ class PlannerConfig:
     """How far ahead the path is released: the robot may drive this far without a message from the planner."""
     republish_s: float = ROBOT_PATH.period_s
     goal_republish_s: float = ROBOT_GOAL.period_s
-    max_pose_age_s: float = ROBOT_STATE.max_age_s
-    """Nothing is planned for a robot whose last pose is older: it is disconnected."""
+    max_pose_age_s: float = 3.0 * ROBOT_POSE.max_age_s
+    """Nothing is planned for a robot whose last pose is older: it is disconnected.
+
+    This is longer than a pose counts as fresh: meanwhile a robot moves less than `max_deviation`, so its path still
+    fits, while a pause in publishing would slow it down after every short loss of its radio link.
+    """
     max_map_age_s: float = MAP_HEARTBEAT.max_age_s
     delta_grace_s: float = 0.5
     """How long a heartbeat may be ahead of the deltas before a snapshot is fetched."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final, Self
 
 from fog_contracts.channels import MAP_HEARTBEAT, ROBOT_PATH
-from fog_contracts.costs import DEFAULT_INFLATION, Inflation
+from fog_contracts.costs import DEFAULT_INFLATION, DEGRADED_SPEED, ROBOT_RADIUS, Inflation
 from robot_agent.hardware import DriveTrain
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ class SafetyConfig:
     """Limits of the safety gate: speeds in m/s, ages and durations in s."""
 
     speed_normal: float = 0.30
-    speed_degraded: float = 0.15
+    speed_degraded: float = DEGRADED_SPEED / 100
     speed_egress: float = 0.10
     relax_after: float = 2.0
     map_late: float = MAP_HEARTBEAT.max_age_s
@@ -91,7 +91,7 @@ class MotionConfig:
     acceleration: float = 2.5
     angular_acceleration: float = 3.2
     wheel_speed: float = 0.5
-    axle: float = 0.235
+    axle: float = DriveTrain().axle_m
     samples_v: int = 25
     samples_w: int = 35
     horizon: float = 1.5
@@ -110,7 +110,7 @@ class AgentConfig:
 
     robot: str
     operator_key: bytes
-    radius: float = 0.17
+    radius: float = ROBOT_RADIUS
     height: float = 0.35
     decision_max_age: float = 0.4
     obstacle_ttl: float = 600.0

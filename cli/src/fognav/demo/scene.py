@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from fog_contracts.costs import UNKNOWN
+from fog_contracts.costs import ROBOT_RADIUS, UNKNOWN
 from fog_contracts.grid import StaticMap
 from fog_contracts.messages import (
     HazardArea,
@@ -88,7 +88,7 @@ class Scene:
         return {
             "site": site.name or site.id,
             "robot": self.robot,
-            "radius": next((r.radius for r in site.robots if r.id == self.robot), 0.17),
+            "radius": next((r.radius for r in site.robots if r.id == self.robot), ROBOT_RADIUS),
             "seed": self.seed,
             "map": {
                 "width": geometry.width,

@@ -25,6 +25,12 @@ UNKNOWN: Final = 255
 
 NO_SPEED_LIMIT: Final = 0
 """In the speed layer (uint8, cm/s): the cell sets no limit."""
+DEGRADED_SPEED: Final = 15
+"""Speed limit (cm/s) where a robot can't rely on what it knows: in unknown areas, and everywhere while it is DEGRADED.
+
+Half the usual speed quarters the braking distance."""
+ROBOT_RADIUS: Final = 0.17
+"""Radius (m) of a robot's body, unless the site says otherwise: that of a Roomba."""
 
 NEUTRAL_WEIGHT: Final = 50
 """Weight of a free cell on a path; a cell of cost c weighs NEUTRAL_WEIGHT + COST_WEIGHT * c."""
@@ -42,7 +48,7 @@ class Inflation:
     values that are negative or not finite.
     """
 
-    inscribed_radius: float = 0.17
+    inscribed_radius: float = ROBOT_RADIUS
     inflation_radius: float = 0.55
     cost_scaling: float = 3.0
 

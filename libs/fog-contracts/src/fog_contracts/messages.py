@@ -96,6 +96,10 @@ class Trace(Message, frozen=True, kw_only=True):
     first_command: Stamp = 0.0
 
 
+SEVERITY: Final = {"clear": 0, "unknown": 1, "unknown_after_blocked": 2, "blocked": 3}
+"""Severity of an area's hazard by its state; an area that was blocked before it became unknown ranks higher."""
+
+
 class AreaHazard(Message, frozen=True, kw_only=True):
     """State of one area; `seq` grows by one with each change, `epoch` with each start of the aggregator."""
 

@@ -4,6 +4,7 @@ from typing import Annotated, Any
 
 from msgspec import Meta, field
 
+from fog_contracts.costs import ROBOT_RADIUS
 from fog_contracts.messages import AreaDefinition, Id, Message, Metres, Pose, Radians, Ring, UnknownPolicy
 
 
@@ -56,7 +57,7 @@ class RobotSite(Message, frozen=True, kw_only=True):
 
     id: Id
     start: Pose
-    radius: Annotated[float, Meta(gt=0.0, le=2.0)] = 0.17
+    radius: Annotated[float, Meta(gt=0.0, le=2.0)] = ROBOT_RADIUS
     height: Annotated[float, Meta(gt=0.0, le=3.0)] = 0.35
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from fog_contracts.channels import BLOCKED, CLEAR, ROBOT_POSE
 from fog_contracts.costs import LETHAL
-from fog_contracts.messages import AreaDefinition, AreaHazard, Trace
+from fog_contracts.messages import SEVERITY, AreaDefinition, AreaHazard, Trace
 from hazard_aggregator.debounce import DEFAULT_RULE, make_rule
 from hazard_aggregator.plausibility import Classification, classify_reading
 
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
 LATE_TICK_S: Final = 0.5
 """A longer gap (s) between two ticks means that the process itself was stalled."""
-SEVERITY: Final = {"clear": 0, "unknown": 1, "unknown_after_blocked": 2, "blocked": 3}
 THESIS_NODE: Final = "thesis-area-{number}"
 """The id of a thesis node, which has none of its own, within its area."""
 

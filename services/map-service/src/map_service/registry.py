@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from fog_contracts.options import OptionError, read_options
 from fog_runtime import parts
-from map_service.layers.base import CostLayer, FloorPlan, LayerFactory
+from map_service.layers.base import CostLayer, LayerFactory
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -35,11 +35,10 @@ def make_layers(static: StaticMap, configured: Sequence[str | Mapping[str, Any]]
     for mandatory in DEFAULT_LAYERS[:3]:
         if names.count(mandatory) != 1:
             raise LayersError(f"layers: {mandatory!r} must occur exactly once. List it once: robots rely on it")
-    plan = FloorPlan(static.geometry, static.cells)
-    return [_make_layer(plan, index, entry) for index, entry in enumerate(entries)]
+    return [_make_layer(static, index, entry) for index, entry in enumerate(entries)]
 
 
-def _make_layer(plan: FloorPlan, index: int, entry: dict[str, Any]) -> CostLayer:
+def _make_layer(plan: StaticMap, index: int, entry: dict[str, Any]) -> CostLayer:
     name = str(entry.pop("name", ""))
     try:
         factory: LayerFactory[Any] = parts.load(GROUP, name, LayerFactory)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fog_contracts.costs import combine_costs, combine_speed_limits
-from fog_contracts.grid import GridGeometry, Window
+from fog_contracts.grid import StaticMap, Window
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -69,13 +69,6 @@ class CostLayer(ABC):
         return updated
 
 
-class FloorPlan(NamedTuple):
-    """The floor plan beneath all layers; `cells` is uint8 (height, width): 0 free, 254 occupied, 255 unknown."""
-
-    geometry: GridGeometry
-    cells: Grid
-
-
 class NoOptions(msgspec.Struct, frozen=True):
     """The options of a layer that has none."""
 
@@ -85,7 +78,7 @@ class LayerFactory(Generic[Options]):
     """What a layer registers under its name in the entry points `fognav.cost_layers`."""
 
     options: type[Options]
-    make: Callable[[FloorPlan, Options], CostLayer]
+    make: Callable[[StaticMap, Options], CostLayer]
 
 
 def write_cost(shape: ShapeMask, window: Window, cost: Grid, value: int) -> None:

@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING
 from msgspec import structs
 
 from fog_contracts import channels as ch
+from fog_contracts.costs import DEGRADED_SPEED
 from fog_contracts.geometry import GeometryError, normalized_polygon, rasterize
 from fog_contracts.handlers import Publication, RefusedMessageError
-from fog_contracts.messages import AreaHazard, Cause, HazardArea
+from fog_contracts.messages import SEVERITY, AreaHazard, Cause, HazardArea
 from map_service.layers.base import CostLayer, LayerFactory, NoOptions, write_cost, write_speed_limit
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-    from typing import Final
 
     from fog_contracts.channels import Channel
     from fog_contracts.geometry import ShapeMask
@@ -27,9 +27,6 @@ if TYPE_CHECKING:
     from fog_contracts.handlers import Handler, Ids, Moment
     from fog_contracts.messages import AreaDefinition
     from map_service.layers.base import Grid
-
-UNKNOWN_SPEED: Final = 15
-"""Speed limit (cm/s) in an unknown area: the robot's DEGRADED speed."""
 
 
 @dataclass
@@ -73,7 +70,12 @@ class HazardsLayer(CostLayer):
             del self._areas[definition.id]
             self.mark_updated(old.mask.window, Cause(kind="hazard", id=definition.id, state="removed"))
             cleared = structs.replace(
-                old.effective, state="clear", severity=0, penalty=0, cause="the area was removed", trace=None
+                old.effective,
+                state="clear",
+                severity=SEVERITY["clear"],
+                penalty=0,
+                cause="the area was removed",
+                trace=None,
             )
             return [_hazard_publication(old.definition, cleared)]
         mask = rasterize(normalized_polygon(definition.polygon), self._geometry)
@@ -121,7 +123,7 @@ class HazardsLayer(CostLayer):
             if area.effective.penalty > 0:
                 write_cost(area.mask, window, cost, area.effective.penalty)
             if area.effective.state == "unknown":
-                write_speed_limit(area.mask, window, speed, UNKNOWN_SPEED)
+                write_speed_limit(area.mask, window, speed, DEGRADED_SPEED)
 
     def _refresh(self, name: str) -> list[Publication]:
         area = self._areas.get(name)
@@ -143,7 +145,7 @@ class HazardsLayer(CostLayer):
         return AreaHazard(
             area=definition.id,
             state="unknown",
-            severity=1,
+            severity=SEVERITY["unknown"],
             penalty=definition.unknown.penalty,
             since=received.since if received else 0.0,
             seq=received.seq if received else 0,

@@ -100,7 +100,7 @@ async def test_normal_start_of_a_robot_gives_three_events(rig: RouterRig) -> Non
     await rig.publish_state("INIT", "the pose is not known yet: checking the saved pose", WAITING)
     await rig.publish_state("INIT", WAITING)
     rig.operator.enabling_paused = False
-    await until(lambda: bool(rig.commands), "it is enabled")
+    await until(lambda: "operator: enable" in rig.event_texts, "it is enabled")
     await rig.publish_state("NORMAL")
     assert [text for text in rig.event_texts if text != "operator: enable again"] == [
         "robot: INIT (just started: it localizes, then waits to be enabled)",

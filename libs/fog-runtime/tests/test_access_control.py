@@ -23,7 +23,7 @@ from fog_supervisor.servers import start_mosquitto
 
 pytestmark = pytest.mark.live
 
-WAIT_S = 15.0
+WAIT_S = 45.0
 
 # --- MQTT -----------------------------------------------------------------------------------------------------------
 

@@ -146,3 +146,11 @@ def test_every_entry_into_a_mode_is_counted() -> None:
             float(now),
         )
     assert evaluation.modes == {"INIT": 1, "NORMAL": 2, "PROTECTIVE_STOP": 1}
+
+
+def test_arrival_counts_though_the_planner_has_ended_the_goal_meanwhile() -> None:
+    drive = evaluation()
+    drive.on_truth(truth(10.0))
+    drive.on_state(state(reached=True), 20.0)
+    drive.on_state(state(reached=False, goal=None), 20.1)
+    assert outcome(drive, 20.2) == "reached"

@@ -102,7 +102,8 @@ class DriveEvaluation:
                 self.stops.append(f"{state.mode}: {'; '.join(state.reasons) or 'no reason given'}")
         if state.goal_reached and state.goal_id in {self.goal_id, None}:
             self._arrival_claimed_at = now if self._arrival_claimed_at is None else self._arrival_claimed_at
-        else:
+        elif state.goal_id == self.goal_id:
+            # The planner ends the goal as soon as it is reached: a later state without a goal takes nothing back.
             self._arrival_claimed_at = None
 
     def on_path(self, path: RobotPath, now: float) -> None:

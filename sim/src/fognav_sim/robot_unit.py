@@ -56,23 +56,28 @@ class _Operator:
         assert settings.operator_key_file is not None
         self._key = bytes.fromhex(settings.operator_key_file.read_text("ascii"))
         self._token = settings.token_file.read_text("ascii").strip()
-        self._state = edge.latest(ch.ROBOT_STATE, RobotState, robot=robot)
+        self._state: RobotState | None = None
         self._policy = OperatorPolicy(self._clock.now())
         self._shuttle = Shuttle(*places)
+        edge.subscribe(ch.ROBOT_STATE, RobotState, self._on_state, robot=robot)
 
     async def run(self) -> None:
         """Send the commands and goals that are due, once a second, until cancelled."""
         async for now in ticker(self._clock, _POLICY_PERIOD_S):
-            state = self._state.get()
+            state = self._state
             if state is None:
                 continue
             self._policy.on_state(state, now)
             if (command := self._policy.command_due(now)) is not None:
                 await self._send_command(command)
-            if (place := self._shuttle.on_state(state)) is not None:
-                _log.info("arrived", place=place, legs=self._shuttle.legs)
             if (place := self._shuttle.goal_due(state)) is not None:
                 await self._send_goal(place)
+
+    def _on_state(self, _ids: dict[str, str], state: RobotState) -> None:
+        """Record a state; an arrival is reported for a tenth of a second only, so every state is looked at."""
+        self._state = state
+        if (place := self._shuttle.on_state(state)) is not None:
+            _log.info("arrived", place=place, legs=self._shuttle.legs)
 
     async def _send_command(self, kind: OperatorCommand) -> None:
         try:

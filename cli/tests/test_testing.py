@@ -66,10 +66,14 @@ def test_bar_on_a_terminal_shows_progress_and_failures_at_once(folder: Path) -> 
     assert "3 skipped: no sonar: plug one in" in text
 
 
-def test_tests_run_on_all_cores_unless_the_arguments_choose_otherwise() -> None:
+@pytest.mark.parametrize(("ci", "beyond_the_cores"), [("", 1), ("true", 0)])
+def test_tests_run_on_all_cores_unless_the_arguments_choose_otherwise(
+    monkeypatch: pytest.MonkeyPatch, ci: str, beyond_the_cores: int
+) -> None:
+    monkeypatch.setenv("CI", ci)
     command = testing.pytest_command(["-k", "replica"], terminal=False)
     assert command[:3] == [sys.executable, "-m", "pytest"]
-    assert command[command.index("-n") + 1] == str((os.cpu_count() or 1) + 1)
+    assert command[command.index("-n") + 1] == str((os.cpu_count() or 1) + beyond_the_cores)
     assert command[-2:] == ["-k", "replica"]
     for arguments in (["-n", "0"], ["-n4"], ["--pdb"], ["-s"], ["--collect-only"]):
         assert "--dist" not in testing.pytest_command(arguments, terminal=False)

@@ -168,6 +168,22 @@ def assert_replay_gives_the_recorded_maps(recording: Path, out: Path) -> None:
     assert (out / "plans.jsonl").read_bytes().count(b"\n") >= 1
 
 
+async def drives(command: Command, children: list[psutil.Process]) -> None:
+    """Wait until the robot of a demo has driven another half metre."""
+    (router,) = {p.environ()["FOGNAV_ZENOH_CONNECT"] for p in children if "FOGNAV_ZENOH_CONNECT" in p.environ()}
+    opened = ZenohEdge.open(connect=[router], clock=SystemClock(), role="console", id="test", site="estig")
+    async with opened as edge:
+        truth = edge.latest(ch.SIM_TRUTH, SimTruth, robot="r1")
+
+        def distance() -> float:
+            latest = truth.get()
+            return latest.distance if latest is not None else 0.0
+
+        await until(lambda: truth.get() is not None, 5, lambda: "the ground truth is received")
+        before = distance()
+        await until(lambda: distance() > before + 0.5, 15, lambda: f"the robot drives on: {command.output}")
+
+
 async def test_interrupting_one_of_two_demos_leaves_the_other_driving(
     start_demo: Callable[..., Command], tmp_path: Path
 ) -> None:
@@ -186,23 +202,14 @@ async def test_interrupting_one_of_two_demos_leaves_the_other_driving(
     assert [len(taken) > 3 for taken in ports] == [True, True]
     assert ports[0].isdisjoint(ports[1])
 
+    # A replay plans at its next tick, 0.1 s after the goal at most: the recording must not end before.
+    await drives(one, families[0])
     os.killpg(one.process.pid, signal.SIGINT)  # what a terminal does at Ctrl-C
     assert await one.wait_end(END_TIMEOUT_S) == FAILED
     assert_nothing_left(one, folders[0], families[0], ports[0])
     assert_replay_gives_the_recorded_maps(recording, tmp_path / "replayed")
 
-    (router,) = {p.environ()["FOGNAV_ZENOH_CONNECT"] for p in families[1] if "FOGNAV_ZENOH_CONNECT" in p.environ()}
-    opened = ZenohEdge.open(connect=[router], clock=SystemClock(), role="console", id="test", site="estig")
-    async with opened as edge:
-        truth = edge.latest(ch.SIM_TRUTH, SimTruth, robot="r1")
-
-        def driven() -> float:
-            latest = truth.get()
-            return latest.distance if latest is not None else 0.0
-
-        await until(lambda: truth.get() is not None, 5, lambda: "the other's ground truth is received")
-        before = driven()
-        await until(lambda: driven() > before + 0.5, 15, lambda: f"the other drives on: {other.output}")
+    await drives(other, families[1])
     assert [child for child in families[1] if not alive(child)] == []
 
     os.kill(other.process.pid, signal.SIGTERM)

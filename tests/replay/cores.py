@@ -33,6 +33,7 @@ from fog_runtime.record import read
 from fog_runtime.site import LoadedSite, load_site
 from fognav_experiments.processes import AggregatorProcess, MapProcess, PlannerProcess
 from hazard_aggregator.core import Aggregator
+from hazard_aggregator.fusion import AreaFusion
 from hazard_aggregator.registry import find_rule
 from map_service.core import MapCore
 from map_service.registry import make_layers
@@ -114,7 +115,7 @@ def replay_aggregator(messages: list[RecordedMessage], site: LoadedSite) -> list
     start, hazard = first(messages, ch.AREA_HAZARD)
     assert isinstance(hazard, AreaHazard)
     replay = Replay(messages, site, "hazard-aggregator", start)
-    core = Aggregator(site.site.definitions(), site.site.nodes, hazard.epoch, registry=find_rule)
+    core = Aggregator(AreaFusion(site.site.definitions(), site.site.nodes, hazard.epoch, registry=find_rule))
     replay.run(AggregatorProcess(core, replay.bus).tick)
     return [message for message in replay.published if isinstance(message, AreaHazard)]
 

@@ -16,6 +16,7 @@ from fog_contracts.handlers import Moment, Publication
 from fog_runtime.health import Health
 from fognav_experiments.rigs import STAMP
 from hazard_aggregator.core import Aggregator
+from hazard_aggregator.fusion import AreaFusion
 from hazard_aggregator.registry import find_rule
 from hazard_aggregator.service import Service as AggregatorService
 from map_service.core import MapCore
@@ -233,7 +234,7 @@ class LiveServices:
             role: BusEdge(self, role) for role in ("hazard-aggregator", "map-service", "planner", "robot-agent")
         }
         self.aggregator = AggregatorService(
-            Aggregator(definitions, loaded.site.nodes, 1, registry=find_rule),
+            Aggregator(AreaFusion(definitions, loaded.site.nodes, 1, registry=find_rule)),
             MemoryStore(), edges["hazard-aggregator"], edges["hazard-aggregator"], clock, Health(),
         )  # fmt: skip
         self.map = MapService(

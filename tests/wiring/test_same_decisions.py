@@ -43,6 +43,7 @@ from fog_contracts.site import AreaSite
 from fognav_experiments.rigs import OPERATOR_KEY, System, moment
 from fognav_sim.scenario import barrier_across
 from hazard_aggregator.core import Aggregator
+from hazard_aggregator.fusion import AreaFusion
 from hazard_aggregator.registry import find_rule
 from map_service.core import MapCore
 from map_service.registry import make_layers
@@ -401,7 +402,7 @@ def cores(loaded: Any, config: AgentConfig) -> dict[str, Any]:
     """Return everything with a table of handlers or query handlers, by name."""
     definitions, layers = loaded.site.definitions(), make_layers(loaded.map, loaded.site.layers)
     return {
-        "aggregator": Aggregator(definitions, loaded.site.nodes, 1, registry=find_rule),
+        "aggregator": Aggregator(AreaFusion(definitions, loaded.site.nodes, 1, registry=find_rule)),
         "map": MapCore(loaded.site.id, loaded.map, 1, layers=layers, definitions=definitions),
         # The map combines its layers' handlers; their message types are those of the layers.
         **{f"map layer {type(layer).__name__}": layer for layer in layers},

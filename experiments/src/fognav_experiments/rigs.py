@@ -20,6 +20,7 @@ from fognav_sim.hardware import STEP_S, Hardware
 from fognav_sim.node import SonarNode
 from fognav_sim.world import World
 from hazard_aggregator.core import Aggregator
+from hazard_aggregator.fusion import AreaFusion
 from hazard_aggregator.registry import find_rule
 from map_service.core import MapCore
 from map_service.registry import make_layers
@@ -163,7 +164,7 @@ class FogRig(Fog):
     def __init__(self, site: LoadedSite, world: World, bus: Bus, seed: int, start: float) -> None:
         definitions = site.site.definitions()
         super().__init__(
-            Aggregator(definitions, site.site.nodes, epoch=1, registry=find_rule),
+            Aggregator(AreaFusion(definitions, site.site.nodes, epoch=1, registry=find_rule)),
             MapCore(
                 site.site.id,
                 site.map,

@@ -7,6 +7,7 @@ from fog_contracts.handlers import Moment, Publication, RefusedMessageError
 from fog_contracts.messages import AreaDefinition, AreaHazard, NodeConfig, NodeReading, RobotPose
 from fog_contracts.site import NodeSite, Sonar
 from hazard_aggregator.core import Aggregator, wsn_line
+from hazard_aggregator.fusion import AreaFusion
 from hazard_aggregator.registry import find_rule
 
 SQUARE = [(0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (0.0, 1.0)]
@@ -22,7 +23,7 @@ class Rig:
     """A core that gets messages through its handlers, 0.1 s apart."""
 
     def __init__(self, *restored: AreaHazard) -> None:
-        self.core = Aggregator([AREA], [NODE], 5, restored, registry=find_rule)
+        self.core = Aggregator(AreaFusion([AREA], [NODE], 5, restored, registry=find_rule))
         self.now = 100.0
         self.seq = 0
         self.published: list[Publication] = []

@@ -16,6 +16,7 @@ from fog_runtime.zenoh_edge import ZenohEdge
 from hazard_aggregator.api import make_api
 from hazard_aggregator.core import Aggregator
 from hazard_aggregator.debounce import make_rule
+from hazard_aggregator.fusion import AreaFusion
 from hazard_aggregator.registry import find_rule
 from hazard_aggregator.service import Service
 from hazard_aggregator.settings import Settings
@@ -39,7 +40,7 @@ async def main() -> None:
             stored.definitions, lambda area: make_rule(area.id, area.debounce, find_rule, settings.debounce)
         )
         definitions = {d.id: d for d in [*loaded.site.definitions(), *usable]}
-        core = Aggregator(
+        fusion = AreaFusion(
             definitions.values(), loaded.site.nodes, stored.epoch, stored.hazards,
             registry=find_rule, default_rule=settings.debounce,
         )  # fmt: skip
@@ -47,7 +48,7 @@ async def main() -> None:
         async with ZenohEdge.open(
             connect=settings.zenoh_endpoints, clock=clock, role="hazard-aggregator", id=site, site=site
         ) as zenoh:
-            service = Service(core, store, mqtt, zenoh, clock, health)
+            service = Service(Aggregator(fusion), store, mqtt, zenoh, clock, health)
             if loaded_from_store:
                 service.mark_store_loaded()
             service.subscribe()

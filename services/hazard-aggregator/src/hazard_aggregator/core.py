@@ -14,8 +14,6 @@ import msgspec
 from fog_contracts import channels as ch
 from fog_contracts.handlers import Publication, RefusedMessageError
 from fog_contracts.messages import NodeConfig
-from hazard_aggregator.debounce import DEFAULT_RULE
-from hazard_aggregator.fusion import AreaFusion
 from hazard_aggregator.outbox import Outbox
 
 if TYPE_CHECKING:
@@ -25,28 +23,16 @@ if TYPE_CHECKING:
     from fog_contracts.handlers import Handler, Ids, Moment, QueryHandler
     from fog_contracts.messages import AreaDefinition, AreaHazard, NodeReading, RobotPose
     from fog_contracts.site import NodeSite
-    from hazard_aggregator.debounce import Registry
-    from hazard_aggregator.fusion import NodeReport
+    from hazard_aggregator.fusion import AreaFusion, NodeReport
 
 
 class Aggregator:
-    """The aggregator's core; it takes the same arguments as `AreaFusion`."""
+    """The aggregator's core: what `fusion` decides, published in the order that `Outbox` allows."""
 
-    def __init__(
-        self,
-        definitions: Iterable[AreaDefinition],
-        nodes: Iterable[NodeSite],
-        epoch: int,
-        restored: Iterable[AreaHazard] = (),
-        *,
-        registry: Registry,
-        default_rule: str = DEFAULT_RULE,
-    ) -> None:
-        self.epoch = epoch
-        self.nodes = {node.id: node for node in nodes}
-        self._fusion = AreaFusion(
-            definitions, self.nodes.values(), epoch, restored, registry=registry, default_rule=default_rule
-        )
+    def __init__(self, fusion: AreaFusion) -> None:
+        self.epoch = fusion.epoch
+        self.nodes = fusion.nodes
+        self._fusion = fusion
         self._outbox = Outbox()
 
     # --- State ------------------------------------------------------------------------------------------------------

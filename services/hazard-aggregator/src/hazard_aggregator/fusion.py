@@ -109,7 +109,7 @@ class AreaFusion:
         default_rule: str = DEFAULT_RULE,
     ) -> None:
         self.epoch = epoch
-        self._node_sites = {node.id: node for node in nodes}
+        self.nodes = {node.id: node for node in nodes}
         self._registry = registry
         self._default_rule = default_rule
         self._areas: dict[str, _Area] = {}
@@ -267,12 +267,12 @@ class AreaFusion:
                 area.last_known_blocked, area.confirmed = old.last_known_blocked, old.confirmed
                 area.hazard = old.hazard
             keep_rules = old is not None and old.definition.debounce == definition.debounce
-            undefined = {name for name in (old.nodes if old else ()) if name not in self._node_sites}
+            undefined = {name for name in (old.nodes if old else ()) if name not in self.nodes}
             thesis = {THESIS_NODE.format(number=definition.number)} & undefined
             for name in [*definition.nodes, *sorted(thesis - set(definition.nodes))]:
                 node = old.nodes.get(name) if old is not None else None
                 if node is None:
-                    node = _NodeState(name, self._node_sites.get(name), self.new_rule(definition))
+                    node = _NodeState(name, self.nodes.get(name), self.new_rule(definition))
                 elif not keep_rules:
                     node.rule = self.new_rule(definition)
                 area.nodes[name] = node

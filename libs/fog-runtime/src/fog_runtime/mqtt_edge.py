@@ -6,33 +6,27 @@ state that must survive is retained, or published again by `on_connect`, never k
 
 import asyncio
 import random
-import ssl
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, TypeVar, overload
-from urllib.parse import unquote, urlsplit
 
 import aiomqtt
 from paho.mqtt.reasoncodes import ReasonCode
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
 from fog_contracts.channels import Channel
-from fog_contracts.codec import ContractError, decode, decode_text, encode, encode_text
-from fog_contracts.handlers import RefusedMessageError
+from fog_contracts.codec import encode, encode_text
 from fog_contracts.messages import Message
 from fog_runtime import logs, metrics
 from fog_runtime.clock import Clock
+from fog_runtime.mqtt_broker import Broker
+from fog_runtime.mqtt_subscriptions import Ids, Subscriptions
 
 M = TypeVar("M", bound=Message)
 T = TypeVar("T")
-Ids = dict[str, str]
 
 BACKOFF_S: Final = (0.2, 2.0)
 """Real seconds between attempts to connect: initial and maximum."""
-KEEPALIVE_S: Final = 10
-"""A connection without traffic for 1.5 times as long is considered lost by both sides."""
-_TIMEOUT_S: Final = 5.0
-_QUEUE: Final = 10_000
 
 _log = logs.get("mqtt_edge")
 
@@ -46,43 +40,13 @@ class Will:
     ids: Ids = field(default_factory=dict)
 
 
-@dataclass
-class _Registration:
-    channel: Channel
-    handler: Callable[[Ids, Any], object]
-    kind: type[Message] | None
-    topics: list[str]
-
-
-@dataclass(frozen=True)
-class _Address:
-    host: str
-    port: int
-    user: str | None
-    password: str | None
-    tls: bool
-
-
-def _address(url: str) -> _Address:
-    parts = urlsplit(url)
-    if parts.scheme not in {"mqtt", "mqtts"} or not parts.hostname:
-        raise ValueError("the broker's address must look like mqtt://host:1883 or mqtts://user:password@host:8883")
-    tls = parts.scheme == "mqtts"
-    return _Address(
-        host=parts.hostname,
-        port=parts.port or (8883 if tls else 1883),
-        user=unquote(parts.username) if parts.username else None,
-        password=unquote(parts.password) if parts.password else None,
-        tls=tls,
-    )
-
-
 def _encoded(channel: Channel, message: Message | str) -> bytes:
     return encode(channel, message) if isinstance(message, Message) else encode_text(channel, message)
 
 
-def _log_refused_subscriptions(topics: Sequence[str], codes: Sequence[object]) -> None:
-    for topic, code in zip(topics, codes, strict=True):
+async def _subscribe(client: aiomqtt.Client, qos_by_topic: Mapping[str, int]) -> None:
+    codes = await client.subscribe([(topic, SubscribeOptions(qos=qos)) for topic, qos in qos_by_topic.items()])
+    for topic, code in zip(qos_by_topic, codes, strict=True):
         if isinstance(code, ReasonCode) and code.is_failure:
             _log.error("subscription_refused", topic=topic, reason=str(code))
 
@@ -95,12 +59,12 @@ class MqttEdge:
 
         Raises `ValueError` for an invalid address.
         """
-        self._address = _address(url)
+        self._broker = Broker.of(url)
         self._client_id = client_id
         self._clock = clock
         self._site = site
         self._will = will
-        self._registrations: list[_Registration] = []
+        self._subscriptions = Subscriptions(clock, site=site)
         self._on_connect: list[Callable[[], Awaitable[None]]] = []
         self._client: aiomqtt.Client | None = None
         self._changed = asyncio.Event()
@@ -143,14 +107,7 @@ class MqttEdge:
         Channels without a message type deliver text. `numbers` lists the areas of the thesis's topics, for which MQTT
         has no wildcard.
         """
-        if channel.transport != "mqtt" or channel.message is not kind:
-            expected = channel.message.__name__ if channel.message else "text"
-            raise ValueError(f"channel {channel.name} carries {expected} over {channel.transport}")
-        if "number" in channel.fields:
-            topics = [channel.key(number=str(number)) for number in numbers]
-        else:
-            topics = [channel.pattern(**self._with_site(channel, {}))]
-        self._registrations.append(_Registration(channel, handler, kind, topics))
+        self._subscriptions.add(channel, handler, kind, numbers)
 
     async def add_number(self, channel: Channel, number: str | int) -> None:
         """Subscribe the handlers of one of the thesis's channels to one more area, now and after every connection.
@@ -158,18 +115,13 @@ class MqttEdge:
         Without a connection the subscription is made at the next one.
         """
         topic = channel.key(number=str(number))
-        unsubscribed = [r for r in self._registrations if r.channel == channel and topic not in r.topics]
-        for registration in unsubscribed:
-            registration.topics.append(topic)
-        client = self._client
-        if not unsubscribed or client is None:
+        added, client = self._subscriptions.add_topic(channel, topic), self._client
+        if not added or client is None:
             return
         try:
-            codes = await client.subscribe([(topic, SubscribeOptions(qos=channel.qos))])
+            await _subscribe(client, {topic: channel.qos})
         except aiomqtt.MqttError as error:
             self._limited.warning("subscription_failed", topic, self._clock.now(), topic=topic, reason=str(error))
-            return
-        _log_refused_subscriptions([topic], codes)
 
     def on_connect(self, callback: Callable[[], Awaitable[None]]) -> None:
         """Run `callback` after every connection, once all subscriptions are made."""
@@ -203,12 +155,12 @@ class MqttEdge:
         failures = 0
         while True:
             try:
-                async with self._create_client() as client:
+                async with self._broker.client(self._client_id, self._mqtt_will()) as client:
                     failures = 0
                     await self._serve(client)
             except aiomqtt.MqttError as error:
                 reason = str(error) or type(error).__name__
-                broker = f"{self._address.host}:{self._address.port}"
+                broker = str(self._broker)
                 self._limited.warning("broker_disconnected", broker, self._clock.now(), broker=broker, reason=reason)
             finally:
                 self._on_disconnected()
@@ -216,52 +168,31 @@ class MqttEdge:
             failures += 1
             await asyncio.sleep(delay)
 
-    def _with_site(self, channel: Channel, ids: Ids) -> Ids:
+    def _topic(self, channel: Channel, ids: Ids) -> str:
         if "site" in ids:
             raise ValueError("the edge fills in the site: leave it out")
-        return {**ids, "site": self._site} if "site" in channel.fields else ids
+        return channel.key(**({**ids, "site": self._site} if "site" in channel.fields else ids))
 
-    def _topic(self, channel: Channel, ids: Ids) -> str:
-        return channel.key(**self._with_site(channel, ids))
-
-    def _mqtt_will(self, will: Will) -> aiomqtt.Will:
+    def _mqtt_will(self) -> aiomqtt.Will | None:
+        if (will := self._will) is None:
+            return None
         channel = will.channel
         return aiomqtt.Will(
             self._topic(channel, will.ids), _encoded(channel, will.message), channel.qos, channel.retained
         )
 
-    def _create_client(self) -> aiomqtt.Client:
-        client = aiomqtt.Client(
-            self._address.host,
-            self._address.port,
-            username=self._address.user,
-            password=self._address.password,
-            identifier=self._client_id,
-            protocol=aiomqtt.ProtocolVersion.V5,
-            clean_start=True,
-            will=self._mqtt_will(self._will) if self._will else None,
-            timeout=_TIMEOUT_S,
-            keepalive=KEEPALIVE_S,
-            max_queued_incoming_messages=_QUEUE,
-            tls_context=ssl.create_default_context() if self._address.tls else None,
-        )
-        client.pending_calls_threshold = 1000
-        return client
-
     async def _serve(self, client: aiomqtt.Client) -> None:
-        topics = {topic: r.channel.qos for r in self._registrations for topic in r.topics}
-        if topics:
-            codes = await client.subscribe([(topic, SubscribeOptions(qos=qos)) for topic, qos in topics.items()])
-            _log_refused_subscriptions(list(topics), codes)
+        if topics := self._subscriptions.qos_by_topic():
+            await _subscribe(client, topics)
         self._client = client
         self._changed.set()
         metrics.CONNECTED.labels("mqtt").set(1)
         metrics.CONNECTIONS.labels("mqtt").inc()
-        _log.info("broker_connected", broker=f"{self._address.host}:{self._address.port}", client=self._client_id)
+        _log.info("broker_connected", broker=str(self._broker), client=self._client_id)
         for callback in self._on_connect:
             self._spawn(callback(), "on_connect")
         async for message in client.messages:
-            self._deliver(message)
+            self._subscriptions.deliver(message)
 
     def _on_disconnected(self) -> None:
         self._client = None
@@ -304,44 +235,3 @@ class MqttEdge:
             return False
         metrics.PUBLISHED.labels(channel.name).inc()
         return True
-
-    def _deliver(self, message: aiomqtt.Message) -> None:
-        topic = message.topic.value
-        for registration in self._registrations:
-            channel = registration.channel
-            ids = channel.match(topic)
-            if ids is None:
-                if any(message.topic.matches(pattern) for pattern in registration.topics):
-                    self._refuse(channel, topic, "the ids in the topic are malformed")
-                continue
-            ids.pop("site", None)  # always this process's own site
-            data = message.payload
-            if message.retain and not channel.retained:
-                # It may be years old; a stale reading must never be used as a fresh one.
-                self._refuse(
-                    channel, topic, "retained, but this channel's messages never are: delete it from the broker"
-                )
-                continue
-            if channel.retained and not data:
-                continue  # a retained message was deleted
-            try:
-                content = (
-                    decode_text(channel, data)
-                    if registration.kind is None
-                    else decode(channel, data, registration.kind)
-                )
-            except ContractError as error:
-                self._refuse(channel, topic, error.reason)
-                continue
-            metrics.RECEIVED.labels(channel.name).inc()
-            try:
-                registration.handler(ids, content)
-            except RefusedMessageError as error:
-                self._refuse(channel, topic, str(error))
-            except Exception as error:  # noqa: BLE001  # one message must not end the process; the bug is logged
-                metrics.HANDLER_ERRORS.labels(channel.name).inc()
-                _log.error("handler_failed", error=error, channel=channel.name, topic=topic)
-
-    def _refuse(self, channel: Channel, topic: str, reason: str) -> None:
-        metrics.REFUSED.labels(channel.name).inc()
-        self._limited.warning("message_refused", channel.name, self._clock.now(), topic=topic, reason=reason)

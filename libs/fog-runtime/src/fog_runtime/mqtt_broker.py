@@ -1,0 +1,61 @@
+"""The broker that a process connects to: its address, and the options of a connection."""
+
+import ssl
+from dataclasses import dataclass
+from typing import Final, Self
+from urllib.parse import unquote, urlsplit
+
+import aiomqtt
+
+_KEEPALIVE_S: Final = 10
+"""A connection without traffic for 1.5 times as long is considered lost by both sides."""
+_TIMEOUT_S: Final = 5.0
+_QUEUE: Final = 10_000
+
+
+@dataclass(frozen=True)
+class Broker:
+    """A broker's address, with the credentials of this process."""
+
+    host: str
+    port: int
+    user: str | None
+    password: str | None
+    tls: bool
+
+    @classmethod
+    def of(cls, url: str) -> Self:
+        """Read an address; raises `ValueError` for an invalid one."""
+        parts = urlsplit(url)
+        if parts.scheme not in {"mqtt", "mqtts"} or not parts.hostname:
+            raise ValueError("the broker's address must look like mqtt://host:1883 or mqtts://user:password@host:8883")
+        tls = parts.scheme == "mqtts"
+        return cls(
+            host=parts.hostname,
+            port=parts.port or (8883 if tls else 1883),
+            user=unquote(parts.username) if parts.username else None,
+            password=unquote(parts.password) if parts.password else None,
+            tls=tls,
+        )
+
+    def __str__(self) -> str:
+        return f"{self.host}:{self.port}"
+
+    def client(self, identifier: str, will: aiomqtt.Will | None) -> aiomqtt.Client:
+        """Return a client of this broker that is not connected yet."""
+        client = aiomqtt.Client(
+            self.host,
+            self.port,
+            username=self.user,
+            password=self.password,
+            identifier=identifier,
+            protocol=aiomqtt.ProtocolVersion.V5,
+            clean_start=True,
+            will=will,
+            timeout=_TIMEOUT_S,
+            keepalive=_KEEPALIVE_S,
+            max_queued_incoming_messages=_QUEUE,
+            tls_context=ssl.create_default_context() if self.tls else None,
+        )
+        client.pending_calls_threshold = 1000
+        return client

@@ -1,0 +1,106 @@
+"""The subscriptions of one MQTT connection: their topics, and the delivery of messages to their handlers."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import aiomqtt
+
+from fog_contracts.channels import Channel
+from fog_contracts.codec import ContractError, decode, decode_text
+from fog_contracts.handlers import RefusedMessageError
+from fog_contracts.messages import Message
+from fog_runtime import logs, metrics
+from fog_runtime.clock import Clock
+
+Ids = dict[str, str]
+
+_log = logs.get("mqtt_edge")
+
+
+@dataclass
+class _Subscription:
+    channel: Channel
+    handler: Callable[[Ids, Any], object]
+    kind: type[Message] | None
+    topics: list[str]
+
+
+class Subscriptions:
+    """All handlers of one process, whether it is connected or not."""
+
+    def __init__(self, clock: Clock, *, site: str) -> None:
+        self._clock = clock
+        self._site = site
+        self._subscriptions: list[_Subscription] = []
+        self._limited = logs.RateLimited(_log)
+
+    def add(
+        self,
+        channel: Channel,
+        handler: Callable[[Ids, Any], object],
+        kind: type[Message] | None,
+        numbers: Sequence[str | int],
+    ) -> None:
+        """Call `handler(ids, message)` for each message of the channel, as `MqttEdge.on` says."""
+        if channel.transport != "mqtt" or channel.message is not kind:
+            expected = channel.message.__name__ if channel.message else "text"
+            raise ValueError(f"channel {channel.name} carries {expected} over {channel.transport}")
+        if "number" in channel.fields:
+            topics = [channel.key(number=str(number)) for number in numbers]
+        else:
+            topics = [channel.pattern(**({"site": self._site} if "site" in channel.fields else {}))]
+        self._subscriptions.append(_Subscription(channel, handler, kind, topics))
+
+    def add_topic(self, channel: Channel, topic: str) -> bool:
+        """Give the channel's handlers one more topic; return whether any of them did not have it yet."""
+        without = [one for one in self._subscriptions if one.channel == channel and topic not in one.topics]
+        for subscription in without:
+            subscription.topics.append(topic)
+        return bool(without)
+
+    def qos_by_topic(self) -> dict[str, int]:
+        """Return every topic to subscribe to, with its quality of service."""
+        return {topic: one.channel.qos for one in self._subscriptions for topic in one.topics}
+
+    def deliver(self, message: aiomqtt.Message) -> None:
+        """Pass a message to the handlers of its channel; count and log it when it breaks the channel's contract."""
+        topic = message.topic.value
+        for subscription in self._subscriptions:
+            channel = subscription.channel
+            ids = channel.match(topic)
+            if ids is None:
+                if any(message.topic.matches(pattern) for pattern in subscription.topics):
+                    self._refuse(channel, topic, "the ids in the topic are malformed")
+                continue
+            ids.pop("site", None)  # always this process's own site
+            data = message.payload
+            if message.retain and not channel.retained:
+                # It may be years old; a stale reading must never be used as a fresh one.
+                self._refuse(
+                    channel, topic, "retained, but this channel's messages never are: delete it from the broker"
+                )
+                continue
+            if channel.retained and not data:
+                continue  # a retained message was deleted
+            try:
+                content = (
+                    decode_text(channel, data)
+                    if subscription.kind is None
+                    else decode(channel, data, subscription.kind)
+                )
+            except ContractError as error:
+                self._refuse(channel, topic, error.reason)
+                continue
+            metrics.RECEIVED.labels(channel.name).inc()
+            try:
+                subscription.handler(ids, content)
+            except RefusedMessageError as error:
+                self._refuse(channel, topic, str(error))
+            except Exception as error:  # noqa: BLE001  # one message must not end the process; the bug is logged
+                metrics.HANDLER_ERRORS.labels(channel.name).inc()
+                _log.error("handler_failed", error=error, channel=channel.name, topic=topic)
+
+    def _refuse(self, channel: Channel, topic: str, reason: str) -> None:
+        metrics.REFUSED.labels(channel.name).inc()
+        self._limited.warning("message_refused", channel.name, self._clock.now(), topic=topic, reason=reason)

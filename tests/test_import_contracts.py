@@ -263,7 +263,7 @@ def test_forbidden_import_breaks_a_contract(copied_sources: Path, file: str, imp
 PLANTED_TYPES = {
     "a core names its store": ("services/planner/src/planner/core.py", "planner.store", "Store", "planner:"),
     "a pure module names a type of an edge": (
-        "sim/src/fognav_sim/scenario.py", "fog_runtime.clock", "Clock", "fognav_sim.scenario",
+        "sim/src/fognav_sim/barrier.py", "fog_runtime.clock", "Clock", "fognav_sim.barrier",
     ),
     "generic code names a concrete type": (
         "robot-agent/src/robot_agent/guardian/process.py", "robot_agent.bases.roomba600.driver", "FACTORY",

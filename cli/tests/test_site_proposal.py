@@ -18,8 +18,8 @@ from fog_runtime.site import load_site
 from fognav.output import WrongUseError
 from fognav.site_command import check_site, identifier, new_site
 from fognav.site_proposal import NoSiteError, propose
+from fognav_sim.barrier import barrier_across
 from fognav_sim.drive.hazard import draw_hazard
-from fognav_sim.scenario import barrier_across
 
 RESOLUTION = 0.05
 

@@ -10,8 +10,8 @@ import pytest
 from fog_contracts.geometry import contains_point
 from fog_runtime.site import load_site
 from fognav_experiments.lockstep import run_lockstep
+from fognav_sim.barrier import BarrierError
 from fognav_sim.drive.hazard import HazardRequest
-from fognav_sim.scenario import ScenarioError
 
 ESTIG = Path(__file__).parents[2] / "sites" / "estig"
 _spec = importlib.util.spec_from_file_location("ring_site", Path(__file__).parent / "ring_site.py")
@@ -95,5 +95,5 @@ def test_same_seed_repeats_the_drive_exactly_and_another_seed_changes_it(warned,
 
 
 def test_unknown_area_is_refused_with_the_known_ones():
-    with pytest.raises(ScenarioError, match="no area 'z9'; it has: z1"):
+    with pytest.raises(BarrierError, match="no area 'z9'; it has: z1"):
         drive(1, HazardRequest(area="z9"))

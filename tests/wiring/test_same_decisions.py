@@ -41,7 +41,7 @@ from fog_contracts.messages import (
 )
 from fog_contracts.site import AreaSite
 from fognav_experiments.rigs import OPERATOR_KEY, System, moment
-from fognav_sim.scenario import barrier_across
+from fognav_sim.barrier import barrier_across
 from hazard_aggregator.core import Aggregator
 from hazard_aggregator.fusion import AreaFusion
 from hazard_aggregator.registry import find_rule

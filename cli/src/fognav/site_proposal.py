@@ -22,7 +22,7 @@ from fog_kernels.astar import Planner
 from fog_kernels.distance import squared_distance_capped
 from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.raycast import cast
-from fognav_sim.scenario import ScenarioError, barrier_across
+from fognav_sim.barrier import BarrierError, barrier_across
 
 PLACE_CLEARANCE_M: Final = 0.45
 DRIVE_M: Final = (15.0, 60.0)
@@ -244,7 +244,7 @@ def _can_be_closed(floor: _Floor, area: AreaSite, node: NodeSite) -> bool:
     try:
         for seed in range(_BARRIERS):
             barrier_across(area, alone, static, seed)
-    except ScenarioError:
+    except BarrierError:
         return False
     return True
 

@@ -24,11 +24,11 @@ from fog_contracts.stages import SPANS, durations_ms
 from fog_runtime.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fog_runtime.site import load_site
 from fognav_experiments.rigs import STAMP, System
+from fognav_sim.barrier import BarrierError
 from fognav_sim.drive.drive import Drive, DriveSummary
 from fognav_sim.drive.evaluation import DriveOutcome
 from fognav_sim.drive.hazard import HazardRequest, HazardSchedule
 from fognav_sim.drive.operator import OperatorPolicy
-from fognav_sim.scenario import ScenarioError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -295,7 +295,7 @@ def run_lockstep(  # noqa: PLR0913  # the options of a run
     With `hazard` a barrier blocks an area, as in a demonstration: which one and after which distance the seed draws,
     unless they are requested, and never within 3 m of the robot. Without `watched` the site has neither areas nor
     nodes: the robot's own lidar must find the barrier. `base` and `lidar` name the robot's hardware, `bus` carries the
-    messages (default: a new one). Raises `ScenarioError` for an unknown area, one that no barrier can close, or if no
+    messages (default: a new one). Raises `BarrierError` for an unknown area, one that no barrier can close, or if no
     area qualifies, `ValueError` for a start inside an obstacle.
     """
     pose = msgspec.convert(
@@ -343,7 +343,7 @@ def main() -> None:
     hazard = None if arguments.no_hazard else HazardRequest(area=arguments.area)
     try:
         result = run_lockstep(site, start, goal, arguments.seed, hazard)
-    except ScenarioError as error:
+    except BarrierError as error:
         parser.error(str(error))
     printed = msgspec.to_builtins(result)
     if not arguments.track:

@@ -6,8 +6,8 @@ from hypothesis import strategies as st
 
 from fog_contracts.messages import SimObstacle
 from fog_contracts.site import AreaSite, DemoPlan, NodeSite, Site, Sonar
+from fognav_sim.barrier import KEEP_AWAY_M, BarrierError
 from fognav_sim.drive.hazard import HazardSchedule, draw_hazard, draw_trigger, entry_distance, is_clear_of_robot
-from fognav_sim.scenario import KEEP_AWAY_M, ScenarioError
 
 PATH = [(0.0, 0.0), (10.0, 0.0), (30.0, 0.0)]
 
@@ -44,9 +44,9 @@ def test_area_beside_the_path_has_no_entry_distance() -> None:
 
 def test_area_that_no_barrier_can_close_is_refused_with_the_reason() -> None:
     def no_barrier(area: AreaSite) -> SimObstacle:
-        raise ScenarioError(f"area {area.id}: no barrier fits")
+        raise BarrierError(f"area {area.id}: no barrier fits")
 
-    with pytest.raises(ScenarioError, match="z1: no barrier fits"):
+    with pytest.raises(BarrierError, match="z1: no barrier fits"):
         draw_hazard(site(("z1", 12.0)), PATH, 1, no_barrier)
 
 
@@ -69,7 +69,7 @@ def test_every_area_on_the_path_is_drawn_by_some_seed() -> None:
 
 
 def test_path_that_crosses_no_area_is_refused_with_the_reason() -> None:
-    with pytest.raises(ScenarioError, match="does not cross far"):
+    with pytest.raises(BarrierError, match="does not cross far"):
         draw_hazard(site(("far", 60.0)), PATH, 1, fill_area)
 
 

@@ -5,9 +5,9 @@ from fog_runtime.clock import Clock
 from fognav.demo.operator import Operator
 from fognav.demo.scene import Scene
 from fognav.output import WrongUseError
+from fognav_sim.barrier import BarrierError
 from fognav_sim.drive.drive import Drive
 from fognav_sim.drive.hazard import PlannedHazard
-from fognav_sim.scenario import ScenarioError
 
 
 class HazardPlacement:
@@ -30,7 +30,7 @@ class HazardPlacement:
         """Place the barrier if it is due; raises `WrongUseError` if no area on the robot's path qualifies."""
         try:
             due = self._drive.hazard_due()
-        except ScenarioError as error:
+        except BarrierError as error:
             raise WrongUseError(str(error)) from error
         planned = self._drive.hazard.planned if self._drive.hazard is not None else None
         if planned is not None and planned.area.id != self._announced_area:

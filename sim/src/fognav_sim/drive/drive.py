@@ -93,7 +93,7 @@ class Drive:
         self.evaluation.on_path(path, now)
 
     def hazard_due(self) -> PlannedHazard | None:
-        """Return the hazard whose barrier is to be placed now, or None; raises `ScenarioError` if no area qualifies."""
+        """Return the hazard whose barrier is to be placed now, or None; raises `BarrierError` if no area qualifies."""
         if self.hazard is None or self.blocked_at_m is not None or not self._path:
             return None
         return self.hazard.due(self._path, self.evaluation.distance_m, (self._truth.x, self._truth.y))

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 from fog_contracts.geometry import contains_point, distance_to_polygon
 from fog_contracts.messages import SimObstacle
 from fog_contracts.site import AreaSite
-from fognav_sim.scenario import KEEP_AWAY_M, ScenarioError, barrier_across
+from fognav_sim.barrier import KEEP_AWAY_M, BarrierError, barrier_across
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -27,7 +27,7 @@ BRAKING_ROOM_M: Final = 1.0
 _STEP_M: Final = 0.05
 
 MakeBarrier = Callable[[AreaSite], SimObstacle]
-"""Makes a barrier that closes an area; raises `ScenarioError` if none fits."""
+"""Makes a barrier that closes an area; raises `BarrierError` if none fits."""
 
 
 class SiteWithMap(Protocol):
@@ -89,7 +89,7 @@ def draw_hazard(
     """Draw the area that becomes blocked, among the demo's areas that the path crosses, and when.
 
     The barrier appears early enough that the robot is still away from the area, after `trigger_m` metres at the latest
-    if that is given. Raises `ScenarioError` if no area qualifies; the message gives the reason for each.
+    if that is given. Raises `BarrierError` if no area qualifies; the message gives the reason for each.
     """
     wanted = site.demo.areas if site.demo else []
     known = {area.id: area for area in site.areas}
@@ -110,11 +110,11 @@ def draw_hazard(
             continue
         try:
             candidates.append(PlannedHazard(area, make_barrier(area), min(trigger, latest)))
-        except ScenarioError as error:
+        except BarrierError as error:
             reasons.append(str(error))
     if not candidates:
         reason = "; ".join(reasons) or "[demo] of site.toml lists no areas"
-        raise ScenarioError(f"no area can be blocked on this path: {reason}. Choose other areas, or use --no-hazard")
+        raise BarrierError(f"no area can be blocked on this path: {reason}. Choose other areas, or use --no-hazard")
     return generator.choice(candidates)
 
 
@@ -130,7 +130,7 @@ class HazardSchedule:
     """
 
     def __init__(self, site: Site, seed: int, make_barrier: MakeBarrier, request: HazardRequest | None = None) -> None:
-        """Prepare the drawing; raises `ScenarioError` for a requested area that the site lacks or that can't be closed.
+        """Prepare the drawing; raises `BarrierError` for a requested area that the site lacks or that can't be closed.
 
         `request` asks for an area or a distance; by default both are drawn.
         """
@@ -147,14 +147,14 @@ class HazardSchedule:
         return cls(site.site, seed, lambda area: barrier_across(area, site.site, site.map, seed), request)
 
     def draw(self, path: Sequence[Point]) -> PlannedHazard:
-        """Draw the hazard for a path, replacing any earlier one; raises `ScenarioError`."""
+        """Draw the hazard for a path, replacing any earlier one; raises `BarrierError`."""
         self.planned = self._fixed or draw_hazard(
             self._site, path, self._seed, self._make_barrier, trigger_m=self._request.trigger_m
         )
         return self.planned
 
     def due(self, path: Sequence[Point], travelled_m: float, robot: Point) -> PlannedHazard | None:
-        """Return the hazard whose barrier is to be placed now, or None while it is too early; raises `ScenarioError`.
+        """Return the hazard whose barrier is to be placed now, or None while it is too early; raises `BarrierError`.
 
         `path` is the robot's path from here on, `travelled_m` the distance that it has driven, `robot` its true
         position (m).
@@ -178,4 +178,4 @@ class HazardSchedule:
                     area, self._make_barrier(area), draw_trigger(self._seed) if trigger is None else trigger
                 )
         known = ", ".join(area.id for area in self._site.areas)
-        raise ScenarioError(f"the site has no area {area_id!r}; it has: {known}")
+        raise BarrierError(f"the site has no area {area_id!r}; it has: {known}")

@@ -14,7 +14,7 @@ from fog_contracts.messages import Pose
 from fog_contracts.site import AreaSite, NodeSite, RobotSite, Site, Sonar
 from fog_kernels.astar import Planner
 from fog_kernels.inflation import inflate, inflation_table
-from fognav_sim.scenario import ScenarioError, barrier_across
+from fognav_sim.barrier import BarrierError, barrier_across
 from fognav_sim.world import World
 
 RES = 0.05
@@ -83,5 +83,5 @@ def test_same_seed_places_the_same_barrier():
 
 def test_area_without_room_for_a_barrier_is_named_in_the_error():
     static, floor = corridor(2.4, door=1.5), site(2.4)
-    with pytest.raises(ScenarioError, match="area z1: no barrier fits"):
+    with pytest.raises(BarrierError, match="area z1: no barrier fits"):
         barrier_across(floor.areas[0], floor, static, seed=1)

@@ -35,15 +35,15 @@ _MAX_RAY_M: Final = 20.0
 _ATTEMPTS: Final = 40
 
 
-class ScenarioError(ValueError):
-    """A scenario that is impossible on this site; the message gives the reason."""
+class BarrierError(ValueError):
+    """No barrier can be placed as wanted on this site; the message gives the reason."""
 
 
 def barrier_across(area: AreaSite, site: Site, static: StaticMap, seed: int, *, name: str = "barrier") -> SimObstacle:
     """Return a box inside the area that a robot can't pass and that the area's nodes see.
 
     It spans the corridor along the beam of one of the area's nodes, from just in front of the node to the opposite wall
-    (in an area without nodes, along its narrowest direction), without entering a wall. Raises `ScenarioError` if the
+    (in an area without nodes, along its narrowest direction), without entering a wall. Raises `BarrierError` if the
     area has no such place.
     """
     generator = np.random.default_rng((seed, *area.id.encode()))
@@ -57,7 +57,7 @@ def barrier_across(area: AreaSite, site: Site, static: StaticMap, seed: int, *, 
             box = _at_narrowest(area, static, thickness, float(generator.uniform(0.35, 0.65)))
         if box is not None and all(contains_point(area.polygon, *_shrunk(box, corner)) for corner in box):
             return SimObstacle(id=name, polygon=box, height=BARRIER_HEIGHT_M)
-    raise ScenarioError(
+    raise BarrierError(
         f"area {area.id}: no barrier fits from wall to wall with gaps up to {_MAX_GAP_M} m: choose another area"
     )
 

@@ -4,7 +4,6 @@ import asyncio
 import hashlib
 import os
 import subprocess
-import sys
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import AsyncExitStack, asynccontextmanager
@@ -12,6 +11,7 @@ from pathlib import Path
 
 import httpx
 import numpy as np
+import programs
 import pytest
 
 from fog_contracts.grid import GridGeometry, StaticMap
@@ -41,6 +41,8 @@ sonars = [{ range_limit = 1.5, no_echo_is_clear = true }, { angle = 0.2, range_l
 """
 OPERATOR_TOKEN = "operator-token"
 VIEWER_TOKEN = "viewer-token"
+DEADLINE_S = 60.0
+"""For any wait, which ends with what it waits for: long, because a busy machine may be ten times slower."""
 
 
 class Fog:
@@ -75,19 +77,14 @@ class Fog:
             # Short, because many tests start no aggregator.
             "FOGNAV_HAZARDS_WAIT_S": "0.3",
         }
-        self.processes: dict[str, subprocess.Popen[bytes]] = {}
+        self.processes: dict[str, programs.Program] = {}
 
     def start(self, module: str) -> None:
-        """Start `python -m module`; may be called again after a kill."""
+        """Start a program, as `python -m module` would; may be called again after a kill."""
         port_file = self.folder / f"{module}.port"
         port_file.unlink(missing_ok=True)
-        with (self.folder / f"{module}.log").open("ab") as log:
-            self.processes[module] = subprocess.Popen(
-                [sys.executable, "-m", module],
-                env={**self.environment, "FOGNAV_PORT_FILE": str(port_file)},
-                stdout=log,
-                stderr=log,
-            )
+        environment = {**self.environment, "FOGNAV_PORT_FILE": str(port_file)}
+        self.processes[module] = programs.start(module, environment, self.folder / f"{module}.log")
 
     def kill(self, module: str) -> None:
         """Kill a process, as a crash would."""
@@ -102,14 +99,19 @@ class Fog:
     async def url(self, module: str) -> str:
         """Return the URL of a process's REST API once it listens."""
         port_file = self.folder / f"{module}.port"
-        await until(port_file.exists, f"{module} listens", lambda: self.log(module))
+
+        def listens() -> bool:
+            assert self.processes[module].poll() is None, f"{module} has ended:\n{self.log(module)}"
+            return port_file.exists()
+
+        await until(listens, f"{module} listens")
         return f"http://127.0.0.1:{port_file.read_text().strip()}"
 
     async def ready(self, module: str) -> str:
         """Return the URL of a process's REST API once it is ready."""
         url = await self.url(module)
         async with httpx.AsyncClient() as client:
-            deadline = time.monotonic() + 15
+            deadline = time.monotonic() + DEADLINE_S
             while (answer := await client.get(f"{url}/readyz")).status_code != 200:
                 assert time.monotonic() < deadline, (answer.text, self.log(module))
                 await asyncio.sleep(0.05)
@@ -145,10 +147,10 @@ class Fog:
 
 
 async def until(condition: Callable[[], object], expected: str, details: Callable[[], str] = str) -> None:
-    """Wait until a condition is true; after 15 s, fail with what was `expected` and the `details`."""
-    deadline = time.monotonic() + 15.0
+    """Wait until a condition is true; after the deadline, fail with what was `expected` and the `details`."""
+    deadline = time.monotonic() + DEADLINE_S
     while not condition():
-        assert time.monotonic() < deadline, f"not within 15 s: {expected}\n{details()}"
+        assert time.monotonic() < deadline, f"not within {DEADLINE_S:.0f} s: {expected}\n{details()}"
         await asyncio.sleep(0.01)
 
 

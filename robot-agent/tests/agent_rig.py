@@ -10,7 +10,6 @@ import json
 import math
 import os
 import subprocess
-import sys
 import threading
 import time
 import urllib.error
@@ -20,6 +19,7 @@ from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
 import numpy as np
+import programs
 from guardian_rig import DEADLINE_S, Base, Watchdog
 from little_world import KEY, L_PATH, L_ROOMS, grid_of
 
@@ -164,7 +164,7 @@ class Fog:
 
 
 class AgentProcess:
-    """`python -m robot_agent`."""
+    """The agent, as `python -m robot_agent` starts it."""
 
     def __init__(self, folder: Path, router: str, watchdog: Watchdog, body: Body, start=(2.0, 2.0, 0.0)) -> None:
         self.log_file = folder / "agent.log"
@@ -190,7 +190,7 @@ class AgentProcess:
             "FOGNAV_SEED": "1",
             "FOGNAV_INPUT_LOG": str(self.input_log),
         }
-        self.process: subprocess.Popen[bytes] | None = None
+        self.process: programs.Program | None = None
 
     def __enter__(self):
         self.start()
@@ -198,10 +198,7 @@ class AgentProcess:
 
     def start(self) -> None:
         self._port_file.unlink(missing_ok=True)
-        with self.log_file.open("ab") as log:
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", "robot_agent"], env=self._environment, stderr=log, stdout=log
-            )
+        self.process = programs.start("robot_agent", self._environment, self.log_file)
 
     def __exit__(self, *_):
         if self.process.poll() is None:

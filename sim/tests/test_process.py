@@ -5,12 +5,12 @@ import contextlib
 import json
 import os
 import signal
-import sys
 import time
 import urllib.request
 from pathlib import Path
 
 import numpy as np
+import programs
 import pytest
 
 from fog_contracts import channels as ch
@@ -59,7 +59,7 @@ class Rig:
         self.readings, self.availability, self.truths = [], [], []
         self.edge = None
 
-    async def spawn(self, speed):
+    def start(self, speed):
         values = {
             "SITE_DIR": self.folder / "site",
             "DATA_DIR": self.folder,
@@ -71,7 +71,7 @@ class Rig:
             "SPEED": speed,
         }
         environment = os.environ | {f"FOGNAV_{key}": str(value) for key, value in values.items()}
-        return await asyncio.create_subprocess_exec(sys.executable, "-m", "fognav_sim", env=environment)
+        return programs.start("fognav_sim", environment, self.folder / "sim.log")
 
     async def send_command(self, **command):
         return await self.edge.query(ch.SIM_COMMAND, SimCommand(**command), CommandReply, 5.0, robot="r1")
@@ -103,14 +103,13 @@ async def simulator(folder: Path, speed=1):
         async with ZenohEdge.open(connect=[router.endpoint], clock=clock, role="test", id="t", site="lab") as rig.edge:
             rig.edge.subscribe(ch.SIM_TRUTH, SimTruth, lambda _, truth: rig.truths.append(truth), robot="r1")
             await mqtt.wait_connected()
-            process = await rig.spawn(speed)
+            process = rig.start(speed)
             try:
                 await until(lambda: rig.truths and rig.readings, "the simulator came up")
                 yield rig, process
             finally:
-                if process.returncode is None:
-                    process.kill()
-                await process.wait()
+                process.kill()
+                process.wait()
                 listening.cancel()
                 await asyncio.gather(listening, return_exceptions=True)
 
@@ -132,7 +131,7 @@ async def test_drive_commands_move_the_robot_and_the_ground_truth_shows_it(tmp_p
             os.close(base)
         assert rig.truths[-1].sustained_speed == pytest.approx(1.0, abs=0.2)
         process.send_signal(signal.SIGTERM)
-        assert await process.wait() == 0
+        assert await asyncio.to_thread(process.wait) == 0
         assert not (rig.run / "base").exists()
     log = rig.log()
     assert any(line["left"] == 0.2 for line in log)

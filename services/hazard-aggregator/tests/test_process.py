@@ -110,7 +110,7 @@ async def test_without_redis_danger_is_announced_and_relief_waits(fog, until):
         await node.read(0.8, 5)
         await until(lambda: node.state == "blocked", "blocked without the store")
         await node.read(3.0, 5)
-        async with asyncio.timeout(15):
+        async with asyncio.timeout(60):
             for _ in iter(int, 1):
                 if "fognav_hazards_withheld 1.0" in (await client.get(f"{url}/metrics")).text:
                     break

@@ -31,7 +31,7 @@ CIRCLE = {"kind": "BLOCKED", "shape": {"type": "circle", "centre": [6.0, 3.0], "
 
 async def poll(request, accepted):
     """Repeat a request until its reply is accepted, and return that reply."""
-    async with asyncio.timeout(15):
+    async with asyncio.timeout(60):
         while True:
             reply = await request()
             if accepted(reply):
@@ -75,7 +75,7 @@ async def running(fog, *modules: str):
     url = await fog.ready("map_service")
     async with (
         fog.edges() as (mqtt, zenoh, connect),
-        httpx.AsyncClient(base_url=url, timeout=15) as client,
+        httpx.AsyncClient(base_url=url, timeout=60) as client,
     ):
         robot = Robot(zenoh)
         connect()
@@ -197,7 +197,7 @@ async def test_invalid_zone_is_refused_naming_its_field(client, tokens):
 @pytest.fixture
 async def client(shared_fog):
     url = await shared_fog.ready("map_service")
-    async with httpx.AsyncClient(base_url=url, timeout=15) as client:
+    async with httpx.AsyncClient(base_url=url, timeout=60) as client:
         yield client
 
 

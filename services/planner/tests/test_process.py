@@ -2,8 +2,6 @@
 
 import asyncio
 import os
-import subprocess
-import sys
 import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
@@ -11,6 +9,7 @@ from pathlib import Path
 
 import httpx
 import numpy as np
+import programs
 import pytest
 
 from fog_contracts import channels as ch
@@ -65,6 +64,8 @@ free_thresh: 0.196
 """
 OPERATOR = {"Authorization": "Bearer operator-token"}
 VIEWER = {"Authorization": "Bearer viewer-token"}
+DEADLINE_S = 60.0
+"""For any wait, which ends with what it waits for."""
 UPPER = [(9.0, 10.0), (11.0, 10.0), (11.0, 12.0), (9.0, 12.0)]
 
 
@@ -100,7 +101,7 @@ class Environment:
         self.master = MasterMap("test", self.geometry, self.static, inflate(self.static, self.table), 5)
         self.paths: list[RobotPath] = []
         self.goals: list[RobotGoal] = []
-        self.process: subprocess.Popen[bytes] | None = None
+        self.process: programs.Program | None = None
         edge.serve(ch.MAP_SNAPSHOT, lambda _ids, _request: self.master.snapshot())
         edge.subscribe(ch.ROBOT_PATH, RobotPath, lambda _, path: self.paths.append(path), robot="r1")
         edge.subscribe(ch.ROBOT_GOAL, RobotGoal, lambda _, goal: self.goals.append(goal), robot="r1")
@@ -116,26 +117,25 @@ class Environment:
             "FOGNAV_PORT_FILE": str(port_file),
             "FOGNAV_TOKENS_FILE": str(self.folder / "tokens.toml"),
         }
-        with (self.folder / "planner.log").open("ab") as log:
-            self.process = subprocess.Popen([sys.executable, "-m", "planner"], env=environ, stdout=log, stderr=log)
+        self.process = programs.start("planner", environ, self.folder / "planner.log")
 
     def stop(self, *, kill: bool = False) -> int:
         assert self.process
         (self.process.kill if kill else self.process.terminate)()
-        return self.process.wait(10)
+        return self.process.wait(DEADLINE_S)
 
     @asynccontextmanager
     async def ready(self) -> AsyncIterator[httpx.AsyncClient]:
         port_file = self.folder / "port"
         await self.until(port_file.exists)
         async with httpx.AsyncClient(base_url=f"http://127.0.0.1:{port_file.read_text().strip()}") as client:
-            deadline = time.monotonic() + 15.0
+            deadline = time.monotonic() + DEADLINE_S
             while (answer := await client.get("/readyz")).status_code != 200:
                 assert time.monotonic() < deadline, answer.text
                 await asyncio.sleep(0.05)
             yield client
 
-    async def until(self, condition: Callable[[], object], seconds: float = 15.0) -> None:
+    async def until(self, condition: Callable[[], object], seconds: float = DEADLINE_S) -> None:
         deadline = time.monotonic() + seconds
         while not condition():
             assert time.monotonic() < deadline, (self.folder / "planner.log").read_text()[-3000:]
@@ -283,7 +283,7 @@ async def test_queries_are_answered_over_zenoh_and_http_without_side_effects(tmp
             request = EgressRequest(robot="r1", pose=Pose(x=9.5, y=11.0, theta=0.0))
             return await env.edge.query(ch.PLANNER_EGRESS, request, PlanReply, 5.0)
 
-        deadline = time.monotonic() + 10.0
+        deadline = time.monotonic() + DEADLINE_S
         while not (out := await query_egress()) or len(out.points) < 5:
             assert time.monotonic() < deadline, out
             await asyncio.sleep(0.05)

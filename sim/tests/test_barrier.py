@@ -15,6 +15,7 @@ from fog_contracts.site import AreaSite, NodeSite, RobotSite, Site, Sonar
 from fog_kernels.astar import Planner
 from fog_kernels.inflation import inflate, inflation_table
 from fognav_sim.barrier import BarrierError, barrier_across
+from fognav_sim.floor import Floor
 from fognav_sim.world import World
 
 RES = 0.05
@@ -65,7 +66,7 @@ def test_barrier_closes_the_corridor_inside_its_area_without_entering_a_wall(wid
 
 def test_node_of_the_area_gets_an_echo_from_the_barrier():
     static, floor = corridor(2.4), site(2.4)
-    world = World(static.geometry, static.cells, floor.robots[0], seed=1)
+    world = World(Floor(static.geometry, static.cells), floor.robots[0], seed=1, axle_m=0.3)
     free = [world.sonar(floor.nodes[0], index) for index in (0, 1)]
     world.place(barrier_across(floor.areas[0], floor, static, seed=5))
     blocked = [world.sonar(floor.nodes[0], index) for index in (0, 1)]

@@ -9,6 +9,7 @@ from fog_contracts.grid import GridGeometry
 from fog_contracts.messages import Pose
 from fog_contracts.site import RobotSite
 from fognav_sim import devices
+from fognav_sim.floor import Floor
 from fognav_sim.hardware import Hardware, Line
 from fognav_sim.world import World
 
@@ -23,7 +24,7 @@ def hall():
     geometry = GridGeometry(120, 80, 0.05, 0.0, 0.0)
     cells = np.zeros(geometry.shape, np.uint8)
     cells[:2], cells[-2:], cells[:, :2], cells[:, -2:] = 254, 254, 254, 254
-    return World(geometry, cells, RobotSite(id="r1", start=Pose(x=1.0, y=2.0, theta=0.0)), seed=1)
+    return World(Floor(geometry, cells), RobotSite(id="r1", start=Pose(x=1.0, y=2.0, theta=0.0)), seed=1, axle_m=0.235)
 
 
 def hardware_in(world, start=0.0, **more):

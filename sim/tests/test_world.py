@@ -11,12 +11,15 @@ from fog_contracts.geometry import GeometryError
 from fog_contracts.grid import GridGeometry
 from fog_contracts.messages import Pose, SimObstacle
 from fog_contracts.site import NodeSite, RobotSite, Sonar
-from fognav_sim.world import Noise, World
+from fognav_sim.floor import Floor
+from fognav_sim.sensors import Noise
+from fognav_sim.world import World
 
 IDEAL = Noise(
     wheel_diameter=0.0, slip=0.0, range_sigma=0.0, range_share=0.0, lidar_dropout=0.0, sonar_sigma=0.0, sonar_spike=0.0
 )
 WALL = 0.2
+AXLE_M = 0.3
 
 
 def hall(x=2.0, y=2.0, theta=0.0, *, noise=IDEAL, seed=1, wheel_lag=0.0):
@@ -25,7 +28,7 @@ def hall(x=2.0, y=2.0, theta=0.0, *, noise=IDEAL, seed=1, wheel_lag=0.0):
     cells = np.zeros(geometry.shape, np.uint8)
     cells[:4], cells[-4:], cells[:, :4], cells[:, -4:] = 254, 254, 254, 254
     robot = RobotSite(id="r1", start=Pose(x=x, y=y, theta=theta))
-    return World(geometry, cells, robot, seed, noise=noise, wheel_lag=wheel_lag)
+    return World(Floor(geometry, cells), robot, seed, axle_m=AXLE_M, noise=noise, wheel_lag=wheel_lag)
 
 
 def box(left, bottom, right, top, height=1.0, name="box"):
@@ -47,7 +50,7 @@ def run(world, seconds, left, right):
 def test_constant_wheel_speeds_drive_the_exact_arc(v, w, theta):
     world = hall(3.0, 2.0, theta)
     seconds = 2.0
-    run(world, seconds, v - 0.1175 * w, v + 0.1175 * w)
+    run(world, seconds, v - AXLE_M / 2 * w, v + AXLE_M / 2 * w)
     turn = w * seconds
     chord = v * seconds * (math.sin(turn / 2) / (turn / 2) if abs(turn) > 1e-9 else 1.0)
     x, y, heading = world.pose
@@ -159,7 +162,7 @@ def test_lidar_gets_no_return_beyond_twelve_metres():
     cells = np.zeros(geometry.shape, np.uint8)
     cells[:, -4:] = 254
     robot = RobotSite(id="r1", start=Pose(x=7.0, y=2.0, theta=0.0))
-    world = World(geometry, cells, robot, 1, noise=IDEAL)
+    world = World(Floor(geometry, cells), robot, 1, axle_m=AXLE_M, noise=IDEAL)
     assert np.isnan(world.lidar(np.zeros(1), 0.0)[0])
     world.kidnap(Pose(x=8.0, y=2.0, theta=0.0))
     assert world.lidar(np.zeros(1), 0.0)[0] == pytest.approx(11.8)

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from fog_contracts.messages import AreaState, HazardArea, Pose, RobotPath, RobotPose, RobotState, SimTruth, Trace
     from fog_contracts.site import Place
     from fog_runtime.site import LoadedSite
-    from fognav_sim.world import Noise
+    from fognav_sim.sensors import Noise
 
 WARM_UP_S: Final = 12.0
 """Time within which all areas must be known, the robot localized and enabled."""

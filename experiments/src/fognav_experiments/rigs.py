@@ -16,6 +16,7 @@ from fog_contracts.messages import CommandReply
 from fog_runtime.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fognav_experiments.processes import AgentProcess, Fog
 from fognav_sim import devices
+from fognav_sim.floor import Floor
 from fognav_sim.hardware import STEP_S, Hardware
 from fognav_sim.node import SonarNode
 from fognav_sim.world import World
@@ -38,7 +39,8 @@ if TYPE_CHECKING:
     from fog_contracts.messages import CommandKind
     from fog_contracts.site import RobotSite
     from fog_runtime.site import LoadedSite
-    from fognav_sim.world import Noise
+    from fognav_sim.emulators import BaseEmulator
+    from fognav_sim.sensors import Noise
     from robot_agent.config import AgentConfig
 
 STAMP: Final = 1_700_000_000.0
@@ -67,6 +69,7 @@ class RobotRig:
         site: LoadedSite,
         robot: RobotSite,
         world: World,
+        base_emulator: BaseEmulator,
         bus: Bus,
         seed: int,
         start: float,
@@ -75,12 +78,14 @@ class RobotRig:
         lidar: str = DEFAULT_LIDAR,
         make_agent: Callable[[AgentConfig, int], AgentCore] = AgentCore,
     ) -> None:
-        """Assemble the robot; `base` and `lidar` name its drivers and their emulators."""
+        """Assemble the robot around its emulated base; `base` names its driver, `lidar` driver and emulator."""
         self.id = robot.id
         self._bus = bus
         driver, self._lidar_driver = make_base(base), make_lidar(lidar)
-        emulators = devices.make_base(base), devices.make_lidar(lidar, world.lidar)
-        self.hardware = Hardware(world, *emulators, start, initial_wheel_travel_m=_INITIAL_WHEEL_TRAVEL_M)
+        lidar_emulator = devices.make_lidar(lidar, world.lidar)
+        self.hardware = Hardware(
+            world, base_emulator, lidar_emulator, start, initial_wheel_travel_m=_INITIAL_WHEEL_TRAVEL_M
+        )
         self.guardian = GuardianCore(driver)
         config = agent_config(robot.id, OPERATOR_KEY, robot).with_hardware(
             driver.drive_train, self._lidar_driver.traits
@@ -208,10 +213,11 @@ class System:
     ) -> None:
         """Assemble the system; `base` and `lidar` name the robot's hardware."""
         self.bus = bus or Bus(site.site.id)
-        self.world = World(site.map.geometry, site.map.cells, robot, seed, noise=noise)
+        emulator = devices.make_base(base)
+        self.world = World(Floor(site.map.geometry, site.map.cells), robot, seed, axle_m=emulator.axle_m, noise=noise)
         self.fog = FogRig(site, self.world, self.bus, seed, 0.0)
         self.robot = RobotRig(
-            site, robot, self.world, self.bus, seed, 0.0, base=base, lidar=lidar, make_agent=make_agent
+            site, robot, self.world, emulator, self.bus, seed, 0.0, base=base, lidar=lidar, make_agent=make_agent
         )
         self._steps = 0
 

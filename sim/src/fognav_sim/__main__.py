@@ -15,6 +15,7 @@ from fog_runtime.settings import SettingsError, describe, load
 from fog_runtime.site import LoadedSite, load_site
 from fog_runtime.zenoh_edge import ZenohEdge
 from fognav_sim import devices
+from fognav_sim.floor import Floor
 from fognav_sim.hardware import Hardware
 from fognav_sim.live import LiveWorld, VirtualNode, run_nodes
 from fognav_sim.node import SonarNode
@@ -43,8 +44,9 @@ async def main() -> None:
     loaded = load_site(settings.site_dir)
     robot = _find_robot(loaded, settings.robot)
     clock = SystemClock(settings.speed)
-    world = World(loaded.map.geometry, loaded.map.cells, robot, settings.seed)
-    base, lidar = devices.make_base(settings.base), devices.make_lidar(settings.lidar, world.lidar)
+    base = devices.make_base(settings.base)
+    world = World(Floor(loaded.map.geometry, loaded.map.cells), robot, settings.seed, axle_m=base.axle_m)
+    lidar = devices.make_lidar(settings.lidar, world.lidar)
     hardware = Hardware(world, base, lidar, clock.now(), initial_wheel_travel_m=_INITIAL_WHEEL_TRAVEL_M)
     boot = int(clock.stamp())
     health = Health("devices", "zenoh")

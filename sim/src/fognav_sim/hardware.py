@@ -57,7 +57,6 @@ class Hardware:
         self.base = base
         self.lidar = lidar
         base.add_wheel_travel(*initial_wheel_travel_m)
-        world.axle = base.axle_m
         self._base_line, self._lidar_line = Line(base.baud), Line(lidar.baud)
 
     @property

@@ -10,10 +10,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from fog_contracts.messages import AreaState, NodeConfig, NodeReading, SonarStatus
-from fognav_sim.world import SOUND_M_S, World
+from fognav_sim.sensors import SOUND_M_S
 
 if TYPE_CHECKING:
     from fog_contracts.site import NodeSite
+    from fognav_sim.world import World
 
 NO_ECHO_S: Final = 0.036
 """The module ends its pulse after about 38 ms without an echo; the firmware times out just before."""

@@ -1,0 +1,136 @@
+"""What lidar and sonars measure on the simulated floor, with their noise. Pure.
+
+Frames as everywhere: x right, y up, metres, radians.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from fog_contracts.site import NodeSite
+    from fognav_sim.floor import Floor
+
+SOUND_M_S: Final = 343.0
+"""Speed of sound in air at 20 degrees Celsius."""
+SONAR_HALF_CONE: Final = math.radians(7.5)
+SONAR_MIN_M: Final = 0.02
+SONAR_MAX_M: Final = 4.0
+SONAR_RAYS: Final = 16
+SONAR_MAX_INCIDENCE: Final = math.radians(45.0)
+"""Smooth surfaces reflect ultrasound like a mirror: beyond this angle of incidence no echo returns."""
+LIDAR_MIN_M: Final = 0.15
+LIDAR_MAX_M: Final = 12.0
+LIDAR_HEIGHT_M: Final = 0.25
+
+
+@dataclass(frozen=True, kw_only=True)
+class Noise:
+    """Errors of the robot and its sensors; zeros give a perfect world.
+
+    Standard deviations: `wheel_diameter` (share, drawn once per wheel), `slip` (share of the travel, per square root
+    of a metre), lidar `range_sigma` (m) plus `range_share` of the range, `lidar_dropout` (probability per beam),
+    `sonar_sigma` (m), `sonar_spike` (probability of a single outlier).
+    """
+
+    wheel_diameter: float = 0.004
+    slip: float = 0.01
+    range_sigma: float = 0.008
+    range_share: float = 0.004
+    lidar_dropout: float = 0.01
+    sonar_sigma: float = 0.004
+    sonar_spike: float = 0.004
+
+
+@dataclass(frozen=True, kw_only=True)
+class Robot:
+    """The robot as the sensors of a node see it: an upright cylinder at (x, y); radius and height in m."""
+
+    x: float
+    y: float
+    radius: float
+    height: float
+
+
+def measure_lidar(
+    floor: Floor,
+    pose: tuple[float, float, float],
+    angles: NDArray[np.float64],
+    noise: Noise,
+    generator: np.random.Generator,
+) -> NDArray[np.float64]:
+    """Measure from `pose` (m, rad) along `angles` (rad, counter-clockwise): ranges (m), nan without a return."""
+    x, y, theta = pose
+    directions = np.ascontiguousarray(angles + theta)
+    ranges = floor.wall_ranges(x, y, directions, LIDAR_MAX_M)
+    for obstacle, seen, _ in floor.obstacle_ranges(x, y, directions):
+        if obstacle.height >= LIDAR_HEIGHT_M:
+            ranges = np.minimum(ranges, seen)
+    sigma = noise.range_sigma + noise.range_share * np.where(np.isfinite(ranges), ranges, 0.0)
+    ranges = ranges + sigma * generator.standard_normal(ranges.size)
+    lost = generator.random(ranges.size) < noise.lidar_dropout
+    valid = (ranges >= LIDAR_MIN_M) & (ranges <= LIDAR_MAX_M) & ~lost
+    return np.where(valid, ranges, np.nan)
+
+
+def measure_sonar(
+    floor: Floor, robot: Robot, node: NodeSite, index: int, noise: Noise, generator: np.random.Generator
+) -> float | None:
+    """Measure with one sonar of a node: range of the nearest echo (m), None without an echo.
+
+    The cone is a fan of rays. Walls and boxes echo only below a maximum angle of incidence; an obstacle that is lower
+    than the cone at its range is not seen.
+    """
+    directions = node.theta + node.sonars[index].angle + np.linspace(-SONAR_HALF_CONE, SONAR_HALF_CONE, SONAR_RAYS)
+    if generator.random() < noise.sonar_spike:
+        return float(generator.uniform(0.1, SONAR_MAX_M))
+    # A node is mounted on a wall, and its own cell may be occupied: measure from one cell in front of it.
+    ahead = floor.geometry.resolution
+    x, y = node.x + ahead * math.cos(node.theta), node.y + ahead * math.sin(node.theta)
+    walls = floor.wall_ranges(x, y, directions, SONAR_MAX_M)
+    # A wall hides everything behind it, whether it echoes or not.
+    echoes = [_echo_ranges(walls, directions)]
+    for obstacle, ranges, incidence in floor.obstacle_ranges(x, y, directions):
+        seen = (ranges < walls) & (incidence <= SONAR_MAX_INCIDENCE) & _in_cone(obstacle.height, node.height, ranges)
+        echoes.append(np.where(seen, ranges, np.inf))
+    ranges = _circle_ranges(robot.x, robot.y, robot.radius, x, y, directions)
+    seen = (ranges < walls) & _in_cone(robot.height, node.height, ranges)
+    echoes.append(np.where(seen, ranges, np.inf))
+    nearest = float(np.min(echoes)) + ahead
+    if not SONAR_MIN_M <= nearest <= SONAR_MAX_M:
+        return None
+    return max(SONAR_MIN_M, nearest + noise.sonar_sigma * float(generator.standard_normal()))
+
+
+def _in_cone(top: float, node_height: float, ranges: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether an obstacle of height `top` (m) reaches up into the cone at its range."""
+    reach = np.where(np.isfinite(ranges), ranges, 0.0) * math.tan(SONAR_HALF_CONE)
+    return np.asarray(top >= node_height - reach)
+
+
+def _echo_ranges(ranges: NDArray[np.float64], directions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Keep the ranges of a fan where the angle of incidence, estimated from neighbouring rays, gives an echo."""
+    finite = np.where(np.isfinite(ranges), ranges, 1e3)
+    x, y = finite * np.cos(directions), finite * np.sin(directions)
+    dx, dy = np.gradient(x), np.gradient(y)
+    # The surface runs along (dx, dy); the incidence is zero where the ray is at a right angle to it.
+    along = np.abs(dx * np.cos(directions) + dy * np.sin(directions)) / np.maximum(np.hypot(dx, dy), 1e-9)
+    return np.where(np.isfinite(ranges) & (along <= math.sin(SONAR_MAX_INCIDENCE)), ranges, np.inf)
+
+
+def _circle_ranges(
+    cx: float, cy: float, radius: float, x: float, y: float, directions: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Range of each ray to a circle, infinite for none."""
+    dx, dy = cx - x, cy - y
+    along = dx * np.cos(directions) + dy * np.sin(directions)
+    offset = dx * np.sin(directions) - dy * np.cos(directions)
+    inside = radius * radius - offset * offset
+    ranges = along - np.sqrt(np.maximum(inside, 0.0))
+    return np.where((inside >= 0) & (ranges >= 0), ranges, np.inf)

@@ -1,0 +1,15 @@
+"""Emulator of a Roomba 600 at its serial port: the Open Interface's modes, commands, sensors and stream.
+
+Pure: bytes, times and the state of the world go in, bytes and wheel speeds come out.
+Source: iRobot Create 2 Open Interface specification based on the Roomba 600 (2018). Where it is silent:
+a byte that is no opcode is ignored; speeds and radii out of range are clamped; Spot, Clean, Max and Seek Dock end in
+Passive mode with the wheels at rest (the simulation may drive it to the dock, see `seeking_dock`);
+Power puts the robot to sleep in Passive mode with its stream off; the encoders survive everything but Reset.
+Not emulated: the five minutes after which Passive mode sleeps, songs, LEDs, brushes, schedules, other baud rates (their
+commands are accepted and have no effect).
+"""
+
+from robot_agent.bases.roomba600.emulator.body import Battery
+from robot_agent.bases.roomba600.emulator.robot import BOOT_TEXT, FULL, OFF, PASSIVE, SAFE, RoombaEmulator
+
+__all__ = ["BOOT_TEXT", "FULL", "OFF", "PASSIVE", "SAFE", "Battery", "RoombaEmulator"]

@@ -1,0 +1,188 @@
+"""The emulated robot's end of the serial line: commands, modes, and Safe mode's own protection."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from robot_agent.bases.roomba600.emulator.body import AXLE_MM, Battery, Wheels, World
+from robot_agent.bases.roomba600.emulator.sensors import Sensors, Stream
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+OFF, PASSIVE, SAFE, FULL = range(4)
+
+BAUD: Final = 115200
+BOOT_TEXT: Final = b"bl-start\r\nSTR730\r\nbootloader id: #x47186549 82ECCFFF\r\nbootloader info rev: #xF000\r\n"
+"""Text that a robot of the 600 series prints when it resets."""
+
+# Bytes of data after each opcode. The data of 140, 148 and 149 begin with the number of bytes that follow.
+_ARGUMENTS: Final = {
+    7: 0, 128: 0, 129: 1, 130: 0, 131: 0, 132: 0, 133: 0, 134: 0, 135: 0, 136: 0, 137: 4, 138: 1, 139: 3, 140: 2,
+    141: 1, 142: 1, 143: 0, 144: 3, 145: 4, 146: 4, 148: 1, 149: 1, 150: 1, 162: 2, 163: 4, 164: 4, 165: 1, 167: 15,
+    168: 3, 173: 0,
+}  # fmt: skip
+
+
+class CommandParser:
+    """Splits received bytes into commands."""
+
+    def __init__(self) -> None:
+        self._incoming = bytearray()
+
+    def parse(self, data: bytes) -> Iterator[tuple[int, bytes]]:
+        """Add bytes; yield the opcode and the data bytes of each whole command."""
+        self._incoming += data
+        while self._incoming:
+            opcode = self._incoming[0]
+            size = _ARGUMENTS.get(opcode)
+            if size is None:
+                del self._incoming[0]
+                continue
+            if opcode in {140, 148, 149} and len(self._incoming) > size:
+                size += self._incoming[size] * (2 if opcode == 140 else 1)
+            if len(self._incoming) < 1 + size:
+                return
+            arguments = bytes(self._incoming[1 : 1 + size])
+            del self._incoming[: 1 + size]
+            yield opcode, arguments
+
+
+class RoombaEmulator:
+    """The robot; implements `fognav_sim.emulators.BaseEmulator`.
+
+    The simulation calls `tick(now, dt)`, reads `wheel_speeds_m_s`, moves its robot, reports the true travel of the
+    wheels by `add_wheel_travel`, and sets `world`. The port calls `receive` and `outgoing`. `now` is any monotonic
+    clock (s). Like the real robot, it keeps its last speeds for ever while the host is silent.
+    """
+
+    def __init__(self, *, left_encoder: int = 0, right_encoder: int = 0, battery: Battery | None = None) -> None:
+        """Wake up in mode Off, with the encoders at these readings."""
+        self.world = World()
+        self.battery = battery or Battery()
+        self.mode = OFF
+        self.seeking_dock = False
+        self._wheels = Wheels(left_encoder, right_encoder)
+        self._commands = CommandParser()
+        self._stream = Stream()
+        self._sensors = Sensors(self.world, self.battery, self._wheels, self._stream, lambda: self.mode)
+        self._outgoing = bytearray()
+
+    @property
+    def baud(self) -> int:
+        """Speed of the serial line."""
+        return BAUD
+
+    @property
+    def axle_m(self) -> float:
+        """Distance between the wheels, m."""
+        return AXLE_MM / 1000.0
+
+    def set_sensors(self, *, bump_left: bool, bump_right: bool, cliff: bool) -> None:
+        """Set bumper and cliff sensors at once; everything else is in `world`."""
+        self.world.bump_left, self.world.bump_right = bump_left, bump_right
+        self.world.cliff_left = self.world.cliff_right = cliff
+        self.world.cliff_front_left = self.world.cliff_front_right = cliff
+
+    @property
+    def wheel_speeds_m_s(self) -> tuple[float, float]:
+        """(left, right) speeds at which the motors are driven now, m/s."""
+        return self._wheels.left_mm_s / 1000.0, self._wheels.right_mm_s / 1000.0
+
+    @property
+    def encoders(self) -> tuple[int, int]:
+        """(left, right) encoder readings, 16 bit."""
+        return self._wheels.encoders
+
+    def add_wheel_travel(self, left_m: float, right_m: float) -> None:
+        """Roll the wheels this far (m); fractions of a tick accumulate."""
+        self._wheels.roll(left_m, right_m)
+
+    def tick(self, now: float, dt: float) -> None:
+        """Advance time by dt (s) to `now`: protection, battery and the stream."""
+        self._protect()
+        moving = sum(abs(speed) for speed in self.wheel_speeds_m_s)
+        self.battery.tick(dt, powered=self.world.powered, wheels_m_s=moving)
+        if self.battery.charge_mah <= 0.0:
+            self._leave(OFF)
+        self._send_stream(now)
+
+    def receive(self, data: bytes, now: float) -> None:
+        """Receive bytes from the host; whole commands take effect immediately."""
+        for opcode, arguments in self._commands.parse(data):
+            self._act(opcode, arguments, now)
+
+    def outgoing(self, now: float) -> bytes:
+        """Return what the robot has sent up to `now`, once."""
+        self._send_stream(now)
+        sent = bytes(self._outgoing)
+        self._outgoing.clear()
+        return sent
+
+    def _send_stream(self, now: float) -> None:
+        self._outgoing += self._stream.due(now, self._sensors.packet)
+
+    # --- commands ---
+
+    def _act(self, opcode: int, arguments: bytes, now: float) -> None:
+        if opcode == 7:
+            self._leave(OFF)
+            self._wheels.reset_encoders()
+            self._stream.forget()
+            self._outgoing += BOOT_TEXT
+        elif opcode == 128:
+            self._leave(PASSIVE, keep_stream=True)
+        elif self.mode == OFF:
+            return
+        elif opcode == 173:
+            self._leave(OFF)
+        elif opcode == 133:
+            self._leave(PASSIVE)
+        elif opcode in {130, 131, 132}:
+            self.seeking_dock = False
+            self.mode = FULL if opcode == 132 else SAFE
+            self._protect()
+        elif opcode in {134, 135, 136, 143}:
+            self._leave(PASSIVE, keep_stream=True)
+            self.seeking_dock = opcode == 143
+        elif opcode in {142, 148, 149, 150}:
+            self._report(opcode, arguments, now)
+        elif opcode in {137, 145, 146} and self.mode in {SAFE, FULL}:
+            move = {137: self._wheels.drive, 145: self._wheels.drive_direct, 146: self._wheels.drive_pwm}[opcode]
+            move(_signed(arguments[:2]), _signed(arguments[2:]))
+            self._protect()
+
+    def _report(self, opcode: int, arguments: bytes, now: float) -> None:
+        """Send packets once (opcodes 142, 149), or begin, resume or pause their stream (148, 150)."""
+        if opcode == 148:
+            self._stream.begin(arguments[1:], now)
+        elif opcode == 150:
+            if arguments[0]:
+                self._stream.resume(now)
+            else:
+                self._stream.pause()
+        else:
+            ids = arguments if opcode == 142 else arguments[1:]
+            self._outgoing += b"".join(self._sensors.packet(packet_id) for packet_id in ids)
+
+    def _leave(self, mode: int, *, keep_stream: bool = False) -> None:
+        """Stop the motors and enter a mode in which the host does not drive."""
+        self.mode = mode
+        self._wheels.stop()
+        self.seeking_dock = False
+        if not keep_stream:
+            self._stream.pause()
+
+    def _protect(self) -> None:
+        """Safe mode's own protection: cliff while moving forward, wheel drop, charger; not bumper."""
+        if self.mode != SAFE:
+            return
+        # Backwards the specification ignores a cliff, unless the robot turns within its own radius.
+        left, right = self._wheels.left_mm_s, self._wheels.right_mm_s
+        forward_or_turning = left > 0 or right > 0 or left == right == 0
+        if self.world.wheel_drop or self.world.powered or (self.world.cliff and forward_or_turning):
+            self._leave(PASSIVE, keep_stream=True)
+
+
+def _signed(two: bytes) -> int:
+    return int.from_bytes(two, "big", signed=True)

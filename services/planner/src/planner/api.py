@@ -95,64 +95,87 @@ def _plan_view(path: RobotPath) -> PlanView:
     )
 
 
+class _Robots:
+    """The robots that are configured or were heard from; asking for any other one is a problem (404)."""
+
+    def __init__(self, service: Service, site: Site) -> None:
+        self._service = service
+        self._configured = {robot.id for robot in site.robots}
+
+    def ids(self) -> list[str]:
+        """Return the ids of all known robots, sorted."""
+        service = self._service
+        return sorted({*self._configured, *service.poses, *service.states, *service.goals})
+
+    def check(self, robot: str) -> None:
+        """Raise a `ProblemError` for an unknown robot."""
+        known = self.ids()
+        if robot not in known:
+            raise ProblemError(404, f"there is no robot {robot}; known robots: {', '.join(known) or 'none'}")
+
+    def view(self, robot: str) -> RobotView:
+        """Return a known robot with pose, state, mission and plan."""
+        service = self._service
+        return RobotView(
+            id=robot,
+            configured=robot in self._configured,
+            pose=service.poses.get(robot),
+            state=service.states.get(robot),
+            goal=_goal_view(robot, service.goals[robot]) if robot in service.goals else None,
+            plan=_plan_view(path) if (path := service.path(robot)) else None,
+        )
+
+
+def _goal_pose(body: GoalBody, site: Site) -> tuple[Pose, bool]:
+    """Return the pose of a goal, and whether any heading will do; raises a `ProblemError` for an invalid goal."""
+    if (body.place is None) == (body.pose is None):
+        raise ProblemError(422, "give either a place or a pose, and not both", field="body")
+    if body.pose is not None:
+        theta = body.pose.theta
+        return Pose(x=body.pose.x, y=body.pose.y, theta=theta or 0.0), theta is None
+    place = site.places.get(body.place or "")
+    if place is None:
+        names = ", ".join(sorted(site.places)) or "none"
+        raise ProblemError(422, f"there is no place {body.place}; known places: {names}", field="body.place")
+    return Pose(x=place.x, y=place.y, theta=place.theta or 0.0), place.theta is None
+
+
 def make_api(service: Service, site: Site, health: Health, tokens: Tokens) -> FastAPI:
     """Return the app over a running service."""
     app = make_app("Fognav planner", health, tokens)
-    _add_robots(Routes(app, "robots"), service, site)
-    _add_plan(Routes(app, "plan"), service)
-    return app
-
-
-def _add_robots(routes: Routes, service: Service, site: Site) -> None:  # noqa: C901  # the complexity of all routes is added up
-    configured = {robot.id for robot in site.robots}
+    robots = _Robots(service, site)
+    routes = Routes(app, "robots")
     routes.raises(
         StoreError,
         {503: "The mission is unchanged: the store does not answer"},
         lambda error: ProblemError(503, f"the mission is unchanged: {error}; try again", headers={"Retry-After": "1"}),
     )
+    _add_views(routes, service, robots)
+    _add_orders(routes, service, robots, site)
+    _add_plan(Routes(app, "plan"), service)
+    return app
 
-    def robots() -> list[str]:
-        return sorted({*configured, *service.poses, *service.states, *service.goals})
 
-    def checked(robot: str) -> str:
-        if robot not in robots():
-            raise ProblemError(404, f"there is no robot {robot}; known robots: {', '.join(robots()) or 'none'}")
-        return robot
-
-    def goal_pose(body: GoalBody) -> tuple[Pose, bool]:
-        if (body.place is None) == (body.pose is None):
-            raise ProblemError(422, "give either a place or a pose, and not both", field="body")
-        if body.pose is not None:
-            theta = body.pose.theta
-            return Pose(x=body.pose.x, y=body.pose.y, theta=theta or 0.0), theta is None
-        place = site.places.get(body.place or "")
-        if place is None:
-            names = ", ".join(sorted(site.places)) or "none"
-            raise ProblemError(422, f"there is no place {body.place}; known places: {names}", field="body.place")
-        return Pose(x=place.x, y=place.y, theta=place.theta or 0.0), place.theta is None
+def _add_views(routes: Routes, service: Service, robots: _Robots) -> None:
+    """Add the routes that read robots and missions."""
 
     @routes.get("/api/v1/robots")
     async def list_robots() -> list[RobotView]:
         """List all robots with pose, state, mission and plan."""
-        return [
-            RobotView(
-                id=robot,
-                configured=robot in configured,
-                pose=service.poses.get(robot),
-                state=service.states.get(robot),
-                goal=_goal_view(robot, service.goals[robot]) if robot in service.goals else None,
-                plan=_plan_view(path) if (path := service.path(robot)) else None,
-            )
-            for robot in robots()
-        ]
+        return [robots.view(robot) for robot in robots.ids()]
 
     @routes.get("/api/v1/robots/{robot}/goal", problems={404: "No robot has this id, or it has no mission"})
     async def get_goal(robot: str) -> GoalView:
         """Return a robot's mission."""
-        stored = service.goals.get(checked(robot))
+        robots.check(robot)
+        stored = service.goals.get(robot)
         if stored is None:
             raise ProblemError(404, f"robot {robot} has no mission")
         return _goal_view(robot, stored)
+
+
+def _add_orders(routes: Routes, service: Service, robots: _Robots, site: Site) -> None:
+    """Add the routes that send and stop robots."""
 
     @routes.put(
         "/api/v1/robots/{robot}/goal",
@@ -165,8 +188,8 @@ def _add_robots(routes: Routes, service: Service, site: Site) -> None:  # noqa: 
     )
     async def put_goal(robot: str, body: Body[GoalBody], caller: Operator) -> GoalView:
         """Send a robot to a place or pose."""
-        checked(robot)
-        pose, any_heading = goal_pose(body)
+        robots.check(robot)
+        pose, any_heading = _goal_pose(body, site)
         answer = await service.send(robot, pose, caller.name, place=body.place, any_heading=any_heading)
         if isinstance(answer, Refusal):
             field = "body.place" if body.place else "body.pose"
@@ -182,7 +205,8 @@ def _add_robots(routes: Routes, service: Service, site: Site) -> None:  # noqa: 
     )
     async def delete_goal(robot: str, caller: Operator) -> None:
         """Cancel a robot's mission."""
-        if not await service.cancel(checked(robot), caller.name):
+        robots.check(robot)
+        if not await service.cancel(robot, caller.name):
             raise ProblemError(404, f"robot {robot} has no mission")
 
 

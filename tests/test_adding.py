@@ -186,7 +186,8 @@ def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
             shutil.copytree(ROOT / package, folder / package, ignore=without)
     shutil.copytree(ROOT / "sites" / "estig", folder / "sites" / "estig", ignore=without)
     (folder / "requirements").mkdir()
-    for name in ("fognav", "pyproject.toml", "conftest.py", "services/conftest.py"):
+    (folder / "tests" / "support").mkdir(parents=True)
+    for name in ("fognav", "pyproject.toml", "conftest.py", "services/conftest.py", "tests/support/programs.py"):
         shutil.copy(ROOT / name, folder / name)
     for edit in (*MESSAGE, *ROUTE, *SHAPE):
         edit.make(folder)
@@ -196,24 +197,35 @@ def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def run(folder: Path, *arguments: str | Path) -> None:
     """Run Python on the sources in a folder; show what it printed when it fails."""
+    done = try_to_run(folder, *arguments)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def try_to_run(folder: Path, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    """Run Python on the sources in a folder."""
     paths = [str(folder / file.parents[1].relative_to(ROOT)) for file in SOURCES]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in paths if Path(path).is_dir())}
     environment.pop("PYTEST_ADDOPTS", None)
     command = [sys.executable, *map(str, arguments)]
-    done = subprocess.run(
+    return subprocess.run(
         command, cwd=folder, env=environment, capture_output=True, text=True, timeout=150, check=False
     )
-    assert done.returncode == 0, done.stdout + done.stderr
 
 
-def check(folder: Path, name: str) -> None:
-    """Run the check of an addition beside the services' tests."""
-    target = folder / "services" / f"check_{name}.py"
-    shutil.copy(CHECKS / target.name, target)
-    run(folder, "-m", "pytest", "-q", "-p", "no:cacheprovider", target)
+@pytest.fixture(scope="module")
+def checked(checkout: Path) -> str:
+    """Run the checks of all additions beside the services' tests, in one process; return what pytest printed."""
+    targets = [Path(shutil.copy(file, checkout / "services")) for file in sorted(CHECKS.glob("check_*.py"))]
+    return try_to_run(checkout, "-m", "pytest", "-v", "-p", "no:cacheprovider", *targets).stdout
 
 
-def test_message_is_added_by_its_type_its_row_and_its_handlers(checkout: Path) -> None:
+def assert_passed(name: str, checked: str) -> None:
+    """Find that the check of an addition has run, and that all its tests passed."""
+    outcomes = re.findall(rf"^services/check_{name}\.py::\S+ ([A-Z]+)", checked, re.MULTILINE)
+    assert set(outcomes) == {"PASSED"}, checked
+
+
+def test_message_is_added_by_its_type_its_row_and_its_handlers(checkout: Path, checked: str) -> None:
     for file, words in {
         "docs/channels.md": ("fog/v1/<site>/nodes/<node>/battery", "### RobotApproach"),
         "deploy/mosquitto/acl": ("pattern write fog/v1/+/nodes/%u/battery",),
@@ -222,20 +234,20 @@ def test_message_is_added_by_its_type_its_row_and_its_handlers(checkout: Path) -
     }.items():
         text = (checkout / file).read_text("utf-8")
         assert all(word in text for word in words), (file, words)
-    check(checkout, "message")
+    assert_passed("message", checked)
 
 
-def test_route_is_added_by_one_function(checkout: Path) -> None:
+def test_route_is_added_by_one_function(checkout: Path, checked: str) -> None:
     assert (
         "| `POST /api/v1/zones/{zone_id}/extension` | Let a zone hold for so many more minutes. |  | Extension "
         "| 200 Zone | 401, 403, 404, 409, 412, 413, 422, 503 | yes |"
     ) in (checkout / "docs" / "channels.md").read_text("utf-8")
-    check(checkout, "route")
+    assert_passed("route", checked)
 
 
-def test_zone_shape_is_added_by_its_message_and_its_class(checkout: Path) -> None:
+def test_zone_shape_is_added_by_its_message_and_its_class(checkout: Path, checked: str) -> None:
     assert "### RingShape" in (checkout / "docs" / "channels.md").read_text("utf-8")
-    check(checkout, "shape")
+    assert_passed("shape", checked)
 
 
 def test_only_messages_and_shapes_distinguish_kinds_of_shapes() -> None:

@@ -16,10 +16,9 @@ from fog_contracts.costs import (
     NEUTRAL_WEIGHT,
     UNKNOWN,
     Inflation,
-    combine_costs,
-    combine_speed_limits,
     is_traversable,
 )
+from fog_contracts.layering import combine_costs, combine_speed_limits
 
 KEY = b"k" * 32
 

@@ -1,16 +1,15 @@
-"""Cost values of costmap cells, their weight on a path, their inflation, and how layers are combined.
+"""Cost values of costmap cells, their weight on a path, and their inflation.
 
 The values are those of Nav2 (`nav2_costmap_2d/cost_values.hpp`), so that maps can be exchanged with it; the weights are
 those of NavFn. Compiled kernels hold these values as constants, and numba does not notice that an imported constant
 changed: after changing one, delete the kernels' cache (`__pycache__` of `fog_kernels`, or NUMBA_CACHE_DIR).
+
+No arrays here: every process reads its settings with this module, and the guardian starts faster without numpy.
 """
 
 import math
 from dataclasses import dataclass
 from typing import Final
-
-import numpy as np
-from numpy.typing import NDArray
 
 FREE: Final = 0
 """No layer assigns a cost to the cell."""
@@ -66,20 +65,3 @@ DEFAULT_INFLATION: Final = Inflation()
 def is_traversable(cost: int) -> bool:
     """Whether the centre of a robot may be on a cell of this cost."""
     return cost < INSCRIBED
-
-
-def combine_costs(below: NDArray[np.uint8], layer: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """Combine a layer with the layers below it; all arrays have the same shape.
-
-    A layer changes cells only where `mask` is true. There the higher cost wins, and no layer lowers a cost.
-    Unknown (255) is the absence of a cost: only `LETHAL` replaces it, so that an obstacle seen in unexplored space
-    counts, while a penalty does not make unexplored space traversable.
-    """
-    graded = np.where(below == UNKNOWN, np.where(layer == LETHAL, layer, below), np.maximum(below, layer))
-    return np.where(mask & (layer != UNKNOWN), graded, below).astype(np.uint8)
-
-
-def combine_speed_limits(below: NDArray[np.uint8], layer: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Combine two speed layers (uint8, cm/s, 0 = no limit): the lower limit wins."""
-    both = np.minimum(below, layer)
-    return np.where(below == NO_SPEED_LIMIT, layer, np.where(layer == NO_SPEED_LIMIT, below, both)).astype(np.uint8)

@@ -16,8 +16,7 @@ import subprocess
 import sys
 import time
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from fog_runtime import parts
 from fog_runtime.default_parts import DEFAULT_BASE
@@ -176,8 +175,7 @@ def refuse_speed(speed: float, device: str) -> str | None:
     return f"FOGNAV_SPEED is {speed:g}, but {device} is no simulated device: unset it, a real base needs real time"
 
 
-@dataclass(frozen=True, slots=True)
-class _Settings:
+class _Settings(NamedTuple):
     """Settings from the environment: the base's port, its stop command, and the ratio of simulated to wall time."""
 
     path: str

@@ -10,8 +10,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from fog_contracts.costs import combine_costs, combine_speed_limits
 from fog_contracts.grid import StaticMap, Window
+from fog_contracts.layering import combine_costs, combine_speed_limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

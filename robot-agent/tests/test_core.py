@@ -397,8 +397,9 @@ def test_a_decision_for_a_path_that_was_replaced_is_dropped(driving):
     driving.path = back
     driving.send(ch.ROBOT_PATH, back)
     driving.agent.accept(late)
-    assert driving.agent._wheels.decision.plan_id == 1  # the old decision expires, the late one did not renew it
-    assert driving.agent._wheels.decision is not late
+    kept = driving.agent._driving.wheels.decision
+    assert kept.plan_id == 1  # the old decision expires, the late one did not renew it
+    assert kept is not late
     assert seconds_to_rest(driving) <= 1.2
 
 

@@ -14,25 +14,20 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from fog_contracts import channels as ch
 from fog_contracts.follower import MapFollower
 from fog_contracts.messages import LoopHealth
 from robot_agent.agent.blocked_places import BlockedPlaces
-from robot_agent.agent.mission import Mission
 from robot_agent.agent.obstacle_reporter import ObstacleReporter
 from robot_agent.agent.operator_commands import OperatorCommands, initial_pose_refusal
-from robot_agent.agent.path_monitor import PathMonitor
-from robot_agent.agent.path_traces import PathTraces
+from robot_agent.agent.path_driving import PathDriving
 from robot_agent.agent.pose_keeper import PoseKeeper
 from robot_agent.agent.publishing import PublishingPolicy
 from robot_agent.agent.reports import hindrances, robot_pose, robot_state
 from robot_agent.agent.safety_supervisor import SafetySupervisor, safety_inputs
 from robot_agent.agent.sensors import BaseSource, LidarSource
-from robot_agent.agent.wheel_control import WheelControl
 from robot_agent.localization.localizer import Localizer, SavedPose
-from robot_agent.motion.local_planner import Decision, Job, decide, make_job, twist
+from robot_agent.motion.local_planner import Decision, Job, decide
 from robot_agent.odometry import EncoderFault, Odometry
 
 if TYPE_CHECKING:
@@ -74,11 +69,8 @@ class AgentCore:
         self._pose_keeper = PoseKeeper(self._localizer)
         self._map = MapFollower()
         self._places = BlockedPlaces()
-        self._mission = Mission()
-        self._path_monitor = PathMonitor()
+        self._driving = PathDriving(config)
         self._safety = SafetySupervisor(config.safety)
-        self._wheels = WheelControl(config)
-        self._traces = PathTraces()
         self._reporter = ObstacleReporter(config.obstacle_ttl, config.obstacle_limit)
         self._commands = OperatorCommands(config.robot, config.operator_key, self)
         self._publishing = PublishingPolicy(config.robot)
@@ -107,7 +99,7 @@ class AgentCore:
 
     def _on_delta(self, _ids: Ids, delta: MapDelta, at: Moment) -> Sequence[Publication]:
         if self._map.on_delta(delta, at.now) is not None:
-            self._path_monitor.check(self._mission, self.replica, at.now)
+            self._driving.check_path(self.replica, at.now)
         return ()
 
     def _on_heartbeat(self, _ids: Ids, heartbeat: MapHeartbeat, at: Moment) -> Sequence[Publication]:
@@ -115,19 +107,11 @@ class AgentCore:
         return ()
 
     def _on_goal(self, _ids: Ids, goal: RobotGoal, at: Moment) -> Sequence[Publication]:
-        if self._mission.on_goal(goal, at.now):
-            self._stop_following()
+        self._driving.on_goal(goal, at.now)
         return ()
 
     def _on_path(self, _ids: Ids, path: RobotPath, at: Moment) -> Sequence[Publication]:
-        mission = self._mission
-        if mission.on_path(path, at.now):
-            pose = self._localizer.pose(at.now)
-            if pose is not None and mission.follower is not None:
-                mission.follower.advance(pose.x, pose.y, at.now)
-            self._traces.begin(path.traces, at.stamp)
-            self._path_monitor.begin()
-        self._path_monitor.check(mission, self.replica, at.now)
+        self._driving.on_path(path, self._localizer.pose(at.now), self.replica, at)
         return ()
 
     def _on_command(self, _ids: Ids, command: RobotCommand, at: Moment) -> CommandReply:
@@ -143,7 +127,7 @@ class AgentCore:
         """Load a snapshot, from the map-service or from disk; raises `MapError` when it is invalid."""
         self._map.on_snapshot(snapshot, now)
         self._pose_keeper.load_map(self.replica)
-        self._path_monitor.check(self._mission, self.replica, now)
+        self._driving.check_path(self.replica, now)
 
     # --- base and lidar ---
 
@@ -177,46 +161,15 @@ class AgentCore:
 
     def stream(self, now: float, stamp: float) -> WheelCommand:
         """Evaluate safety and return the wheel speeds to send now; call it 20 times a second."""
-        command = self._wheels.command(self._evaluate_safety(now), now)
-        if self._wheels.following:
-            self._traces.close(stamp)
-        return command
+        return self._driving.command(self._evaluate_safety(now), now, stamp)
 
     def control_job(self, now: float) -> Job | None:
         """Return the inputs of the next decision; None while there is no goal or the robot must not drive."""
-        pose, mission, replica = self._localizer.pose(now), self._mission, self.replica
-        follower, path = mission.follower, mission.path
-        if follower is None or path is None or pose is None or replica.geometry is None or not mission.active:
-            return None
-        follower.advance(pose.x, pose.y, now)
-        if self.safety.stop != "none":
-            follower.restart_progress_timer(now)
-            return None
-        points = self._localizer.points_in_map()
-        return make_job(
-            follower,
-            plan_id=path.plan_id,
-            planner_epoch=path.planner_epoch,
-            now=now,
-            pose=pose,
-            speeds=twist(*self._wheels.speeds, self._config.motion.axle),
-            goal_theta=path.goal_theta,
-            cap=self.safety.cap,
-            cost=replica.cost,
-            speed_limits=replica.speed,
-            geometry=replica.geometry,
-            lidar_points=np.zeros((0, 2)) if points is None else points,
-            config=self._config.motion,
-        )
+        return self._driving.job(self._localizer, self.replica, self.safety, now)
 
     def accept(self, decision: Decision) -> None:
         """Drive by a decision; one for a path that is no longer followed is dropped."""
-        if self._mission.path_id != (decision.planner_epoch, decision.plan_id) or not self._mission.active:
-            return
-        self._wheels.decision = decision
-        if decision.at_goal:
-            self._mission.reach()
-            self._stop_following()
+        self._driving.accept(decision)
 
     def _evaluate_safety(self, now: float, request: Request | None = None) -> SafetyOutputs:
         pose = self._localizer.pose(now)
@@ -226,8 +179,8 @@ class AgentCore:
             self._lidar,
             self._map,
             self._localizer,
-            self._mission,
-            path_problem=self._path_monitor.problem(self._mission, self.replica.version, now),
+            self._driving.mission,
+            path_problem=self._driving.path_problem(self.replica, now),
             inside_blocked=self._places.containing(pose, self.replica, self._reporter, now)
             if pose and localized
             else None,
@@ -235,14 +188,8 @@ class AgentCore:
             now=now,
         )
         outputs = self._safety.evaluate(inputs, now, request)
-        if outputs.stop == "immediate" or (outputs.changed and outputs.stop != "none"):
-            self._wheels.decision = None
+        self._driving.obey(outputs)
         return outputs
-
-    def _stop_following(self) -> None:
-        """Forget decision and blockage of the path that the mission dropped."""
-        self._wheels.decision = None
-        self._path_monitor.reset()
 
     # --- operators' commands: `OperatorCommands` calls these ---
 
@@ -250,19 +197,16 @@ class AgentCore:
         """Pass an operator's request to the safety gate; the outputs carry its refusal."""
         outputs = self._evaluate_safety(now, request)
         if request == "reset" and outputs.refusal is None:
-            self._wheels.pass_reset()
+            self._driving.wheels.pass_reset()
         return outputs
 
     def cancel_goal(self) -> str | None:
         """Cancel the goal; return its id, None without one."""
-        cancelled = self._mission.cancel()
-        if cancelled is not None:
-            self._stop_following()
-        return cancelled
+        return self._driving.cancel_goal()
 
     def set_initial_pose(self, pose: Pose | None) -> str | None:
         """Start localization at a pose in `map`; return why the pose is refused, None when it is accepted."""
-        refusal = initial_pose_refusal(pose, self.replica, at_rest=self._wheels.at_rest)
+        refusal = initial_pose_refusal(pose, self.replica, at_rest=self._driving.wheels.at_rest)
         if refusal is None and pose is not None:
             self._localizer.initial_pose(pose.x, pose.y, pose.theta)
         return refusal
@@ -271,7 +215,7 @@ class AgentCore:
 
     def tick(self, at: Moment) -> Sequence[Publication]:
         """Advance time, at least ten times a second; return what to publish now."""
-        self._pose_keeper.search(self.safety.mode, at.now, at_rest=self._wheels.at_rest)
+        self._pose_keeper.search(self.safety.mode, at.now, at_rest=self._driving.wheels.at_rest)
         return self._publishing.due(self.pose(at), self.state(at), partial(self._report_obstacles, at), at.now)
 
     def _report_obstacles(self, at: Moment) -> RobotObstacles | None:
@@ -283,22 +227,22 @@ class AgentCore:
 
     def state(self, at: Moment) -> RobotState:
         """Return mode, reasons, goal, path and map version as a message."""
-        may_drive = self._mission.active and self.safety.stop == "none"
-        stuck_after = self._config.motion.stuck_after
+        mission, stuck_after = self._driving.mission, self._config.motion.stuck_after
+        may_drive = mission.active and self.safety.stop == "none"
         return robot_state(
             self._safety.state,
-            self._mission,
+            mission,
             self.replica.version,
             self._base.feedback,
-            hindrances=hindrances(self._mission, self._wheels.decision, stuck_after, at.now) if may_drive else [],
-            traces=self._traces.recent,
+            hindrances=hindrances(mission, self._driving.wheels.decision, stuck_after, at.now) if may_drive else [],
+            traces=self._driving.traces.recent,
             loop=self._loop_health,
             stamp=at.stamp,
         )
 
     def finished_traces(self) -> list[Trace]:
         """Return the traces that were completed since the last call, each once: for histograms."""
-        return self._traces.take_finished()
+        return self._driving.traces.take_finished()
 
     # --- restart ---
 

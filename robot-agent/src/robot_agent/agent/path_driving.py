@@ -1,0 +1,125 @@
+"""Driving along the planner's path: from goal and path to wheel commands, within what the safety gate allows."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from robot_agent.agent.mission import Mission
+from robot_agent.agent.path_monitor import PathMonitor
+from robot_agent.agent.path_traces import PathTraces
+from robot_agent.agent.wheel_control import WheelControl
+from robot_agent.motion.local_planner import make_job, twist
+
+if TYPE_CHECKING:
+    from fog_contracts.handlers import Moment
+    from fog_contracts.messages import RobotGoal, RobotPath
+    from fog_contracts.replica import Replica
+    from robot_agent.config import AgentConfig
+    from robot_agent.guardian.link import WheelCommand
+    from robot_agent.localization.localizer import Localizer
+    from robot_agent.localization.pose import Pose2
+    from robot_agent.motion.local_planner import Decision, Job
+    from robot_agent.safety.gate import SafetyOutputs
+
+
+class PathDriving:
+    """The mission, its path with the blockages on it, and the decision that the wheels follow.
+
+    `now` is s of the robot's monotonic clock.
+    """
+
+    def __init__(self, config: AgentConfig) -> None:
+        self._config = config.motion
+        self.mission = Mission()
+        self.wheels = WheelControl(config)
+        self.traces = PathTraces()
+        self._monitor = PathMonitor()
+
+    # --- goal and path ---
+
+    def on_goal(self, goal: RobotGoal, now: float) -> None:
+        """Set the goal; the path to another goal is no longer followed."""
+        if self.mission.on_goal(goal, now):
+            self._stop_following()
+
+    def on_path(self, path: RobotPath, pose: Pose2 | None, replica: Replica, at: Moment) -> None:
+        """Follow a new path from where the robot is, extend the current one, or record a refusal."""
+        mission = self.mission
+        if mission.on_path(path, at.now):
+            if pose is not None and mission.follower is not None:
+                mission.follower.advance(pose.x, pose.y, at.now)
+            self.traces.begin(path.traces, at.stamp)
+            self._monitor.begin()
+        self.check_path(replica, at.now)
+
+    def check_path(self, replica: Replica, now: float) -> None:
+        """Look for blockages along the path; call it whenever the map may have changed."""
+        self._monitor.check(self.mission, replica, now)
+
+    def path_problem(self, replica: Replica, now: float) -> str | None:
+        """Return why the path must not be driven; None when it may. Call it steadily: it measures durations."""
+        return self._monitor.problem(self.mission, replica.version, now)
+
+    def cancel_goal(self) -> str | None:
+        """Cancel the goal; return its id, None without one."""
+        cancelled = self.mission.cancel()
+        if cancelled is not None:
+            self._stop_following()
+        return cancelled
+
+    def _stop_following(self) -> None:
+        """Forget decision and blockage of the path that the mission dropped."""
+        self.wheels.decision = None
+        self._monitor.reset()
+
+    # --- decisions and wheels ---
+
+    def job(self, localizer: Localizer, replica: Replica, safety: SafetyOutputs, now: float) -> Job | None:
+        """Return the inputs of the next decision; None while there is no goal or the robot must not drive."""
+        pose, mission = localizer.pose(now), self.mission
+        follower, path = mission.follower, mission.path
+        if follower is None or path is None or pose is None or replica.geometry is None or not mission.active:
+            return None
+        follower.advance(pose.x, pose.y, now)
+        if safety.stop != "none":
+            follower.restart_progress_timer(now)
+            return None
+        points = localizer.points_in_map()
+        return make_job(
+            follower,
+            plan_id=path.plan_id,
+            planner_epoch=path.planner_epoch,
+            now=now,
+            pose=pose,
+            speeds=twist(*self.wheels.speeds, self._config.axle),
+            goal_theta=path.goal_theta,
+            cap=safety.cap,
+            cost=replica.cost,
+            speed_limits=replica.speed,
+            geometry=replica.geometry,
+            lidar_points=np.zeros((0, 2)) if points is None else points,
+            config=self._config,
+        )
+
+    def accept(self, decision: Decision) -> None:
+        """Drive by a decision; one for a path that is no longer followed is dropped."""
+        if self.mission.path_id != (decision.planner_epoch, decision.plan_id) or not self.mission.active:
+            return
+        self.wheels.decision = decision
+        if decision.at_goal:
+            self.mission.reach()
+            self._stop_following()
+
+    def obey(self, safety: SafetyOutputs) -> None:
+        """Drop the decision when the safety gate stops the robot."""
+        if safety.stop == "immediate" or (safety.changed and safety.stop != "none"):
+            self.wheels.decision = None
+
+    def command(self, safety: SafetyOutputs, now: float, stamp: float) -> WheelCommand:
+        """Return the wheel speeds to send now; the first ones on a new path close its traces."""
+        command = self.wheels.command(safety, now)
+        if self.wheels.following:
+            self.traces.close(stamp)
+        return command

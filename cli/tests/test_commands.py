@@ -17,7 +17,24 @@ runner = CliRunner()
 
 @pytest.mark.parametrize(
     "command",
-    [["doctor"], ["test"], ["channels"], ["demo"], ["site", "new"], ["site", "check"], ["record"], ["replay"]],
+    [
+        ["doctor"],
+        ["test"],
+        ["channels"],
+        ["demo"],
+        ["site", "new"],
+        ["site", "check"],
+        ["record"],
+        ["replay"],
+        ["status"],
+        ["goal"],
+        ["area", "list"],
+        *(["zone", name] for name in ("add", "list", "show", "remove")),
+        *(
+            ["robot", name]
+            for name in ("enable", "disable", "reset", "stop", "pose", "goal", "cancel", "status", "watch")
+        ),
+    ],
 )
 def test_every_command_has_help_with_an_example(command: list[str]) -> None:
     done = runner.invoke(app, [*command, "--help"])
@@ -25,7 +42,7 @@ def test_every_command_has_help_with_an_example(command: list[str]) -> None:
     assert "Example: fognav " + " ".join(command) in done.output
 
 
-@pytest.mark.parametrize("group", [[], ["site"]])
+@pytest.mark.parametrize("group", [[], ["site"], ["zone"], ["robot"]])
 def test_list_of_commands_truncates_no_sentence(group: list[str]) -> None:
     done = runner.invoke(app, [*group, "--help"], env={"COLUMNS": "80"})
     commands = done.output.partition("Commands:\n")[2].strip().splitlines()

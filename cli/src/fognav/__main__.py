@@ -6,7 +6,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import Annotated
 
 import typer
 from rich.table import Table
@@ -14,8 +14,24 @@ from rich.table import Table
 from fog_runtime import parts
 from fog_runtime.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fognav import __version__, checkout, doctor, kernels, system
+from fognav.area_command import area_app
 from fognav.channels_command import channels_command
-from fognav.output import NOT_TRUE, OK, WRONG_USE, WrongUseError, check_writable, console, print_json, write_report
+from fognav.operate.options import NUMBERS, JsonOption
+from fognav.output import (
+    NOT_TRUE,
+    OK,
+    WRONG_USE,
+    WrongUseError,
+    check_writable,
+    console,
+    fail,
+    print_json,
+    print_line,
+    write_report,
+)
+from fognav.robot_command import robot_app, robot_goal
+from fognav.status_command import status_command
+from fognav.zone_command import zone_app
 from fognav_sim import emulators
 
 app = typer.Typer(
@@ -28,23 +44,18 @@ app = typer.Typer(
 )
 site_app = typer.Typer(help="Create and check sites.", no_args_is_help=True)
 app.add_typer(site_app, name="site")
+app.add_typer(zone_app, name="zone")
+app.add_typer(area_app, name="area")
+app.add_typer(robot_app, name="robot")
+app.command("status", epilog="Example: fognav status --json")(status_command)
+app.command("goal", context_settings=NUMBERS, epilog="Example: fognav goal b")(robot_goal)
 app.command("channels", epilog="Example: fognav channels --format acl --broker mqtt")(channels_command)
 
 Yes = Annotated[bool, typer.Option("--yes", help="Install missing system packages without asking (as does CI=true).")]
-Json = Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")]
 
 
 def _known_parts(group: str) -> str:
     return " or ".join(parts.names(group))
-
-
-def _print_line(text: str) -> None:
-    console.print(text, markup=False)
-
-
-def _fail(message: str, code: int = NOT_TRUE) -> NoReturn:
-    console.print(f"fognav: {message}", markup=False, style="red")
-    raise typer.Exit(code)
 
 
 def _version(show: bool) -> None:  # noqa: FBT001  # Typer passes only its value
@@ -64,7 +75,7 @@ def _main(
 
 
 @app.command("doctor", epilog="Example: fognav doctor --json")
-def doctor_command(*, json: Json = False) -> None:
+def doctor_command(*, json: JsonOption = False) -> None:
     """Show what is installed, what is missing and how to install it."""
     found = list(doctor.checks())
     if json:
@@ -82,10 +93,10 @@ def doctor_command(*, json: Json = False) -> None:
 
 def _prepare(*, yes: bool) -> None:
     try:
-        system.ensure([system.MOSQUITTO, system.REDIS], yes=yes, print_line=_print_line)
-        kernels.warm_cache(_print_line)
+        system.ensure([system.MOSQUITTO, system.REDIS], yes=yes, print_line=print_line)
+        kernels.warm_cache(print_line)
     except (system.MissingToolsError, kernels.KernelsError) as error:
-        _fail(str(error))
+        fail(str(error))
 
 
 @app.command(
@@ -101,13 +112,13 @@ def run_tests(context: typer.Context, *, yes: Yes = False) -> None:
     from fognav import testing  # noqa: PLC0415  # keeps the other commands fast
 
     _prepare(yes=yes)
-    testing.get_browser(yes=yes, print_line=_print_line)
+    testing.get_browser(yes=yes, print_line=print_line)
     done = subprocess.run(testing.pytest_command(context.args), check=False, cwd=checkout.root())
     raise typer.Exit(done.returncode)
 
 
 @app.command("check", epilog="Example: fognav check --json")
-def check_command(*, json: Json = False) -> None:
+def check_command(*, json: JsonOption = False) -> None:
     """Run all static checks.
 
     These are format, lint, types, import contracts, dead code and generated files. All of them run; the exit code is 1
@@ -119,21 +130,21 @@ def check_command(*, json: Json = False) -> None:
         mark = "[green]ok[/]    " if result.ok else "[red]failed[/]"
         console.print(f"{mark} {result.seconds:5.1f} s  {result.check.name}")
         if not result.ok:
-            _print_line(result.output)
+            print_line(result.output)
 
     started = time.monotonic()
     try:
         results = asyncio.run(checks.run_checks(checks.CHECKS, checkout.root(), show))
     except WrongUseError as error:
-        _fail(str(error), WRONG_USE)
+        fail(str(error), WRONG_USE)
     seconds, failed = time.monotonic() - started, [result for result in results if not result.ok]
     if json:
         shown = [{"check": r.check.name, "ok": r.ok, "seconds": round(r.seconds, 1)} for r in results]
         print_json({"ok": not failed, "seconds": round(seconds, 1), "checks": shown})
     if failed:
         remedies = "\n".join(f"  {result.check.name}: {result.check.remedy}" for result in failed)
-        _fail(f"{len(failed)} of {len(results)} checks failed in {seconds:.0f} s:\n{remedies}")
-    _print_line(f"all {len(results)} checks passed ({seconds:.0f} s)")
+        fail(f"{len(failed)} of {len(results)} checks failed in {seconds:.0f} s:\n{remedies}")
+    print_line(f"all {len(results)} checks passed ({seconds:.0f} s)")
 
 
 @app.command("demo", epilog="Example: fognav demo --headless --report report.json --seed 7")
@@ -167,7 +178,7 @@ def demo_command(  # noqa: PLR0913  # each option is an argument
         int, typer.Option("--page-port", metavar="P", min=0, max=65535, help="Port of the page; 0: any free one.")
     ] = 0,
     yes: Yes = False,
-    json: Json = False,
+    json: JsonOption = False,
 ) -> None:
     """Run the system with simulated hardware; block the robot's path.
 
@@ -184,7 +195,7 @@ def demo_command(  # noqa: PLR0913  # each option is an argument
         for file in (report, record):
             check_writable(file)
     except (WrongUseError, SiteError) as error:
-        _fail(str(error), WRONG_USE)
+        fail(str(error), WRONG_USE)
     _prepare(yes=yes)
     options = Options(
         seed=seed,
@@ -196,11 +207,11 @@ def demo_command(  # noqa: PLR0913  # each option is an argument
         record=record,
     )
     try:
-        values = asyncio.run(run_demo(folder, options, headless=headless, page_port=page_port, print_line=_print_line))
+        values = asyncio.run(run_demo(folder, options, headless=headless, page_port=page_port, print_line=print_line))
         if report is not None:
             write_report(report, values)
     except WrongUseError as error:
-        _fail(str(error), WRONG_USE)
+        fail(str(error), WRONG_USE)
     if json:
         print_json(values)
     raise typer.Exit(OK if values["success"] else NOT_TRUE)
@@ -219,7 +230,7 @@ def record_command(
     zenoh: Router = "tcp/127.0.0.1:7447",
     site: SiteId = "estig",
     seconds: Annotated[float, typer.Option("--seconds", min=0.0, help="Duration; 0: until Ctrl-C.")] = 0.0,
-    json: Json = False,
+    json: JsonOption = False,
 ) -> None:
     """Record every channel of a running system to an MCAP file.
 
@@ -233,11 +244,11 @@ def record_command(
         check_writable(file)
         recorded = asyncio.run(recording.record(file, mqtt_url=mqtt, zenoh_endpoint=zenoh, site=site, seconds=seconds))
     except WrongUseError as error:
-        _fail(str(error), WRONG_USE)
+        fail(str(error), WRONG_USE)
     if json:
         print_json(recorded)
     else:
-        _print_line(f"wrote {file}: {recorded['seconds']} s, {recorded['messages']}")
+        print_line(f"wrote {file}: {recorded['seconds']} s, {recorded['messages']}")
 
 
 @app.command("replay", epilog="Example: fognav replay drive.mcap --speed 2")
@@ -248,7 +259,7 @@ def replay_command(
     zenoh: Router = "tcp/127.0.0.1:7447",
     site: SiteId = "estig",
     speed: Annotated[float, typer.Option("--speed", min=0.1, max=50.0, help="Speed factor.")] = 1.0,
-    json: Json = False,
+    json: JsonOption = False,
 ) -> None:
     """Publish a recording's messages again, with their timing.
 
@@ -261,14 +272,14 @@ def replay_command(
     try:
         sent = asyncio.run(recording.play(file, mqtt_url=mqtt, zenoh_endpoint=zenoh, site=site, speed=speed))
     except WrongUseError as error:
-        _fail(str(error), WRONG_USE)
+        fail(str(error), WRONG_USE)
     if json:
         print_json(sent)
     else:
         lost = (
             f"; the file is cut off: {sent['bytes_lost']} bytes at its end are incomplete" if sent["bytes_lost"] else ""
         )
-        _print_line(f"published {sent['sent']} messages of {file}{lost}")
+        print_line(f"published {sent['sent']} messages of {file}{lost}")
 
 
 @site_app.command(
@@ -279,7 +290,7 @@ def site_new(
     map_file: Annotated[Path, typer.Option("--map", metavar="MAP.yaml", help="map_server YAML; it is not copied.")],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to create, without a site in it.")],
     seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Each seed proposes other places.")] = 1,
-    json: Json = False,
+    json: JsonOption = False,
 ) -> None:
     """Propose a site on any map_server map, ready for a demo.
 
@@ -288,23 +299,23 @@ def site_new(
     from fognav.site_command import new_site  # noqa: PLC0415  # keeps the other commands fast
 
     try:
-        kernels.warm_cache(_print_line)
+        kernels.warm_cache(print_line)
         made = new_site(map_file, out, seed)
     except WrongUseError as error:
-        _fail(str(error), WRONG_USE)
+        fail(str(error), WRONG_USE)
     except kernels.KernelsError as error:
-        _fail(str(error))
+        fail(str(error))
     if json:
         print_json(made)
     else:
-        _print_line(f"wrote {made['file']}: {made['areas']} watched areas. Try it: fognav demo --site {out}")
+        print_line(f"wrote {made['file']}: {made['areas']} watched areas. Try it: fognav demo --site {out}")
 
 
 @site_app.command("check", epilog="Example: fognav site check sites/estig")
 def site_check(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder with site.toml, or a name in sites/.")],
     *,
-    json: Json = False,
+    json: JsonOption = False,
 ) -> None:
     """Check a site: map, ids, and that everything is on free floor."""
     from fognav.site_command import check_site  # noqa: PLC0415  # keeps the other commands fast
@@ -312,13 +323,13 @@ def site_check(
     try:
         found = check_site(checkout.site_folder(folder))
     except WrongUseError as error:
-        _fail(str(error), WRONG_USE)
+        fail(str(error), WRONG_USE)
     if json:
         print_json(found)
     elif found["ok"]:
-        _print_line(f"{folder}: ok ({found['areas']} areas, {found['nodes']} nodes, {found['places']} places)")
+        print_line(f"{folder}: ok ({found['areas']} areas, {found['nodes']} nodes, {found['places']} places)")
     else:
-        _fail(str(found["problem"]))
+        fail(str(found["problem"]))
     raise typer.Exit(OK if found["ok"] else NOT_TRUE)
 
 

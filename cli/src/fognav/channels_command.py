@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 from fognav import checkout
-from fognav.output import NOT_TRUE, WRONG_USE, WrongUseError, console
+from fognav.output import NOT_TRUE, WrongUseError, console, exit_codes
 
 
 def channels_command(
@@ -30,11 +30,8 @@ def channels_command(
 
     This is the document of all messages and routes, the brokers' access control lists, or the firmware's header.
     """
-    try:
+    with exit_codes():
         _run(format, broker, site, write=write, check=check)
-    except WrongUseError as error:
-        console.print(f"fognav: {error}", markup=False, style="red")
-        raise typer.Exit(WRONG_USE) from error
 
 
 def _run(format: str, broker: str | None, site: Path | None, *, write: bool, check: bool) -> None:  # noqa: A002  # same

@@ -3,10 +3,12 @@
 import json
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
+from typing import Final, NoReturn
 
+import typer
 from rich.console import Console
 
 from fognav import __version__
@@ -24,6 +26,32 @@ console = Console(stderr=True, highlight=False, width=None if sys.stderr.isatty(
 
 class WrongUseError(ValueError):
     """An option, argument or file can't be used; the message names it and the remedy."""
+
+
+class FailedError(RuntimeError):
+    """What was asked for did not come true; the message names the thing, the place and the remedy."""
+
+
+def print_line(text: str) -> None:
+    """Write a line for people."""
+    console.print(text, markup=False)
+
+
+def fail(message: str, code: int = NOT_TRUE) -> NoReturn:
+    """Print an error and end the command with an exit code."""
+    console.print(f"fognav: {message}", markup=False, style="red", soft_wrap=True)
+    raise typer.Exit(code)
+
+
+@contextmanager
+def exit_codes() -> Iterator[None]:
+    """Turn the errors of a command into their messages and exit codes."""
+    try:
+        yield
+    except WrongUseError as error:
+        fail(str(error), WRONG_USE)
+    except FailedError as error:
+        fail(str(error))
 
 
 def envelope(values: Mapping[str, object]) -> dict[str, object]:

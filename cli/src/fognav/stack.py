@@ -1,9 +1,7 @@
 """The whole system on one machine: real brokers, every process of fog and robot, and simulated hardware."""
 
 import asyncio
-import hashlib
 import os
-import secrets
 import shutil
 import sys
 import tempfile
@@ -15,6 +13,8 @@ from types import TracebackType
 from typing import Final, Self
 
 from fog_runtime.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
+from fog_runtime.keys import ADMIN_TOKEN, OPERATOR_KEY, TOKENS, make_keys
+from fog_runtime.operator_key import read_operator_key
 from fog_supervisor import net, servers
 from fog_supervisor.supervisor import Event, Program, Supervisor
 
@@ -34,7 +34,6 @@ ROBOT: Final = (WATCHDOG, AGENT)
 
 _SOCKET_PATH_LIMIT: Final = 80
 """Unix socket paths are limited to 108 bytes; folders up to this length leave room for the file's name."""
-_KEY_BYTES: Final = 32
 
 Ready = Callable[[], Awaitable[str | None]]
 
@@ -54,12 +53,6 @@ class StackConfig:
     seed: int = 1
     speed: float = 1.0
     extra: Mapping[str, str] | None = None
-
-
-def _write_secret(path: Path, text: str) -> None:
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-    with os.fdopen(descriptor, "w", encoding="utf-8") as file:
-        file.write(text)
 
 
 def _new_folder() -> Path:
@@ -89,9 +82,12 @@ class Stack:
         self.config = config
         self.folder = _new_folder()
         self.keep_files = False
-        self.token = secrets.token_urlsafe(24)
+        make_keys(self.folder)
+        self.token_file = self.folder / ADMIN_TOKEN
+        self.token = self.token_file.read_text("ascii").strip()
         """Bearer token of an administrator of this run."""
-        self.operator_key = secrets.token_bytes(_KEY_BYTES)
+        self.key_file = self.folder / OPERATOR_KEY
+        self.operator_key = read_operator_key(self.key_file)
         taken: set[int] = set()
         self.mqtt_port, self.redis_port, self.zenoh_port = (net.free_port(taken) for _ in range(3))
         self.supervisor = Supervisor(on_event)
@@ -168,10 +164,6 @@ class Stack:
     def _prepare(self) -> None:
         for name in ("logs", "ports", "data", "sim"):
             (self.folder / name).mkdir(mode=0o700)
-        digest = hashlib.sha256(self.token.encode()).hexdigest()
-        tokens = f'[[tokens]]\nname = "demo"\nrole = "admin"\nsha256 = "{digest}"\n'
-        _write_secret(self.folder / "tokens.toml", tokens)
-        _write_secret(self.folder / "operator.key", self.operator_key.hex() + "\n")
         self._add_servers()
         hardware = {"BASE": self.config.base, "LIDAR": self.config.lidar}
         self._add_python(SIMULATOR, "fognav_sim", {**hardware, "RUN_DIR": str(self.folder / "sim")})
@@ -221,8 +213,8 @@ class Stack:
             "ZENOH_CONNECT": self.zenoh_endpoint,
             "PORT_FILE": str(port_file),
             "DATA_DIR": str(data),
-            "TOKENS_FILE": str(self.folder / "tokens.toml"),
-            "OPERATOR_KEY_FILE": str(self.folder / "operator.key"),
+            "TOKENS_FILE": str(self.folder / TOKENS),
+            "OPERATOR_KEY_FILE": str(self.key_file),
             **(self.config.extra or {}),
             **own,
         }

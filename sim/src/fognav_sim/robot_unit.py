@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import os
-import secrets
 import sys
 import urllib.error
 import urllib.request
@@ -19,10 +18,11 @@ import msgspec
 
 from fog_contracts import channels as ch
 from fog_contracts.codec import ContractError
-from fog_contracts.commands import signed_command
-from fog_contracts.messages import CommandReply, RobotState
+from fog_contracts.messages import RobotState
 from fog_runtime import logs, process
 from fog_runtime.clock import SystemClock, ticker
+from fog_runtime.operator_key import read_operator_key
+from fog_runtime.robot_commands import RobotCommands
 from fog_runtime.settings import CommonSettings, SettingsError, describe, load
 from fog_runtime.site import load_site
 from fog_runtime.zenoh_edge import ZenohEdge
@@ -51,10 +51,10 @@ class _Operator:
     def __init__(self, settings: Settings, robot: str, places: tuple[str, str], edge: ZenohEdge) -> None:
         self._settings = settings
         self._robot = robot
-        self._edge = edge
         self._clock = SystemClock(settings.speed)
         assert settings.operator_key_file is not None
-        self._key = bytes.fromhex(settings.operator_key_file.read_text("ascii"))
+        key = read_operator_key(settings.operator_key_file)
+        self._commands = RobotCommands(edge, self._clock, operator="sim-robot", key=key)
         self._token = settings.token_file.read_text("ascii").strip()
         self._state: RobotState | None = None
         self._policy = OperatorPolicy(self._clock.now())
@@ -81,15 +81,7 @@ class _Operator:
 
     async def _send_command(self, kind: OperatorCommand) -> None:
         try:
-            command = signed_command(
-                kind,
-                robot=self._robot,
-                operator="sim-robot",
-                nonce=secrets.token_hex(16),
-                issued_at=self._clock.stamp(),
-                key=self._key,
-            )
-            reply = await self._edge.query(ch.ROBOT_COMMAND, command, CommandReply, _TIMEOUT_S, robot=self._robot)
+            reply = await self._commands.send(kind, self._robot, timeout_s=_TIMEOUT_S)
         except ContractError as error:
             _log.warning("command_failed", kind=kind, reason=str(error))
             return

@@ -13,6 +13,7 @@ from fognav.demo.operator import Operator
 from fognav.demo.options import DrivePlan
 from fognav.demo.placement import HazardPlacement
 from fognav.demo.preparation import Preparation
+from fognav.demo.presence import Presence
 from fognav.demo.scene import Scene
 from fognav.demo.speed import SpeedWatch, TooFastError
 from fognav.demo.usage import Usage, children
@@ -26,7 +27,7 @@ from fognav_sim.drive.hazard import HazardSchedule
 READY_S: Final = 90.0
 """Real seconds for everything to start."""
 _TICK_S: Final = 0.1
-_USAGE_S: Final = 1.0
+_SAMPLE_S: Final = 1.0
 _SPEED_CHECK_S: Final = 2.0
 
 
@@ -73,7 +74,10 @@ class Attempt:
                 await stack.start_system(READY_S)
                 edge = await ends.enter_async_context(self._open(stack, clock, "demo"))
                 operator = Operator(edge, stack, self.scene, clock)
-                async with Background(operator.keep_enabled(), self._sample_usage(stack)) as background:
+                presence = ends.enter_context(Presence(self.plan, self.scene, stack))
+                presence.update()
+                presence.announce()
+                async with Background(operator.keep_enabled(), self._sample(stack, presence)) as background:
                     await self.run_drive(operator, clock, background)
                     if options.keep_running:
                         self.scene.log_event("the system keeps running: end it with Ctrl-C")
@@ -120,15 +124,17 @@ class Attempt:
         elif event.kind == "started" and event.program in self.restarts:
             self.scene.log_event(f"{event.program} was restarted")
 
-    async def _sample_usage(self, stack: Stack) -> None:
+    async def _sample(self, stack: Stack, presence: Presence) -> None:
+        """Keep the processes' usage and the register's entry current."""
         while True:
+            presence.update()
             pids = stack.pids()
             if watchdog := pids.get(WATCHDOG):
                 for child in children(watchdog)[:1]:
                     pids["robot-guardian"] = child
             self.usage.sample(pids)
             self.scene.usage = self.usage.recent()
-            await asyncio.sleep(_USAGE_S)
+            await asyncio.sleep(_SAMPLE_S)
 
     # --- the drive ---
 
@@ -168,6 +174,9 @@ class Attempt:
         checked = clock.now()
         while (outcome := drive.outcome(clock.now())) is None:
             background.check()
+            if (taken := self._taken_over(drive)) is not None:
+                self.end(taken)
+                return
             await placement.place_if_due()
             if clock.now() - checked >= _SPEED_CHECK_S * clock.speed:
                 self._check_speed(clock.now() - checked, drive)
@@ -182,6 +191,13 @@ class Attempt:
             hazard_placed=drive.hazard_met,
         )
         self.end(outcome)
+
+    def _taken_over(self, drive: Drive) -> DriveOutcome | None:
+        """Return the outcome of a drive whose robot somebody has sent elsewhere: it is theirs from then on."""
+        goal = self.scene.goal
+        if goal is None or goal.pose is None or goal.goal_id == drive.evaluation.goal_id:
+            return None
+        return DriveOutcome("stopped", f"somebody sent the robot elsewhere ({goal.place or 'a position'})")
 
     def _check_speed(self, elapsed_s: float, drive: Drive) -> None:
         truth, state = self.scene.truth, self.scene.state

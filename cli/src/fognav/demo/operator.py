@@ -3,18 +3,15 @@
 import asyncio
 import http.client
 import re
-import secrets
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Final
 
 from fog_contracts import channels as ch
 from fog_contracts.codec import ContractError
-from fog_contracts.commands import signed_command
 from fog_contracts.messages import (
     CommandKind,
     CommandReply,
     HazardArea,
-    Message,
     Pose,
     RobotGoal,
     RobotObstacles,
@@ -25,6 +22,7 @@ from fog_contracts.messages import (
     SimTruth,
 )
 from fog_runtime.clock import Clock
+from fog_runtime.robot_commands import RobotCommands
 from fog_runtime.zenoh_edge import ZenohEdge
 from fog_supervisor import net
 from fognav.demo.scene import Scene
@@ -35,7 +33,7 @@ from fognav_sim.drive.operator import OperatorPolicy
 if TYPE_CHECKING:
     from fognav_sim.drive.drive import Drive
 
-_QUERY_TIMEOUT_S: Final = 2.0
+_SIMULATOR_TIMEOUT_S: Final = 2.0
 _POLICY_PERIOD_S: Final = 1.0
 
 
@@ -48,6 +46,7 @@ class Operator:
         self._scene = scene
         self._clock = clock
         self._robot = scene.robot
+        self._commands = RobotCommands(edge, clock, operator="demo", key=stack.operator_key)
         self.drive: Drive | None = None
         self.enabling_paused = False
         """While this is true, the robot is not enabled."""
@@ -123,27 +122,24 @@ class Operator:
 
     async def command(self, kind: CommandKind, pose: Pose | None = None) -> CommandReply | None:
         """Send the robot a signed command (`initial_pose` with a pose); return None if it did not reply."""
-        command = signed_command(
-            kind,
-            robot=self._robot,
-            operator="demo",
-            nonce=secrets.token_hex(16),
-            issued_at=self._clock.stamp(),
-            key=self._stack.operator_key,
-            pose=pose,
-        )
-        return await self._query(ch.ROBOT_COMMAND, command)
+        try:
+            return await self._commands.send(kind, self._robot, pose)
+        except ContractError as error:
+            self._log_invalid_reply(error)
+            return None
 
     async def simulate(self, command: SimCommand) -> CommandReply | None:
         """Change the simulated world; return None if the simulator did not reply."""
-        return await self._query(ch.SIM_COMMAND, command)
-
-    async def _query(self, channel: ch.Channel, request: Message) -> CommandReply | None:
         try:
-            return await self._edge.query(channel, request, CommandReply, _QUERY_TIMEOUT_S, robot=self._robot)
+            return await self._edge.query(
+                ch.SIM_COMMAND, command, CommandReply, _SIMULATOR_TIMEOUT_S, robot=self._robot
+            )
         except ContractError as error:
-            self._scene.log_event(f"invalid reply on {channel.name}: {error.reason}")
+            self._log_invalid_reply(error)
             return None
+
+    def _log_invalid_reply(self, error: ContractError) -> None:
+        self._scene.log_event(f"invalid reply on {error.channel}: {error.reason}")
 
     async def put_goal(self, place: str) -> net.Response:
         """Give the robot its goal by the planner's REST API; raises `OSError` if the planner can't be reached."""
@@ -171,7 +167,8 @@ class Operator:
             await asyncio.sleep(self._clock.real(_POLICY_PERIOD_S))
 
     def _due(self) -> CommandKind | None:
-        drive_over = self.drive is None and self._scene.outcome is not None
+        # After the drive the robot is left to whoever uses the demo: nobody undoes their commands.
+        drive_over = self._scene.outcome is not None
         return None if self.enabling_paused or drive_over else self._policy.command_due(self._clock.now())
 
     async def _send(self, kind: CommandKind) -> None:

@@ -39,6 +39,8 @@ class Scene:
     speed: float
     phase: str = "starting"
     page_url: str = ""
+    hint: str = ""
+    """How to operate the system, once it runs."""
     pose: RobotPose | None = None
     truth: SimTruth | None = None
     state: RobotState | None = None

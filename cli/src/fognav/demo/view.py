@@ -106,11 +106,13 @@ def render(scene: Scene, height: int) -> RenderableType:
     header.append(scene.phase, style="bold cyan")
     if scene.page_url:
         header.append(f"    {scene.page_url}", style="underline")
+    if scene.hint:
+        header.append(f"\n{scene.hint}", style="dim")
     columns = Table.grid(expand=True)
     for ratio in (5, 3, 4):
         columns.add_column(ratio=ratio)
     columns.add_row(_robot(scene), _hazards(scene), _processes(scene))
-    used = 4 + max(len(scene.usage) + 3, len(scene.site.site.areas) + 9)
+    used = 4 + bool(scene.hint) + max(len(scene.usage) + 3, len(scene.site.site.areas) + 9)
     return Group(header, columns, _events(scene, max(5, height - used)))
 
 

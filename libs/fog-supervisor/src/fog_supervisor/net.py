@@ -1,4 +1,4 @@
-"""Loopback ports, and a small HTTP client for local services."""
+"""Loopback ports, and a small HTTP client for the services."""
 
 import asyncio
 import contextlib
@@ -59,7 +59,7 @@ class Response:
         return str(self.body)
 
 
-def request(
+def request(  # noqa: PLR0913  # the parts of a request
     method: str,
     port: int,
     path: str,
@@ -67,8 +67,9 @@ def request(
     body: object = None,
     token: str | None = None,
     headers: Mapping[str, str] | None = None,
+    host: str = LOOPBACK,
 ) -> Response:
-    """Send a request to a server on the loopback address; raises `OSError` or `http.client.HTTPException`."""
+    """Send a request to a server on the loopback address or a `host`; raises `OSError` or `HTTPException`."""
     sent_headers = {"Accept": "application/json", **(headers or {})}
     data = None
     if body is not None:
@@ -76,7 +77,7 @@ def request(
         sent_headers["Content-Type"] = "application/json"
     if token is not None:
         sent_headers["Authorization"] = f"Bearer {token}"
-    connection = http.client.HTTPConnection(LOOPBACK, port, timeout=HTTP_TIMEOUT_S)
+    connection = http.client.HTTPConnection(host, port, timeout=HTTP_TIMEOUT_S)
     try:
         connection.request(method, path, body=data, headers=sent_headers)
         response = connection.getresponse()

@@ -13,6 +13,8 @@ from fog_contracts.commands import KEY_BYTES
 from fog_contracts.messages import Id
 from fog_contracts.site import Site
 from fog_runtime.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
+from fog_runtime.operator_key import OperatorKeyError
+from fog_runtime.operator_key import read_operator_key as read_key
 from fog_runtime.settings import CommonSettings, SettingsError
 
 if TYPE_CHECKING:
@@ -78,13 +80,7 @@ def read_operator_key(file: Path | None) -> bytes:
             "there is no operators' key, so nobody could enable the robot. Set FOGNAV_OPERATOR_KEY_FILE to a file "
             f"with {2 * KEY_BYTES} or more hexadecimal digits (openssl rand -hex {KEY_BYTES})"
         )
-    remedy = f"Write {2 * KEY_BYTES} or more hexadecimal digits into it (openssl rand -hex {KEY_BYTES})"
     try:
-        key = bytes.fromhex(file.read_text("ascii").strip())
-    except OSError as error:
-        raise SettingsError(f"the operators' key {file} can't be read: {error.strerror}. {remedy}") from error
-    except ValueError as error:
-        raise SettingsError(f"the operators' key {file} is not hexadecimal. {remedy}") from error
-    if len(key) < KEY_BYTES:
-        raise SettingsError(f"the operators' key {file} is only {len(key)} bytes long. {remedy}")
-    return key
+        return read_key(file)
+    except OperatorKeyError as error:
+        raise SettingsError(str(error)) from error

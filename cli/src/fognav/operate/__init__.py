@@ -1,0 +1,1 @@
+"""Operating running systems from the command line: finding them, their REST APIs, and commands to their robots."""

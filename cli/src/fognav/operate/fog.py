@@ -1,0 +1,152 @@
+"""The fog that a command talks to (a demo, this machine's fog node, or one elsewhere), and its REST APIs."""
+
+import http.client
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final
+from urllib.parse import quote, urlsplit
+
+import msgspec
+
+from fog_contracts.messages import Id
+from fog_runtime.operator_key import OperatorKeyError, read_operator_key
+from fog_supervisor import net
+from fognav.operate.registry import System, registered
+from fognav.operate.systems import FOG_NODE, MAP_SERVICE, PLANNER, ROUTER, addresses, find_systems
+from fognav.output import FailedError, WrongUseError
+
+FOG: Final = "FOGNAV_FOG"
+TOKEN: Final = "FOGNAV_TOKEN"  # noqa: S105  # a variable's name
+TOKEN_FILE: Final = "FOGNAV_TOKEN_FILE"  # noqa: S105  # same
+KEY_FILE: Final = "FOGNAV_OPERATOR_KEY_FILE"
+_GIVE_TOKEN: Final = f"Set {TOKEN} to an operator's token, or {TOKEN_FILE} to a file that holds it"
+
+
+class RefusedError(FailedError):
+    """A service refused a request; `status` is that of its problem document."""
+
+    def __init__(self, message: str, status: int) -> None:
+        super().__init__(message)
+        self.status = status
+
+
+@dataclass(frozen=True)
+class Fog:
+    """A running system and the caller's secrets for it."""
+
+    system: System
+
+    @cached_property
+    def site(self) -> str:
+        """Id of the site; raises `FailedError` if the map-service can't be asked for it."""
+        return self.system.site or str(self.get(MAP_SERVICE, "/api/v1/map")["site"])
+
+    @cached_property
+    def token(self) -> str | None:
+        """The caller's bearer token, or None; raises `WrongUseError` for a file that can't be read."""
+        if token := os.environ.get(TOKEN):
+            return token
+        file = os.environ.get(TOKEN_FILE) or self.system.token_file
+        if file is None:
+            return None
+        try:
+            return Path(file).read_text("ascii").strip()
+        except (OSError, UnicodeDecodeError) as error:
+            raise WrongUseError(f"the token file {file} can't be read: {error}. {_GIVE_TOKEN}") from error
+
+    @cached_property
+    def operator_key(self) -> bytes:
+        """The key that signs commands to robots; raises `WrongUseError` without one."""
+        file = os.environ.get(KEY_FILE) or self.system.key_file
+        if file is None:
+            raise WrongUseError(
+                f"commands to the robots of {self.system.name} are signed: set {KEY_FILE} to the site's operator.key"
+            )
+        try:
+            return read_operator_key(Path(file))
+        except OperatorKeyError as error:
+            raise WrongUseError(str(error)) from error
+
+    def robot(self, chosen: str | None) -> str:
+        """Return the chosen robot, or the only one; raises `WrongUseError` when there is a choice."""
+        if chosen is not None:
+            try:
+                return msgspec.convert(chosen, Id)
+            except msgspec.ValidationError as error:
+                raise WrongUseError(f"--robot {chosen}: an id has only a to z, 0 to 9 and -, at most 32") from error
+        known = self.system.robots or [str(robot["id"]) for robot in self.get(PLANNER, "/api/v1/robots")]
+        if len(known) == 1:
+            return known[0]
+        raise WrongUseError(f"name a robot with --robot; {self.system.name} has: {', '.join(known) or 'none'}")
+
+    def get(self, service: str, path: str) -> Any:  # noqa: ANN401  # JSON
+        """Return the JSON answer of a service; raises `FailedError`, or `RefusedError` with the service's reason."""
+        return self.send("GET", service, path)
+
+    def send(
+        self, method: str, service: str, path: str, body: object = None, headers: Mapping[str, str] | None = None
+    ) -> Any:  # noqa: ANN401  # JSON
+        """Send a request to a service and return its JSON answer; raises as `get`."""
+        url = self.system.urls.get(service)
+        if url is None:
+            raise FailedError(f"the {service} of {self.system.name} does not run: look at its log, then start it")
+        parts = urlsplit(url)
+        try:
+            response = net.request(
+                method,
+                parts.port or 80,
+                quote(path, safe="/?=&"),
+                body=body,
+                token=self.token,
+                headers=headers,
+                host=parts.hostname or net.LOOPBACK,
+            )
+        except (OSError, http.client.HTTPException) as error:
+            raise FailedError(
+                f"the {service} does not answer at {url}: {error}. Check that it runs there (fognav status)"
+            ) from error
+        if response.status >= http.client.BAD_REQUEST:
+            remedy = f". {_GIVE_TOKEN}" if response.status == http.client.UNAUTHORIZED else ""
+            raise RefusedError(f"the {service} refused it: {response.reason}{remedy}", response.status)
+        return response.body
+
+
+def find_fog(address: str | None) -> Fog:
+    """Return the fog to talk to: `address` or FOGNAV_FOG is a host or a name from `fognav status`.
+
+    Without either it is the only demo or fog node of this machine; raises `FailedError` without any, `WrongUseError`
+    when there is a choice.
+    """
+    named = address or os.environ.get(FOG)
+    if named:
+        return Fog(next((demo for demo in registered() if demo.name == named), None) or _fog_node(named))
+    fogs = [system for system in find_systems() if system.kind != "robot"]
+    if not fogs:
+        raise FailedError(
+            "no demo or fog node runs on this machine. Start one (fognav demo --keep-running), "
+            f"or name a fog node with --fog ADDRESS or {FOG}"
+        )
+    if len(fogs) > 1:
+        names = ", ".join(system.name for system in fogs)
+        raise WrongUseError(f"several systems run on this machine: choose one with --fog ({names})")
+    return Fog(fogs[0])
+
+
+def _fog_node(name: str) -> System:
+    """Return the fog node of a host, or of this machine by its name; raises `WrongUseError` for more than a host."""
+    if "/" in name or re.fullmatch(r"[^:]*:[0-9]*", name):
+        raise WrongUseError(
+            f"--fog {name}: give a host's name or address, without scheme and port. The ports are those of "
+            "docker-compose.yml; set FOGNAV_PLANNER_PORT, … if they were changed"
+        )
+    host = net.LOOPBACK if name == FOG_NODE else name
+    return System(name=name, kind="fog node", site="", urls=addresses(host), pids={})
+
+
+def router(fog: Fog) -> str:
+    """Return the endpoint of a fog's zenoh router."""
+    return fog.system.urls[ROUTER]

@@ -1,0 +1,50 @@
+"""Options that several commands have, and the texts of points and shapes in their arguments."""
+
+import math
+from typing import Annotated, Final
+
+import typer
+
+from fognav.output import WrongUseError
+
+FogOption = Annotated[
+    str | None,
+    typer.Option(
+        "--fog",
+        metavar="ADDRESS",
+        help="Host of a fog node, or a name from fognav status; default: FOGNAV_FOG, else the one that runs here.",
+    ),
+]
+RobotOption = Annotated[
+    str | None, typer.Option("--robot", metavar="ID", help="The robot; not needed where there is only one.")
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")]
+
+Point = tuple[float, float]
+
+NUMBERS: Final = {"ignore_unknown_options": True}
+"""Context settings of a command whose arguments may begin with a minus sign."""
+
+
+def numbers(text: str, count: tuple[int, ...], form: str) -> list[float]:
+    """Return the numbers of a text like `1.5,-2`; raises `WrongUseError` that shows the `form`."""
+    try:
+        found = [float(part) for part in text.split(",")]
+    except ValueError:
+        found = []
+    if len(found) not in count or not all(math.isfinite(value) for value in found):
+        raise WrongUseError(f"{text!r} is not {form}, such as {_example(form)}; metres, separated by commas")
+    return found
+
+
+def points(text: str, least: int, form: str) -> list[Point]:
+    """Return the points of a text like `0,0 1,0 1,1`; raises `WrongUseError`."""
+    found = [numbers(part, (2,), "X,Y") for part in text.split()]
+    if len(found) < least:
+        raise WrongUseError(f"{text!r} has {len(found)} points, but {form} needs at least {least}: 'X,Y X,Y …'")
+    return [(x, y) for x, y in found]
+
+
+def _example(form: str) -> str:
+    values = {"X": "12.5", "Y": "3", "R": "0.5", "THETA": "1.57", "X2": "14", "Y2": "4.5"}
+    return ",".join(values[name] for name in form.replace("[", "").replace("]", "").split(","))

@@ -1,0 +1,13 @@
+"""What became of an operator's command to a robot."""
+
+import msgspec
+
+from fog_contracts.messages import Mode
+
+
+class Outcome(msgspec.Struct, frozen=True, kw_only=True):
+    """What became of a command: the robot's answer, and its mode afterwards (None if it publishes no state)."""
+
+    accepted: bool
+    reason: str
+    mode: Mode | None

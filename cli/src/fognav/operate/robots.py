@@ -1,0 +1,79 @@
+"""Signed commands to a robot, and its states, over the zenoh router of a running system."""
+
+import asyncio
+import getpass
+from collections.abc import AsyncIterator, Mapping
+from contextlib import asynccontextmanager
+from typing import Final
+
+from fog_contracts import channels as ch
+from fog_contracts.codec import ContractError
+from fog_contracts.messages import CommandKind, Pose, RobotPose, RobotState
+from fog_runtime.clock import SystemClock
+from fog_runtime.robot_commands import REPLY_TIMEOUT_S, RobotCommands
+from fog_runtime.zenoh_edge import ZenohEdge
+from fognav.operate.fog import Fog, router
+from fognav.operate.outcome import Outcome
+from fognav.output import FailedError
+
+STATE_TIMEOUT_S: Final = 3.0
+"""Real seconds to wait for a robot's state: it is published once a second of the robot's clock, and on change."""
+
+
+class Robot:
+    """A robot of a running system: its latest state and pose, and commands to it."""
+
+    def __init__(self, edge: ZenohEdge, fog: Fog, robot: str, clock: SystemClock) -> None:
+        self._edge = edge
+        self._fog = fog
+        self._clock = clock
+        self.id = robot
+        self.state: RobotState | None = None
+        self.pose: RobotPose | None = None
+        self._changed = asyncio.Event()
+        edge.subscribe(ch.ROBOT_STATE, RobotState, self._on_state, robot=robot)
+        edge.subscribe(ch.ROBOT_POSE, RobotPose, self._on_pose, robot=robot)
+
+    def _on_state(self, _ids: Mapping[str, str], state: RobotState) -> None:
+        self.state = state
+        self._changed.set()
+
+    def _on_pose(self, _ids: Mapping[str, str], pose: RobotPose) -> None:
+        self.pose = pose
+
+    async def next_state(self) -> RobotState | None:
+        """Return the next state that the robot publishes, or None when none comes in time."""
+        self._changed.clear()
+        try:
+            async with asyncio.timeout(STATE_TIMEOUT_S):
+                await self._changed.wait()
+        except TimeoutError:
+            return None
+        return self.state
+
+    async def command(self, kind: CommandKind, key: bytes, pose: Pose | None = None) -> Outcome:
+        """Send a command signed with the operators' `key`; raises `FailedError` when the robot does not answer."""
+        commands = RobotCommands(self._edge, self._clock, operator=getpass.getuser(), key=key)
+        try:
+            # The timeout is in the clock's seconds, of which more pass in a fast simulation.
+            timeout_s = REPLY_TIMEOUT_S * max(1.0, self._clock.speed)
+            reply = await commands.send(kind, self.id, pose, timeout_s)
+        except ContractError as error:
+            raise FailedError(f"robot {self.id} gave an invalid reply: {error}. Check that versions match") from error
+        if reply is None:
+            raise FailedError(
+                f"robot {self.id} did not answer within {REPLY_TIMEOUT_S:.0f} s. Check its id, that its agent runs, "
+                f"and that it is connected to {router(self._fog)}"
+            )
+        state = await self.next_state()
+        return Outcome(accepted=reply.accepted, reason=reply.reason, mode=state.mode if state is not None else None)
+
+
+@asynccontextmanager
+async def connect(fog: Fog, robot: str) -> AsyncIterator[Robot]:
+    """Connect to a robot; raises `FailedError` when the router can't be reached."""
+    clock = SystemClock(fog.system.speed)
+    async with ZenohEdge.open(connect=[router(fog)], clock=clock, role="console", id=robot, site=fog.site) as edge:
+        if not edge.connected:
+            raise FailedError(f"the zenoh router {router(fog)} can't be reached: check that it runs (fognav status)")
+        yield Robot(edge, fog, robot, clock)

@@ -1,0 +1,162 @@
+"""The systems that run on this machine: registered demos, and the processes of a fog node or a robot."""
+
+import http.client
+import os
+import tomllib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Final
+
+import psutil
+
+from fog_supervisor import net
+from fognav.operate.registry import System, registered
+
+FOG_NODE: Final = "fog-node"
+"""Name of the fog node of this machine."""
+AGGREGATOR: Final = "hazard-aggregator"
+MAP_SERVICE: Final = "map-service"
+PLANNER: Final = "planner"
+ROUTER: Final = "zenoh-router"
+
+SERVICE_PORTS: Final = {
+    AGGREGATOR: ("FOGNAV_AGGREGATOR_PORT", 8001),
+    MAP_SERVICE: ("FOGNAV_MAP_PORT", 8002),
+    PLANNER: ("FOGNAV_PLANNER_PORT", 8003),
+}
+"""The ports of a fog node's REST APIs: the variables that docker-compose.yml reads, and its defaults."""
+ZENOH_PORT: Final = ("FOGNAV_ZENOH_PORT", 7447)
+
+_FOG_MODULES: Final = {"hazard_aggregator": AGGREGATOR, "map_service": MAP_SERVICE, "planner": PLANNER}
+_ROBOT_MODULES: Final = {
+    "robot_agent": "robot-agent",
+    "robot_agent.guardian": "robot-guardian",
+    "robot_agent.guardian.watchdog": "robot-watchdog",
+}
+
+
+def find_systems() -> list[System]:
+    """Return every system on this machine, those of other users as far as they can be seen."""
+    demos = registered()
+    known = {pid for demo in demos for pid in demo.pids.values()}
+    fog_node = _fog_node(_processes(_FOG_MODULES, known))
+    return [*demos, *([fog_node] if fog_node else []), *_robots(_processes(_ROBOT_MODULES, known))]
+
+
+def port(setting: tuple[str, int]) -> int:
+    """Return the port that a variable of the environment gives, or its default."""
+    variable, default = setting
+    return int(os.environ.get(variable) or default)
+
+
+def addresses(host: str) -> dict[str, str]:
+    """Return the addresses of a fog node's REST APIs and router on a host."""
+    shown = f"[{host}]" if ":" in host else host  # IPv6
+    urls = {name: f"http://{shown}:{port(setting)}" for name, setting in SERVICE_PORTS.items()}
+    return {**urls, ROUTER: f"tcp/{shown}:{port(ZENOH_PORT)}"}
+
+
+def _module(process: psutil.Process) -> str:
+    """Return the module of a `python -m MODULE`, else an empty text."""
+    arguments = process.info["cmdline"] or []
+    if len(arguments) > 2 and "-m" in arguments[1:-1] and "python" in os.path.basename(arguments[0]):  # noqa: PTH119  # a name, not a path
+        return str(arguments[arguments.index("-m") + 1])
+    return ""
+
+
+def _processes(modules: Mapping[str, str], known: set[int]) -> list[tuple[str, psutil.Process]]:
+    """Return the processes that run one of the modules, with their parts' names, without those of `known` systems."""
+    found = []
+    for process in psutil.process_iter(["cmdline", "pid"]):
+        name = modules.get(_module(process))
+        if name is not None and process.pid not in known and not _belongs(process, known):
+            found.append((name, process))
+    return found
+
+
+def _belongs(process: psutil.Process, known: Iterable[int]) -> bool:
+    try:
+        return not {parent.pid for parent in process.parents()}.isdisjoint(known)
+    except psutil.Error:
+        return True  # it has just ended
+
+
+def _setting(process: psutil.Process, name: str) -> str:
+    try:
+        return str(process.environ().get(f"FOGNAV_{name}", ""))
+    except psutil.Error:
+        return ""  # of another user, or in a container
+
+
+def _fog_node(processes: list[tuple[str, psutil.Process]]) -> System | None:
+    """Return the fog node whose REST APIs are at this machine's published ports."""
+    urls = addresses(net.LOOPBACK)
+    titles = {name: f"Fognav {name}" for name in SERVICE_PORTS}
+    answering = {name for name, setting in SERVICE_PORTS.items() if _title(port(setting)) == titles[name]}
+    if not answering:
+        return None
+    return System(
+        name=FOG_NODE,
+        kind="fog node",
+        site=_site(port(SERVICE_PORTS[MAP_SERVICE])) if MAP_SERVICE in answering else "",
+        urls={name: url for name, url in urls.items() if name in answering or name == ROUTER},
+        pids={name: process.pid for name, process in processes},
+    )
+
+
+def _get(port: int, path: str) -> dict[str, object]:
+    try:
+        response = net.request("GET", port, path)
+    except (OSError, http.client.HTTPException):
+        return {}
+    return response.body if response.status == http.client.OK and isinstance(response.body, dict) else {}
+
+
+def _title(port: int) -> str:
+    info = _get(port, "/openapi.json").get("info")
+    return str(info.get("title", "")) if isinstance(info, dict) else ""
+
+
+def _site(port: int) -> str:
+    return str(_get(port, "/api/v1/map").get("site", ""))
+
+
+def _robots(processes: list[tuple[str, psutil.Process]]) -> list[System]:
+    """Return one system for each robot whose processes run here: those that share a guardian's socket."""
+    by_socket: dict[tuple[str, str], list[tuple[str, psutil.Process]]] = {}
+    for name, process in processes:
+        key = (_setting(process, "ROBOT"), _setting(process, "GUARDIAN_SOCKET"))
+        by_socket.setdefault(key, []).append((name, process))
+    return [
+        System(
+            name=f"robot-{robot}" if robot else "robot",
+            kind="robot",
+            site=next((site for _, process in own if (site := _site_of(process))), ""),
+            urls={name: url for name, process in own if (url := _listening(process))},
+            pids={name: process.pid for name, process in own},
+            robots=[robot] if robot else [],
+        )
+        for (robot, _), own in by_socket.items()
+    ]
+
+
+def _site_of(process: psutil.Process) -> str:
+    """Return the id of a process's site by its settings, or an empty text if they can't be seen."""
+    from fog_runtime.site import SITE_FILE  # noqa: PLC0415  # numpy: keeps the commands fast
+
+    if site := _setting(process, "SITE"):
+        return site
+    try:
+        file = Path(_setting(process, "SITE_DIR")) / SITE_FILE
+        return str(tomllib.loads(file.read_text("utf-8")).get("id", ""))
+    except (OSError, ValueError):
+        return ""
+
+
+def _listening(process: psutil.Process) -> str:
+    try:
+        connections = process.net_connections("tcp")
+    except psutil.Error:
+        return ""
+    ports = [c.laddr.port for c in connections if c.status == psutil.CONN_LISTEN]
+    return f"http://{net.LOOPBACK}:{ports[0]}" if ports else ""

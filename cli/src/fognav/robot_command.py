@@ -1,0 +1,245 @@
+"""`fognav robot`: an operator's commands to a robot, its state, and its mission."""
+
+import asyncio
+import contextlib
+import sys
+import time
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+import msgspec
+import typer
+
+from fog_contracts.messages import CommandKind, Pose, RobotPose, RobotState
+from fog_runtime import logs
+from fognav.operate.fog import Fog, RefusedError, find_fog
+from fognav.operate.options import NUMBERS, FogOption, JsonOption, RobotOption, numbers
+from fognav.operate.outcome import Outcome
+from fognav.operate.systems import MAP_SERVICE, PLANNER
+from fognav.output import NOT_TRUE, FailedError, WrongUseError, envelope, exit_codes, print_json, print_line
+
+robot_app = typer.Typer(help="Enable, stop and send robots, and watch them.", no_args_is_help=True)
+
+Target = Annotated[str, typer.Argument(metavar="PLACE|X,Y[,THETA]", help="A place of the site, or metres and radians.")]
+Start = Annotated[str, typer.Argument(metavar="PLACE|X,Y,THETA", help="A place of the site, or metres and radians.")]
+
+
+@robot_app.command("enable", epilog="Example: fognav robot enable")
+def robot_enable(*, robot: RobotOption = None, fog: FogOption = None, json: JsonOption = False) -> None:
+    """Let a robot drive that waits for it."""
+    _run_command("enable", robot, fog, json=json)
+
+
+@robot_app.command("disable", epilog="Example: fognav robot disable --robot r1")
+def robot_disable(*, robot: RobotOption = None, fog: FogOption = None, json: JsonOption = False) -> None:
+    """Stop a robot at once; its mission is kept.
+
+    The robot continues it when it is enabled again.
+    """
+    _run_command("disable", robot, fog, json=json)
+
+
+@robot_app.command("reset", epilog="Example: fognav robot reset && fognav robot enable")
+def robot_reset(*, robot: RobotOption = None, fog: FogOption = None, json: JsonOption = False) -> None:
+    """Reset a robot's latched fault, after its cause is gone."""
+    _run_command("reset", robot, fog, json=json)
+
+
+@robot_app.command("stop", epilog="Example: fognav robot stop")
+def robot_stop(*, robot: RobotOption = None, fog: FogOption = None, json: JsonOption = False) -> None:
+    """Stop a robot at once and end its mission."""
+    with exit_codes():
+        found = find_fog(fog)
+        chosen = found.robot(robot)
+        outcome = asyncio.run(_command(found, chosen, "disable"))
+        # The robot comes first: it stops whether or not the planner answers.
+        reason = f"{outcome.reason}; {_end_mission(found, chosen)}"
+        _report(msgspec.structs.replace(outcome, reason=reason), json=json)
+
+
+@robot_app.command("pose", context_settings=NUMBERS, epilog="Example: fognav robot pose 12.5,3,1.57")
+def robot_pose(pose: Start, *, robot: RobotOption = None, fog: FogOption = None, json: JsonOption = False) -> None:
+    """Tell a robot where it is.
+
+    This is for a robot that does not find out by itself; it must be disabled.
+    """
+    with exit_codes():
+        found = find_fog(fog)
+        place = _place(found, pose)
+        if place is None:
+            x, y, theta = numbers(pose, (3,), "X,Y,THETA")
+        elif place.get("theta") is None:
+            raise WrongUseError(f"place {pose} has no heading: give {place['x']},{place['y']},THETA")
+        else:
+            x, y, theta = place["x"], place["y"], place["theta"]
+        outcome = asyncio.run(_command(found, found.robot(robot), "initial_pose", Pose(x=x, y=y, theta=theta)))
+        _report(outcome, json=json)
+
+
+@robot_app.command("goal", context_settings=NUMBERS, epilog="Example: fognav robot goal b")
+def robot_goal(goal: Target, *, robot: RobotOption = None, fog: FogOption = None, json: JsonOption = False) -> None:
+    """Send a robot to a place or position.
+
+    It must be enabled to drive there.
+    """
+    with exit_codes():
+        found = find_fog(fog)
+        chosen = found.robot(robot)
+        try:
+            found.send("PUT", PLANNER, f"/api/v1/robots/{chosen}/goal", _goal(goal))
+        except RefusedError as error:
+            _report(Outcome(accepted=False, reason=str(error), mode=_view(found, chosen)[1]), json=json)
+        mode = _view(found, chosen)[1]
+        waits = "; it waits to be enabled (fognav robot enable)" if mode == "INIT" else ""
+        _report(Outcome(accepted=True, reason=f"robot {chosen} goes to {goal}{waits}", mode=mode), json=json)
+
+
+@robot_app.command("cancel", epilog="Example: fognav robot cancel")
+def robot_cancel(*, robot: RobotOption = None, fog: FogOption = None, json: JsonOption = False) -> None:
+    """End a robot's mission; the robot stays enabled."""
+    with exit_codes():
+        found = find_fog(fog)
+        chosen = found.robot(robot)
+        try:
+            found.send("DELETE", PLANNER, f"/api/v1/robots/{chosen}/goal")
+        except RefusedError as error:
+            _report(Outcome(accepted=False, reason=str(error), mode=_view(found, chosen)[1]), json=json)
+        except FailedError as error:
+            # Without the planner the robot can drop its goal itself, until the planner is back.
+            outcome = asyncio.run(_command(found, chosen, "cancel"))
+            _report(msgspec.structs.replace(outcome, reason=f"{outcome.reason}; {error}"), json=json)
+        _report(
+            Outcome(accepted=True, reason=f"the mission of robot {chosen} is ended", mode=_view(found, chosen)[1]),
+            json=json,
+        )
+
+
+@robot_app.command("status", epilog="Example: fognav robot status --json")
+def robot_status(*, robot: RobotOption = None, fog: FogOption = None, json: JsonOption = False) -> None:
+    """Show a robot's mode, pose, mission and plan."""
+    with exit_codes():
+        found = find_fog(fog)
+        view, mode = _view(found, found.robot(robot))
+        if json:
+            print_json({"mode": mode, "reasons": view["state"]["reasons"] if view["state"] else [], **view})
+            return
+        print_line(f"{view['id']}: {_describe(view['state'], view['pose'])}")
+        if (goal := view["goal"]) is not None:
+            print_line(f"  goal: {goal['place'] or _position(goal['pose'])}")
+        if (plan := view["plan"]) is not None and plan["refusal"] is not None:
+            print_line(f"  no path: {plan['refusal']['reason']}")
+
+
+@robot_app.command("watch", epilog="Example: fognav robot watch --seconds 60 --json")
+def robot_watch(
+    *,
+    seconds: Annotated[float, typer.Option("--seconds", min=0.0, help="Duration; 0: until Ctrl-C.")] = 0.0,
+    robot: RobotOption = None,
+    fog: FogOption = None,
+    json: Annotated[bool, typer.Option("--json", help="Write one JSON object per line to standard output.")] = False,
+) -> None:
+    """Print a robot's state whenever it changes.
+
+    An unchanged state is printed once a second, because the robot publishes it so.
+    """
+    with exit_codes(), contextlib.suppress(KeyboardInterrupt):
+        found = find_fog(fog)
+        asyncio.run(_watch(found, found.robot(robot), seconds, json=json))
+
+
+def _run_command(kind: CommandKind, robot: str | None, fog: str | None, *, json: bool) -> None:
+    with exit_codes():
+        found = find_fog(fog)
+        _report(asyncio.run(_command(found, found.robot(robot), kind)), json=json)
+
+
+async def _command(fog: Fog, robot: str, kind: CommandKind, pose: Pose | None = None) -> Outcome:
+    from fognav.operate.robots import connect  # noqa: PLC0415  # zenoh: keeps the other commands fast
+
+    logs.configure("fognav", "error", "text")
+    key = fog.operator_key  # a command that can't be signed is refused before anything is connected
+    async with connect(fog, robot) as connected:
+        return await connected.command(kind, key, pose)
+
+
+def _report(outcome: Outcome, *, json: bool) -> None:
+    """Print what became of a command and end it: with exit code 1 if it was refused."""
+    if json:
+        print_json(msgspec.to_builtins(outcome))
+    else:
+        print_line(f"{'accepted' if outcome.accepted else 'refused'}: {outcome.reason} (mode {outcome.mode})")
+    raise typer.Exit(0 if outcome.accepted else NOT_TRUE)
+
+
+def _end_mission(fog: Fog, robot: str) -> str:
+    try:
+        fog.send("DELETE", PLANNER, f"/api/v1/robots/{robot}/goal")
+    except RefusedError as error:
+        return "it had no mission" if error.status == 404 else str(error)
+    except FailedError as error:
+        return f"its mission is not ended: {error}"
+    return "its mission is ended"
+
+
+def _place(fog: Fog, text: str) -> Mapping[str, Any] | None:
+    """Return the place that a text names, None for numbers; raises `WrongUseError` for an unknown place."""
+    if "," in text:
+        return None
+    places: dict[str, Mapping[str, Any]] = fog.get(MAP_SERVICE, "/api/v1/places")
+    if text not in places:
+        raise WrongUseError(f"there is no place {text}; known places: {', '.join(sorted(places)) or 'none'}")
+    return places[text]
+
+
+def _goal(text: str) -> dict[str, object]:
+    if "," not in text:
+        return {"place": text}
+    x, y, *theta = numbers(text, (2, 3), "X,Y[,THETA]")
+    return {"pose": {"x": x, "y": y, **({"theta": theta[0]} if theta else {})}}
+
+
+def _view(fog: Fog, robot: str) -> tuple[Mapping[str, Any], Any]:
+    """Return the planner's view of a robot, and its mode (None if unknown); raises `FailedError` for no such robot."""
+    robots = fog.get(PLANNER, "/api/v1/robots")
+    for view in robots:
+        if view["id"] == robot:
+            return view, view["state"] and view["state"]["mode"]
+    known = ", ".join(view["id"] for view in robots) or "none"
+    raise FailedError(f"there is no robot {robot} at {fog.system.name}; known robots: {known}")
+
+
+async def _watch(fog: Fog, robot: str, seconds: float, *, json: bool) -> None:
+    from fognav.operate.robots import connect  # noqa: PLC0415  # zenoh: keeps the other commands fast
+
+    logs.configure("fognav", "error", "text")
+    ends = time.monotonic() + seconds if seconds else None
+    async with connect(fog, robot) as connected:
+        while ends is None or time.monotonic() < ends:
+            state = await connected.next_state()
+            if state is None:
+                raise FailedError(f"robot {robot} publishes no state: check that its agent runs and is connected")
+            _print_state(robot, state, connected.pose, json=json)
+
+
+def _print_state(robot: str, state_message: RobotState, pose_message: RobotPose | None, *, json: bool) -> None:
+    state, pose = msgspec.to_builtins(state_message), msgspec.to_builtins(pose_message)
+    if json:
+        sys.stdout.write(msgspec.json.encode(envelope({"robot": robot, **state, "pose": pose})).decode() + "\n")
+        sys.stdout.flush()
+    else:
+        print_line(f"{time.strftime('%H:%M:%S')} {_describe(state, pose)}")
+
+
+def _describe(state: Mapping[str, Any] | None, pose: Mapping[str, Any] | None) -> str:
+    if state is None:
+        return "no state received yet"
+    parts = [state["mode"], *state["reasons"][:3]]
+    if pose is not None:
+        parts.append(f"at {_position(pose)}" + ("" if pose["localized"] else ", not localized"))
+    if state["goal_distance"] is not None:
+        parts.append(f"{state['goal_distance']:.1f} m to the goal")
+    return "; ".join(parts)
+
+
+def _position(pose: Mapping[str, Any]) -> str:
+    return f"({pose['x']:.2f}, {pose['y']:.2f})"

@@ -1,0 +1,369 @@
+"""The operator's commands against a stand-in for the REST APIs; tests/live runs them against a real demo."""
+
+import json
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import msgspec
+import psutil
+import pytest
+from typer.testing import CliRunner
+
+from fognav.__main__ import app
+from fognav.operate import registry
+from fognav.operate.registry import Registration, System, registered
+from fognav.output import FailedError
+
+ZONE = {
+    "id": "z-1", "kind": "BLOCKED", "shape": {"type": "circle", "centre": [1, 2], "radius": 0.5}, "factor": None,
+    "speed": None, "reason": "wet floor", "author": "anna", "starts_at": None, "expires_at": None, "enabled": True,
+    "version": 1,
+}  # fmt: skip
+ROBOT = {
+    "id": "r1", "configured": True, "pose": None, "goal": None, "plan": None,
+    "state": {"mode": "NORMAL", "reasons": [], "goal_distance": None},
+}  # fmt: skip
+
+
+class Service:
+    """Answers every request with what `answers` holds for its method and path, and records the requests."""
+
+    def __init__(self) -> None:
+        self.requests: list[tuple[str, str, object, str | None]] = []
+        self.answers: dict[tuple[str, str], tuple[int, object]] = {}
+        service = self
+
+        class Handler(BaseHTTPRequestHandler):
+            def answer(self) -> None:
+                body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
+                token = self.headers.get("Authorization")
+                service.requests.append((self.command, self.path, json.loads(body or b"null"), token))
+                status, value = service.answers.get((self.command, self.path), (404, {"detail": "there is no such"}))
+                data = json.dumps(value).encode() if status != 204 else b""
+                self.send_response(status)
+                self.send_header("Content-Length", str(len(data)))
+                self.end_headers()
+                self.wfile.write(data)
+
+            do_GET = do_POST = do_PUT = do_DELETE = answer  # noqa: N815  # the names are http.server's
+
+            def log_message(self, *_: object) -> None:
+                pass
+
+        self.server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        threading.Thread(target=self.server.serve_forever, args=(0.02,), daemon=True).start()
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.server.server_port}"
+
+
+@pytest.fixture(autouse=True)
+def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A register of its own, and a machine without a fog node."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    for name in ("AGGREGATOR_PORT", "MAP_PORT", "PLANNER_PORT"):
+        monkeypatch.setenv(f"FOGNAV_{name}", "1")
+    for name in ("FOG", "TOKEN", "TOKEN_FILE", "OPERATOR_KEY_FILE"):
+        monkeypatch.delenv(f"FOGNAV_{name}", raising=False)
+    return tmp_path / "fognav"
+
+
+@pytest.fixture
+def service() -> Iterator[Service]:
+    running = Service()
+    yield running
+    running.server.shutdown()
+    running.server.server_close()
+
+
+def system(name: str, url: str, **others: object) -> System:
+    urls = dict.fromkeys(("map-service", "planner", "hazard-aggregator"), url)
+    given = {
+        "site": "here",
+        "urls": {**urls, "zenoh-router": "tcp/127.0.0.1:1"},
+        "pids": {},
+        "robots": ["r1"],
+        **others,
+    }
+    return System(name=name, kind="demo", **given)
+
+
+@pytest.fixture
+def demo(service: Service, tmp_path: Path) -> Iterator[Service]:
+    """A registered demo whose services are all this one."""
+    (tmp_path / "token").write_text("secret\n")
+    with Registration(lambda: system("demo-1", service.url, token_file=str(tmp_path / "token"))) as registration:
+        registration.update()
+        yield service
+
+
+def run(*arguments: str, code: int = 0) -> str:
+    """Run a command that must end with this exit code; return its output in one line, or its JSON text."""
+    done = CliRunner().invoke(app, list(arguments))
+    assert done.exit_code == code, done.output
+    return done.stdout if "--json" in arguments and code == 0 else " ".join(done.output.split())
+
+
+def test_register_lists_a_demo_until_its_end(runtime: Path) -> None:
+    with Registration(lambda: system("demo-1", "http://x")) as registration:
+        assert registered() == []
+        registration.update()
+        assert [found.name for found in registered()] == ["demo-1"]
+        (file,) = runtime.iterdir()
+        assert [file.stat().st_mode & 0o777, runtime.stat().st_mode & 0o777] == [0o600, 0o700]
+    assert registered() == []
+
+
+def test_register_forgets_a_demo_that_was_killed(runtime: Path) -> None:
+    code = (
+        "import sys; from fognav.operate.registry import *\n"
+        "Registration(lambda: System(name='demo-9', kind='demo', site='', urls={}, pids={})).update()\n"
+        "print('up', flush=True); sys.stdin.read()"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    assert process.stdout is not None
+    assert process.stdout.readline() == b"up\n"
+    assert [found.name for found in registered()] == ["demo-9"]
+    process.kill()
+    process.communicate()
+    assert registered() == []
+    assert list(runtime.iterdir()) == []
+
+
+def test_register_forgets_a_demo_whose_process_id_belongs_to_another_process(runtime: Path) -> None:
+    with Registration(lambda: system("demo-1", "http://x")) as registration:
+        registration.update()
+        (file,) = runtime.iterdir()
+        entry = json.loads(file.read_text())
+        file.write_text(json.dumps({**entry, "started": entry["started"] - 60}))
+        assert registered() == []
+        assert not file.exists()
+
+
+def test_unreadable_entry_is_removed(runtime: Path) -> None:
+    registry.folder()
+    (runtime / "demo-1.json").write_text('{"pid": 1')
+    assert registered() == []
+    assert list(runtime.iterdir()) == []
+
+
+@pytest.mark.parametrize("prepare", ["open to others", "a link"])
+def test_folder_that_is_not_private_is_not_trusted(runtime: Path, tmp_path: Path, prepare: str) -> None:
+    if prepare == "a link":
+        (tmp_path / "elsewhere").mkdir(mode=0o700)
+        runtime.symlink_to(tmp_path / "elsewhere")
+    else:
+        runtime.mkdir()
+        runtime.chmod(0o755)
+    with pytest.raises(FailedError, match="is not a private folder of yours"):
+        registered()
+
+
+def test_without_a_runtime_folder_the_register_is_in_the_temporary_folder(monkeypatch, tmp_path: Path) -> None:
+    monkeypatch.delenv("XDG_RUNTIME_DIR")
+    monkeypatch.setattr("tempfile.gettempdir", lambda: str(tmp_path))
+    assert registry.folder() == tmp_path / f".fognav-{os.getuid()}"
+
+
+def test_command_without_a_system_fails_with_the_remedy() -> None:
+    assert "no demo or fog node runs on this machine. Start one (fognav demo" in run("zone", "list", code=1)
+
+
+def test_command_with_several_systems_asks_for_one(demo: Service) -> None:
+    demo.answers["GET", "/api/v1/zones"] = (200, {"zones": [], "active": [], "epoch": 1, "seq": 1})
+    with Registration(lambda: system("demo-2", demo.url)) as registration:
+        registration.update()
+        assert "choose one with --fog (demo-1, demo-2)" in run("zone", "list", code=2)
+        assert run("zone", "list", "--fog", "demo-2") == "no zones"
+
+
+def test_status_shows_addresses_token_and_processes(demo: Service, tmp_path: Path) -> None:
+    found = json.loads(run("status", "--json"))
+    (shown,) = [entry for entry in found["systems"] if entry["name"] == "demo-1"]
+    assert (shown["kind"], shown["site"], shown["token_file"]) == ("demo", "here", str(tmp_path / "token"))
+    assert shown["urls"]["planner"] == demo.url
+    assert shown["pids"] == {}
+
+
+def test_status_of_a_fog_node_that_does_not_answer_fails() -> None:
+    output = run("status", "--fog", "127.0.0.1", code=1)
+    assert "the hazard-aggregator does not answer at http://127.0.0.1:1" in output
+
+
+def test_fog_node_elsewhere_is_found_by_its_address_and_asked_with_the_token(service, monkeypatch) -> None:
+    for name in ("AGGREGATOR_PORT", "MAP_PORT", "PLANNER_PORT"):
+        monkeypatch.setenv(f"FOGNAV_{name}", str(service.server.server_port))
+    monkeypatch.setenv("FOGNAV_FOG", "localhost")
+    monkeypatch.setenv("FOGNAV_TOKEN", "mine")
+    service.answers["GET", "/healthz"] = (200, {"status": "ok"})
+    service.answers["GET", "/api/v1/map"] = (200, {"site": "there"})
+    (shown,) = json.loads(run("status", "--json"))["systems"]
+    assert (shown["kind"], shown["site"]) == ("fog node", "there")
+    assert {token for _, _, _, token in service.requests} == {"Bearer mine"}
+
+
+@pytest.mark.parametrize("address", ["http://host", "host:8001"])
+def test_address_with_scheme_or_port_is_refused(address: str) -> None:
+    assert "give a host's name or address, without scheme and port" in run("zone", "list", "--fog", address, code=2)
+
+
+@pytest.mark.parametrize(
+    ("options", "shape"),
+    [
+        (["--circle", "-1.5,2,0.5"], {"type": "circle", "centre": [-1.5, 2.0], "radius": 0.5}),
+        (["--rectangle", "0,0,2,1"], {"type": "rectangle", "corner": [0, 0], "opposite": [2, 1]}),
+        (["--polygon", "0,0 1,0 1,1"], {"type": "polygon", "points": [[0, 0], [1, 0], [1, 1]]}),
+        (["--corridor", "0,0 5,0", "--width", "1"], {"type": "corridor", "line": [[0, 0], [5, 0]], "width": 1}),
+    ],
+)
+def test_zone_is_added_with_the_shape_of_its_option(demo: Service, options: list[str], shape: object) -> None:
+    demo.answers["POST", "/api/v1/zones"] = (201, ZONE)
+    made = json.loads(run("zone", "add", *options, "--reason", "wet floor", "--ttl", "60", "--json"))
+    assert {key: made[key] for key in ZONE} == ZONE
+    ((method, path, body, token),) = demo.requests
+    assert (method, path, token) == ("POST", "/api/v1/zones", "Bearer secret")
+    assert isinstance(body, dict)
+    assert body.pop("id").startswith("z-")
+    assert body == {"kind": "BLOCKED", "shape": shape, "reason": "wet floor", "ttl_s": 60.0}
+
+
+@pytest.mark.parametrize(
+    ("options", "problem"),
+    [
+        ([], "give the zone one shape"),
+        (["--circle", "1,2,3", "--polygon", "0,0 1,0 1,1"], "give the zone one shape"),
+        (["--circle", "1,2"], "'1,2' is not X,Y,R, such as 12.5,3,0.5"),
+        (["--circle", "1,2,nan"], "'1,2,nan' is not X,Y,R"),
+        (["--polygon", "0,0 1,0"], "has 2 points, but a polygon needs at least 3"),
+        (["--corridor", "0,0 1,0"], "--corridor needs --width"),
+        (["--circle", "1,2,3", "--width", "1"], "--corridor needs --width"),
+        (["--circle", "1,2,3", "--kind", "lava"], "lava"),
+    ],
+)
+def test_zone_with_an_impossible_shape_is_refused_before_it_is_sent(demo: Service, options, problem: str) -> None:
+    assert problem in run("zone", "add", *options, code=2)
+    assert demo.requests == []
+
+
+def test_zones_are_listed_shown_and_removed(demo: Service) -> None:
+    demo.answers["GET", "/api/v1/zones"] = (200, {"zones": [ZONE], "active": [], "epoch": 1, "seq": 1})
+    demo.answers["GET", "/api/v1/zones/z-1"] = (200, ZONE)
+    demo.answers["DELETE", "/api/v1/zones/z-1"] = (204, None)
+    assert run("zone", "list") == "z-1: BLOCKED circle, wet floor, by anna (has no effect now)"
+    assert run("zone", "show", "z-1") == "z-1: BLOCKED circle, wet floor, by anna"
+    assert json.loads(run("zone", "remove", "z-1", "--json"))["removed"] is True
+
+
+def test_refusal_gives_the_reason_of_the_problem_document(demo: Service) -> None:
+    demo.answers["GET", "/api/v1/zones/nix"] = (404, {"detail": "there is no zone nix"})
+    assert "the map-service refused it: there is no zone nix" in run("zone", "show", "nix", code=1)
+    demo.answers["DELETE", "/api/v1/zones/z-1"] = (401, {"detail": "the token is unknown"})
+    assert "the token is unknown. Set FOGNAV_TOKEN to an operator's token" in run("zone", "remove", "z-1", code=1)
+
+
+def test_missing_token_file_is_named(demo: Service, monkeypatch) -> None:
+    monkeypatch.setenv("FOGNAV_TOKEN_FILE", "/nowhere/token")
+    assert "the token file /nowhere/token can't be read" in run("zone", "list", code=2)
+
+
+def test_areas_are_listed_with_their_state(demo: Service) -> None:
+    definition = {"id": "hall", "label": "the hall"}
+    areas = [{"definition": definition, "hazard": {"state": "clear", "cause": "n1 sees nothing"}, "withheld": False}]
+    demo.answers["GET", "/api/v1/areas"] = (200, areas)
+    assert run("area", "list") == "hall (the hall): clear, n1 sees nothing"
+    assert json.loads(run("area", "list", "--json"))["areas"] == areas
+
+
+@pytest.mark.parametrize(
+    ("goal", "body"),
+    [
+        ("b", {"place": "b"}),
+        ("-1,2.5", {"pose": {"x": -1.0, "y": 2.5}}),
+        ("1,2,0.5", {"pose": {"x": 1.0, "y": 2.0, "theta": 0.5}}),
+    ],
+)
+@pytest.mark.parametrize("command", [["goal"], ["robot", "goal"]])
+def test_goal_is_a_place_or_a_position(demo: Service, command: list[str], goal: str, body: object) -> None:
+    demo.answers["PUT", "/api/v1/robots/r1/goal"] = (200, {})
+    demo.answers["GET", "/api/v1/robots"] = (200, [ROBOT])
+    answer = json.loads(run(*command, goal, "--json"))
+    assert {key: answer[key] for key in ("accepted", "mode")} == {"accepted": True, "mode": "NORMAL"}
+    assert demo.requests[0][2] == body
+
+
+def test_refused_goal_is_reported_with_its_reason_and_exit_code_1(demo: Service) -> None:
+    demo.answers["PUT", "/api/v1/robots/r1/goal"] = (422, {"detail": "the goal is in a wall"})
+    demo.answers["GET", "/api/v1/robots"] = (200, [ROBOT])
+    done = CliRunner().invoke(app, ["goal", "1,2", "--json"])
+    assert done.exit_code == 1
+    answer = json.loads(done.stdout)
+    assert (answer["accepted"], answer["mode"]) == (False, "NORMAL")
+    assert "the goal is in a wall" in answer["reason"]
+
+
+def test_robot_must_be_named_where_there_are_several(service: Service) -> None:
+    with Registration(lambda: system("demo-1", service.url, robots=["r1", "r2"])) as registration:
+        registration.update()
+        assert "name a robot with --robot; demo-1 has: r1, r2" in run("goal", "b", code=2)
+        assert "an id has only a to z" in run("goal", "b", "--robot", "R 2", code=2)
+
+
+@pytest.mark.parametrize("command", ["enable", "disable", "reset"])
+def test_signed_command_needs_a_key_and_a_router(demo: Service, tmp_path, monkeypatch, command: str) -> None:
+    assert "set FOGNAV_OPERATOR_KEY_FILE to the site's operator.key" in run("robot", command, code=2)
+    monkeypatch.setenv("FOGNAV_OPERATOR_KEY_FILE", str(tmp_path / "key"))
+    (tmp_path / "key").write_text("aa")
+    assert "is only 1 bytes long" in run("robot", command, code=2)
+    (tmp_path / "key").write_text("aa" * 32)
+    output = run("robot", command, code=1)
+    assert "the zenoh router tcp/127.0.0.1:1 can't be reached" in output
+
+
+def test_pose_needs_a_heading(demo: Service) -> None:
+    demo.answers["GET", "/api/v1/places"] = (200, {"b": {"x": 1, "y": 2, "theta": None, "label": ""}})
+    assert "place b has no heading: give 1,2,THETA" in run("robot", "pose", "b", code=2)
+    assert "there is no place c; known places: b" in run("robot", "pose", "c", code=2)
+    assert "'1,2' is not X,Y,THETA" in run("robot", "pose", "1,2", code=2)
+
+
+def test_processes_of_a_robot_are_shown_as_one_system(tmp_path: Path) -> None:
+    package = tmp_path / "robot_agent"
+    package.mkdir()
+    (package / "__init__.py").touch()
+    (package / "__main__.py").write_text("import sys; print('up', flush=True); sys.stdin.read()")
+    environment = {
+        **os.environ, "PYTHONPATH": str(tmp_path), "FOGNAV_ROBOT": "r9", "FOGNAV_SITE": "there",
+        "FOGNAV_GUARDIAN_SOCKET": str(tmp_path / "socket"),
+    }  # fmt: skip
+    process = subprocess.Popen(
+        [sys.executable, "-m", "robot_agent"], env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+    )  # fmt: skip
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"up\n"
+        shown = [entry for entry in json.loads(run("status", "--json"))["systems"] if entry["robots"] == ["r9"]]
+        assert [(entry["kind"], entry["site"], entry["pids"]) for entry in shown] == [
+            ("robot", "there", {"robot-agent": process.pid})
+        ]
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def test_register_is_written_again_only_when_the_system_changes(runtime: Path) -> None:
+    current = system("demo-1", "http://x")
+    with Registration(lambda: current) as registration:
+        registration.update()
+        (file,) = runtime.iterdir()
+        before = file.stat().st_mtime_ns
+        registration.update()
+        assert file.stat().st_mtime_ns == before
+        current = msgspec.structs.replace(current, pids={"planner": psutil.Process().pid})
+        registration.update()
+        assert [found.pids for found in registered()] == [{"planner": psutil.Process().pid}]

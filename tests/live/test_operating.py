@@ -1,0 +1,99 @@
+"""The README's walk through a running demo, run as it is written."""
+
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+pytestmark = [pytest.mark.live, pytest.mark.timeout(150)]
+
+ROOT = Path(__file__).parents[2]
+START_TIMEOUT_S = 60.0
+
+
+def readme_commands() -> tuple[str, list[str]]:
+    """The command that starts the demo, and the commands of the second terminal, without their comments."""
+    section = (ROOT / "README.md").read_text("utf-8").partition("### Talk to a running demo")[2]
+    first, second = re.findall(r"```sh\n(.*?)```", section, re.DOTALL)[:2]
+    return first.strip(), [line.partition("  #")[0].strip() for line in second.splitlines()]
+
+
+class Terminal:
+    """A shell in the checkout whose systems are registered apart from those of other tests."""
+
+    def __init__(self, runtime: Path, environment: dict[str, str]) -> None:
+        runtime.mkdir(mode=0o700)
+        # No fog node of this machine, and no other demo.
+        ports = {f"FOGNAV_{name}_PORT": "1" for name in ("AGGREGATOR", "MAP", "PLANNER")}
+        self.environment = {**environment, "XDG_RUNTIME_DIR": str(runtime), **ports}
+        self.output: dict[str, str] = {}
+
+    def arguments(self, command: str) -> list[str]:
+        """The command as the launcher runs it, in the environment of the tests."""
+        words = shlex.split(command)
+        assert words[0] in ("./fognav", str(ROOT / "fognav"))
+        return [sys.executable, "-m", "fognav", *words[1:]]
+
+    def run(self, command: str) -> subprocess.CompletedProcess[str]:
+        done = subprocess.run(
+            self.arguments(command), cwd=ROOT, env=self.environment, capture_output=True, text=True, timeout=60,
+            check=False,
+        )  # fmt: skip
+        self.output[command] = done.stdout + done.stderr
+        return done
+
+
+def wait_for(pattern: str, output: Path, demo: subprocess.Popen[bytes]) -> re.Match[str]:
+    deadline = time.monotonic() + START_TIMEOUT_S
+    while (found := re.search(pattern, output.read_text("utf-8"), re.MULTILINE)) is None:
+        assert demo.poll() is None, output.read_text("utf-8")
+        assert time.monotonic() < deadline, f"not printed in time: {pattern}\n{output.read_text()}"
+        time.sleep(0.1)
+    return found
+
+
+def test_walk_through_a_running_demo_works_as_the_readme_says(tmp_path):
+    start, commands = readme_commands()
+    assert len(commands) > 8
+    terminal = Terminal(tmp_path / "runtime", dict(os.environ))
+    printed = tmp_path / "demo.txt"
+    with printed.open("wb") as output:
+        demo = subprocess.Popen(
+            terminal.arguments(start), cwd=ROOT, env=terminal.environment, stdin=subprocess.DEVNULL, stdout=output,
+            stderr=output, process_group=0,
+        )  # fmt: skip
+    try:
+        zone = wait_for(r"^draw a zone: (.+)$", printed, demo)
+        wait_for("^planner: plan 1", printed, demo)
+        drawn = terminal.run(zone[1])
+        assert drawn.returncode == 0, terminal.output
+        for command in commands:
+            done = terminal.run(command)
+            assert done.returncode == 0, f"{command}\n{terminal.output[command]}\n{printed.read_text()}"
+            if " zone add" in command:
+                wait_for("^planner: plan 2", printed, demo)
+            if " goal c" in command:
+                wait_for("^stopped: somebody sent the robot elsewhere", printed, demo)
+        status = json.loads((terminal.run("./fognav status --json")).stdout)
+        (system,) = [system for system in status["systems"] if system["kind"] == "demo"]
+        assert system["site"] == "estig"
+        assert set(system["urls"]) >= {"map-service", "planner", "hazard-aggregator", "page"}
+        assert Path(system["token_file"]).stat().st_mode & 0o777 == 0o600
+        assert system["pids"]["demo"] == demo.pid
+        watched = terminal.output["./fognav robot watch --seconds 3"]
+        assert len(re.findall(r"^\d\d:\d\d:\d\d NORMAL", watched, re.MULTILINE)) >= 2, watched
+        assert "wet floor" in terminal.output["./fognav zone list"]
+        assert "mission is ended" in terminal.output["./fognav robot stop"]
+    finally:
+        demo.terminate()
+        assert demo.wait(30) == 1  # interrupted
+    assert list((tmp_path / "runtime").rglob("*.json")) == []
+    gone = terminal.run("./fognav zone list")
+    assert gone.returncode == 1
+    assert "no demo or fog node runs on this machine" in gone.stderr

@@ -165,7 +165,10 @@ class MemoryStore:
     def __init__(self) -> None:
         self.writes: list[tuple[Any, ...]] = []
 
-    async def ping(self) -> None: ...
+    async def check(self) -> None: ...
+
+    async def earlier_result(self, _attempt: Any) -> None:
+        return None
 
     async def durability_warning(self) -> str:
         return ""
@@ -182,6 +185,10 @@ class MemoryStore:
     async def put(self, *args: Any, **_: Any) -> str:
         self.writes.append(args)
         return "ok"
+
+    async def create(self, zone: Any, _audit: Any) -> tuple[str, Any]:
+        self.writes.append((zone,))
+        return "ok", zone
 
     async def delete(self, *args: Any, **_: Any) -> str:
         self.writes.append(args)

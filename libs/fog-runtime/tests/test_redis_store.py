@@ -12,9 +12,9 @@ from fog_supervisor.servers import Server, start_redis
 
 pytestmark = pytest.mark.live
 ABSENT = "0"
-AUDIT = Audit(at=1.5, who="anna", action="put")
-THINGS = Table("things", "thing")
-JOBS = Table("jobs", "robot", version="job.id")
+AUDIT = Audit(1.5, "anna", "put")
+THINGS = Table("things", "zone")
+JOBS = Table("jobs", "mission", version="job.id")
 
 
 class Thing(Message, frozen=True, kw_only=True):
@@ -41,7 +41,7 @@ async def test_one_of_eight_concurrent_writers_that_expect_the_same_version_succ
             refusal = "exists" if expected == ABSENT else "stale"
             assert sorted(outcomes) == sorted(["ok"] + 7 * [refusal])
             assert await store._records("things", Thing) == {"a": things[outcomes.index("ok")]}
-        assert len(await store.audit_entries(100)) == 2
+        assert len((await store.audit()).entries) == 2
 
 
 async def test_deletion_needs_the_stored_version_and_a_repeated_one_is_missing(redis: Server):
@@ -68,13 +68,12 @@ async def test_audit_entries_have_author_action_before_and_after_newest_first(re
         await store._swap(THINGS, "a", Thing(label="x"), ABSENT, AUDIT, before=site)
         await store._swap(THINGS, "a", Thing(label="x"), ABSENT, AUDIT)  # a repeated attempt, after a lost reply
         await store._swap(THINGS, "a", Thing(label="y", version=2), "1", AUDIT)
-        assert await store.audit_entries(100) == [
-            {"at": "1.500", "who": "anna", "action": "put", "thing": "a",
-             "before": '{"label":"x","version":1}', "after": '{"label":"y","version":2}'},
-            {"at": "1.500", "who": "anna", "action": "put", "thing": "a",
-             "before": '{"label":"from the site","version":0}', "after": '{"label":"x","version":1}'},
-        ]  # fmt: skip
-        assert len(await store.audit_entries(1)) == 1
+        entries = (await store.audit()).entries
+        assert [(e.at, e.who, e.action, e.kind, e.id) for e in entries] == 2 * [(1.5, "anna", "put", "zone", "a")]
+        assert [(bytes(e.before), bytes(e.after)) for e in entries] == [
+            (b'{"label":"x","version":1}', b'{"label":"y","version":2}'),
+            (b'{"label":"from the site","version":0}', b'{"label":"x","version":1}'),
+        ]
 
 
 async def test_unreadable_record_raises_or_is_left_out(redis: Server):
@@ -97,7 +96,7 @@ async def test_epochs_grow_after_a_clock_reset_and_without_redis(redis: Server):
         assert await store.durability_warning() == ""
         await asyncio.to_thread(redis.kill)
         assert await store.begin_epoch("map") >= first
-        for attempt in (store.ping(), store.claim_epoch("map"), store._swap(THINGS, "a", None, ANY, AUDIT)):
+        for attempt in (store.check(), store.claim_epoch("map"), store._swap(THINGS, "a", None, ANY, AUDIT)):
             with pytest.raises(StoreError, match="Redis: "):
                 await attempt
 

@@ -48,8 +48,8 @@ async def test_one_of_eight_concurrent_changes_to_a_version_succeeds(fog, client
     assert (await client.get("/api/v1/areas/hall")).json()["definition"]["label"] == label
     async with Redis.from_url(fog.redis.url) as raw:
         assert json.loads(await raw.hget("fog:test:areas", "hall"))["label"] == label
-        ((_, entry),) = await raw.xrange("fog:test:audit")
-    assert (entry[b"who"], entry[b"area"]) == (b"anna", b"hall")
+        ((_, entry),) = await raw.xrange("fog:test:audit:area")
+    assert (entry[b"who"], entry[b"id"]) == (b"anna", b"hall")
     assert json.loads(entry[b"before"])["version"] == 0, "the site's own definition, which was not stored"
 
 

@@ -11,7 +11,7 @@ from fog_supervisor.servers import Server, start_redis
 from map_service.store import Audit, Store, StoreError
 
 pytestmark = pytest.mark.live
-AUDIT = Audit(at=1.0, who="anna", action="create")
+AUDIT = Audit(1.0, "anna", "create")
 
 
 @pytest.fixture
@@ -26,31 +26,47 @@ def zone(version: int = 1, radius: float = 0.5) -> Zone:
 
 async def test_version_is_written_once_and_a_stale_one_is_refused(redis: Server):
     async with Store(redis.url, "test") as store:
-        assert await store.put(zone(), expected=0, audit=AUDIT) == "ok"
-        assert await store.put(zone(radius=0.7), expected=0, audit=AUDIT) == "exists"
-        assert await store.put(zone(2, 0.7), expected=1, audit=AUDIT) == "ok"
-        assert await store.put(zone(2, 0.9), expected=1, audit=AUDIT) == "stale"
+        assert await store.create(zone(), AUDIT) == ("ok", zone())
+        assert (await store.create(zone(radius=0.7), AUDIT))[0] == "exists"
+        assert await store.replace(zone(2, 0.7), expected=1, audit=AUDIT) == "ok"
+        assert await store.replace(zone(2, 0.9), expected=1, audit=AUDIT) == "stale"
         assert await store.zones() == [zone(2, 0.7)]
         assert await store.delete(zone(1), AUDIT) == "stale"
         assert await store.delete(zone(2), AUDIT) == "ok"
         assert await store.zones() == []
 
 
+async def test_zone_that_is_created_again_has_a_version_that_no_zone_had_before(redis: Server):
+    async with Store(redis.url, "test") as store, Store(redis.url, "test") as other:
+        assert await other.zones() == []
+        await store.create(zone(), AUDIT)
+        for version in range(2, 4):
+            await store.replace(zone(version), expected=version - 1, audit=AUDIT)
+        assert await store.delete(zone(3), AUDIT) == "ok"
+        # Another process, which did not see the deletion.
+        assert await other.create(zone(), AUDIT) == ("ok", zone(4))
+        assert await store.delete(zone(4), AUDIT) == "ok"
+    async with Store(redis.url, "test") as restarted:
+        assert await restarted.zones() == []
+        assert await restarted.create(zone(), AUDIT) == ("ok", zone(5))
+
+
 async def test_repeated_write_leaves_one_audit_entry(redis: Server):
     async with Store(redis.url, "test") as store, Redis.from_url(redis.url) as raw:
         for _ in range(2):
-            assert await store.put(zone(), expected=0, audit=AUDIT) == "ok"
-        assert await raw.xlen("fog:test:audit") == 1
+            assert await store.create(zone(), AUDIT) == ("ok", zone())
+        assert await raw.xlen("fog:test:audit:zone") == 1
         for _ in range(2):
             assert await store.delete(zone(), AUDIT) == "ok"
-        entries = await raw.xrange("fog:test:audit")
+        entries = await raw.xrange("fog:test:audit:zone")
         assert {fields[b"who"] for _, fields in entries} == {b"anna"}
 
 
 async def test_acknowledged_zones_survive_kills_of_redis(redis: Server):
     async with Store(redis.url, "test", timeout_s=5.0) as store:
-        for version in range(1, 6):
-            assert await store.put(zone(version), expected=version - 1, audit=AUDIT) == "ok"
+        await store.create(zone(), AUDIT)
+        for version in range(2, 7):
+            assert await store.replace(zone(version), expected=version - 1, audit=AUDIT) == "ok"
             await asyncio.to_thread(redis.kill)
             await asyncio.to_thread(redis.start)
             assert await store.zones() == [zone(version)]
@@ -63,7 +79,7 @@ async def test_write_to_a_dead_redis_is_a_store_error_and_epochs_still_grow(redi
         assert await store.durability_warning() == ""
         await asyncio.to_thread(redis.kill)
         with pytest.raises(StoreError):
-            await store.put(zone(), expected=0, audit=AUDIT)
+            await store.create(zone(), AUDIT)
         assert await store.begin_epoch("map") > first
 
 

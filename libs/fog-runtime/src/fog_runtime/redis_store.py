@@ -1,24 +1,40 @@
-"""The base of all services' stores in Redis: connection, versioned records, epochs and the audit stream.
+"""The base of all services' stores in Redis: versioned records, epochs, the audit trail, and what Redis may not lose.
 
-A service's store adds its own keys and records. All keys of a site begin with `fog:SITE:`.
+A service's store adds its own keys and records. All keys of a site begin with `fog:SITE:`. Why writes are scripts, and
+how a loss of acknowledged records is noticed: docs/adr/0013-store-that-notices-its-loss.md.
 """
 
 from __future__ import annotations
 
+import secrets
 import time
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, Self, TypeVar, cast
 
 import msgspec
-from redis.asyncio import Redis
-from redis.asyncio.retry import Retry
-from redis.backoff import NoBackoff
-from redis.exceptions import RedisError
 
 from fog_contracts.messages import Message
-from fog_runtime import logs
+from fog_runtime import logs, store_scripts
+from fog_runtime.audit import KINDS, AuditPage, read_page
+from fog_runtime.idempotency import LIFETIME_S, IdempotencyError
+from fog_runtime.redis_connection import RedisConnection, StoreError
+from fog_runtime.store_identity import StoreIdentity, StoreLostError
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+    from fog_runtime.idempotency import Attempt
+
+__all__ = [
+    "ANY",
+    "Audit",
+    "Outcome",
+    "RecoveryError",
+    "RedisStore",
+    "StoreError",
+    "StoreLostError",
+    "Table",
+]
 
 M = TypeVar("M", bound=Message)
 
@@ -28,45 +44,24 @@ Outcome = Literal["ok", "exists", "missing", "stale"]
 ANY: Final = "*"
 """Expect no particular version: overwrite what is stored."""
 
-# One atomic step of Redis: after a crash either both record and audit entry are stored or neither, and of two writers
-# that expect the same version one is refused. It is idempotent: a record that is already stored is left unchanged.
-_SWAP: Final = """
-local current = redis.call('HGET', KEYS[1], ARGV[1])
-local expected, data = ARGV[2], ARGV[3]
-if current and current == data then return 'ok' end
-if expected == '0' then
-  if current then return 'exists' end
-elseif expected ~= '*' or data == '' then
-  if not current then return 'missing' end
-  if expected ~= '*' then
-    local version = cjson.decode(current)
-    for part in string.gmatch(ARGV[4], '[^.]+') do version = version[part] end
-    if tostring(version) ~= expected then return 'stale' end
-  end
-end
-if data == '' then redis.call('HDEL', KEYS[1], ARGV[1]) else redis.call('HSET', KEYS[1], ARGV[1], data) end
-redis.call('XADD', KEYS[2], 'MAXLEN', '~', 100000, '*', 'at', ARGV[5], 'who', ARGV[6], 'action', ARGV[7],
-  ARGV[8], ARGV[1], 'before', current or ARGV[9], 'after', data)
-return 'ok'
-"""
-
 _log = logs.get("store")
 
 
-class StoreError(Exception):
-    """Redis can't be reached, refused a write, or contains an unreadable record; the message says which."""
-
-
-class Audit(Message, frozen=True, kw_only=True):
-    """An audit entry: who does what, and when (`at`: seconds since the epoch)."""
+class Audit(NamedTuple):
+    """A change for the audit trail: when (s since the epoch), by whom, what; and its idempotency key, if it has one."""
 
     at: float
     who: str
     action: str
+    attempt: Attempt | None = None
+
+
+class RecoveryError(Exception):
+    """There is nothing to recover: Redis lost nothing, or the service has nothing in memory."""
 
 
 class Table(NamedTuple):
-    """A Redis hash of JSON records by id: `name` ends its key, `subject` names its records in audit entries.
+    """A Redis hash of JSON records by id: `name` ends its key, `subject` is the kind of its records in the audit trail.
 
     `version` is the path of a record's version, which a writer expects to be unchanged.
     """
@@ -77,17 +72,20 @@ class Table(NamedTuple):
 
 
 class RedisStore:
-    """A connection to the site's keys; every call may raise `StoreError` and may be repeated.
+    """The site's keys; every call may raise `StoreError` and may be repeated.
 
-    A command has a timeout of `timeout_s` and is tried twice: the first attempt after a restart of Redis may use a dead
-    connection of the pool.
+    `data_dir` is a folder that survives restarts: in it the service `service` remembers which store it uses, so that it
+    notices at its start that Redis was emptied. Without it, only a running service notices.
     """
 
-    def __init__(self, url: str, site: str, *, timeout_s: float = 1.0) -> None:
-        self._redis = Redis.from_url(
-            url, socket_timeout=timeout_s, socket_connect_timeout=timeout_s, retry=Retry(NoBackoff(), 1)
-        )
+    def __init__(
+        self, url: str, site: str, *, service: str = "service", data_dir: Path | None = None, timeout_s: float = 1.0
+    ) -> None:
+        self._redis = RedisConnection(url, timeout_s=timeout_s)
         self._site = site
+        self._service = service
+        self._identity = StoreIdentity(None if data_dir is None else data_dir / f"{service}.{site}.store")
+        self._floors: dict[str, int] = {}
 
     async def __aenter__(self) -> Self:
         """Return the store; it connects with the first command."""
@@ -97,17 +95,27 @@ class RedisStore:
         """Close the connections."""
         await self._redis.aclose()
 
-    async def ping(self) -> None:
-        """Check that Redis answers."""
-        await self._execute(cast("Awaitable[Any]", self._redis.ping()))
+    async def check(self) -> None:
+        """Check that Redis answers, accepts writes, and has all that it acknowledged; raises `StoreLostError` if not.
+
+        A store that nobody has used yet is marked as this site's.
+        """
+        # Redis checks whether it may write (a read-only replica, full, too few replicas, a broken disk) before it finds
+        # that an empty text changes nothing: a probe that neither changes anything nor waits for the disk.
+        commands = [("SETRANGE", self._key("probe"), 0, ""), *self._read_identity()]
+        *_, generation, writes = await self._redis.write(*commands)
+        if generation is None and not self._identity.used_before:
+            mark = ("SET", self._key("generation"), secrets.token_hex(8), "NX")
+            *_, generation, writes = await self._redis.write(mark, *self._read_identity())
+        self._identity.verify(_text(generation or b""), _pairs(writes))
 
     async def durability_warning(self) -> str:
         """Return why acknowledged writes are not durable, or an empty text; also empty if Redis hides its settings."""
         try:
-            config = await self._redis.config_get("appendonly", "appendfsync")
-        except (RedisError, OSError):
+            config = await self._redis.read("CONFIG", "GET", "append*")
+        except StoreError:
             return ""
-        values = {_text(name): _text(value) for name, value in config.items()}
+        values = {_text(name): _text(value) for name, value in _items(config)}
         if values.get("appendonly") != "yes" or values.get("appendfsync") != "always":
             return "run Redis with `appendonly yes` and `appendfsync always`: it may lose acknowledged writes"
         return ""
@@ -117,10 +125,11 @@ class RedisStore:
 
         `running` is the epoch of a process that started without Redis; it is stored instead if it is larger.
         """
+        await self.check()
         key = self._key(f"{service}:epoch")
-        last = int(await self._execute(self._redis.get(key)) or b"0")
+        last = int(await self._redis.read("GET", key) or b"0")
         epoch = max(last, running) if running else max(last + 1, _now_ms())
-        await self._execute(self._redis.set(key, epoch))
+        await self._redis.write(("SET", key, epoch))
         return epoch
 
     async def begin_epoch(self, service: str) -> int:
@@ -132,41 +141,76 @@ class RedisStore:
             _log.warning("epoch_from_clock", epoch=epoch, reason=str(error))
             return epoch
 
-    async def audit_entries(self, limit: int) -> list[dict[str, str]]:
-        """Return the newest entries of the site's audit stream, which all services share, newest first."""
-        entries = await self._execute(self._redis.xrevrange(self._key("audit"), count=limit))
-        return [{_text(name): _text(value) for name, value in fields.items()} for _, fields in entries]
+    async def recall(self, attempt: Attempt | None, kind: type[M]) -> M | None:
+        """Return the result of an earlier attempt under the same idempotency key; None if there was none.
+
+        Raises `IdempotencyError` when the key was used for another request.
+        """
+        if attempt is None:
+            return None
+        data = await self._redis.read("GET", self._key(attempt.name))
+        return None if data is None else self._result_of(attempt, data, kind)
+
+    async def audit(self, *, kinds: Sequence[str] = KINDS, cursor: str | None = None, limit: int = 100) -> AuditPage:
+        """Return a page of the audit trail that all services of the site share; raises `CursorError` too."""
+        return await read_page(self._redis, self._key("audit:"), kinds=kinds, cursor=cursor, limit=limit)
+
+    async def require_loss(self) -> None:
+        """Raise `RecoveryError` unless Redis lost acknowledged records."""
+        try:
+            await self.check()
+        except StoreLostError:
+            return
+        raise RecoveryError("Redis has all records that this service knows of: there is nothing to recover")
+
+    async def accept_loss(self, audit: Audit) -> None:
+        """Go on with what Redis has now, on an administrator's decision; the caller loads it then."""
+        await self._adopt({}, audit)
 
     # --- For the services' stores -----------------------------------------------------------------------------------
 
     async def _records(self, table: str, kind: type[M]) -> dict[str, M]:
         """Return all records of a table; raises `StoreError` for an unreadable one, which must not be lost silently."""
-        key = self._key(table)
-        found: dict[str, M] = {}
-        for name, data in (await self._execute(self._redis.hgetall(key))).items():
-            try:
-                found[_text(name)] = msgspec.json.decode(data, type=kind)
-            except msgspec.DecodeError as error:
-                raise StoreError(
-                    f"{key} contains an invalid {kind.__name__} ({_text(name)}): {error}; repair or delete that field"
-                ) from error
-        return found
+        records, failures = await self._decoded(table, kind)
+        for name, reason in failures.items():
+            raise StoreError(
+                f"{self._key(table)} contains an invalid {kind.__name__} ({name}): {reason}; repair or delete that"
+                " field"
+            )
+        return records
 
     async def _readable_records(self, table: str, kind: type[M]) -> dict[str, M]:
         """Return the readable records of a table; an unreadable one is logged and left out."""
-        key = self._key(table)
-        found: dict[str, M] = {}
-        for name, data in (await self._execute(self._redis.hgetall(key))).items():
-            try:
-                found[_text(name)] = msgspec.json.decode(data, type=kind)
-            except msgspec.DecodeError as error:
-                _log.error("unreadable_record", kind=kind.__name__, key=key, id=_text(name), reason=str(error))
-        return found
+        records, failures = await self._decoded(table, kind)
+        for name, reason in failures.items():
+            _log.error("unreadable_record", kind=kind.__name__, key=self._key(table), id=name, reason=reason)
+        return records
 
-    async def _write_records(self, table: str, records: dict[str, Message]) -> None:
+    async def _write_records(self, table: str, records: Mapping[str, Message]) -> None:
         """Write records durably, overwriting what is stored, without audit entries."""
-        values = {name: msgspec.json.encode(record) for name, record in records.items()}
-        await self._execute(self._redis.hset(self._key(table), mapping=cast("Any", values)))
+        encoded = [part for name, record in records.items() for part in (name, msgspec.json.encode(record))]
+        keys = [self._key(name) for name in ("generation", "writes", table)]
+        await self._run(store_scripts.WRITE, keys, table, {}, *encoded)
+
+    async def _adopt(self, tables: Mapping[str, Mapping[str, Message]], audit: Audit) -> None:
+        """Use the store that Redis has now, and replace these tables in it by the given records, in one step."""
+        for name in self._floors:
+            await self._load_floor(name)
+        commands: list[tuple[str | bytes | int, ...]] = [
+            ("SET", self._key("generation"), secrets.token_hex(8), "NX"),
+            *(("HSET", self._key("floors"), name, floor) for name, floor in self._floors.items()),
+        ]
+        for table, records in tables.items():
+            encoded = [part for name, record in records.items() for part in (name, msgspec.json.encode(record))]
+            commands.append(("DEL", self._key(table)))
+            if encoded:
+                commands.append(("HSET", self._key(table), *encoded))
+        entry = {"at": f"{audit.at:.3f}", "who": audit.who, "action": audit.action, "id": self._service}
+        fields = [text for pair in {**entry, "before": "", "after": ""}.items() for text in pair]
+        trail = (self._key("audit:store"), "MAXLEN", "~", store_scripts.AUDIT_ENTRIES, "*")
+        *_, generation, writes = await self._redis.write(*commands, ("XADD", *trail, *fields), *self._read_identity())
+        self._identity.adopt(_text(generation), _pairs(writes))
+        _log.warning("store_recovered", action=audit.action, who=audit.who, generation=self._identity.generation)
 
     async def _swap(
         self,
@@ -182,25 +226,77 @@ class RedisStore:
 
         `expected` is the version as text, `0` when none may be stored yet, or ANY; `before` is the previous value for
         the audit entry when none was stored. A repeated attempt, after the first reply was lost, is `ok` for a write
-        and `missing` for a deletion.
+        and `missing` for a deletion. A new record's version must be above `_floor`, or the outcome is `stale`.
         """
-        data = b"" if record is None else msgspec.json.encode(record)
-        arguments: list[str | bytes] = [
-            name, expected, data, table.version, f"{audit.at:.3f}", audit.who, audit.action, table.subject,
-            b"" if before is None else msgspec.json.encode(before),
-        ]  # fmt: skip
-        keys = (self._key(table.name), self._key("audit"))
-        return cast("Outcome", _text(await self._execute(self._redis.eval(_SWAP, 2, *keys, *cast("Any", arguments)))))
+        data, attempt = b"" if record is None else msgspec.json.encode(record), audit.attempt
+        names = ("generation", "writes", table.name, f"audit:{table.subject}", "floors")
+        keys = [self._key(part) for part in (*names, attempt.name if attempt else "no-attempt")]
+        arguments = {
+            "id": name,
+            "expected": expected,
+            "version": table.version,
+            "at": f"{audit.at:.3f}",
+            "who": audit.who,
+            "action": audit.action,
+            "attempt_s": 0 if attempt is None else LIFETIME_S,
+        }
+        result = b"" if attempt is None else msgspec.json.encode(attempt.result(data))
+        outcome, details = await self._run(
+            store_scripts.SWAP, keys, table.name, arguments, data,
+            b"" if before is None else msgspec.json.encode(before), result,
+        )  # fmt: skip
+        if outcome == "replay" and attempt is not None:
+            # Usually this attempt itself, repeated after a lost reply; else another process was faster.
+            return "ok" if attempt.recorded(details) == data else "exists"
+        self._floors[table.name] = max(int(details or b"0"), self._floor(table.name))
+        return cast("Outcome", outcome)
+
+    def _floor(self, table: str) -> int:
+        """Return the highest version that a deleted record of the table had: versions are never used again."""
+        return self._floors.get(table, 0)
+
+    async def _load_floor(self, table: str) -> None:
+        stored = await self._redis.read("HGET", self._key("floors"), table)
+        self._floors[table] = max(int(stored or b"0"), self._floor(table))
 
     def _key(self, name: str) -> str:
         return f"fog:{self._site}:{name}"
 
-    @staticmethod
-    async def _execute(command: Awaitable[Any]) -> Any:  # noqa: ANN401  # redis does not type its replies
+    # --- Inside -----------------------------------------------------------------------------------------------------
+
+    async def _decoded(self, table: str, kind: type[M]) -> tuple[dict[str, M], dict[str, str]]:
+        """Return the records of a table, and why others are unreadable."""
+        await self.check()
+        records: dict[str, M] = {}
+        failures: dict[str, str] = {}
+        for name, data in _items(await self._redis.read("HGETALL", self._key(table))):
+            try:
+                records[_text(name)] = msgspec.json.decode(data, type=kind)
+            except msgspec.DecodeError as error:
+                failures[_text(name)] = str(error)
+        return records, failures
+
+    def _result_of(self, attempt: Attempt, data: bytes, kind: type[M]) -> M:
         try:
-            return await command
-        except (RedisError, OSError) as error:
-            raise StoreError(f"Redis: {error}") from error
+            return msgspec.json.decode(attempt.recorded(data), type=kind)
+        except msgspec.DecodeError as error:
+            raise IdempotencyError("this Idempotency-Key was used for another request: use a new one") from error
+
+    async def _run(
+        self, script: str, keys: list[str], table: str, arguments: Mapping[str, object], *data: str | bytes
+    ) -> tuple[str, bytes]:
+        """Run a script that begins with the guard; return its outcome and details. Raises `StoreLostError`."""
+        if not self._identity.generation:
+            await self.check()
+        request = msgspec.json.encode({**self._identity.guard(table), **arguments})
+        ((outcome, writes, details),) = await self._redis.write(("EVAL", script, len(keys), *keys, request, *data))
+        if outcome == b"lost":
+            raise StoreLostError("Redis lost acknowledged records")
+        self._identity.acknowledge(table, int(writes))
+        return _text(outcome), details
+
+    def _read_identity(self) -> list[tuple[str | bytes | int, ...]]:
+        return [("GET", self._key("generation")), ("HGETALL", self._key("writes"))]
 
 
 def _now_ms() -> int:
@@ -209,3 +305,12 @@ def _now_ms() -> int:
 
 def _text(value: object) -> str:
     return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
+
+
+def _items(reply: Any) -> list[tuple[bytes, bytes]]:  # noqa: ANN401  # redis does not type its replies
+    """Return the pairs of a reply that is a dictionary or, inside a transaction, a flat list."""
+    return list(reply.items()) if isinstance(reply, dict) else list(zip(reply[::2], reply[1::2], strict=True))
+
+
+def _pairs(reply: Any) -> dict[str, int]:  # noqa: ANN401
+    return {_text(name): int(value) for name, value in _items(reply)}

@@ -34,7 +34,7 @@ async def main() -> None:
     site = settings.site or loaded.site.id
     clock = SystemClock(settings.speed)
     health = Health("store", "mqtt")
-    async with Store(settings.redis_url, site) as store:
+    async with Store(settings.redis_url, site, service="hazard-aggregator", data_dir=settings.data_dir) as store:
         stored, loaded_from_store = await load_at_start(store)
         usable = usable_areas(
             stored.definitions, lambda area: make_rule(area.id, area.debounce, find_rule, settings.debounce)

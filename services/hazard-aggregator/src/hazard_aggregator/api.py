@@ -21,16 +21,23 @@ from fog_runtime.health import Health
 from fog_runtime.http import (
     Answer,
     Body,
+    IdempotencyKey,
     IfMatch,
+    IfNoneMatch,
     Operator,
     ProblemError,
     Routes,
     Tokens,
+    add_recovery,
+    add_store_errors,
+    attempt_of,
     etag,
     expected_version,
     make_app,
+    must_be_new,
 )
-from hazard_aggregator.debounce import DebounceError
+from fog_runtime.idempotency import IdempotencyError
+from hazard_aggregator.area_size import AreaError, check_size
 from hazard_aggregator.service import ConflictError, Service
 from hazard_aggregator.store import StoreError
 
@@ -73,19 +80,14 @@ def make_api(service: Service, geometry: GridGeometry, clock: Clock, health: Hea
     app = make_app("Fognav hazard-aggregator", health, tokens)
     _add_areas(Routes(app, "areas"), service, geometry)
     _add_nodes(Routes(app, "nodes"), service, clock)
+    recovery = Routes(app, "store")
+    add_store_errors(recovery)
+    add_recovery(recovery, service)
     return app
 
 
 def _add_areas(routes: Routes, service: Service, geometry: GridGeometry) -> None:
-    routes.raises(
-        StoreError,
-        {503: "The store does not answer; the change may not be stored"},
-        lambda error: ProblemError(
-            503,
-            f"the store does not answer, so the change may not be stored: try again ({error})",
-            headers={"Retry-After": "1"},
-        ),
-    )
+    add_store_errors(routes)
     routes.raises(
         ConflictError,
         {412: "Somebody else changed the area"},
@@ -113,13 +115,26 @@ def _add_areas(routes: Routes, service: Service, geometry: GridGeometry) -> None
             raise ProblemError(404, f"there is no area {area_id}")
         return Answer(view, etag(view.definition.version))
 
-    @routes.put("/api/v1/areas/{area_id}", raises=[ConflictError, StoreError])
+    @routes.put("/api/v1/areas/{area_id}", raises=[ConflictError, IdempotencyError, StoreError])
     async def put_area(
-        area_id: str, body: Body[AreaBody], caller: Operator, if_match: IfMatch = None
+        area_id: str,
+        body: Body[AreaBody],
+        caller: Operator,
+        if_match: IfMatch = None,
+        if_none_match: IfNoneMatch = None,
+        idempotency_key: IdempotencyKey = None,
     ) -> Answer[AreaDefinition]:
-        """Add or replace an area; replies once it is durably stored. With If-Match, only if it is unchanged."""
-        definition = _validated(area_id, body, service, geometry)
-        definition = await service.put_area(definition, caller.name, expected=expected_version(if_match))
+        """Add or replace an area; replies once it is durably stored.
+
+        With If-Match, only if it is unchanged; with `If-None-Match: *`, only if there is none.
+        """
+        definition = await service.put_area(
+            _validated(area_id, body, service, geometry),
+            caller.name,
+            expected=expected_version(if_match),
+            must_be_new=must_be_new(if_none_match),
+            attempt=attempt_of(idempotency_key, caller, f"PUT /api/v1/areas/{area_id}", body),
+        )
         return Answer(definition, etag(definition.version))
 
 
@@ -163,7 +178,8 @@ def _validated(area_id: str, body: AreaBody, service: Service, geometry: GridGeo
             422, f"{area_id!r} is no valid id: use a to z, 0 to 9 and -, at most 32", field="path"
         ) from error
     try:
+        check_size(definition)
         service.core.check(definition)
-    except DebounceError as error:
+    except AreaError as error:
         raise ProblemError(422, error.problem, field=f"body.{error.field}") from error
     return definition

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from msgspec import structs
@@ -13,15 +14,17 @@ from fog_contracts.messages import AreaHazard
 from fog_runtime import logs, metrics
 from fog_runtime.clock import ticker
 from fog_runtime.edges import Edges
-from hazard_aggregator.store import Audit, StoreError, usable_areas
+from hazard_aggregator.store import Audit, RecoveryError, StoreError, usable_areas
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
+    from typing import Literal
 
     from fog_contracts.handlers import Publication
     from fog_contracts.messages import AreaDefinition
     from fog_runtime.clock import Clock
     from fog_runtime.health import Health
+    from fog_runtime.idempotency import Attempt
     from fog_runtime.mqtt_edge import MqttEdge
     from fog_runtime.zenoh_edge import ZenohEdge
     from hazard_aggregator.core import Aggregator
@@ -66,44 +69,92 @@ class Service:
         self._edges.serve(self.core.query_handlers())
         self._mqtt.on_connect(self._republish_all)
 
-    async def put_area(self, definition: AreaDefinition, who: str, *, expected: int | None = None) -> AreaDefinition:
+    async def put_area(
+        self,
+        definition: AreaDefinition,
+        who: str,
+        *,
+        expected: int | None = None,
+        must_be_new: bool = False,
+        attempt: Attempt | None = None,
+    ) -> AreaDefinition:
         """Store an area as its next version, then put it into force; with `expected`, only if that is its version.
 
-        Raises `ConflictError` when it is not; raises `StoreError`, after which the area may or may not be stored.
+        With `must_be_new`, only if there is none (a removed one counts as none). An `attempt` that succeeded before
+        returns its area again. Raises `ConflictError`, `IdempotencyError`, and `StoreError`: then the area may be
+        stored or not.
         """
         async with self._area_lock:
+            with self._uncertain_write():
+                if (earlier := await self._store.earlier_result(attempt)) is not None:
+                    if self._reload_areas:
+                        await self._load_areas()
+                    return earlier
             old = next((known for known in self.core.definitions() if known.id == definition.id), None)
+            if must_be_new and old is not None and not old.removed:
+                raise ConflictError(definition.id)
             if expected is not None and (old is None or old.version != expected):
                 raise ConflictError(definition.id)
-            version = 0 if old is None else old.version
-            definition = structs.replace(definition, version=version + 1)
-            audit = Audit(at=self._clock.stamp(), who=who, action="put")
-            try:
-                outcome = await self._store.put_area(definition, expected=version, audit=audit, before=old)
-                if outcome == "missing":
-                    # Redis lost an acknowledged write: the definition in force replaces it.
-                    outcome = await self._store.put_area(definition, expected=0, audit=audit, before=old)
-            except StoreError as error:
-                # It may have been written although the reply was lost: reload the areas.
-                self._reload_areas = True
-                self._health.set("store", ok=False, detail=str(error))
-                raise
-            if outcome != "ok":
-                self._reload_areas = True
-                raise ConflictError(definition.id)
+            definition = structs.replace(definition, version=1 if old is None else old.version + 1)
+            with self._uncertain_write():
+                await self._store_area(definition, old, Audit(self._clock.stamp(), who, "put", attempt))
             self._announce(self.core.put_area(definition, self._edges.now()))
         await self._subscribe_numbers()
         return definition
 
-    async def _load_newer_areas(self) -> None:
-        """Put stored areas into force that are newer than the known ones; raises `StoreError`."""
+    async def _store_area(self, definition: AreaDefinition, old: AreaDefinition | None, audit: Audit) -> None:
+        """Store an area as the successor of `old`; raises `ConflictError` and `StoreError`."""
+        version = definition.version - 1
+        outcome = await self._store.put_area(definition, expected=version, audit=audit, before=old)
+        if outcome == "missing":
+            # An administrator accepted a store without this area, which stays in force: it is stored again.
+            outcome = await self._store.put_area(definition, expected=0, audit=audit, before=old)
+        if outcome != "ok":
+            self._reload_areas = True
+            raise ConflictError(definition.id)
+
+    @contextmanager
+    def _uncertain_write(self) -> Iterator[None]:
+        """Reload the areas after a failure: one may have been written although the reply was lost."""
+        try:
+            yield
+        except StoreError as error:
+            self._reload_areas = True
+            self._health.set("store", ok=False, detail=str(error))
+            raise
+
+    async def recover_store(self, action: Literal["restore", "accept"], who: str) -> None:
+        """Restore areas and hazards from memory, or accept those in Redis, after Redis lost records.
+
+        Raises `RecoveryError` and `StoreError`.
+        """
+        await self._store.require_loss()
+        audit = Audit(self._clock.stamp(), who, action)
         async with self._area_lock:
-            known = {definition.id: definition.version for definition in self.core.definitions()}
-            for definition in usable_areas(await self._store.areas(), self.core.check):
-                if definition.version > known.get(definition.id, -1):
-                    self._announce(self.core.put_area(definition, self._edges.now()))
-            self._reload_areas = False
+            if action == "accept":
+                await self._store.accept_loss(audit)
+                self._reload_areas = True
+            elif self._store_loaded.is_set():
+                stored = [definition for definition in self.core.definitions() if definition.version > 0]
+                await self._store.restore(stored, self.core.announced().values(), audit)
+            else:
+                raise RecoveryError(
+                    "this service was started after the loss and has no stored areas: restore a backup of Redis, or"
+                    " accept"
+                )
+
+    async def _reload_stored_areas(self) -> None:
+        """Put stored areas into force that differ from the known ones; raises `StoreError`."""
+        async with self._area_lock:
+            await self._load_areas()
         await self._subscribe_numbers()
+
+    async def _load_areas(self) -> None:
+        known = {definition.id: definition for definition in self.core.definitions()}
+        for definition in usable_areas(await self._store.areas(), self.core.check):
+            if definition != known.get(definition.id):
+                self._announce(self.core.put_area(definition, self._edges.now()))
+        self._reload_areas = False
 
     # --- Publishing -------------------------------------------------------------------------------------------------
 
@@ -175,12 +226,14 @@ class Service:
             try:
                 if self._store_loaded.is_set():
                     if self._reload_areas:
-                        await self._load_newer_areas()
-                    await self._store.ping()
+                        await self._reload_stored_areas()
+                    await self._store.check()
                     self._health.set("store", ok=True)
                     continue
                 stored = await self._store.load(self.core.epoch)
             except StoreError as error:
+                # What was stored but never acknowledged may have gone with a failed primary.
+                self._reload_areas = True
                 self._health.set("store", ok=False, detail=str(error))
                 continue
             usable = usable_areas(stored.definitions, self.core.check)

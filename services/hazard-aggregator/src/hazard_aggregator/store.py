@@ -7,13 +7,15 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from fog_contracts.messages import AreaDefinition, AreaHazard
 from fog_runtime import logs
-from fog_runtime.redis_store import Audit, Outcome, RedisStore, StoreError, Table
-from hazard_aggregator.debounce import DebounceError
+from fog_runtime.redis_store import Audit, Outcome, RecoveryError, RedisStore, StoreError, Table
+from hazard_aggregator.area_size import AreaError, check_size
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-__all__ = ["Audit", "Outcome", "Store", "StoreError", "Stored", "load_at_start", "usable_areas"]
+    from fog_runtime.idempotency import Attempt
+
+__all__ = ["Audit", "Outcome", "RecoveryError", "Store", "StoreError", "Stored", "load_at_start", "usable_areas"]
 
 _AREAS: Final = Table("areas", "area")
 _HAZARDS: Final = "hazards"
@@ -56,6 +58,15 @@ class Store(RedisStore):
         """
         return await self._swap(_AREAS, definition.id, definition, str(expected), audit, before=before)
 
+    async def earlier_result(self, attempt: Attempt | None) -> AreaDefinition | None:
+        """Return the area that an earlier attempt with the same idempotency key stored."""
+        return await self.recall(attempt, AreaDefinition)
+
+    async def restore(self, definitions: Iterable[AreaDefinition], hazards: Iterable[AreaHazard], audit: Audit) -> None:
+        """Replace the stored areas and hazards by these, on an administrator's decision after Redis lost them."""
+        areas = {definition.id: definition for definition in definitions}
+        await self._adopt({_AREAS.name: areas, _HAZARDS: {hazard.area: hazard for hazard in hazards}}, audit)
+
 
 async def load_at_start(store: Store) -> tuple[Stored, bool]:
     """Return the stored records, and whether Redis answered; if not, no records and an epoch (ms) from the clock."""
@@ -70,7 +81,7 @@ async def load_at_start(store: Store) -> tuple[Stored, bool]:
 def usable_areas(
     definitions: Iterable[AreaDefinition], check: Callable[[AreaDefinition], object]
 ) -> list[AreaDefinition]:
-    """Return the stored areas that `check` accepts; one with invalid debounce settings is logged and left out.
+    """Return the stored areas that `check` accepts; one that is invalid or too large is logged and left out.
 
     Its rule may have gone with the package that provided it. Whatever is in force without the record stays in force,
     and the REST API stays there to repair it.
@@ -78,8 +89,9 @@ def usable_areas(
     usable = []
     for definition in definitions:
         try:
+            check_size(definition)
             check(definition)
-        except DebounceError as error:
+        except AreaError as error:
             _log.error("stored_area_unusable", area=definition.id, reason=str(error), remedy="PUT the area again")
         else:
             usable.append(definition)

@@ -32,7 +32,7 @@ async def main() -> None:
     site = settings.site or loaded.site.id
     clock = SystemClock(settings.speed)
     health = Health("store", "zones", "mqtt", "map")
-    async with Store(settings.redis_url, site) as store:
+    async with Store(settings.redis_url, site, service="map-service", data_dir=settings.data_dir) as store:
         core = MapCore(
             site,
             loaded.map,

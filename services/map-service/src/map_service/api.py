@@ -6,7 +6,8 @@ Reading needs no token, except for the audit log; writing needs the role operato
 import asyncio
 import io
 import secrets
-from typing import Annotated, Final
+from typing import Annotated, Final, Literal
+from urllib.parse import urlencode
 
 import msgspec
 import numpy as np
@@ -25,31 +26,42 @@ from fog_contracts.messages import (
     ZoneKind,
 )
 from fog_contracts.site import Place, Site
+from fog_runtime.audit import KINDS, AuditEntry, CursorError
 from fog_runtime.clock import Clock
 from fog_runtime.health import Health
 from fog_runtime.http import (
+    RETRY_AFTER,
     Answer,
     Body,
+    IdempotencyKey,
     IfMatch,
+    IfNoneMatch,
     Operator,
     ProblemError,
     Routes,
     Tokens,
     Viewer,
+    add_recovery,
+    add_store_errors,
+    attempt_of,
     etag,
     expected_version,
     make_app,
+    must_be_new,
 )
 from fog_runtime.http.routes import InvalidBodyError
+from fog_runtime.idempotency import IdempotencyError
 from map_service.layers.base import Grid
 from map_service.service import ConflictError, Service
-from map_service.store import AuditEntry, StoreError
+from map_service.store import StoreError
 from map_service.zone_validation import ZoneError
+
+AuditKind = Literal["area", "mission", "store", "zone"]
 
 _PNG: Final = "image/png"
 _ZONES_NOT_LOADED: Final = {503: "The stored zones are not loaded yet, or the store does not answer"}
+_REFUSALS: Final = (ZoneError, IdempotencyError, StoreError)
 _NO_SUCH_ZONE: Final = {404: "No zone has this id", **_ZONES_NOT_LOADED}
-_RETRY_AFTER: Final = {"Retry-After": "1"}
 
 
 class ZoneBody(Message, frozen=True, kw_only=True):
@@ -90,6 +102,9 @@ def make_api(service: Service, site: Site, clock: Clock, health: Health, tokens:
     app = make_app("Fognav map-service", health, tokens)
     _add_zones(Routes(app, "zones"), service, clock)
     _add_views(Routes(app, "map"), service, site)
+    recovery = Routes(app, "store")
+    add_store_errors(recovery)
+    add_recovery(recovery, service)
     return app
 
 
@@ -104,12 +119,15 @@ def _add_zones(routes: Routes, service: Service, clock: Clock) -> None:
         zones = service.core.zones()
         return ZoneList(zones=zones, active=service.core.active_zones(), epoch=version.epoch, seq=version.seq)
 
-    @routes.post("/api/v1/zones", status=201, raises=[ZoneError, ConflictError, StoreError], problems=_ZONES_NOT_LOADED)
-    async def create_zone(body: Body[ZoneBody], caller: Operator) -> Answer[Zone]:
+    @routes.post("/api/v1/zones", status=201, raises=[*_REFUSALS, ConflictError], problems=_ZONES_NOT_LOADED)
+    async def create_zone(
+        body: Body[ZoneBody], caller: Operator, idempotency_key: IdempotencyKey = None
+    ) -> Answer[Zone]:
         """Add a zone; replies once it is durably stored and on the map."""
         _require_zones(service)
+        attempt = attempt_of(idempotency_key, caller, "POST /api/v1/zones", body)
         zone_id = body.id or f"z-{secrets.token_hex(4)}"
-        zone = await service.create(_zone_from_body(body, zone_id, caller.name, clock.stamp()), caller.name)
+        zone = await service.create(_zone_from_body(body, zone_id, caller.name, clock.stamp()), caller.name, attempt)
         return Answer(zone, {**etag(zone.version), "Location": f"/api/v1/zones/{zone.id}"})
 
     @routes.get("/api/v1/zones/{zone_id}", problems=_NO_SUCH_ZONE)
@@ -118,17 +136,34 @@ def _add_zones(routes: Routes, service: Service, clock: Clock) -> None:
         zone = _find_zone(service, zone_id)
         return Answer(zone, etag(zone.version))
 
-    @routes.put("/api/v1/zones/{zone_id}", raises=[ZoneError, ConflictError, StoreError], problems=_NO_SUCH_ZONE)
-    async def put_zone(zone_id: str, body: Body[ZoneBody], caller: Operator, if_match: IfMatch = None) -> Answer[Zone]:
-        """Replace a zone; with If-Match, only if it is unchanged."""
+    @routes.put(
+        "/api/v1/zones/{zone_id}", status=(200, 201), raises=[*_REFUSALS, ConflictError], problems=_NO_SUCH_ZONE
+    )
+    async def put_zone(  # headers are parameters
+        zone_id: str,
+        body: Body[ZoneBody],
+        caller: Operator,
+        if_match: IfMatch = None,
+        if_none_match: IfNoneMatch = None,
+        idempotency_key: IdempotencyKey = None,
+    ) -> Answer[Zone]:
+        """Replace a zone; with If-Match, only if it is unchanged. With `If-None-Match: *`, add it if it is new."""
         if body.id not in (None, zone_id):
             raise ProblemError(
                 422, f"the path names zone {zone_id}: leave the id out, or give the same id", field="body.id"
             )
+        attempt = attempt_of(idempotency_key, caller, f"PUT /api/v1/zones/{zone_id}", body)
+        zone = _zone_from_body(body, zone_id, caller.name, clock.stamp())
+        if must_be_new(if_none_match):
+            _require_zones(service)
+            _check_id(zone_id)
+            try:
+                zone = await service.create(zone, caller.name, attempt)
+            except ConflictError as error:
+                raise ProblemError(412, f"zone {zone_id} exists already: PUT it with If-Match") from error
+            return Answer(zone, etag(zone.version), created=True)
         old = _find_matching(service, zone_id, if_match)
-        zone = await service.replace(
-            _zone_from_body(body, zone_id, caller.name, clock.stamp()), old.version, caller.name
-        )
+        zone = await service.replace(zone, old.version, caller.name, attempt)
         return Answer(zone, etag(zone.version))
 
     @routes.delete("/api/v1/zones/{zone_id}", raises=[ConflictError, StoreError], problems=_NO_SUCH_ZONE)
@@ -136,10 +171,16 @@ def _add_zones(routes: Routes, service: Service, clock: Clock) -> None:
         """Delete a zone; with If-Match, only if it is unchanged."""
         await service.delete(_find_matching(service, zone_id, if_match), caller.name)
 
-    @routes.get("/api/v1/audit", raises=[StoreError])
-    async def audit(_caller: Viewer, limit: int = 100) -> list[AuditEntry]:
-        """Return the audit log of the zones, newest first."""
-        return await service.audit(max(1, min(limit, 1000)))
+    @routes.get("/api/v1/audit", raises=[CursorError, StoreError])
+    async def audit(
+        _caller: Viewer, kind: AuditKind | None = None, cursor: str | None = None, limit: int = 100
+    ) -> Answer[list[AuditEntry]]:
+        """Return the audit trail of all services, newest first; the Link header has the next page's address."""
+        kinds, limit = KINDS if kind is None else (kind,), max(1, min(limit, 1000))
+        page = await service.audit(kinds, cursor, limit)
+        query = {"kind": kind, "cursor": page.next, "limit": limit}
+        address = urlencode({name: value for name, value in query.items() if value is not None})
+        return Answer(page.entries, {"Link": f'</api/v1/audit?{address}>; rel="next"'} if page.next else {})
 
 
 def _add_errors(routes: Routes) -> None:
@@ -149,14 +190,9 @@ def _add_errors(routes: Routes) -> None:
         {422: "The zone is invalid: `errors` names its fields"},
         lambda error: ProblemError(422, error.message, field=f"body.{error.field}"),
     )
+    add_store_errors(routes)
     routes.raises(
-        StoreError,
-        {503: "The store does not answer; the change may not be stored"},
-        lambda error: ProblemError(
-            503,
-            f"the store does not answer, so the change may not be stored: try again ({error})",
-            headers=_RETRY_AFTER,
-        ),
+        CursorError, {422: "The cursor is invalid"}, lambda error: ProblemError(422, str(error), field="query.cursor")
     )
     routes.raises(
         ConflictError,
@@ -231,8 +267,16 @@ def _add_views(routes: Routes, service: Service, site: Site) -> None:
 def _require_zones(service: Service) -> None:
     if not service.core.zones_loaded:
         raise ProblemError(
-            503, "the stored zones are not loaded yet: try again once /readyz reports ready", headers=_RETRY_AFTER
+            503, "the stored zones are not loaded yet: try again once /readyz reports ready", headers=RETRY_AFTER
         )
+
+
+def _check_id(zone_id: str) -> None:
+    try:
+        msgspec.convert(zone_id, Id)
+    except msgspec.ValidationError as error:
+        detail = f"{zone_id!r} is no valid id: use a to z, 0 to 9 and -, at most 32"
+        raise ProblemError(422, detail, field="path") from error
 
 
 def _find_zone(service: Service, zone_id: str) -> Zone:

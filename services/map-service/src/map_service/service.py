@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from msgspec import structs
@@ -14,19 +15,22 @@ from fog_contracts.shapes import ShapeError
 from fog_runtime import logs, metrics
 from fog_runtime.clock import ticker
 from fog_runtime.edges import Edges
-from map_service.store import Audit, StoreError
-from map_service.zone_validation import validated_zone
+from map_service.store import Audit, RecoveryError, StoreError
+from map_service.zone_validation import check_list_size, list_size, validated_zone
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Sequence
+    from collections.abc import Iterator, Sequence
+    from typing import Literal
 
     from fog_contracts.handlers import Publication
+    from fog_runtime.audit import AuditPage
     from fog_runtime.clock import Clock
     from fog_runtime.health import Health
+    from fog_runtime.idempotency import Attempt
     from fog_runtime.mqtt_edge import MqttEdge
     from fog_runtime.zenoh_edge import ZenohEdge
     from map_service.core import MapCore
-    from map_service.store import AuditEntry, Outcome, Store
+    from map_service.store import Outcome, Store
 
 TICK_S = ch.MAP_HEARTBEAT.period_s
 STORE_PERIOD_S = 0.5
@@ -95,53 +99,97 @@ class Service:
 
     # --- Zones: stored first, then put on the map -------------------------------------------------------------------
 
-    async def create(self, zone: Zone, who: str) -> Zone:
-        """Store a new zone and put it on the map; raises `ZoneError`, `ConflictError` (exists), `StoreError`."""
+    async def create(self, zone: Zone, who: str, attempt: Attempt | None = None) -> Zone:
+        """Store a new zone and put it on the map; raises `ZoneError`, `ConflictError` (exists), `StoreError`.
+
+        An `attempt` that succeeded before returns its zone again; raises `IdempotencyError` for another request's.
+        """
         async with self._zone_lock:
+            if (earlier := await self._earlier_result(attempt)) is not None:
+                return earlier
             stamp = self._clock.stamp()
-            zone = validated_zone(structs.replace(zone, version=1), self.core.costmap.geometry, stamp)
+            zone = validated_zone(zone, self.core.costmap.geometry, stamp)
             if any(known.id == zone.id for known in self.core.zones()):
                 # The store would treat an identical zone as a repeated attempt.
                 raise ConflictError("exists", zone.id)
-            await self._write(
-                self._store.put(zone, expected=0, audit=Audit(at=stamp, who=who, action="create")), zone.id
-            )
+            check_list_size(zone, self.core.zones())
+            audit = Audit(stamp, who, "create", attempt)
+            with self._uncertain_write():
+                outcome, zone = await self._store.create(zone, audit)
+            self._require_ok(outcome, zone.id)
             self._publish(self.core.put_zone(zone, self._edges.now()))
             return zone
 
-    async def replace(self, zone: Zone, expected: int, who: str) -> Zone:
-        """Store a new version of a zone; raises `ZoneError`, `ConflictError` (stale, missing), `StoreError`."""
+    async def replace(self, zone: Zone, expected: int, who: str, attempt: Attempt | None = None) -> Zone:
+        """Store a new version of a zone; raises `ZoneError`, `ConflictError` (stale, missing), `StoreError`.
+
+        `attempt` as in `create`.
+        """
         async with self._zone_lock:
+            if (earlier := await self._earlier_result(attempt)) is not None:
+                return earlier
             if not any(known.id == zone.id and known.version == expected for known in self.core.zones()):
                 # The store would treat an identical zone as a repeated attempt.
                 raise ConflictError("stale", zone.id)
             stamp = self._clock.stamp()
             zone = validated_zone(structs.replace(zone, version=expected + 1), self.core.costmap.geometry, stamp)
-            audit = Audit(at=stamp, who=who, action="replace")
-            await self._write(self._store.put(zone, expected=expected, audit=audit), zone.id)
+            check_list_size(zone, self.core.zones())
+            audit = Audit(stamp, who, "replace", attempt)
+            with self._uncertain_write():
+                outcome = await self._store.replace(zone, expected=expected, audit=audit)
+            self._require_ok(outcome, zone.id)
             self._publish(self.core.put_zone(zone, self._edges.now()))
             return zone
 
     async def delete(self, zone: Zone, who: str) -> None:
         """Delete this version of a zone; raises `ConflictError` (stale) and `StoreError`."""
         async with self._zone_lock:
-            audit = Audit(at=self._clock.stamp(), who=who, action="delete")
-            await self._write(self._store.delete(zone, audit), zone.id)
+            with self._uncertain_write():
+                outcome = await self._store.delete(zone, Audit(self._clock.stamp(), who, "delete"))
+            self._require_ok(outcome, zone.id)
             self._publish(self.core.remove_zone(zone.id, self._edges.now()))
 
-    async def audit(self, limit: int) -> list[AuditEntry]:
-        """Return the newest entries of the audit log; raises `StoreError`."""
-        return await self._store.audit(limit)
+    async def audit(self, kinds: Sequence[str], cursor: str | None, limit: int) -> AuditPage:
+        """Return a page of the site's audit trail; raises `CursorError` and `StoreError`."""
+        return await self._store.audit(kinds=kinds, cursor=cursor, limit=limit)
 
-    async def _write(self, attempt: Awaitable[Outcome], zone_id: str) -> None:
+    async def recover_store(self, action: Literal["restore", "accept"], who: str) -> None:
+        """Restore the zones from memory, or accept those in Redis, after Redis lost records.
+
+        Raises `RecoveryError` and `StoreError`.
+        """
+        await self._store.require_loss()
+        async with self._zone_lock:
+            audit = Audit(self._clock.stamp(), who, action)
+            if action == "accept":
+                await self._store.accept_loss(audit)
+            elif self.core.zones_loaded:
+                await self._store.restore(self.core.zones(), audit)
+            else:
+                raise RecoveryError(
+                    "this service was started after the loss and has no zones: restore a backup of Redis, or accept"
+                )
+        await self.load_zones()
+
+    async def _earlier_result(self, attempt: Attempt | None) -> Zone | None:
+        """Return the zone that an earlier attempt stored, once it is on the map."""
+        earlier = await self._store.earlier_result(attempt)
+        if earlier is not None and self._reload_zones:
+            await self._load_zones()
+        return earlier
+
+    @contextmanager
+    def _uncertain_write(self) -> Iterator[None]:
+        """Reload the zones after a failure: they may have been written although the reply was lost."""
         try:
-            outcome = await attempt
+            yield
         except StoreError as error:
-            # It may have been written although the reply was lost: reload the zones.
             self._reload_zones = True
             self._health.set("store", ok=False, detail=str(error))
             ZONE_WRITES.labels("failed").inc()
             raise
+
+    def _require_ok(self, outcome: Outcome, zone_id: str) -> None:
         ZONE_WRITES.labels(outcome).inc()
         if outcome != "ok":
             self._reload_zones = True
@@ -150,13 +198,20 @@ class Service:
     async def load_zones(self) -> None:
         """Replace the map's zones by the stored ones; raises `StoreError`."""
         async with self._zone_lock:
-            zones = await self._store.zones()
-            try:
-                self._publish(self.core.load_zones(zones, self._edges.now()))
-            except ShapeError as error:
-                raise StoreError(f"a stored zone is invalid: {error}; repair or delete it") from error
-            self._reload_zones = False
-        self._health.set("zones", ok=True, detail=f"{len(zones)} loaded")
+            await self._load_zones()
+
+    async def _load_zones(self) -> None:
+        zones = await self._store.zones()
+        try:
+            self._publish(self.core.load_zones(zones, self._edges.now()))
+        except ShapeError as error:
+            raise StoreError(f"a stored zone is invalid: {error}; repair or delete it") from error
+        self._reload_zones = False
+        detail = f"{len(zones)} loaded"
+        if (excess := list_size(zones) - ch.ZONES.limit) > 0:
+            detail += f"; their list is {excess} bytes too large for robots, which drive by the map alone: delete some"
+            _log.error("zone_list_too_large", zones=len(zones), excess_bytes=excess, remedy="delete zones")
+        self._health.set("zones", ok=True, detail=detail)
         self._health.set("store", ok=True)
 
     async def store_loop(self) -> None:
@@ -168,9 +223,11 @@ class Service:
                     if warning := await self._store.durability_warning():
                         _log.warning("store_not_durable", remedy=warning)
                 else:
-                    await self._store.ping()
+                    await self._store.check()
                     self._health.set("store", ok=True)
             except StoreError as error:
+                # What was stored but never acknowledged may have gone with a failed primary.
+                self._reload_zones = True
                 self._health.set("store", ok=False, detail=str(error))
                 if not self.core.zones_loaded:
                     self._health.set("zones", ok=False, detail=f"not loaded yet, so the map is not served: {error}")

@@ -1,25 +1,22 @@
-"""The map-service's records in Redis: zones with optimistic versioning, and the audit log."""
+"""The map-service's records in Redis: zones with optimistic versioning."""
 
 from __future__ import annotations
 
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-import msgspec
+from msgspec import structs
 
 from fog_contracts.messages import Zone
-from fog_runtime.redis_store import Audit, Outcome, RedisStore, StoreError, Table
+from fog_runtime.redis_store import Audit, Outcome, RecoveryError, RedisStore, StoreError, Table
 
-__all__ = ["Audit", "AuditEntry", "Outcome", "Store", "StoreError"]
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from fog_runtime.idempotency import Attempt
+
+__all__ = ["Audit", "Outcome", "RecoveryError", "Store", "StoreError"]
 
 _ZONES: Final = Table("zones", "zone")
-
-
-class AuditEntry(Audit, frozen=True, kw_only=True):
-    """A change of a zone; `before` and `after` are null where the zone did or does not exist."""
-
-    zone: str
-    before: Zone | None
-    after: Zone | None
 
 
 class Store(RedisStore):
@@ -27,10 +24,22 @@ class Store(RedisStore):
 
     async def zones(self) -> list[Zone]:
         """Return all stored zones; an unreadable one raises `StoreError`: a no-go zone must never be left out."""
-        return list((await self._records(_ZONES.name, Zone)).values())
+        zones = list((await self._records(_ZONES.name, Zone)).values())
+        await self._load_floor(_ZONES.name)
+        return zones
 
-    async def put(self, zone: Zone, *, expected: int, audit: Audit) -> Outcome:
-        """Write a zone durably if the stored version is `expected` (0: none is stored)."""
+    async def create(self, zone: Zone, audit: Audit) -> tuple[Outcome, Zone]:
+        """Write a new zone durably; return it with its version, which no zone of this id had before."""
+        outcome: Outcome = "stale"
+        for _ in range(2):
+            zone = structs.replace(zone, version=self._floor(_ZONES.name) + 1)
+            outcome = await self._swap(_ZONES, zone.id, zone, "0", audit)
+            if outcome != "stale":
+                break  # else this process did not know of the newest deletion, and does now
+        return outcome, zone
+
+    async def replace(self, zone: Zone, *, expected: int, audit: Audit) -> Outcome:
+        """Write a new version of a zone durably if the stored version is `expected`."""
         return await self._swap(_ZONES, zone.id, zone, str(expected), audit)
 
     async def delete(self, zone: Zone, audit: Audit) -> Outcome:
@@ -39,20 +48,10 @@ class Store(RedisStore):
         # The zone is deleted already: by an attempt whose reply was lost, or by somebody else.
         return "ok" if outcome == "missing" else outcome
 
-    async def audit(self, limit: int) -> list[AuditEntry]:
-        """Return the newest entries about zones, newest first."""
-        return [_audit_entry(fields) for fields in await self.audit_entries(limit) if _ZONES.subject in fields]
+    async def earlier_result(self, attempt: Attempt | None) -> Zone | None:
+        """Return the zone that an earlier attempt with the same idempotency key stored."""
+        return await self.recall(attempt, Zone)
 
-
-def _audit_entry(fields: dict[str, str]) -> AuditEntry:
-    before, after = (
-        msgspec.json.decode(fields[name], type=Zone) if fields[name] else None for name in ("before", "after")
-    )
-    return AuditEntry(
-        at=float(fields["at"]),
-        who=fields["who"],
-        action=fields["action"],
-        zone=fields["zone"],
-        before=before,
-        after=after,
-    )
+    async def restore(self, zones: Iterable[Zone], audit: Audit) -> None:
+        """Replace the stored zones by these, on an administrator's decision after Redis lost them."""
+        await self._adopt({_ZONES.name: {zone.id: zone for zone in zones}}, audit)

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import msgspec
 from msgspec import structs
 
+from fog_contracts import channels as ch
+from fog_contracts.messages import ZoneSet
 from fog_contracts.shapes import ShapeError, normalized_shape, rasterize_shape
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from fog_contracts.grid import GridGeometry
     from fog_contracts.messages import Zone
 
@@ -47,3 +52,23 @@ def validated_zone(zone: Zone, geometry: GridGeometry, stamp: float) -> Zone:
             " move it onto the map",
         )
     return structs.replace(zone, shape=shape)
+
+
+def list_size(zones: Sequence[Zone]) -> int:
+    """Return the largest size (bytes) of the message that tells robots of these zones."""
+    largest = 2**53
+    return len(msgspec.msgpack.encode(ZoneSet(epoch=largest, seq=largest, zones=list(zones))))
+
+
+def check_list_size(zone: Zone, zones: Sequence[Zone]) -> None:
+    """Raise `ZoneError` when this zone, new or changed, would make the list of all zones too large for robots.
+
+    A list that is too large already may shrink.
+    """
+    size = list_size([zone, *(known for known in zones if known.id != zone.id)])
+    if size > max(ch.ZONES.limit, list_size(zones)):
+        raise ZoneError(
+            "shape",
+            f"the list of all zones would have {size} bytes, and robots accept {ch.ZONES.limit}: give the shape fewer"
+            " corners, or delete zones that nobody needs",
+        )

@@ -33,7 +33,7 @@ async def main() -> None:
     health = Health("store", "goals", "map", "zenoh")
     config = PlannerConfig(inflation=settings.inflation, release_length=settings.release_m)
     async with (
-        Store(settings.redis_url, site) as store,
+        Store(settings.redis_url, site, service="planner", data_dir=settings.data_dir) as store,
         ZenohEdge.open(connect=settings.zenoh_endpoints, clock=clock, role="planner", id=site, site=site) as zenoh,
     ):
         service = Service(PlannerCore(await store.begin_epoch("planner"), config), store, zenoh, clock, health)

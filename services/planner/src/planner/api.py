@@ -18,7 +18,19 @@ from fog_contracts.messages import (
 )
 from fog_contracts.site import Site
 from fog_runtime.health import Health
-from fog_runtime.http import Body, Operator, ProblemError, Routes, Tokens, make_app
+from fog_runtime.http import (
+    Body,
+    IdempotencyKey,
+    Operator,
+    ProblemError,
+    Routes,
+    Tokens,
+    add_recovery,
+    add_store_errors,
+    attempt_of,
+    make_app,
+)
+from fog_runtime.idempotency import IdempotencyError
 from planner.service import Service
 from planner.store import StoredGoal, StoreError
 
@@ -145,14 +157,13 @@ def make_api(service: Service, site: Site, health: Health, tokens: Tokens) -> Fa
     app = make_app("Fognav planner", health, tokens)
     robots = _Robots(service, site)
     routes = Routes(app, "robots")
-    routes.raises(
-        StoreError,
-        {503: "The mission is unchanged: the store does not answer"},
-        lambda error: ProblemError(503, f"the mission is unchanged: {error}; try again", headers={"Retry-After": "1"}),
-    )
+    add_store_errors(routes)
     _add_views(routes, service, robots)
     _add_orders(routes, service, robots, site)
     _add_plan(Routes(app, "plan"), service)
+    recovery = Routes(app, "store")
+    add_store_errors(recovery)
+    add_recovery(recovery, service)
     return app
 
 
@@ -179,18 +190,23 @@ def _add_orders(routes: Routes, service: Service, robots: _Robots, site: Site) -
 
     @routes.put(
         "/api/v1/robots/{robot}/goal",
-        raises=[StoreError],
+        raises=[IdempotencyError, StoreError],
         problems={
             404: "No robot has this id",
             422: "The body is invalid, or the goal can never be reached: then with Nav2's `code` and `name`, and the"
             " `nearest` reachable point",
         },
     )
-    async def put_goal(robot: str, body: Body[GoalBody], caller: Operator) -> GoalView:
+    async def put_goal(
+        robot: str, body: Body[GoalBody], caller: Operator, idempotency_key: IdempotencyKey = None
+    ) -> GoalView:
         """Send a robot to a place or pose."""
         robots.check(robot)
         pose, any_heading = _goal_pose(body, site)
-        answer = await service.send(robot, pose, caller.name, place=body.place, any_heading=any_heading)
+        attempt = attempt_of(idempotency_key, caller, f"PUT /api/v1/robots/{robot}/goal", body)
+        answer = await service.send(
+            robot, pose, caller.name, place=body.place, any_heading=any_heading, attempt=attempt
+        )
         if isinstance(answer, Refusal):
             field = "body.place" if body.place else "body.pose"
             raise ProblemError(

@@ -10,6 +10,7 @@ import asyncio
 import secrets
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, TypeVar
@@ -34,15 +35,18 @@ from fog_contracts.replica import MapError
 from fog_runtime import logs, metrics
 from fog_runtime.clock import ticker
 from fog_runtime.edges import Edges
-from planner.store import StoredGoal, StoreError
+from fog_runtime.redis_connection import StoreRefusedError
+from planner.store import Audit, RecoveryError, StoredGoal, StoreError
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Sequence
+    from collections.abc import Callable, Iterator, Sequence
+    from typing import Literal
 
     from fog_contracts.handlers import Handler, Ids, Moment, Publication, QueryHandler
     from fog_contracts.messages import Message
     from fog_runtime.clock import Clock
     from fog_runtime.health import Health
+    from fog_runtime.idempotency import Attempt
     from fog_runtime.zenoh_edge import ZenohEdge
     from planner.core import PlannerCore
     from planner.goal_fields import FieldJob
@@ -97,6 +101,7 @@ class Service:
         self._field_tasks: set[asyncio.Task[None]] = set()
         self._goals_loaded = asyncio.Event()
         self._goal_lock = asyncio.Lock()
+        self._reload_goals = True
         self._reached: dict[str, str] = {}
         self._exported_counts: dict[tuple[int, object], int] = {}
         self.poses: dict[str, RobotPose] = {}
@@ -167,9 +172,18 @@ class Service:
     # --- Missions: stored first, then in force ----------------------------------------------------------------------
 
     async def send(
-        self, robot: str, pose: Pose, who: str, *, place: str | None, any_heading: bool
+        self, robot: str, pose: Pose, who: str, *, place: str | None, any_heading: bool, attempt: Attempt | None = None
     ) -> StoredGoal | Refusal:
-        """Give a robot a mission; returns a refusal for an unreachable goal. Raises `StoreError`."""
+        """Give a robot a mission; returns a refusal for an unreachable goal.
+
+        An `attempt` that succeeded before returns its mission again and changes nothing. Raises `IdempotencyError` for
+        another request's attempt, and `StoreError`, after which the mission may or may not be stored.
+        """
+        with self._uncertain_write():
+            if (earlier := await self._store.earlier_result(attempt)) is not None:
+                if self._reload_goals:
+                    await self._load_goals()
+                return earlier
         refusal = await self._run_in_core(lambda: self._core.check_goal(pose.x, pose.y))
         if refusal is not None:
             return refusal
@@ -177,7 +191,10 @@ class Service:
             stamp = self._clock.stamp()
             goal = RobotGoal(goal_id=secrets.token_hex(8), pose=pose, place=place, stamp=stamp)
             stored = StoredGoal(goal=goal, any_heading=any_heading)
-            await self._write(lambda: self._store.put(robot, stored, who, stamp))
+            with self._uncertain_write():
+                outcome = await self._store.put(robot, stored, Audit(stamp, who, "goal", attempt))
+            if outcome != "ok":
+                raise StoreError("another request with this Idempotency-Key is in progress: repeat it")
             self._begin_mission(robot, stored)
         _log.info("goal_accepted", robot=robot, goal=goal.goal_id, x=pose.x, y=pose.y, place=place, who=who)
         return stored
@@ -188,22 +205,59 @@ class Service:
             stored = self.goals.get(robot)
             if stored is None:
                 return False
-            stamp = self._clock.stamp()
-            goal_id = stored.goal.goal_id
-            await self._write(lambda: self._store.delete(robot, goal_id, who, "cancel", stamp))
-            del self.goals[robot]
-            self._change_goal(partial(self._core.cancel, robot))
+            with self._uncertain_write():
+                await self._store.delete(robot, stored.goal.goal_id, Audit(self._clock.stamp(), who, "cancel"))
+            self._cancel_mission(robot)
         _log.info("goal_cancelled", robot=robot, goal=stored.goal.goal_id, who=who)
         return True
 
-    async def _write(self, write: Callable[[], Awaitable[None]]) -> None:
+    async def recover_store(self, action: Literal["restore", "accept"], who: str) -> None:
+        """Restore the missions from memory, or accept those in Redis, after Redis lost records.
+
+        Raises `RecoveryError` and `StoreError`.
+        """
+        await self._store.require_loss()
+        async with self._goal_lock:
+            audit = Audit(self._clock.stamp(), who, action)
+            if action == "accept":
+                await self._store.accept_loss(audit)
+                self._reload_goals = True
+            elif self._goals_loaded.is_set():
+                await self._store.restore(self.goals, audit)
+            else:
+                raise RecoveryError(
+                    "this service was started after the loss and has no missions: restore a backup of Redis, or accept"
+                )
+
+    @contextmanager
+    def _uncertain_write(self) -> Iterator[None]:
+        """Reload the missions after a failure: one may have been written although the reply was lost."""
         if not self._goals_loaded.is_set():
-            raise StoreError("the stored missions are not loaded yet")
+            raise StoreRefusedError("the stored missions are not loaded yet")
         try:
-            await write()
+            yield
         except StoreError as error:
+            self._reload_goals = True
             self._health.set("store", ok=False, detail=str(error))
             raise
+
+    async def _load_goals(self) -> None:
+        """Put the stored missions into force, and end those that are not stored; raises `StoreError`."""
+        async with self._goal_lock:
+            stored = await self._store.goals()
+            for robot in [robot for robot in self.goals if robot not in stored]:
+                self._cancel_mission(robot)
+            for robot, mission in stored.items():
+                # One that is reached may still be stored, until its deletion succeeds.
+                if mission != self.goals.get(robot) and mission.goal.goal_id != self._reached.get(robot):
+                    self._begin_mission(robot, mission)
+            self._reload_goals = False
+        self._goals_loaded.set()
+        self._health.set("goals", ok=True, detail=f"{len(self.goals)} loaded")
+
+    def _cancel_mission(self, robot: str) -> None:
+        del self.goals[robot]
+        self._change_goal(partial(self._core.cancel, robot))
 
     def _begin_mission(self, robot: str, stored: StoredGoal) -> None:
         self.goals[robot] = stored
@@ -217,18 +271,17 @@ class Service:
         """Load the missions, retrying until the store answers; then delete ended ones, and monitor the store."""
         while True:
             try:
-                if not self._goals_loaded.is_set():
-                    for robot, stored in (await self._store.goals()).items():
-                        self._begin_mission(robot, stored)
-                    self._goals_loaded.set()
-                    self._health.set("goals", ok=True, detail=f"{len(self.goals)} loaded")
+                if self._reload_goals:
+                    await self._load_goals()
                 for robot, goal_id in list(self._reached.items()):
-                    await self._store.delete(robot, goal_id, robot, "reached", self._clock.stamp())
+                    await self._store.delete(robot, goal_id, Audit(self._clock.stamp(), robot, "reached"))
                     if self._reached.get(robot) == goal_id:
                         del self._reached[robot]
-                await self._store.ping()
+                await self._store.check()
                 self._health.set("store", ok=True)
             except StoreError as error:
+                # What was stored but never acknowledged may have gone with a failed primary.
+                self._reload_goals = True
                 self._health.set("store", ok=False, detail=str(error))
                 if not self._goals_loaded.is_set():
                     self._health.set("goals", ok=False, detail=f"not loaded yet: {error}")

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from fog_contracts.messages import Message, RobotGoal
-from fog_runtime.redis_store import ANY, Audit, RedisStore, StoreError, Table
+from fog_runtime.redis_store import ANY, Audit, Outcome, RecoveryError, RedisStore, StoreError, Table
 
-__all__ = ["Store", "StoreError", "StoredGoal"]
+if TYPE_CHECKING:
+    from collections.abc import Mapping
 
-_GOALS: Final = Table("goals", "robot", version="goal.goal_id")
+    from fog_runtime.idempotency import Attempt
+
+__all__ = ["Audit", "RecoveryError", "Store", "StoreError", "StoredGoal"]
+
+_GOALS: Final = Table("goals", "mission", version="goal.goal_id")
 
 
 class StoredGoal(Message, frozen=True, kw_only=True):
@@ -29,10 +34,18 @@ class Store(RedisStore):
         """
         return await self._readable_records(_GOALS.name, StoredGoal)
 
-    async def put(self, robot: str, goal: StoredGoal, who: str, stamp: float) -> None:
-        """Write a mission durably, with its audit entry."""
-        await self._swap(_GOALS, robot, goal, ANY, Audit(at=stamp, who=who, action="goal"))
+    async def put(self, robot: str, goal: StoredGoal, audit: Audit) -> Outcome:
+        """Write a mission durably, with its audit entry; `exists` if another process used the same idempotency key."""
+        return await self._swap(_GOALS, robot, goal, ANY, audit)
 
-    async def delete(self, robot: str, goal_id: str, who: str, action: str, stamp: float) -> None:
-        """Delete a mission durably if it is still this one (`action`: cancel or reached): a newer one stays."""
-        await self._swap(_GOALS, robot, None, goal_id, Audit(at=stamp, who=who, action=action))
+    async def delete(self, robot: str, goal_id: str, audit: Audit) -> None:
+        """Delete a mission durably if it is still this one: a newer one stays."""
+        await self._swap(_GOALS, robot, None, goal_id, audit)
+
+    async def earlier_result(self, attempt: Attempt | None) -> StoredGoal | None:
+        """Return the mission that an earlier attempt with the same idempotency key stored."""
+        return await self.recall(attempt, StoredGoal)
+
+    async def restore(self, goals: Mapping[str, StoredGoal], audit: Audit) -> None:
+        """Replace the stored missions by these, on an administrator's decision after Redis lost them."""
+        await self._adopt({_GOALS.name: goals}, audit)

@@ -4,22 +4,39 @@ from fog_runtime.http.app import make_app
 from fog_runtime.http.problems import ProblemError
 from fog_runtime.http.routes import Answer, Body, IfMatch, Routes, etag, expected_version
 from fog_runtime.http.server import serve
-from fog_runtime.http.tokens import Operator, Tokens, TokensError, Viewer, load_tokens, token_hash
+from fog_runtime.http.store_routes import (
+    RETRY_AFTER,
+    IdempotencyKey,
+    IfNoneMatch,
+    add_recovery,
+    add_store_errors,
+    attempt_of,
+    must_be_new,
+)
+from fog_runtime.http.tokens import Admin, Operator, Tokens, TokensError, Viewer, load_tokens, token_hash
 
 __all__ = [
+    "RETRY_AFTER",
+    "Admin",
     "Answer",
     "Body",
+    "IdempotencyKey",
     "IfMatch",
+    "IfNoneMatch",
     "Operator",
     "ProblemError",
     "Routes",
     "Tokens",
     "TokensError",
     "Viewer",
+    "add_recovery",
+    "add_store_errors",
+    "attempt_of",
     "etag",
     "expected_version",
     "load_tokens",
     "make_app",
+    "must_be_new",
     "serve",
     "token_hash",
 ]

@@ -46,10 +46,11 @@ IfMatch = Annotated[
 
 @dataclass(frozen=True, slots=True)
 class Answer(Generic[T]):
-    """An answer with headers."""
+    """An answer with headers, and whether it tells of a new record (201 instead of the route's status)."""
 
     value: T
     headers: Mapping[str, str] = field(default_factory=dict)
+    created: bool = False
 
 
 def etag(version: int) -> dict[str, str]:
@@ -70,6 +71,7 @@ class Routes:
 
     A route is an async function. `Body[T]` declares the type of its body, `Viewer` or `Operator` the role of its
     callers, and the return type its response: a msgspec type, an `Answer` of one, None for 204, or a ready `Response`.
+    The first `status` is the usual one; a route that may create something has 201 as another (`Answer.created`).
     `raises` lists exceptions that become problem documents as registered by `Routes.raises`; `problems` describes
     further ones.
     """
@@ -112,26 +114,28 @@ class Routes:
         method: str,
         path: str,
         *,
-        status: int = 200,
+        status: int | tuple[int, ...] = 200,
         media_type: str = "",
         raises: Sequence[type[Exception]] = (),
         problems: Mapping[int, str] | None = None,
     ) -> Callable[[Handler], Handler]:
         def add(handler: Handler) -> Handler:
             signature = _Signature(handler)
-            answered = 204 if signature.answer is type(None) else status
+            statuses = (status,) if isinstance(status, int) else status
+            if signature.answer is type(None):
+                statuses = (204,)
             described = {status: text for kind in raises for status, text in self._raised[kind].items()} | dict(
                 problems or {}
             )
             self._app.add_api_route(
                 path,
-                _endpoint(handler, signature, answered),
+                _endpoint(handler, signature, statuses[0]),
                 methods=[method],
                 tags=[self._tag],
-                status_code=answered,
+                status_code=statuses[0],
                 response_model=None,
                 response_class=Response,
-                responses=self._responses(signature, answered, media_type, described),
+                responses=self._responses(signature, statuses, media_type, described),
                 openapi_extra=self._body(signature),
             )
             return handler
@@ -145,12 +149,12 @@ class Routes:
         return {"requestBody": {"required": True, "content": content}}
 
     def _responses(
-        self, signature: "_Signature", status: int, media_type: str, problems: Mapping[int, str]
+        self, signature: "_Signature", statuses: Sequence[int], media_type: str, problems: Mapping[int, str]
     ) -> dict[int | str, dict[str, Any]]:
-        answer: dict[str, Any] = {"description": "Done" if status == 204 else "The answer"}
+        answer: dict[str, Any] = {"description": "Done" if 204 in statuses else "The answer"}
         if media_type:
             answer["content"] = {media_type: {}}
-        elif status != 204:
+        elif 204 not in statuses:
             answer["content"] = {"application/json": {"schema": schema(self._app, signature.answer)}}
         described: dict[int, str] = {}
         if signature.needs_token:
@@ -159,7 +163,7 @@ class Routes:
             described |= {413: "The body is too large", 422: "The body is invalid: `errors` names the fields"}
         described.update(problems)
         content = {PROBLEM: {"schema": schema(self._app, Problem)}}
-        responses: dict[int | str, dict[str, Any]] = {status: answer}
+        responses: dict[int | str, dict[str, Any]] = dict.fromkeys(statuses, answer)
         for code, text in described.items():
             responses[code] = {"description": text, "content": content}
         responses["default"] = {"description": "Any other error", "content": content}
@@ -202,8 +206,9 @@ def _endpoint(
             return answer
         if answer is None:
             return Response(status_code=status)
-        value, headers = (answer.value, dict(answer.headers)) if isinstance(answer, Answer) else (answer, None)
-        return Response(msgspec.json.encode(value), status, headers, media_type="application/json")
+        full: Answer[object] = answer if isinstance(answer, Answer) else Answer(answer)
+        data, answered = msgspec.json.encode(full.value), 201 if full.created else status
+        return Response(data, answered, dict(full.headers), media_type="application/json")
 
     setattr(endpoint, "__signature__", inspect.Signature(signature.parameters))  # noqa: B010  # what FastAPI reads
     return endpoint

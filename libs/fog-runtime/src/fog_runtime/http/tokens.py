@@ -98,5 +98,7 @@ def require(role: Role) -> Callable[..., Caller]:
 
 Viewer = Annotated[Caller, Depends(require("viewer"))]
 """A parameter of a route that viewers, operators and admins may call."""
+Admin = Annotated[Caller, Depends(require("admin"))]
+"""A parameter of a route that admins may call."""
 Operator = Annotated[Caller, Depends(require("operator"))]
 """A parameter of a route that operators and admins may call."""

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, Generic, Protocol, TypeVar
 import msgspec
 
 from fog_contracts.options import OptionError, read_options
+from hazard_aggregator.area_size import AreaError
 
 if TYPE_CHECKING:
     from fog_contracts.messages import AreaState
@@ -45,13 +46,8 @@ class RuleFactory(Generic[Options]):
     make: Callable[[Options], Rule]
 
 
-class DebounceError(ValueError):
+class DebounceError(AreaError):
     """An area's debounce settings are invalid; the message names the area, the field and the known values."""
-
-    def __init__(self, area: str, field: str, problem: str) -> None:
-        super().__init__(f"area {area}: {field}: {problem}")
-        self.field = field
-        self.problem = problem
 
 
 Registry = Callable[[str], "RuleFactory[Any]"]

@@ -1,0 +1,85 @@
+"""What the REST interfaces of all services with a store have in common: its errors, its recovery, idempotency keys."""
+
+from typing import Annotated, Any, Final, Literal, Protocol
+
+from fastapi import Header
+
+from fog_contracts.messages import Message
+from fog_runtime.http.problems import ProblemError
+from fog_runtime.http.routes import Body, Routes
+from fog_runtime.http.tokens import Admin, Caller
+from fog_runtime.idempotency import Attempt, IdempotencyError
+from fog_runtime.redis_connection import StoreError, StoreRefusedError
+from fog_runtime.redis_store import RecoveryError
+
+RETRY_AFTER: Final = {"Retry-After": "1"}
+
+IdempotencyKey = Annotated[
+    str | None,
+    Header(
+        alias="Idempotency-Key",
+        min_length=1,
+        max_length=128,
+        pattern=r"^[\x21-\x7e]+$",
+        description="Any text of your own, new for each change: a repeated request with it returns the first result"
+        " and changes nothing, for 24 hours",
+    ),
+]
+IfNoneMatch = Annotated[
+    str | None, Header(alias="If-None-Match", description="`*`: refuse the request if the record exists already")
+]
+
+
+class Recovery(Message, frozen=True, kw_only=True):
+    """What to do after Redis lost records: `restore` what the service has in memory, or `accept` what Redis has."""
+
+    action: Literal["restore", "accept"]
+
+
+class Recoverable(Protocol):
+    """A service that can recover its store."""
+
+    async def recover_store(self, action: Literal["restore", "accept"], who: str) -> None:
+        """Carry out an administrator's decision; raises `RecoveryError` and `StoreError`."""
+
+
+def attempt_of(key: str | None, caller: Caller, target: str, body: Any) -> Attempt | None:  # noqa: ANN401  # any message
+    """Return the attempt that an Idempotency-Key identifies; None without one. `target` is the method and path."""
+    return None if key is None else Attempt.of(caller.name, key, target, body)
+
+
+def must_be_new(if_none_match: str | None) -> bool:
+    """Return whether an If-None-Match header asks for a new record; raises `ProblemError` for any value but `*`."""
+    if if_none_match not in (None, "*"):
+        raise ProblemError(422, "send `If-None-Match: *`, or leave it out", field="header.If-None-Match")
+    return if_none_match is not None
+
+
+def add_store_errors(routes: Routes) -> None:
+    """Register the problem documents of the store's errors."""
+    routes.raises(StoreError, {503: "The store does not answer, or refuses writes: `detail` names the cause"}, _problem)
+    routes.raises(
+        IdempotencyError,
+        {422: "The body is invalid, or the Idempotency-Key was used for another request"},
+        lambda error: ProblemError(422, str(error), field="header.Idempotency-Key"),
+    )
+
+
+def add_recovery(routes: Routes, service: Recoverable) -> None:
+    """Add the route by which an administrator decides what happens after Redis lost records."""
+    routes.raises(RecoveryError, {409: "There is nothing to recover"}, lambda error: ProblemError(409, str(error)))
+
+    @routes.post("/api/v1/store/recovery", raises=[StoreError, RecoveryError])
+    async def recover_store(body: Body[Recovery], caller: Admin) -> None:
+        """Decide what happens after Redis lost acknowledged records: restore them from memory, or accept the loss."""
+        await service.recover_store(body.action, caller.name)
+
+
+def _problem(error: StoreError) -> ProblemError:
+    if isinstance(error, StoreRefusedError):
+        return ProblemError(503, f"nothing was changed: {error}", headers=RETRY_AFTER)
+    return ProblemError(
+        503,
+        f"the change may or may not be stored: repeat the request, with its Idempotency-Key if it had one ({error})",
+        headers=RETRY_AFTER,
+    )

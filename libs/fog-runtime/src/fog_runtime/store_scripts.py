@@ -1,0 +1,76 @@
+"""The scripts that write to the store. Each is one atomic step of Redis: after a crash all of it is stored, or nothing.
+
+Every script begins with the guard: it writes nothing into a store that was emptied, replaced, or went back to an older
+state. Its first argument is a JSON object; it returns an outcome, the number of writes of the table, and details.
+"""
+
+from typing import Final
+
+AUDIT_ENTRIES: Final = 100_000
+"""Entries of the audit trail that are kept, for each kind of record."""
+
+_GUARD: Final = """
+local request = cjson.decode(ARGV[1])
+if redis.call('GET', KEYS[1]) ~= request.generation then return {'lost', 0, ''} end
+local writes = tonumber(redis.call('HGET', KEYS[2], request.table) or '0')
+if writes < request.acknowledged then return {'lost', 0, ''} end
+"""
+
+WRITE: Final = f"""{_GUARD}
+for i = 2, #ARGV, 2 do redis.call('HSET', KEYS[3], ARGV[i], ARGV[i + 1]) end
+return {{'ok', redis.call('HINCRBY', KEYS[2], request.table, 1), ''}}
+"""
+"""Overwrite records: keys `generation`, `writes`, table; further arguments: ids and records, alternating."""
+
+SWAP: Final = f"""{_GUARD}
+local id, expected, data = request.id, request.expected, ARGV[2]
+local attempted = request.attempt_s > 0
+if attempted then
+  local earlier = redis.call('GET', KEYS[6])
+  if earlier then return {{'replay', writes, earlier}} end
+end
+
+local function version_of(record)
+  local version = cjson.decode(record)
+  for part in string.gmatch(request.version, '[^.]+') do version = version[part] end
+  return version
+end
+
+local floor = tonumber(redis.call('HGET', KEYS[5], request.table) or '0')
+local current = redis.call('HGET', KEYS[3], id)
+local outcome = 'ok'
+if current and current == data then
+  -- A repeated attempt whose first reply was lost.
+elseif expected == '0' and current then
+  outcome = 'exists'
+elseif not current and (data == '' or (expected ~= '0' and expected ~= '*')) then
+  outcome = 'missing'
+elseif current and expected ~= '*' and tostring(version_of(current)) ~= expected then
+  outcome = 'stale'
+elseif not current and type(version_of(data)) == 'number' and version_of(data) <= floor then
+  outcome = 'stale'
+else
+  if data == '' then
+    local version = version_of(current)
+    redis.call('HDEL', KEYS[3], id)
+    if type(version) == 'number' and version > floor then
+      floor = version
+      redis.call('HSET', KEYS[5], request.table, string.format('%d', floor))
+    end
+  else
+    redis.call('HSET', KEYS[3], id, data)
+  end
+  redis.call('XADD', KEYS[4], 'MAXLEN', '~', {AUDIT_ENTRIES}, '*', 'at', request.at, 'who', request.who,
+    'action', request.action, 'id', id, 'before', current or ARGV[3], 'after', data)
+  writes = redis.call('HINCRBY', KEYS[2], request.table, 1)
+  if attempted then redis.call('SET', KEYS[6], ARGV[4], 'EX', request.attempt_s) end
+end
+return {{outcome, writes, string.format('%d', floor)}}
+"""
+"""Write or delete one record if its version is the expected one, with its audit entry.
+
+Keys: `generation`, `writes`, table, audit trail, `floors`, idempotency key. Further arguments: the record (empty:
+delete), the value before for the audit entry if none is stored, and the result to remember for the idempotency key.
+A deleted record leaves its version as the table's floor, above which every new record's version must be, so that a
+version never names two states. It is idempotent: a record that is already stored is left unchanged.
+"""

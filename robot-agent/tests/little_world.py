@@ -21,18 +21,19 @@ from fog_contracts.replica import MasterMap
 from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.raycast import cast
 from robot_agent.agent.core import AgentCore, decide
-from robot_agent.config import AgentConfig
+from robot_agent.config import agent_config
 from robot_agent.guardian.link import BaseFeedback
-from robot_agent.hardware import BaseStatus, DriveTrain, LaserScan, RepeatCounter, WheelOdometry
+from robot_agent.hardware import BaseStatus, DriveTrain, LaserScan, LidarTraits, RepeatCounter, WheelOdometry
 
 KEY = b"k" * 32
 TICK_M = math.pi * 0.072 / 508.8
 AXLE = 0.235
-DRIVE_TRAIN = DriveTrain(axle_m=AXLE, travel_wrap_m=65_536 * TICK_M)
-AGENT = AgentConfig(robot="r1", operator_key=KEY, drive_train=DRIVE_TRAIN)
+DRIVE_TRAIN = DriveTrain(axle_m=AXLE, wheel_speed_max_m_s=0.5, travel_wrap_m=65_536 * TICK_M)
 DT = 0.01
 BEAMS = 360
 SCAN_S = 0.18
+LIDAR = LidarTraits(range_min_m=0.15, range_max_m=12.0, scan_period_s=SCAN_S)
+AGENT = agent_config("r1", KEY, DRIVE_TRAIN, LIDAR)
 START = 1_000.0
 STAMP = 1_700_000_000.0
 

@@ -10,13 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fog_contracts.grid import GridGeometry
+from fog_kernels.dwa import DwaLimits
 from robot_agent.config import MotionConfig
 from robot_agent.localization.pose import Pose2
 from robot_agent.motion.local_planner import decide, detour, make_job, twist, wheels
 from robot_agent.motion.path_follower import PathFollower, first_blocked
 
 GRID = GridGeometry(200, 120, 0.05, 0.0, 0.0)
-CONFIG = MotionConfig()
+CONFIG = MotionConfig(limits=DwaLimits(axle=0.235, wheel_max=0.5))
 EIGHT = np.array([(1.0, 1.0), (4.0, 4.0), (4.0, 1.0), (1.0, 4.0)])
 
 

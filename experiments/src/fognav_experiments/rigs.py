@@ -87,9 +87,7 @@ class RobotRig:
             world, base_emulator, lidar_emulator, start, initial_wheel_travel_m=_INITIAL_WHEEL_TRAVEL_M
         )
         self.guardian = GuardianCore(driver)
-        config = agent_config(robot.id, OPERATOR_KEY, robot).with_hardware(
-            driver.drive_train, self._lidar_driver.traits
-        )
+        config = agent_config(robot.id, OPERATOR_KEY, driver.drive_train, self._lidar_driver.traits, robot)
         self.agent = make_agent(config, seed)
         self.agent.restore(start_pose(site.site.id, robot))
         self.process = AgentProcess(self.agent, robot.id, bus)

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 RESOLUTION = 0.05
 PERIOD = 0.2
+ROOMBA = DwaLimits(axle=0.235, wheel_max=0.5)
 Point = tuple[float, float]
 
 
@@ -61,7 +62,7 @@ def decide(  # noqa: PLR0913  # the kernel's inputs
     window = np.ascontiguousarray(costmap[row : row + 40, column : column + 40])
     return dwa(
         *speeds, x, y, theta, window, RESOLUTION, column * RESOLUTION, row * RESOLUTION, path, *goal, goal_theta,
-        limits=limits or DwaLimits(), settings=settings or DwaSettings(),
+        limits=limits or ROOMBA, settings=settings or DwaSettings(),
     )  # fmt: skip
 
 
@@ -83,7 +84,7 @@ def drive(  # noqa: PLR0913  # the kernel's inputs, and how long
         seen = (x + noise * rng.normal(), y + noise * rng.normal(), theta + noise * rng.normal())
         result = decide(costmap, seen, (v, w), path, goal, goal_theta)
         assert result.v >= 0.0
-        assert result.v + 0.5 * 0.235 * abs(result.w) <= 0.5 + 1e-6
+        assert result.v + 0.5 * ROOMBA.axle * abs(result.w) <= ROOMBA.wheel_max + 1e-6
         assert abs(result.v - v) <= 2.5 * PERIOD + 1e-9
         rows.append((t, x, y, theta, result.v, result.w, costmap[int(y / 0.05), int(x / 0.05)], result.n_admissible))
         v, w = result.v, result.w
@@ -184,7 +185,7 @@ def test_robot_stops_without_contact_before_an_unmapped_wall() -> None:
 def test_low_deceleration_gives_a_longer_stopping_distance() -> None:
     """With 0.05 m/s^2 of braking, 0.3 m/s needs 0.9 m: more than the arcs' 0.45 m."""
     costmap = world((0.5, 2.7, 4.0, 3.3))  # a dead end too narrow to circle in
-    limits = DwaLimits(acc_v=0.05)
+    limits = replace(ROOMBA, acc_v=0.05)
     pose = (3.15, 3.0, 0.0)  # 0.68 m before the inscribed band
     path = [(1.0, 3.0), (7.0, 3.0)]
     assert decide(costmap, pose, (0.3, 0.0), path, (7.0, 3.0), limits=limits).n_admissible == 0
@@ -223,6 +224,6 @@ def test_non_finite_or_malformed_inputs_are_refused() -> None:
     with pytest.raises(ValueError, match="finite"):
         decide(OPEN, (3.0, 3.0, math.inf), (0.0, 0.0), [], (4.0, 3.0))
     with pytest.raises(ValueError, match="acc_v"):
-        DwaLimits(acc_v=0.0)
+        replace(ROOMBA, acc_v=0.0)
     with pytest.raises(ValueError, match="n_v"):
         DwaSettings(n_v=1)

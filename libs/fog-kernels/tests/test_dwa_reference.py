@@ -91,8 +91,10 @@ def scenes(draw: st.DrawFn, routes: list[str]) -> Scene:
     )
 
 
+ROOMBA = DwaLimits(axle=0.235, wheel_max=0.5)
 limits = st.builds(
     DwaLimits,
+    axle=st.just(ROOMBA.axle),
     v_max=st.sampled_from([0.0, 0.08, 0.3, 1.0]),
     w_max=st.sampled_from([0.7, 2.75]),
     acc_v=st.sampled_from([0.1, 2.5]),
@@ -153,8 +155,8 @@ def test_merging_points_of_a_curve_changes_scores_only_slightly(scene: Scene) ->
     assume(np.hypot(*(scene.path - scene.pose[:2]).T).min() < 0.2)
     scene = replace(scene, costmap=np.zeros_like(scene.costmap))
     weights = DwaSettings(n_v=5, n_w=7, turn_in_place=4.0)
-    result = choose(scene, DwaLimits(), weights)
-    arcs = decide(scene, DwaLimits(), weights)
+    result = choose(scene, ROOMBA, weights)
+    arcs = decide(scene, ROOMBA, weights)
     if arcs and result != (0.0, 0.0, 0.0, 1):
         assert result.score == pytest.approx(max(arc.score for arc in arcs), abs=0.25, rel=0.05)
 
@@ -167,7 +169,7 @@ def test_generated_scenes_cover_all_kinds_of_decisions() -> None:
     @settings(max_examples=examples(150), deadline=None, database=None, derandomize=True)
     @given(scenes(["corners", "hairpin", "line", "none"]))
     def collect(scene: Scene) -> None:
-        result = choose(scene, DwaLimits(), DwaSettings(n_v=5, n_w=7))
+        result = choose(scene, ROOMBA, DwaSettings(n_v=5, n_w=7))
         if result.n_admissible == 0:
             kinds.add("nothing is free")
         elif result == (0.0, 0.0, 0.0, 1):

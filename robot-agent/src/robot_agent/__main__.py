@@ -32,12 +32,12 @@ async def main() -> None:
     logs.configure("robot-agent", settings.log_level, settings.log_format)
     _log.info("settings_loaded", **describe(settings))
     site, body = read_site(settings)
-    config = agent_config(
-        settings.robot, read_operator_key(settings.operator_key_file), body, obstacle_ttl=settings.obstacle_memory_s
-    )
+    key = read_operator_key(settings.operator_key_file)
     base = make_base(settings.base, settings.base_options)
     lidar_driver = make_lidar(settings.lidar, settings.lidar_options)
-    config = config.with_hardware(base.drive_train, lidar_driver.traits)
+    config = agent_config(
+        settings.robot, key, base.drive_train, lidar_driver.traits, body, obstacle_ttl=settings.obstacle_memory_s
+    )
     clock = SystemClock(settings.speed)
     health = Health("map", "pose", "lidar", "base")
     async with ZenohEdge.open(

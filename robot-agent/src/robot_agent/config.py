@@ -6,11 +6,12 @@ Lengths in m, angles in rad, times in s.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Final, Self
+from typing import TYPE_CHECKING, Final
 
 from fog_contracts.channels import MAP_HEARTBEAT, ROBOT_PATH
 from fog_contracts.costs import DEFAULT_INFLATION, DEGRADED_SPEED, ROBOT_RADIUS, Inflation
-from robot_agent.hardware import DriveTrain
+from fog_kernels.dwa import DwaLimits, DwaSettings
+from robot_agent.hardware import DriveTrain  # noqa: TC001  # read at run time, when a configuration is decoded
 
 if TYPE_CHECKING:
     from fog_contracts.site import RobotSite
@@ -25,6 +26,8 @@ obstacle really is and may pass it closely, whereas the map's costs keep whole p
 
 _LOST_AFTER_REVOLUTIONS: Final = 2.4
 """Without a whole scan for so many revolutions the scan counts as lost."""
+_WHEEL_SPEED_MAX: Final = 0.5
+"""No wheel turns faster (m/s), whatever the base can do."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,21 +87,10 @@ class LocalizationConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MotionConfig:
-    """Path follower and dynamic window (Fox, Burgard, Thrun 1997)."""
+    """Path follower and dynamic window (Fox, Burgard, Thrun 1997): the base's limits, and how arcs are chosen."""
 
-    speed: float = 0.30
-    angular_speed: float = 2.75
-    acceleration: float = 2.5
-    angular_acceleration: float = 3.2
-    wheel_speed: float = 0.5
-    axle: float = DriveTrain().axle_m
-    samples_v: int = 25
-    samples_w: int = 35
-    horizon: float = 1.5
-    step: float = 0.1
-    period: float = 0.2
-    tolerance_xy: float = 0.10
-    tolerance_theta: float = 0.17
+    limits: DwaLimits
+    arcs: DwaSettings = field(default_factory=DwaSettings)
     window: float = 2.0
     inflation: Inflation = LOCAL_INFLATION
     stuck_after: float = 10.0
@@ -110,42 +102,44 @@ class AgentConfig:
 
     robot: str
     operator_key: bytes
+    drive_train: DriveTrain
+    motion: MotionConfig
     radius: float = ROBOT_RADIUS
     height: float = 0.35
     decision_max_age: float = 0.4
     obstacle_ttl: float = 600.0
     """How long (s) a reported obstacle counts while no lidar looks there again: longer than a detour takes."""
     obstacle_limit: int = 400
-    drive_train: DriveTrain = field(default_factory=DriveTrain)
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     localization: LocalizationConfig = field(default_factory=LocalizationConfig)
-    motion: MotionConfig = field(default_factory=MotionConfig)
-
-    def with_hardware(self, drive_train: DriveTrain, lidar: LidarTraits) -> Self:
-        """Return a copy fitted to a base and a lidar: geometry, top speed, ranges, and how long a scan may take."""
-        speed = min(self.motion.wheel_speed, drive_train.wheel_speed_max_m_s)
-        return replace(
-            self,
-            drive_train=drive_train,
-            motion=replace(self.motion, axle=drive_train.axle_m, wheel_speed=speed),
-            localization=replace(self.localization, range_min=lidar.range_min_m, range_max=lidar.range_max_m),
-            safety=replace(
-                self.safety, scan_lost=max(self.safety.scan_lost, _LOST_AFTER_REVOLUTIONS * lidar.scan_period_s)
-            ),
-        )
 
 
 def agent_config(
-    robot: str, operator_key: bytes, body: RobotSite | None = None, *, obstacle_ttl: float | None = None
+    robot: str,
+    operator_key: bytes,
+    drive_train: DriveTrain,
+    lidar: LidarTraits,
+    body: RobotSite | None = None,
+    *,
+    obstacle_ttl: float | None = None,
 ) -> AgentConfig:
-    """Return the configuration of a robot with this id, with the radius and height that its site gives, if any.
+    """Return the configuration of a robot with this id, base and lidar, and the radius and height that its site gives.
 
     obstacle_ttl: how long (s) a reported obstacle counts while no lidar looks there again; None for the default.
     """
-    defaults = AgentConfig(robot=robot, operator_key=operator_key)
-    ttl = defaults.obstacle_ttl if obstacle_ttl is None else obstacle_ttl
+    limits = DwaLimits(axle=drive_train.axle_m, wheel_max=min(_WHEEL_SPEED_MAX, drive_train.wheel_speed_max_m_s))
+    scan_lost = max(SafetyConfig().scan_lost, _LOST_AFTER_REVOLUTIONS * lidar.scan_period_s)
+    config = AgentConfig(
+        robot=robot,
+        operator_key=operator_key,
+        drive_train=drive_train,
+        motion=MotionConfig(limits=limits),
+        localization=LocalizationConfig(range_min=lidar.range_min_m, range_max=lidar.range_max_m),
+        safety=SafetyConfig(scan_lost=scan_lost),
+    )
+    if obstacle_ttl is not None:
+        config = replace(config, obstacle_ttl=obstacle_ttl)
     if body is None:
-        return replace(defaults, obstacle_ttl=ttl)
-    inflation = replace(defaults.motion.inflation, inscribed_radius=body.radius)
-    motion = replace(defaults.motion, inflation=inflation)
-    return replace(defaults, obstacle_ttl=ttl, radius=body.radius, height=body.height, motion=motion)
+        return config
+    inflation = replace(config.motion.inflation, inscribed_radius=body.radius)
+    return replace(config, radius=body.radius, height=body.height, motion=replace(config.motion, inflation=inflation))

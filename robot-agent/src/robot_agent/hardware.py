@@ -88,8 +88,8 @@ class DriveTrain:
     which the encoders' counters wrap (infinite: never).
     """
 
-    axle_m: float = 0.235
-    wheel_speed_max_m_s: float = 0.5
+    axle_m: float
+    wheel_speed_max_m_s: float
     travel_wrap_m: float = math.inf
 
     def twist(self, left_m_s: float, right_m_s: float) -> Twist:

@@ -6,10 +6,8 @@ import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
-from robot_agent.hardware import DriveTrain
-
 if TYPE_CHECKING:
-    from robot_agent.hardware import WheelOdometry
+    from robot_agent.hardware import DriveTrain, WheelOdometry
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,8 +116,8 @@ def _step(old: Reading, new: Reading, drive: DriveTrain) -> tuple[float, float, 
 class Odometry:
     """The odometry of one base: `advance` with its state kept."""
 
-    def __init__(self, drive: DriveTrain | None = None) -> None:
-        self._drive = drive or DriveTrain()
+    def __init__(self, drive: DriveTrain) -> None:
+        self._drive = drive
         self._state = OdometryState()
         self.faults = 0
 

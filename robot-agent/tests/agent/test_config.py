@@ -2,20 +2,37 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import pytest
+
 from fog_contracts.messages import Pose
 from fog_contracts.site import RobotSite
-from robot_agent.config import AgentConfig, agent_config
+from robot_agent.config import agent_config
+from robot_agent.hardware import DriveTrain, LidarTraits
 
 KEY = b"k" * 32
 BODY = RobotSite(id="r1", start=Pose(x=0.0, y=0.0, theta=0.0), radius=0.25, height=0.5)
+BASE = DriveTrain(axle_m=0.3, wheel_speed_max_m_s=0.4)
+LIDAR = LidarTraits(range_min_m=0.1, range_max_m=8.0, scan_period_s=0.2)
 
 
 def test_site_sets_radius_height_and_inscribed_radius():
-    config = agent_config("r1", KEY, BODY, obstacle_ttl=30.0)
+    config = agent_config("r1", KEY, BASE, LIDAR, BODY, obstacle_ttl=30.0)
     assert (config.robot, config.operator_key, config.obstacle_ttl) == ("r1", KEY, 30.0)
     assert (config.radius, config.height, config.motion.inflation.inscribed_radius) == (0.25, 0.5, 0.25)
 
 
+def test_hardware_sets_axle_top_speed_ranges_and_how_long_a_scan_may_take():
+    config = agent_config("r1", KEY, BASE, LIDAR)
+    assert config.drive_train == BASE
+    assert (config.motion.limits.axle, config.motion.limits.wheel_max) == (0.3, 0.4)
+    assert (config.localization.range_min, config.localization.range_max) == (0.1, 8.0)
+    assert config.safety.scan_lost == pytest.approx(2.4 * 0.2)
+    fast = agent_config("r1", KEY, replace(BASE, wheel_speed_max_m_s=2.0), replace(LIDAR, scan_period_s=0.1))
+    assert (fast.motion.limits.wheel_max, fast.safety.scan_lost) == (0.5, 0.45)
+
+
 def test_defaults_apply_without_a_site():
-    assert agent_config("r1", KEY) == AgentConfig(robot="r1", operator_key=KEY)
-    assert agent_config("r1", KEY, obstacle_ttl=30.0).obstacle_ttl == 30.0
+    config = agent_config("r1", KEY, BASE, LIDAR)
+    assert (config.radius, config.height, config.obstacle_ttl) == (0.17, 0.35, 600.0)

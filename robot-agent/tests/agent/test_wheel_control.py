@@ -3,11 +3,15 @@ from __future__ import annotations
 import pytest
 
 from robot_agent.agent.wheel_control import WheelControl
-from robot_agent.config import AgentConfig
+from robot_agent.config import agent_config
+from robot_agent.hardware import DriveTrain, LidarTraits
 from robot_agent.motion.local_planner import Decision
 from robot_agent.safety.gate import SafetyOutputs
 
-CONFIG = AgentConfig(robot="r1", operator_key=b"k" * 32)
+CONFIG = agent_config(
+    "r1", b"k" * 32, DriveTrain(axle_m=0.235, wheel_speed_max_m_s=0.5),
+    LidarTraits(range_min_m=0.15, range_max_m=12.0, scan_period_s=0.18),
+)  # fmt: skip
 DT = 0.05
 
 
@@ -35,7 +39,7 @@ def test_commands_are_numbered_and_approach_the_decision_within_the_acceleration
     first, second = control.command(outputs(), 0.0), control.command(outputs(), DT)
     assert (first.seq, first.left, first.right) == (1, 0.0, 0.0)
     assert second.seq == 2
-    assert second.right == pytest.approx(CONFIG.motion.acceleration * DT)
+    assert second.right == pytest.approx(CONFIG.motion.limits.acc_v * DT)
     assert second.left == pytest.approx(second.right * 0.2 / 0.3)
     assert driving.following
 
@@ -68,7 +72,7 @@ def test_speed_step_after_a_long_pause_is_limited():
     control.command(outputs(), 0.0)
     control.decision = decision(100.0, left=0.5, right=0.5)
     command = control.command(outputs(cap=0.5), 100.0)
-    assert command.left <= CONFIG.motion.acceleration * 0.2 + 1e-9
+    assert command.left <= CONFIG.motion.limits.acc_v * 0.2 + 1e-9
 
 
 def test_reset_is_passed_on_once():

@@ -41,17 +41,17 @@ _ESCAPE_LENGTH = 0.3
 
 @dataclass(frozen=True, slots=True)
 class DwaLimits:
-    """Limits of the base: m/s, rad/s, m/s^2, rad/s^2, the limit of each wheel (m/s) and the distance of the wheels (m).
+    """Limits of the base: the distance of the wheels (m), the limit of each wheel (m/s), m/s, rad/s, m/s^2, rad/s^2.
 
-    The defaults are a Roomba 600's with the speeds and accelerations of the thesis that Fognav builds on.
+    The defaults are the speeds and accelerations of the thesis that Fognav builds on.
     """
 
+    axle: float
+    wheel_max: float
     v_max: float = 0.3
     w_max: float = 2.75
     acc_v: float = 2.5
     acc_w: float = 3.2
-    wheel_max: float = 0.5
-    axle: float = 0.235
 
     def __post_init__(self) -> None:
         for name in ("w_max", "acc_v", "acc_w", "wheel_max", "axle"):
@@ -111,7 +111,6 @@ class DwaResult(NamedTuple):
     n_admissible: int
 
 
-DEFAULT_LIMITS = DwaLimits()
 DEFAULT_SETTINGS = DwaSettings()
 
 
@@ -570,8 +569,8 @@ def dwa(
     path: ArrayLike,
     goal_x: float,
     goal_y: float,
-    goal_theta: float | None = None,
-    limits: DwaLimits = DEFAULT_LIMITS,
+    goal_theta: float | None,
+    limits: DwaLimits,
     settings: DwaSettings = DEFAULT_SETTINGS,
 ) -> DwaResult:
     """Choose the speeds for the next control period.

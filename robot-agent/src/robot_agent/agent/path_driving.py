@@ -93,7 +93,7 @@ class PathDriving:
             planner_epoch=path.planner_epoch,
             now=now,
             pose=pose,
-            speeds=twist(*self.wheels.speeds, self._config.axle),
+            speeds=twist(*self.wheels.speeds, self._config.limits.axle),
             goal_theta=path.goal_theta,
             cap=safety.cap,
             cost=replica.cost,

@@ -44,21 +44,21 @@ class WheelControl:
         """Return the wheel speeds to send at `now` (s, monotonic)."""
         dt = 0.0 if self._streamed_at is None else min(max(now - self._streamed_at, 0.0), _STEP_MAX_S)
         self._streamed_at = now
-        motion, safety = self._config.motion, self._config.safety
+        limits, safety = self._config.motion.limits, self._config.safety
         # A decision is as old as its inputs, so a hung control loop stops the robot too.
         decision = self.decision
         if decision is not None and now - decision.made_at > self._config.decision_max_age:
             decision = None
         if outputs.stop == "none" and decision is None:
-            self.speeds = ramp_down(self.speeds, dt, motion.wheel_speed / safety.ramp)
+            self.speeds = ramp_down(self.speeds, dt, limits.wheel_max / safety.ramp)
         else:
             self.speeds = limit_wheels(
                 (0.0, 0.0) if decision is None else (decision.left, decision.right),
                 self.speeds,
                 outputs,
                 dt,
-                acceleration=motion.acceleration,
-                wheel_speed=motion.wheel_speed,
+                acceleration=limits.acc_v,
+                wheel_speed=limits.wheel_max,
                 config=safety,
             )
         self.following = decision is not None and outputs.stop == "none"

@@ -7,14 +7,14 @@ Frames: everything in `map`. Method: Dynamic Window Approach (Fox, Burgard and T
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from fog_contracts.costs import INSCRIBED, LETHAL, NO_SPEED_LIMIT, UNKNOWN
 from fog_kernels.astar import Planner
-from fog_kernels.dwa import DwaLimits, DwaSettings, dwa
+from fog_kernels.dwa import dwa
 from fog_kernels.inflation import InflationTable, inflate, inflation_table
 from robot_agent.localization.pose import Pose2, wrap
 from robot_agent.motion.path_follower import PathFollower
@@ -119,15 +119,15 @@ def decide(job: Job) -> Decision:
         float(end[0]),
         float(end[1]),
         goal_theta,
-        _limits(config, job.cap),
-        _settings(config),
+        replace(config.limits, v_max=max(0.0, min(job.cap, config.limits.v_max))),
+        config.arcs,
     )
-    at_position = math.hypot(end[0] - job.pose.x, end[1] - job.pose.y) <= config.tolerance_xy
-    at_heading = goal_theta is None or abs(wrap(goal_theta - job.pose.theta)) <= config.tolerance_theta
+    at_position = math.hypot(end[0] - job.pose.x, end[1] - job.pose.y) <= config.arcs.goal_tolerance
+    at_heading = goal_theta is None or abs(wrap(goal_theta - job.pose.theta)) <= config.arcs.heading_tolerance
     blocked = None
     if chosen.n_admissible == 0 and not at_position:
         blocked = "an obstacle is so near that no arc is free"
-    left, right = wheels(chosen.v, chosen.w, config.axle)
+    left, right = wheels(chosen.v, chosen.w, config.limits.axle)
     return Decision(
         plan_id=job.plan_id,
         planner_epoch=job.planner_epoch,
@@ -138,31 +138,6 @@ def decide(job: Job) -> Decision:
         right=right,
         at_goal=job.ends_here and at_position and at_heading,
         blocked=blocked,
-    )
-
-
-def _limits(config: MotionConfig, cap: float) -> DwaLimits:
-    """Return the limits of the base, no faster than `cap` (m/s)."""
-    return DwaLimits(
-        v_max=max(0.0, min(cap, config.speed)),
-        w_max=config.angular_speed,
-        acc_v=config.acceleration,
-        acc_w=config.angular_acceleration,
-        wheel_max=config.wheel_speed,
-        axle=config.axle,
-    )
-
-
-def _settings(config: MotionConfig) -> DwaSettings:
-    """Return how arcs are sampled, and when the goal counts as reached; weights are the kernel's."""
-    return DwaSettings(
-        n_v=config.samples_v,
-        n_w=config.samples_w,
-        sim_time=config.horizon,
-        dt=config.step,
-        period=config.period,
-        goal_tolerance=config.tolerance_xy,
-        heading_tolerance=config.tolerance_theta,
     )
 
 

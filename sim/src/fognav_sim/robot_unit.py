@@ -7,14 +7,11 @@ operator: it enables the robot whenever it waits for that, and sends it back and
 from __future__ import annotations
 
 import asyncio
+import http.client
 import os
 import sys
-import urllib.error
-import urllib.request
 from pathlib import Path
 from typing import Final
-
-import msgspec
 
 from fog_contracts import channels as ch
 from fog_contracts.codec import ContractError
@@ -28,6 +25,7 @@ from fog_runtime.site import load_site
 from fog_runtime.zenoh_edge import ZenohEdge
 from fog_supervisor.supervisor import Event, Program, Supervisor
 from fognav_sim.drive.operator import OperatorCommand, OperatorPolicy, Shuttle
+from fognav_sim.planner_client import put_goal
 
 _POLICY_PERIOD_S: Final = 1.0
 _TIMEOUT_S: Final = 5.0
@@ -93,23 +91,17 @@ class _Operator:
         )
 
     async def _send_goal(self, place: str) -> None:
+        url = self._settings.planner_url
         try:
-            await asyncio.to_thread(self._put_goal, place)
-        except (OSError, urllib.error.URLError) as error:
-            _log.warning("goal_failed", place=place, reason=str(error), url=self._settings.planner_url)
+            answer = await asyncio.to_thread(put_goal, url, self._robot, place, self._token)
+            problem = None if answer.status < http.client.BAD_REQUEST else answer.reason
+        except OSError as error:
+            problem = str(error)
+        if problem is not None:
+            _log.warning("goal_failed", place=place, reason=problem, url=url)
             return
         self._shuttle.under_way = True
         _log.info("goal_accepted", place=place)
-
-    def _put_goal(self, place: str) -> None:
-        request = urllib.request.Request(  # noqa: S310  # the address is the operator's own setting
-            f"{self._settings.planner_url}/api/v1/robots/{self._robot}/goal",
-            data=msgspec.json.encode({"place": place}),
-            method="PUT",
-            headers={"Content-Type": "application/json", "Authorization": f"Bearer {self._token}"},
-        )
-        with urllib.request.urlopen(request, timeout=_TIMEOUT_S) as answer:  # noqa: S310  # same
-            answer.read()
 
 
 def _programs(settings: Settings, robot: str) -> list[Program]:

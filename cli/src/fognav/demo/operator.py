@@ -1,7 +1,6 @@
 """The operator of a demonstration: monitors and enables the robot, sends its goal, changes the simulated world."""
 
 import asyncio
-import http.client
 import re
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Final
@@ -29,6 +28,7 @@ from fognav.demo.scene import Scene
 from fognav.stack import PLANNER, Stack
 from fognav_sim.drive.hazard import path_length
 from fognav_sim.drive.operator import OperatorPolicy
+from fognav_sim.planner_client import put_goal
 
 if TYPE_CHECKING:
     from fognav_sim.drive.drive import Drive
@@ -146,17 +146,8 @@ class Operator:
         port = self._stack.port(PLANNER)
         if port is None:
             raise ConnectionError("the planner has not published its port yet")
-        try:
-            return await asyncio.to_thread(
-                net.request,
-                "PUT",
-                port,
-                f"/api/v1/robots/{self._robot}/goal",
-                body={"place": place},
-                token=self._stack.token,
-            )
-        except http.client.HTTPException as error:
-            raise ConnectionError(f"the planner closed the connection: {error!r}") from error
+        url = f"http://{net.LOOPBACK}:{port}"
+        return await asyncio.to_thread(put_goal, url, self._robot, place, self._stack.token)
 
     async def keep_enabled(self) -> None:
         """Send the commands that the operator's policy decides on (enable, reset), until cancelled."""

@@ -41,6 +41,8 @@ sonars = [{ range_limit = 1.5, no_echo_is_clear = true }, { angle = 0.2, range_l
 """
 OPERATOR_TOKEN = "operator-token"
 VIEWER_TOKEN = "viewer-token"
+ADMIN_TOKEN = "admin-token"
+TOKENS = (("anna", "operator", OPERATOR_TOKEN), ("vera", "viewer", VIEWER_TOKEN), ("ada", "admin", ADMIN_TOKEN))
 DEADLINE_S = 60.0
 """For any wait, which ends with what it waits for: long, because a busy machine may be ten times slower."""
 
@@ -62,7 +64,7 @@ class Fog:
         save_map(self.site / "map", StaticMap(GridGeometry(160, 120, 0.05, 0.0, 0.0), cells))
         tokens = folder / "tokens.toml"
         lines = []
-        for name, role, token in (("anna", "operator", OPERATOR_TOKEN), ("vera", "viewer", VIEWER_TOKEN)):
+        for name, role, token in TOKENS:
             digest = hashlib.sha256(token.encode()).hexdigest()
             lines += ["[[tokens]]", f'name = "{name}"', f'role = "{role}"', f'sha256 = "{digest}"']
         tokens.write_text("\n".join(lines))
@@ -161,10 +163,7 @@ def until_fixture():
 
 @pytest.fixture(name="tokens")
 def tokens_fixture() -> dict[str, dict[str, str]]:
-    return {
-        name: {"Authorization": f"Bearer {token}"}
-        for name, token in (("operator", OPERATOR_TOKEN), ("viewer", VIEWER_TOKEN))
-    }
+    return {role: {"Authorization": f"Bearer {token}"} for _, role, token in TOKENS}
 
 
 @pytest.fixture

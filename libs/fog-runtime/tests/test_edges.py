@@ -4,7 +4,9 @@ import pytest
 
 from fog_contracts import channels as ch
 from fog_contracts import messages as m
+from fog_contracts.codec import encode
 from fog_contracts.handlers import Moment, Publication
+from fog_runtime import metrics
 from fog_runtime.clock import ManualClock
 from fog_runtime.edges import Edges
 
@@ -113,3 +115,18 @@ def test_published_channel_is_served_under_each_key_from_its_first_publication()
     assert [ids for _, ids in zenoh.served[ch.ROBOT_GOAL]] == [{"robot": "r1"}, {"robot": "r2"}]
     handler, ids = zenoh.served[ch.ROBOT_GOAL][0]
     assert handler(ids, None) == GOAL
+
+
+def test_message_that_violates_its_channel_is_counted_and_does_not_end_the_caller():
+    class StrictZenoh(Zenoh):
+        def publish(self, channel, message, **ids):
+            encode(channel, message)
+            super().publish(channel, message, **ids)
+
+    zenoh = StrictZenoh()
+    edges = Edges(ManualClock(5.0), zenoh=zenoh)
+    before = metrics.UNPUBLISHABLE.labels("robot_goal")._value.get()
+    edges.publish(Publication(ch.ROBOT_GOAL, m.RobotGoal(goal_id="g" * 2000, pose=None), {"robot": "r1"}))
+    edges.publish(Publication(ch.ROBOT_GOAL, GOAL, {"robot": "r1"}))
+    assert [message for _, message, _ in zenoh.sent] == [GOAL]
+    assert metrics.UNPUBLISHABLE.labels("robot_goal")._value.get() == before + 1

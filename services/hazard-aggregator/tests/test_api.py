@@ -93,3 +93,26 @@ async def test_nodes_report_their_health(client):
     assert (node["id"], node["area"], node["state"], node["age_s"]) == ("n1", "hall", "unknown", None)
     described = (await client.get("/openapi.json")).json()
     assert {"/api/v1/areas", "/api/v1/areas/{area_id}", "/api/v1/nodes"} <= set(described["paths"])
+
+
+async def test_repeated_put_returns_the_first_result_and_emptied_redis_is_restored_from_memory(fog, client, tokens):
+    body = {"polygon": POLYGON, "nodes": ["n1"]}
+    headers = {**tokens["operator"], "Idempotency-Key": "k1"}
+    answers = [await client.put("/api/v1/areas/hall", json=body, headers=headers) for _ in range(2)]
+    assert [(answer.status_code, answer.headers["etag"]) for answer in answers] == 2 * [(200, '"1"')]
+    other = await client.put("/api/v1/areas/hall", json={"polygon": POLYGON}, headers=headers)
+    assert (other.status_code, other.json()["errors"][0]["field"]) == (422, "header.Idempotency-Key")
+    new = {**tokens["operator"], "If-None-Match": "*"}
+    assert (await client.put("/api/v1/areas/hall", json=body, headers=new)).status_code == 412
+    assert (await client.put("/api/v1/areas/gate", json=body, headers=new)).status_code == 200
+    async with Redis.from_url(fog.redis.url) as raw:
+        await raw.flushall()
+        refused = await client.put("/api/v1/areas/hall", json=body, headers=tokens["operator"])
+        assert (refused.status_code, "nothing was changed" in refused.json()["detail"]) == (503, True)
+        recovery = {"json": {"action": "restore"}, "headers": tokens["admin"]}
+        assert (await client.post("/api/v1/store/recovery", **recovery)).status_code == 204
+        assert set(await raw.hkeys("fog:test:areas")) == {b"hall", b"gate"}
+        assert set(await raw.hkeys("fog:test:hazards")) == {b"hall", b"gate"}
+    await fog.ready("hazard_aggregator")
+    put = await client.put("/api/v1/areas/hall", json=body, headers=tokens["operator"])
+    assert (put.status_code, put.headers["etag"]) == (200, '"2"')

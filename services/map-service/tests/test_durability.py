@@ -1,7 +1,7 @@
 """What operators can rely on when they repeat requests, and when Redis loses records or refuses writes."""
 
 import asyncio
-import hashlib
+import json
 import os
 import signal
 
@@ -11,16 +11,11 @@ from redis.asyncio import Redis
 
 pytestmark = pytest.mark.live
 CIRCLE = {"kind": "BLOCKED", "shape": {"type": "circle", "centre": [6.0, 3.0], "radius": 0.5}, "reason": "wet floor"}
-ADMIN = {"Authorization": "Bearer admin-token"}
 RECOVERY = "/api/v1/store/recovery"
 
 
 @pytest.fixture
 async def client(fog):
-    tokens = fog.folder / "tokens.toml"
-    digest = hashlib.sha256(b"admin-token").hexdigest()
-    with tokens.open("a") as file:
-        file.write(f'\n[[tokens]]\nname = "ada"\nrole = "admin"\nsha256 = "{digest}"\n')
     fog.start("map_service")
     async with httpx.AsyncClient(base_url=await fog.ready("map_service"), timeout=15) as client:
         yield client
@@ -95,7 +90,7 @@ async def test_put_with_if_none_match_creates_a_zone_once(client, tokens):
 
 async def test_emptied_redis_is_noticed_and_the_zones_are_restored_from_memory(fog, client, raw, tokens):
     await client.post("/api/v1/zones", json={**CIRCLE, "id": "wet"}, headers=tokens["operator"])
-    refused = await client.post(RECOVERY, json={"action": "restore"}, headers=ADMIN)
+    refused = await client.post(RECOVERY, json={"action": "restore"}, headers=tokens["admin"])
     assert refused.status_code == 409, "nothing was lost"
     await raw.flushall()
     await unready(client, "Redis was emptied")
@@ -108,7 +103,7 @@ async def test_emptied_redis_is_noticed_and_the_zones_are_restored_from_memory(f
         assert RECOVERY in refused.json()["detail"]
     assert await raw.keys("*") == [], "nothing was written into the emptied store"
     assert (await client.post(RECOVERY, json={"action": "restore"}, headers=tokens["operator"])).status_code == 403
-    assert (await client.post(RECOVERY, json={"action": "restore"}, headers=ADMIN)).status_code == 204
+    assert (await client.post(RECOVERY, json={"action": "restore"}, headers=tokens["admin"])).status_code == 204
     await fog.ready("map_service")
     assert (
         await client.post("/api/v1/zones", json={**CIRCLE, "id": "dry"}, headers=tokens["operator"])
@@ -117,7 +112,7 @@ async def test_emptied_redis_is_noticed_and_the_zones_are_restored_from_memory(f
     fog.start("map_service")
     async with httpx.AsyncClient(base_url=await fog.ready("map_service")) as restarted:
         assert await ids(restarted) == ["dry", "wet"]
-        (entry,) = (await restarted.get("/api/v1/audit", params={"kind": "store"}, headers=ADMIN)).json()
+        (entry,) = (await restarted.get("/api/v1/audit", params={"kind": "store"}, headers=tokens["admin"])).json()
     assert (entry["who"], entry["action"], entry["id"]) == ("ada", "restore", "map-service")
 
 
@@ -129,9 +124,9 @@ async def test_start_on_an_emptied_redis_serves_no_map_until_an_administrator_ac
     async with httpx.AsyncClient(base_url=await fog.url("map_service")) as restarted:
         await unready(restarted, "Redis was emptied")
         assert (await restarted.get("/api/v1/zones")).status_code == 503
-        nothing = await restarted.post(RECOVERY, json={"action": "restore"}, headers=ADMIN)
+        nothing = await restarted.post(RECOVERY, json={"action": "restore"}, headers=tokens["admin"])
         assert (nothing.status_code, "restore a backup" in nothing.json()["detail"]) == (409, True)
-        assert (await restarted.post(RECOVERY, json={"action": "accept"}, headers=ADMIN)).status_code == 204
+        assert (await restarted.post(RECOVERY, json={"action": "accept"}, headers=tokens["admin"])).status_code == 204
         await fog.ready("map_service")
         assert await ids(restarted) == []
 
@@ -147,7 +142,7 @@ async def test_older_state_of_redis_is_noticed(fog, client, raw, tokens):
         await pipeline.execute()
     await unready(client, "Redis went back to an older state: it has 1 of 2 writes of zones")
     assert await ids(client) == ["dry", "wet"]
-    assert (await client.post(RECOVERY, json={"action": "accept"}, headers=ADMIN)).status_code == 204
+    assert (await client.post(RECOVERY, json={"action": "accept"}, headers=tokens["admin"])).status_code == 204
     assert await ids(client) == ["wet"]
 
 
@@ -199,3 +194,24 @@ async def test_audit_is_paged_over_all_kinds_and_no_kind_pushes_out_another(clie
     assert seen == 10 * [("mission", "r1")] + [("zone", zone["id"]) for zone in reversed(created)]
     for query in ("cursor=yesterday", "cursor=1-1.token", "kind=token"):
         assert (await client.get(f"/api/v1/audit?{query}", headers=tokens["viewer"])).status_code == 422
+
+
+async def test_start_with_a_zone_list_too_large_for_robots_says_so_and_goes_on(fog, raw, tokens):
+    square = {"type": "rectangle", "corner": [6.0, 3.0], "opposite": [6.2, 3.2]}
+    zone = {"kind": "BLOCKED", "shape": square, "reason": "\N{GRINNING FACE}" * 500, "version": 1}
+    stored = {f"z{number}": json.dumps({**zone, "id": f"z{number}"}) for number in range(2050)}
+    await raw.hset("fog:test:zones", mapping=stored)
+    fog.start("map_service")
+    async with httpx.AsyncClient(base_url=await fog.ready("map_service"), timeout=15) as client:
+        report = (await client.get("/readyz")).json()
+        assert "too large for robots" in report["parts"]["zones"]["detail"]
+        assert 'fognav_unpublishable_messages_total{channel="zones"}' in (await client.get("/metrics")).text
+        refused = await client.post("/api/v1/zones", json=CIRCLE, headers=tokens["operator"])
+        assert (refused.status_code, refused.json()["errors"][0]["field"]) == (422, "body.shape")
+        assert "delete zones" in refused.json()["detail"]
+        assert (await client.delete("/api/v1/zones/z0", headers=tokens["operator"])).status_code == 204
+        shorter = await client.put(
+            "/api/v1/zones/z1", json={"kind": "BLOCKED", "shape": square}, headers=tokens["operator"]
+        )
+        assert shorter.status_code == 200
+        assert len(await ids(client)) == 2049

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from fog_contracts.codec import ContractError
 from fog_contracts.handlers import Moment
 from fog_contracts.messages import Message
+from fog_runtime import logs, metrics
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -20,6 +22,9 @@ if TYPE_CHECKING:
     OnReply = Callable[[Channel, Message | None, Message], object]
 
 
+_log = logs.get("edges")
+
+
 class Edges:
     """The MQTT and zenoh connections of one process; each channel uses that of its transport."""
 
@@ -28,6 +33,7 @@ class Edges:
         self._mqtt = mqtt
         self._zenoh = zenoh
         self._served_when_published: dict[Channel, Reply] = {}
+        self._limited = logs.RateLimited(_log)
         self._served: set[tuple[Channel, frozenset[tuple[str, str]]]] = set()
 
     def now(self) -> Moment:
@@ -75,7 +81,18 @@ class Edges:
                 raise ValueError(f"channel {channel.name} can't be served without the ids {sorted(missing)}")
 
     def publish(self, publication: Publication) -> None:
-        """Publish without waiting; raises `ContractError` when the message violates the channel's contract."""
+        """Publish without waiting; a message that violates its channel's contract is logged, counted and not published.
+
+        It must not end the loop of a process: the others of its publications still matter.
+        """
+        try:
+            self._publish(publication)
+        except ContractError as error:
+            metrics.UNPUBLISHABLE.labels(publication.channel.name).inc()
+            key = publication.channel.pattern(**publication.ids)
+            self._limited.warning("message_unpublishable", key, self._clock.now(), key=key, reason=error.reason)
+
+    def _publish(self, publication: Publication) -> None:
         channel, message = publication.channel, publication.message
         if channel.transport == "mqtt":
             if self._mqtt is None:

@@ -32,6 +32,11 @@ TRACE_SKEW: Final = Counter(
 REFUSED: Final = Counter(
     "fognav_refused_messages_total", "Messages refused because they violate their channel's contract", ["channel"]
 )
+UNPUBLISHABLE: Final = Counter(
+    "fognav_unpublishable_messages_total",
+    "Messages not published because they violate their channel's contract: too large, mostly",
+    ["channel"],
+)
 RECEIVED: Final = Counter("fognav_received_messages_total", "Messages received and decoded", ["channel"])
 PUBLISHED: Final = Counter("fognav_published_messages_total", "Messages published", ["channel"])
 DROPPED: Final = Counter(

@@ -38,6 +38,11 @@ class Broker:
             tls=tls,
         )
 
+    @classmethod
+    def listed(cls, urls: str) -> list[Self]:
+        """Read comma separated addresses of bridged brokers; raises `ValueError` for an invalid one."""
+        return [cls.of(url.strip()) for url in urls.split(",")]
+
     def __str__(self) -> str:
         return f"{self.host}:{self.port}"
 

@@ -6,6 +6,7 @@ state that must survive is retained, or published again by `on_connect`, never k
 
 import asyncio
 import random
+from collections import deque
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, TypeVar, overload
@@ -57,9 +58,10 @@ class MqttEdge:
     def __init__(self, url: str, client_id: str, clock: Clock, *, site: str, will: Will | None = None) -> None:
         """Prepare a connection that `run` opens. `site` is filled into every topic that contains one.
 
-        Raises `ValueError` for an invalid address.
+        `url` may list several brokers, comma separated, that are bridged: each failure moves on to the next one. Raises
+        `ValueError` for an invalid address.
         """
-        self._broker = Broker.of(url)
+        self._brokers = deque(Broker.listed(url))
         self._client_id = client_id
         self._clock = clock
         self._site = site
@@ -151,20 +153,23 @@ class MqttEdge:
         return await self._send(channel, self._topic(channel, ids), b"", wait=wait)
 
     async def run(self) -> None:
-        """Connect and stay connected until cancelled; a failed or lost connection is tried again."""
+        """Connect and stay connected until cancelled; after a failure at the next broker."""
         failures = 0
         while True:
+            broker = self._brokers[0]
             try:
-                async with self._broker.client(self._client_id, self._mqtt_will()) as client:
+                async with broker.client(self._client_id, self._mqtt_will()) as client:
                     failures = 0
-                    await self._serve(client)
+                    await self._serve(client, broker)
             except aiomqtt.MqttError as error:
                 reason = str(error) or type(error).__name__
-                broker = str(self._broker)
-                self._limited.warning("broker_disconnected", broker, self._clock.now(), broker=broker, reason=reason)
+                now = self._clock.now()
+                self._limited.warning("broker_disconnected", str(broker), now, broker=str(broker), reason=reason)
+                self._brokers.rotate(-1)
             finally:
                 self._on_disconnected()
-            delay = random.uniform(BACKOFF_S[0], min(BACKOFF_S[1], BACKOFF_S[0] * 2 ** min(failures + 1, 10)))  # noqa: S311  # spreads attempts in time, no secret
+            rounds = failures // len(self._brokers)
+            delay = random.uniform(BACKOFF_S[0], min(BACKOFF_S[1], BACKOFF_S[0] * 2 ** min(rounds + 1, 10)))  # noqa: S311  # spreads attempts in time, no secret
             failures += 1
             await asyncio.sleep(delay)
 
@@ -181,14 +186,14 @@ class MqttEdge:
             self._topic(channel, will.ids), _encoded(channel, will.message), channel.qos, channel.retained
         )
 
-    async def _serve(self, client: aiomqtt.Client) -> None:
+    async def _serve(self, client: aiomqtt.Client, broker: Broker) -> None:
         if topics := self._subscriptions.qos_by_topic():
             await _subscribe(client, topics)
         self._client = client
         self._changed.set()
         metrics.CONNECTED.labels("mqtt").set(1)
         metrics.CONNECTIONS.labels("mqtt").inc()
-        _log.info("broker_connected", broker=str(self._broker), client=self._client_id)
+        _log.info("broker_connected", broker=str(broker), client=self._client_id)
         for callback in self._on_connect:
             self._spawn(callback(), "on_connect")
         async for message in client.messages:

@@ -55,7 +55,9 @@ class CommonSettings(msgspec.Struct, frozen=True, kw_only=True):
     speed: float = 1.0
     """How many times faster than real time the clock runs (simulation only)."""
     mqtt_url: str = "mqtt://127.0.0.1:1883"
+    """Addresses of the broker, or of several that are bridged, comma separated."""
     redis_url: str = "redis://127.0.0.1:6379/0"
+    """As `fog_runtime.redis_connection` describes, also for Sentinels."""
     zenoh_connect: str = "tcp/127.0.0.1:7447"
     """Endpoints of routers, comma separated."""
     http_host: str = "127.0.0.1"

@@ -52,7 +52,8 @@ def reference_inflation(raw: NDArray[np.uint8], table: InflationTable) -> NDArra
     squares = brute_force_squares(raw == 254, table.reach + 1)
     inside = squares <= table.reach**2
     inflated = np.where(inside, table.cost[np.where(inside, squares, 0)], 0)
-    return np.where(raw == 255, 255, np.maximum(raw, inflated)).astype(np.uint8)
+    unknown = np.where(inflated >= 253, inflated, 255)
+    return np.where(raw == 255, unknown, np.maximum(raw, inflated)).astype(np.uint8)
 
 
 @settings(max_examples=examples(60), deadline=None)
@@ -91,6 +92,24 @@ def test_costs_follow_the_exponential_decay() -> None:
     assert table.cost[16] == int(252 * math.exp(-3.0 * (0.20 - 0.17)))
     assert table.cost[121] == int(252 * math.exp(-3.0 * (0.55 - 0.17)))
     assert np.all(np.diff(table.cost.astype(int)) <= 0)
+
+
+def test_reach_is_the_inflation_radius_rounded_up_to_whole_cells() -> None:
+    for radius, cells in ((0.0, 0), (0.01, 1), (0.05, 1), (0.52, 11), (0.55, 11), (0.56, 12)):
+        table = inflation_table(0.05, Inflation(inflation_radius=radius))
+        assert table.reach == cells, radius
+        assert len(table.cost) == cells**2 + 1
+    raw = np.zeros((1, 15), np.uint8)
+    raw[0, 0] = 254
+    inflated = inflate(raw, inflation_table(0.05, Inflation(inflation_radius=0.52)))
+    assert inflated[0, 11] == int(252 * math.exp(-3.0 * (0.55 - 0.17)))
+    assert inflated[0, 12] == 0
+
+
+def test_unknown_cells_within_the_inscribed_radius_are_inscribed_and_others_stay_unknown() -> None:
+    raw = np.full((1, 12), 255, np.uint8)
+    raw[0, 0] = 254
+    assert inflate(raw, inflation_table(0.05, DEFAULT_INFLATION)).tolist() == [[254, 253, 253, 253, *[255] * 8]]
 
 
 def test_read_only_maps_are_accepted() -> None:

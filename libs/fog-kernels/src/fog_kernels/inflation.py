@@ -1,7 +1,8 @@
 """Inflation of lethal cells, for whole maps and for the cells that a change affects.
 
-Costs follow Nav2's inflation layer: 254 on a lethal cell, 253 within the inscribed radius, an exponential decay beyond.
-Unknown cells (255) stay unknown and are not inflated.
+Costs follow Nav2's inflation layer with its default settings: 254 on a lethal cell, 253 within the inscribed radius, an
+exponential decay beyond, up to the inflation radius rounded up to whole cells. Unknown cells (255) are not inflated
+themselves; within the inscribed radius of a lethal cell they become 253, elsewhere they stay unknown.
 """
 
 # Kernels take arrays and scalars, typed by their compiled signatures, and are single functions where a call per cell
@@ -17,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numba import int64, njit, void
 
-from fog_contracts.costs import INSCRIBED, LETHAL, PENALTY_MAX
+from fog_contracts.costs import INSCRIBED, LETHAL, PENALTY_MAX, UNKNOWN
 from fog_kernels import _arrays
 
 if TYPE_CHECKING:
@@ -42,7 +43,8 @@ def inflation_table(resolution: float, inflation: Inflation) -> InflationTable:
     Raises ValueError if the resolution is not above 0, or the inflation radius spans more than 180 cells.
     """
     resolution = _arrays.positive(resolution, "resolution")
-    reach = math.floor(inflation.inflation_radius / resolution + 1e-9)
+    # Up, as Nav2; the tolerance keeps a radius that is a whole number of cells from gaining one by rounding.
+    reach = math.ceil(inflation.inflation_radius / resolution - 1e-9)
     if reach > MAX_REACH:
         raise ValueError(f"inflation_radius spans {reach} cells, at most {MAX_REACH} are supported")
     cost = np.zeros(reach * reach + 1, np.uint8)
@@ -138,8 +140,9 @@ def _inflate(raw: Any, cost: Any, reach: int, x0: int, y0: int, x1: int, y1: int
             for i in range(count):
                 distance = squares[i]
                 inflated = cost[distance] if distance <= limit else np.uint8(0)
-                # 255 is the highest value, so unknown stays unknown.
-                target[start + i] = max(source[start + i], inflated)
+                below = source[start + i]
+                # Where a robot's centre can't be, it matters no more what is there.
+                target[start + i] = inflated if below == UNKNOWN and inflated >= INSCRIBED else max(below, inflated)
 
 
 def _check_out(raw: NDArray[np.uint8], out: NDArray[np.uint8]) -> None:
@@ -151,7 +154,7 @@ def _check_out(raw: NDArray[np.uint8], out: NDArray[np.uint8]) -> None:
 
 
 def inflate(raw: NDArray[np.uint8], table: InflationTable, out: NDArray[np.uint8] | None = None) -> NDArray[np.uint8]:
-    """Return max(raw, cost inflated around lethal cells), uint8 (h, w); 255 stays 255 and is not inflated.
+    """Return max(raw, cost inflated around lethal cells), uint8 (h, w); 255 is kept but where 253 replaces it.
 
     Writes into `out` when given. Raises TypeError or ValueError for wrong types or shapes.
     """

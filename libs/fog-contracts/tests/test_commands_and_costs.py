@@ -10,13 +10,11 @@ from fog_contracts.channels import ROBOT_COMMAND
 from fog_contracts.codec import decode, encode
 from fog_contracts.commands import VALID_S, CommandGate, sign
 from fog_contracts.costs import (
-    COST_PER_FACTOR,
-    COST_WEIGHT,
     LETHAL,
-    NEUTRAL_WEIGHT,
     UNKNOWN,
     Inflation,
     is_traversable,
+    penalty_cost,
 )
 from fog_contracts.layering import combine_costs, combine_speed_limits
 
@@ -109,9 +107,16 @@ def test_lower_speed_limit_wins_and_zero_means_no_limit(a, b):
         assert got == (min(limits) if limits else 0)
 
 
-@pytest.mark.parametrize("factor", [1.0, 2.0, 5.0])
-def test_cost_per_factor_adds_the_weight_of_one_free_cell(factor):
-    assert NEUTRAL_WEIGHT + COST_WEIGHT * COST_PER_FACTOR * (factor - 1.0) == pytest.approx(factor * NEUTRAL_WEIGHT)
+def test_penalty_factors_are_distinguishable_over_their_whole_range_and_mean_free_cells():
+    factors = np.arange(100, 501, 2) / 100
+    found = [penalty_cost(float(factor)) for factor in factors]
+    assert np.all(np.diff(found) > 0)
+    assert found[-1] == penalty_cost(5.0) == 250
+    for factor, cost in zip(factors, found, strict=True):
+        assert 50 + 0.8 * cost == pytest.approx(50 * factor, abs=0.41)
+    for factor in (0.99, 5.01, float("nan")):
+        with pytest.raises(ValueError, match="from 1 to 5"):
+            penalty_cost(factor)
 
 
 @pytest.mark.parametrize("name", ["inscribed_radius", "inflation_radius", "cost_scaling"])

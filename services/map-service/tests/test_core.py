@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fog_contracts import channels as ch
-from fog_contracts.costs import INSCRIBED, LETHAL, UNKNOWN
-from fog_contracts.geometry import ShapeMask
+from fog_contracts.costs import INSCRIBED, LETHAL, UNKNOWN, penalty_cost
 from fog_contracts.grid import GridGeometry, Window
 from fog_contracts.handlers import Moment, Publication, RefusedMessageError
 from fog_contracts.messages import (
@@ -34,12 +33,12 @@ from fog_contracts.messages import (
     Zone,
     ZoneSet,
 )
+from fog_contracts.geometry import ShapeMask
 from fog_contracts.replica import Applied, Replica
 from fog_contracts.shapes import ShapeError
 from map_service.core import MapCore
 from map_service.costmap import merge_overlapping
 from map_service.layers.base import CostLayer, write_cost
-from map_service.layers.zones import penalty_cost
 from map_service.registry import LayersError, make_layers
 from map_service.zone_validation import ZoneError, validated_zone
 
@@ -459,12 +458,6 @@ def test_each_kind_of_zone_sets_its_cost_or_speed_limit():
     assert change.zones.seq == rig.map.version.seq
     rig.remove_zone("c", 0.0)
     assert cost_and_speed(rig, 1.0, 1.0) == (penalty_cost(2.0), 20)
-
-
-def test_penalty_of_factor_f_costs_the_planner_as_much_as_f_free_cells():
-    for factor in (1.0, 1.5, 2.0, 3.0, 5.0):
-        assert 50 + 0.8 * penalty_cost(factor) == pytest.approx(50 * factor, abs=0.5)
-    assert penalty_cost(100.0) == 252
 
 
 def test_penalty_zone_lowers_no_cost_and_leaves_unknown_cells_unknown():

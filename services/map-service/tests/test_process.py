@@ -190,6 +190,7 @@ async def test_invalid_zone_is_refused_naming_its_field(client, tokens):
         ({"shape": {"type": "polygon", "points": bowtie}}, "body.shape.points", "crosses itself"),
         ({"shape": {"type": "circle", "centre": [90, 3], "radius": 1}}, "body.shape", "off the map"),
         ({"kind": "PENALTY"}, "body.factor", "needs a factor"),
+        ({"kind": "PENALTY", "factor": 5.1}, "body.factor", "<= 5.0"),
         ({"kind": "CLOSED"}, "body.kind", "CLOSED"),
         ({"ttl_s": 5, "expires_at": 5}, "body.ttl_s", "not both"),
     ):

@@ -36,15 +36,28 @@ NEUTRAL_WEIGHT: Final = 50
 COST_WEIGHT: Final = 0.8
 COST_PER_FACTOR: Final = NEUTRAL_WEIGHT / COST_WEIGHT
 """The cost that adds the weight of one free cell: cost c weighs as much as 1 + c / COST_PER_FACTOR free cells."""
+PENALTY_FACTOR_MAX: Final = 5.0
+"""The highest factor of a PENALTY zone: beyond about 5.03 every factor would be the highest graded cost."""
+
+
+def penalty_cost(factor: float) -> int:
+    """Return the cost (0 to 250) at which a free cell weighs `factor` (1 to PENALTY_FACTOR_MAX) free cells on a path.
+
+    Factors that differ by 0.02 have different costs. Where a cell costs more already, that cost stays. Raises
+    ValueError for a factor outside the range.
+    """
+    if not 1.0 <= factor <= PENALTY_FACTOR_MAX:
+        raise ValueError(f"a penalty's factor must lie from 1 to {PENALTY_FACTOR_MAX:g}, not {factor}")
+    return round(COST_PER_FACTOR * (factor - 1.0))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Inflation:
     """How lethal cells are inflated, as by Nav2's inflation layer.
 
-    Within `inscribed_radius` (m, that of the robot) of a lethal cell the cost is INSCRIBED; beyond, up to
-    `inflation_radius` (m), it decays as exp(-cost_scaling * distance), `cost_scaling` in 1/m. Raises ValueError for
-    values that are negative or not finite.
+    Within `inscribed_radius` (m, that of the robot) of a lethal cell the cost is INSCRIBED, even of unknown cells;
+    beyond, up to `inflation_radius` (m, rounded up to whole cells), it decays as exp(-cost_scaling * distance),
+    `cost_scaling` in 1/m. Raises ValueError for values that are negative or not finite.
     """
 
     inscribed_radius: float = ROBOT_RADIUS

@@ -8,6 +8,8 @@ from typing import Annotated, Any, Final, Literal
 
 from msgspec import Meta, Struct
 
+from fog_contracts.costs import PENALTY_FACTOR_MAX
+
 # The lookahead refuses a line feed at the end, which a bare $ accepts.
 Id = Annotated[str, Meta(pattern=r"^[a-z0-9][a-z0-9-]{0,31}$(?!\n)")]
 # Bounds also refuse NaN and infinity: no comparison with a bound holds for NaN.
@@ -229,6 +231,7 @@ class HazardArea(Message, frozen=True, kw_only=True):
 
 
 ZoneKind = Literal["BLOCKED", "PENALTY", "SPEED_LIMIT"]
+PenaltyFactor = Annotated[float, Meta(ge=1.0, le=PENALTY_FACTOR_MAX)]
 
 
 class PolygonShape(Message, frozen=True, kw_only=True, tag="polygon", tag_field="type"):
@@ -267,7 +270,7 @@ class Zone(Message, frozen=True, kw_only=True):
     id: Id
     kind: ZoneKind
     shape: Shape
-    factor: Annotated[float, Meta(ge=1.0, le=100.0)] | None = None
+    factor: PenaltyFactor | None = None
     speed: Annotated[float, Meta(ge=0.01, le=2.54, extra={"unit": "m/s"})] | None = None
     reason: Sentence = ""
     author: Annotated[str, Meta(max_length=100)] = ""

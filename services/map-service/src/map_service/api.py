@@ -19,6 +19,7 @@ from fog_contracts.messages import (
     Id,
     MapGeometry,
     Message,
+    PenaltyFactor,
     Sentence,
     Shape,
     Stamp,
@@ -70,7 +71,7 @@ class ZoneBody(Message, frozen=True, kw_only=True):
     id: Id | None = None
     kind: ZoneKind
     shape: Shape
-    factor: Annotated[float, msgspec.Meta(ge=1.0, le=100.0)] | None = None
+    factor: PenaltyFactor | None = None
     speed: Annotated[float, msgspec.Meta(ge=0.01, le=2.54)] | None = None
     reason: Sentence = ""
     starts_at: Stamp | None = None

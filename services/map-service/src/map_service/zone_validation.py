@@ -30,7 +30,9 @@ class ZoneError(ValueError):
 def validated_zone(zone: Zone, geometry: GridGeometry, stamp: float) -> Zone:
     """Return the zone as it is stored (polygons counter-clockwise); raises `ZoneError` that names field and remedy."""
     if zone.kind == "PENALTY" and zone.factor is None:
-        raise ZoneError("factor", "a PENALTY zone needs a factor of 1 or more: how much more a free cell costs")
+        raise ZoneError(
+            "factor", "a PENALTY zone needs a factor from 1 to 5: how many free cells a cell counts"
+        )
     if zone.kind == "SPEED_LIMIT" and zone.speed is None:
         raise ZoneError("speed", "a SPEED_LIMIT zone needs a speed in m/s")
     if zone.kind != "PENALTY" and zone.factor is not None:

@@ -1,15 +1,11 @@
-"""Operators' zones: no-go, penalty and speed limit, each while it is enabled and between its start and expiry.
-
-A PENALTY of factor f makes a free cell cost as much as f free cells, up to the highest graded cost (252, a factor of
-five). Where a cell costs more already, the higher cost stays.
-"""
+"""Operators' zones: no-go, penalty and speed limit, each while it is enabled and between its start and expiry."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from fog_contracts.costs import COST_PER_FACTOR, LETHAL, PENALTY_MAX
+from fog_contracts.costs import LETHAL, penalty_cost
 from fog_contracts.messages import Cause
 from fog_contracts.shapes import ShapeError, rasterize_shape
 from map_service.layers.base import CostLayer, LayerFactory, NoOptions, write_cost, write_speed_limit
@@ -17,16 +13,11 @@ from map_service.layers.base import CostLayer, LayerFactory, NoOptions, write_co
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from fog_contracts.geometry import ShapeMask
     from fog_contracts.grid import GridGeometry, Window
     from fog_contracts.handlers import Moment, Publication
     from fog_contracts.messages import Zone
+    from fog_contracts.geometry import ShapeMask
     from map_service.layers.base import Grid
-
-
-def penalty_cost(factor: float) -> int:
-    """Return the cost (0..252) of a PENALTY zone of this factor (>= 1)."""
-    return min(PENALTY_MAX, round(COST_PER_FACTOR * (factor - 1.0)))
 
 
 def speed_layer_value(speed: float) -> int:

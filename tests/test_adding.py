@@ -146,6 +146,7 @@ class RingShape(Message, frozen=True, kw_only=True, tag="ring", tag_field="type"
 ''', behind=" | RingShape"),
     Edit(SHAPES, r"^from fog_contracts\.messages import", before="""\
 from fog_contracts.messages import RingShape
+from fog_contracts.raster import mask_spans, rasterize_line
 """),
     Edit(SHAPES, r"^KINDS: ", before="""\
 class _Ring(ShapeKind[RingShape]):
@@ -157,13 +158,13 @@ class _Ring(ShapeKind[RingShape]):
     def contains(self, shape: RingShape, x: float, y: float) -> bool:
         return shape.inner <= math.dist(shape.centre, (x, y)) <= shape.outer
 
-    def rasterized(self, shape: RingShape, geometry: GridGeometry) -> ShapeMask:
+    def spans(self, shape: RingShape, geometry: GridGeometry) -> Spans:
         disc = rasterize_line([shape.centre], self.normalized(shape).outer, geometry)
         # A disc is drawn larger by half a cell's diagonal: the hole has to be smaller by that.
         hole = rasterize_line([shape.centre], shape.inner - math.sqrt(2.0) * geometry.resolution, geometry)
         x, y = hole.window.x - disc.window.x, hole.window.y - disc.window.y
         disc.mask[y : y + hole.window.height, x : x + hole.window.width] &= ~hole.mask
-        return disc
+        return mask_spans(disc)
 
 
 """, after="""\

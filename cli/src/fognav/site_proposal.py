@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fog_contracts.costs import DEFAULT_INFLATION, FREE, LETHAL
-from fog_contracts.geometry import Point, rasterize
+from fog_contracts.geometry import Point
 from fog_contracts.grid import GridGeometry, StaticMap
 from fog_contracts.messages import Pose
+from fog_contracts.raster import rasterize
 from fog_contracts.site import AreaSite, DemoPlan, NodeSite, Place, RobotSite, Site, Sonar
 from fog_kernels.astar import Planner
 from fog_kernels.distance import squared_distance_capped

@@ -11,10 +11,10 @@ from fog_contracts.geometry import (
     contains_point,
     distance_to_polygon,
     normalized_polygon,
-    rasterize,
     signed_area,
 )
 from fog_contracts.grid import GridGeometry, Window
+from fog_contracts.raster import rasterize
 
 SQUARE = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)]
 GRID = GridGeometry(40, 30, 0.1, -2.0, -1.0)

@@ -33,7 +33,7 @@ from fog_contracts.messages import (
     Zone,
     ZoneSet,
 )
-from fog_contracts.geometry import ShapeMask
+from fog_contracts.raster import ShapeMask
 from fog_contracts.replica import Applied, Replica
 from fog_contracts.shapes import ShapeError
 from map_service.core import MapCore

@@ -1,17 +1,15 @@
 """Plane geometry of areas and zones: polygons as sequences of (x, y) in metres, frame `map`."""
 
-import itertools
 import math
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fog_contracts.grid import GridGeometry, Window
-
 Point = tuple[float, float]
 Polygon = Sequence[Point]
+_Floats = NDArray[np.float64]
 
 _COLLINEAR: Final = 1e-12
 """Twice a triangle's area, relative to the square of its size, below which its sign is only rounding."""
@@ -28,19 +26,6 @@ def signed_area(polygon: Polygon) -> float:
 
 def _cross(o: Point, a: Point, b: Point) -> float:
     return (a[0] - o[0]) * (b[1] - o[1]) - (a[1] - o[1]) * (b[0] - o[0])
-
-
-def _on_segment(a: Point, b: Point, p: Point) -> bool:
-    return min(a[0], b[0]) <= p[0] <= max(a[0], b[0]) and min(a[1], b[1]) <= p[1] <= max(a[1], b[1])
-
-
-def segments_touch(a: Point, b: Point, c: Point, d: Point) -> bool:
-    """Whether the closed segments ab and cd share a point."""
-    d1, d2, d3, d4 = _cross(c, d, a), _cross(c, d, b), _cross(a, b, c), _cross(a, b, d)
-    if ((d1 > 0) != (d2 > 0)) and ((d3 > 0) != (d4 > 0)) and d1 and d2 and d3 and d4:
-        return True
-    touching = ((d1, c, d, a), (d2, c, d, b), (d3, a, b, c), (d4, a, b, d))
-    return any(side == 0 and _on_segment(p, q, r) for side, p, q, r in touching)
 
 
 def normalized_polygon(points: Sequence[Sequence[float]]) -> list[Point]:
@@ -79,14 +64,43 @@ def _open_ring(points: Sequence[Sequence[float]]) -> list[Point]:
 
 
 def _first_crossing(ring: Sequence[Point]) -> tuple[int, int] | None:
-    """Return the numbers of the first two sides that touch without being neighbours, or None."""
+    """Return the numbers of the first two sides that touch without being neighbours, or None.
+
+    All pairs of sides whose bounding boxes meet are compared at once: a message's 500 vertices take some milliseconds.
+    """
     count = len(ring)
-    for i in range(count):
-        # Neighbouring sides share a vertex: each with the next, and the first with the last.
-        for j in range(i + 2, count - 1 if i == 0 else count):
-            if segments_touch(ring[i], ring[i + 1], ring[j], ring[(j + 1) % count]):
-                return i, j
-    return None
+    a = np.array(ring, dtype=np.float64)
+    b = np.roll(a, -1, axis=0)
+    low, high = np.minimum(a, b), np.maximum(a, b)
+    near = np.tri(count, k=-2, dtype=np.bool_).T
+    for axis in (0, 1):
+        reaches = low[:, None, axis] <= high[None, :, axis]
+        near &= reaches & reaches.T
+    # Neighbouring sides share a vertex: each with the next, and the first with the last.
+    near[0, count - 1] = False
+    first, second = np.nonzero(near)
+    touching = np.flatnonzero(_segments_touch(a[first].T, b[first].T, a[second].T, b[second].T))
+    return (int(first[touching[0]]), int(second[touching[0]])) if touching.size else None
+
+
+def _segments_touch(a: _Floats, b: _Floats, c: _Floats, d: _Floats) -> NDArray[np.bool_]:
+    """Whether the closed segments ab and cd, whose bounding boxes meet, share a point; each end is float64 (2, n)."""
+
+    def side(o: _Floats, p: _Floats, q: _Floats) -> _Floats:
+        turn: _Floats = (p[0] - o[0]) * (q[1] - o[1]) - (p[1] - o[1]) * (q[0] - o[0])
+        return turn
+
+    def between(p: _Floats, q: _Floats, r: _Floats) -> NDArray[np.bool_]:
+        inside: NDArray[np.bool_] = ((np.minimum(p, q) <= r) & (r <= np.maximum(p, q))).all(axis=0)
+        return inside
+
+    sides = (side(c, d, a), side(c, d, b), side(a, b, c), side(a, b, d))
+    crossing = ((sides[0] > 0) != (sides[1] > 0)) & ((sides[2] > 0) != (sides[3] > 0))
+    for value in sides:
+        crossing &= value != 0
+    for value, (p, q, r) in zip(sides, ((c, d, a), (c, d, b), (a, b, c), (a, b, d)), strict=True):
+        crossing |= (value == 0) & between(p, q, r)
+    return crossing
 
 
 def contains_point(polygon: Polygon, x: float, y: float) -> bool:
@@ -121,58 +135,3 @@ def bounding_box(polygon: Polygon) -> tuple[float, float, float, float]:
     """Smallest upright rectangle around the polygon: (left, bottom, right, top) in metres."""
     xs, ys = [p[0] for p in polygon], [p[1] for p in polygon]
     return min(xs), min(ys), max(xs), max(ys)
-
-
-class ShapeMask(NamedTuple):
-    """The cells of a shape: a window of the grid, and a mask (window height, window width) of the cells in it."""
-
-    window: Window
-    mask: NDArray[np.bool_]
-
-
-def rasterize(polygon: Polygon, geometry: GridGeometry) -> ShapeMask:
-    """Return the cells of a polygon.
-
-    A cell belongs to the polygon when its centre lies inside or within half a cell's diagonal of the border, so that
-    no part of a hazard is missing. The window is empty when the polygon lies off the grid.
-
-    Inside is determined by the even-odd rule along scan lines: every side flips, in each row that it crosses, all cells
-    to its left, so the time does not grow with sides times cells.
-    """
-    window, near = rasterize_line([*polygon, polygon[0]], 0.0, geometry)
-    if window.empty:
-        return ShapeMask(window, near)
-    xs, ys = geometry.axes(window)
-    flips = np.zeros((window.height, window.width + 1), dtype=np.bool_)
-    for (x0, y0), (x1, y1) in itertools.pairwise([*polygon, polygon[0]]):
-        crossed = np.flatnonzero((y0 > ys) != (y1 > ys))
-        if crossed.size:
-            at = (x1 - x0) * (ys[crossed] - y0) / (y1 - y0) + x0
-            flips[crossed, np.searchsorted(xs, at, side="left")] ^= True
-    inside = np.logical_xor.accumulate(flips[:, :0:-1], axis=1)[:, ::-1]
-    return ShapeMask(window, near | inside)
-
-
-def rasterize_line(line: Sequence[Point], reach: float, geometry: GridGeometry) -> ShapeMask:
-    """Return the cells within `reach` (m) of a polyline; a single point gives a disc.
-
-    As with a polygon, cells within half a cell's diagonal of the border belong to it.
-    """
-    reach += geometry.resolution * math.sqrt(0.5)
-    left, bottom, right, top = bounding_box(line)
-    window = geometry.window_around(left - reach, bottom - reach, right + reach, top + reach)
-    mask = np.zeros((window.height, window.width), dtype=np.bool_)
-    for (ax, ay), (bx, by) in itertools.pairwise(line if len(line) > 1 else [line[0], line[0]]):
-        part = geometry.window_around(
-            min(ax, bx) - reach, min(ay, by) - reach, max(ax, bx) + reach, max(ay, by) + reach
-        )
-        if part.empty:
-            continue
-        xs, ys = geometry.axes(part)
-        px, py = np.meshgrid(xs, ys)
-        dx, dy = bx - ax, by - ay
-        squared = dx * dx + dy * dy
-        t = np.zeros(px.shape) if squared == 0 else np.clip(((px - ax) * dx + (py - ay) * dy) / squared, 0.0, 1.0)
-        in_window = Window(part.x - window.x, part.y - window.y, part.width, part.height)
-        mask[in_window.rows, in_window.columns] |= np.hypot(px - ax - t * dx, py - ay - t * dy) <= reach
-    return ShapeMask(window, mask)

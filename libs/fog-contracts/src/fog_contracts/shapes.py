@@ -9,17 +9,10 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any, Final, Generic, TypeVar
 
-from fog_contracts.geometry import (
-    GeometryError,
-    ShapeMask,
-    contains_point,
-    distance_to_segment,
-    normalized_polygon,
-    rasterize,
-    rasterize_line,
-)
+from fog_contracts.geometry import GeometryError, contains_point, distance_to_segment, normalized_polygon
 from fog_contracts.grid import GridGeometry
 from fog_contracts.messages import CircleShape, CorridorShape, PolygonShape, RectangleShape, Shape
+from fog_contracts.raster import ShapeMask, Spans, line_spans, polygon_spans
 
 S = TypeVar("S")
 
@@ -34,7 +27,9 @@ class ShapeError(GeometryError):
 
 
 class ShapeKind(ABC, Generic[S]):
-    """One kind of shape."""
+    """One kind of shape; `outline` names the field that determines how long its outline is."""
+
+    outline = ""
 
     def normalized(self, shape: S) -> S:
         """Return the shape as it is stored; raises `ShapeError` for an invalid one."""
@@ -45,11 +40,13 @@ class ShapeKind(ABC, Generic[S]):
         """Whether a point (m, frame `map`) lies in the shape."""
 
     @abstractmethod
-    def rasterized(self, shape: S, geometry: GridGeometry) -> ShapeMask:
-        """Return the cells of a shape, with the same margin as `rasterize`; raises `ShapeError`."""
+    def spans(self, shape: S, geometry: GridGeometry) -> Spans:
+        """Return the cells of a shape, with the same margin as `polygon_spans`; raises `GeometryError`."""
 
 
 class _Polygon(ShapeKind[PolygonShape]):
+    outline = "points"
+
     def normalized(self, shape: PolygonShape) -> PolygonShape:
         """Return it open and counter-clockwise."""
         try:
@@ -60,11 +57,13 @@ class _Polygon(ShapeKind[PolygonShape]):
     def contains(self, shape: PolygonShape, x: float, y: float) -> bool:
         return contains_point(shape.points, x, y)
 
-    def rasterized(self, shape: PolygonShape, geometry: GridGeometry) -> ShapeMask:
-        return rasterize(self.normalized(shape).points, geometry)
+    def spans(self, shape: PolygonShape, geometry: GridGeometry) -> Spans:
+        return polygon_spans(self.normalized(shape).points, geometry)
 
 
 class _Rectangle(ShapeKind[RectangleShape]):
+    outline = "opposite"
+
     def normalized(self, shape: RectangleShape) -> RectangleShape:
         (x0, y0), (x1, y1) = shape.corner, shape.opposite
         if x0 == x1 or y0 == y1:
@@ -75,21 +74,25 @@ class _Rectangle(ShapeKind[RectangleShape]):
         (x0, y0), (x1, y1) = shape.corner, shape.opposite
         return min(x0, x1) <= x <= max(x0, x1) and min(y0, y1) <= y <= max(y0, y1)
 
-    def rasterized(self, shape: RectangleShape, geometry: GridGeometry) -> ShapeMask:
+    def spans(self, shape: RectangleShape, geometry: GridGeometry) -> Spans:
         (x0, y0), (x1, y1) = self.normalized(shape).corner, shape.opposite
         left, right, bottom, top = min(x0, x1), max(x0, x1), min(y0, y1), max(y0, y1)
-        return rasterize([(left, bottom), (right, bottom), (right, top), (left, top)], geometry)
+        return polygon_spans([(left, bottom), (right, bottom), (right, top), (left, top)], geometry)
 
 
 class _Circle(ShapeKind[CircleShape]):
+    outline = "radius"
+
     def contains(self, shape: CircleShape, x: float, y: float) -> bool:
         return math.dist(shape.centre, (x, y)) <= shape.radius
 
-    def rasterized(self, shape: CircleShape, geometry: GridGeometry) -> ShapeMask:
-        return rasterize_line([shape.centre], shape.radius, geometry)
+    def spans(self, shape: CircleShape, geometry: GridGeometry) -> Spans:
+        return line_spans([shape.centre], shape.radius, geometry)
 
 
 class _Corridor(ShapeKind[CorridorShape]):
+    outline = "line"
+
     def normalized(self, shape: CorridorShape) -> CorridorShape:
         if len(set(shape.line)) < 2:
             raise ShapeError("line", "a corridor needs at least two different points")
@@ -99,8 +102,8 @@ class _Corridor(ShapeKind[CorridorShape]):
         sides = zip(shape.line, shape.line[1:], strict=False)
         return any(distance_to_segment(a, b, x, y) <= shape.width / 2 for a, b in sides)
 
-    def rasterized(self, shape: CorridorShape, geometry: GridGeometry) -> ShapeMask:
-        return rasterize_line(shape.line, shape.width / 2, geometry)
+    def spans(self, shape: CorridorShape, geometry: GridGeometry) -> Spans:
+        return line_spans(shape.line, shape.width / 2, geometry)
 
 
 KINDS: Final[Mapping[type, ShapeKind[Any]]] = {
@@ -122,9 +125,20 @@ def shape_contains(shape: Shape, x: float, y: float) -> bool:
     return KINDS[type(shape)].contains(shape, x, y)
 
 
-def rasterize_shape(shape: Shape, geometry: GridGeometry) -> ShapeMask:
+def shape_spans(shape: Shape, geometry: GridGeometry) -> Spans:
     """Return the cells of a shape and those within half a cell's diagonal of it, so that no part is missing.
 
-    The window is empty for a shape off the grid. Raises `ShapeError` for an invalid one.
+    There are none for a shape off the grid. Raises `ShapeError` for an invalid one, or one whose outline is too long.
     """
-    return KINDS[type(shape)].rasterized(shape, geometry)
+    kind = KINDS[type(shape)]
+    try:
+        return kind.spans(shape, geometry)
+    except ShapeError:
+        raise
+    except GeometryError as error:
+        raise ShapeError(kind.outline, f"{error}") from error
+
+
+def rasterize_shape(shape: Shape, geometry: GridGeometry) -> ShapeMask:
+    """Return the cells of a shape (`shape_spans`) as a mask; its window is empty for a shape off the grid."""
+    return shape_spans(shape, geometry).to_mask()

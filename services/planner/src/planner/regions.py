@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fog_contracts.costs import LETHAL
-from fog_contracts.geometry import GeometryError, normalized_polygon, rasterize
+from fog_contracts.geometry import GeometryError, normalized_polygon
 from fog_contracts.grid import GridGeometry, Window
 from fog_contracts.messages import Cause, HazardArea, Zone
+from fog_contracts.raster import rasterize
 from fog_contracts.shapes import rasterize_shape
 from fog_kernels.distance import squared_distance_capped
 

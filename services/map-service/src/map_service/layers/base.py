@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from fog_contracts.channels import Channel
-    from fog_contracts.geometry import ShapeMask
     from fog_contracts.handlers import Handler, Moment, Publication
     from fog_contracts.messages import Cause, Trace
+    from fog_contracts.raster import ShapeMask
 
 Options = TypeVar("Options", bound=msgspec.Struct)
 Grid = NDArray[np.uint8]

@@ -13,19 +13,20 @@ from msgspec import structs
 
 from fog_contracts import channels as ch
 from fog_contracts.costs import DEGRADED_SPEED
-from fog_contracts.geometry import GeometryError, normalized_polygon, rasterize
+from fog_contracts.geometry import GeometryError, normalized_polygon
 from fog_contracts.handlers import Publication, RefusedMessageError
 from fog_contracts.messages import SEVERITY, AreaHazard, Cause, HazardArea
+from fog_contracts.raster import rasterize
 from map_service.layers.base import CostLayer, LayerFactory, NoOptions, write_cost, write_speed_limit
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from fog_contracts.channels import Channel
-    from fog_contracts.geometry import ShapeMask
     from fog_contracts.grid import GridGeometry, Window
     from fog_contracts.handlers import Handler, Ids, Moment
     from fog_contracts.messages import AreaDefinition
+    from fog_contracts.raster import ShapeMask
     from map_service.layers.base import Grid
 
 

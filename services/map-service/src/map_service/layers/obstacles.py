@@ -17,9 +17,9 @@ import numpy as np
 
 from fog_contracts import channels as ch
 from fog_contracts.costs import LETHAL
-from fog_contracts.geometry import ShapeMask
 from fog_contracts.grid import Window
 from fog_contracts.messages import VIEW_SECTORS, Cause
+from fog_contracts.raster import ShapeMask
 from map_service.layers.base import CostLayer, LayerFactory, NoOptions, write_cost
 
 if TYPE_CHECKING:

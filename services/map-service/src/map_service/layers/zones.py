@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from fog_contracts.grid import GridGeometry, Window
     from fog_contracts.handlers import Moment, Publication
     from fog_contracts.messages import Zone
-    from fog_contracts.geometry import ShapeMask
+    from fog_contracts.raster import ShapeMask
     from map_service.layers.base import Grid
 
 

@@ -80,6 +80,8 @@ _.start_mosquitto  # private servers
 _.start_redis
 _.start_router
 _.save_map
+_.mask_spans  # for shapes that are made of others
+_.rasterize_line
 _.find_channel
 _.frames  # counters and views that tests assert on
 _.particles

@@ -37,10 +37,10 @@ from fog_contracts.raster import ShapeMask
 from fog_contracts.replica import Applied, Replica
 from fog_contracts.shapes import ShapeError
 from map_service.core import MapCore
-from map_service.costmap import merge_overlapping
 from map_service.layers.base import CostLayer, write_cost
+from map_service.pending import merge_overlapping
 from map_service.registry import LayersError, make_layers
-from map_service.zone_validation import ZoneError, validated_zone
+from map_service.zone_validation import ZoneError, prepare_zone
 
 
 @dataclass
@@ -496,13 +496,13 @@ def test_zone_is_in_force_between_its_start_and_expiry_and_while_enabled():
 )
 def test_invalid_zone_is_refused_naming_its_field(invalid, field):
     with pytest.raises(ZoneError) as caught:
-        validated_zone(invalid, floor_plan().geometry, 10.0)
+        prepare_zone(invalid, floor_plan().geometry, 10.0)
     assert caught.value.field == field
 
 
 def test_polygon_is_stored_counter_clockwise():
     clockwise = [(0.5, 0.5), (0.5, 1.5), (1.5, 0.5)]
-    stored = validated_zone(zone(shape=PolygonShape(points=clockwise)), floor_plan().geometry, 0.0)
+    stored = prepare_zone(zone(shape=PolygonShape(points=clockwise)), floor_plan().geometry, 0.0).zone
     assert stored.shape.points == clockwise[::-1]
 
 

@@ -91,15 +91,16 @@ def _segments_touch(a: _Floats, b: _Floats, c: _Floats, d: _Floats) -> NDArray[n
         return turn
 
     def between(p: _Floats, q: _Floats, r: _Floats) -> NDArray[np.bool_]:
-        inside: NDArray[np.bool_] = ((np.minimum(p, q) <= r) & (r <= np.maximum(p, q))).all(axis=0)
-        return inside
+        inside: NDArray[np.bool_] = (np.minimum(p, q) <= r) & (r <= np.maximum(p, q))
+        both: NDArray[np.bool_] = inside[0] & inside[1]
+        return both
 
     sides = (side(c, d, a), side(c, d, b), side(a, b, c), side(a, b, d))
-    crossing = ((sides[0] > 0) != (sides[1] > 0)) & ((sides[2] > 0) != (sides[3] > 0))
+    crossing: NDArray[np.bool_] = ((sides[0] > 0) != (sides[1] > 0)) & ((sides[2] > 0) != (sides[3] > 0))
     for value in sides:
-        crossing &= value != 0
+        crossing = crossing & (value != 0)
     for value, (p, q, r) in zip(sides, ((c, d, a), (c, d, b), (a, b, c), (a, b, d)), strict=True):
-        crossing |= (value == 0) & between(p, q, r)
+        crossing = crossing | ((value == 0) & between(p, q, r))
     return crossing
 
 
@@ -129,9 +130,3 @@ def distance_to_polygon(polygon: Polygon, x: float, y: float) -> float:
         return 0.0
     sides = zip(polygon, [*polygon[1:], polygon[0]], strict=True)
     return min(distance_to_segment(a, b, x, y) for a, b in sides)
-
-
-def bounding_box(polygon: Polygon) -> tuple[float, float, float, float]:
-    """Smallest upright rectangle around the polygon: (left, bottom, right, top) in metres."""
-    xs, ys = [p[0] for p in polygon], [p[1] for p in polygon]
-    return min(xs), min(ys), max(xs), max(ys)

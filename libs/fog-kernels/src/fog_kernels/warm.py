@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 PROFILES: dict[str, tuple[str, ...]] = {
     "robot": ("amcl", "astar", "distance", "dwa", "inflation", "likelihood", "raycast"),
     "planner": ("astar", "distance", "inflation"),
-    "map": ("distance", "inflation"),
+    "map": ("distance", "inflation", "spans"),
     "sim": ("distance", "raycast"),
-    "all": ("amcl", "astar", "distance", "dwa", "inflation", "likelihood", "raycast"),
+    "all": ("amcl", "astar", "distance", "dwa", "inflation", "likelihood", "raycast", "spans"),
 }
 
 

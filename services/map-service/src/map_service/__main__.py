@@ -54,6 +54,7 @@ async def main() -> None:
                 tasks.create_task(mqtt.run(), name="mqtt")
                 tasks.create_task(service.store_loop(), name="store")
                 tasks.create_task(service.tick_loop(), name="tick")
+                tasks.create_task(service.commit_loop(), name="commit")
                 tasks.create_task(serve(app, settings.http_host, settings.http_port, settings.port_file), name="http")
 
 

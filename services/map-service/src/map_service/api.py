@@ -52,6 +52,7 @@ from fog_runtime.http import (
 )
 from fog_runtime.http.routes import InvalidBodyError
 from fog_runtime.idempotency import IdempotencyError
+from fog_runtime.work import BusyError
 from map_service.layers.base import Grid
 from map_service.service import ConflictError, Service
 from map_service.store import StoreError
@@ -61,7 +62,7 @@ AuditKind = Literal["area", "mission", "store", "zone"]
 
 _PNG: Final = "image/png"
 _ZONES_NOT_LOADED: Final = {503: "The stored zones are not loaded yet, or the store does not answer"}
-_REFUSALS: Final = (ZoneError, IdempotencyError, StoreError)
+_REFUSALS: Final = (ZoneError, BusyError, IdempotencyError, StoreError)
 _NO_SUCH_ZONE: Final = {404: "No zone has this id", **_ZONES_NOT_LOADED}
 
 
@@ -194,6 +195,11 @@ def _add_errors(routes: Routes) -> None:
     add_store_errors(routes)
     routes.raises(
         CursorError, {422: "The cursor is invalid"}, lambda error: ProblemError(422, str(error), field="query.cursor")
+    )
+    routes.raises(
+        BusyError,
+        {503: "Too many requests wait for a calculation; `Retry-After` says when to try again"},
+        lambda error: ProblemError(503, f"{error}: try again", headers=RETRY_AFTER),
     )
     routes.raises(
         ConflictError,

@@ -6,6 +6,7 @@ Pure: every input comes with its `Moment`, and everything to be published is ret
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, TypeVar
 
 from fog_contracts import channels as ch
@@ -25,10 +26,16 @@ if TYPE_CHECKING:
     from fog_contracts.grid import StaticMap
     from fog_contracts.handlers import Handler, Ids, Moment, QueryHandler
     from fog_contracts.messages import AreaDefinition, MapSnapshot, Zone
+    from fog_contracts.raster import Spans
     from map_service.layers.base import CostLayer
 
 L = TypeVar("L", bound="CostLayer")
 
+COMMIT_CELLS: Final = 512 * 1024
+"""About how many cells one commit recomputes, so that the next heartbeat, hazard or request need not wait for long."""
+MANY_ZONES: Final = 200
+MANY_ZONES_PERIOD_S: Final = 0.5
+"""More zones than MANY_ZONES are published at most once in this time: they are a message of up to 4 MiB."""
 AGGREGATOR_LOST_S: Final = 3.0
 """How long (s) the aggregator or the broker may be disconnected until no area counts as clear any more."""
 
@@ -61,6 +68,7 @@ class MapCore:
         self._zones_loaded = False
         self._hazards_wait_s = hazards_wait_s
         self._serving = False
+        self._zones_published_at = -math.inf
         self._first_tick: float | None = None
         self._aggregators: set[str] = set()
         self._broker_connected = False
@@ -72,6 +80,11 @@ class MapCore:
     def serving(self) -> bool:
         """Whether the map is complete, so that it is published and queries are answered."""
         return self._serving
+
+    @property
+    def pending(self) -> bool:
+        """Whether a large change is only partly on the map: `continue_commit` puts the next portion on it."""
+        return self.costmap.pending
 
     @property
     def zones_loaded(self) -> bool:
@@ -93,6 +106,10 @@ class MapCore:
     def active_zones(self) -> list[str]:
         """Return the ids of the zones that are in force now."""
         return self._zones.active()
+
+    def zones_besides(self, zone_id: str) -> tuple[int, int]:
+        """Return how many zones there are besides the one with this id, and how many cells they cover in sum."""
+        return self._zones.size(zone_id)
 
     def zone_set(self) -> ZoneSet:
         """Return all zones with the map version that contains them."""
@@ -144,20 +161,29 @@ class MapCore:
         self._broker_connected = connected
         return self._commit(self._check_aggregator_liveness(at), at)
 
-    def load_zones(self, zones: Iterable[Zone], at: Moment) -> list[Publication]:
-        """Replace the map's zones by the stored ones; raises `ShapeError`, and changes nothing, for an invalid one."""
-        self._zones.replace_all(zones, at.stamp)
+    def load_zones(
+        self, zones: Iterable[Zone], at: Moment, spans: Mapping[str, Spans] | None = None
+    ) -> list[Publication]:
+        """Replace the map's zones by the stored ones; raises `ShapeError`, and changes nothing, for an invalid one.
+
+        `spans` are the cells of zones, by id, where they were computed before.
+        """
+        self._zones.replace_all(zones, at.stamp, spans)
         self._zones_loaded = True
         return self._commit([], at)
 
-    def put_zone(self, zone: Zone, at: Moment) -> list[Publication]:
-        """Add or replace a stored zone; raises `ShapeError` for an invalid shape."""
-        self._zones.put(zone, at.stamp)
+    def put_zone(self, zone: Zone, at: Moment, spans: Spans | None = None) -> list[Publication]:
+        """Add or replace a stored zone, whose cells may be given; raises `ShapeError` for an invalid shape."""
+        self._zones.put(zone, at.stamp, spans)
         return self._commit([], at)
 
     def remove_zone(self, zone_id: str, at: Moment) -> list[Publication]:
         """Remove a zone that is not stored any more."""
         self._zones.remove(zone_id)
+        return self._commit([], at)
+
+    def continue_commit(self, at: Moment) -> list[Publication]:
+        """Put the next portion of a large change on the map; call it while there is one (`pending`)."""
         return self._commit([], at)
 
     # --- Inside -----------------------------------------------------------------------------------------------------
@@ -169,10 +195,25 @@ class MapCore:
         return handle
 
     def _commit(self, publications: list[Publication], at: Moment) -> list[Publication]:
-        """Make a version of the layers' changes; return its deltas and all publications, once the map is served."""
-        deltas = [Publication(ch.MAP_DELTA, delta) for delta in self.costmap.update(at.stamp)]
-        zones = [Publication(ch.ZONES, self.zone_set())] if self._zones.pop_changed() else []
-        return [*deltas, *publications, *zones] if self._serving else []
+        """Make a version of the layers' changes; return its deltas and all publications, once the map is served.
+
+        A large change is made in several versions; zones are published when the last one is made.
+        """
+        cells = COMMIT_CELLS if self._serving else None
+        deltas = [Publication(ch.MAP_DELTA, delta) for delta in self.costmap.update(at.stamp, cells)]
+        if not self._serving:
+            self._zones.pop_changed()
+            return []
+        return [*deltas, *publications, *self._changed_zones(at.now)]
+
+    def _changed_zones(self, now: float) -> list[Publication]:
+        """Return the publication of the zones when they changed and are on the map; many of them not too often."""
+        zones = self._zones.zones()
+        too_soon = len(zones) > MANY_ZONES and now < self._zones_published_at + MANY_ZONES_PERIOD_S
+        if self.costmap.pending or too_soon or not self._zones.pop_changed():
+            return []
+        self._zones_published_at = now
+        return [Publication(ch.ZONES, self.zone_set())]
 
     def _check_aggregator_liveness(self, at: Moment) -> list[Publication]:
         """Let areas count as clear only while an aggregator is alive and the broker is connected.

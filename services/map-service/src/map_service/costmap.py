@@ -1,7 +1,11 @@
-"""The master costmap: combines and inflates the layers, and versions the result. Pure."""
+"""The master costmap: combines and inflates the layers, and versions the result.
+
+Pure, apart from `measure`, by which a process observes how long the steps take.
+"""
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,9 +14,11 @@ from msgspec import structs
 from fog_contracts.messages import Trace
 from fog_contracts.replica import MasterMap
 from map_service.layers.inflation import InflationLayer
+from map_service.pending import PendingUpdates
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
+    from contextlib import AbstractContextManager
 
     from fog_contracts.costs import Inflation
     from fog_contracts.grid import StaticMap, Window
@@ -28,7 +34,10 @@ class LayeredCostmap:
         self, site: str, static: StaticMap, layers: Sequence[CostLayer], inflation: Inflation, epoch: int
     ) -> None:
         self.geometry = static.geometry
+        self.measure: Callable[[str], AbstractContextManager[object]] = lambda _step: nullcontext()
+        """Called with the name of each step of a commit, and entered around it."""
         self._layers = layers
+        self._pending = PendingUpdates(static.geometry)
         for layer in layers:
             layer.pop_updated_bounds()  # everything is computed below
         self._raw, speed = self._combine_layers(self.geometry.whole)
@@ -40,6 +49,11 @@ class LayeredCostmap:
     def version(self) -> Version:
         """The current version."""
         return self._master.version
+
+    @property
+    def pending(self) -> bool:
+        """Whether an update left windows for the next one."""
+        return self._pending.waiting
 
     @property
     def cost(self) -> Grid:
@@ -69,31 +83,33 @@ class LayeredCostmap:
         raw, speed = self._combine_layers(self.geometry.whole)
         return self._inflation.inflate_all(raw), speed
 
-    def update(self, stamp: float) -> list[MapDelta]:
+    def update(self, stamp: float, cells: int | None = None) -> list[MapDelta]:
         """Recompute the layers' updated bounds; return the deltas of the new version, none when no cell differs.
 
-        `stamp` (s since the epoch) is added to the traces of the hazards that caused it.
+        `stamp` (s since the epoch) is added to the traces of the hazards that caused it. Only about `cells` cells are
+        recomputed (None: all), small windows first; what is left (`pending`) is for the next update.
         """
         updated = [bounds for layer in self._layers for bounds in layer.pop_updated_bounds()]
-        if not updated:
+        if not updated and not self._pending.waiting:
             return []
-        windows = merge_overlapping([bounds.window for bounds in updated])
+        windows, updated = self._pending.take(updated, cells)
         changes: list[tuple[Layer, Window, Grid]] = []
-        for window in windows:
-            cost, speed = self._combine_layers(window)
-            self._raw[window.rows, window.columns] = cost
-            changes.append(("speed", window, speed))
-        changes.extend(
-            ("cost", window, self._inflation.cost[window.rows, window.columns])
-            for window in self._inflation.update(self._raw, windows)
-        )
+        with self.measure("combine"):
+            for window in windows:
+                cost, speed = self._combine_layers(window)
+                self._raw[window.rows, window.columns] = cost
+                changes.append(("speed", window, speed))
+        with self.measure("inflate"):
+            inflated = self._inflation.update(self._raw, windows)
+        changes.extend(("cost", window, self._inflation.cost[window.rows, window.columns]) for window in inflated)
         causes: list[Cause] = list(dict.fromkeys(bounds.cause for bounds in updated))
         traces = {
             (trace.area, trace.epoch, trace.seq): structs.replace(trace, costmap_published=stamp)
             for trace in (bounds.trace for bounds in updated)
             if trace is not None
         }
-        return self._master.write(changes, causes, list[Trace](traces.values()))
+        with self.measure("version"):
+            return self._master.write(changes, causes, list[Trace](traces.values()))
 
     def _combine_layers(self, window: Window) -> tuple[Grid, Grid]:
         """Return cost (not inflated) and speed limit of a window, combined from all layers."""
@@ -102,21 +118,3 @@ class LayeredCostmap:
         for layer in self._layers:
             layer.update_costs(window, cost, speed)
         return cost, speed
-
-
-def merge_overlapping(windows: list[Window]) -> list[Window]:
-    """Merge overlapping windows, so that no cell is computed twice; disjoint windows stay separate and small."""
-    result: list[Window] = []
-    for window in windows:
-        if window.empty:
-            continue
-        grown = window
-        disjoint = []
-        for other in result:
-            if grown.intersection(other).empty:
-                disjoint.append(other)
-            else:
-                grown = grown.union(other)
-        # Once grown, it may overlap further windows.
-        result = [*disjoint, grown] if grown == window else merge_overlapping([*disjoint, grown])
-    return result

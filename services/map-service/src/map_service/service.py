@@ -10,13 +10,14 @@ from msgspec import structs
 from prometheus_client import Counter, Gauge, Histogram
 
 from fog_contracts import channels as ch
-from fog_contracts.messages import MapDelta, Zone, ZoneSet
+from fog_contracts.messages import MapDelta, MapHeartbeat, Zone, ZoneSet
 from fog_contracts.shapes import ShapeError
 from fog_runtime import logs, metrics
 from fog_runtime.clock import ticker
 from fog_runtime.edges import Edges
+from fog_runtime.work import Worker
 from map_service.store import Audit, RecoveryError, StoreError
-from map_service.zone_validation import check_list_size, list_size, validated_zone
+from map_service.zone_validation import check_list_size, check_room, list_size, prepare_zone, zones_spans
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from fog_runtime.zenoh_edge import ZenohEdge
     from map_service.core import MapCore
     from map_service.store import Outcome, Store
+    from map_service.zone_validation import PreparedZone
 
 TICK_S = ch.MAP_HEARTBEAT.period_s
 STORE_PERIOD_S = 0.5
@@ -44,6 +46,21 @@ DELTA_BYTES = Histogram(
 )
 ZONES = Gauge("fognav_zones", "Zones, stored and active", ["state"])
 ZONE_WRITES = Counter("fognav_zone_writes_total", "Writes of zones to the store, by outcome", ["outcome"])
+
+COMMIT_SECONDS = Histogram(
+    "fognav_map_commit_seconds",
+    "Time of a map version's steps: combining the layers, inflating them, making the version",
+    ["step"],
+    buckets=(0.0001, 0.00025, 0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0),
+)
+HEARTBEAT_GAP = Histogram(
+    "fognav_map_heartbeat_gap_seconds",
+    "Time between two heartbeats of the map",
+    buckets=(0.09, 0.11, 0.125, 0.15, 0.2, 0.25, 0.3, 0.5, 1.0, 2.0, 5.0),
+)
+EPOCH = Gauge("fognav_map_epoch", "Epoch of the map: when this process claimed it, in ms since 1970")
+MAX_PREPARING = 64
+"""Most zones that are validated or wait for it; further requests are answered with 503."""
 
 _log = logs.get("map")
 
@@ -71,6 +88,12 @@ class Service:
         self._health = health
         self._edges = Edges(clock, mqtt=mqtt, zenoh=zenoh)
         self._zone_lock = asyncio.Lock()
+        self._zone_worker = Worker("zones", limit=MAX_PREPARING)
+        self._changes_wait = asyncio.Event()
+        self._all_on_map = asyncio.Event()
+        self._all_on_map.set()
+        self._last_heartbeat: float | None = None
+        core.costmap.measure = lambda step: COMMIT_SECONDS.labels(step).time()
         self._reload_zones = False
         self._serving_queries = False
 
@@ -97,6 +120,16 @@ class Service:
             self._health.set("map", ok=self.core.serving, detail=self.core.missing())
             self._health.set("mqtt", ok=connected, detail="" if connected else "not connected to the broker")
 
+    async def commit_loop(self) -> None:
+        """Put large changes on the map portion by portion; other tasks run in between."""
+        while True:
+            await self._changes_wait.wait()
+            while self.core.pending:
+                self._publish(self.core.continue_commit(self._edges.now()))
+                await asyncio.sleep(0)
+            self._changes_wait.clear()
+            self._all_on_map.set()
+
     # --- Zones: stored first, then put on the map -------------------------------------------------------------------
 
     async def create(self, zone: Zone, who: str, attempt: Attempt | None = None) -> Zone:
@@ -108,17 +141,17 @@ class Service:
             if (earlier := await self._earlier_result(attempt)) is not None:
                 return earlier
             stamp = self._clock.stamp()
-            zone = validated_zone(zone, self.core.costmap.geometry, stamp)
             if any(known.id == zone.id for known in self.core.zones()):
                 # The store would treat an identical zone as a repeated attempt.
                 raise ConflictError("exists", zone.id)
-            check_list_size(zone, self.core.zones())
+            zone, spans = await self._prepare(zone, stamp)
             audit = Audit(stamp, who, "create", attempt)
             with self._uncertain_write():
                 outcome, zone = await self._store.create(zone, audit)
             self._require_ok(outcome, zone.id)
-            self._publish(self.core.put_zone(zone, self._edges.now()))
-            return zone
+            self._publish(self.core.put_zone(zone, self._edges.now(), spans))
+        await self._all_on_map.wait()
+        return zone
 
     async def replace(self, zone: Zone, expected: int, who: str, attempt: Attempt | None = None) -> Zone:
         """Store a new version of a zone; raises `ZoneError`, `ConflictError` (stale, missing), `StoreError`.
@@ -132,14 +165,14 @@ class Service:
                 # The store would treat an identical zone as a repeated attempt.
                 raise ConflictError("stale", zone.id)
             stamp = self._clock.stamp()
-            zone = validated_zone(structs.replace(zone, version=expected + 1), self.core.costmap.geometry, stamp)
-            check_list_size(zone, self.core.zones())
+            zone, spans = await self._prepare(structs.replace(zone, version=expected + 1), stamp)
             audit = Audit(stamp, who, "replace", attempt)
             with self._uncertain_write():
                 outcome = await self._store.replace(zone, expected=expected, audit=audit)
             self._require_ok(outcome, zone.id)
-            self._publish(self.core.put_zone(zone, self._edges.now()))
-            return zone
+            self._publish(self.core.put_zone(zone, self._edges.now(), spans))
+        await self._all_on_map.wait()
+        return zone
 
     async def delete(self, zone: Zone, who: str) -> None:
         """Delete this version of a zone; raises `ConflictError` (stale) and `StoreError`."""
@@ -148,6 +181,15 @@ class Service:
                 outcome = await self._store.delete(zone, Audit(self._clock.stamp(), who, "delete"))
             self._require_ok(outcome, zone.id)
             self._publish(self.core.remove_zone(zone.id, self._edges.now()))
+        await self._all_on_map.wait()
+
+    async def _prepare(self, zone: Zone, stamp: float) -> PreparedZone:
+        """Validate and rasterize a zone on the worker thread; raises `ZoneError`, and `BusyError` if too many wait."""
+        geometry, others = self.core.costmap.geometry, self.core.zones_besides(zone.id)
+        prepared = await self._zone_worker.run(prepare_zone, zone, geometry, stamp)
+        check_room(prepared, *others, geometry)
+        await self._zone_worker.run(check_list_size, prepared.zone, self.core.zones())
+        return prepared
 
     async def audit(self, kinds: Sequence[str], cursor: str | None, limit: int) -> AuditPage:
         """Return a page of the site's audit trail; raises `CursorError` and `StoreError`."""
@@ -202,8 +244,11 @@ class Service:
 
     async def _load_zones(self) -> None:
         zones = await self._store.zones()
+        known = {zone.id: zone.shape for zone in self.core.zones()}
+        changed = [zone for zone in zones if known.get(zone.id) != zone.shape]
         try:
-            self._publish(self.core.load_zones(zones, self._edges.now()))
+            spans = await self._zone_worker.run(zones_spans, changed, self.core.costmap.geometry)
+            self._publish(self.core.load_zones(zones, self._edges.now(), spans))
         except ShapeError as error:
             raise StoreError(f"a stored zone is invalid: {error}; repair or delete it") from error
         self._reload_zones = False
@@ -242,13 +287,25 @@ class Service:
             elif isinstance(publication.message, ZoneSet):
                 ZONES.labels("stored").set(len(publication.message.zones))
                 ZONES.labels("active").set(len(self.core.active_zones()))
+            elif isinstance(publication.message, MapHeartbeat):
+                self._record_heartbeat()
             self._edges.publish(publication)
+        if self.core.pending:
+            self._all_on_map.clear()
+            self._changes_wait.set()
+
+    def _record_heartbeat(self) -> None:
+        now, last = self._clock.now(), self._last_heartbeat
+        self._last_heartbeat = now
+        if last is not None:
+            HEARTBEAT_GAP.observe(now - last)
 
     def _record_delta(self, delta: MapDelta) -> None:
         DELTA_BYTES.observe(len(delta.cells))
         if delta.part > 0:
             return
         VERSION.set(delta.seq)
+        EPOCH.set(delta.epoch)
         for trace in delta.traces:
             metrics.observe_trace(trace, ["costmap"])
         _log.info(

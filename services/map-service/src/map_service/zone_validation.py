@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import msgspec
 from msgspec import structs
 
 from fog_contracts import channels as ch
 from fog_contracts.messages import ZoneSet
-from fog_contracts.shapes import ShapeError, normalized_shape, rasterize_shape
+from fog_contracts.shapes import ShapeError, normalized_shape, shape_spans
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     from fog_contracts.grid import GridGeometry
     from fog_contracts.messages import Zone
+    from fog_contracts.raster import Spans
+
+MAX_ZONES: Final = 5_000
+"""Most zones of a site."""
+MAX_COVERAGE: Final = 64
+"""How many times all zones together may cover the floor."""
 
 
 class ZoneError(ValueError):
@@ -27,12 +33,20 @@ class ZoneError(ValueError):
         self.message = message
 
 
-def validated_zone(zone: Zone, geometry: GridGeometry, stamp: float) -> Zone:
-    """Return the zone as it is stored (polygons counter-clockwise); raises `ZoneError` that names field and remedy."""
+class PreparedZone(NamedTuple):
+    """A valid zone as it is stored (polygons counter-clockwise), and its cells."""
+
+    zone: Zone
+    spans: Spans
+
+
+def prepare_zone(zone: Zone, geometry: GridGeometry, stamp: float) -> PreparedZone:
+    """Validate and rasterize a zone; raises `ZoneError` that names field and remedy.
+
+    It takes some ten milliseconds for the largest shapes: a service runs it on another thread.
+    """
     if zone.kind == "PENALTY" and zone.factor is None:
-        raise ZoneError(
-            "factor", "a PENALTY zone needs a factor from 1 to 5: how many free cells a cell counts"
-        )
+        raise ZoneError("factor", "a PENALTY zone needs a factor from 1 to 5: how many free cells a cell counts")
     if zone.kind == "SPEED_LIMIT" and zone.speed is None:
         raise ZoneError("speed", "a SPEED_LIMIT zone needs a speed in m/s")
     if zone.kind != "PENALTY" and zone.factor is not None:
@@ -43,17 +57,40 @@ def validated_zone(zone: Zone, geometry: GridGeometry, stamp: float) -> Zone:
         raise ZoneError("expires_at", "the zone would end before it starts: give a later time, or leave it out")
     try:
         shape = normalized_shape(zone.shape)
-        on_map = rasterize_shape(shape, geometry).mask.any()
+        spans = shape_spans(shape, geometry)
     except ShapeError as error:
         raise ZoneError(f"shape.{error.field}", error.problem) from error
-    if not on_map:
+    if spans.window.empty:
         left, bottom, right, top = geometry.bounds
         raise ZoneError(
             "shape",
             f"the zone lies off the map, which reaches from ({left:.2f}, {bottom:.2f}) to ({right:.2f}, {top:.2f}) m:"
             " move it onto the map",
         )
-    return structs.replace(zone, shape=shape)
+    return PreparedZone(structs.replace(zone, shape=shape), spans)
+
+
+def check_room(prepared: PreparedZone, count: int, cells: int, geometry: GridGeometry) -> None:
+    """Raise `ZoneError` when a zone is one too many for `count` others that cover `cells` cells in sum."""
+    if count >= MAX_ZONES:
+        raise ZoneError("", f"there are {count} zones already, which is the limit: delete zones that are not needed")
+    floor = geometry.width * geometry.height
+    if cells + prepared.spans.cells > MAX_COVERAGE * floor:
+        problem = f"all zones together would cover the floor more than {MAX_COVERAGE} times"
+        raise ZoneError("shape", f"{problem}: make it smaller, or delete zones that are not needed")
+
+
+def zones_spans(zones: Iterable[Zone], geometry: GridGeometry) -> dict[str, Spans]:
+    """Return the cells of each zone by its id; raises `ShapeError`, which names the zone."""
+    return {zone.id: named_spans(zone, geometry) for zone in zones}
+
+
+def named_spans(zone: Zone, geometry: GridGeometry) -> Spans:
+    """Return the cells of a zone; raises `ShapeError`, which names the zone."""
+    try:
+        return shape_spans(zone.shape, geometry)
+    except ShapeError as error:
+        raise ShapeError(f"{zone.id}.shape.{error.field}", error.problem) from error
 
 
 def list_size(zones: Sequence[Zone]) -> int:

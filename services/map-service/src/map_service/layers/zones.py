@@ -5,18 +5,24 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from fog_contracts.costs import LETHAL, penalty_cost
 from fog_contracts.messages import Cause
-from fog_contracts.shapes import ShapeError, rasterize_shape
-from map_service.layers.base import CostLayer, LayerFactory, NoOptions, write_cost, write_speed_limit
+from fog_contracts.shapes import shape_spans
+from fog_kernels.spans import lower_speeds, raise_costs
+from map_service.layers.base import CostLayer, LayerFactory, NoOptions
+from map_service.zone_validation import named_spans
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
+
+    from numpy.typing import NDArray
 
     from fog_contracts.grid import GridGeometry, Window
     from fog_contracts.handlers import Moment, Publication
     from fog_contracts.messages import Zone
-    from fog_contracts.raster import ShapeMask
+    from fog_contracts.raster import Spans
     from map_service.layers.base import Grid
 
 
@@ -35,7 +41,8 @@ def is_active(zone: Zone, stamp: float) -> bool:
 @dataclass
 class _ZoneEntry:
     zone: Zone
-    mask: ShapeMask
+    spans: Spans
+    cells: int
     active: bool
 
 
@@ -47,39 +54,47 @@ class ZonesLayer(CostLayer):
         self._geometry = geometry
         self._entries: dict[str, _ZoneEntry] = {}
         self._changed = False
+        self._zones: list[Zone] | None = None
+        self._active: tuple[list[_ZoneEntry], NDArray[np.int64]] | None = None
 
-    def put(self, zone: Zone, stamp: float) -> None:
-        """Add or replace a zone; raises `ShapeError` for an invalid shape."""
-        self._put(zone, rasterize_shape(zone.shape, self._geometry), stamp)
+    def put(self, zone: Zone, stamp: float, spans: Spans | None = None) -> None:
+        """Add or replace a zone, whose cells may be given; raises `ShapeError` for an invalid shape."""
+        self._put(zone, spans or shape_spans(zone.shape, self._geometry), stamp)
 
     def remove(self, zone_id: str) -> None:
         """Remove a zone, if it exists."""
         old = self._entries.pop(zone_id, None)
         if old is not None:
-            self._changed = True
+            self._set_changed()
             if old.active:
                 self._mark(old, "removed")
 
-    def replace_all(self, zones: Iterable[Zone], stamp: float) -> None:
-        """Replace all zones; for an invalid one, raises `ShapeError`, which names it, and changes nothing."""
-        masks: dict[str, tuple[Zone, ShapeMask]] = {}
-        for zone in zones:
-            try:
-                masks[zone.id] = zone, rasterize_shape(zone.shape, self._geometry)
-            except ShapeError as error:
-                raise ShapeError(f"{zone.id}.shape.{error.field}", error.problem) from error
-        for name in [name for name in self._entries if name not in masks]:
+    def replace_all(self, zones: Iterable[Zone], stamp: float, spans: Mapping[str, Spans] | None = None) -> None:
+        """Replace all zones, whose cells may be given by id; those that are the same already keep theirs.
+
+        For an invalid shape, raises `ShapeError`, which names the zone, and changes nothing.
+        """
+        prepared = [(zone, self._known_spans(zone, spans or {}) or named_spans(zone, self._geometry)) for zone in zones]
+        kept = {zone.id for zone, _ in prepared}
+        for name in [name for name in self._entries if name not in kept]:
             self.remove(name)
-        for zone, mask in masks.values():
-            self._put(zone, mask, stamp)
+        for zone, cells in prepared:
+            self._put(zone, cells, stamp)
 
     def zones(self) -> list[Zone]:
         """Return all zones, active or not, by id."""
-        return [self._entries[name].zone for name in sorted(self._entries)]
+        if self._zones is None:
+            self._zones = [self._entries[name].zone for name in sorted(self._entries)]
+        return self._zones
 
     def active(self) -> list[str]:
         """Return the ids of the active zones."""
         return sorted(name for name, entry in self._entries.items() if entry.active)
+
+    def size(self, without: str) -> tuple[int, int]:
+        """Return how many zones there are besides the one with this id, and how many cells they cover in sum."""
+        others = [entry.cells for name, entry in self._entries.items() if name != without]
+        return len(others), sum(others)
 
     def pop_changed(self) -> bool:
         """Return whether a zone was added, changed, removed, activated or ended since the last call."""
@@ -92,37 +107,54 @@ class ZonesLayer(CostLayer):
             active = is_active(entry.zone, at.stamp)
             if active != entry.active:
                 entry.active = active
-                self._changed = True
+                self._set_changed()
                 self._mark(entry, "active" if active else "inactive")
         return []
 
     def update_costs(self, window: Window, cost: Grid, speed: Grid) -> None:
         """Write the active zones."""
-        for entry in self._entries.values():
+        for entry in self._active_in(window):
             zone = entry.zone
-            if not entry.active:
-                continue
             if zone.kind == "BLOCKED":
-                write_cost(entry.mask, window, cost, LETHAL)
+                raise_costs(entry.spans, window.x, window.y, LETHAL, cost)
             elif zone.kind == "PENALTY" and zone.factor is not None:
-                write_cost(entry.mask, window, cost, penalty_cost(zone.factor))
+                raise_costs(entry.spans, window.x, window.y, penalty_cost(zone.factor), cost)
             elif zone.kind == "SPEED_LIMIT" and zone.speed is not None:
-                write_speed_limit(entry.mask, window, speed, speed_layer_value(zone.speed))
+                lower_speeds(entry.spans, window.x, window.y, speed_layer_value(zone.speed), speed)
 
-    def _put(self, zone: Zone, mask: ShapeMask, stamp: float) -> None:
+    def _active_in(self, window: Window) -> list[_ZoneEntry]:
+        """Return the active zones whose windows overlap this one."""
+        if self._active is None:
+            entries = [entry for entry in self._entries.values() if entry.active and not entry.spans.window.empty]
+            self._active = entries, np.array([entry.spans.window for entry in entries], dtype=np.int64).reshape(-1, 4)
+        entries, windows = self._active
+        x, y, width, height = windows.T
+        overlapping = (x < window.x + window.width) & (window.x < x + width)
+        overlapping &= (y < window.y + window.height) & (window.y < y + height)
+        return [entries[index] for index in np.flatnonzero(overlapping)]
+
+    def _known_spans(self, zone: Zone, given: Mapping[str, Spans]) -> Spans | None:
+        old = self._entries.get(zone.id)
+        return old.spans if old is not None and old.zone.shape == zone.shape else given.get(zone.id)
+
+    def _put(self, zone: Zone, spans: Spans, stamp: float) -> None:
         old = self._entries.get(zone.id)
         if old is not None and old.zone == zone:
             return
-        entry = _ZoneEntry(zone, mask, is_active(zone, stamp))
+        entry = _ZoneEntry(zone, spans, spans.cells, is_active(zone, stamp))
         self._entries[zone.id] = entry
-        self._changed = True
+        self._set_changed()
         if old is not None and old.active:
             self._mark(old, "active" if entry.active else "inactive")
         if entry.active:
             self._mark(entry, "active")
 
+    def _set_changed(self) -> None:
+        self._changed = True
+        self._zones = self._active = None
+
     def _mark(self, entry: _ZoneEntry, state: str) -> None:
-        self.mark_updated(entry.mask.window, Cause(kind="zone", id=entry.zone.id, state=state))
+        self.mark_updated(entry.spans.window, Cause(kind="zone", id=entry.zone.id, state=state))
 
 
 LAYER = LayerFactory(options=NoOptions, make=lambda plan, _options: ZonesLayer(plan.geometry))

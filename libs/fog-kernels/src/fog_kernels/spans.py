@@ -1,0 +1,75 @@
+"""Writing a shape's cost or speed limit into a window of a map, from the shape's spans of columns per row."""
+
+# Kernels take arrays and scalars, typed by their compiled signatures.
+# ruff: noqa: ANN401, PLR0913
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numba import int64, njit, uint8, void
+
+from fog_contracts.costs import LETHAL
+from fog_kernels import _arrays
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from fog_contracts.raster import Spans
+
+
+@njit(
+    void(_arrays.I32_FLAT, _arrays.I32_FLAT, _arrays.I32_FLAT, int64, int64, uint8, _arrays.U8_GRID_OUT),
+    cache=True,
+    nogil=True,
+)
+def _raise_costs(rows: Any, starts: Any, stops: Any, x: int, y: int, value: int, cost: Any) -> None:
+    height, width = cost.shape
+    for i in range(np.searchsorted(rows, y), np.searchsorted(rows, y + height)):
+        row = cost[rows[i] - y]
+        first, last = max(starts[i] - x, 0), min(stops[i] - x, width)
+        if value == LETHAL:
+            row[first:last] = LETHAL
+        else:
+            # Unknown is the highest value, so it stays.
+            for column in range(first, last):
+                row[column] = max(row[column], value)
+
+
+@njit(
+    void(_arrays.I32_FLAT, _arrays.I32_FLAT, _arrays.I32_FLAT, int64, int64, uint8, _arrays.U8_GRID_OUT),
+    cache=True,
+    nogil=True,
+)
+def _lower_speeds(rows: Any, starts: Any, stops: Any, x: int, y: int, value: int, speed: Any) -> None:
+    height, width = speed.shape
+    for i in range(np.searchsorted(rows, y), np.searchsorted(rows, y + height)):
+        row = speed[rows[i] - y]
+        for column in range(max(starts[i] - x, 0), min(stops[i] - x, width)):
+            if row[column] == 0 or row[column] > value:
+                row[column] = value
+
+
+def raise_costs(spans: Spans, x: int, y: int, value: int, cost: NDArray[np.uint8]) -> None:
+    """Combine one cost (0 to 254) with `cost` (uint8, a map's window from column x, row y on) in the cells of a shape.
+
+    As `combine_costs`: the higher cost wins, and only 254 replaces unknown. Raises TypeError or ValueError for a wrong
+    array or value.
+    """
+    _check(value, cost, "cost")
+    _raise_costs(spans.rows, spans.starts, spans.stops, x, y, value, cost)
+
+
+def lower_speeds(spans: Spans, x: int, y: int, value: int, speed: NDArray[np.uint8]) -> None:
+    """Combine one speed limit (1 to 254 cm/s) with `speed` (as `cost` of `raise_costs`): the lower limit wins."""
+    _check(value, speed, "speed")
+    if value == 0:
+        raise ValueError("a speed limit must be at least 1 cm/s: 0 means no limit")
+    _lower_speeds(spans.rows, spans.starts, spans.stops, x, y, value, speed)
+
+
+def _check(value: int, array: NDArray[np.uint8], name: str) -> None:
+    _arrays.exact(array, np.uint8, 2, name)
+    if not 0 <= value <= LETHAL:
+        raise ValueError(f"{name} must be 0 to {LETHAL}, not {value}")

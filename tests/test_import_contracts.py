@@ -6,6 +6,8 @@ import shutil
 import subprocess
 import sys
 import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from fnmatch import fnmatchcase
 from pathlib import Path
 
@@ -164,15 +166,27 @@ def test_every_listed_module_exists() -> None:
     assert sorted(set(CONTRACTS["Cores touch no world"]["source_modules"]) - known) == []
 
 
-@pytest.fixture
-def copied_sources(tmp_path: Path) -> Path:
-    """A copy of all members' sources, with the contracts."""
+@pytest.fixture(scope="module")
+def copied_sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of all members' sources, with the contracts; each test plants an import, and removes it."""
+    folder = tmp_path_factory.mktemp("sources")
     for package in SOURCES:
         shutil.copytree(
-            package, tmp_path / package.relative_to(ROOT), ignore=shutil.ignore_patterns("__pycache__", "static")
+            package, folder / package.relative_to(ROOT), ignore=shutil.ignore_patterns("__pycache__", "static")
         )
-    shutil.copy(ROOT / "pyproject.toml", tmp_path)
-    return tmp_path
+    shutil.copy(ROOT / "pyproject.toml", folder)
+    return folder
+
+
+@contextmanager
+def planted(file: Path, code: str) -> Iterator[None]:
+    """Append code to a file for a while."""
+    text = file.read_text("utf-8")
+    file.write_text(f"{text}\n{code}\n", "utf-8")
+    try:
+        yield
+    finally:
+        file.write_text(text, "utf-8")
 
 
 def check(folder: Path) -> subprocess.CompletedProcess[str]:
@@ -253,9 +267,8 @@ PLANTED = {
 
 @pytest.mark.parametrize(("file", "imported", "named"), PLANTED.values(), ids=PLANTED.keys())
 def test_forbidden_import_breaks_a_contract(copied_sources: Path, file: str, imported: str, named: str) -> None:
-    target = copied_sources / file
-    target.write_text(f"{target.read_text('utf-8')}\nimport {imported} as _planted\n", "utf-8")
-    result = check(copied_sources)
+    with planted(copied_sources / file, f"import {imported} as _planted"):
+        result = check(copied_sources)
     assert result.returncode == 1, result.stdout + result.stderr
     assert "BROKEN" in result.stdout
     assert named in result.stdout.split("Broken contracts")[-1]
@@ -277,18 +290,17 @@ PLANTED_TYPES = {
 def test_import_for_the_type_checker_only_breaks_a_contract(
     copied_sources: Path, file: str, module: str, name: str, named: str
 ) -> None:
-    target = copied_sources / file
-    planted = f"from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from {module} import {name}\n"
-    target.write_text(f"{target.read_text('utf-8')}\n{planted}", "utf-8")
-    result = check(copied_sources)
+    code = f"from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from {module} import {name}"
+    with planted(copied_sources / file, code):
+        result = check(copied_sources)
     assert result.returncode == 1, result.stdout + result.stderr
     assert named in result.stdout.split("Broken contracts")[-1]
 
 
 def test_forbidden_indirect_import_breaks_a_contract(copied_sources: Path) -> None:
     helper = copied_sources / "services/map-service/src/map_service/costmap.py"
-    helper.write_text(f"{helper.read_text('utf-8')}\nimport fog_runtime.clock as _planted\n", "utf-8")
-    result = check(copied_sources)
+    with planted(helper, "import fog_runtime.clock as _planted"):
+        result = check(copied_sources)
     assert result.returncode == 1
     assert "map_service.core" in result.stdout.split("Broken contracts")[-1]
 

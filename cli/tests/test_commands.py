@@ -15,6 +15,12 @@ from fognav.__main__ import app
 runner = CliRunner()
 
 
+@pytest.fixture(autouse=True)
+def _warm_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Refusals don't depend on the kernels, whose check takes seconds; it has tests of its own."""
+    monkeypatch.setattr("fognav.kernels.warm_cache", lambda _print_line: None)
+
+
 @pytest.mark.parametrize(
     "command",
     [

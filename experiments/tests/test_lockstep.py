@@ -77,16 +77,16 @@ def test_hazard_reaches_the_wheels_within_a_second_and_every_stage_is_stamped(wa
 
 def test_robot_without_nodes_meets_the_barrier_once_and_remembers_it():
     site = load_site(ESTIG)
-    start, goal = site.site.places["a"], site.site.places["b"]
-    begin = msgspec.structs.replace(site.site.robots[0].start, x=start.x, y=start.y)
-    met = run_lockstep(site, begin, goal, 1, HazardRequest(area="z4", trigger_m=0.5), watched=False)
+    # In the corridor of the barrier, because a shorter drive shows the same.
+    begin = msgspec.structs.replace(site.site.robots[0].start, x=20.0, y=39.2, theta=0.0)
+    met = run_lockstep(site, begin, site.site.places["b"], 1, HazardRequest(area="z4", trigger_m=0.5), watched=False)
     assert (met.outcome, met.contacts) == ("reached", 0), met.reason
     barrier = next(area.polygon for area in site.site.areas if area.id == "z4")
     distances = [math.dist(point, barrier[0]) for point in met.track]
     nearest = distances.index(min(distances))
     assert min(distances) < 8.0, "the robot must come near enough to see the barrier"
     assert min(distances[nearest + 60 :]) > 8.0, "the robot must not come back to the barrier"
-    assert met.distance_m < 140.0
+    assert met.distance_m < 115.0
 
 
 def test_same_seed_repeats_the_drive_exactly_and_another_seed_changes_it(warned, free):

@@ -18,7 +18,7 @@ def open_host(port: PtyPort) -> int:
 
 
 def read_until(read, size: int) -> bytes:
-    data, deadline = b"", time.monotonic() + 5.0
+    data, deadline = b"", time.monotonic() + 60.0
     while len(data) < size and time.monotonic() < deadline:
         data += read()
     return data

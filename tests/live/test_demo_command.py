@@ -28,11 +28,11 @@ from fog_runtime.zenoh_edge import ZenohEdge
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-pytestmark = [pytest.mark.live, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.live, pytest.mark.timeout(300)]
 
-START_TIMEOUT_S = 60.0
-"""For two demos that start at the same time on a small machine."""
-END_TIMEOUT_S = 15.0
+START_TIMEOUT_S = 180.0
+"""For two demos that start at the same time on a small machine that has other work."""
+END_TIMEOUT_S = 60.0
 """For all processes to end; the supervisor gives each rank of programs 5 s before it kills them."""
 PROCESSES = 10
 """Nine programs, and the guardian started by its watchdog."""
@@ -155,7 +155,7 @@ def assert_replay_gives_the_recorded_maps(recording: Path, out: Path) -> None:
     assert first["sim_truth"] - first["map_heartbeat"] > 1e9
     out.mkdir()
     command = [sys.executable, str(CORES), str(recording), str(ESTIG), str(out)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=180, check=False)
     assert done.returncode == 0, done.stderr
     versions = [
         msgspec.json.decode(line, type=MapHeartbeat) for line in (out / "versions.jsonl").read_bytes().splitlines()
@@ -179,9 +179,9 @@ async def drives(command: Command, children: list[psutil.Process]) -> None:
             latest = truth.get()
             return latest.distance if latest is not None else 0.0
 
-        await until(lambda: truth.get() is not None, 5, lambda: "the ground truth is received")
+        await until(lambda: truth.get() is not None, 60, lambda: "the ground truth is received")
         before = distance()
-        await until(lambda: distance() > before + 0.5, 15, lambda: f"the robot drives on: {command.output}")
+        await until(lambda: distance() > before + 0.5, 60, lambda: f"the robot drives on: {command.output}")
 
 
 async def test_interrupting_one_of_two_demos_leaves_the_other_driving(
@@ -241,8 +241,8 @@ async def test_killed_demo_leaves_files_but_no_process(start_demo: Callable[...,
     assert await command.wait_end(END_TIMEOUT_S) == -signal.SIGKILL
     # A guardian without its watchdog stops the wheels first, then ends.
     await until(
-        lambda: not any(alive(child) for child in children), 5, lambda: f"these have ended: {processes_of(folder)}"
+        lambda: not any(alive(child) for child in children), 60, lambda: f"these have ended: {processes_of(folder)}"
     )
     assert processes_of(folder) == []
     # The last thread of a killed process may close its sockets after the process counts as dead.
-    await until(lambda: not any(listens(port) for port in ports), 5, lambda: f"none of {sorted(ports)} is open")
+    await until(lambda: not any(listens(port) for port in ports), 60, lambda: f"none of {sorted(ports)} is open")

@@ -171,7 +171,7 @@ async def record(path: Path) -> tuple[MapSnapshot, str]:
         faded_at = clock.now() + seen.ttl + FADE_MARGIN_S
 
     # The default memory for obstacles would make the recording too long.
-    extra = {"OBSTACLE_MEMORY_S": "30", "INPUT_LOG": str(input_log(path))}
+    extra = {"OBSTACLE_MEMORY_S": "10", "INPUT_LOG": str(input_log(path))}
     async with Stack(StackConfig(site_dir=SITE, robot=plan.robot, seed=1, speed=SPEED, extra=extra)) as stack:
         supervisor = stack.supervisor
         for name in SERVERS:

@@ -278,7 +278,7 @@ def test_whole_scans_are_received_over_a_pty():
     lidar = RplidarEmulator(box)
     parser, assembler = rplidar.Parser(), rplidar.ScanAssembler()
     scans = []
-    deadline = time.monotonic() + 20.0
+    deadline = time.monotonic() + 60.0
     with PtyPort() as line, open_port(str(line.path), 115200) as port:
         port.set_dtr(on=False)
         port.write(rplidar.stop() + rplidar.get_health() + rplidar.scan())

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from compiler import examples
+from compiler import COMPILED, examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -64,7 +64,7 @@ def test_inflation_equals_its_definition(raw: NDArray[np.uint8], radius: float) 
 
 
 @settings(max_examples=examples(150), deadline=None)
-@given(raw_maps(), st.data())
+@given(raw_maps(90 if COMPILED else 40), st.data())
 def test_inflating_a_window_updates_the_whole_map(raw: NDArray[np.uint8], data: st.DataObject) -> None:
     table = inflation_table(0.05, Inflation(inflation_radius=data.draw(st.sampled_from([0.0, 0.2, 0.55]))))
     out = inflate(raw, table)

@@ -98,7 +98,7 @@ async def client(tokens, tmp_path):
 async def running(app, folder):
     task = asyncio.create_task(serve(app, port_file=folder / "port"))
     try:
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(60):
             while not (folder / "port").exists():
                 assert not task.done()
                 await asyncio.sleep(0.01)

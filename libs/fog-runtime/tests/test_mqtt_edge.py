@@ -37,7 +37,7 @@ def broker(shared_broker):
 async def running(*edges):
     tasks = [asyncio.create_task(edge.run()) for edge in edges]
     try:
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(60):
             for edge in edges:
                 await edge.wait_connected()
         yield
@@ -66,7 +66,7 @@ def raw_client(broker):
     return aiomqtt.Client("127.0.0.1", broker.port)
 
 
-async def until(condition, failure, seconds=10.0):
+async def until(condition, failure, seconds=60.0):
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline, failure

@@ -38,7 +38,7 @@ def edge(endpoint, name="e1", site="lab"):
     return ZenohEdge.open(connect=[endpoint], clock=SystemClock(), role="test", id=name, site=site)
 
 
-async def until(condition, failure, seconds=10.0):
+async def until(condition, failure, seconds=60.0):
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline, failure
@@ -65,7 +65,7 @@ def counter(name, channel):
 
 async def publish_until(publisher, channel, make, condition, failure, **ids):
     """Publish repeatedly: a subscription takes a moment to reach the publisher."""
-    deadline = time.monotonic() + 10.0
+    deadline = time.monotonic() + 60.0
     n = 0
     while not condition():
         assert time.monotonic() < deadline, failure
@@ -157,7 +157,7 @@ def plan(x):
     return m.PlanRequest(start=at, goal=at)
 
 
-async def query_until_answered(querier, x, seconds=10.0):
+async def query_until_answered(querier, x, seconds=60.0):
     """Query until a reply arrives."""
     deadline = time.monotonic() + seconds
     while True:

@@ -60,7 +60,7 @@ async def test_version_stored_by_another_writer_is_loaded_after_the_conflict(fog
     body = {"polygon": POLYGON, "nodes": ["n1"]}
     refused = await client.put("/api/v1/areas/hall", json=body, headers=tokens["operator"])
     assert refused.status_code == 412
-    async with asyncio.timeout(15):
+    async with asyncio.timeout(60):
         for _ in iter(int, 1):
             if (await client.get("/api/v1/areas/hall")).json()["definition"]["label"] == "elsewhere":
                 break

@@ -84,7 +84,7 @@ async def test_debounce_rule_and_cost_layer_of_an_external_package_work_in_the_r
         connect()
         await mqtt.wait_connected()
         seq = 0
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(60):
             while not hazards or hazards[-1].state != "blocked":
                 reading = NodeReading(
                     seq=seq, boot=1, uptime_ms=0, range_m=[0.8, 3.0], status=["ok", "ok"], state="blocked"

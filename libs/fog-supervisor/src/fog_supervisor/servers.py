@@ -19,7 +19,8 @@ from typing import IO, Final, Self
 from fog_supervisor import configurations
 from fog_supervisor.net import LOOPBACK, free_port
 
-_READY_S: Final = 15.0
+_READY_S: Final = 60.0
+"""Long, because a server that can't start ends at once, and a busy machine may be ten times slower."""
 _STOP_S: Final = 5.0
 _ATTEMPTS: Final = 5
 """Ports to try: another process may take one between its choice and its use."""

@@ -56,7 +56,7 @@ def test_first_start_installs_pins_with_hashes_then_the_members(checkout: Path) 
     ]
     venv, pins, members = uv_log(checkout)
     assert venv.startswith("venv")
-    assert f"--require-hashes -r {checkout}/requirements/dev.txt -r {checkout}/cli/build.txt" in pins
+    assert f"--compile-bytecode --require-hashes -r {checkout}/requirements/dev.txt -r {checkout}/cli/build.txt" in pins
     assert "--no-deps --no-build-isolation" in members
     for member in ("libs/one", "services/two", "cli"):
         assert f"--editable {checkout}/{member}" in members

@@ -91,4 +91,5 @@ _.scanning
 _.seeking_dock
 _.skipped_bytes
 _.odom_at
+_.subscribe_liveliness  # zenoh: presence, for operators' tools
 _.reveal  # the way to the value of a secret setting

@@ -156,7 +156,7 @@ async def until(condition: Callable[[], object], expected: str, details: Callabl
         await asyncio.sleep(0.01)
 
 
-@pytest.fixture(name="until")
+@pytest.fixture(name="until", scope="session")
 def until_fixture():
     return until
 

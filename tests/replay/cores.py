@@ -139,7 +139,6 @@ def replay_map(messages: list[RecordedMessage], site: LoadedSite) -> tuple[list[
     process = MapProcess(empty_map(messages, site), replay.bus)
     start = Moment(messages[0][0], messages[0][0])
     process.load_zones([], start)
-    process.connect(start)
 
     def load_stored_zones(event: RecordedMessage, at: Moment) -> None:
         if isinstance(zones := event[3], ZoneSet):

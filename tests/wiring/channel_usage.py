@@ -30,6 +30,7 @@ NOT_YET: Final[frozenset[tuple[Role, Channel]]] = frozenset(
         ("hazard-aggregator", ch.HOME_ASSISTANT),
         ("robot-agent", ch.PLANNER_EGRESS),
         ("console", ch.PLANNER_PLAN),
+        ("console", ch.LIVE),
     }
 )
 """What the table allows and no program does so far; whoever makes it true removes it from here."""

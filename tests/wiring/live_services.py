@@ -10,7 +10,6 @@ import inspect
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, Final
 
-from fog_contracts import channels as ch
 from fog_contracts.bus import Bus, roundtrip
 from fog_contracts.handlers import Moment, Publication
 from fog_runtime.health import Health
@@ -94,6 +93,7 @@ class BusEdge:
     """The interfaces of `MqttEdge` and `ZenohEdge` over a bus; it enforces the roles of the channel table."""
 
     connected = True
+    pending = 0
 
     def __init__(self, live: LiveServices, role: Role) -> None:
         self._live = live
@@ -145,11 +145,6 @@ class BusEdge:
 
     def refuse(self, _channel: Channel, key: str, reason: str) -> None:
         self._live.bus.refused.append(f"{key}: {reason}")
-
-    def subscribe_liveliness(self, handler: Any) -> None:
-        assert self._role in ch.LIVE.subscribers
-        self._live.subscribed.add((self._role, ch.LIVE))
-        self._live.liveliness_handlers.append(handler)
 
     def on_connect(self, callback: Callable[[], Awaitable[None]]) -> None:
         self._on_connect.append(callback)
@@ -228,7 +223,6 @@ class LiveServices:
         self.site = loaded.site.id
         self.clock = SteppedClock((*AGENT_LOOPS, *TICKS, *OTHERS))
         self.query_handlers: dict[str, tuple[Any, dict[str, str]]] = {}
-        self.liveliness_handlers: list[Any] = []
         self.subscribed: set[tuple[Role, Channel]] = set()
         self.published: set[tuple[Role, Channel]] = set()
         self.served: set[tuple[Role, Channel]] = set()
@@ -270,8 +264,6 @@ class LiveServices:
             ("planner plan", self.planner.plan_loop()),
         ):
             await self._begin(name, loop)
-        for handler in self.liveliness_handlers:
-            handler("hazard-aggregator", "live", True)  # noqa: FBT003  # as the edge calls it
         await self.edges["hazard-aggregator"].connect()
         await self.run_until_idle()
 

@@ -22,6 +22,7 @@ from fog_contracts.bus import Bus
 from fog_contracts.commands import sign
 from fog_contracts.handlers import Core, Publication
 from fog_contracts.messages import (
+    AreaHazard,
     CircleShape,
     CommandReply,
     EgressRequest,
@@ -93,13 +94,14 @@ EGRESS = EgressRequest(robot="r1", pose=Pose(x=7.5, y=1.5, theta=0.0))
 
 
 class RecordingBus(Bus):
-    """Records every publication with its step, and loses the first map version in which an area is blocked."""
+    """Records every publication with its step; loses the first map version with a blocked area, and one hazard."""
 
     def __init__(self, site: str) -> None:
         super().__init__(site)
         self.step = 0
         self.published: list[tuple[int, Publication]] = []
         self.lost: int | None = None
+        self.lost_hazard: AreaHazard | None = None
 
     def publish(self, publications: Any) -> None:
         for publication in publications:
@@ -108,6 +110,9 @@ class RecordingBus(Bus):
                 super().publish([publication])
 
     def _loses(self, message: Any) -> bool:
+        if isinstance(message, AreaHazard) and message.state == "clear" and self.lost_hazard is None:
+            self.lost_hazard = message
+            return True
         if not isinstance(message, MapDelta):
             return False
         if self.lost is None and any(cause.state == "blocked" for cause in message.causes):
@@ -308,7 +313,7 @@ def lockstep() -> Run:
 @pytest.fixture(scope="module")
 def live(lockstep: Run) -> tuple[Run, Any]:
     with pytest.MonkeyPatch.context() as patch:
-        for service in ("planner.service", "robot_agent.agent.service"):
+        for service in ("planner.service", "robot_agent.agent.service", "fog_runtime.work"):
             patch.setattr(f"{service}.ThreadPoolExecutor", live_services.InlineExecutor)
         patch.setattr("planner.service.secrets.token_hex", lambda _: GOAL_ID)
         return asyncio.run(drive_live(lockstep))
@@ -323,6 +328,8 @@ def test_recorded_drive_contains_all_kinds_of_decisions(lockstep):
     assert len({path.plan_id for _, _, path in decisions["robot_path"]}) >= 3
     assert {delta.layer for _, _, delta in decisions["map_delta"]} == {"cost", "speed"}
     assert lockstep.bus.lost is not None
+    assert lockstep.bus.lost_hazard is not None
+    assert decisions["aggregator_request"]
     assert [accepted.accepted for accepted in lockstep.replies[:1]] == [True]
 
 

@@ -62,11 +62,6 @@ class MapProcess:
         self._serving = False
         bus.subscribe(core.handlers())
 
-    def connect(self, at: Moment) -> None:
-        """Report to the core that the broker is connected and the aggregator alive."""
-        self._bus.publish(self.core.on_broker(at, connected=True))
-        self._bus.publish(self.core.on_aggregator("bus", at, alive=True))
-
     def load_zones(self, zones: Iterable[Zone], at: Moment) -> None:
         """Load the stored zones; the map is not served before."""
         self._bus.publish(self.core.load_zones(zones, at))
@@ -172,7 +167,6 @@ class Fog:
     def start(self, at: Moment) -> None:
         """Connect everything, with no zones stored."""
         self.map.load_zones([], at)
-        self.map.connect(at)
         self.aggregator.connect()
         self.deliver(at)
 

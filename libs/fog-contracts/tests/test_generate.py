@@ -181,7 +181,12 @@ def test_mqtt_acl_gives_each_role_the_rights_of_its_channels():
     rights = {
         s.split("\n")[0]: [tuple(x.split()[1:3]) for x in s.splitlines() if x.startswith("topic")] for s in sections
     }
-    assert rights["map-service"] == [("read", "fog/v1/lab/areas/+/hazard"), ("read", "fog/v1/lab/areas/+/definition")]
+    assert rights["map-service"] == [
+        ("read", "fog/v1/lab/areas/+/hazard"),
+        ("read", "fog/v1/lab/areas/+/definition"),
+        ("read", "fog/v1/lab/aggregator/heartbeat"),
+        ("write", "fog/v1/lab/aggregator/request"),
+    ]
     assert {access for access, _ in rights["recorder"]} == {"read"}
     assert rights["thesis-node"] == [("write", "+"), ("deny", "WSN")]
     assert ("write", "fog/v1/lab/areas/+/hazard") in rights["hazard-aggregator"]
@@ -238,12 +243,12 @@ def test_recorder_may_subscribe_and_not_publish():
     assert ("recorder", "ingress", "declare_queryable") not in rights
 
 
-def test_map_service_watches_the_liveliness_of_all_roles_and_declares_only_its_own():
+def test_console_watches_the_liveliness_of_all_roles_and_a_service_declares_only_its_own():
     rights = rules(zenoh_acl())
     for flow, message in (
         ("ingress", "declare_liveliness_subscriber"), ("ingress", "liveliness_query"), ("egress", "liveliness_token"),
     ):  # fmt: skip
-        assert "fog/*/live/*/*" in rights["map-service", flow, message]
+        assert "fog/*/live/*/*" in rights["console", flow, message]
     declared = {key for key in rights["map-service", "ingress", "liveliness_token"] if "/live/" in key}
     assert declared == {"fog/*/live/map-service/*"}
 

@@ -91,8 +91,8 @@ async def test_epochs_grow_after_a_clock_reset_and_without_redis(redis: Server):
         assert await store.begin_epoch("map") > first
         await raw.set("fog:test:map:epoch", first + 10**9)
         assert await store.claim_epoch("map") == first + 10**9 + 1
-        assert await store.claim_epoch("map", running=first) == first + 10**9 + 1
-        assert await store.claim_epoch("map", running=first + 2 * 10**9) == first + 2 * 10**9
+        assert await store.claim_epoch("map", floor=first) == first + 10**9 + 2
+        assert await store.claim_epoch("map", floor=first + 2 * 10**9) == first + 2 * 10**9 + 1
         assert await store.durability_warning() == ""
         await asyncio.to_thread(redis.kill)
         assert await store.begin_epoch("map") >= first

@@ -1,10 +1,12 @@
 """When the aggregator publishes: dangers at once, reliefs once stored, everything again for a new broker."""
 
 import pytest
+from msgspec import structs
 
 from fog_contracts import channels as ch
 from fog_contracts.handlers import Moment, Publication, RefusedMessageError
-from fog_contracts.messages import AreaDefinition, AreaHazard, NodeConfig, NodeReading, RobotPose
+from fog_contracts.hazards import digest
+from fog_contracts.messages import AggregatorHeartbeat, AreaDefinition, AreaHazard, NodeConfig, NodeReading, RobotPose
 from fog_contracts.site import NodeSite, Sonar
 from hazard_aggregator.core import Aggregator, wsn_line
 from hazard_aggregator.fusion import AreaFusion
@@ -19,11 +21,15 @@ def stored(state: str, penalty: int, epoch: int = 0) -> AreaHazard:
     return AreaHazard(area="hall", state=state, severity=3, penalty=penalty, since=1.0, seq=9, epoch=epoch, cause="")
 
 
+def heartbeat(epoch: int, uptime: float = 1.0) -> AggregatorHeartbeat:
+    return AggregatorHeartbeat(epoch=epoch, areas={}, complete=True, digest=0, uptime=uptime, stamp=0.0)
+
+
 class Rig:
     """A core that gets messages through its handlers, 0.1 s apart."""
 
-    def __init__(self, *restored: AreaHazard) -> None:
-        self.core = Aggregator(AreaFusion([AREA], [NODE], 5, restored, registry=find_rule))
+    def __init__(self, *restored: AreaHazard, complete: bool = True) -> None:
+        self.core = Aggregator(AreaFusion([AREA], [NODE], 5, restored, registry=find_rule), complete=complete)
         self.now = 100.0
         self.seq = 0
         self.published: list[Publication] = []
@@ -61,7 +67,9 @@ def test_handler_of_every_channel_accepts_its_message():
     rig.deliver(ch.THESIS_AREA, "clear", number="7")
     rig.deliver(ch.AREA_HAZARD, stored("blocked", 254), area="hall")
     rig.deliver(ch.ROBOT_POSE, pose, robot="r1")
-    assert len(rig.core.handlers()) == 5
+    rig.deliver(ch.AGGREGATOR_HEARTBEAT, heartbeat(epoch=4))
+    rig.deliver(ch.AGGREGATOR_REQUEST, ch.REPUBLISH)
+    assert len(rig.core.handlers()) == 7
 
 
 def test_danger_is_published_at_once_with_its_thesis_line():
@@ -101,13 +109,12 @@ def test_availability_that_is_neither_online_nor_offline_is_refused():
     assert rig.states() == ["unknown"]
 
 
-def test_retained_hazard_of_an_earlier_run_is_restored_and_one_of_this_run_ignored():
+def test_retained_hazard_of_an_earlier_run_is_restored():
     rig = Rig()
     rig.published.clear()
-    rig.deliver(ch.AREA_HAZARD, stored("blocked", 254, epoch=5), area="hall")
-    assert rig.states() == []
     rig.deliver(ch.AREA_HAZARD, stored("blocked", 254, epoch=4), area="hall")
     assert [p.message.penalty for p in rig.published if p.channel is ch.AREA_HAZARD] == [254]
+    assert rig.core.outranked_by is None
 
 
 def test_reconnected_broker_gets_definitions_announced_hazards_and_node_configs():
@@ -137,8 +144,137 @@ def test_removed_area_is_published_as_removed_and_leaves_nothing_to_store():
     rig = Rig()
     removed = AreaDefinition(id="hall", polygon=SQUARE, removed=True, version=1)
     publications = rig.core.put_area(removed, rig.at)
-    assert [(p.channel.name, p.message) for p in publications] == [("area_definition", removed)]
+    assert [(p.channel.name, p.message) for p in publications] == [
+        ("area_definition", removed),
+        ("area_hazard", None),
+        ("area_definition", None),
+    ]
     assert (rig.core.to_store(), rig.core.announced(), rig.core.thesis_numbers()) == ([], {}, [])
+
+
+# --- The aggregator's own word on the broker --------------------------------------------------------------------------
+
+
+def heartbeats(publications: list[Publication]) -> list[AggregatorHeartbeat]:
+    return [p.message for p in publications if p.channel is ch.AGGREGATOR_HEARTBEAT]
+
+
+def test_heartbeat_is_published_five_times_a_second_and_lists_every_announced_hazard():
+    rig = Rig()
+    rig.read(0.8)
+    beats = []
+    for _ in range(20):
+        rig.now += 0.1
+        beats += heartbeats(rig.core.tick(rig.at))
+    assert len(beats) == 10
+    announced = rig.core.announced()["hall"]
+    assert (beats[-1].epoch, beats[-1].areas, beats[-1].complete) == (5, {"hall": announced.seq}, True)
+    assert beats[-1].digest == digest([announced])
+    assert beats[-1].uptime - beats[0].uptime == pytest.approx(1.8)
+    rig.read(3.0)
+    assert rig.core.withheld() == ["hall"]
+    rig.now += 1.0
+    assert heartbeats(rig.core.tick(rig.at))[0].areas == {"hall": announced.seq}, "what is withheld is not announced"
+
+
+def test_late_tick_causes_no_burst_of_heartbeats():
+    rig = Rig()
+    rig.now += 10.0
+    assert len(heartbeats([*rig.core.tick(rig.at), *rig.core.tick(rig.at)])) == 1
+
+
+def test_own_messages_that_the_broker_returns_are_not_foreign():
+    rig = Rig()
+    rig.read(0.8)
+    rig.now += 0.3
+    own = [*rig.published, *rig.core.tick(rig.at)]
+    own += rig.core.set_epoch(9)
+    rig.now += 0.3
+    own += rig.core.tick(rig.at)
+    rig.published.clear()
+    for publication in own:
+        if publication.channel in {ch.AREA_HAZARD, ch.AGGREGATOR_HEARTBEAT}:
+            rig.deliver(publication.channel, publication.message, **publication.ids)
+    assert rig.published == []
+    assert rig.core.pop_foreign() == []
+    assert rig.core.outranked_by is None
+
+
+@pytest.mark.parametrize("epoch", [5, 77])
+@pytest.mark.parametrize("state", ["clear", "blocked"])
+def test_aggregator_goes_above_a_foreign_hazard_and_publishes_its_own_word_again(epoch, state):
+    rig = Rig()
+    rig.read(0.8)
+    own = rig.core.announced()["hall"]
+    foreign = structs.replace(own, state=state, penalty=0 if state == "clear" else 254, seq=own.seq + 9, epoch=epoch)
+    rig.deliver(ch.AREA_HAZARD, foreign, area="hall")
+    assert rig.core.outranked_by == epoch
+    assert [tuple(f) for f in rig.core.pop_foreign()] == [("hazard", epoch, "hall")]
+    published = rig.core.set_epoch(epoch + 1)
+    (again,) = [p.message for p in published if p.channel is ch.AREA_HAZARD]
+    assert (again.state, again.penalty, again.epoch) == ("blocked", 254, epoch + 1)
+    assert rig.core.outranked_by is None
+    assert [h.epoch for h in rig.core.to_store()] == [epoch + 1]
+    with pytest.raises(ValueError, match="only grows"):
+        rig.core.set_epoch(epoch + 1)
+
+
+def test_foreign_heartbeat_with_a_higher_epoch_outranks_and_a_lower_one_does_not():
+    rig = Rig()
+    rig.deliver(ch.AGGREGATOR_HEARTBEAT, heartbeat(epoch=4))
+    assert rig.core.outranked_by is None
+    rig.deliver(ch.AGGREGATOR_HEARTBEAT, heartbeat(epoch=5, uptime=3.0))
+    assert rig.core.outranked_by == 5
+    rig.deliver(ch.AGGREGATOR_HEARTBEAT, heartbeat(epoch=8))
+    assert rig.core.outranked_by == 8
+
+
+def test_own_word_is_published_again_over_a_foreign_one_with_a_lower_epoch():
+    rig = Rig()
+    rig.read(0.8)
+    rig.published.clear()
+    rig.deliver(ch.AREA_HAZARD, stored("clear", 0, epoch=3), area="hall")
+    assert [(p.message.state, p.message.epoch) for p in rig.published if p.channel is ch.AREA_HAZARD] == [
+        ("blocked", 5)
+    ]
+
+
+def test_hazard_on_the_topic_of_another_area_is_refused():
+    rig = Rig()
+    with pytest.raises(RefusedMessageError, match="another area"):
+        rig.deliver(ch.AREA_HAZARD, stored("clear", 0), area="gate")
+
+
+def test_retained_messages_of_an_area_that_nobody_lists_are_deleted_from_the_broker():
+    rig = Rig()
+    gone = structs.replace(stored("blocked", 254), area="gone")
+    deleted = rig.deliver(ch.AREA_HAZARD, gone, area="gone")
+    assert [(p.channel, p.message, p.ids["area"]) for p in deleted] == [
+        (ch.AREA_HAZARD, None, "gone"),
+        (ch.AREA_DEFINITION, None, "gone"),
+    ]
+
+
+def test_no_area_counts_as_gone_before_the_stored_areas_are_loaded():
+    rig = Rig(complete=False)
+    for name in ("gone", "gate"):
+        rig.deliver(ch.AREA_HAZARD, structs.replace(stored("blocked", 254), area=name), area=name)
+    rig.now += 1.0
+    assert [beat.complete for beat in heartbeats(rig.core.tick(rig.at))] == [False]
+    assert [p for p in rig.published if p.message is None] == []
+    loaded = rig.core.restore([AreaDefinition(id="gate", polygon=SQUARE)], [], rig.at)
+    assert {p.ids["area"] for p in loaded if p.message is None} == {"gone"}
+    rig.now += 1.0
+    (beat,) = heartbeats(rig.core.tick(rig.at))
+    assert beat.complete
+    assert set(beat.areas) == {"hall", "gate"}
+
+
+def test_everything_is_published_again_on_request_and_another_request_is_refused():
+    rig = Rig()
+    assert rig.deliver(ch.AGGREGATOR_REQUEST, ch.REPUBLISH) == rig.core.republish_all()
+    with pytest.raises(RefusedMessageError, match="restart"):
+        rig.deliver(ch.AGGREGATOR_REQUEST, "restart")
 
 
 def test_thesis_line_has_the_position_of_node_or_area_and_none_when_clear():

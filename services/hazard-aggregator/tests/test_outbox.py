@@ -3,8 +3,9 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fog_contracts.hazards import is_relief
 from fog_contracts.messages import AreaHazard
-from hazard_aggregator.outbox import Outbox, relieves
+from hazard_aggregator.outbox import Outbox
 
 
 def hazard(state: str, seq: int, penalty: int | None = None, area: str = "hall") -> AreaHazard:
@@ -56,7 +57,7 @@ def test_no_relief_is_announced_before_it_is_stored(steps):
         else:
             released = outbox.offer([hazard(step[0], seq, step[1])])
         for newest in released:
-            if relieves(newest, announced):
+            if is_relief(newest, announced):
                 assert on_disk is newest
             assert announced is None or newest.seq > announced.seq
             announced = newest

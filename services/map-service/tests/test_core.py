@@ -13,8 +13,10 @@ from fog_contracts import channels as ch
 from fog_contracts.costs import INSCRIBED, LETHAL, UNKNOWN, penalty_cost
 from fog_contracts.grid import GridGeometry, Window
 from fog_contracts.handlers import Moment, Publication, RefusedMessageError
+from fog_contracts.hazards import digest
 from fog_contracts.messages import (
     VIEW_SECTORS,
+    AggregatorHeartbeat,
     AreaDefinition,
     AreaHazard,
     Cause,
@@ -36,6 +38,7 @@ from fog_contracts.messages import (
 from fog_contracts.raster import ShapeMask
 from fog_contracts.replica import Applied, Replica
 from fog_contracts.shapes import ShapeError
+from map_service.aggregator_monitor import TRUSTED_AFTER_S
 from map_service.core import MapCore
 from map_service.layers.base import CostLayer, write_cost
 from map_service.pending import merge_overlapping
@@ -67,6 +70,38 @@ class Change:
     zones: ZoneSet | None
 
 
+AGE_S = ch.AGGREGATOR_HEARTBEAT.max_age_s
+
+
+class LivingAggregator:
+    """An aggregator that has announced some hazards and confirms them."""
+
+    def __init__(self, core: MapCore, epoch: int = 1) -> None:
+        self.core = core
+        self.epoch = epoch
+        self.announced: dict[str, AreaHazard] = {}
+
+    def heartbeat(self, stamp: float, *, areas: dict[str, int] | None = None, complete: bool = False):
+        listed = {name: h.seq for name, h in self.announced.items()} if areas is None else areas
+        return AggregatorHeartbeat(
+            epoch=self.epoch, areas=listed, complete=complete, digest=digest(self.announced.values()),
+            uptime=stamp + 1e5, stamp=stamp,
+        )  # fmt: skip
+
+    def send(self, heartbeat: AggregatorHeartbeat, now: float) -> list[Publication]:
+        return list(self.core.handlers()[ch.AGGREGATOR_HEARTBEAT]({}, heartbeat, Moment(now, now)))
+
+    def announce(self, hazard: AreaHazard, stamp: float) -> list[Publication]:
+        self.announced[hazard.area] = hazard
+        return self.beat(stamp)
+
+    def beat(self, stamp: float) -> list[Publication]:
+        """Send heartbeats up to `stamp` for as long as it takes to be trusted."""
+        sent = [self.send(self.heartbeat(stamp - TRUSTED_AFTER_S + i * 0.125), stamp - TRUSTED_AFTER_S + i * 0.125)
+                for i in range(5)]  # fmt: skip
+        return [publication for publications in sent for publication in publications]
+
+
 class Rig:
     """A core that serves its map and gets messages through its handlers."""
 
@@ -74,9 +109,8 @@ class Rig:
         self.core = MapCore("test", plan, 3, layers=make_layers(plan))
         at = Moment(0.0, 0.0)
         self.core.load_zones([], at)
-        self.core.on_broker(at, connected=True)
-        self.core.on_aggregator("a1", at, alive=True)
         self.core.tick(at)
+        self.aggregator = LivingAggregator(self.core)
         self.map = self.core.costmap
         self.geometry = self.map.geometry
 
@@ -91,8 +125,14 @@ class Rig:
     def on_definition(self, definition: AreaDefinition, stamp: float) -> Change:
         return self._deliver(ch.AREA_DEFINITION, definition, stamp, stamp, area=definition.id)
 
-    def on_hazard(self, hazard: AreaHazard, stamp: float) -> Change:
+    def receive(self, hazard: AreaHazard, stamp: float) -> Change:
+        """Deliver a hazard that no heartbeat confirms."""
         return self._deliver(ch.AREA_HAZARD, hazard, stamp, stamp, area=hazard.area)
+
+    def on_hazard(self, hazard: AreaHazard, stamp: float) -> Change:
+        """Deliver a hazard that the living aggregator announces, and heartbeats that confirm it."""
+        published = self.core.handlers()[ch.AREA_HAZARD]({"area": hazard.area}, hazard, Moment(stamp, stamp))
+        return self._change([*published, *self.aggregator.announce(hazard, stamp)])
 
     def on_obstacles(self, robot: str, obstacles: RobotObstacles, now: float, stamp: float) -> Change:
         return self._deliver(ch.ROBOT_OBSTACLES, obstacles, now, stamp, robot=robot)
@@ -101,9 +141,9 @@ class Rig:
         return self._deliver(ch.ROBOT_POSE, pose, now, now, robot=robot)
 
     def on_aggregator(self, *, present: bool, stamp: float) -> Change:
-        changed = self.core.on_aggregator("a1", Moment(stamp, stamp), alive=present)
-        # The broker is still connected, but by then the aggregator has been lost for too long.
-        return self._change([*changed, *self.core.on_broker(Moment(stamp + 3.1, stamp), connected=True)])
+        if present:
+            return self._change(self.aggregator.beat(stamp))
+        return self.tick(stamp + AGE_S + 0.1, stamp)
 
     def put_zone(self, zone: Zone, stamp: float) -> Change:
         return self._change(self.core.put_zone(zone, Moment(stamp, stamp)))
@@ -220,11 +260,12 @@ def test_outdated_hazards_are_ignored_and_one_of_a_new_epoch_is_applied():
     rig.on_definition(definition(), 0.0)
     rig.on_hazard(hazard("blocked", 5), 0.0)
     for late in (hazard("clear", 5), hazard("clear", 4), hazard("clear", 9, epoch=0)):
-        assert rig.on_hazard(late, 0.0).deltas == []
+        assert rig.receive(late, 0.0).deltas == []
         assert cost_and_speed(rig, 0.75, 0.75)[0] == LETHAL
-    rig.on_hazard(hazard("clear", 1, epoch=2), 0.0)
+    rig.aggregator = LivingAggregator(rig.core, epoch=2)
+    rig.on_hazard(hazard("clear", 1, epoch=2), 1.0)
     assert cost_and_speed(rig, 0.75, 0.75)[0] == 0
-    rig.on_hazard(hazard("blocked", 1, epoch=1), 0.0)
+    rig.receive(hazard("blocked", 1, epoch=1), 1.0)
     assert cost_and_speed(rig, 0.75, 0.75)[0] == LETHAL, "a hazard of an old epoch may raise the cost"
 
 
@@ -259,8 +300,11 @@ def test_no_area_is_clear_while_the_aggregator_is_lost():
     change = rig.on_aggregator(present=False, stamp=1.0)
     assert cost_and_speed(rig, 0.75, 0.75) == (200, 15)
     assert cost_and_speed(rig, 1.75, 0.75)[0] == LETHAL
-    assert [h.hazard.area for h in change.hazards] == ["hall"]
-    rig.on_aggregator(present=True, stamp=2.0)
+    assert [(h.hazard.area, h.hazard.state, h.confirmed) for h in change.hazards] == [
+        ("hall", "unknown", False),
+        ("gate", "blocked", False),
+    ]
+    rig.on_aggregator(present=True, stamp=4.0)
     assert cost_and_speed(rig, 0.75, 0.75) == (0, 0)
 
 
@@ -374,8 +418,13 @@ def test_first_map_waits_for_the_hazards_of_all_areas_until_a_timeout():
         assert core.missing() == "waiting for the hazards of gate"
     assert without_gate.tick(moment(2.9)) == []
     assert channel_names(without_gate.tick(moment(3.0)))[-1] == "map_heartbeat"
-    with_gate.handlers()[ch.AREA_HAZARD]({"area": "gate"}, hazard("clear", area="gate"), moment(0.3))
-    assert channel_names(with_gate.tick(moment(0.4)))[-1] == "map_heartbeat"
+    gate = hazard("clear", area="gate")
+    with_gate.handlers()[ch.AREA_HAZARD]({"area": "gate"}, gate, moment(0.3))
+    assert with_gate.tick(moment(0.4)) == [], "nobody has confirmed yet that it is clear"
+    aggregator = LivingAggregator(with_gate)
+    aggregator.announced = {"hall": hazard("blocked")}
+    aggregator.announce(gate, 1.0)
+    assert channel_names(with_gate.tick(moment(1.0)))[-1] == "map_heartbeat"
 
 
 def test_queries_return_the_map_its_zones_and_an_areas_hazard():
@@ -386,50 +435,6 @@ def test_queries_return_the_map_its_zones_and_an_areas_hazard():
     assert answers[ch.MAP_SNAPSHOT]({}, None, moment(1.0)) is core.costmap.snapshot()
     assert [z.id for z in answers[ch.ZONES]({}, None, moment(1.0)).zones] == ["z1"]
     assert answers[ch.HAZARD]({"area": "gate"}, None, moment(1.0)).hazard.area == "gate"
-
-
-@pytest.mark.parametrize("lost", ["aggregator", "broker", "both from the start"])
-def test_no_area_is_clear_three_seconds_after_the_aggregator_or_the_broker_is_lost(lost):
-    core = make_core()
-    core.load_zones([], moment(0.0))
-    if lost != "both from the start":
-        core.on_broker(moment(0.0), connected=True)
-        core.on_aggregator("a1", moment(0.0), alive=True)
-    core.tick(moment(0.0))
-    core.handlers()[ch.AREA_HAZARD]({"area": "hall"}, hazard("clear"), moment(0.0))
-
-    def state(now: float) -> str:
-        core.tick(moment(now))
-        return core.hazards()[0].hazard.state
-
-    begin = 0.0
-    if lost != "both from the start":
-        begin = 10.0
-        assert state(begin) == "clear"
-    if lost == "aggregator":
-        core.on_aggregator("a1", moment(begin), alive=False)
-    elif lost == "broker":
-        core.on_broker(moment(begin), connected=False)
-    assert state(begin + 2.9) == "clear"
-    assert state(begin + 3.1) == "unknown"
-    restored = [
-        *core.on_broker(moment(begin + 4.0), connected=True),
-        *core.on_aggregator("a1", moment(begin + 4.0), alive=True),
-    ]
-    assert channel_names(restored) == ["map_delta", "map_delta", "hazard"]
-    assert state(begin + 4.1) == "clear"
-
-
-def test_areas_stay_clear_while_one_of_two_aggregators_is_alive():
-    core = make_core()
-    core.load_zones([], moment(0.0))
-    core.on_broker(moment(0.0), connected=True)
-    for name in ("a1", "a2"):
-        core.on_aggregator(name, moment(0.0), alive=True)
-    core.handlers()[ch.AREA_HAZARD]({"area": "hall"}, hazard("clear"), moment(0.0))
-    core.on_aggregator("a1", moment(1.0), alive=False)
-    core.tick(moment(9.0))
-    assert core.hazards()[0].hazard.state == "clear"
 
 
 def test_loaded_zones_replace_all_zones_and_an_invalid_one_changes_nothing():

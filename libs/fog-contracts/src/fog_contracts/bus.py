@@ -74,6 +74,8 @@ class Bus:
         """Queue messages for delivery; raises `ContractError` for one that violates its channel's contract."""
         for publication in publications:
             channel, message = publication.channel, publication.message
+            if message is None:
+                continue  # a bus retains nothing, so there is nothing to delete
             data = encode(channel, message) if isinstance(message, Message) else encode_text(channel, message)
             self._in_flight.append(_InFlight(channel, self._key(channel, publication.ids), data))
 

@@ -153,6 +153,7 @@ ONLINE: Final = "online"
 OFFLINE: Final = "offline"
 BLOCKED: Final = "blocked"
 CLEAR: Final = "clear"
+REPUBLISH: Final = "republish"
 
 _mqtt = partial(Channel, transport="mqtt", kind="pub", encoding="json")
 _text = partial(Channel, transport="mqtt", kind="pub", encoding="text", message=None)
@@ -176,6 +177,12 @@ AREA_HAZARD       = _mqtt( "area_hazard",       V1 + "areas/{area}/hazard",     
     publishers=(AGGREGATOR,),    subscribers=(AGGREGATOR, MAP),   durability=LATEST,   qos=1)
 AREA_DEFINITION   = _mqtt( "area_definition",   V1 + "areas/{area}/definition",       m.AreaDefinition, limit=32 * KIB,
     publishers=(AGGREGATOR,),    subscribers=(MAP,),              durability=LATEST,   qos=1)
+AGGREGATOR_HEARTBEAT = _mqtt("aggregator_heartbeat", V1 + "aggregator/heartbeat", m.AggregatorHeartbeat,
+    limit=64 * KIB,
+    publishers=(AGGREGATOR,),    subscribers=(AGGREGATOR, MAP),   durability=VOLATILE, qos=0, rate_hz=5, max_age_s=1.5)
+AGGREGATOR_REQUEST = _text("aggregator_request", V1 + "aggregator/request",                             limit=16,
+    publishers=(MAP,),           subscribers=(AGGREGATOR,),       durability=VOLATILE, qos=0,
+    values=(REPUBLISH,), about="asks the aggregator to publish all areas again: a subscriber has missed some")
 THESIS_AREA       = _text( "thesis_area",       "area {number}",                                        limit=16,
     publishers=("thesis-node",), subscribers=(AGGREGATOR,),       durability=VOLATILE, qos=0,
     values=(BLOCKED, CLEAR), about="state of a thesis node's area")
@@ -216,7 +223,7 @@ ROBOT_OBSTACLES   = _pub(  "robot_obstacles",   FOG + "robots/{robot}/obstacles"
 ROBOT_COMMAND     = _query("robot_command",     FOG + "robots/{robot}/command",   m.RobotCommand,   limit=KIB,
     publishers=(ROBOT,),   subscribers=(CONSOLE,),         reply=m.CommandReply, reply_limit=2 * KIB)
 LIVE              = _live( "live",              FOG + "live/{role}/{id}", about="presence, no safety signal",
-    publishers=(AGGREGATOR, MAP, PLANNER, ROBOT), subscribers=(MAP,))
+    publishers=(AGGREGATOR, MAP, PLANNER, ROBOT), subscribers=(CONSOLE,))
 
 # The simulated world: zenoh, msgpack
 SIM_TRUTH         = _pub(  "sim_truth",         FOG + "sim/{robot}/truth",   m.SimTruth,   limit=256 * KIB,

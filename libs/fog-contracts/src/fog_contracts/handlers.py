@@ -30,10 +30,10 @@ class Moment:
 
 @dataclass(frozen=True, slots=True)
 class Publication:
-    """A message to be published on its channel, under these ids."""
+    """A message to be published on its channel, under these ids; None deletes the retained one (MQTT)."""
 
     channel: Channel
-    message: Message | str
+    message: Message | str | None
     ids: Ids = field(default_factory=dict)
 
 

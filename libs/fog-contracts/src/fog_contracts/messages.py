@@ -118,6 +118,23 @@ class AreaHazard(Message, frozen=True, kw_only=True):
     trace: Trace | None = None
 
 
+class AggregatorHeartbeat(Message, frozen=True, kw_only=True):
+    """The aggregator's sign of life, and its word on every area: a hazard that it does not list is not its own.
+
+    `areas` has the `seq` of each area's announced hazard (0: none yet), `digest` (`fog_contracts.hazards.digest`)
+    covers these hazards. Without `complete` there may be further areas, whose records are not loaded yet. `uptime` is
+    the sender's monotonic clock with an arbitrary origin; how late a heartbeat arrives is computed from it, never from
+    `stamp`.
+    """
+
+    epoch: Count
+    areas: dict[Id, Count]
+    complete: bool
+    digest: Hash
+    uptime: Annotated[float, Meta(ge=0.0, le=1e12, extra={"unit": "s"})]
+    stamp: Stamp
+
+
 class UnknownPolicy(Message, frozen=True, kw_only=True):
     """When a silent node's area becomes unknown, and the cost of an unknown area that was clear before."""
 
@@ -223,11 +240,15 @@ class MapSnapshot(Message, frozen=True, kw_only=True):
 
 
 class HazardArea(Message, frozen=True, kw_only=True):
-    """A hazard with its area's polygon: the reason for costs inside it."""
+    """A hazard with its area's polygon: the reason for costs inside it.
+
+    `confirmed`: the aggregator lives and confirms the hazard; if not, the area may have changed since.
+    """
 
     hazard: AreaHazard
     polygon: Ring
     label: str = ""
+    confirmed: bool = True
 
 
 ZoneKind = Literal["BLOCKED", "PENALTY", "SPEED_LIMIT"]

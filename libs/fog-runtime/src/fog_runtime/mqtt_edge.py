@@ -16,7 +16,7 @@ from paho.mqtt.reasoncodes import ReasonCode
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
 from fog_contracts.channels import Channel
-from fog_contracts.codec import encode, encode_text
+from fog_contracts.codec import ContractError, encode, encode_text
 from fog_contracts.messages import Message
 from fog_runtime import logs, metrics
 from fog_runtime.clock import Clock
@@ -41,7 +41,11 @@ class Will:
     ids: Ids = field(default_factory=dict)
 
 
-def _encoded(channel: Channel, message: Message | str) -> bytes:
+def _encoded(channel: Channel, message: Message | str | None) -> bytes:
+    if message is None:
+        if not channel.retained:
+            raise ContractError(channel.name, "is not retained: there is no message to delete")
+        return b""
     return encode(channel, message) if isinstance(message, Message) else encode_text(channel, message)
 
 
@@ -77,6 +81,11 @@ class MqttEdge:
     def connected(self) -> bool:
         """Whether the connection is up and all subscriptions are made."""
         return self._client is not None
+
+    @property
+    def pending(self) -> int:
+        """How many messages wait for the connection or for the broker's answer."""
+        return len(self._tasks)
 
     async def wait_connected(self) -> None:
         """Wait until the connection is up."""
@@ -137,10 +146,11 @@ class MqttEdge:
         """
         return await self._send(channel, self._topic(channel, ids), _encoded(channel, message), wait=wait)
 
-    def publish_nowait(self, channel: Channel, message: Message | str, **ids: str) -> None:
+    def publish_nowait(self, channel: Channel, message: Message | str | None, **ids: str) -> None:
         """Publish in the order of the calls, without waiting; without a connection the message is dropped and counted.
 
-        Raises `ContractError` when the message violates the channel's contract.
+        None deletes the retained message (in MQTT: by an empty retained payload). Raises `ContractError` when the
+        message violates the channel's contract.
         """
         topic, data, client = self._topic(channel, ids), _encoded(channel, message), self._client
         if client is None:
@@ -150,7 +160,7 @@ class MqttEdge:
 
     async def clear(self, channel: Channel, *, wait: bool = False, **ids: str) -> bool:
         """Delete a retained message (in MQTT: by an empty retained payload)."""
-        return await self._send(channel, self._topic(channel, ids), b"", wait=wait)
+        return await self._send(channel, self._topic(channel, ids), _encoded(channel, None), wait=wait)
 
     async def run(self) -> None:
         """Connect and stay connected until cancelled; after a failure at the next broker."""

@@ -120,15 +120,15 @@ class RedisStore:
             return "run Redis with `appendonly yes` and `appendfsync always`: it may lose acknowledged writes"
         return ""
 
-    async def claim_epoch(self, service: str, running: int = 0) -> int:
-        """Store and return an epoch (ms) larger than that of every earlier start.
+    async def claim_epoch(self, service: str, floor: int = 0) -> int:
+        """Store and return an epoch (ms) larger than every one before, and than `floor`.
 
-        `running` is the epoch of a process that started without Redis; it is stored instead if it is larger.
+        `floor` is the highest epoch that was heard or used while Redis did not answer.
         """
         await self.check()
         key = self._key(f"{service}:epoch")
         last = int(await self._redis.read("GET", key) or b"0")
-        epoch = max(last, running) if running else max(last + 1, _now_ms())
+        epoch = max(last + 1, floor + 1, _now_ms())
         await self._redis.write(("SET", key, epoch))
         return epoch
 

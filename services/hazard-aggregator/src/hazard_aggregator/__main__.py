@@ -48,7 +48,7 @@ async def main() -> None:
         async with ZenohEdge.open(
             connect=settings.zenoh_endpoints, clock=clock, role="hazard-aggregator", id=site, site=site
         ) as zenoh:
-            service = Service(Aggregator(fusion), store, mqtt, zenoh, clock, health)
+            service = Service(Aggregator(fusion, complete=loaded_from_store), store, mqtt, zenoh, clock, health)
             if loaded_from_store:
                 service.mark_store_loaded()
             service.subscribe()

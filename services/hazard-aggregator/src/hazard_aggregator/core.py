@@ -6,15 +6,18 @@ states. `outbox` withholds a relief until it is stored: the process writes `to_s
 
 from __future__ import annotations
 
+import math
 import zlib
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 import msgspec
 
 from fog_contracts import channels as ch
 from fog_contracts.handlers import Publication, RefusedMessageError
-from fog_contracts.messages import NodeConfig
+from fog_contracts.hazards import digest
+from fog_contracts.messages import AggregatorHeartbeat, NodeConfig
 from hazard_aggregator.outbox import Outbox
+from hazard_aggregator.own_messages import OwnMessages
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -26,14 +29,38 @@ if TYPE_CHECKING:
     from hazard_aggregator.fusion import AreaFusion, NodeReport
 
 
-class Aggregator:
-    """The aggregator's core: what `fusion` decides, published in the order that `Outbox` allows."""
+_HALF_TICK_S: Final = 0.05
+_MAX_FOREIGN: Final = 100
+"""Messages of others between two calls of `pop_foreign`; further ones are not counted."""
 
-    def __init__(self, fusion: AreaFusion) -> None:
+ForeignKind = Literal["area", "hazard", "heartbeat"]
+
+
+class ForeignMessage(NamedTuple):
+    """A message of another sender on our topics: about an area that we don't list, or above our epoch."""
+
+    kind: ForeignKind
+    epoch: int
+    area: str
+
+
+class Aggregator:
+    """The aggregator's core: what `fusion` decides, published in the order that `Outbox` allows.
+
+    `complete`: whether `fusion` has all areas and stored hazards; else `restore` adds what the store holds.
+    """
+
+    def __init__(self, fusion: AreaFusion, *, complete: bool = True) -> None:
         self.epoch = fusion.epoch
         self.nodes = fusion.nodes
         self._fusion = fusion
         self._outbox = Outbox()
+        self._own = OwnMessages()
+        self._complete = complete
+        self._unlisted: set[str] = set()
+        self._foreign: list[ForeignMessage] = []
+        self._foreign_epoch = 0
+        self._heartbeat_at = -math.inf
 
     # --- State ------------------------------------------------------------------------------------------------------
 
@@ -65,6 +92,19 @@ class Aggregator:
         """Raise `DebounceError` when an area's debounce rule or its options are invalid."""
         self._fusion.new_rule(definition)
 
+    def pop_foreign(self) -> list[ForeignMessage]:
+        """Return the messages of others on this aggregator's topics since the last call, for logs and metrics."""
+        foreign, self._foreign = self._foreign, []
+        return foreign
+
+    @property
+    def outranked_by(self) -> int | None:
+        """The highest epoch that another sender uses on our topics, unless ours is above it.
+
+        The map believes that sender, or no one: this aggregator needs an epoch above it (`set_epoch`).
+        """
+        return self._foreign_epoch if self._foreign_epoch >= self.epoch else None
+
     # --- Inputs -----------------------------------------------------------------------------------------------------
 
     def handlers(self) -> Mapping[Channel, Handler]:
@@ -73,7 +113,9 @@ class Aggregator:
             ch.NODE_READING: self._on_reading,
             ch.NODE_AVAILABILITY: self._on_availability,
             ch.THESIS_AREA: self._on_thesis_state,
-            ch.AREA_HAZARD: self._on_own_hazard,
+            ch.AREA_HAZARD: self._on_hazard,
+            ch.AGGREGATOR_HEARTBEAT: self._on_heartbeat,
+            ch.AGGREGATOR_REQUEST: self._on_request,
             ch.ROBOT_POSE: self._on_pose,
         }
 
@@ -82,8 +124,21 @@ class Aggregator:
         return {}
 
     def tick(self, at: Moment) -> list[Publication]:
-        """Detect silent and flapping nodes; call ten times a second."""
-        return self._announce(self._fusion.tick(at.now, at.stamp))
+        """Detect silent and flapping nodes, and publish the heartbeat when it is due; call ten times a second."""
+        publications = self._announce(self._fusion.tick(at.now, at.stamp))
+        if at.now - self._heartbeat_at > ch.AGGREGATOR_HEARTBEAT.period_s - _HALF_TICK_S:
+            self._heartbeat_at = at.now
+            publications.append(Publication(ch.AGGREGATOR_HEARTBEAT, self._heartbeat(at)))
+        return publications
+
+    def set_epoch(self, epoch: int) -> list[Publication]:
+        """Continue with a higher epoch; return everything, published again with it."""
+        if epoch <= self.epoch:
+            raise ValueError(f"the epoch only grows: {epoch} is not above {self.epoch}")
+        self.epoch = epoch
+        self._fusion.set_epoch(epoch)
+        self._outbox.set_epoch(epoch)
+        return self.republish_all()
 
     def mark_stored(self, hazards: Iterable[AreaHazard]) -> list[Publication]:
         """Record that these hazards of `to_store` are stored; return the reliefs among them, announced now."""
@@ -94,21 +149,33 @@ class Aggregator:
         changed = self._fusion.put_area(definition, at.stamp)
         if definition.removed:
             self._outbox.forget(definition.id)
+            return [_definition_publication(definition), *_deletions(definition.id)]
         return [_definition_publication(definition), *self._announce(changed)]
 
     def restore(
         self, definitions: Iterable[AreaDefinition], hazards: Iterable[AreaHazard], at: Moment
     ) -> list[Publication]:
-        """Restore areas and hazards that were unreadable at the start of this run; republish everything."""
+        """Restore areas and hazards that were unreadable at the start of this run; republish everything.
+
+        Now all areas are known: retained messages of others are deleted from the broker.
+        """
         for definition in definitions:
             self._outbox.offer(self._fusion.put_area(definition, at.stamp))
         self._outbox.offer(self._fusion.restore(hazards, at.stamp))
-        return self.republish_all()
+        self._complete = True
+        unlisted, self._unlisted = self._unlisted - set(self._listed()), set()
+        return [*self.republish_all(), *(deletion for area in sorted(unlisted) for deletion in _deletions(area))]
 
     def republish_all(self) -> list[Publication]:
         """Return all retained messages, for a broker that has (re)connected and may have lost its own copies."""
         configs = [Publication(ch.NODE_CONFIG, node_config(node), {"node": node.id}) for node in self.nodes.values()]
-        definitions = [_definition_publication(definition) for definition in self.definitions()]
+        definitions = [
+            publication
+            for definition in self.definitions()
+            for publication in (
+                _deletions(definition.id) if definition.removed else [_definition_publication(definition)]
+            )
+        ]
         return [*definitions, *self._hazard_publications(self._outbox.announced()), *configs]
 
     # --- Inside -----------------------------------------------------------------------------------------------------
@@ -125,14 +192,63 @@ class Aggregator:
     def _on_thesis_state(self, ids: Ids, text: str, at: Moment) -> list[Publication]:
         return self._announce(self._fusion.on_thesis_state(int(ids["number"]), text.strip(), at.now, at.stamp))
 
-    def _on_own_hazard(self, _ids: Ids, hazard: AreaHazard, at: Moment) -> list[Publication]:
-        """Restore a hazard that an earlier run left retained on the broker: it survives a restart without Redis."""
-        if hazard.epoch >= self.epoch:
+    def _on_hazard(self, ids: Ids, hazard: AreaHazard, at: Moment) -> list[Publication]:
+        """Hear what the broker distributes as our word: it must be ours.
+
+        A hazard that an earlier run left retained is restored, so that a danger survives a restart without Redis. Our
+        own word is published again over every other one; against a higher epoch it needs a new epoch (`outranked_by`).
+        """
+        if hazard.area != ids["area"]:
+            raise RefusedMessageError(f"it is about another area, {hazard.area}")
+        if self._own.contains(hazard):
             return []
-        return self._announce(self._fusion.restore([hazard], at.stamp))
+        if hazard.area not in self._listed():
+            self._hear_foreign("area", hazard.epoch, hazard.area)
+            if self._complete:
+                return _deletions(hazard.area)
+            self._unlisted.add(hazard.area)
+            return []
+        changed = self._announce(self._fusion.restore([hazard], at.stamp))
+        if hazard.epoch >= self.epoch:
+            self._hear_foreign("hazard", hazard.epoch, hazard.area)
+            return changed
+        announced = self.announced().get(hazard.area)
+        return changed or self._hazard_publications([announced] if announced else [])
+
+    def _on_heartbeat(self, _ids: Ids, heartbeat: AggregatorHeartbeat, _at: Moment) -> list[Publication]:
+        if heartbeat.epoch >= self.epoch and not self._own.contains_heartbeat(heartbeat):
+            self._hear_foreign("heartbeat", heartbeat.epoch, "")
+        return []
+
+    def _on_request(self, _ids: Ids, text: str, _at: Moment) -> list[Publication]:
+        if text != ch.REPUBLISH:
+            raise RefusedMessageError(f"the request is `{ch.REPUBLISH}`, not {text!r}")
+        return self.republish_all()
 
     def _on_pose(self, ids: Ids, pose: RobotPose, at: Moment) -> Sequence[Publication]:
         return self._announce(self._fusion.on_pose(ids["robot"], pose, at.now))
+
+    def _listed(self) -> list[str]:
+        return [definition.id for definition in self.definitions() if not definition.removed]
+
+    def _hear_foreign(self, kind: ForeignKind, epoch: int, area: str) -> None:
+        self._foreign_epoch = max(self._foreign_epoch, epoch)
+        if len(self._foreign) < _MAX_FOREIGN:
+            self._foreign.append(ForeignMessage(kind, epoch, area))
+
+    def _heartbeat(self, at: Moment) -> AggregatorHeartbeat:
+        announced = self.announced()
+        areas = {area: announced[area].seq if area in announced else 0 for area in self._listed()}
+        heartbeat = AggregatorHeartbeat(
+            epoch=self.epoch,
+            areas=areas,
+            complete=self._complete,
+            digest=digest(announced[area] for area, seq in areas.items() if seq > 0),
+            uptime=at.now,
+            stamp=at.stamp,
+        )
+        self._own.add_heartbeat(heartbeat)
+        return heartbeat
 
     def _announce(self, changed: Iterable[AreaHazard]) -> list[Publication]:
         return self._hazard_publications(self._outbox.offer(changed))
@@ -141,6 +257,7 @@ class Aggregator:
         """Return the publications of hazards, each with its line for the thesis's robots."""
         publications: list[Publication] = []
         for hazard in hazards:
+            self._own.add(hazard)
             publications.append(Publication(ch.AREA_HAZARD, hazard, {"area": hazard.area}))
             if (definition := self._fusion.definition(hazard.area)) is not None:
                 node = self.nodes.get(definition.nodes[0]) if definition.nodes else None
@@ -151,6 +268,11 @@ class Aggregator:
 
 def _definition_publication(definition: AreaDefinition) -> Publication:
     return Publication(ch.AREA_DEFINITION, definition, {"area": definition.id})
+
+
+def _deletions(area: str) -> list[Publication]:
+    """Return the publications that delete an area's retained messages from the broker."""
+    return [Publication(channel, None, {"area": area}) for channel in (ch.AREA_HAZARD, ch.AREA_DEFINITION)]
 
 
 def node_config(node: NodeSite) -> NodeConfig:

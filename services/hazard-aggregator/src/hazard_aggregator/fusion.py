@@ -8,6 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from msgspec import structs
+
 from fog_contracts.channels import BLOCKED, CLEAR, ROBOT_POSE
 from fog_contracts.costs import LETHAL
 from fog_contracts.messages import SEVERITY, AreaDefinition, AreaHazard, Trace
@@ -247,6 +249,13 @@ class AreaFusion:
                 area.last_known_blocked = True
                 changed += self._evaluate(area, stamp)
         return changed
+
+    def set_epoch(self, epoch: int) -> None:
+        """Give all hazards, those to come too, another epoch."""
+        self.epoch = epoch
+        for area in self._areas.values():
+            if area.hazard is not None:
+                area.hazard = structs.replace(area.hazard, epoch=epoch)
 
     def new_rule(self, definition: AreaDefinition) -> Rule:
         """Return a fresh debounce rule for a node of an area; raises `DebounceError` for invalid settings."""

@@ -9,19 +9,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from msgspec import structs
+
+from fog_contracts.hazards import is_relief
+
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from fog_contracts.messages import AreaHazard
-
-
-def relieves(hazard: AreaHazard, announced: AreaHazard | None) -> bool:
-    """Whether a hazard allows robots more than the one announced before (an area without one counts as forbidden)."""
-    if announced is None:
-        return hazard.state == "clear"
-    if hazard.penalty < announced.penalty:
-        return True
-    return hazard.state == "clear" and announced.state != "clear"
 
 
 class Outbox:
@@ -36,7 +31,7 @@ class Outbox:
         to_announce: list[AreaHazard] = []
         for hazard in hazards:
             self._unstored[hazard.area] = hazard
-            if not relieves(hazard, self._announced.get(hazard.area)):
+            if not is_relief(hazard, self._announced.get(hazard.area)):
                 self._announced[hazard.area] = hazard
                 to_announce.append(hazard)
         return to_announce
@@ -64,6 +59,16 @@ class Outbox:
     def withheld(self) -> list[str]:
         """Return the areas whose newest hazard is announced only once it is stored."""
         return sorted(area for area, hazard in self._unstored.items() if self._announced.get(area) is not hazard)
+
+    def set_epoch(self, epoch: int) -> None:
+        """Give all hazards another epoch; those that are not stored yet must be stored with it."""
+        for area, hazard in self._announced.items():
+            renamed = self._announced[area] = structs.replace(hazard, epoch=epoch)
+            if self._unstored.get(area) is hazard:
+                self._unstored[area] = renamed
+        for area, hazard in self._unstored.items():
+            if hazard.epoch != epoch:
+                self._unstored[area] = structs.replace(hazard, epoch=epoch)
 
     def forget(self, area: str) -> None:
         """Discard a removed area's hazards."""

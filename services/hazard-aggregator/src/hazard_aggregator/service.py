@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import asyncio
-from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING, Final, get_args
 
 from msgspec import structs
-from prometheus_client import Gauge
+from prometheus_client import Counter, Gauge
 
 from fog_contracts import channels as ch
-from fog_contracts.messages import AreaHazard
+from fog_contracts.messages import AreaHazard, AreaState
 from fog_runtime import logs, metrics
 from fog_runtime.clock import ticker
 from fog_runtime.edges import Edges
@@ -32,9 +32,17 @@ if TYPE_CHECKING:
 
 TICK_S = 0.1
 STORE_RETRY_S = 0.5
+AREA_STATES: Final[tuple[str, ...]] = get_args(AreaState)
 
 HAZARDS = Gauge("fognav_hazards", "Whether an area is announced in this state (1) or not (0)", ["area", "state"])
 WITHHELD = Gauge("fognav_hazards_withheld", "Areas whose relief is withheld until it is stored")
+UNSTORED = Gauge("fognav_hazards_unstored", "Areas whose newest hazard is not stored yet")
+PENDING = Gauge("fognav_mqtt_pending_messages", "Messages that wait for the connection or for the broker's answer")
+FOREIGN = Counter(
+    "fognav_foreign_messages_total",
+    "Messages on the aggregator's topics that it did not publish itself, by what they are about",
+    ["kind"],
+)
 
 _log = logs.get("aggregator")
 
@@ -62,6 +70,9 @@ class Service:
         self._store_loaded = asyncio.Event()
         self._area_lock = asyncio.Lock()
         self._reload_areas = False
+        self._epoch_provisional = False
+        self._limited = logs.RateLimited(_log)
+        self._logged: dict[str, int] = {}  # the seq of each area's last hazard in the log
 
     def subscribe(self) -> None:
         """Register the core's handlers; call before the connections run."""
@@ -159,9 +170,11 @@ class Service:
     # --- Publishing -------------------------------------------------------------------------------------------------
 
     def _announce(self, publications: Sequence[Publication]) -> None:
-        """Log and publish new decisions of the core."""
+        """Publish decisions of the core, and log each new one once, however often it is published again."""
         for publication in publications:
-            if isinstance(hazard := publication.message, AreaHazard):
+            hazard = publication.message
+            if isinstance(hazard, AreaHazard) and self._logged.get(hazard.area) != hazard.seq:
+                self._logged[hazard.area] = hazard.seq
                 if hazard.trace is not None:
                     metrics.observe_trace(hazard.trace, ["debounce"])
                 _log.info(
@@ -172,12 +185,28 @@ class Service:
     def _publish(self, publications: Sequence[Publication]) -> None:
         for publication in publications:
             if isinstance(hazard := publication.message, AreaHazard):
-                for state in ("blocked", "clear", "unknown"):
+                for state in AREA_STATES:
                     HAZARDS.labels(hazard.area, state).set(hazard.state == state)
+            elif publication.message is None and publication.channel is ch.AREA_HAZARD:
+                for state in AREA_STATES:
+                    with suppress(KeyError):  # an area that another aggregator had published
+                        HAZARDS.remove(publication.ids["area"], state)
             self._edges.publish(publication)
         WITHHELD.set(len(self.core.withheld()))
+        UNSTORED.set(len(self.core.to_store()))
         if self.core.to_store():
             self._write_pending.set()
+
+    def _report_foreign(self) -> None:
+        for foreign in self.core.pop_foreign():
+            FOREIGN.labels(foreign.kind).inc()
+            self._limited.warning(
+                "foreign_message",
+                f"{foreign.kind} {foreign.epoch}",
+                self._clock.now(),
+                **foreign._asdict(),
+                remedy="only one fog may use this broker and site; an area that left the site is deleted",
+            )
 
     async def _republish_all(self) -> None:
         self._publish(self.core.republish_all())
@@ -190,6 +219,8 @@ class Service:
         """Tick the core, and report the broker connection's health."""
         async for _ in ticker(self._clock, TICK_S):
             self._announce(self.core.tick(self._edges.now()))
+            self._report_foreign()
+            PENDING.set(self._mqtt.pending)
             self._health.set(
                 "mqtt", ok=self._mqtt.connected, detail="" if self._mqtt.connected else "not connected to the broker"
             )
@@ -224,19 +255,38 @@ class Service:
         while True:
             await asyncio.sleep(STORE_RETRY_S)
             try:
-                if self._store_loaded.is_set():
-                    if self._reload_areas:
-                        await self._reload_stored_areas()
-                    await self._store.check()
-                    self._health.set("store", ok=True)
-                    continue
-                stored = await self._store.load(self.core.epoch)
+                await self._use_store()
             except StoreError as error:
                 # What was stored but never acknowledged may have gone with a failed primary.
                 self._reload_areas = True
                 self._health.set("store", ok=False, detail=str(error))
-                continue
-            usable = usable_areas(stored.definitions, self.core.check)
-            self._publish(self.core.restore(usable, stored.hazards, self._edges.now()))
-            await self._subscribe_numbers()
-            self.mark_store_loaded()
+                if (outranked_by := self.core.outranked_by) is not None:
+                    self._epoch_provisional = True
+                    self._set_epoch(outranked_by + 1)
+
+    async def _use_store(self) -> None:
+        if not self._store_loaded.is_set():
+            await self._load_late()
+            return
+        if self._reload_areas:
+            await self._reload_stored_areas()
+        if self.core.outranked_by is not None or self._epoch_provisional:
+            self._set_epoch(await self._store.new_epoch(max(self.core.epoch, self.core.outranked_by or 0)))
+            self._epoch_provisional = False
+        await self._store.check()
+        self._health.set("store", ok=True)
+
+    async def _load_late(self) -> None:
+        """Load what could not be loaded at the start, and replace the epoch that was made without Redis."""
+        stored = await self._store.load(max(self.core.epoch, self.core.outranked_by or 0))
+        usable = usable_areas(stored.definitions, self.core.check)
+        self._set_epoch(stored.epoch)
+        self._publish(self.core.restore(usable, stored.hazards, self._edges.now()))
+        await self._subscribe_numbers()
+        self.mark_store_loaded()
+
+    def _set_epoch(self, epoch: int) -> None:
+        """Continue with a higher epoch, unless a still higher one was set meanwhile."""
+        if epoch > self.core.epoch:
+            _log.warning("epoch_changed", epoch=epoch, before=self.core.epoch, outranked_by=self.core.outranked_by)
+            self._publish(self.core.set_epoch(epoch))

@@ -25,7 +25,7 @@ _log = logs.get("store")
 
 
 class Stored(NamedTuple):
-    """What an aggregator loads at its start; `epoch` is its own, larger than that of every start before."""
+    """What an aggregator loads at its start; `epoch` is its own, larger than every one before."""
 
     epoch: int
     definitions: list[AreaDefinition]
@@ -35,11 +35,15 @@ class Stored(NamedTuple):
 class Store(RedisStore):
     """The aggregator's keys."""
 
-    async def load(self, running: int = 0) -> Stored:
-        """Claim an epoch and return all readable records; with `running`, claim that epoch instead of a new one."""
-        epoch = await self.claim_epoch(_SERVICE, running)
+    async def load(self, floor: int = 0) -> Stored:
+        """Claim an epoch above all earlier ones and `floor`, and return all readable records."""
+        epoch = await self.new_epoch(floor)
         hazards = await self._readable_records(_HAZARDS, AreaHazard)
         return Stored(epoch, await self.areas(), list(hazards.values()))
+
+    async def new_epoch(self, floor: int) -> int:
+        """Claim and return an epoch above all earlier ones and `floor`."""
+        return await self.claim_epoch(_SERVICE, floor)
 
     async def areas(self) -> list[AreaDefinition]:
         """Return the stored areas; an unreadable one is left out, so the site's definition of it stays in force."""

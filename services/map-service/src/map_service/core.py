@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, TypeVar
 
 from fog_contracts import channels as ch
 from fog_contracts.costs import DEFAULT_INFLATION
-from fog_contracts.handlers import Publication
-from fog_contracts.messages import HazardArea, ZoneSet
+from fog_contracts.handlers import Moment, Publication
+from fog_contracts.messages import ZoneSet
 from map_service.costmap import LayeredCostmap
 from map_service.layers.hazards import HazardsLayer
 from map_service.layers.zones import ZonesLayer
@@ -24,9 +24,10 @@ if TYPE_CHECKING:
     from fog_contracts.channels import Channel
     from fog_contracts.costs import Inflation
     from fog_contracts.grid import StaticMap
-    from fog_contracts.handlers import Handler, Ids, Moment, QueryHandler
-    from fog_contracts.messages import AreaDefinition, MapSnapshot, Zone
+    from fog_contracts.handlers import Handler, Ids, QueryHandler
+    from fog_contracts.messages import AreaDefinition, HazardArea, MapSnapshot, Zone
     from fog_contracts.raster import Spans
+    from map_service.aggregator_monitor import AggregatorMonitor
     from map_service.layers.base import CostLayer
 
 L = TypeVar("L", bound="CostLayer")
@@ -36,8 +37,6 @@ COMMIT_CELLS: Final = 512 * 1024
 MANY_ZONES: Final = 200
 MANY_ZONES_PERIOD_S: Final = 0.5
 """More zones than MANY_ZONES are published at most once in this time: they are a message of up to 4 MiB."""
-AGGREGATOR_LOST_S: Final = 3.0
-"""How long (s) the aggregator or the broker may be disconnected until no area counts as clear any more."""
 
 
 class MapCore:
@@ -63,16 +62,13 @@ class MapCore:
         self._hazards = _find_layer(layers, HazardsLayer)
         self._zones = _find_layer(layers, ZonesLayer)
         for definition in definitions:
-            self._hazards.define(definition)
+            self._hazards.define(definition, Moment(0.0, 0.0))
         self.costmap = LayeredCostmap(site, static, layers, inflation, epoch)
         self._zones_loaded = False
         self._hazards_wait_s = hazards_wait_s
         self._serving = False
         self._zones_published_at = -math.inf
         self._first_tick: float | None = None
-        self._aggregators: set[str] = set()
-        self._broker_connected = False
-        self._aggregator_lost_since: float | None = None
 
     # --- State ------------------------------------------------------------------------------------------------------
 
@@ -116,9 +112,14 @@ class MapCore:
         version = self.costmap.version
         return ZoneSet(epoch=version.epoch, seq=version.seq, zones=self.zones())
 
+    @property
+    def aggregator(self) -> AggregatorMonitor:
+        """What the map knows about the aggregator."""
+        return self._hazards.aggregator
+
     def hazards(self) -> list[HazardArea]:
         """Return every area with its hazard."""
-        return [p.message for p in self._hazards.publications() if isinstance(p.message, HazardArea)]
+        return self._hazards.hazards()
 
     # --- Channels ---------------------------------------------------------------------------------------------------
 
@@ -135,31 +136,20 @@ class MapCore:
         return {ch.MAP_SNAPSHOT: self._answer_snapshot, ch.ZONES: self._answer_zones, ch.HAZARD: self._answer_hazard}
 
     def tick(self, at: Moment) -> list[Publication]:
-        """Activate and end zones, expire obstacles, check the aggregator's liveliness; call ten times a second."""
+        """Activate and end zones, expire obstacles, check the aggregator's heartbeat; call ten times a second."""
         if self._first_tick is None:
             self._first_tick = at.now
-        publications = self._check_aggregator_liveness(at)
-        for layer in self._layers:
-            publications += layer.tick(at)
+        publications = [publication for layer in self._layers for publication in layer.tick(at)]
         publications = self._commit(publications, at)
+        requests = self._hazards.requests(at)
         if not self._serving:
             if not self._is_complete(at.now):
-                return []
+                return requests
             self._serving = True
             publications = [*self._hazards.publications(), Publication(ch.ZONES, self.zone_set())]
-        return [*publications, Publication(ch.MAP_HEARTBEAT, self.costmap.heartbeat(at.stamp))]
+        return [*requests, *publications, Publication(ch.MAP_HEARTBEAT, self.costmap.heartbeat(at.stamp))]
 
     # --- Inputs without a channel -----------------------------------------------------------------------------------
-
-    def on_aggregator(self, name: str, at: Moment, *, alive: bool) -> list[Publication]:
-        """Handle the appearance or loss of an aggregator's liveliness token."""
-        (self._aggregators.add if alive else self._aggregators.discard)(name)
-        return self._commit(self._check_aggregator_liveness(at), at)
-
-    def on_broker(self, at: Moment, *, connected: bool) -> list[Publication]:
-        """Record whether the broker, which carries the aggregator's messages, is connected."""
-        self._broker_connected = connected
-        return self._commit(self._check_aggregator_liveness(at), at)
 
     def load_zones(
         self, zones: Iterable[Zone], at: Moment, spans: Mapping[str, Spans] | None = None
@@ -215,20 +205,6 @@ class MapCore:
         self._zones_published_at = now
         return [Publication(ch.ZONES, self.zone_set())]
 
-    def _check_aggregator_liveness(self, at: Moment) -> list[Publication]:
-        """Let areas count as clear only while an aggregator is alive and the broker is connected.
-
-        An aggregator that has not appeared since the start is lost, like one that disappeared.
-        """
-        if self._aggregators and self._broker_connected:
-            self._aggregator_lost_since = None
-            return self._hazards.set_aggregator_lost(False)
-        if self._aggregator_lost_since is None:
-            self._aggregator_lost_since = at.now
-        if at.now - self._aggregator_lost_since > AGGREGATOR_LOST_S:
-            return self._hazards.set_aggregator_lost(True)
-        return []
-
     def _is_complete(self, now: float) -> bool:
         """Whether zones and all hazards have arrived; areas whose hazard is missing after the wait are unknown."""
         waited = self._first_tick is not None and now - self._first_tick >= self._hazards_wait_s
@@ -241,7 +217,7 @@ class MapCore:
         return self.zone_set()
 
     def _answer_hazard(self, ids: Ids, _request: None, _at: Moment) -> HazardArea:
-        return next(area for area in self.hazards() if area.hazard.area == ids["area"])
+        return self._hazards.hazard(ids["area"])
 
 
 def _find_layer(layers: Iterable[CostLayer], kind: type[L]) -> L:

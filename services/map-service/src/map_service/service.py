@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 
 TICK_S = ch.MAP_HEARTBEAT.period_s
 STORE_PERIOD_S = 0.5
-AGGREGATOR_ROLE = "hazard-aggregator"
 
 VERSION = Gauge("fognav_map_seq", "Sequence number of the map version within this epoch")
 DELTA_BYTES = Histogram(
@@ -46,6 +45,17 @@ DELTA_BYTES = Histogram(
 )
 ZONES = Gauge("fognav_zones", "Zones, stored and active", ["state"])
 ZONE_WRITES = Counter("fognav_zone_writes_total", "Writes of zones to the store, by outcome", ["outcome"])
+AGGREGATOR_AGE = Gauge(
+    "fognav_aggregator_heartbeat_age_seconds", "Time since the aggregator's latest heartbeat was sent"
+)
+AGGREGATOR_DELAY = Gauge(
+    "fognav_aggregator_heartbeat_delay_seconds",
+    "How much longer the aggregator's latest heartbeat took than its fastest one",
+)
+AREAS_UNCONFIRMED = Gauge("fognav_areas_unconfirmed", "Areas whose hazard no living aggregator confirms")
+REQUESTS = Counter(
+    "fognav_aggregator_requests_total", "Requests to publish all hazards again, because the map missed some"
+)
 
 COMMIT_SECONDS = Histogram(
     "fognav_map_commit_seconds",
@@ -83,7 +93,6 @@ class Service:
         self.core = core
         self._store = store
         self._mqtt = mqtt
-        self._zenoh = zenoh
         self._clock = clock
         self._health = health
         self._edges = Edges(clock, mqtt=mqtt, zenoh=zenoh)
@@ -96,27 +105,23 @@ class Service:
         core.costmap.measure = lambda step: COMMIT_SECONDS.labels(step).time()
         self._reload_zones = False
         self._serving_queries = False
+        self._aggregator_alive = False
 
     def subscribe(self) -> None:
         """Register the core's handlers; call before the connections run."""
         self._edges.subscribe(self.core.handlers(), self._publish)
-        self._zenoh.subscribe_liveliness(self._on_liveliness)
-
-    def _on_liveliness(self, role: str, name: str, alive: bool) -> None:  # noqa: FBT001  # the edge's callback
-        if role == AGGREGATOR_ROLE:
-            self._publish(self.core.on_aggregator(name, self._edges.now(), alive=alive))
 
     async def tick_loop(self) -> None:
         """Tick the core, and answer queries once it serves the map."""
         async for _ in ticker(self._clock, TICK_S):
             connected, at = self._mqtt.connected, self._edges.now()
-            self._publish(self.core.on_broker(at, connected=connected))
             publications = self.core.tick(at)
             if self.core.serving and not self._serving_queries:
                 # Before the first publication: channels with a key for each area are served as these are published.
                 self._serving_queries = True
                 self._edges.serve(self.core.query_handlers())
             self._publish(publications)
+            self._observe_aggregator(at.now)
             self._health.set("map", ok=self.core.serving, detail=self.core.missing())
             self._health.set("mqtt", ok=connected, detail="" if connected else "not connected to the broker")
 
@@ -282,7 +287,10 @@ class Service:
 
     def _publish(self, publications: Sequence[Publication]) -> None:
         for publication in publications:
-            if isinstance(publication.message, MapDelta):
+            if publication.channel is ch.AGGREGATOR_REQUEST:
+                REQUESTS.inc()
+                _log.warning("hazards_requested", missing=self.core.aggregator.overdue(self._clock.now()))
+            elif isinstance(publication.message, MapDelta):
                 self._record_delta(publication.message)
             elif isinstance(publication.message, ZoneSet):
                 ZONES.labels("stored").set(len(publication.message.zones))
@@ -299,6 +307,19 @@ class Service:
         self._last_heartbeat = now
         if last is not None:
             HEARTBEAT_GAP.observe(now - last)
+
+    def _observe_aggregator(self, now: float) -> None:
+        aggregator = self.core.aggregator
+        AGGREGATOR_AGE.set(aggregator.age(now))
+        AGGREGATOR_DELAY.set(aggregator.delay_s)
+        AREAS_UNCONFIRMED.set(sum(not area.confirmed for area in self.core.hazards()))
+        alive = aggregator.alive(now)
+        if alive != self._aggregator_alive:
+            self._aggregator_alive = alive
+            if alive:
+                _log.info("aggregator_alive", epoch=aggregator.epoch)
+            else:
+                _log.warning("aggregator_lost", consequence="no area counts as clear")
 
     def _record_delta(self, delta: MapDelta) -> None:
         DELTA_BYTES.observe(len(delta.cells))

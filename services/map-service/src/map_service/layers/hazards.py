@@ -1,7 +1,8 @@
 """Hazard areas: the hazards that the aggregator publishes, as cost and speed limit.
 
-Penalty 254 is lethal and gets inflated, a lower one is a graded cost. An unknown area limits the speed too. An area
-whose hazard was not received yet is unknown, with the penalty of its own policy.
+Penalty 254 is lethal and gets inflated, a lower one is a graded cost. An unknown area limits the speed too. A clear
+area whose hazard no living aggregator confirms is unknown, with the penalty of its own policy, as is one whose hazard
+was not received yet; what was blocked stays blocked.
 """
 
 from __future__ import annotations
@@ -15,8 +16,10 @@ from fog_contracts import channels as ch
 from fog_contracts.costs import DEGRADED_SPEED
 from fog_contracts.geometry import GeometryError, normalized_polygon
 from fog_contracts.handlers import Publication, RefusedMessageError
+from fog_contracts.hazards import is_relief
 from fog_contracts.messages import SEVERITY, AreaHazard, Cause, HazardArea
 from fog_contracts.raster import rasterize
+from map_service.aggregator_monitor import AggregatorMonitor
 from map_service.layers.base import CostLayer, LayerFactory, NoOptions, write_cost, write_speed_limit
 
 if TYPE_CHECKING:
@@ -25,7 +28,7 @@ if TYPE_CHECKING:
     from fog_contracts.channels import Channel
     from fog_contracts.grid import GridGeometry, Window
     from fog_contracts.handlers import Handler, Ids, Moment
-    from fog_contracts.messages import AreaDefinition
+    from fog_contracts.messages import AggregatorHeartbeat, AreaDefinition
     from fog_contracts.raster import ShapeMask
     from map_service.layers.base import Grid
 
@@ -34,7 +37,11 @@ if TYPE_CHECKING:
 class _Area:
     definition: AreaDefinition
     mask: ShapeMask
-    effective: AreaHazard
+    shown: AreaHazard
+    """The hazard on the map."""
+    accepted: AreaHazard | None = None
+    """The last hazard that was confirmed or is no relief."""
+    confirmed: bool = False
 
 
 class HazardsLayer(CostLayer):
@@ -45,19 +52,35 @@ class HazardsLayer(CostLayer):
         self._geometry = geometry
         self._areas: dict[str, _Area] = {}
         self._received: dict[str, AreaHazard] = {}
-        self._aggregator_lost = False
+        self._removed: dict[str, HazardArea] = {}
+        self.aggregator = AggregatorMonitor()
+
+    # --- Inputs -----------------------------------------------------------------------------------------------------
 
     def handlers(self) -> Mapping[Channel, Handler]:
-        """Return the handlers of area definitions and hazards."""
-        return {ch.AREA_DEFINITION: self._on_definition, ch.AREA_HAZARD: self._on_hazard}
+        """Return the handlers of area definitions, hazards and the aggregator's heartbeat."""
+        return {
+            ch.AREA_DEFINITION: self._on_definition,
+            ch.AREA_HAZARD: self._on_hazard,
+            ch.AGGREGATOR_HEARTBEAT: self._on_heartbeat,
+        }
 
-    def _on_definition(self, _ids: Ids, definition: AreaDefinition, _at: Moment) -> list[Publication]:
+    def tick(self, at: Moment) -> list[Publication]:
+        """Let clear areas become unknown when the aggregator does not confirm them any more."""
+        return self._refresh_all(at)
+
+    def requests(self, at: Moment) -> list[Publication]:
+        """Return the request to publish everything again, when something is missing and it is time to ask."""
+        due = self.aggregator.request_due(at.now)
+        return [Publication(ch.AGGREGATOR_REQUEST, ch.REPUBLISH)] if due else []
+
+    def _on_definition(self, _ids: Ids, definition: AreaDefinition, at: Moment) -> list[Publication]:
         try:
-            return self.define(definition)
+            return self.define(definition, at)
         except GeometryError as error:
             raise RefusedMessageError(f"area {definition.id}: {error}") from error
 
-    def define(self, definition: AreaDefinition) -> list[Publication]:
+    def define(self, definition: AreaDefinition, at: Moment) -> list[Publication]:
         """Add, change or remove an area; raises `GeometryError` when its polygon is invalid.
 
         A version older than the known one is ignored.
@@ -66,100 +89,146 @@ class HazardsLayer(CostLayer):
         if old is not None and (definition == old.definition or definition.version < old.definition.version):
             return []
         if definition.removed:
-            if old is None:
-                return []
-            del self._areas[definition.id]
-            self.mark_updated(old.mask.window, Cause(kind="hazard", id=definition.id, state="removed"))
-            cleared = structs.replace(
-                old.effective,
-                state="clear",
-                severity=SEVERITY["clear"],
-                penalty=0,
-                cause="the area was removed",
-                trace=None,
-            )
-            return [_hazard_publication(old.definition, cleared)]
+            return self._remove(definition.id)
         mask = rasterize(normalized_polygon(definition.polygon), self._geometry)
-        area = _Area(definition, mask, self._effective(definition))
+        area = _Area(definition, mask, _unknown(definition, None, at.stamp))
+        if old is not None:
+            area.accepted, area.shown = old.accepted, old.shown
         self._areas[definition.id] = area
-        cause = Cause(kind="hazard", id=definition.id, state=area.effective.state)
+        self._removed.pop(definition.id, None)
+        self._update(area, at)
+        cause = Cause(kind="hazard", id=definition.id, state=area.shown.state)
         if old is not None:
             self.mark_updated(old.mask.window, cause)
-        self.mark_updated(mask.window, cause, area.effective.trace)
-        return [_hazard_publication(definition, area.effective)]
+        self.mark_updated(mask.window, cause, area.shown.trace)
+        return [_publication(area)]
 
-    def _on_hazard(self, _ids: Ids, hazard: AreaHazard, _at: Moment) -> list[Publication]:
-        """Apply an area's hazard.
+    def _on_hazard(self, ids: Ids, hazard: AreaHazard, at: Moment) -> list[Publication]:
+        """Receive an area's hazard.
 
-        Duplicate and outdated ones of the same epoch are ignored; one of an older epoch is applied only if it raises
-        the cost (a clock that went back must not hide a danger).
+        Duplicate and outdated ones of the same epoch are ignored; one of an older epoch counts only if it raises the
+        cost (a clock that went back must not hide a danger), or if it is from the aggregator that the map believes.
         """
+        if hazard.area != ids["area"]:
+            raise RefusedMessageError(f"it is about another area, {hazard.area}")
         old = self._received.get(hazard.area)
         if old is not None:
             if hazard.epoch == old.epoch and hazard.seq <= old.seq:
                 return []
-            if hazard.epoch < old.epoch and hazard.penalty <= old.penalty:
+            believed = hazard.epoch == self.aggregator.epoch
+            if hazard.epoch < old.epoch and not believed and hazard.penalty <= old.penalty:
                 return []
         self._received[hazard.area] = hazard
-        return self._refresh(hazard.area)
+        self.aggregator.on_hazard(hazard)
+        return self._refresh(hazard.area, at)
 
-    def set_aggregator_lost(self, lost: bool) -> list[Publication]:  # noqa: FBT001  # a setter
-        """Set whether the aggregator is lost; while it is, no area counts as clear."""
-        if lost == self._aggregator_lost:
-            return []
-        self._aggregator_lost = lost
-        return [publication for area in list(self._areas) for publication in self._refresh(area)]
+    def _on_heartbeat(self, _ids: Ids, heartbeat: AggregatorHeartbeat, at: Moment) -> list[Publication]:
+        self.aggregator.on_heartbeat(heartbeat, self._received, self._areas.keys(), at.now)
+        removed: list[Publication] = []
+        if (listed := self.aggregator.areas(at.now)) is not None:
+            removed = [p for area in list(self._areas) if area not in listed for p in self._remove(area)]
+            self._received = {area: hazard for area, hazard in self._received.items() if area in listed}
+        return [*removed, *self._refresh_all(at)]
+
+    # --- State ------------------------------------------------------------------------------------------------------
+
+    def hazards(self) -> list[HazardArea]:
+        """Return every area with its hazard."""
+        return [_described(area) for area in self._areas.values()]
+
+    def hazard(self, name: str) -> HazardArea:
+        """Return an area with its hazard, a removed one as it was last published; raises `RefusedMessageError`."""
+        if (area := self._areas.get(name)) is not None:
+            return _described(area)
+        if (removed := self._removed.get(name)) is not None:
+            return removed
+        raise RefusedMessageError(f"there is no area {name}")
 
     def publications(self) -> list[Publication]:
         """Return the publications of all areas with their hazards."""
-        return [_hazard_publication(area.definition, area.effective) for area in self._areas.values()]
+        return [_publication(area) for area in self._areas.values()]
 
     def areas_without_hazard(self) -> list[str]:
-        """Return the defined areas whose hazard was not received yet."""
-        return sorted(set(self._areas) - set(self._received))
+        """Return the defined areas whose hazard was not received yet, or is a relief that is not confirmed yet."""
+        return sorted(
+            name for name, area in self._areas.items() if area.accepted is None or area.accepted != self._received[name]
+        )
 
     def update_costs(self, window: Window, cost: Grid, speed: Grid) -> None:
         """Write the penalties, and the speed limit of unknown areas."""
         for area in self._areas.values():
-            if area.effective.penalty > 0:
-                write_cost(area.mask, window, cost, area.effective.penalty)
-            if area.effective.state == "unknown":
+            if area.shown.penalty > 0:
+                write_cost(area.mask, window, cost, area.shown.penalty)
+            if area.shown.state == "unknown":
                 write_speed_limit(area.mask, window, speed, DEGRADED_SPEED)
 
-    def _refresh(self, name: str) -> list[Publication]:
+    # --- Inside -----------------------------------------------------------------------------------------------------
+
+    def _remove(self, name: str) -> list[Publication]:
+        area = self._areas.pop(name, None)
+        if area is None:
+            return []
+        self.mark_updated(area.mask.window, Cause(kind="hazard", id=name, state="removed"))
+        area.shown = structs.replace(
+            area.shown, state="clear", severity=SEVERITY["clear"], penalty=0, cause="the area was removed", trace=None
+        )
+        self._removed[name] = _described(area)
+        return [_publication(area)]
+
+    def _refresh_all(self, at: Moment) -> list[Publication]:
+        return [publication for name in self._areas for publication in self._refresh(name, at)]
+
+    def _refresh(self, name: str, at: Moment) -> list[Publication]:
         area = self._areas.get(name)
         if area is None:
             return []
-        before, area.effective = area.effective, self._effective(area.definition)
-        if area.effective == before:
+        before, confirmed = area.shown, area.confirmed
+        self._update(area, at)
+        if (area.shown, area.confirmed) == (before, confirmed):
             return []
-        if (before.penalty, before.state) != (area.effective.penalty, area.effective.state):
-            cause = Cause(kind="hazard", id=name, state=area.effective.state)
-            self.mark_updated(area.mask.window, cause, area.effective.trace)
-        return [_hazard_publication(area.definition, area.effective)]
+        if (before.penalty, before.state) != (area.shown.penalty, area.shown.state):
+            cause = Cause(kind="hazard", id=name, state=area.shown.state)
+            self.mark_updated(area.mask.window, cause, area.shown.trace)
+        return [_publication(area)]
 
-    def _effective(self, definition: AreaDefinition) -> AreaHazard:
-        """Return the hazard in force: the received one, or unknown when there is none or the aggregator is lost."""
-        received = self._received.get(definition.id)
-        if received is not None and (not self._aggregator_lost or received.state != "clear"):
-            return received
-        return AreaHazard(
-            area=definition.id,
-            state="unknown",
-            severity=SEVERITY["unknown"],
-            penalty=definition.unknown.penalty,
-            since=received.since if received else 0.0,
-            seq=received.seq if received else 0,
-            epoch=received.epoch if received else 0,
-            cause="the hazard aggregator or the broker is not connected"
-            if received
-            else "no hazard received from the hazard aggregator yet",
-        )
+    def _update(self, area: _Area, at: Moment) -> None:
+        """Set the hazard on the map: the accepted one, or unknown when nobody upholds that the area is clear."""
+        received = self._received.get(area.definition.id)
+        confirmed = received is not None and self.aggregator.confirms(received, at.now)
+        if received is not None and (confirmed or not is_relief(received, area.shown)):
+            area.accepted = received
+        accepted = area.accepted
+        upheld = accepted is not None and self.aggregator.upholds(area.definition.id, at.now)
+        area.confirmed = confirmed or upheld
+        if accepted is not None and (accepted.state != "clear" or area.confirmed):
+            area.shown = accepted
+        elif accepted is None or area.shown.state != "unknown" or area.shown.penalty != area.definition.unknown.penalty:
+            area.shown = _unknown(area.definition, accepted, at.stamp)
 
 
-def _hazard_publication(definition: AreaDefinition, hazard: AreaHazard) -> Publication:
-    described = HazardArea(hazard=hazard, polygon=definition.polygon, label=definition.label)
-    return Publication(ch.HAZARD, described, {"area": hazard.area})
+def _unknown(definition: AreaDefinition, accepted: AreaHazard | None, stamp: float) -> AreaHazard:
+    """Return the hazard of an area that nobody confirms to be clear, since `stamp`."""
+    return AreaHazard(
+        area=definition.id,
+        state="unknown",
+        severity=SEVERITY["unknown"],
+        penalty=definition.unknown.penalty,
+        since=stamp if accepted else 0.0,
+        seq=accepted.seq if accepted else 0,
+        epoch=accepted.epoch if accepted else 0,
+        cause="the hazard aggregator does not confirm that the area is clear"
+        if accepted
+        else "no hazard received from the hazard aggregator yet",
+    )
+
+
+def _described(area: _Area) -> HazardArea:
+    definition = area.definition
+    return HazardArea(hazard=area.shown, polygon=definition.polygon, label=definition.label, confirmed=area.confirmed)
+
+
+def _publication(area: _Area) -> Publication:
+    return Publication(ch.HAZARD, _described(area), {"area": area.definition.id})
 
 
 LAYER = LayerFactory(options=NoOptions, make=lambda plan, _options: HazardsLayer(plan.geometry))

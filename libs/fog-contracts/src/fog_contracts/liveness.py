@@ -1,0 +1,58 @@
+"""Whether a sender of heartbeats lives, judged by the receiver's own monotonic clock. Pure; time is an argument.
+
+A heartbeat that arrives is not yet a sign of life: a broker that was frozen delivers what it has queued, and the sender
+may be dead by then. So each heartbeat carries its sender's monotonic clock. The difference between the two clocks is
+unknown, but no heartbeat can arrive before it was sent: the smallest difference seen is that of the fastest heartbeat,
+and whatever one takes longer is its delay, which counts as age. No wall clock is involved.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+CLOCK_DRIFT: Final = 5e-4
+"""How much faster one host's monotonic clock may run than the other's: crystals 1e-4, corrected by NTP up to 5e-4."""
+LATE_S: Final = 0.25
+"""A sender that is not trusted yet must start anew when a heartbeat was this much (s) faster than those before."""
+
+
+class HeartbeatWatch:
+    """Watches one sender, from its first heartbeat on.
+
+    It is trusted once its heartbeats have kept arriving for `trusted_after_s`, so that heartbeats that were queued
+    and arrive all at once prove nothing. Its age is the time since its latest heartbeat was sent, not since it arrived.
+    """
+
+    def __init__(self, max_age_s: float, *, trusted_after_s: float) -> None:
+        self._max_age_s = max_age_s
+        self._trusted_after_s = trusted_after_s
+        self._offset = math.inf
+        self._offset_at = 0.0
+        self._since = math.inf
+        self._trusted = False
+        self._latest_sent = -math.inf
+        self.delay_s = 0.0
+        """How much longer (s) the latest heartbeat took than the fastest one."""
+
+    def on_heartbeat(self, uptime: float, now: float) -> None:
+        """Handle a heartbeat that was sent at `uptime` of the sender's monotonic clock (s) and arrives `now`."""
+        if self.age(now) > self._max_age_s:
+            self._trusted, self._since = False, now
+        offset = now - uptime
+        known = self._offset + CLOCK_DRIFT * (now - self._offset_at) if self._offset < math.inf else math.inf
+        if known - offset > LATE_S and not self._trusted:
+            self._since = now  # this one shows that those before were late
+        self._offset, self._offset_at = min(known, offset), now
+        self.delay_s = offset - self._offset
+        self._latest_sent = max(self._latest_sent, now - self.delay_s)
+        if self._latest_sent - self._since >= self._trusted_after_s:
+            self._trusted = True
+
+    def age(self, now: float) -> float:
+        """Return the time (s) since the latest heartbeat was sent; infinite before the first."""
+        return now - self._latest_sent
+
+    def alive(self, now: float) -> bool:
+        """Whether the sender is trusted and its latest heartbeat young enough."""
+        return self._trusted and self.age(now) <= self._max_age_s

@@ -1,6 +1,6 @@
 """A store on a replicated Redis behind Sentinels: no acknowledged write is lost when primaries die.
 
-`FOGNAV_KILLS=200` kills that many primaries instead of two.
+`FOGNAV_KILLS=200` kills that many primaries instead of one.
 """
 
 import asyncio
@@ -22,7 +22,7 @@ from fog_supervisor.net import LOOPBACK, free_port
 from fog_supervisor.servers import Server, ServerProgram, find_program
 
 pytestmark = pytest.mark.live
-KILLS = int(os.environ.get("FOGNAV_KILLS", "2"))
+KILLS = int(os.environ.get("FOGNAV_KILLS", "1"))
 THINGS = Table("things", "zone")
 AUDIT = Audit(1.0, "anna", "create")
 REPLICATION = "min-replicas-to-write 1\nmin-replicas-max-lag 2\n"
@@ -133,7 +133,6 @@ async def test_no_acknowledged_write_is_lost_when_primaries_are_killed_under_loa
             await asyncio.to_thread(cluster.servers[port].start)
         stopped.set()
         await asyncio.gather(*writers)
-        await cluster.primary()
         stored = set(await store._records("things", Thing))
     lost = acknowledged - stored
     sys.stdout.write(f"{KILLS} kills: {len(acknowledged)} acknowledged, {len(lost)} lost\n")

@@ -313,9 +313,9 @@ def lockstep() -> Run:
 @pytest.fixture(scope="module")
 def live(lockstep: Run) -> tuple[Run, Any]:
     with pytest.MonkeyPatch.context() as patch:
-        for service in ("planner.service", "robot_agent.agent.service", "fog_runtime.work"):
-            patch.setattr(f"{service}.ThreadPoolExecutor", live_services.InlineExecutor)
-        patch.setattr("planner.service.secrets.token_hex", lambda _: GOAL_ID)
+        for module in ("planner.threads", "robot_agent.agent.service", "fog_runtime.work"):
+            patch.setattr(f"{module}.ThreadPoolExecutor", live_services.InlineExecutor)
+        patch.setattr("planner.mission_keeper.secrets.token_hex", lambda _: GOAL_ID)
         return asyncio.run(drive_live(lockstep))
 
 

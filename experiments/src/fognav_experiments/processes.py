@@ -95,16 +95,16 @@ class PlannerProcess:
         self.due = True
 
     def tick(self, at: Moment) -> None:
-        """Tick the core, then compute the distance fields and fetch the snapshot that it requests.
+        """Tick the core, then run the jobs and fetch the snapshot that it requests.
 
         Call it ten times a second, and when it is `due`.
         """
         self.due = False
         self._bus.publish(self.core.tick(at))
-        self.core.pop_reached()
-        for job in self.core.field_jobs():
+        self.core.missions.pop_reached()
+        for job in self.core.jobs(at):
             job.run()
-            self.core.add_field(job)
+            self.due = self.core.add(job, at.now) or self.due
         if self.core.wants_snapshot(at.now):
             snapshot = self._bus.query(ch.MAP_SNAPSHOT, None, MapSnapshot, at)
             if snapshot is not None:

@@ -18,7 +18,7 @@ import numpy as np
 from fog_contracts.costs import DEFAULT_INFLATION
 from fog_kernels import warm
 warm.warm()
-from fog_kernels import amcl, astar, distance, dwa, inflation, likelihood, raycast
+from fog_kernels import amcl, astar, components, distance, dwa, inflation, likelihood, raycast
 raw = np.zeros((60, 60), np.uint8)
 raw[0] = 254
 shut = raw.copy()
@@ -30,11 +30,13 @@ for source in (raw, shut):
     distance.squared_distance_capped(source, 5)
     field = likelihood.likelihood_field(source == 254, 0.05)
     planner = astar.Planner(60, 60)
-    planner.set_goal_field(cost, (50, 50))
-    cells = planner.plan(cost, (20, 20), (50, 50)).cells
+    guide = planner.goal_field(cost, (50, 50)).coarser()
+    cells = planner.plan(cost, (20, 20), (50, 50), field=guide).cells
     planner.plan(cost, (np.int64(20), np.int32(20)), (40, 50), max_expansions=10)
     planner.shortcut(cost, cells)
-    planner.nearest_reachable(cost, (20, 20), (0, 0)), astar.nearest_traversable(cost, (0, 0), 20)
+    planner.exit_path(cost, cost, (20, 20)), astar.nearest_traversable(cost, (0, 0), 20)
+    found = components.Components(cost)
+    found.nearest(found.of(20, 20), (0, 0)), found.labels(0, 0, 5, 5)
     astar.line_cost(cost, 20, 20, 30, 30)
     limits = dwa.DwaLimits(axle=0.235, wheel_max=0.5)
     dwa.dwa(0, 0, 1, 1, np.float32(0), cost, 0.05, 0, 0, [(1, 1), (2, 1)], 2, 1, None, limits)

@@ -17,6 +17,7 @@ from fog_contracts.messages import (
     RobotPose,
     Trace,
 )
+from fog_contracts.raster import rasterize
 from fog_contracts.replica import MasterMap
 from fog_kernels.inflation import inflate, inflation_table
 
@@ -50,7 +51,10 @@ class RingMap:
     def cost(self) -> Grid:
         raw = self.static.copy()
         for name, box in self.areas.items():
-            self.raise_costs(raw, box, self.penalties[name])
+            # As the map-service does it: cells at the border belong to the area.
+            window, mask = rasterize(polygon(box), self.geometry)
+            cells = raw[window.rows, window.columns]
+            cells[mask] = np.maximum(cells[mask], self.penalties[name])
         return inflate(raw, self.table)
 
     def put(self, name: str, box: Box, penalty: int = 254, trace: Trace | None = None) -> list[MapDelta]:
@@ -73,9 +77,16 @@ class RingMap:
         return self.master.write([("cost", window, cells)], causes, [trace] if trace else [])
 
     def hazard_area(self, name: str, state: AreaState = "blocked") -> HazardArea:
-        x0, y0, x1, y1 = self.areas[name]
-        hazard = AreaHazard(area=name, state=state, severity=2, penalty=254, since=0.0, seq=1, epoch=1, cause="test")
-        return HazardArea(hazard=hazard, polygon=[(x0, y0), (x1, y0), (x1, y1), (x0, y1)])
+        penalty = 0 if state == "clear" else 254
+        hazard = AreaHazard(
+            area=name, state=state, severity=2, penalty=penalty, since=0.0, seq=1, epoch=1, cause="test"
+        )
+        return HazardArea(hazard=hazard, polygon=polygon(self.areas[name]))
+
+
+def polygon(box: Box) -> list[tuple[float, float]]:
+    x0, y0, x1, y1 = box
+    return [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
 
 
 def pose(x: float, y: float, theta: float = 0.0, *, localized: bool = True) -> RobotPose:

@@ -31,6 +31,7 @@ from fog_contracts.messages import (
     ZoneSet,
 )
 from fog_kernels.astar import Planner
+from planner.config import PlannerConfig
 from planner.core import PlannerCore
 from planner.route import Route
 
@@ -54,9 +55,14 @@ def length(path: RobotPath) -> float:
 class Drive:
     """A core with one robot, time in steps of 0.1 s with heartbeats."""
 
-    def __init__(self, ring_map: RingMap | None = None, start: tuple[float, float] = (1.0, 6.0)) -> None:
+    def __init__(
+        self,
+        ring_map: RingMap | None = None,
+        start: tuple[float, float] = (1.0, 6.0),
+        config: PlannerConfig | None = None,
+    ) -> None:
         self.map = ring_map or RingMap()
-        self.core = PlannerCore(epoch=7)
+        self.core = PlannerCore(epoch=7, config=config)
         self.now = 100.0
         self.core.load(self.map.master.snapshot(), self.now)
         self.at = start
@@ -83,6 +89,14 @@ class Drive:
             if posed:
                 self.deliver(ch.ROBOT_POSE, pose(*self.at), robot="r1")
             self.publish(self.core.tick(self.moment))
+            self.run_jobs()
+
+    def run_jobs(self) -> None:
+        """Run the jobs, and tick again if their results call for it."""
+        for job in self.core.jobs(self.moment):
+            job.run()
+            if self.core.add(job, self.now):
+                self.publish(self.core.tick(self.moment))
 
     def publish(self, publications: Sequence[Publication]) -> None:
         for publication in publications:
@@ -132,7 +146,8 @@ def test_change_far_from_the_path_triggers_no_search() -> None:
     drive.send(drive.map.put("z2", LOWER))
     drive.step(1.0)
     assert drive.paths[-1].plan_id == first.plan_id
-    assert drive.core.plans == {"goal": 1}
+    assert drive.core.replanner.plans == {"goal": 1}
+    assert drive.core.replanner.avoided == {"far_from_path": 1}
     assert drive.paths[-1].map_seq == 1
 
 
@@ -143,7 +158,7 @@ def test_clearing_that_saves_enough_changes_the_path_and_a_smaller_saving_does_n
     drive.send(drive.map.clear("z1"))
     drive.step()
     assert via(drive.paths[-1]) == "upper"
-    assert drive.core.plans["clearing"] == 1
+    assert drive.core.replanner.plans["clearing"] == 1
 
     drive = Drive(start=(1.0, 6.1))  # both paths are about as long
     drive.send(drive.map.put("z1", UPPER))
@@ -163,7 +178,7 @@ def test_plan_does_not_oscillate_between_two_paths_of_nearly_the_same_cost() -> 
         drive.send(drive.map.clear("bin"))
         drive.step(0.3)
     assert {path.plan_id for path in drive.paths} == {first.plan_id}
-    assert drive.core.plans["map"] >= 4
+    assert drive.core.replanner.plans["map"] >= 4
 
 
 def test_path_is_republished_twice_a_second_with_a_released_length_that_grows_with_progress() -> None:
@@ -209,7 +224,7 @@ def test_robot_more_than_a_metre_off_its_path_gets_a_new_one_from_its_position()
     drive.step()
     assert drive.paths[-1].points[0] == (1.0, 5.0)
     assert drive.paths[-1].plan_id > first.plan_id
-    assert drive.core.plans["off_path"] == 1
+    assert drive.core.replanner.plans["off_path"] == 1
 
 
 def test_lost_delta_requires_a_snapshot_and_deltas_received_meanwhile_are_applied() -> None:
@@ -245,7 +260,7 @@ def test_new_epoch_of_the_map_triggers_a_new_plan() -> None:
     drive.core.load(drive.map.master.snapshot(), drive.now)
     drive.step()
     assert (drive.paths[-1].map_epoch, via(drive.paths[-1])) == (2, "lower")
-    assert drive.core.plans["epoch"] == 1
+    assert drive.core.replanner.plans["epoch"] == 1
 
 
 def test_blocked_goal_is_refused_naming_each_decisive_area_and_the_nearest_point() -> None:
@@ -318,7 +333,7 @@ def test_goal_inside_a_hazard_is_refused_until_the_hazard_ends() -> None:
 def test_no_go_zones_are_named_as_causes() -> None:
     drive = Drive(start=LEFT)
     drive.send(drive.map.put("circle", (9.2, 10.2, 10.8, 11.8)) + drive.map.put("strip", LOWER))
-    circle = Zone(id="circle", kind="BLOCKED", shape=CircleShape(centre=(10.0, 11.0), radius=0.85), reason="wet floor")
+    circle = Zone(id="circle", kind="BLOCKED", shape=CircleShape(centre=(10.0, 11.0), radius=0.8), reason="wet floor")
     strip = Zone(id="strip", kind="BLOCKED", shape=CorridorShape(line=[(10.0, 0.0), (10.0, 2.0)], width=2.0))
     drive.deliver(ch.ZONES, ZoneSet(epoch=1, seq=2, zones=[circle, strip]))
     refusal = drive.go(*RIGHT).refusal
@@ -382,11 +397,11 @@ def test_reached_goal_ends_and_its_end_is_published_until_the_next_goal() -> Non
     drive.go(*RIGHT)
 
     drive.deliver(ch.ROBOT_STATE, reached("another"), robot="r1")
-    assert drive.core.goal("r1")
+    assert drive.core.missions.goal("r1")
     drive.deliver(ch.ROBOT_STATE, reached("g1"), robot="r1")
     count = len(drive.paths)
     drive.step(1.2)
-    assert drive.core.goal("r1") is None
+    assert drive.core.missions.goal("r1") is None
     assert len(drive.paths) == count
     assert [(g.goal_id, g.pose) for g in drive.goals[-2:]] == [("g1", None), ("g1", None)]
     assert drive.go(*LEFT, name="g2").goal_id == "g2"
@@ -401,7 +416,7 @@ def test_goal_set_between_planning_and_publishing_gets_no_outdated_path() -> Non
         drive.now += 1.0
         drive.deliver(ch.MAP_HEARTBEAT, drive.map.master.heartbeat(drive.now))
         drive.deliver(ch.ROBOT_POSE, pose(*LEFT), robot="r1")
-        drive.core.plan(drive.moment)
+        assert list(drive.core.plan(drive.moment)) in ([], ["r1"])
         change()
         drive.publish(drive.core.publish(drive.moment))
         assert len(drive.paths) == count
@@ -411,14 +426,14 @@ def test_goal_set_between_planning_and_publishing_gets_no_outdated_path() -> Non
 def test_reached_goal_is_returned_once() -> None:
     drive = Drive(start=LEFT)
     drive.go(*RIGHT)
-    assert drive.core.pop_reached() == []
+    assert drive.core.missions.pop_reached() == []
     drive.deliver(ch.ROBOT_STATE, reached("g1"), robot="r1")
     drive.deliver(ch.ROBOT_STATE, reached("g1"), robot="r1")
-    assert drive.core.pop_reached() == [("r1", "g1")]
-    assert drive.core.pop_reached() == []
+    assert drive.core.missions.pop_reached() == [("r1", "g1")]
+    assert drive.core.missions.pop_reached() == []
     drive.go(*LEFT, name="g2")
     drive.core.cancel("r1")
-    assert drive.core.pop_reached() == []
+    assert drive.core.missions.pop_reached() == []
 
 
 def test_ages_count_from_the_arrival_of_a_message_not_from_its_handling() -> None:
@@ -447,18 +462,137 @@ def test_plan_query_changes_no_mission() -> None:
 def test_goal_field_keeps_the_path_length_and_is_discarded_when_costs_fall_below_it() -> None:
     drive = Drive(start=LEFT)
     drive.core.set_goal("r1", goal(*RIGHT))
-    (job,) = drive.core.field_jobs()
-    assert drive.core.field_jobs() == []
+    (job,) = drive.core.jobs(drive.moment)
+    assert drive.core.jobs(drive.moment) == []
     job.run()
-    drive.core.add_field(job)
+    assert not drive.core.add(job, drive.now)
+    assert drive.core.fields_bytes == 2 * drive.map.static.size
     guided = drive.go(*RIGHT)
     assert length(guided) == pytest.approx(length(Drive(start=LEFT).go(*RIGHT)), rel=0.01)
     # A door in the static wall opens: the map-service got another floor plan under the same epoch.
     drive.map.static[:, :] = 0
     drive.send(drive.map.put("anything", (5.0, 11.0, 5.2, 11.2)))
+    assert drive.core.fields_bytes == 0
     drive.step()
     assert length(drive.paths[-1]) < 18.5
-    assert len(drive.core.field_jobs()) == 1
+    assert drive.core.fields_bytes > 0
+
+
+def test_refused_robot_is_searched_again_only_after_a_cost_fell_and_at_most_once_a_second() -> None:
+    drive = Drive(start=LEFT)
+    drive.send(drive.map.put("z1", UPPER) + drive.map.put("z2", LOWER))
+    assert drive.go(*RIGHT).refusal
+    for number in range(6):
+        drive.send(drive.map.put(f"far{number}", (2.2 + number, 0.0, 2.4 + number, 0.2)))
+        drive.step()
+    assert drive.core.replanner.plans == {"goal": 1}
+    assert drive.core.replanner.avoided["no_cost_fell"] == 6
+    begun = drive.now
+    for number in range(6):
+        drive.send(drive.map.clear(f"far{number}"))
+        drive.step(0.3)
+    assert drive.core.replanner.plans["refused"] <= math.ceil(drive.now - begun) + 1
+    assert drive.core.replanner.plans["refused"] >= 2
+
+
+def test_refusal_is_published_at_once_and_again_with_its_reason() -> None:
+    drive = Drive(start=LEFT)
+    for name, box in (("z1", UPPER), ("z2", LOWER)):
+        drive.send(drive.map.put(name, box))
+        drive.deliver(ch.HAZARD, drive.map.hazard_area(name))
+    drive.go(*RIGHT)
+    first, explained = drive.paths
+    assert first.refusal
+    assert explained.refusal
+    assert (first.plan_id, first.refusal.code) == (explained.plan_id, 208)
+    assert first.refusal.causes == []
+    assert "z1" not in first.refusal.reason
+    assert first.refusal.nearest == explained.refusal.nearest
+    assert [cause.id for cause in explained.refusal.causes] == ["z1", "z2"]
+
+
+def test_hazard_that_is_named_after_the_refusal_is_in_its_reason_at_once() -> None:
+    drive = Drive(start=LEFT)
+    drive.send(drive.map.put("z1", UPPER) + drive.map.put("z2", LOWER))
+    unnamed = drive.go(*RIGHT).refusal
+    assert unnamed
+    assert [cause.kind for cause in unnamed.causes] == ["obstacle"]
+    for name in ("z1", "z2"):
+        drive.deliver(ch.HAZARD, drive.map.hazard_area(name))
+    drive.step()
+    named = drive.paths[-1].refusal
+    assert named
+    assert [cause.id for cause in named.causes] == ["z1", "z2"]
+
+
+def test_refusal_never_blames_a_clear_area_in_a_wall_or_a_zone_that_is_off() -> None:
+    drive = Drive(start=LEFT)
+    drive.send(drive.map.put("z1", UPPER) + drive.map.put("z2", LOWER))
+    for name in ("z1", "z2"):
+        drive.deliver(ch.HAZARD, drive.map.hazard_area(name))
+    drive.map.areas["inside wall"] = (9.0, 9.0, 11.0, 10.2)  # its cells hold the wall, and a part of z1's inflation
+    drive.deliver(ch.HAZARD, drive.map.hazard_area("inside wall", "clear"))
+    del drive.map.areas["inside wall"]
+    across = CorridorShape(line=[(10.0, 0.0), (10.0, 12.0)], width=1.0)
+    zones = [
+        Zone(id="off", kind="BLOCKED", shape=across, enabled=False),
+        Zone(id="expired", kind="BLOCKED", shape=across, expires_at=10.0),
+        Zone(id="later", kind="BLOCKED", shape=across, starts_at=1e9),
+    ]
+    drive.deliver(ch.ZONES, ZoneSet(epoch=1, seq=2, zones=zones))
+    refusal = drive.go(*RIGHT).refusal
+    assert refusal
+    assert [cause.id for cause in refusal.causes] == ["z1", "z2"]
+
+
+def test_wall_is_said_to_be_a_wall_whatever_hazards_there_are() -> None:
+    drive = Drive(RingMap(walls=((9.0, 0.0, 11.0, 12.0),)), start=LEFT)
+    for name, box in (("z1", UPPER), ("z2", (12.0, 0.0, 13.0, 12.0))):
+        drive.send(drive.map.put(name, box))
+        drive.deliver(ch.HAZARD, drive.map.hazard_area(name))
+    refusal = drive.go(*RIGHT).refusal
+    assert refusal
+    assert [cause.kind for cause in refusal.causes] == ["map"]
+    assert "walls" in refusal.reason
+
+
+def fleet(drive: Drive, robots: dict[str, tuple[float, float]]) -> list[str]:
+    """Give every robot the goal RIGHT from its place; return the robots in the order of their first paths."""
+    for robot, place in robots.items():
+        drive.deliver(ch.ROBOT_POSE, pose(*place), robot=robot)
+        drive.core.set_goal(robot, goal(*RIGHT, robot))
+    drive.now += 0.1
+    drive.deliver(ch.MAP_HEARTBEAT, drive.map.master.heartbeat(drive.now))
+    published = drive.core.tick(drive.moment)
+    return [publication.ids["robot"] for publication in published if isinstance(publication.message, RobotPath)]
+
+
+def test_robots_that_meet_a_change_soonest_are_planned_first_and_refused_ones_last() -> None:
+    drive = Drive()
+    drive.send(drive.map.put("cell", (0.0, 0.0, 2.0, 3.0)))
+    fleet(drive, {"shut in": (1.0, 1.5), "far": (1.0, 7.0), "near": (7.0, 11.0), "middle": (3.0, 11.0)})
+    drive.send(drive.map.clear("cell"))
+    drive.send(drive.map.put("z1", UPPER))
+    assert list(drive.core.plan(drive.moment)) == ["near", "middle", "far", "shut in"]
+
+
+def test_robots_that_are_cut_off_from_their_goals_share_one_look_at_the_map(monkeypatch: pytest.MonkeyPatch) -> None:
+    drive = Drive()
+    robots = {f"r{number}": (1.0, 3.0 + 0.3 * number) for number in range(20)}
+    fleet(drive, robots)
+    searches: list[int] = []
+    search = Planner.plan
+
+    def counted(self: Planner, *args: object, **kwargs: object) -> object:
+        found = search(self, *args, **kwargs)  # type: ignore[arg-type]
+        searches.append(found.expansions)
+        return found
+
+    monkeypatch.setattr(Planner, "plan", counted)
+    drive.send(drive.map.put("z1", UPPER) + drive.map.put("z2", LOWER))
+    assert sorted(drive.core.plan(drive.moment)) == sorted(robots)
+    assert drive.core.replanner.refusals == {208: 20}
+    assert len(searches) <= 1
 
 
 BOXES = st.tuples(
@@ -477,7 +611,7 @@ CHANGES = st.lists(
 def test_path_stays_passable_and_near_optimal_after_any_changes(
     changes: list[tuple[str, tuple[float, float, float, float] | None, int, float]],
 ) -> None:
-    drive = Drive(start=(1.0, 7.0))
+    drive = Drive(start=(1.0, 7.0), config=PlannerConfig(switch_dwell_s=0.0))
     drive.go(19.0, 7.0)
     fresh = Planner(drive.map.geometry.width, drive.map.geometry.height)
     for name, box, penalty, ahead in changes:

@@ -1,6 +1,7 @@
 """The modules of the planner's core, each on its own."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,18 +12,23 @@ from ring_map import LEFT, LOWER, RIGHT, UPPER, Box, RingMap, goal, pose
 
 from fog_contracts import channels as ch
 from fog_contracts.costs import DEFAULT_INFLATION
+from fog_contracts.grid import GridGeometry
 from fog_contracts.handlers import Moment
-from fog_contracts.messages import PointXY, Refusal, Trace
+from fog_contracts.messages import PointXY, RectangleShape, Refusal, Trace, Zone, ZoneSet
 from fog_contracts.replica import MapError, Version
-from planner.blocked_regions import BlockedRegions
+from fog_contracts.shapes import rasterize_shape
+from fog_kernels.astar import Planner
+from fog_kernels.inflation import inflate, inflation_table
+from planner.blocked_regions import BlockedRegions, cover
 from planner.config import PlannerConfig
 from planner.egress import find_egress
-from planner.goal_fields import GoalFields
+from planner.goal_fields import FieldJob, GoalFields
 from planner.mission import Mission, Plan
-from planner.path_monitor import affects_corridor, may_save, reason_from_change, reason_from_pose
+from planner.path_monitor import distance_to_change, effect_of_change, may_save, reason_from_pose
 from planner.path_search import PathSearch, SearchResult
 from planner.planning_map import CostChange, MapTracker, PlanningMap
 from planner.refusals import refuse
+from planner.regions import Region, Regions
 from planner.replan_policy import is_kept
 from planner.route import Route
 
@@ -121,7 +127,17 @@ def test_change_beside_the_path_affects_it_within_the_corridor(side: float, affe
     along = plan((1.0, 1.0), (9.0, 1.0))
     planning_map = current(make_tracker(RingMap()))
     beside = change((4.0, 1.0 + side, 4.2, 1.2 + side))
-    assert affects_corridor(along, straight(along), beside, planning_map, CONFIG.corridor_half_width) == affected
+    distance = distance_to_change(along, straight(along), beside, planning_map, CONFIG.corridor_half_width)
+    assert math.isfinite(distance) == affected
+
+
+def test_distance_to_a_change_counts_from_the_robot_along_its_path() -> None:
+    planning_map = current(make_tracker(RingMap()))
+    on_path = change((6.0, 0.9, 6.2, 1.1))
+    for progress in (0.0, 2.0):
+        driven = plan((1.0, 1.0), (9.0, 1.0), progress=progress)
+        distance = distance_to_change(driven, straight(driven), on_path, planning_map, CONFIG.corridor_half_width)
+        assert distance == pytest.approx(5.0 - CONFIG.corridor_half_width - progress, abs=0.2)
 
 
 def test_change_behind_the_robot_does_not_affect_its_path() -> None:
@@ -129,7 +145,8 @@ def test_change_behind_the_robot_does_not_affect_its_path() -> None:
     behind = change((2.0, 0.9, 2.2, 1.1))
     for progress, affected in ((0.0, True), (3.0, False)):
         driven = plan((1.0, 1.0), (9.0, 1.0), progress=progress)
-        assert affects_corridor(driven, straight(driven), behind, planning_map, CONFIG.corridor_half_width) == affected
+        distance = distance_to_change(driven, straight(driven), behind, planning_map, CONFIG.corridor_half_width)
+        assert math.isfinite(distance) == affected
 
 
 def test_clearing_may_save_only_where_a_path_through_it_could_be_shorter() -> None:
@@ -148,15 +165,21 @@ def test_change_near_the_path_is_a_stronger_reason_than_a_clearing() -> None:
     planning_map = current(make_tracker(RingMap()))
     mission = Mission()
     on_path, inside = change((4.0, 0.9, 4.2, 1.1), decreased=True), change((9.0, 5.5, 11.0, 6.5), decreased=True)
-    assert reason_from_change(mission, on_path, planning_map, CONFIG) is None
+
+    def reason(cause: CostChange) -> str | None:
+        effect = effect_of_change(mission, cause, planning_map, CONFIG)
+        return effect.reason if effect else None
+
+    assert reason(on_path) is None
     mission.begin(goal(*RIGHT), any_heading=False)
-    assert reason_from_change(mission, on_path, planning_map, CONFIG) is None
+    assert reason(on_path) is None
     mission.plan = plan((1.0, 6.0), (1.0, 1.0), (19.0, 1.0), (19.0, 6.0))
-    assert reason_from_change(mission, on_path, planning_map, CONFIG) == "map"
-    assert reason_from_change(mission, inside, planning_map, CONFIG) == "clearing"
-    assert reason_from_change(mission, change((9.0, 5.5, 11.0, 6.5)), planning_map, CONFIG) is None
+    assert reason(on_path) == "map"
+    assert reason(inside) == "clearing"
+    assert reason(change((9.0, 5.5, 11.0, 6.5))) is None
     mission.plan.route = None
-    assert reason_from_change(mission, inside, planning_map, CONFIG) == "refused"
+    assert reason(inside) == "refused"
+    assert reason(change((9.0, 5.5, 11.0, 6.5))) is None  # what only rises opens no path
 
 
 def test_pose_advances_progress_and_requests_a_replan_off_the_path() -> None:
@@ -267,17 +290,21 @@ def test_replan_requests_collect_traces_once_and_map_replaces_the_first_reason()
 BOUND = np.zeros((12, 20), dtype=np.uint8)
 
 
+def run(fields: GoalFields, job: FieldJob) -> None:
+    job.run()
+    fields.add(job)
+
+
 def test_field_is_computed_once_per_goal_and_discarded_with_its_lower_bound() -> None:
-    fields = GoalFields(2)
+    fields = GoalFields(10_000)
     fields.set_lower_bound(BOUND)
     (job,) = fields.jobs([(3, 3), (3, 3)])
     assert fields.jobs([(3, 3)]) == []
     assert fields.guide((3, 3)) is None
-    job.run()
-    fields.add(job)
+    run(fields, job)
     guide = fields.guide((3, 3))
     assert guide is not None
-    assert guide.plan(BOUND, (10, 3), (3, 3)).found
+    assert Planner(20, 12).plan(BOUND, (10, 3), (3, 3), field=guide).found
     assert fields.jobs([(3, 3)]) == []
     fields.set_lower_bound(BOUND)
     assert fields.guide((3, 3)) is guide
@@ -287,49 +314,116 @@ def test_field_is_computed_once_per_goal_and_discarded_with_its_lower_bound() ->
     assert again.lower_bound is not BOUND
 
 
-def test_field_over_an_outdated_lower_bound_is_dropped() -> None:
-    fields = GoalFields(2)
+def test_field_over_an_outdated_lower_bound_is_not_computed_and_dropped() -> None:
+    fields = GoalFields(10_000)
     fields.set_lower_bound(BOUND)
-    (job,) = fields.jobs([(3, 3)])
+    (job, late) = fields.jobs([(3, 3), (4, 4)])
     job.run()
     fields.set_lower_bound(BOUND.copy())
     fields.add(job)
-    assert fields.guide((3, 3)) is None
+    run(fields, late)
+    assert late.field is None
+    assert fields.size == 0
 
 
-def test_fields_are_limited_to_their_capacity_and_a_goal_in_a_wall_gets_none() -> None:
-    fields = GoalFields(2)
+def test_every_goal_has_a_field_within_the_bound_of_memory_and_a_goal_in_a_wall_gets_none() -> None:
+    fields = GoalFields(2 * BOUND.size + 200)  # one field at full resolution and a bit
     walled = BOUND.copy()
     walled[5, 5] = 254
     fields.set_lower_bound(walled)
-    jobs = fields.jobs([(5, 5), (1, 1), (2, 2)])
-    assert [job.goal for job in jobs] == [(1, 1)]
-    for goals in ([(1, 1), (2, 2)], [(7, 7)]):
-        for job in [*jobs, *fields.jobs(goals)]:
-            job.run()
-            fields.add(job)
-        jobs = []
-    assert fields.guide((7, 7)) is not None
-    assert [fields.guide(cell) is None for cell in ((1, 1), (2, 2))].count(True) == 1
+    assert fields.jobs([(5, 5)]) == []
+    (first,) = fields.jobs([(1, 1)])
+    run(fields, first)
+    assert fields.size == 2 * BOUND.size
+    goals = [(1, 1), *((x, 2) for x in range(2, 14))]
+    for job in fields.jobs(goals):
+        run(fields, job)
+        assert fields.size <= 2 * BOUND.size + 200
+    assert all(fields.guide(goal) is not None for goal in goals)
+    assert fields.fields.keys() == set(goals)
+
+
+def test_fields_of_goals_that_ended_make_room_for_new_ones() -> None:
+    fields = GoalFields(2 * BOUND.size)
+    fields.set_lower_bound(BOUND)
+    for goal_cell in ((1, 1), (2, 2)):
+        (job,) = fields.jobs([goal_cell])
+        run(fields, job)
+        guide = fields.guide(goal_cell)
+        assert guide is not None
+        assert guide.bits == 0
+    assert fields.guide((1, 1)) is None
 
 
 # --- Regions, search, egress ---
 
 
-def regions(ring_map: RingMap, *names: str) -> BlockedRegions:
-    known = BlockedRegions(DEFAULT_INFLATION.inflation_radius)
+def sources(ring_map: RingMap, *names: str) -> BlockedRegions:
+    known = BlockedRegions()
     for name in names:
         known.handlers()[ch.HAZARD]({"area": name}, ring_map.hazard_area(name), NOW)
     return known
 
 
-def test_region_blocks_only_while_its_cells_are_lethal() -> None:
+def on(ring_map: RingMap, known: BlockedRegions, stamp: float = 0.0) -> list[Region]:
+    return Regions(DEFAULT_INFLATION).on(current(make_tracker(ring_map)), known.sources, stamp)
+
+
+def test_region_is_on_only_while_all_its_cells_are_lethal() -> None:
     ring_map = RingMap()
     ring_map.put("z1", (9.0, 10.2, 11.0, 11.8))
-    known = regions(ring_map, "z1")
-    assert [region.cause.id for region in known.blocking(current(make_tracker(ring_map)))] == ["z1"]
+    known = sources(ring_map, "z1")
+    assert [region.cause.id for region in on(ring_map, known)] == ["z1"]
     ring_map.clear("z1")
-    assert known.blocking(current(make_tracker(ring_map))) == []
+    assert on(ring_map, known) == []
+
+
+def test_area_whose_cells_hold_only_a_wall_is_not_on() -> None:
+    ring_map = RingMap()
+    ring_map.put("z1", (5.0, 5.0, 6.0, 6.0))
+    assert on(ring_map, sources(ring_map, "z1")) == []
+
+
+def test_clear_area_and_disabled_zone_are_no_regions() -> None:
+    ring_map = RingMap()
+    ring_map.put("crates", UPPER)
+    x0, y0, x1, y1 = UPPER
+    shape = RectangleShape(corner=(x0, y0), opposite=(x1, y1))
+    known = BlockedRegions()
+    known.handlers()[ch.HAZARD]({"area": "crates"}, ring_map.hazard_area("crates", "clear"), NOW)
+    zones = [
+        Zone(id="off", kind="BLOCKED", shape=shape, enabled=False),
+        Zone(id="slow", kind="SPEED_LIMIT", speed=0.1, shape=shape),
+    ]
+    known.handlers()[ch.ZONES]({}, ZoneSet(epoch=1, seq=1, zones=zones), NOW)
+    assert on(ring_map, known) == []
+
+
+def test_zone_outside_its_times_is_not_on_where_another_region_explains_its_cells() -> None:
+    ring_map = RingMap()
+    ring_map.put("z1", UPPER)
+    known = sources(ring_map, "z1")
+    inner = RectangleShape(corner=(9.5, 10.5), opposite=(10.5, 11.5))
+    later = Zone(id="later", kind="BLOCKED", shape=inner, starts_at=1000.0)
+    known.handlers()[ch.ZONES]({}, ZoneSet(epoch=1, seq=1, zones=[later]), NOW)
+    assert [region.cause.id for region in on(ring_map, known, stamp=500.0)] == ["z1"]
+    assert [region.cause.id for region in on(ring_map, known, stamp=1500.0)] == ["z1", "later"]
+    # The map decides, not the planner's clock: lethal cells that nothing else explains are the zone's.
+    known = BlockedRegions()
+    known.handlers()[ch.ZONES]({}, ZoneSet(epoch=1, seq=1, zones=[later]), NOW)
+    assert [region.cause.id for region in on(ring_map, known, stamp=500.0)] == ["later"]
+
+
+def test_unchanged_shapes_are_not_rasterized_again() -> None:
+    ring_map = RingMap()
+    ring_map.put("z1", UPPER)
+    ring_map.put("z2", LOWER)
+    known = sources(ring_map, "z1")
+    regions, planning_map = Regions(DEFAULT_INFLATION), current(make_tracker(ring_map))
+    (first,) = regions.on(planning_map, known.sources, 0.0)
+    known.handlers()[ch.HAZARD]({"area": "z2"}, ring_map.hazard_area("z2"), NOW)
+    again, _ = regions.on(planning_map, known.sources, 0.0)
+    assert again is first
 
 
 @pytest.mark.parametrize(
@@ -340,19 +434,38 @@ def test_search_refuses_start_and_goal_outside_the_map_or_occupied(start: PointX
     ring_map = RingMap()
     ring_map.put("z1", UPPER)
     planning_map = current(make_tracker(ring_map))
-    blocking = regions(ring_map, "z1").blocking(planning_map)
-    result = PathSearch(CONFIG, ring_map.geometry, GoalFields(1)).find(planning_map, blocking, start, end)
+    covers = partial(cover, sources(ring_map, "z1").sources)
+    result = PathSearch(CONFIG, ring_map.geometry).find(planning_map, covers, start, end)
     assert result.route is None
     assert result.refusal
     assert result.refusal.code == code
 
 
+def nothing(_x: float, _y: float, _margin: float) -> bool:
+    return False
+
+
 def test_search_beyond_its_limit_of_expansions_is_refused() -> None:
     ring_map = RingMap()
-    search = PathSearch(PlannerConfig(max_expansions=10), ring_map.geometry, GoalFields(1))
-    result = search.find(current(make_tracker(ring_map)), [], LEFT, RIGHT)
+    search = PathSearch(PlannerConfig(max_expansions=10), ring_map.geometry)
+    result = search.find(current(make_tracker(ring_map)), nothing, LEFT, RIGHT)
     assert result.refusal
     assert result.refusal.code == 207
+
+
+def test_unreachable_goal_is_refused_without_a_full_search() -> None:
+    ring_map = RingMap()
+    ring_map.put("z1", UPPER)
+    ring_map.put("z2", LOWER)
+    planning_map = current(make_tracker(ring_map))
+    search = PathSearch(PlannerConfig(quick_expansions=50), ring_map.geometry)
+    for _ in range(2):
+        result = search.find(planning_map, nothing, LEFT, RIGHT)
+        assert not result.searched
+        assert result.refusal
+        assert result.refusal.code == 208
+        assert result.question
+        assert planning_map.has_components
 
 
 @settings(max_examples=60, deadline=None)
@@ -362,20 +475,29 @@ def test_search_beyond_its_limit_of_expansions_is_refused() -> None:
 )
 def test_path_begins_and_ends_at_the_exact_points_and_its_cost_is_finite(start: PointXY, end: PointXY) -> None:
     planning_map = current(make_tracker(RingMap()))
-    result = PathSearch(CONFIG, planning_map.geometry, GoalFields(1)).find(planning_map, [], start, end)
+    result = PathSearch(CONFIG, planning_map.geometry).find(planning_map, nothing, start, end)
     assert result.route is not None
     assert math.hypot(*(result.route.points[0] - start)) <= 0.08
     assert math.hypot(*(result.route.points[-1] - end)) <= 0.08
     assert math.isfinite(result.cost)
 
 
-def test_egress_search_beyond_its_limit_of_cells_is_refused() -> None:
-    ring_map = RingMap()
-    ring_map.put("z1", UPPER)
-    planning_map = current(make_tracker(ring_map))
-    blocking = regions(ring_map, "z1").blocking(planning_map)
-    out = find_egress(planning_map, blocking, (10.0, 11.0), CONFIG)
+def test_egress_is_found_however_large_the_blocked_area_is() -> None:
+    # 30 x 30 m at 5 cm: a search of 100 m2, as before, ends inside.
+    geometry = GridGeometry(800, 800, 0.05, 0.0, 0.0)
+    shape = RectangleShape(corner=(2.0, 2.0), opposite=(38.0, 38.0))
+    zone = Zone(id="hall", kind="BLOCKED", shape=shape)
+    window, mask = rasterize_shape(shape, geometry)
+    raw = np.zeros(geometry.shape, np.uint8)
+    raw[window.rows, window.columns][mask] = 254
+    cost = inflate(raw, inflation_table(0.05, DEFAULT_INFLATION))
+    static = np.zeros(geometry.shape, np.uint8)
+    planning_map = PlanningMap(geometry, Version(1, 1, 1), cost, static, static)
+    regions = Regions(DEFAULT_INFLATION).on(planning_map, [zone], 0.0)
+    out = find_egress(planning_map, regions, (18.0, 20.0), CONFIG, Planner(800, 800))
     assert out.route is not None
-    lost = find_egress(planning_map, blocking, (10.0, 11.0), PlannerConfig(max_egress_cells=5))
-    assert lost.refusal
-    assert lost.refusal.code == 205
+    x, y = out.route.corners[-1]
+    column, row = geometry.cell(float(x), float(y))
+    assert cost[row, column] < 253
+    assert x < 2.0
+    assert out.route.length == pytest.approx(16.2, abs=0.3)

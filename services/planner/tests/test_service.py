@@ -5,20 +5,21 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, cast
 
 import pytest
-from ring_map import RingMap, pose
+from ring_map import LEFT, RIGHT, RingMap, goal, pose
 
 from fog_contracts import channels as ch
-from fog_contracts.handlers import Publication, RefusedMessageError
-from fog_contracts.messages import RobotGoal
+from fog_contracts.handlers import Moment, Publication, RefusedMessageError
+from fog_contracts.messages import RobotGoal, RobotPath
 from fog_runtime.clock import ManualClock
 from fog_runtime.health import Health
 from planner.core import PlannerCore
+from planner.cycle import MOST_SEARCHING_S, CycleResult
 from planner.service import Service
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
-    from fog_contracts.handlers import Handler, Ids, Moment
+    from fog_contracts.handlers import Handler, Ids
 
 
 class Session:
@@ -62,6 +63,11 @@ class Rig:
         self.core, self.clock, self.session = core, ManualClock(10.0), Session()
         self.service = Service(self.core, cast("Any", None), cast("Any", self.session), self.clock, Health())
         self.service.subscribe()
+        self.published: list[Publication] = []
+
+    def cycle(self) -> CycleResult:
+        """Run one cycle; return what it leaves to do."""
+        return self.service._cycle.run(self.service._edges.now, self.published.extend)
 
 
 @pytest.fixture
@@ -80,12 +86,12 @@ def test_messages_keep_their_time_of_arrival_until_the_core_handles_them(rig: Ri
     rig.session.subscribed[ch.ROBOT_POSE]({"robot": "r1"}, pose(1.0, 7.0))
     assert rig.core.handled == []
     rig.clock.advance(8.0)
-    rig.service._run_cycle()
+    rig.cycle()
     assert [(channel.name, at.now) for channel, at in rig.core.handled] == [
         (ch.MAP_HEARTBEAT.name, 10.0),
         (ch.ROBOT_POSE.name, 11.0),
     ]
-    rig.service._run_cycle()
+    rig.cycle()
     assert len(rig.core.handled) == 2
 
 
@@ -113,15 +119,18 @@ class ReplyingCore(PlannerCore):
 def test_publications_of_handlers_are_published_by_their_cycle() -> None:
     rig = Rig(ReplyingCore(epoch=1))
     rig.session.subscribed[ch.ROBOT_POSE]({"robot": "r1"}, pose(1.0, 7.0))
-    assert [(p.channel.name, p.ids) for p in rig.service._run_cycle().publications] == [("robot_goal", {"robot": "r1"})]
-    assert rig.service._run_cycle().publications == []
+    rig.cycle()
+    assert [(p.channel.name, p.ids) for p in rig.published] == [("robot_goal", {"robot": "r1"})]
+    rig.cycle()
+    assert len(rig.published) == 1
 
 
 def test_message_refused_by_a_handler_is_reported_and_the_cycle_continues() -> None:
     rig = Rig(ReplyingCore(epoch=1))
     for robot in ("r2", "r1"):
         rig.session.subscribed[ch.ROBOT_POSE]({"robot": robot}, pose(1.0, 7.0))
-    assert [p.ids for p in rig.service._run_cycle().publications] == [{"robot": "r1"}]
+    rig.cycle()
+    assert [p.ids for p in rig.published] == [{"robot": "r1"}]
     assert rig.session.refused == [(ch.ROBOT_POSE, "fog/*/robots/r2/pose", "unknown robot")]
 
 
@@ -138,7 +147,8 @@ class BrokenCore(PlannerCore):
 def test_handler_that_fails_is_logged_and_the_cycle_continues(caplog: pytest.LogCaptureFixture) -> None:
     rig = Rig(BrokenCore(epoch=1))
     rig.session.subscribed[ch.ROBOT_POSE]({"robot": "r1"}, pose(1.0, 7.0))
-    assert rig.service._run_cycle().publications == []
+    rig.cycle()
+    assert rig.published == []
     assert "handler_failed" in caplog.messages
 
 
@@ -155,5 +165,52 @@ def test_messages_that_arrive_during_a_cycle_wait_for_the_next() -> None:
     core = FloodedCore()
     rig = Rig(core)
     rig.session.subscribed[ch.ROBOT_POSE]({"robot": "r1"}, pose(1.0, 7.0))
-    rig.service._run_cycle()
+    rig.cycle()
     assert len(core.handled) == 1
+
+
+class SlowCore(PlannerCore):
+    """Whose searches take 30 ms by the rig's clock; records the robots in the order of their searches."""
+
+    def __init__(self, clock: list[ManualClock]) -> None:
+        super().__init__(epoch=1)
+        self.searched: list[str] = []
+        self._clock = clock
+
+    def plan(self, at: Moment) -> Iterator[str]:
+        for robot in super().plan(at):
+            self._clock[0].advance(0.03)
+            self.searched.append(robot)
+            yield robot
+
+
+def test_paths_are_published_one_by_one_and_a_long_cycle_leaves_the_rest_for_the_next() -> None:
+    clock: list[ManualClock] = []
+    core = SlowCore(clock)
+    rig = Rig(core)
+    clock.append(rig.clock)
+    ring_map = RingMap()
+    core.load(ring_map.master.snapshot(), 10.0)
+    core.handlers()[ch.MAP_HEARTBEAT]({}, ring_map.master.heartbeat(0.0), Moment(10.0, 10.0))
+    robots = [f"r{number}" for number in range(5)]
+    for robot in robots:
+        core.handlers()[ch.ROBOT_POSE]({"robot": robot}, pose(*LEFT), Moment(10.0, 10.0))
+        core.set_goal(robot, goal(*RIGHT, robot))
+    with_path: list[list[str]] = []
+    searched: list[int] = []
+
+    def emit(publications: Sequence[Publication]) -> None:
+        with_path.append([p.ids["robot"] for p in publications if isinstance(p.message, RobotPath)])
+        searched.append(len(core.searched))
+
+    result = rig.service._cycle.run(rig.service._edges.now, emit)
+    assert result.unfinished
+    assert MOST_SEARCHING_S < 0.06
+    # Each path was published before the next search began.
+    assert [(robots_, count) for robots_, count in zip(with_path, searched, strict=True) if robots_] == [
+        (["r0"], 1),
+        (["r1"], 2),
+    ]
+    assert rig.service._cycle.run(rig.service._edges.now, emit).unfinished
+    assert not rig.service._cycle.run(rig.service._edges.now, emit).unfinished
+    assert core.searched == robots

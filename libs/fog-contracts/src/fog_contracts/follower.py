@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from fog_contracts.messages import MapDelta, MapHeartbeat, MapSnapshot
-from fog_contracts.replica import Applied, MapError, Replica, Version
+from fog_contracts.replica import Applied, DecodedMap, MapError, Replica, Version
 
 GRACE_S: Final = 0.5
 """How long an announced delta may be in transit before it is considered lost (5 heartbeats)."""
@@ -65,17 +65,18 @@ class MapFollower:
                 self._replica.invalidate()
         self._update_freshness(now, confirmed=announced == self._newest)
 
-    def on_snapshot(self, snapshot: MapSnapshot, now: float) -> Applied:
-        """Load a snapshot and apply the deltas held since it was requested; return all that changed.
+    def on_snapshot(self, snapshot: MapSnapshot | DecodedMap, now: float) -> Applied:
+        """Load a snapshot, decoded or not, and apply the deltas held since it was requested; return all that changed.
 
         It does not make the copy fresh, because it may come from a disk: the next heartbeat does. Raises `MapError` and
         changes nothing when it is damaged, older than the copy, or from a writer that was replaced.
         """
-        self._check_not_outdated(snapshot)
+        announced = snapshot.version if isinstance(snapshot, DecodedMap) else _version_of(snapshot)
+        self._check_not_outdated(announced)
         loaded = self._replica.load(snapshot)
         if self._newest is None or _order(loaded.version) > _order(self._newest):
             self._newest, self._contradicted_since = loaded.version, None
-        self._held = {key: delta for key, delta in self._held.items() if delta.epoch == snapshot.epoch}
+        self._held = {key: delta for key, delta in self._held.items() if delta.epoch == announced.epoch}
         applied = _merged([loaded, *self._apply_held()])
         assert applied is not None
         self._update_freshness(now, confirmed=False)
@@ -147,7 +148,7 @@ class MapFollower:
             self._held = {key: delta for key, delta in self._held.items() if key[:2] > applied_up_to}
         return changes
 
-    def _check_not_outdated(self, snapshot: MapSnapshot) -> None:
+    def _check_not_outdated(self, snapshot: Version) -> None:
         version, newest = self._replica.version, self._newest
         if newest is None:
             return
@@ -166,6 +167,10 @@ class MapFollower:
                 self._confirmed_at = max(self._confirmed_at, now)
         elif self._behind_since is None:
             self._behind_since = now
+
+
+def _version_of(snapshot: MapSnapshot) -> Version:
+    return Version(snapshot.epoch, snapshot.seq, snapshot.hash)
 
 
 def _order(version: Version) -> tuple[int, int]:

@@ -348,7 +348,10 @@ class PlanRequest(Message, frozen=True, kw_only=True):
 
 
 class PlanReply(Message, frozen=True, kw_only=True):
-    """A path (points at least 5 cm apart, frame `map`) with its length in metres, or the refusal."""
+    """A path (points at least 5 cm apart, frame `map`) with its length in metres, or the refusal.
+
+    `retry_after`: the planner was too busy to look for a path; ask again after so many seconds.
+    """
 
     points: Points = []
     length: Annotated[float, Meta(ge=0.0, le=1e6, extra={"unit": "m"})] = 0.0
@@ -356,6 +359,7 @@ class PlanReply(Message, frozen=True, kw_only=True):
     map_epoch: Count = 0
     map_seq: Count = 0
     refusal: Refusal | None = None
+    retry_after: Annotated[float, Meta(ge=0.0, le=3600.0, extra={"unit": "s"})] | None = None
 
 
 class RobotGoal(Message, frozen=True, kw_only=True):

@@ -7,7 +7,9 @@ search is exact for this integer problem, and no float rounding can make it depe
 
 Methods: A* (Hart, Nilsson and Raphael 1968) on a circular bucket queue (Dial 1969). A bucket spans several costs, so a
 cell is expanded again when a cheaper path to it appears; the search ends only when no open cell can lead to a cheaper
-path. Shortcuts integrate the cost along lines of sight cell by cell (Amanatides and Woo 1987).
+path. An entry is never put into a bucket below the current one (pathmax, Mero 1984), nor beyond the last: the search is
+exact for every heuristic that never overestimates, also for the rounded one of a goal field. Shortcuts integrate the
+cost along lines of sight cell by cell (Amanatides and Woo 1987).
 """
 
 # Kernels take arrays and scalars, typed by their compiled signatures, and are single functions where a call per cell
@@ -18,10 +20,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numba import float64, int64, njit, types
+from numba import float64, int64, njit, types, void
 
 from fog_contracts.costs import COST_WEIGHT, INSCRIBED, NEUTRAL_WEIGHT, PENALTY_MAX
 from fog_kernels import _arrays
@@ -43,8 +45,13 @@ type_cells = _arrays.I32_FLAT
 type_scratch = _arrays.I32_OUT
 
 
+_UNREACHABLE = 65535
+"""In a goal field: no path leads from the block to the goal."""
+
+_U16_FLAT = types.Array(types.uint16, 1, "C", readonly=True)
+
+
 def _search_signature(costs: Any) -> Any:
-    read = types.Array(costs, 1, "C", readonly=True)
     write = types.Array(costs, 1, "C")
     return types.void(
         _arrays.U8_FLAT,  # costmap
@@ -52,7 +59,10 @@ def _search_signature(costs: Any) -> Any:
         _arrays.I32_FLAT,  # weight
         int64,  # start
         int64,  # goal
-        read,  # field
+        _U16_FLAT,  # field
+        int64,  # field_width
+        int64,  # field_bits
+        int64,  # field_unit
         write,  # g
         type_scratch,  # queue_cell
         type_scratch,  # queue_next
@@ -72,6 +82,9 @@ def _search(
     start: int,
     goal: int,
     field: Any,
+    field_width: int,
+    field_bits: int,
+    field_unit: int,
     g: Any,
     queue_cell: Any,
     queue_next: Any,
@@ -81,7 +94,7 @@ def _search(
     max_expansions: int,
     result: Any,
 ) -> None:
-    """Search from start to goal; an empty field means the octile heuristic.
+    """Search from start to goal; an empty field (see `GoalField`) means the octile heuristic.
 
     `g` holds its largest value everywhere before and after. A negative g is the complement of an expanded cell's
     cost. `result` receives status, cost, path length, expansions; the path itself ends in queue_cell, goal first.
@@ -111,9 +124,10 @@ def _search(
         result[2] = 1
         return
     if use_field:
-        if field[start] == unset:
+        block = np.int64(field[(start // width >> field_bits) * field_width + (start % width >> field_bits)])
+        if block == _UNREACHABLE:
             return
-        bucket = np.int64(field[start]) >> shift
+        bucket = (block * field_unit) >> shift
     else:
         dx = abs(start % width - goal_x)
         dy = abs(start // width - goal_y)
@@ -163,7 +177,8 @@ def _search(
         x = cell - y * width
         if best != highest:
             if use_field:
-                f = here + field[np.uint64(cell)]
+                block = np.int64(field[np.uint64((y >> field_bits) * field_width + (x >> field_bits))])
+                f = here + block * field_unit
             else:
                 dx = abs(x - goal_x)
                 dy = abs(y - goal_y)
@@ -209,13 +224,16 @@ def _search(
                     status = _OVERFLOW
                     break
                 continue
+            nx = x + columns[k]
+            ny = y + rows[k]
             if use_field:
-                remaining = np.int64(field[np.uint64(neighbour)])
-                if remaining == unset:
-                    continue  # the goal is unreachable from there
+                block = np.int64(field[np.uint64((ny >> field_bits) * field_width + (nx >> field_bits))])
+                if block == _UNREACHABLE:
+                    continue
+                remaining = block * field_unit
             else:
-                dx = abs(x + columns[k] - goal_x)
-                dy = abs(y + rows[k] - goal_y)
+                dx = abs(nx - goal_x)
+                dy = abs(ny - goal_y)
                 remaining = step_straight * max(dx, dy) + step_extra * min(dx, dy)
             f = reached + remaining
             if f >= highest:
@@ -240,7 +258,7 @@ def _search(
             else:
                 status = _QUEUE_FULL
                 break
-            slot = (f >> shift) & mask
+            slot = min(max(f >> shift, bucket), bucket + mask) & mask
             queue_cell[np.uint64(entry)] = neighbour
             queue_next[np.uint64(entry)] = heads[np.uint64(slot)]
             heads[np.uint64(slot)] = entry
@@ -292,11 +310,12 @@ def _search(
 
 
 def _field_signature(costs: Any) -> Any:
-    return types.int64(
+    return types.Tuple((int64, int64))(  # type: ignore[no-untyped-call]  # numba has no types
         _arrays.U8_FLAT,
         int64,
         _arrays.I32_FLAT,
         int64,
+        _arrays.U8_FLAT,
         types.Array(costs, 1, "C"),
         type_scratch,
         type_scratch,
@@ -311,23 +330,26 @@ def _fill_field(
     width: int,
     weight: Any,
     goal: int,
+    exits: Any,
     field: Any,
     queue_cell: Any,
     queue_next: Any,
     heads: Any,
     shift: int,
-) -> int:
+) -> tuple[int, int]:
     """Write the exact cost from every cell to the goal; cells without a path keep the largest value.
 
-    A bucket is no wider than the cheapest edge, so the costs in the lowest bucket are final (Dinitz's caliber).
+    With a costmap `exits` (else it is empty) the search ends at the cell that is nearest among those traversable
+    there. Return a status and that cell. A bucket is no wider than the cheapest edge, so the costs in the lowest
+    bucket are final (Dinitz's caliber).
     """
-    unset = field[goal]
+    exit_cell: Any = np.int64(-1)
     highest = np.int64(2147483646) if field.itemsize == 4 else np.int64(1) << 61
     height = costmap.size // width
     mask = heads.size - 1
     capacity = queue_cell.size
     if weight[costmap[goal]] == 0:
-        return _NOT_FOUND
+        return _NOT_FOUND, exit_cell
     offsets = np.empty(8, np.int64)
     lengths = np.empty(8, np.int64)
     for k, (cx, cy) in enumerate(((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1))):
@@ -348,6 +370,8 @@ def _fill_field(
         while entry == -1:
             bucket += 1
             entry = np.int64(heads[np.uint64(bucket & mask)])
+        if exit_cell >= 0 and bucket > np.int64(field[np.uint64(exit_cell)]) >> shift:
+            return _FOUND, exit_cell
         cell: Any = np.int64(queue_cell[np.uint64(entry)])
         heads[np.uint64(bucket & mask)] = queue_next[np.uint64(entry)]
         queue_next[np.uint64(entry)] = free
@@ -356,6 +380,10 @@ def _fill_field(
         here = np.int64(field[np.uint64(cell)])
         if here >> shift != bucket:
             continue  # a stale entry: the cell was expanded from a lower bucket
+        if exits.size > 0 and exits[np.uint64(cell)] < INSCRIBED:
+            if exit_cell < 0 or here < np.int64(field[np.uint64(exit_cell)]):
+                exit_cell = cell
+            continue
         y = np.int64(np.uint32(cell) // np.uint32(width))
         x = cell - y * width
         own = np.int64(weight[costmap[np.uint64(cell)]])
@@ -378,7 +406,7 @@ def _fill_field(
             neighbour = cell + offsets[k]
             reached = here + lengths[k] * (own + other)
             if reached >= highest:
-                return _OVERFLOW
+                return _OVERFLOW, exit_cell
             if reached >= field[np.uint64(neighbour)]:
                 continue
             field[np.uint64(neighbour)] = reached
@@ -389,53 +417,60 @@ def _fill_field(
                 entry = used
                 used += 1
             else:
-                return _QUEUE_FULL
+                return _QUEUE_FULL, exit_cell
             slot = (reached >> shift) & mask
             queue_cell[np.uint64(entry)] = neighbour
             queue_next[np.uint64(entry)] = heads[np.uint64(slot)]
             heads[np.uint64(slot)] = entry
             queued += 1
-    # Cells that are still `unset` have no path to the goal.
-    return _FOUND if unset != 0 else _NOT_FOUND
+    if exits.size > 0 and exit_cell < 0:
+        return _NOT_FOUND, exit_cell
+    return _FOUND, exit_cell
 
 
-@njit(int64(_arrays.U8_FLAT, int64, int64, int64, int64, _arrays.U8_GRID_OUT, type_scratch), cache=True, nogil=True)
-def _nearest_reachable(costmap: Any, width: int, start: int, goal_x: int, goal_y: int, seen: Any, stack: Any) -> Any:
-    # A diagonal needs both orthogonal cells, so 4-connectivity determines what is reachable.
+def _compact_signature(costs: Any) -> Any:
+    return void(types.Array(costs, 1, "C", readonly=True), int64, int64, types.Array(types.uint16, 1, "C"))
+
+
+@njit([_compact_signature(types.int32), _compact_signature(types.int64)], cache=True, nogil=True)
+def _compact(field: Any, unset: int, unit: int, out: Any) -> None:
+    """Write the field in multiples of `unit`, rounded down."""
+    for cell in range(field.size):
+        cost = np.int64(field[cell])
+        out[cell] = _UNREACHABLE if cost == unset else cost // unit
+
+
+def _descend_signature(costs: Any) -> Any:
+    field = types.Array(costs, 1, "C", readonly=True)
+    return int64(_arrays.U8_FLAT, int64, _arrays.I32_FLAT, int64, field, type_scratch)
+
+
+@njit([_descend_signature(types.int32), _descend_signature(types.int64)], cache=True, nogil=True)
+def _descend(costmap: Any, width: int, weight: Any, cell: int, field: Any, path: Any) -> int:
+    """Write the cells from `cell` to where the field is 0; return their number."""
     height = costmap.size // width
-    nearest: Any = start
-    least: Any = (start % width - goal_x) ** 2 + (start // width - goal_y) ** 2
-    if costmap[start] >= INSCRIBED:
-        return start
-    stack[0] = start
-    seen[start // width, start % width] = 1
-    count = 1
-    while count > 0 and least > 0:
-        count -= 1
-        cell = np.int64(stack[count])
+    count = 0
+    while True:
+        path[count] = cell
+        count += 1
+        here = np.int64(field[cell])
+        if here == 0:
+            return count
         y = cell // width
         x = cell - y * width
-        square = (x - goal_x) ** 2 + (y - goal_y) ** 2
-        if square < least or (square == least and cell < nearest):
-            least = square
-            nearest = cell
-        if x > 0 and seen[y, x - 1] == 0 and costmap[cell - 1] < INSCRIBED:
-            seen[y, x - 1] = 1
-            stack[count] = cell - 1
-            count += 1
-        if x + 1 < width and seen[y, x + 1] == 0 and costmap[cell + 1] < INSCRIBED:
-            seen[y, x + 1] = 1
-            stack[count] = cell + 1
-            count += 1
-        if y > 0 and seen[y - 1, x] == 0 and costmap[cell - width] < INSCRIBED:
-            seen[y - 1, x] = 1
-            stack[count] = cell - width
-            count += 1
-        if y + 1 < height and seen[y + 1, x] == 0 and costmap[cell + width] < INSCRIBED:
-            seen[y + 1, x] = 1
-            stack[count] = cell + width
-            count += 1
-    return nearest
+        for k in range(9):
+            dx = k % 3 - 1
+            dy = k // 3 - 1
+            if (dx == 0 and dy == 0) or not (0 <= x + dx < width and 0 <= y + dy < height):
+                continue
+            if weight[costmap[y * width + x + dx]] == 0 or weight[costmap[(y + dy) * width + x]] == 0:
+                continue
+            neighbour = (y + dy) * width + x + dx
+            weights = np.int64(weight[costmap[cell]]) + np.int64(weight[costmap[neighbour]])
+            length = DIAGONAL if dx != 0 and dy != 0 else STRAIGHT
+            if weight[costmap[neighbour]] > 0 and np.int64(field[neighbour]) + length * weights == here:
+                cell = neighbour
+                break
 
 
 @njit(int64(_arrays.U8_GRID, int64, int64, int64), cache=True, nogil=True)
@@ -611,6 +646,10 @@ def _weights(neutral: int, factor: float) -> NDArray[np.int32]:
 _DEFAULT_WEIGHTS = _weights(NEUTRAL_WEIGHT, COST_WEIGHT)
 
 
+_NO_FIELD: NDArray[np.uint16] = np.empty(0, np.uint16)
+_NO_EXITS: NDArray[np.uint8] = np.empty(0, np.uint8)
+
+
 def _weights_of(neutral: int, factor: float) -> NDArray[np.int32]:
     if neutral == NEUTRAL_WEIGHT and factor == COST_WEIGHT:
         return _DEFAULT_WEIGHTS
@@ -640,26 +679,44 @@ class PlanResult:
     timed_out: bool = False
 
 
-class _GoalField(NamedTuple):
-    """A goal and the exact cost from every cell to it."""
+@dataclass(frozen=True, slots=True)
+class GoalField:
+    """A lower bound of the cost to one goal, for every block of 2^bits x 2^bits cells.
+
+    `costs` is uint16 (rows, columns): the lowest cost in a block in multiples of `unit`, rounded down; 65535 where no
+    path leads to the goal. It guides `Planner.plan` on costmaps of `width` x `height` cells none of which is lower than
+    in the costmap that it was computed on. 2000 x 1200 cells take 4.8 MB, and a quarter of that with each further bit.
+    """
 
     goal: tuple[int, int]
-    field: NDArray[np.int32 | np.int64]
+    width: int
+    height: int
+    bits: int
+    costs: NDArray[np.uint16]
+    unit: int
 
+    @property
+    def size(self) -> int:
+        """The memory (bytes) of the costs."""
+        return self.costs.nbytes
 
-def _as_wide(field: NDArray[np.int32 | np.int64]) -> NDArray[np.int64]:
-    wide = field.astype(np.int64)
-    if field.dtype == np.int32:
-        wide[wide == np.iinfo(np.int32).max] = np.iinfo(np.int64).max
-    return wide
+    def coarser(self) -> GoalField:
+        """Return the field with blocks of twice the side: searches stay exact and expand more cells."""
+        rows, columns = self.costs.shape
+        padded = np.full((rows + rows % 2, columns + columns % 2), _UNREACHABLE, np.uint16)
+        padded[:rows, :columns] = self.costs
+        costs = np.minimum(
+            np.minimum(padded[::2, ::2], padded[1::2, ::2]), np.minimum(padded[::2, 1::2], padded[1::2, 1::2])
+        )
+        return GoalField(self.goal, self.width, self.height, self.bits + 1, costs, self.unit)
 
 
 class Planner:
     """Exact A* on costmaps of one size; owns the memory of its searches, so that planning allocates little.
 
-    One thread may call `plan` at a time; `set_goal_field` uses memory of its own and may run in another thread.
-    `neutral` is the weight of a free cell, `factor` multiplies the cost (0..252) that is added to it: with the defaults
-    a path through cells of the highest cost weighs about as much as a detour five times as long over free cells.
+    One thread may use it at a time. `neutral` is the weight of a free cell, `factor` multiplies the cost (0..252) that
+    is added to it: with the defaults a path through cells of the highest cost weighs about as much as a detour five
+    times as long over free cells.
     """
 
     def __init__(self, width: int, height: int, neutral: int = NEUTRAL_WEIGHT, factor: float = COST_WEIGHT) -> None:
@@ -671,7 +728,7 @@ class Planner:
         self.factor = factor
         self._weight = _weights_of(neutral, factor)
         highest_edge_cost = 2 * DIAGONAL * int(self._weight.max())
-        # The total estimate rises by at most twice the highest edge cost per step, which bounds the open buckets.
+        # With a consistent heuristic the total estimate rises by at most twice the highest edge cost per step.
         self._shift = max(0, (2 * highest_edge_cost // (BUCKETS - 2)).bit_length())
         self._field_shift = (2 * STRAIGHT * int(self._weight[0])).bit_length() - 1
         open_buckets = (highest_edge_cost >> self._field_shift) + 3
@@ -682,14 +739,12 @@ class Planner:
         self._heads = np.empty(BUCKETS, np.int32)
         self._reached_cells = np.empty(width * height, np.int32)
         self._result = np.zeros(4, np.int64)
-        self._goal_field: _GoalField | None = None
 
     def _allocate(self) -> None:
         # np.empty only reserves memory; pages that no search uses cost none. g must be initialized.
         self._g: NDArray[np.int32 | np.int64] = np.full(
             self.width * self.height, np.iinfo(self._costs).max, self._costs
         )
-        self._no_field: NDArray[np.int32 | np.int64] = np.empty(0, self._costs)
         self._queue_cell = np.empty(self._capacity, np.int32)
         self._queue_next = np.empty(self._capacity, np.int32)
 
@@ -711,31 +766,37 @@ class Planner:
         start: tuple[int, int],
         goal: tuple[int, int],
         max_expansions: int = 0,
+        field: GoalField | None = None,
     ) -> PlanResult:
         """Return a cheapest path from start to goal, both (column, row), on a uint8 (h, w) costmap.
 
-        A goal field that is set for this goal guides the search, which stays exact as long as no cell of the costmap is
-        lower than in the field's static costmap. `max_expansions` above 0 limits the work. A start or goal that isn't
-        traversable gives `found=False`. Raises ValueError for cells outside and for a costmap of another shape.
+        The goal's field, if given, guides the search, which stays exact as long as no cell of the costmap is lower than
+        in the costmap of the field. `max_expansions` above 0 limits the work. A start or goal that isn't traversable
+        gives `found=False`. Raises ValueError for cells outside, for a costmap of another shape, and for a field of
+        another goal or shape.
         """
         costmap = self._grid(costmap)
         first = self._index(start, "start")
         last = self._index(goal, "goal")
+        if field is None:
+            guide, columns, bits, unit = _NO_FIELD, 0, 0, 0
+        elif field.goal == (int(goal[0]), int(goal[1])) and (field.width, field.height) == (self.width, self.height):
+            guide, columns = field.costs.ravel(), field.costs.shape[1]
+            bits, unit = field.bits, field.unit
+        else:
+            size = f"{field.width} x {field.height}"
+            raise ValueError(f"the field is of goal {field.goal} on {size} cells: pass that of this goal and map")
         while True:
-            goal_field = self._goal_field  # read once: another thread may replace it
-            field = self._no_field
-            if goal_field is not None and goal_field.goal == (int(goal[0]), int(goal[1])):
-                if goal_field.field.dtype != self._g.dtype:
-                    self._widen()
-                    continue
-                field = goal_field.field
             _search(
                 costmap.ravel(),
                 self.width,
                 self._weight,
                 first,
                 last,
-                field,
+                guide,
+                columns,
+                bits,
+                unit,
                 self._g,
                 self._queue_cell,
                 self._queue_next,
@@ -771,60 +832,62 @@ class Planner:
         """Switch to 64-bit costs permanently: a path's cost exceeds 32 bits."""
         self._costs = np.int64
         self._allocate()
-        goal_field = self._goal_field
-        if goal_field is not None:
-            self._goal_field = _GoalField(goal_field.goal, _as_wide(goal_field.field))
 
-    def set_goal_field(self, static_costmap: NDArray[np.uint8], goal: tuple[int, int]) -> None:
-        """Compute the exact cost to the goal from every cell, which from now on guides `plan` for this goal.
+    def goal_field(self, costmap: NDArray[np.uint8], goal: tuple[int, int]) -> GoalField:
+        """Return the field of a goal (column, row), which guides `plan` on this costmap and on any with raised costs.
 
-        Guided plans are exact as long as costs are only raised above the static costmap. Takes as long as a Dijkstra
-        search of the whole map; it may run in a thread beside `plan`, and the static costmap is copied first. Raises
-        ValueError as `plan` does.
+        Takes as long as a Dijkstra search of the whole map. Raises ValueError as `plan` does.
         """
-        static = self._grid(static_costmap).copy()
-        target = self._index(goal, "goal")
-        capacity = self.width * self.height
-        costs = self._costs
+        costmap = self._grid(costmap)
+        self._fill(costmap, self._index(goal, "goal"), _NO_EXITS)
+        unset = np.iinfo(self._costs).max
+        highest = int(self._g.max(where=self._g != unset, initial=0))
+        unit = highest // (_UNREACHABLE - 1) + 1
+        costs = np.empty((self.height, self.width), np.uint16)
+        _compact(self._g, unset, unit, costs.ravel())
+        self._g.fill(unset)
+        return GoalField((int(goal[0]), int(goal[1])), self.width, self.height, 0, costs, unit)
+
+    def exit_path(
+        self, costmap: NDArray[np.uint8], exits: NDArray[np.uint8], start: tuple[int, int]
+    ) -> NDArray[np.int32] | None:
+        """Return a cheapest path over `costmap` from start (column, row) to a cell that is traversable on `exits`.
+
+        Both are uint8 (h, w); the path is int32 (n, 2) as (column, row), None without one. Raises ValueError as `plan`
+        does.
+        """
+        costmap, exits = self._grid(costmap), self._grid(exits)
+        status, cell = self._fill(costmap, self._index(start, "start"), exits.ravel())
+        cells = None
+        if status == _FOUND:
+            count = int(_descend(costmap.ravel(), self.width, self._weight, cell, self._g, self._queue_cell))
+            flat = self._queue_cell[:count][::-1]
+            cells = np.stack((flat % self.width, flat // self.width), axis=1).astype(np.int32)
+        self._g.fill(np.iinfo(self._costs).max)
+        return cells
+
+    def _fill(self, costmap: NDArray[np.uint8], target: int, exits: NDArray[np.uint8]) -> tuple[int, int]:
+        """Write the costs to a cell into `g`, which the caller resets; return the kernel's status and exit."""
         while True:
-            field: NDArray[np.int32 | np.int64] = np.full(self.width * self.height, np.iinfo(costs).max, costs)
-            status = _fill_field(
-                static.ravel(),
+            status, cell = _fill_field(
+                costmap.ravel(),
                 self.width,
                 self._weight,
                 target,
-                field,
-                np.empty(capacity, np.int32),
-                np.empty(capacity, np.int32),
+                exits,
+                self._g,
+                self._queue_cell,
+                self._queue_next,
                 np.empty(self._field_buckets, np.int32),
                 self._field_shift,
             )
             if status == _OVERFLOW:
-                costs = np.int64
+                self._widen()
             elif status == _QUEUE_FULL:
-                capacity *= 2
+                self._capacity *= 2
+                self._allocate()
             else:
-                break
-        self._goal_field = _GoalField((int(goal[0]), int(goal[1])), field)
-
-    def nearest_reachable(
-        self, costmap: NDArray[np.uint8], start: tuple[int, int], goal: tuple[int, int]
-    ) -> tuple[int, int]:
-        """Return the (column, row) nearest to the goal (Euclid) that can be reached from start.
-
-        Among equals the lowest row, then column, wins. A start that isn't traversable is returned itself; the goal may
-        lie anywhere on the grid. Raises ValueError as `plan` does.
-        """
-        costmap = self._grid(costmap)
-        first = self._index(start, "start")
-        self._index(goal, "goal")
-        seen = np.zeros((self.height, self.width), np.uint8)
-        nearest = int(
-            _nearest_reachable(
-                costmap.ravel(), self.width, first, int(goal[0]), int(goal[1]), seen, self._reached_cells
-            )
-        )
-        return nearest % self.width, nearest // self.width
+                return int(status), int(cell)
 
     def shortcut(self, costmap: NDArray[np.uint8], cells: NDArray[np.int32]) -> NDArray[np.float64]:
         """Return `shortcut` with this planner's weights."""

@@ -1,6 +1,6 @@
 """REST under /api/v1: robots with their missions, and plans on request. Reading needs no token, writing needs one."""
 
-from fastapi import FastAPI
+from fastapi import FastAPI, Request
 
 from fog_contracts.messages import (
     Id,
@@ -31,6 +31,7 @@ from fog_runtime.http import (
     make_app,
 )
 from fog_runtime.idempotency import IdempotencyError
+from planner.query_queue import BusyError
 from planner.service import Service
 from planner.store import StoredGoal, StoreError
 
@@ -227,7 +228,13 @@ def _add_orders(routes: Routes, service: Service, robots: _Robots, site: Site) -
 
 
 def _add_plan(routes: Routes, service: Service) -> None:
-    @routes.post("/api/v1/plan")
-    async def preview(body: Body[PlanRequest]) -> PlanReply:
+    routes.raises(
+        BusyError,
+        {503: "Too many plans are waiting, or of this client; try again after `Retry-After`"},
+        lambda error: ProblemError(503, str(error), headers={"Retry-After": f"{error.retry_after:.0f}"}),
+    )
+
+    @routes.post("/api/v1/plan", raises=[BusyError])
+    async def preview(request: Request, body: Body[PlanRequest]) -> PlanReply:
         """Plan a path without side effects; the reply may be a refusal."""
-        return await service.preview(body)
+        return await service.preview(body, request.client.host if request.client else "")

@@ -1,53 +1,75 @@
-"""The hazards and zones behind the costmap's cells, as regions, so that refusals can name them."""
+"""The newest hazards and zones, the reasons behind the costmap's lethal cells."""
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 from fog_contracts import channels as ch
-from planner.regions import Region, hazard_region, zone_region
+from fog_contracts.geometry import contains_point
+from fog_contracts.messages import HazardArea
+from fog_contracts.shapes import shape_contains
+from planner.regions import closes_floor
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from fog_contracts.grid import GridGeometry
     from fog_contracts.handlers import Handler, Ids, Moment, Publication
-    from fog_contracts.messages import HazardArea, ZoneSet
-    from planner.planning_map import PlanningMap
+    from fog_contracts.messages import ZoneSet
+    from planner.regions import Source
 
 
 class BlockedRegions:
-    """All published hazards and zones; `inflation_radius` (m) is how far their costs reach."""
+    """All published hazards and zones; nothing is rasterized here, because that takes long for many zones."""
 
-    def __init__(self, inflation_radius: float) -> None:
-        self._inflation_radius = inflation_radius
+    def __init__(self) -> None:
         self._hazards: dict[str, HazardArea] = {}
         self._zones: ZoneSet | None = None
-        self._regions: tuple[GridGeometry, list[Region]] | None = None
+        self._sources: tuple[Source, ...] | None = None
+        self.revision = 0
+        """Grows with every change."""
 
     def handlers(self) -> Mapping[ch.Channel, Handler]:
         """Return the handlers of hazards and zones."""
         return {ch.HAZARD: self._on_hazard, ch.ZONES: self._on_zones}
 
-    def blocking(self, planning_map: PlanningMap) -> list[Region]:
-        """Return the regions that have lethal cells on the map."""
-        geometry = planning_map.geometry
-        if self._regions is None or self._regions[0] != geometry:
-            self._regions = (geometry, self._rasterized(geometry))
-        return [region for region in self._regions[1] if region.blocks(planning_map.cost)]
-
-    def _rasterized(self, geometry: GridGeometry) -> list[Region]:
-        reach = self._inflation_radius + 2 * geometry.resolution
-        hazards = (hazard_region(hazard, geometry, reach) for _, hazard in sorted(self._hazards.items()))
-        zones = (zone_region(zone, geometry, reach) for zone in (self._zones.zones if self._zones else []))
-        return [region for region in (*hazards, *zones) if region is not None]
+    @property
+    def sources(self) -> tuple[Source, ...]:
+        """The hazards and zones that, by what they say of themselves, make cells lethal; the same until one changes."""
+        if self._sources is None:
+            zones = self._zones.zones if self._zones else []
+            hazards = [self._hazards[area] for area in sorted(self._hazards)]
+            known: list[Source] = [*hazards, *zones]
+            self._sources = tuple(source for source in known if closes_floor(source))
+        return self._sources
 
     def _on_hazard(self, _ids: Ids, hazard: HazardArea, _at: Moment) -> Sequence[Publication]:
-        self._hazards[hazard.hazard.area] = hazard
-        self._regions = None
+        if self._hazards.get(hazard.hazard.area) != hazard:
+            self._hazards[hazard.hazard.area] = hazard
+            self._change()
         return ()
 
     def _on_zones(self, _ids: Ids, zones: ZoneSet, _at: Moment) -> Sequence[Publication]:
-        self._zones = zones
-        self._regions = None
+        if self._zones is None or self._zones.zones != zones.zones:
+            # Zones that did not change stay the same objects, so that they are not rasterized again.
+            known = {zone.id: zone for zone in self._zones.zones} if self._zones else {}
+            kept = [known[zone.id] if known.get(zone.id) == zone else zone for zone in zones.zones]
+            self._zones = type(zones)(epoch=zones.epoch, seq=zones.seq, zones=kept)
+            self._change()
         return ()
+
+    def _change(self) -> None:
+        self._sources = None
+        self.revision += 1
+
+
+def cover(sources: Sequence[Source], x: float, y: float, margin: float) -> bool:
+    """Whether a point (m, frame `map`) lies in one of the hazards or zones, or within about `margin` (m) of it."""
+    offsets = [(0.0, 0.0)] + [(margin * math.cos(a), margin * math.sin(a)) for a in (0.8, 2.4, 3.9, 5.5)]
+    return any(_contains(source, x + dx, y + dy) for source in sources for dx, dy in offsets)
+
+
+def _contains(source: Source, x: float, y: float) -> bool:
+    if isinstance(source, HazardArea):
+        return contains_point(source.polygon, x, y)
+    return shape_contains(source.shape, x, y)

@@ -36,7 +36,17 @@ class PlannerConfig:
     delta_grace_s: float = 0.5
     """How long a heartbeat may be ahead of the deltas before a snapshot is fetched."""
     max_expansions: int = 50_000_000
-    max_goal_fields: int = 8
-    """For how many goals a distance field is kept (20 to 30 MB each on 2000 x 1200 cells)."""
-    max_egress_cells: int = 40_000
-    """How many cells (100 m2 at 5 cm) an egress search expands at most."""
+    quick_expansions: int = 40_000
+    """After so many expanded cells (1 ms) a search first asks whether the goal can be reached at all."""
+    goal_fields_bytes: int = 40_000_000
+    """The memory of all distance fields together."""
+    refused_retry_s: float = 1.0
+    """A refused robot gets a new search at most this often, and only after a cost fell or the robot moved."""
+    explain_period_s: float = 1.0
+    """How often the reason of a refusal is looked for again while the map changes."""
+    switch_dwell_s: float = 2.0
+    """After a robot's path was moved to another way, the time before it is moved again although it is passable.
+
+    It doubles with each switch that follows another within a minute, up to `max_switch_dwell_s`.
+    """
+    max_switch_dwell_s: float = 30.0

@@ -4,48 +4,50 @@ Pure: inputs are values, time is an argument, no I/O and no background work. Thi
 
 - a map delta (`planning_map`) that affects a path, or could shorten it, requests a replan (`path_monitor`);
 - so do a new goal, a pose off the path and a new snapshot of the map (`mission`);
-- `tick` searches a path for every robot that needs one (`path_search`, guided by `goal_fields`), keeps the current path
-  unless the new one is clearly better (`replan_policy`), and publishes goals, paths and refusals (`refusals`).
+- `tick` searches a path for every robot that needs one (`replanner`, guided by `goal_fields`), the most urgent one
+  first (`missions`), keeps the current path unless the new one is clearly better (`replan_policy`), and publishes
+  goals, paths and refusals;
+- what may take long is a job for another thread: distance fields, reasons of refusals, answers to queries (`queries`).
 """
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from fog_contracts import channels as ch
 from fog_contracts.handlers import Publication
-from fog_contracts.messages import PlanReply
-from planner.blocked_regions import BlockedRegions
+from planner.blocked_regions import BlockedRegions, cover
 from planner.config import PlannerConfig
-from planner.egress import find_egress
 from planner.goal_fields import FieldJob, GoalFields
-from planner.mission import Mission, Plan, ReplanReason
-from planner.path_monitor import reason_from_change, reason_from_pose
-from planner.path_search import PathSearch, SearchResult
+from planner.missions import Missions
+from planner.path_monitor import effect_of_change, reason_from_pose
 from planner.planning_map import MapTracker
-from planner.refusals import goal_out_of_reach, no_map
-from planner.replan_policy import is_kept
+from planner.queries import Answerer, ExplainJob, View
+from planner.refusals import goal_out_of_reach
+from planner.replanner import Replanner
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from typing import Any
 
-    from fog_contracts.grid import GridGeometry
     from fog_contracts.handlers import Handler, Ids, Moment, QueryHandler
     from fog_contracts.messages import (
         EgressRequest,
         MapDelta,
         MapHeartbeat,
         MapSnapshot,
-        PlanCode,
+        PlanReply,
         PlanRequest,
-        PointXY,
-        Pose,
         Refusal,
         RobotGoal,
         RobotPose,
         RobotState,
     )
-    from planner.planning_map import Cell, PlanningMap
+    from planner.mission import Mission
+    from planner.planning_map import CostChange, PlanningMap, PreparedMap
+
+    Job = FieldJob | ExplainJob
 
 
 class PlannerCore:
@@ -60,18 +62,15 @@ class PlannerCore:
         self._map = MapTracker(
             self.config.inflation, grace_s=self.config.delta_grace_s, max_age_s=self.config.max_map_age_s
         )
-        self._regions = BlockedRegions(self.config.inflation.inflation_radius)
-        self._fields = GoalFields(self.config.max_goal_fields)
-        self._search: tuple[GridGeometry, PathSearch] | None = None
-        self._missions: dict[str, Mission] = {}
+        self._regions = BlockedRegions()
+        self._fields = GoalFields(self.config.goal_fields_bytes)
+        self.missions = Missions()
+        self.replanner = Replanner(self.config, self._fields)
+        self.answerer = Answerer(self.config)
+        """Used by the thread that runs jobs for "query" and answers queries."""
         self._served: set[str] = set()
         """The robots to which `publish` may release paths."""
-        self._reached: list[tuple[str, str]] = []
-        self._next_id = 1
-        self.plans: dict[ReplanReason, int] = {}
-        """Number of path searches, by reason."""
-        self.refusals: dict[PlanCode, int] = {}
-        """Number of path searches that ended in a refusal, by code."""
+        self._explaining: ExplainJob | None = None
 
     # --- Inputs -----------------------------------------------------------------------------------------------------
 
@@ -92,18 +91,23 @@ class PlannerCore:
             return ()
         self._fields.set_lower_bound(planning_map.lower_bound)
         for change in changes:
-            for mission in self._missions.values():
-                reason = reason_from_change(mission, change, planning_map, self.config)
-                if reason is not None:
-                    mission.request_replan(reason, change.traces)
+            for _, mission in self.missions.active():
+                self._apply_change(mission, change, planning_map)
         return ()
+
+    def _apply_change(self, mission: Mission, change: CostChange, planning_map: PlanningMap) -> None:
+        effect = effect_of_change(mission, change, planning_map, self.config)
+        if effect is not None:
+            mission.request_replan(effect.reason, change.traces, effect.distance)
+        elif mission.plan is not None:
+            self.replanner.count_avoided("no_cost_fell" if mission.plan.route is None else "far_from_path")
 
     def _on_heartbeat(self, _ids: Ids, heartbeat: MapHeartbeat, at: Moment) -> Sequence[Publication]:
         self._map.on_heartbeat(heartbeat, at.now)
         return ()
 
     def _on_pose(self, ids: Ids, pose: RobotPose, at: Moment) -> Sequence[Publication]:
-        mission = self._mission(ids["robot"])
+        mission = self.missions.of(ids["robot"])
         if not pose.localized:
             mission.pose = None
             return ()
@@ -113,11 +117,8 @@ class PlannerCore:
         return ()
 
     def _on_state(self, ids: Ids, state: RobotState, _at: Moment) -> Sequence[Publication]:
-        robot = ids["robot"]
-        goal = self.goal(robot)
-        if goal is not None and state.goal_reached and state.goal_id == goal.goal_id:
-            self.cancel(robot)
-            self._reached.append((robot, goal.goal_id))
+        if state.goal_reached and state.goal_id is not None:
+            self.missions.reach(ids["robot"], state.goal_id)
         return ()
 
     # --- The map ----------------------------------------------------------------------------------------------------
@@ -126,19 +127,18 @@ class PlannerCore:
         """Whether a snapshot is needed: deltas were lost, or there is no map yet."""
         return self._map.wants_snapshot(now)
 
-    def load(self, snapshot: MapSnapshot, now: float) -> None:
-        """Load a snapshot of the map; raises `MapError` and changes nothing when it is damaged or outdated."""
+    def load(self, snapshot: MapSnapshot | PreparedMap, now: float) -> None:
+        """Load a snapshot of the map; raises `MapError` and changes nothing when it is damaged or outdated.
+
+        One that `prepare_map` has prepared on another thread is loaded in 2 ms.
+        """
         loaded = self._map.load(snapshot, now)
         planning_map = self._map.current
         assert planning_map is not None
         self._fields.set_lower_bound(planning_map.lower_bound)
-        for mission in self._missions.values():
-            if mission.target is not None:
-                reason: ReplanReason = "epoch" if loaded.restarted else "map"
-                mission.replan = mission.replan or reason
-                mission.traces += loaded.traces
-
-    # --- Missions ---------------------------------------------------------------------------------------------------
+        for _, mission in self.missions.active():
+            refused = mission.plan is not None and mission.plan.route is None
+            mission.request_replan("epoch" if loaded.restarted else "refused" if refused else "map", loaded.traces)
 
     def check_goal(self, x: float, y: float) -> Refusal | None:
         """Return why a goal (m, frame `map`) can never be reached: off the map, in a wall or unknown space; else None.
@@ -148,133 +148,128 @@ class PlannerCore:
         planning_map = self._map.current
         return None if planning_map is None else goal_out_of_reach(planning_map, (x, y))
 
+    # --- Missions ---------------------------------------------------------------------------------------------------
+
     def set_goal(self, robot: str, goal: RobotGoal, *, any_heading: bool = False) -> None:
         """Give a robot a mission; the same goal again changes nothing. `any_heading`: ignore the goal's theta."""
-        if goal.pose is None:
-            self.cancel(robot)
-        else:
-            self._mission(robot).begin(goal, any_heading=any_heading)
+        self.missions.set_goal(robot, goal, any_heading=any_heading)
 
     def cancel(self, robot: str) -> None:
         """End a robot's mission; the next `tick` publishes that."""
-        self._mission(robot).end()
-
-    def goal(self, robot: str) -> RobotGoal | None:
-        """Return the robot's mission, if it has one."""
-        mission = self._missions.get(robot)
-        return mission.goal if mission and mission.target else None
-
-    def pop_reached(self) -> list[tuple[str, str]]:
-        """Return (robot, goal id) of the goals that were reached since the last call."""
-        reached, self._reached = self._reached, []
-        return reached
-
-    def _mission(self, robot: str) -> Mission:
-        return self._missions.setdefault(robot, Mission())
+        self.missions.of(robot).end()
 
     # --- Planning and publishing -----------------------------------------------------------------------------------
 
     def tick(self, at: Moment) -> Sequence[Publication]:
-        """Run `plan`, then `publish`. Call it ten times a second, and at once after an urgent message."""
-        self.plan(at)
-        return self.publish(at)
+        """Plan and publish. Call it ten times a second, and at once after an urgent message."""
+        found = [publication for robot in self.plan(at) for publication in self.publish_for(robot, at)]
+        return [*found, *self.publish(at)]
 
-    def plan(self, at: Moment) -> None:
-        """Search paths for the robots that need one; goals may be set and cancelled between this and `publish`.
+    def plan(self, at: Moment) -> Iterator[str]:
+        """Search paths for the robots that need one, most urgent first; yield each robot when its search is done.
 
-        While the map or a robot's pose is outdated, nothing is released to the robot: it slows down by itself.
+        Goals may be set and cancelled between two searches. A caller that stops early leaves the others for the next
+        call. While the map or a robot's pose is outdated, nothing is released to the robot: it slows down by itself.
         """
         self._served = set()
         planning_map = self._map.current
         if planning_map is None or not self._map.is_fresh(at.now):
             return
-        for robot, mission in self._missions.items():
-            pose, target = mission.pose, mission.target
-            if target is None or pose is None or at.now - mission.pose_received > self.config.max_pose_age_s:
-                continue
-            if mission.replan is not None or mission.plan is None:
-                self._replan(mission, target, pose, planning_map)
-            self._served.add(robot)
+        self._served = self.missions.located(at.now, self.config)
+        covers = partial(cover, self._regions.sources)
+        for robot, mission, reason in self.missions.to_replan(at.now, self.config):
+            if mission.target is not None and mission.pose is not None:
+                self.replanner.replan(mission, reason, planning_map, covers, at.now)
+                yield robot
 
     def publish(self, at: Moment) -> Sequence[Publication]:
         """Return the goals, paths and refusals that are due; a goal that was set since `plan` has no path yet."""
+        return [publication for robot, _ in self.missions.items() for publication in self.publish_for(robot, at)]
+
+    def publish_for(self, robot: str, at: Moment) -> Sequence[Publication]:
+        """Return the goal, and the path or refusal, of one robot, as far as they are due."""
+        mission, planning_map, ids = self.missions.of(robot), self._map.current, {"robot": robot}
         publications: list[Publication] = []
-        planning_map = self._map.current
-        for robot, mission in self._missions.items():
-            ids = {"robot": robot}
-            if (goal := mission.due_goal(at, self.config)) is not None:
-                publications.append(Publication(ch.ROBOT_GOAL, goal, ids))
-            if planning_map is None or robot not in self._served:
-                continue
-            if (path := mission.due_path(at, self.config, self.epoch, planning_map.version)) is not None:
-                publications.append(Publication(ch.ROBOT_PATH, path, ids))
+        if (goal := mission.due_goal(at, self.config)) is not None:
+            publications.append(Publication(ch.ROBOT_GOAL, goal, ids))
+        if planning_map is None or robot not in self._served or mission.path_is_outdated:
+            return publications
+        if (path := mission.due_path(at, self.config, self.epoch, planning_map.version)) is not None:
+            publications.append(Publication(ch.ROBOT_PATH, path, ids))
         return publications
 
-    def _replan(self, mission: Mission, target: Pose, pose: RobotPose, planning_map: PlanningMap) -> None:
-        reason, traces = mission.replan or "goal", mission.traces
-        mission.replan, mission.traces = None, []
-        mission.publish_path_now()
-        found = self._find(planning_map, (pose.x, pose.y), (target.x, target.y))
-        self.plans[reason] = self.plans.get(reason, 0) + 1
-        if found.refusal is not None:
-            self.refusals[found.refusal.code] = self.refusals.get(found.refusal.code, 0) + 1
-        if mission.plan is not None and is_kept(mission.plan, found, reason, planning_map, self.config):
-            return
-        mission.plan = Plan(self._next_id, found.route, found.refusal, traces, planned_from=(pose.x, pose.y))
-        self._next_id += 1
+    # --- Jobs: run on other threads ---------------------------------------------------------------------------------
 
-    def _find(self, planning_map: PlanningMap, start: PointXY, goal: PointXY) -> SearchResult:
-        if self._search is None or self._search[0] != planning_map.geometry:
-            self._search = planning_map.geometry, PathSearch(self.config, planning_map.geometry, self._fields)
-        return self._search[1].find(planning_map, self._regions.blocking(planning_map), start, goal)
-
-    # --- Distance fields: computed on other threads -----------------------------------------------------------------
-
-    def field_jobs(self) -> list[FieldJob]:
-        """Return the distance fields to compute, each once: run them on any thread, then pass them to `add_field`."""
+    def jobs(self, at: Moment) -> list[Job]:
+        """Return new background work, each piece once: run it on any thread, one for each `thread`, then `add` it."""
         planning_map = self._map.current
-        return [] if planning_map is None else self._fields.jobs(self._goal_cells(planning_map.geometry))
+        if planning_map is None:
+            return []
+        jobs: list[Job] = [*self._fields.jobs(self.missions.goal_cells(planning_map.geometry))]
+        if self._explaining is None and (explain := self._explain_job(at, planning_map)) is not None:
+            self._explaining = explain
+            jobs.append(explain)
+        return jobs
 
-    def add_field(self, job: FieldJob) -> None:
-        """Use a computed field from now on; one over an outdated lower bound is dropped."""
-        self._fields.add(job)
+    def add(self, job: Job, now: float) -> bool:
+        """Use the result of a job that has run; return whether it calls for an immediate `tick`."""
+        if isinstance(job, FieldJob):
+            self._fields.add(job)
+            return False
+        self._explaining = None
+        version, changed = (job.view.planning_map.version, job.view.revision), False
+        for robot, (plan, _) in job.questions.items():
+            plan.explained_for, plan.explained_at = version, now
+            refusal = job.answers.get(robot)
+            mission = self.missions.of(robot)
+            if refusal is not None and mission.plan is plan and refusal != plan.refusal:
+                plan.refusal, changed = refusal, True
+                mission.publish_path_now()
+        return changed
 
-    def _goal_cells(self, geometry: GridGeometry) -> Iterator[Cell]:
-        for mission in self._missions.values():
-            if mission.target is not None:
-                cell = geometry.cell(mission.target.x, mission.target.y)
-                if geometry.contains_cell(*cell):
-                    yield cell
+    def _explain_job(self, at: Moment, planning_map: PlanningMap) -> ExplainJob | None:
+        """Return the job that explains the refusals whose reasons are unknown or may have changed."""
+        version, revision = planning_map.version, self._regions.revision
+        questions = {}
+        for robot, mission in self.missions.active():
+            plan = mission.plan
+            if plan is None or plan.question is None:
+                continue
+            known = plan.explained_for
+            new_regions = known is None or known[1] != revision
+            new_map = known is not None and known[0] != version
+            if new_regions or (new_map and at.now - plan.explained_at >= self.config.explain_period_s):
+                questions[robot] = plan, plan.question
+        view = self.view(at) if questions else None
+        return None if view is None else ExplainJob(view, questions, self.answerer)
+
+    @property
+    def fields_bytes(self) -> int:
+        """The memory of all distance fields."""
+        return self._fields.size
 
     # --- Queries: answered without side effects ---------------------------------------------------------------------
 
+    def view(self, at: Moment) -> View | None:
+        """Return what queries are answered on, by the thread of the `answerer`; None before the first map."""
+        planning_map = self._map.copy()
+        if planning_map is None:
+            return None
+        sources = self._regions.sources
+        return View(
+            planning_map, sources, self._regions.revision, partial(cover, sources), self._fields.fields, at.stamp
+        )
+
+    def answers(self) -> Mapping[ch.Channel, Callable[[View | None, Any], PlanReply]]:
+        """Return what answers each query on a view, to be called on the thread of the `answerer`."""
+        return {ch.PLANNER_PLAN: self.answerer.plan, ch.PLANNER_EGRESS: self.answerer.egress}
+
     def query_handlers(self) -> Mapping[ch.Channel, QueryHandler]:
-        """Return the handler of every query that the planner answers."""
+        """Return the handler of every query that the planner answers, where everything runs on one thread."""
         return {ch.PLANNER_PLAN: self._answer_plan, ch.PLANNER_EGRESS: self._answer_egress}
 
-    def _answer_plan(self, _ids: Ids, request: PlanRequest, _at: Moment) -> PlanReply:
-        planning_map = self._map.current
-        if planning_map is None:
-            return PlanReply(refusal=no_map())
-        start, goal = request.start, request.goal
-        return _reply(self._find(planning_map, (start.x, start.y), (goal.x, goal.y)), planning_map)
+    def _answer_plan(self, _ids: Ids, request: PlanRequest, at: Moment) -> PlanReply:
+        return self.answerer.plan(self.view(at), request)
 
-    def _answer_egress(self, _ids: Ids, request: EgressRequest, _at: Moment) -> PlanReply:
-        planning_map = self._map.current
-        if planning_map is None:
-            return PlanReply(refusal=no_map())
-        blocking = self._regions.blocking(planning_map)
-        start = (request.pose.x, request.pose.y)
-        return _reply(find_egress(planning_map, blocking, start, self.config), planning_map)
-
-
-def _reply(found: SearchResult, planning_map: PlanningMap) -> PlanReply:
-    route = found.route
-    return PlanReply(
-        points=[(float(x), float(y)) for x, y in route.points] if route else [],
-        length=route.length if route else 0.0,
-        cost=found.cost if route else 0.0,
-        map_epoch=planning_map.version.epoch,
-        map_seq=planning_map.version.seq,
-        refusal=found.refusal,
-    )
+    def _answer_egress(self, _ids: Ids, request: EgressRequest, at: Moment) -> PlanReply:
+        return self.answerer.egress(self.view(at), request)

@@ -9,16 +9,21 @@ from typing import TYPE_CHECKING, Literal
 from msgspec import structs
 
 from fog_contracts.messages import PointXY, Refusal, RobotGoal, RobotPath, RobotPose, Trace
+from planner.switch_limiter import SwitchLimiter
 
 if TYPE_CHECKING:
     from fog_contracts.handlers import Moment
     from fog_contracts.messages import Pose
     from fog_contracts.replica import Version
     from planner.config import PlannerConfig
+    from planner.path_search import Question
     from planner.route import Route
 
 ReplanReason = Literal["goal", "map", "epoch", "off_path", "clearing", "refused"]
 """Why a path is replanned; `map` is a change of costs within the swept corridor of the remaining path."""
+
+
+Explained = tuple["Version", int]
 
 
 @dataclass
@@ -30,8 +35,13 @@ class Plan:
     refusal: Refusal | None
     traces: list[Trace]
     planned_from: PointXY
+    question: Question | None = None
+    """What the refusal leaves open."""
     progress: float = 0.0
     published: bool = False
+    explained_at: float = -math.inf
+    explained_for: Explained | None = None
+    """The versions of map and regions for which the refusal was last explained."""
 
 
 @dataclass
@@ -48,6 +58,11 @@ class Mission:
     replan: ReplanReason | None = None
     traces: list[Trace] = field(default_factory=list)
     """Traces of the hazards that caused the replan."""
+    danger: float = math.inf
+    """How far along its path (m) the robot meets the first of the changes that caused the replan."""
+    refused_search_at: float = -math.inf
+    """When a search was last repeated after a refusal."""
+    switches: SwitchLimiter = field(default_factory=SwitchLimiter)
     goal_due: float = math.inf
     path_due: float = -math.inf
 
@@ -62,7 +77,7 @@ class Mission:
         if current is not None and current.goal_id == goal.goal_id and current.pose == goal.pose:
             return
         self.goal, self.any_heading = goal, any_heading
-        self.plan, self.replan, self.traces = None, "goal", []
+        self._reset("goal")
         self.goal_due = -math.inf
 
     def end(self) -> None:
@@ -70,14 +85,44 @@ class Mission:
         if self.goal is None or self.goal.pose is None:
             return
         self.goal = structs.replace(self.goal, pose=None)
-        self.plan, self.replan, self.traces = None, None, []
+        self._reset(None)
         self.goal_due = -math.inf
 
-    def request_replan(self, reason: ReplanReason, traces: list[Trace]) -> None:
-        """Request a replan; the first reason is kept, except that `map` replaces it."""
+    def _reset(self, reason: ReplanReason | None) -> None:
+        self.plan, self.replan, self.traces, self.danger = None, reason, [], math.inf
+        self.switches = SwitchLimiter()
+
+    def request_replan(self, reason: ReplanReason, traces: list[Trace], danger: float = math.inf) -> None:
+        """Request a replan; the first reason is kept, except that `map` replaces it.
+
+        `danger`: how far along its path (m) the robot meets the change.
+        """
         if self.replan is None or reason == "map":
             self.replan = reason
+        self.danger = min(self.danger, danger)
         self.traces += [trace for trace in traces if trace not in self.traces]
+
+    def replan_due(self, now: float, config: PlannerConfig) -> ReplanReason | None:
+        """Return why a search is due now; None when none is, or when it has to wait."""
+        if self.replan is None and self.plan is not None:
+            return "clearing" if now >= self.switches.deferred_until else None
+        if self.replan == "refused" and now - self.refused_search_at < config.refused_retry_s:
+            return None
+        return self.replan or "goal"
+
+    def begin_replan(self, reason: ReplanReason, now: float) -> list[Trace]:
+        """Withdraw the request, whose search begins; return its traces."""
+        traces = self.traces
+        self.replan, self.traces, self.danger = None, [], math.inf
+        self.switches.deferred_until = math.inf
+        if reason == "refused":
+            self.refused_search_at = now
+        return traces
+
+    @property
+    def path_is_outdated(self) -> bool:
+        """Whether the path must not be published again before its replan."""
+        return self.replan not in (None, "clearing", "refused")
 
     def publish_path_now(self) -> None:
         """Make the path due, new or kept: it was compared with the newest map."""
@@ -107,7 +152,7 @@ class Mission:
             plan_id=plan.plan_id,
             planner_epoch=epoch,
             goal_id=goal.goal_id,
-            points=[(round(float(x), 4), round(float(y), 4)) for x, y in route.points] if route else [],
+            points=route.rounded_points if route else [],
             map_epoch=version.epoch,
             map_seq=version.seq,
             released_length=min(route.length, plan.progress + config.release_length) if route else 0.0,

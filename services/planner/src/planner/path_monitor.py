@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from fog_contracts.costs import NEUTRAL_WEIGHT
@@ -19,29 +20,42 @@ _PROGRESS_WINDOW_M: Final = 5.0
 """How far ahead of its last progress a robot is searched on its path, so that a loop is not cut short."""
 
 
-def reason_from_change(
+@dataclass(frozen=True)
+class Effect:
+    """A change of the map requires a replan; the robot meets it `distance` (m) along its path, if it does."""
+
+    reason: ReplanReason
+    distance: float = math.inf
+
+
+def effect_of_change(
     mission: Mission, change: CostChange, planning_map: PlanningMap, config: PlannerConfig
-) -> ReplanReason | None:
-    """Return why a change of the map requires a replan; None when it does not matter to the mission."""
+) -> Effect | None:
+    """Return why a change of the map requires a replan; None when it does not matter to the mission.
+
+    A refused robot gets a path only where a cost fell.
+    """
     plan = mission.plan
     if plan is None or mission.target is None:
         return None
     if plan.route is None:
-        return "refused"
-    if affects_corridor(plan, plan.route, change, planning_map, config.corridor_half_width):
-        return "map"
-    if change.decreased.any():
+        return Effect("refused") if change.any_decreased else None
+    distance = distance_to_change(plan, plan.route, change, planning_map, config.corridor_half_width)
+    if not math.isinf(distance):
+        return Effect("map", distance)
+    if change.any_decreased:
         robot = (mission.pose.x, mission.pose.y) if mission.pose else _point_at(plan.route, plan.progress)
         if may_save(plan, plan.route, change.window, planning_map, robot, config.min_saving):
-            return "clearing"
+            return Effect("clearing")
     return None
 
 
-def affects_corridor(
+def distance_to_change(
     plan: Plan, route: Route, change: CostChange, planning_map: PlanningMap, half_width: float
-) -> bool:
-    """Whether a changed cell lies within `half_width` (m) of the remaining path."""
-    return route.passes_near(change.changed, change.window, planning_map.geometry, half_width, plan.progress)
+) -> float:
+    """Return how far (m) along its path a robot comes within `half_width` (m) of a changed cell; infinity if never."""
+    window, near = change.near(half_width, planning_map.geometry)
+    return route.distance_to(near, window, planning_map.geometry, plan.progress)
 
 
 def may_save(

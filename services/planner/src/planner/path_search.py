@@ -3,75 +3,126 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from fog_contracts.costs import FREE, INSCRIBED
+from fog_contracts.costs import FREE, INSCRIBED, LETHAL
 from fog_kernels.astar import Planner, line_cost, nearest_traversable
-from planner.refusals import GoalRefusals, goal_out_of_reach, refuse, start_occupied, start_outside
+from planner.refusals import (
+    goal_occupied,
+    goal_out_of_reach,
+    nearest_reachable,
+    no_path,
+    refuse,
+    start_occupied,
+    start_outside,
+)
 from planner.route import Floats, Route
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from fog_contracts.grid import GridGeometry
     from fog_contracts.messages import PointXY, Refusal
+    from fog_kernels.astar import GoalField, PlanResult
     from planner.config import PlannerConfig
-    from planner.goal_fields import GoalFields
     from planner.planning_map import Cell, Grid, PlanningMap
-    from planner.regions import Region
+
+
+@dataclass(frozen=True)
+class Question:
+    """What a refusal leaves open: which hazards or zones close the start, the goal, or every path between them."""
+
+    kind: Literal["start", "goal", "path"]
+    start: PointXY
+    goal: PointXY
+    start_cell: Cell
+    """For a goal or path: the traversable cell where the search began."""
+    goal_cell: Cell
 
 
 @dataclass(frozen=True)
 class SearchResult:
-    """A route with its cost, as the kernels integrate it, or a refusal."""
+    """A route with its cost, as the kernels integrate it, or a refusal.
+
+    `question`: what the refusal does not tell yet; None when it is complete. `searched`: whether A* found out.
+    """
 
     route: Route | None
     cost: float
     refusal: Refusal | None
+    question: Question | None = None
+    searched: bool = True
 
 
-def refused(refusal: Refusal) -> SearchResult:
+def refused(refusal: Refusal, question: Question | None = None, *, searched: bool = False) -> SearchResult:
     """Return the result of a search without a path."""
-    return SearchResult(None, math.inf, refusal)
+    return SearchResult(None, math.inf, refusal, question, searched)
+
+
+Covers = Callable[[float, float, float], bool]
+"""Whether a point (m, frame `map`) lies in a blocked hazard or zone, or within a margin (m) of it."""
 
 
 class PathSearch:
     """Searches paths on maps of one geometry; owns the memory that A* needs."""
 
-    def __init__(self, config: PlannerConfig, geometry: GridGeometry, fields: GoalFields) -> None:
+    def __init__(self, config: PlannerConfig, geometry: GridGeometry) -> None:
         self._config = config
-        self._geometry = geometry
-        self._fields = fields
-        self._planner = Planner(geometry.width, geometry.height)
+        self.geometry = geometry
+        self.planner = Planner(geometry.width, geometry.height)
 
-    def find(  # noqa: PLR0911  # one return per reason for a refusal
-        self, planning_map: PlanningMap, blocking: Sequence[Region], start: PointXY, goal: PointXY
+    def find(
+        self, planning_map: PlanningMap, covers: Covers, start: PointXY, goal: PointXY, field: GoalField | None = None
     ) -> SearchResult:
-        """Return the cheapest path between two points (m, frame `map`), or why there is none."""
-        geometry, cost = self._geometry, planning_map.cost
+        """Return the cheapest path between two points (m, frame `map`), or why there is none.
+
+        `field` is that of the goal's cell, if there is one. Refusals name no hazard and no zone: the `question` can be
+        answered later.
+        """
+        geometry = self.geometry
         first, last = geometry.cell(*start), geometry.cell(*goal)
-        if not geometry.contains_cell(*first):
-            return refused(start_outside(geometry, start))
-        if (unreachable := goal_out_of_reach(planning_map, goal)) is not None:
-            return refused(unreachable)
-        free = self._free_start(planning_map, blocking, first)
+        impossible = None if geometry.contains_cell(*first) else start_outside(geometry, start)
+        impossible = impossible or goal_out_of_reach(planning_map, goal)
+        if impossible is not None:
+            return refused(impossible)
+        free = self._free_start(planning_map, covers, first)
         if free is None:
-            return refused(start_occupied(blocking, first, start))
-        refusals = GoalRefusals(planning_map, blocking, self._planner, free)
-        if cost[last[1], last[0]] >= INSCRIBED:
-            return refused(refusals.goal_occupied(last, goal))
-        found = (self._fields.guide(last) or self._planner).plan(cost, free, last, self._config.max_expansions)
-        if found.timed_out:
-            return refused(refuse(207, f"no path was found within {self._config.max_expansions} expanded cells"))
-        if not found.found:
-            return refused(refusals.no_path(last))
-        corners = self._planner.shortcut(cost, found.cells)
-        points = self._points(cost, corners, start, goal, escaping=free != first)
+            return refused(start_occupied(start), Question("start", start, goal, first, last))
+        if planning_map.cost[last[1], last[0]] >= INSCRIBED:
+            nearest = nearest_reachable(planning_map, free, last)
+            return refused(goal_occupied(goal, nearest), Question("goal", start, goal, free, last))
+        found = self._search(planning_map, free, last, field)
+        if found is None or found.timed_out:
+            return self._without_path(planning_map, Question("path", start, goal, free, last), found)
+        corners = self.planner.shortcut(planning_map.cost, found.cells)
+        points = self._points(planning_map.cost, corners, start, goal, escaping=free != first)
         route = Route(points, self._config.point_spacing, escape_lines=int(free != first))
-        return SearchResult(route, route.cost(cost, geometry), None)
+        return SearchResult(route, route.cost(planning_map.cost, geometry), None)
+
+    def _without_path(self, planning_map: PlanningMap, question: Question, found: PlanResult | None) -> SearchResult:
+        if found is not None:
+            reason = f"no path was found within {self._config.max_expansions} expanded cells"
+            return refused(refuse(207, reason), searched=True)
+        return refused(no_path(nearest_reachable(planning_map, question.start_cell, question.goal_cell)), question)
+
+    def _search(self, planning_map: PlanningMap, start: Cell, goal: Cell, field: GoalField | None) -> PlanResult | None:
+        """Search a path between two traversable cells; None if they are not connected.
+
+        Most searches are short, so a few cells are expanded first; then it is worth to ask whether there is a path.
+        """
+        if planning_map.has_components and not planning_map.reachable(start, goal):
+            return None
+        most = self._config.max_expansions
+        if not planning_map.has_components and self._config.quick_expansions < most:
+            found = self.planner.plan(planning_map.cost, start, goal, self._config.quick_expansions, field)
+            if not found.timed_out:
+                return found if found.found else None
+            if not planning_map.reachable(start, goal):
+                return None
+        found = self.planner.plan(planning_map.cost, start, goal, most, field)
+        return found if found.found or found.timed_out else None
 
     def _points(self, cost: Grid, corners: Floats, start: PointXY, goal: PointXY, *, escaping: bool) -> Floats:
         """Return corners ((n, 2), columns and rows) as points (m) that start at the robot and end at the goal exactly.
@@ -79,7 +130,7 @@ class PathSearch:
         Where the line between the exact point and the next corner crosses an impassable cell, the centre of the point's
         cell is used: at most 4 cm away.
         """
-        geometry = self._geometry
+        geometry = self.geometry
         cells = corners.astype(np.float64)
         exact_start, exact_goal = geometry.grid_coordinates(np.array((start, goal)))
         if len(cells) == 1:
@@ -92,7 +143,7 @@ class PathSearch:
             cells[0] = exact_start
         return geometry.centres(cells)
 
-    def _free_start(self, planning_map: PlanningMap, blocking: Sequence[Region], start: Cell) -> Cell | None:
+    def _free_start(self, planning_map: PlanningMap, covers: Covers, start: Cell) -> Cell | None:
         """Return the start's cell, or the nearest one where a robot may be; None when it is in a hazard, zone or wall.
 
         The line to it may cross inscribed cells and lidar obstacles, but no wall and no blocked region.
@@ -100,9 +151,9 @@ class PathSearch:
         column, row = start
         if planning_map.cost[row, column] < INSCRIBED:
             return start
-        if any(region.covers(column, row) for region in blocking):
+        if self._is_closed(planning_map, covers, start):
             return None
-        reach = math.floor(self._config.escape_distance / self._geometry.resolution)
+        reach = math.floor(self._config.escape_distance / self.geometry.resolution)
         free = nearest_traversable(planning_map.cost, start, reach)
         if free is None:
             return None
@@ -110,9 +161,15 @@ class PathSearch:
         for step in range(1, steps + 1):
             x = round(column + (free[0] - column) * step / steps)
             y = round(row + (free[1] - row) * step / steps)
-            if planning_map.static[y, x] != FREE or any(region.covers(x, y) for region in blocking):
+            if planning_map.static[y, x] != FREE or self._is_closed(planning_map, covers, (x, y)):
                 return None
         return free
+
+    def _is_closed(self, planning_map: PlanningMap, covers: Covers, cell: Cell) -> bool:
+        """Whether a cell belongs to a blocked hazard or zone: only lethal cells do."""
+        if planning_map.cost[cell[1], cell[0]] != LETHAL:
+            return False
+        return covers(*self.geometry.centre(*cell), self.geometry.resolution * math.sqrt(0.5))
 
 
 def _is_passable(cost: Grid, a: Floats, b: Floats) -> bool:

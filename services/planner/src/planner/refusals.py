@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from fog_contracts.costs import INSCRIBED, LETHAL, UNKNOWN
 from fog_contracts.messages import PLAN_CODES, Cause, PlanCode, PointXY, Refusal
-from fog_kernels.astar import Planner, nearest_traversable
-from planner.regions import Region, decisive_regions, remove_regions
+from fog_kernels.astar import nearest_traversable
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from fog_contracts.grid import GridGeometry
-    from planner.planning_map import Cell, Grid, PlanningMap
+    from planner.explanation import Cut
+    from planner.planning_map import Cell, PlanningMap
+    from planner.regions import Region
 
 _OBSTACLE: Final = Cause(kind="obstacle", id="lidar", state="seen")
+_WALL: Final = Cause(kind="map", id="static", state="occupied")
 _NEAR_GOAL_M: Final = 5.0
 """How far from a goal in a wall a reachable point is searched."""
 
@@ -32,18 +33,26 @@ def no_map() -> Refusal:
     return refuse(207, "the planner has no map yet: try again when it is ready")
 
 
+def busy(reason: str) -> Refusal:
+    """Refuse because too many queries are waiting."""
+    return refuse(207, reason)
+
+
 def start_outside(geometry: GridGeometry, start: PointXY) -> Refusal:
     """Refuse because the robot stands off the map."""
     return refuse(203, f"the robot at {_point(start)} is outside the map {_extent(geometry)}")
 
 
-def start_occupied(blocking: Sequence[Region], cell: Cell, start: PointXY) -> Refusal:
-    """Refuse because the robot stands on an impassable cell, and no free one is near."""
-    inside = [region for region in blocking if region.influences(*cell)]
+def start_occupied(start: PointXY, inside: Sequence[Region] | None = None) -> Refusal:
+    """Refuse because the robot stands on an impassable cell, and no free one is near.
+
+    `inside`: the regions that close its cell; None while they are not known.
+    """
     where = f"the robot at {_point(start)} stands "
     if inside:
         return refuse(205, f"{where}inside or at the edge of {_listed(inside)}", _causes(inside))
-    return refuse(205, f"{where}on a wall, an obstacle or unknown space")
+    what = "in a closed place" if inside is None else "on a wall, an obstacle or unknown space"
+    return refuse(205, where + what)
 
 
 def goal_out_of_reach(planning_map: PlanningMap, goal: PointXY) -> Refusal | None:
@@ -65,51 +74,41 @@ def goal_out_of_reach(planning_map: PlanningMap, goal: PointXY) -> Refusal | Non
     return refuse(206, f"the goal {_point(goal)} lies {where}{_nearest_clause(nearest)}", nearest=nearest)
 
 
-@dataclass(frozen=True)
-class GoalRefusals:
-    """Refusals that depend on what can be reached on the map from `start`, a traversable cell."""
+def goal_occupied(goal: PointXY, nearest: PointXY | None, inside: Sequence[Region] | None = None) -> Refusal:
+    """Refuse because a hazard, a zone or an obstacle closes the goal's cell.
 
-    planning_map: PlanningMap
-    blocking: Sequence[Region]
-    planner: Planner
-    start: Cell
+    `inside`: the regions that close it; None while they are not known.
+    """
+    if inside is None:
+        where = "in a place that is closed now"
+    elif inside:
+        where = f"inside or at the edge of {_listed(inside)}"
+    else:
+        where = "on or beside an obstacle that a robot sees"
+    causes = [] if inside is None else _causes(inside) or [_OBSTACLE]
+    return refuse(206, f"the goal {_point(goal)} lies {where}{_nearest_clause(nearest)}", causes, nearest)
 
-    def goal_occupied(self, cell: Cell, goal: PointXY) -> Refusal:
-        """Refuse because a hazard, a zone or an obstacle lies on the goal."""
-        inside = [region for region in self.blocking if region.influences(*cell)]
-        nearest = self._nearest(cell)
-        where = (
-            f"inside or at the edge of {_listed(inside)}" if inside else "on or beside an obstacle that a robot sees"
-        )
-        reason = f"the goal {_point(goal)} lies {where}{_nearest_clause(nearest)}"
-        return refuse(206, reason, _causes(inside) or [_OBSTACLE], nearest)
 
-    def no_path(self, cell: Cell) -> Refusal:
-        """Refuse because every path to the goal's cell is blocked, naming what blocks it."""
-        cost, lower_bound = self.planning_map.cost, self.planning_map.lower_bound
-
-        def has_path(costmap: Grid) -> bool:
-            return self.planner.nearest_reachable(costmap, self.start, cell) == cell
-
-        nearest = self._nearest(cell)
-        regions = decisive_regions(cost, lower_bound, self.blocking, has_path)
-        if regions:
-            joint = len(regions) > 1 and not has_path(remove_regions(cost, lower_bound, regions[:1], regions[1:]))
-            blockers = _listed(regions) + (", which must all end" if joint else "")
-            return refuse(
-                208, f"every path is blocked by {blockers}{_nearest_clause(nearest)}", _causes(regions), nearest
-            )
-        if has_path(lower_bound):
-            reason = f"every path is blocked by obstacles that robots see{_nearest_clause(nearest)}"
-            return refuse(208, reason, [_OBSTACLE], nearest)
-        cause = Cause(kind="map", id="static", state="occupied")
+def no_path(nearest: PointXY, cut: Cut | None = None) -> Refusal:
+    """Refuse because every path to the goal is blocked; `cut` tells by what, None while that is not known."""
+    if cut is None:
+        return refuse(208, f"every path is blocked{_nearest_clause(nearest)}", (), nearest)
+    if cut.kind == "walls":
         reason = f"no path leads there: walls or unknown space lie between{_nearest_clause(nearest)}"
-        return refuse(208, reason, [cause], nearest)
+        return refuse(208, reason, [_WALL], nearest)
+    if cut.kind == "obstacles":
+        reason = f"every path is blocked by obstacles that robots see{_nearest_clause(nearest)}"
+        return refuse(208, reason, [_OBSTACLE], nearest)
+    joint = ", which must all end" if cut.jointly and len(cut.regions) > 1 else ""
+    reason = f"every path is blocked by {_listed(cut.regions)}{joint}{_nearest_clause(nearest)}"
+    return refuse(208, reason, _causes(cut.regions), nearest)
 
-    def _nearest(self, cell: Cell) -> PointXY:
-        reachable = self.planner.nearest_reachable(self.planning_map.cost, self.start, cell)
-        x, y = self.planning_map.geometry.centre(*reachable)
-        return round(x, 3), round(y, 3)
+
+def nearest_reachable(planning_map: PlanningMap, start: Cell, goal: Cell) -> PointXY:
+    """Return the point (m) nearest to the goal that can be reached from a traversable cell."""
+    components = planning_map.components
+    x, y = planning_map.geometry.centre(*components.nearest(components.of(*start), goal))
+    return round(x, 3), round(y, 3)
 
 
 def _point(point: PointXY) -> str:

@@ -1,119 +1,173 @@
-"""Hazards and zones as regions of the costmap, and which of them block all paths to a goal."""
+"""Hazards and zones as regions of the costmap: their cells, and the cells that they make impassable."""
+
+from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fog_contracts.costs import LETHAL
+from fog_contracts.costs import FREE, LETHAL
 from fog_contracts.geometry import GeometryError, normalized_polygon
-from fog_contracts.grid import GridGeometry, Window
 from fog_contracts.messages import Cause, HazardArea, Zone
 from fog_contracts.raster import rasterize
 from fog_contracts.shapes import rasterize_shape
 from fog_kernels.distance import squared_distance_capped
 
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from fog_contracts.costs import Inflation
+    from fog_contracts.grid import GridGeometry, Window
+    from fog_contracts.raster import ShapeMask
+    from planner.planning_map import PlanningMap
+
 Grid = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
+Source = HazardArea | Zone
+"""The message that a region is made of."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Region:
-    """A hazard or zone as masks over a window: its own cells, and those that its inflation can reach (`inflated`)."""
+    """A hazard or zone as masks over a window: its own cells, and those that it makes impassable (`closed`)."""
 
-    cause: Cause
-    description: str
+    source: Source
     window: Window
     cells: Mask
-    inflated: Mask
+    closed: Mask
 
-    def blocks(self, cost: Grid) -> bool:
-        """Whether cells of this region are lethal on the costmap."""
-        return bool(np.any(cost[self.window.rows, self.window.columns][self.cells] == LETHAL))
+    @property
+    def cause(self) -> Cause:
+        """The region as the cause of a refusal."""
+        if isinstance(self.source, HazardArea):
+            return Cause(kind="hazard", id=self.source.hazard.area, state=self.source.hazard.state)
+        return Cause(kind="zone", id=self.source.id, state="BLOCKED")
 
-    def covers(self, column: int, row: int) -> bool:
-        """Whether the cell is one of the region's own."""
+    @property
+    def description(self) -> str:
+        """The region in words."""
+        if isinstance(self.source, HazardArea):
+            name = self.source.hazard.area + (f" ({self.source.label})" if self.source.label else "")
+            return f"hazard {name}, {self.source.hazard.state}"
+        return f"no-go zone {self.source.id}" + (f" ({self.source.reason})"[:80] if self.source.reason else "")
+
+    def closes(self, column: int, row: int) -> bool:
+        """Whether the region makes this cell impassable."""
         x, y = column - self.window.x, row - self.window.y
-        return 0 <= x < self.window.width and 0 <= y < self.window.height and bool(self.cells[y, x])
+        return 0 <= x < self.window.width and 0 <= y < self.window.height and bool(self.closed[y, x])
 
-    def influences(self, column: int, row: int) -> bool:
-        """Whether the region or its inflation can raise the cell's cost."""
-        x, y = column - self.window.x, row - self.window.y
-        return 0 <= x < self.window.width and 0 <= y < self.window.height and bool(self.inflated[y, x])
+    def is_on(self, planning_map: PlanningMap) -> bool:
+        """Whether the region is on this map: all its cells are lethal, and not only because of walls.
+
+        The cells of its border are not looked at: a rounding error there decides nothing.
+        """
+        rows, columns = self.window.rows, self.window.columns
+        inner = self.cells.copy()
+        inner[1:] &= self.cells[:-1]
+        inner[:-1] &= self.cells[1:]
+        inner[:, 1:] &= self.cells[:, :-1]
+        inner[:, :-1] &= self.cells[:, 1:]
+        looked_at = inner if inner.any() else self.cells
+        if not np.all(planning_map.cost[rows, columns][looked_at] == LETHAL):
+            return False
+        return bool(np.any(planning_map.static[rows, columns][looked_at] == FREE))
 
 
-def _region(cause: Cause, description: str, window: Window, mask: Mask, geometry: GridGeometry, reach: float) -> Region:
-    cells = max(1, math.ceil(reach / geometry.resolution))
-    grown = geometry.clip(window.grown(cells))
-    own = np.zeros((grown.height, grown.width), dtype=np.bool_)
+def closes_floor(source: Source) -> bool:
+    """Whether a hazard or zone, by what it says of itself, makes its cells lethal: times of zones are not looked at."""
+    if isinstance(source, HazardArea):
+        return source.hazard.penalty == LETHAL
+    return source.kind == "BLOCKED" and source.enabled
+
+
+def in_its_time(source: Source, stamp: float) -> bool:
+    """Whether a zone has started and not expired at a time (s since the epoch); hazards have no times."""
+    if isinstance(source, HazardArea):
+        return True
+    started = source.starts_at is None or source.starts_at <= stamp
+    return started and (source.expires_at is None or stamp < source.expires_at)
+
+
+def region_of(source: Source, geometry: GridGeometry, inflation: Inflation) -> Region | None:
+    """Return the region of a hazard or zone; None off the map, or for an invalid shape."""
+    try:
+        window, mask = _rasterized(source, geometry)
+    except GeometryError:
+        # The map-service refuses such a shape too: it has no cells on the costmap.
+        return None
+    if window.empty:
+        return None
+    reach = math.floor(inflation.inscribed_radius / geometry.resolution + 1e-9)
+    grown = geometry.clip(window.grown(reach))
+    cells = np.zeros((grown.height, grown.width), dtype=np.bool_)
     x, y = window.x - grown.x, window.y - grown.y
-    own[y : y + window.height, x : x + window.width] = mask
-    inflated = squared_distance_capped(own, cells + 1) <= cells * cells
-    return Region(cause, description, grown, own, inflated)
+    cells[y : y + window.height, x : x + window.width] = mask
+    within = (inflation.inscribed_radius / geometry.resolution) ** 2 + 1e-6
+    return Region(source, grown, cells, squared_distance_capped(cells, reach + 1) <= within)
 
 
-def hazard_region(area: HazardArea, geometry: GridGeometry, reach: float) -> Region | None:
-    """Return a hazard's region with its inflation `reach` (m); None off the map, or for an invalid polygon."""
-    try:
-        window, mask = rasterize(normalized_polygon(area.polygon), geometry)
-    except GeometryError:
-        # The map-service refuses such an area too: it has no cells on the costmap.
-        return None
-    if window.empty:
-        return None
-    name = area.hazard.area + (f" ({area.label})" if area.label else "")
-    cause = Cause(kind="hazard", id=area.hazard.area, state=area.hazard.state)
-    return _region(cause, f"hazard {name}, {area.hazard.state}", window, mask, geometry, reach)
+def _rasterized(source: Source, geometry: GridGeometry) -> ShapeMask:
+    if isinstance(source, HazardArea):
+        return rasterize(normalized_polygon(source.polygon), geometry)
+    return rasterize_shape(source.shape, geometry)
 
 
-def zone_region(zone: Zone, geometry: GridGeometry, reach: float) -> Region | None:
-    """Return a BLOCKED zone's region; None for another kind, off the map, or for an invalid shape."""
-    if zone.kind != "BLOCKED":
-        return None
-    try:
-        window, mask = rasterize_shape(zone.shape, geometry)
-    except GeometryError:
-        return None
-    if window.empty:
-        return None
-    reason = f" ({zone.reason})"[:80] if zone.reason else ""
-    cause = Cause(kind="zone", id=zone.id, state="BLOCKED")
-    return _region(cause, f"no-go zone {zone.id}{reason}", window, mask, geometry, reach)
+class Regions:
+    """The regions of one map that are on, made of the newest hazards and zones.
 
-
-def remove_regions(cost: Grid, lower_bound: Grid, removed: Sequence[Region], kept: Sequence[Region]) -> Grid:
-    """Return the costmap without some regions: their cells get the lower bound, except those that `kept` influence."""
-    result = cost.copy()
-    for region in removed:
-        rows, columns = region.window.rows, region.window.columns
-        result[rows, columns][region.inflated] = lower_bound[rows, columns][region.inflated]
-    for region in kept:
-        rows, columns = region.window.rows, region.window.columns
-        result[rows, columns][region.inflated] = cost[rows, columns][region.inflated]
-    return result
-
-
-def decisive_regions(
-    cost: Grid, lower_bound: Grid, regions: Sequence[Region], has_path: Callable[[Grid], bool]
-) -> list[Region]:
-    """Return the regions that block all paths: those of which removing one suffices, else a minimal set to remove.
-
-    `has_path(costmap)` returns whether there is a path. Empty when removing all regions gives no path either.
+    A shape is rasterized when it is new, not again when others change. One thread may use it.
     """
-    blocking = [region for region in regions if region.blocks(cost)]
 
-    def has_path_without(removed: Sequence[Region]) -> bool:
-        kept = [region for region in blocking if region not in removed]
-        return has_path(remove_regions(cost, lower_bound, removed, kept))
+    def __init__(self, inflation: Inflation) -> None:
+        self._inflation = inflation
+        self._geometry: GridGeometry | None = None
+        self._known: list[tuple[Source, Region | None]] = []
 
-    sufficient = [region for region in blocking if has_path_without([region])]
-    if sufficient or not blocking or not has_path_without(blocking):
-        return sufficient
-    minimal = list(blocking)
-    for region in blocking:
-        fewer = [other for other in minimal if other is not region]
-        if has_path_without(fewer):
-            minimal = fewer
-    return minimal
+    def on(self, planning_map: PlanningMap, sources: Sequence[Source], stamp: float) -> list[Region]:
+        """Return the regions that are on, in the order of their sources; `stamp` in s since the epoch.
+
+        What counts are the map's cells, because the map-service decides by its own clock which zones are on. Only a
+        zone that is outside its times, and whose cells others have made lethal, is left out by its times.
+        """
+        if self._geometry != planning_map.geometry:
+            self._geometry, self._known = planning_map.geometry, []
+        known = {id(source): (source, region) for source, region in self._known}
+        self._known = [
+            known.get(id(source)) or (source, region_of(source, planning_map.geometry, self._inflation))
+            for source in sources
+            if closes_floor(source)
+        ]
+        regions = [region for _, region in self._known if region is not None and region.is_on(planning_map)]
+        certain = [region for region in regions if in_its_time(region.source, stamp)]
+        return [region for region in regions if region in certain or not _is_covered(region, certain, planning_map)]
+
+
+def _is_covered(region: Region, others: Sequence[Region], planning_map: PlanningMap) -> bool:
+    """Whether other regions or walls hold every cell of a region."""
+    rows, columns = region.window.rows, region.window.columns
+    open_cells = region.cells & (planning_map.static[rows, columns] == FREE)
+    for other in others:
+        part = overlap(region.window, other.window)
+        if part is not None:
+            mine, theirs = part
+            open_cells[mine] &= ~other.cells[theirs]
+    return not open_cells.any()
+
+
+Slices = tuple[slice, slice]
+
+
+def overlap(a: Window, b: Window) -> tuple[Slices, Slices] | None:
+    """Return the cells that two windows share as (rows, columns) of arrays over either; None if they share none."""
+    both = a.intersection(b)
+    if both.empty:
+        return None
+
+    def inside(window: Window) -> Slices:
+        x, y = both.x - window.x, both.y - window.y
+        return slice(y, y + both.height), slice(x, x + both.width)
+
+    return inside(a), inside(b)

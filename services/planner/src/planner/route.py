@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fog_contracts.grid import GridGeometry, Window
+from fog_contracts.messages import PointXY
 from fog_kernels.astar import line_cost
-from fog_kernels.distance import squared_distance_capped
 
 Floats = NDArray[np.float64]
 Grid = NDArray[np.uint8]
@@ -33,6 +33,11 @@ class Route:
             fraction = np.arange(1, count + 1)[:, None] / count
             parts.append(a + fraction * (b - a))
         return np.concatenate(parts)
+
+    @cached_property
+    def rounded_points(self) -> list[PointXY]:
+        """The points rounded to 0.1 mm, as they are published."""
+        return [(x, y) for x, y in np.round(self.points, 4).tolist()]
 
     @cached_property
     def along(self) -> Floats:
@@ -84,21 +89,31 @@ class Route:
                 return total
         return total
 
-    def passes_near(
-        self, changed: NDArray[np.bool_], window: Window, geometry: GridGeometry, reach: float, along: float
-    ) -> bool:
-        """Whether a changed cell of the window lies within `reach` (m) of the route from `along` on."""
-        cells = math.ceil(reach / geometry.resolution)
-        remaining = self.points[self.along >= along - geometry.resolution]
-        on_line, _ = geometry.cells(remaining)
-        columns, rows = on_line.T
-        grown = geometry.clip(window.grown(cells))
-        inside = (columns >= grown.x) & (columns < grown.x + grown.width)
-        inside &= (rows >= grown.y) & (rows < grown.y + grown.height)
+    def distance_to(self, mask: NDArray[np.bool_], window: Window, geometry: GridGeometry, along: float) -> float:
+        """Return how far (m) beyond `along` the route first enters the cells of a mask over a window; else infinity."""
+        begin = int(np.searchsorted(self.along, along - geometry.resolution))
+        columns, rows = self._point_cells(geometry)[begin:].T
+        inside = (columns >= window.x) & (columns < window.x + window.width)
+        inside &= (rows >= window.y) & (rows < window.y + window.height)
         if not inside.any():
-            return False
-        padded = np.zeros((grown.height, grown.width), dtype=np.bool_)
-        x, y = window.x - grown.x, window.y - grown.y
-        padded[y : y + window.height, x : x + window.width] = changed
-        squares = squared_distance_capped(padded, cells + 1)
-        return bool(np.any(squares[rows[inside] - grown.y, columns[inside] - grown.x] <= cells * cells))
+            return math.inf
+        inside[inside] = mask[rows[inside] - window.y, columns[inside] - window.x]
+        first = int(np.argmax(inside))
+        return max(0.0, float(self.along[begin + first]) - along) if inside[first] else math.inf
+
+    def _point_cells(self, geometry: GridGeometry) -> NDArray[np.int64]:
+        """Return the cells of all points, computed once: a route stays on one map."""
+        cells: NDArray[np.int64] | None = self.__dict__.get("_cells")
+        if cells is None:
+            cells = self.__dict__["_cells"] = geometry.cells(self.points)[0]
+        return cells
+
+    def differs_from(self, other: "Route", along: float, reach: float) -> bool:
+        """Whether this route leaves the rest of another, from `along` (m) on, by more than `reach` (m) somewhere."""
+        every = max(1, round(0.5 * reach / self.spacing))
+        rest = other.points[other.along >= along]
+        if len(rest) == 0:
+            return True
+        own, rest = self.points[::every], rest[::every]
+        gaps = np.hypot(own[:, None, 0] - rest[None, :, 0], own[:, None, 1] - rest[None, :, 1])
+        return bool(np.any(gaps.min(axis=1) > reach))

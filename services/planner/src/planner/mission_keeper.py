@@ -1,0 +1,172 @@
+"""Stored missions: what an operator orders is stored first, then in force."""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+from contextlib import contextmanager
+from functools import partial
+from typing import TYPE_CHECKING
+
+from fog_contracts.messages import RobotGoal
+from fog_runtime import logs
+from fog_runtime.redis_connection import StoreRefusedError
+from planner.store import Audit, RecoveryError, StoredGoal, StoreError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from typing import Literal
+
+    from fog_contracts.messages import Pose
+    from fog_runtime.clock import Clock
+    from fog_runtime.health import Health
+    from fog_runtime.idempotency import Attempt
+    from planner.core import PlannerCore
+    from planner.store import Store
+
+STORE_PERIOD_S = 0.5
+
+_log = logs.get("planner")
+
+
+class MissionKeeper:
+    """Keeps the missions of store and core equal; `change_core` passes a change to the core's thread."""
+
+    def __init__(
+        self,
+        core: PlannerCore,
+        store: Store,
+        clock: Clock,
+        health: Health,
+        change_core: Callable[[Callable[[], object]], None],
+    ) -> None:
+        self._core = core
+        self._store = store
+        self._clock = clock
+        self._health = health
+        self._change_core = change_core
+        self._loaded = asyncio.Event()
+        self._lock = asyncio.Lock()
+        self._reload = True
+        self._reached: dict[str, str] = {}
+        self.goals: dict[str, StoredGoal] = {}
+        """The missions by robot."""
+
+    async def earlier_result(self, attempt: Attempt | None) -> StoredGoal | None:
+        """Return the mission that an earlier attempt stored, which is in force; None for a first attempt.
+
+        Raises `IdempotencyError` for another request's attempt, and `StoreError`.
+        """
+        with self._uncertain_write():
+            earlier = await self._store.earlier_result(attempt)
+            if earlier is not None and self._reload:
+                await self._load()
+            return earlier
+
+    async def send(
+        self, robot: str, pose: Pose, who: str, *, place: str | None, any_heading: bool, attempt: Attempt | None
+    ) -> StoredGoal:
+        """Give a robot a mission. Raises `StoreError`, after which the mission may or may not be stored."""
+        async with self._lock:
+            stamp = self._clock.stamp()
+            goal = RobotGoal(goal_id=secrets.token_hex(8), pose=pose, place=place, stamp=stamp)
+            stored = StoredGoal(goal=goal, any_heading=any_heading)
+            with self._uncertain_write():
+                outcome = await self._store.put(robot, stored, Audit(stamp, who, "goal", attempt))
+            if outcome != "ok":
+                raise StoreError("another request with this Idempotency-Key is in progress: repeat it")
+            self._begin(robot, stored)
+        _log.info("goal_accepted", robot=robot, goal=goal.goal_id, x=pose.x, y=pose.y, place=place, who=who)
+        return stored
+
+    async def cancel(self, robot: str, who: str) -> bool:
+        """End a robot's mission; False when it has none. Raises `StoreError`."""
+        async with self._lock:
+            stored = self.goals.get(robot)
+            if stored is None:
+                return False
+            with self._uncertain_write():
+                await self._store.delete(robot, stored.goal.goal_id, Audit(self._clock.stamp(), who, "cancel"))
+            self._cancel(robot)
+        _log.info("goal_cancelled", robot=robot, goal=stored.goal.goal_id, who=who)
+        return True
+
+    async def recover_store(self, action: Literal["restore", "accept"], who: str) -> None:
+        """Restore the missions from memory, or accept those in Redis, after Redis lost records.
+
+        Raises `RecoveryError` and `StoreError`.
+        """
+        await self._store.require_loss()
+        async with self._lock:
+            audit = Audit(self._clock.stamp(), who, action)
+            if action == "accept":
+                await self._store.accept_loss(audit)
+                self._reload = True
+            elif self._loaded.is_set():
+                await self._store.restore(self.goals, audit)
+            else:
+                raise RecoveryError(
+                    "this service was started after the loss and has no missions: restore a backup of Redis, or accept"
+                )
+
+    def end(self, robot: str, goal_id: str) -> None:
+        """Mark a reached goal for deletion, unless the robot has another one by now."""
+        stored = self.goals.get(robot)
+        if stored is not None and stored.goal.goal_id == goal_id:
+            del self.goals[robot]
+            self._reached[robot] = goal_id
+            _log.info("goal_reached", robot=robot, goal=goal_id)
+
+    async def store_loop(self) -> None:
+        """Load the missions, retrying until the store answers; then delete ended ones, and monitor the store."""
+        while True:
+            try:
+                if self._reload:
+                    await self._load()
+                for robot, goal_id in list(self._reached.items()):
+                    await self._store.delete(robot, goal_id, Audit(self._clock.stamp(), robot, "reached"))
+                    if self._reached.get(robot) == goal_id:
+                        del self._reached[robot]
+                await self._store.check()
+                self._health.set("store", ok=True)
+            except StoreError as error:
+                # What was stored but never acknowledged may have gone with a failed primary.
+                self._reload = True
+                self._health.set("store", ok=False, detail=str(error))
+                if not self._loaded.is_set():
+                    self._health.set("goals", ok=False, detail=f"not loaded yet: {error}")
+            await asyncio.sleep(STORE_PERIOD_S)
+
+    @contextmanager
+    def _uncertain_write(self) -> Iterator[None]:
+        """Reload the missions after a failure: one may have been written although the reply was lost."""
+        if not self._loaded.is_set():
+            raise StoreRefusedError("the stored missions are not loaded yet")
+        try:
+            yield
+        except StoreError as error:
+            self._reload = True
+            self._health.set("store", ok=False, detail=str(error))
+            raise
+
+    async def _load(self) -> None:
+        """Put the stored missions into force, and end those that are not stored; raises `StoreError`."""
+        async with self._lock:
+            stored = await self._store.goals()
+            for robot in [robot for robot in self.goals if robot not in stored]:
+                self._cancel(robot)
+            for robot, mission in stored.items():
+                # One that is reached may still be stored, until its deletion succeeds.
+                if mission != self.goals.get(robot) and mission.goal.goal_id != self._reached.get(robot):
+                    self._begin(robot, mission)
+            self._reload = False
+        self._loaded.set()
+        self._health.set("goals", ok=True, detail=f"{len(self.goals)} loaded")
+
+    def _cancel(self, robot: str) -> None:
+        del self.goals[robot]
+        self._change_core(partial(self._core.cancel, robot))
+
+    def _begin(self, robot: str, stored: StoredGoal) -> None:
+        self.goals[robot] = stored
+        self._change_core(partial(self._core.set_goal, robot, stored.goal, any_heading=stored.any_heading))

@@ -1,0 +1,78 @@
+"""Searches a mission's path and decides whether it replaces the current one."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+from planner.mission import Plan
+from planner.path_search import PathSearch
+from planner.replan_policy import is_kept, is_other_way, must_wait
+
+if TYPE_CHECKING:
+    from fog_contracts.messages import PlanCode, Pose, RobotPose
+    from planner.config import PlannerConfig
+    from planner.goal_fields import GoalFields
+    from planner.mission import Mission, ReplanReason
+    from planner.path_search import Covers, SearchResult
+    from planner.planning_map import PlanningMap
+
+AvoidReason = Literal["far_from_path", "no_cost_fell", "unreachable"]
+"""Why no search was needed: a change is far from the path, none lowered a cost, or the goal can't be reached."""
+
+
+class Replanner:
+    """Owns the memory of the searches, and counts them."""
+
+    def __init__(self, config: PlannerConfig, fields: GoalFields) -> None:
+        self._config = config
+        self._fields = fields
+        self._search: PathSearch | None = None
+        self._next_id = 1
+        self.plans: dict[ReplanReason, int] = {}
+        """Number of replans, by reason."""
+        self.refusals: dict[PlanCode, int] = {}
+        """Number of replans that ended in a refusal, by code."""
+        self.avoided: dict[AvoidReason, int] = {}
+        """Number of searches that were not needed, by reason."""
+
+    def count_avoided(self, reason: AvoidReason) -> None:
+        """Count a search that was not needed."""
+        self.avoided[reason] = self.avoided.get(reason, 0) + 1
+
+    def replan(
+        self, mission: Mission, reason: ReplanReason, planning_map: PlanningMap, covers: Covers, now: float
+    ) -> None:
+        """Search a path for a mission with a target and a pose, and keep or replace its plan."""
+        pose, target = mission.pose, mission.target
+        assert pose is not None
+        assert target is not None
+        traces = mission.begin_replan(reason, now)
+        mission.publish_path_now()
+        found = self._find(planning_map, covers, pose, target)
+        self.plans[reason] = self.plans.get(reason, 0) + 1
+        if found.refusal is not None:
+            self.refusals[found.refusal.code] = self.refusals.get(found.refusal.code, 0) + 1
+            if not found.searched:
+                self.count_avoided("unreachable")
+        plan = mission.plan
+        if plan is not None:
+            if is_kept(plan, found, reason, planning_map, self._config):
+                plan.question = found.question
+                return
+            if reason not in ("goal", "off_path"):
+                if must_wait(plan, found, mission.switches, now, planning_map, self._config):
+                    mission.switches.deferred_until = mission.switches.allowed_from(self._config)
+                    return
+                if is_other_way(plan, found, self._config):
+                    mission.switches.record(now)
+        mission.plan = Plan(
+            self._next_id, found.route, found.refusal, traces, planned_from=(pose.x, pose.y), question=found.question
+        )
+        self._next_id += 1
+
+    def _find(self, planning_map: PlanningMap, covers: Covers, pose: RobotPose, target: Pose) -> SearchResult:
+        geometry = planning_map.geometry
+        if self._search is None or self._search.geometry != geometry:
+            self._search = PathSearch(self._config, geometry)
+        field = self._fields.guide(geometry.cell(target.x, target.y))
+        return self._search.find(planning_map, covers, (pose.x, pose.y), (target.x, target.y), field)

@@ -184,3 +184,15 @@ def shared_fog(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fog]:
         yield running
     finally:
         running.close()
+
+
+@pytest.fixture(scope="module")
+def all_services(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fog]:
+    """Yield a fog in which all services run, shared by the tests of a module that kill and restart nothing."""
+    running = Fog(tmp_path_factory.mktemp("fog"))
+    try:
+        for module in ("hazard_aggregator", "map_service", "planner"):
+            running.start(module)
+        yield running
+    finally:
+        running.close()

@@ -168,17 +168,23 @@ def test_if_match_header_gives_a_version_or_any_or_an_invalid_one(header, versio
 async def test_openapi_describes_responses_errors_and_tokens_by_the_signature(client):
     paths = (await client.get("/openapi.json")).json()["paths"]
     post = paths["/zones"]["post"]
-    assert set(post["responses"]) == {"201", "401", "403", "409", "413", "422", "503", "default"}
+    assert set(post["responses"]) == {"201", "401", "403", "409", "413", "422", "500", "503"}
     assert post["responses"]["201"]["content"]["application/json"]["schema"] == {"$ref": "#/components/schemas/Zone"}
     problem = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
     assert post["responses"]["503"] == {"description": "It is busy", "content": problem}
     assert post["security"] == [{"HTTPBearer": []}]
     assert [parameter["name"] for parameter in post["parameters"]] == ["If-Match"]
     put = paths["/zones/{zone}"]["put"]
-    assert set(put["responses"]) == {"200", "413", "422", "default"}
+    assert set(put["responses"]) == {"200", "413", "422", "500"}
     assert "security" not in put
-    assert set(paths["/zones/{zone}"]["delete"]["responses"]) == {"204", "401", "403", "default"}
+    assert set(paths["/zones/{zone}"]["delete"]["responses"]) == {"204", "401", "403", "422", "500"}
     assert "content" not in paths["/zones/{zone}"]["delete"]["responses"]["204"]
+
+
+async def test_refused_method_names_those_of_every_route_of_the_path(client):
+    answer = await client.post("/zones/z1")
+    is_problem(answer, 405)
+    assert answer.headers["allow"] == "DELETE, PUT"
 
 
 async def test_openapi_describes_message_bodies_and_resolves_all_references(client):

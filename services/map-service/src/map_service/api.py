@@ -163,7 +163,7 @@ def _add_zones(routes: Routes, service: Service, clock: Clock) -> None:
                 zone = await service.create(zone, caller.name, attempt)
             except ConflictError as error:
                 raise ProblemError(412, f"zone {zone_id} exists already: PUT it with If-Match") from error
-            return Answer(zone, etag(zone.version), created=True)
+            return Answer(zone, etag(zone.version), status=201)
         old = _find_matching(service, zone_id, if_match)
         zone = await service.replace(zone, old.version, caller.name, attempt)
         return Answer(zone, etag(zone.version))

@@ -1,14 +1,16 @@
 """The base of every service's REST interface: health, metrics, problem documents, roles, a body limit, OpenAPI."""
 
 from collections.abc import Awaitable, Callable, MutableMapping
-from typing import Any, Final
+from typing import Any, Final, Literal
 
+import msgspec
 from fastapi import FastAPI, Response
-from fastapi.responses import JSONResponse
 
+from fog_contracts.messages import Message
 from fog_runtime import metrics
 from fog_runtime.health import Health
 from fog_runtime.http.problems import add_problem_handlers, problem
+from fog_runtime.http.routes import Answer, Routes
 from fog_runtime.http.tokens import Tokens
 from fog_runtime.version import VERSION
 
@@ -63,18 +65,42 @@ class _BodyLimit:
         await self._app(scope, replay, send)
 
 
-def _add_health(app: FastAPI, health: Health) -> None:
-    @app.get("/healthz", tags=["health"], summary="Whether the process runs")
-    async def healthz() -> dict[str, str]:
-        return {"status": "ok"}
+class Alive(Message, frozen=True, kw_only=True):
+    """The process runs."""
 
-    @app.get("/readyz", tags=["health"], summary="Whether it can do its work; 503 names what is missing")
-    async def readyz() -> JSONResponse:
-        report = health.report()
-        return JSONResponse(report, 200 if report["ready"] else 503)
+    status: Literal["ok"] = "ok"
 
-    @app.get("/metrics", tags=["health"], summary="Metrics for Prometheus", response_class=Response)
+
+class Part(Message, frozen=True, kw_only=True):
+    """A condition of readiness: whether it is met, and if not, why."""
+
+    ok: bool
+    detail: str
+
+
+class Readiness(Message, frozen=True, kw_only=True):
+    """Whether the process can do its work, the names of the unmet conditions, and every condition."""
+
+    ready: bool
+    missing: list[str]
+    parts: dict[str, Part]
+
+
+def _add_health(routes: Routes, health: Health) -> None:
+    @routes.get("/healthz")
+    async def healthz() -> Alive:
+        """Whether the process runs."""
+        return Alive()
+
+    @routes.get("/readyz", status=(200, 503))
+    async def readyz() -> Answer[Readiness]:
+        """Whether the process can do its work; 503 names what is missing."""
+        report = msgspec.convert(health.report(), Readiness)
+        return Answer(report, status=200 if report.ready else 503)
+
+    @routes.get("/metrics", media_type="text/plain")
     async def prometheus() -> Response:
+        """Metrics for Prometheus."""
         text, kind = metrics.exposition()
         return Response(text, media_type=kind)
 
@@ -86,7 +112,7 @@ def make_app(title: str, health: Health, tokens: Tokens, *, body_limit: int = BO
     app.state.tokens = tokens
     app.state.schemas = {}
     add_problem_handlers(app)
-    _add_health(app, health)
+    _add_health(Routes(app, "health"), health)
     app.add_middleware(_BodyLimit, limit=body_limit)
     generate = app.openapi
 

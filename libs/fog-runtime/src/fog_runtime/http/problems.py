@@ -9,6 +9,7 @@ from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
+from starlette.routing import Match, Route
 
 from fog_runtime import logs
 
@@ -78,6 +79,12 @@ def problem(
     return JSONResponse(body, status, headers, media_type=PROBLEM)
 
 
+def _allowed_methods(request: Request) -> list[str]:
+    """Return the methods of every route of the request's path: Starlette names only those of the first."""
+    matching = (route for route in request.app.routes if route.matches(request.scope)[0] is not Match.NONE)
+    return sorted({method for route in matching if isinstance(route, Route) for method in route.methods or ()})
+
+
 _SENTENCES: Final = re.compile(r"^(Value error|Assertion failed), ")
 
 
@@ -93,7 +100,10 @@ def add_problem_handlers(app: FastAPI) -> None:
         detail = str(error.detail)
         if detail == HTTPStatus(error.status_code).phrase:
             detail = f"{request.method} {request.url.path}: {detail.lower()}"
-        return problem(error.status_code, detail, headers=dict(error.headers) if error.headers else None)
+        headers = dict(error.headers or {})
+        if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
+            headers["Allow"] = ", ".join(_allowed_methods(request))
+        return problem(error.status_code, detail, headers=headers)
 
     @app.exception_handler(RequestValidationError)
     async def _(_: Request, error: RequestValidationError) -> Response:

@@ -28,6 +28,7 @@ T = TypeVar("T")
 E = TypeVar("E", bound=Exception)
 Handler = TypeVar("Handler", bound=Callable[..., Awaitable[object]])
 
+_ANSWERS: Final = {201: "The new record", 204: "Done", 503: "The answer while something is missing"}
 _SCHEMAS: Final = "#/components/schemas/{name}"
 
 
@@ -46,11 +47,11 @@ IfMatch = Annotated[
 
 @dataclass(frozen=True, slots=True)
 class Answer(Generic[T]):
-    """An answer with headers, and whether it tells of a new record (201 instead of the route's status)."""
+    """An answer with headers, and with another of the route's statuses than the usual one."""
 
     value: T
     headers: Mapping[str, str] = field(default_factory=dict)
-    created: bool = False
+    status: int | None = None
 
 
 def etag(version: int) -> dict[str, str]:
@@ -71,7 +72,7 @@ class Routes:
 
     A route is an async function. `Body[T]` declares the type of its body, `Viewer` or `Operator` the role of its
     callers, and the return type its response: a msgspec type, an `Answer` of one, None for 204, or a ready `Response`.
-    The first `status` is the usual one; a route that may create something has 201 as another (`Answer.created`).
+    The first `status` is the usual one; those of a route that may create something are (200, 201), for example.
     `raises` lists exceptions that become problem documents as registered by `Routes.raises`; `problems` describes
     further ones.
     """
@@ -151,23 +152,24 @@ class Routes:
     def _responses(
         self, signature: "_Signature", statuses: Sequence[int], media_type: str, problems: Mapping[int, str]
     ) -> dict[int | str, dict[str, Any]]:
-        answer: dict[str, Any] = {"description": "Done" if 204 in statuses else "The answer"}
-        if media_type:
-            answer["content"] = {media_type: {}}
-        elif 204 not in statuses:
-            answer["content"] = {"application/json": {"schema": schema(self._app, signature.answer)}}
-        described: dict[int, str] = {}
+        """Describe every response that a route may give: no other status is ever answered."""
+        content: dict[str, Any] = {"content": {media_type or "application/json": {}}}
+        if not media_type and 204 not in statuses:
+            content = {"content": {"application/json": {"schema": schema(self._app, signature.answer)}}}
+        elif 204 in statuses:
+            content = {}
+        described: dict[int, str] = {500: "The service failed: its log names the reason"}
         if signature.needs_token:
             described |= {401: "The token is missing or unknown", 403: "The token's role does not allow this"}
+        if signature.has_parameters:
+            described |= {422: "A parameter is invalid: `errors` names it"}
         if signature.body is not None:
             described |= {413: "The body is too large", 422: "The body is invalid: `errors` names the fields"}
-        described.update(problems)
-        content = {PROBLEM: {"schema": schema(self._app, Problem)}}
-        responses: dict[int | str, dict[str, Any]] = dict.fromkeys(statuses, answer)
-        for code, text in described.items():
-            responses[code] = {"description": text, "content": content}
-        responses["default"] = {"description": "Any other error", "content": content}
-        return responses
+        problem = {PROBLEM: {"schema": schema(self._app, Problem)}}
+        return {
+            **{status: {"description": _ANSWERS.get(status, "The answer"), **content} for status in statuses},
+            **{code: {"description": text, "content": problem} for code, text in {**described, **problems}.items()},
+        }
 
 
 class _Signature:
@@ -189,6 +191,8 @@ class _Signature:
             # The caller's role is checked before everything else.
             (first if arguments[0] is Caller else others).append(replaced)
         self.needs_token = bool(first)
+        body = self.body[0] if self.body is not None else None
+        self.has_parameters = any(parameter.name != body for parameter in others)
         self.parameters = [*first, *others]
         answer = hints["return"]
         self.answer = get_args(answer)[0] if get_origin(answer) is Answer else answer
@@ -207,8 +211,8 @@ def _endpoint(
         if answer is None:
             return Response(status_code=status)
         full: Answer[object] = answer if isinstance(answer, Answer) else Answer(answer)
-        data, answered = msgspec.json.encode(full.value), 201 if full.created else status
-        return Response(data, answered, dict(full.headers), media_type="application/json")
+        data = msgspec.json.encode(full.value)
+        return Response(data, full.status or status, dict(full.headers), media_type="application/json")
 
     setattr(endpoint, "__signature__", inspect.Signature(signature.parameters))  # noqa: B010  # what FastAPI reads
     return endpoint

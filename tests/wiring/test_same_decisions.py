@@ -440,6 +440,7 @@ def test_every_query_handler_takes_the_request_type_of_its_channel_and_gives_its
             expected = "None" if request is None else request.__name__
             assert annotations(query_handler) == ["Ids", expected, "Moment"], f"{name}: {channel.name}"
             assert reply is not None
-            assert inspect.signature(query_handler).return_annotation == reply.__name__, f"{name}: {channel.name}"
+            answered = inspect.signature(query_handler).return_annotation
+            assert answered in {reply.__name__, f"Later[{reply.__name__}]"}, f"{name}: {channel.name}"
             checked += 1
     assert checked == 6

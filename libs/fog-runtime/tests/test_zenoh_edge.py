@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import itertools
 import json
 import time
 
@@ -14,6 +15,7 @@ from fog_contracts import messages as m
 from fog_contracts.codec import ContractError
 from fog_contracts.handlers import RefusedMessageError
 from fog_runtime.clock import SystemClock
+from fog_runtime.reply_parts import PART_BYTES, decode_announcement
 from fog_runtime.zenoh_edge import ZenohEdge, session_config
 from fog_supervisor.net import free_port
 from fog_supervisor.servers import start_router
@@ -351,3 +353,47 @@ async def test_router_logs_its_endpoint_and_ends_on_sigterm(tmp_path):
     events = [json.loads(line) for line in router.log.read_text().splitlines()]
     assert [event["event"] for event in events] == ["listening", "stopping", "stopped"]
     assert events[0]["endpoints"] == [router.endpoint]
+
+
+def snapshot_of(cells: bytes, seq: int = 1) -> m.MapSnapshot:
+    geometry = m.MapGeometry(width=1, height=1, resolution=0.05, origin_x=0.0, origin_y=0.0)
+    return m.MapSnapshot(site="lab", epoch=1, seq=seq, hash=1, cost=cells, speed=b"", static=b"", geometry=geometry)
+
+
+async def test_large_reply_is_fetched_by_several_clients_while_newer_ones_replace_it(router):
+    served = [snapshot_of(bytes([seq]) * 300_000, seq) for seq in range(12)]
+    asked = itertools.count()
+    async with edge(router.endpoint, "a") as a, edge(router.endpoint, "b") as b, edge(router.endpoint, "c") as c:
+        a.serve(ch.MAP_SNAPSHOT, lambda *_: served[next(asked) % len(served)])
+        a.serve(ch.PLANNER_PLAN, lambda _, request: m.PlanReply(length=request.goal.x))
+        await query_until_answered(b, 1.0)
+        await query_until_answered(c, 1.0)
+        replies = await asyncio.gather(
+            *(client.query(ch.MAP_SNAPSHOT, None, m.MapSnapshot, 30.0) for client in (b, c) for _ in range(5))
+        )
+        assert all(reply in served for reply in replies)
+
+
+async def test_large_reply_without_flow_control_is_only_announced(router):
+    """Whoever asks and never fetches gets a few bytes, however large the reply."""
+    async with edge(router.endpoint, "a") as a, edge(router.endpoint, "b") as b:
+        a.serve(ch.MAP_SNAPSHOT, lambda *_: snapshot_of(bytes(5_000_000)))
+        a.serve(ch.PLANNER_PLAN, lambda _, request: m.PlanReply(length=request.goal.x))
+        await query_until_answered(b, 1.0)
+        with raw_session(router.endpoint) as session:
+            key = ch.MAP_SNAPSHOT.key(site="lab")
+
+            async def fetch(name: str, number: str) -> zenoh.Reply:
+                selector = zenoh.Selector(key, {"reply": name, "part": number})
+                (part,) = await asyncio.to_thread(lambda: list(session.get(selector)))
+                return part
+
+            (reply,) = await asyncio.to_thread(lambda: list(session.get(key)))
+            assert len(reply.ok.payload) == 0
+            announced = decode_announcement(reply.ok.attachment.to_bytes())
+            assert announced.size > 5_000_000
+            for number, expected in ((0, PART_BYTES), (announced.parts - 1, announced.size % PART_BYTES)):
+                assert len((await fetch(announced.reply, str(number))).ok.payload) == expected
+            for wrong in ("-1", "x", str(announced.parts), "9" * 30, "\u0663"):
+                assert b"ask again" in bytes((await fetch(announced.reply, wrong)).err.payload)
+            assert b"ask again" in bytes((await fetch("another", "0")).err.payload)

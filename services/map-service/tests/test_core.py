@@ -432,7 +432,7 @@ def test_queries_return_the_map_its_zones_and_an_areas_hazard():
     core.load_zones([zone()], moment(0.0))
     core.tick(moment(0.0))
     answers = core.query_handlers()
-    assert answers[ch.MAP_SNAPSHOT]({}, None, moment(1.0)) is core.costmap.snapshot()
+    assert answers[ch.MAP_SNAPSHOT]({}, None, moment(1.0)).make() is core.costmap.snapshot()
     assert [z.id for z in answers[ch.ZONES]({}, None, moment(1.0)).zones] == ["z1"]
     assert answers[ch.HAZARD]({"area": "gate"}, None, moment(1.0)).hazard.area == "gate"
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from fog_contracts.codec import ContractError, decode, decode_text, encode, encode_text
-from fog_contracts.handlers import RefusedMessageError
+from fog_contracts.handlers import RefusedMessageError, completed
 from fog_contracts.messages import Message
 
 if TYPE_CHECKING:
@@ -103,7 +103,7 @@ class Bus:
         for service in self._services:
             if service.channel is channel and _matches(service.only, requested):
                 received = None if request is None else roundtrip(channel, request)
-                reply = service.query_handler(requested, received, at)
+                reply = completed(service.query_handler(requested, received, at))
                 if not isinstance(reply, kind):
                     raise ContractError(channel.name, f"was answered with {type(reply).__name__}, not {kind.__name__}")
                 return roundtrip(channel, reply, reply=channel.kind == "query")

@@ -8,10 +8,12 @@ decisions.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 from fog_contracts.channels import Channel
 from fog_contracts.messages import Message
+
+M = TypeVar("M", bound=Message)
 
 Ids = Mapping[str, str]
 """The variable parts of a topic or key by name, without the site: for example `{"robot": "r1"}`."""
@@ -47,7 +49,34 @@ class RefusedMessageError(ValueError):
 Handler = Callable[[Ids, Any, Moment], Sequence[Publication]]
 """Handles one message of a channel; its second argument is the channel's message type (text for a text channel)."""
 
-QueryHandler = Callable[[Ids, Any, Moment], Message]
+
+class Later(Generic[M]):
+    """An answer that takes long to make. It owns its inputs, so that one other thread may make it, for all who ask."""
+
+    def __init__(self, make: Callable[[], M]) -> None:
+        self._make: Callable[[], M] | None = make
+        self._made: M | None = None
+
+    @property
+    def made(self) -> M | None:
+        """The answer, if it was made."""
+        return self._made
+
+    def make(self) -> M:
+        """Return the answer, and make it first if that was not done yet."""
+        if self._made is None:
+            assert self._make is not None
+            self._made = self._make()
+            self._make = None  # it may hold large inputs
+        return self._made
+
+
+def completed(answer: Message | Later[Message]) -> Message:
+    """Return a query's answer, made here and now if it is for later."""
+    return answer.make() if isinstance(answer, Later) else answer
+
+
+QueryHandler = Callable[[Ids, Any, Moment], Message | Later[Any]]
 """Answers one query; its second argument is the channel's request type, or None for a query without one."""
 
 

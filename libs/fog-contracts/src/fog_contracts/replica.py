@@ -9,6 +9,7 @@ import hashlib
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Final, Literal, get_args
 
 import numpy as np
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from fog_contracts.channels import DELTA_LIMIT
 from fog_contracts.grid import GridGeometry, Window
+from fog_contracts.handlers import Later
 from fog_contracts.messages import (
     Cause,
     Layer,
@@ -109,7 +111,8 @@ class MasterMap:
         self.layers: dict[Layer, Grid] = {"cost": cost.copy(), "speed": np.zeros(geometry.shape, dtype=np.uint8)}
         self._hashes = TileHashes(self.layers)
         self._version = Version(epoch, 0, self._hashes.value)
-        self._snapshot: MapSnapshot | None = None
+        self._snapshot: Later[MapSnapshot] | None = None
+        self._static_packed: bytes | None = None
 
     @property
     def version(self) -> Version:
@@ -166,25 +169,35 @@ class MasterMap:
 
     def snapshot(self) -> MapSnapshot:
         """Return the whole map; it is encoded once per version."""
+        return self.snapshot_later().make()
+
+    def snapshot_later(self) -> Later[MapSnapshot]:
+        """Return the whole map as it is now, to be encoded on any thread; the same one until the next version."""
         if self._snapshot is None:
-            g = self.geometry
-            self._snapshot = MapSnapshot(
-                site=self.site,
-                epoch=self._version.epoch,
-                seq=self._version.seq,
-                hash=self._version.hash,
-                geometry=MapGeometry(
-                    width=g.width,
-                    height=g.height,
-                    resolution=g.resolution,
-                    origin_x=g.origin_x,
-                    origin_y=g.origin_y,
-                ),
-                cost=zlib.compress(self.layers["cost"].tobytes(), 1),
-                speed=zlib.compress(self.layers["speed"].tobytes(), 1),
-                static=zlib.compress(self.static.tobytes(), 1),
-            )
+            # The floor plan never changes; the layers are copied, because the next version is written into them.
+            cost, speed = self.layers["cost"].copy(), self.layers["speed"].copy()
+            self._snapshot = Later(partial(self._encode, self._version, cost, speed))
         return self._snapshot
+
+    def _encode(self, version: Version, cost: Grid, speed: Grid) -> MapSnapshot:
+        g = self.geometry
+        return MapSnapshot(
+            site=self.site,
+            epoch=version.epoch,
+            seq=version.seq,
+            hash=version.hash,
+            geometry=MapGeometry(
+                width=g.width, height=g.height, resolution=g.resolution, origin_x=g.origin_x, origin_y=g.origin_y
+            ),
+            cost=zlib.compress(cost.data, 1),
+            speed=zlib.compress(speed.data, 1),
+            static=self._packed_static(),
+        )
+
+    def _packed_static(self) -> bytes:
+        if self._static_packed is None:
+            self._static_packed = zlib.compress(np.ascontiguousarray(self.static).data, 1)
+        return self._static_packed
 
     @staticmethod
     def _changed_window(grid: Grid, window: Window, cells: Grid) -> Window:

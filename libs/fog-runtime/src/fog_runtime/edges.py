@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import asyncio
 from typing import TYPE_CHECKING, Any
 
 from fog_contracts.codec import ContractError
-from fog_contracts.handlers import Moment
+from fog_contracts.handlers import Later, Moment
 from fog_contracts.messages import Message
 from fog_runtime import logs, metrics
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Awaitable, Callable, Mapping, Sequence
 
     from fog_contracts.channels import Channel
     from fog_contracts.handlers import Handler, Ids, Publication, QueryHandler
@@ -18,7 +19,8 @@ if TYPE_CHECKING:
     from fog_runtime.mqtt_edge import MqttEdge
     from fog_runtime.zenoh_edge import ZenohEdge
 
-    Reply = Callable[[dict[str, str], Any], Message]
+    Answer = Message | Awaitable[Message]
+    Reply = Callable[[dict[str, str], Any], Answer]
     OnReply = Callable[[Channel, Message | None, Message], object]
 
 
@@ -34,6 +36,7 @@ class Edges:
         self._zenoh = zenoh
         self._served_when_published: dict[Channel, Reply] = {}
         self._limited = logs.RateLimited(_log)
+        self._making: dict[Later[Message], asyncio.Future[Message]] = {}
         self._served: set[tuple[Channel, frozenset[tuple[str, str]]]] = set()
 
     def now(self) -> Moment:
@@ -123,13 +126,33 @@ class Edges:
         return deliver
 
     def _reply(self, channel: Channel, query_handler: QueryHandler, on_reply: OnReply | None) -> Reply:
-        def reply(ids: dict[str, str], request: Any) -> Message:  # noqa: ANN401  # of the channel's type
-            answer = query_handler(ids, request, self.now())
+        def replied(request: Any, message: Message) -> Message:  # noqa: ANN401  # of the channel's type
             if on_reply is not None:
-                on_reply(channel, request, answer)
-            return answer
+                on_reply(channel, request, message)
+            return message
+
+        async def later(request: Any, answer: Later[Message]) -> Message:  # noqa: ANN401
+            return replied(request, await self._made(channel, answer))
+
+        def reply(ids: dict[str, str], request: Any) -> Answer:  # noqa: ANN401
+            answer = query_handler(ids, request, self.now())
+            return later(request, answer) if isinstance(answer, Later) else replied(request, answer)
 
         return reply
+
+    async def _made(self, channel: Channel, answer: Later[Message]) -> Message:
+        """Return an answer that takes long to make: on another thread, once for all who ask for it meanwhile."""
+        if answer.made is not None:
+            return answer.made
+        making = self._making.get(answer)
+        if making is None:
+            making = self._making[answer] = asyncio.ensure_future(self._make(channel, answer))
+            making.add_done_callback(lambda _: self._making.pop(answer, None))
+        return await asyncio.shield(making)
+
+    async def _make(self, channel: Channel, answer: Later[Message]) -> Message:
+        with metrics.REPLY_SECONDS.labels(channel.name).time():
+            return await asyncio.to_thread(answer.make)
 
     def _subscribe(
         self,

@@ -42,6 +42,13 @@ PUBLISHED: Final = Counter("fognav_published_messages_total", "Messages publishe
 DROPPED: Final = Counter(
     "fognav_dropped_messages_total", "Messages dropped without a connection or because a queue was full", ["channel"]
 )
+ANSWERED: Final = Counter("fognav_answered_queries_total", "Queries answered with a reply", ["channel"])
+REPLY_SECONDS: Final = Histogram(
+    "fognav_reply_encoding_seconds",
+    "Time to make a long reply (a snapshot of the map), away from the event loop; once per version, shared by all",
+    ["channel"],
+    buckets=(0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0),
+)
 HANDLER_ERRORS: Final = Counter(
     "fognav_handler_errors_total", "Messages whose handler raised an exception, which is a bug", ["channel"]
 )

@@ -26,7 +26,9 @@ from fog_contracts.handlers import RefusedMessageError
 from fog_contracts.messages import Message
 from fog_runtime import logs, metrics
 from fog_runtime.clock import Clock
+from fog_runtime.reply_parts import GONE, PART, PART_BYTES, REPLY, LargeReplies
 from fog_runtime.slots import Slot
+from fog_runtime.zenoh_query import ask
 
 M = TypeVar("M", bound=Message)
 Ids = dict[str, str]
@@ -204,6 +206,7 @@ class _Queryable:
         self._ids = edge.ids(channel, key) or {}
         self._pending = 0
         self._last: tuple[Message, bytes] | None = None
+        self._large = LargeReplies()
 
     def declare(self, session: zenoh.Session) -> object:
         return session.declare_queryable(self._key, self._on_query)
@@ -223,6 +226,9 @@ class _Queryable:
 
     async def _answer(self, query: zenoh.Query) -> None:
         try:
+            if (reply := query.parameters.get(REPLY)) is not None:
+                await self._send_part(query, reply, query.parameters.get(PART) or "")
+                return
             try:
                 request = self._request(query)
             except ContractError as error:
@@ -239,10 +245,22 @@ class _Queryable:
                 _log.error("handler_failed", error=error, channel=self._channel.name, key=self._key)
                 await self._edge.in_thread(partial(query.reply_err, b"the answering process failed; see its log"))
                 return
-            await self._edge.in_thread(partial(query.reply, self._key, data))
+            if len(data) > PART_BYTES:
+                announcement = self._large.announce(data).encoded()
+                await self._edge.in_thread(partial(query.reply, self._key, b"", attachment=announcement))
+            else:
+                await self._edge.in_thread(partial(query.reply, self._key, data))
+            metrics.ANSWERED.labels(self._channel.name).inc()
         finally:
             self._pending -= 1
             _finish(query)
+
+    async def _send_part(self, query: zenoh.Query, reply: str, number: str) -> None:
+        part = self._large.part(reply, number)
+        if part is None:
+            await self._edge.in_thread(partial(query.reply_err, GONE))
+        else:
+            await self._edge.in_thread(partial(query.reply, self._key, part))
 
     def _request(self, query: zenoh.Query) -> Message | None:
         if self._channel.kind != "query" or self._channel.message is None:
@@ -360,37 +378,8 @@ class ZenohEdge:
         session = self._session
         if session is None:
             return None
-        answer: asyncio.Future[bytes | ContractError | None] = self._loop.create_future()
-        reply = channel.kind == "query"
-        limit = channel.reply_limit if reply else channel.limit
-
-        def set_answer(value: bytes | ContractError | None) -> None:
-            if not answer.done():
-                answer.set_result(value)
-
-        def on_reply(reply_or_error: zenoh.Reply) -> None:
-            if reply_or_error.ok is not None:
-                size = len(reply_or_error.ok.payload)
-                if size > limit:
-                    self.call(set_answer, ContractError(channel.name, f"{size} bytes are over the limit of {limit}"))
-                else:
-                    self.call(set_answer, reply_or_error.ok.payload.to_bytes())
-            elif reply_or_error.err is not None and (text := bytes(reply_or_error.err.payload)[:500]) != b"Timeout":
-                # zenoh reports a missing reply as the error "Timeout": the same as none.
-                self.call(set_answer, ContractError(channel.name, f"refused: {text.decode('utf-8', 'replace')}"))
-
-        timeout = max(0.001, self._clock.real(timeout_s))
-        handler = zenoh.handlers.Callback(on_reply, lambda: self.call(set_answer, None))
-        get = partial(session.get, key, handler, timeout=timeout, payload=data)
-        try:
-            async with asyncio.timeout(timeout):
-                await self.in_thread(get)
-                result = await answer
-        except TimeoutError:
-            return None
-        if isinstance(result, ContractError):
-            raise result
-        return None if result is None else decode(channel, result, kind, reply=reply)
+        result = await ask(self, session, channel, key, data, max(0.001, self._clock.real(timeout_s)))
+        return None if result is None else decode(channel, result, kind, reply=channel.kind == "query")
 
     def serve(self, channel: Channel, handler: Callable[[Ids, Any], Answer], **ids: str) -> None:
         """Answer queries with `handler(ids, request)`, plain or async; `request` is None where the channel has none."""

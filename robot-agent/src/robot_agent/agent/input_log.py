@@ -20,6 +20,7 @@ import numpy as np
 
 from fog_contracts import channels as ch
 from fog_contracts.commands import sign
+from fog_contracts.handlers import completed
 from fog_contracts.messages import LoopHealth, MapSnapshot, Mode, RobotCommand
 from robot_agent.agent.core import AgentCore
 from robot_agent.config import AgentConfig
@@ -258,7 +259,7 @@ class LoggedAgent(AgentCore):
     def _answer(self, channel: Channel, query_handler: QueryHandler, ids: Ids, request: Any, at: Moment) -> Message:  # noqa: ANN401  # of the channel's type
         logged = self._re_signed(request) if channel is ch.ROBOT_COMMAND else request
         self._write(QueryReceived(channel=channel.name, ids=dict(ids), request=logged, now=at.now, stamp=at.stamp))
-        reply = query_handler(ids, request, at)
+        reply = completed(query_handler(ids, request, at))
         self._write(Answered(reply=reply))
         return reply
 

@@ -52,7 +52,8 @@ from fog_runtime.http import (
 )
 from fog_runtime.http.routes import InvalidBodyError
 from fog_runtime.idempotency import IdempotencyError
-from fog_runtime.work import BusyError
+from fog_runtime.work import BusyError, Worker
+from map_service.costmap import LayeredCostmap
 from map_service.layers.base import Grid
 from map_service.service import ConflictError, Service
 from map_service.store import StoreError
@@ -61,6 +62,8 @@ from map_service.zone_validation import ZoneError
 AuditKind = Literal["area", "mission", "store", "zone"]
 
 _PNG: Final = "image/png"
+_MAX_PICTURES: Final = 4
+"""Most pictures that are being encoded or wait for it."""
 _ZONES_NOT_LOADED: Final = {503: "The stored zones are not loaded yet, or the store does not answer"}
 _REFUSALS: Final = (ZoneError, BusyError, IdempotencyError, StoreError)
 _NO_SUCH_ZONE: Final = {404: "No zone has this id", **_ZONES_NOT_LOADED}
@@ -196,11 +199,7 @@ def _add_errors(routes: Routes) -> None:
     routes.raises(
         CursorError, {422: "The cursor is invalid"}, lambda error: ProblemError(422, str(error), field="query.cursor")
     )
-    routes.raises(
-        BusyError,
-        {503: "Too many requests wait for a calculation; `Retry-After` says when to try again"},
-        lambda error: ProblemError(503, f"{error}: try again", headers=RETRY_AFTER),
-    )
+    _add_busy_error(routes)
     routes.raises(
         ConflictError,
         {409: "A zone with this id exists already", 412: "Somebody else changed the zone"},
@@ -228,17 +227,36 @@ def _with_remedies(error: InvalidBodyError) -> InvalidBodyError:
     return InvalidBodyError(errors)
 
 
-def _add_views(routes: Routes, service: Service, site: Site) -> None:
-    core, costmap = service.core, service.core.costmap
-    images: dict[str, tuple[object, bytes]] = {}
+def _add_busy_error(routes: Routes) -> None:
+    routes.raises(
+        BusyError,
+        {503: "Too many requests wait for a calculation; `Retry-After` says when to try again"},
+        lambda error: ProblemError(503, f"{error}: try again", headers=RETRY_AFTER),
+    )
 
-    async def image(name: str, cells: Grid, palette: bytes) -> Response:
-        """Return a PNG whose pixel values are the cells'; encoded in a thread, once per map version."""
-        cached = images.get(name)
-        if cached is None or cached[0] != costmap.version:
+
+class _Pictures:
+    """PNGs whose pixel values are the cells', encoded on a thread of their own, once per version for all who ask."""
+
+    def __init__(self, costmap: LayeredCostmap) -> None:
+        self._costmap = costmap
+        self._worker = Worker("pictures", limit=_MAX_PICTURES)
+        self._latest: dict[str, tuple[object, asyncio.Future[bytes]]] = {}
+
+    async def response(self, name: str, cells: Grid, palette: bytes) -> Response:
+        """Return the picture of the current version; raises `BusyError` while too many are being encoded."""
+        version, picture = self._latest.get(name, (None, None))
+        if picture is None or version != self._costmap.version or (picture.done() and picture.exception()):
             # Copied before the event loop can change the map.
-            images[name] = cached = (costmap.version, await asyncio.to_thread(_png, cells.copy(), palette))
-        return Response(cached[1], media_type=_PNG, headers={"Cache-Control": "no-cache"})
+            picture = asyncio.ensure_future(self._worker.run(_png, cells.copy(), palette))
+            self._latest[name] = self._costmap.version, picture
+        return Response(await asyncio.shield(picture), media_type=_PNG, headers={"Cache-Control": "no-cache"})
+
+
+def _add_views(routes: Routes, service: Service, site: Site) -> None:
+    _add_busy_error(routes)
+    core, costmap = service.core, service.core.costmap
+    pictures = _Pictures(costmap)
 
     @routes.get("/api/v1/hazards")
     async def hazards() -> list[HazardArea]:
@@ -259,16 +277,16 @@ def _add_views(routes: Routes, service: Service, site: Site) -> None:
         )
         return MapInfo(site=site.id, geometry=geometry, epoch=costmap.version.epoch, seq=costmap.version.seq)
 
-    @routes.get("/api/v1/map.png", media_type=_PNG)
+    @routes.get("/api/v1/map.png", media_type=_PNG, raises=[BusyError])
     async def map_png() -> Response:
         """Return the floor plan: white is free, black occupied, grey unknown."""
-        return await image("map", costmap.static, _PLAN)
+        return await pictures.response("map", costmap.static, _PLAN)
 
-    @routes.get("/api/v1/costmap.png", media_type=_PNG, problems=_ZONES_NOT_LOADED)
+    @routes.get("/api/v1/costmap.png", media_type=_PNG, raises=[BusyError], problems=_ZONES_NOT_LOADED)
     async def costmap_png() -> Response:
         """Return the master costmap; a pixel's palette index is the cell's cost."""
         _require_zones(service)
-        return await image("cost", costmap.cost, _COSTS)
+        return await pictures.response("cost", costmap.cost, _COSTS)
 
 
 def _require_zones(service: Service) -> None:

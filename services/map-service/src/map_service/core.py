@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from fog_contracts.channels import Channel
     from fog_contracts.costs import Inflation
     from fog_contracts.grid import StaticMap
-    from fog_contracts.handlers import Handler, Ids, QueryHandler
+    from fog_contracts.handlers import Handler, Ids, Later, QueryHandler
     from fog_contracts.messages import AreaDefinition, HazardArea, MapSnapshot, Zone
     from fog_contracts.raster import Spans
     from map_service.aggregator_monitor import AggregatorMonitor
@@ -210,8 +210,8 @@ class MapCore:
         waited = self._first_tick is not None and now - self._first_tick >= self._hazards_wait_s
         return self._zones_loaded and (waited or not self._hazards.areas_without_hazard())
 
-    def _answer_snapshot(self, _ids: Ids, _request: None, _at: Moment) -> MapSnapshot:
-        return self.costmap.snapshot()
+    def _answer_snapshot(self, _ids: Ids, _request: None, _at: Moment) -> Later[MapSnapshot]:
+        return self.costmap.snapshot_later()
 
     def _answer_zones(self, _ids: Ids, _request: None, _at: Moment) -> ZoneSet:
         return self.zone_set()

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from fog_contracts.costs import Inflation
     from fog_contracts.grid import StaticMap, Window
+    from fog_contracts.handlers import Later
     from fog_contracts.messages import Cause, Layer, MapDelta, MapHeartbeat, MapSnapshot
     from fog_contracts.replica import Version
     from map_service.layers.base import CostLayer, Grid
@@ -77,6 +78,10 @@ class LayeredCostmap:
     def snapshot(self) -> MapSnapshot:
         """Return the whole map."""
         return self._master.snapshot()
+
+    def snapshot_later(self) -> Later[MapSnapshot]:
+        """Return the whole map as it is now, to be encoded on any thread."""
+        return self._master.snapshot_later()
 
     def recompute(self) -> tuple[Grid, Grid]:
         """Return cost and speed layer computed from scratch; the master must equal them, cell by cell."""

@@ -35,6 +35,11 @@ _STALE: Final = """\
 *Stale after* is measured from a message's arrival by the receiver's own clock. Without it
 the value holds until the next message, or as long as the message itself says.
 """
+_PARTS: Final = """\
+A reply over 32 KiB is only announced, and its parts are asked for: the reply is empty, with an attachment (JSON)
+`{"reply": NAME, "size": BYTES}`; the query `KEY?reply=NAME;part=NUMBER` returns a part of 32 KiB (the last one is
+shorter), or an error once the reply is not kept any more. Replies are dropped on a congested link: ask again.
+"""
 _LARGE: Final = 2**31
 _METHODS: Final = ("get", "put", "post", "patch", "delete")
 
@@ -90,6 +95,7 @@ def _zenoh() -> str:
             f"## zenoh\n\nMessages are msgpack. {_STALE}",
             "### Published\n\n" + _table(columns, rows),
             "### Queries\n\n" + _table(["key", "request", "reply", "sent by", "answered by", "size limit"], queries),
+            _PARTS,
             "### Presence\n\n"
             + _table(["key", "meaning", "from → to"], ([_key(row), row.about, _ends(row)] for row in presence)),
         ]

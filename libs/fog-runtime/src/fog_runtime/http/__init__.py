@@ -1,11 +1,10 @@
 """The REST interface of all services: problem documents (RFC 9457), tokens with roles, health, metrics, limits."""
 
 from fog_runtime.http.app import make_app
-from fog_runtime.http.problems import ProblemError
+from fog_runtime.http.problems import RETRY_AFTER, ProblemError
 from fog_runtime.http.routes import Answer, Body, IfMatch, Routes, etag, expected_version
 from fog_runtime.http.server import serve
 from fog_runtime.http.store_routes import (
-    RETRY_AFTER,
     IdempotencyKey,
     IfNoneMatch,
     add_recovery,

@@ -1,5 +1,6 @@
 """The base of every service's REST interface: health, metrics, problem documents, roles, a body limit, OpenAPI."""
 
+import asyncio
 from collections.abc import Awaitable, Callable, MutableMapping
 from typing import Any, Final, Literal
 
@@ -9,7 +10,7 @@ from fastapi import FastAPI, Response
 from fog_contracts.messages import Message
 from fog_runtime import metrics
 from fog_runtime.health import Health
-from fog_runtime.http.problems import add_problem_handlers, problem
+from fog_runtime.http.problems import RETRY_AFTER, add_problem_handlers, problem
 from fog_runtime.http.routes import Answer, Routes
 from fog_runtime.http.tokens import Tokens
 from fog_runtime.version import VERSION
@@ -18,15 +19,20 @@ BODY_LIMIT: Final = 1024 * 1024
 _DRAIN_FACTOR: Final = 16
 """A body is read and discarded up to this many times the limit."""
 
+MAX_OPEN_REQUESTS: Final = 128
+"""Most requests that are served at the same time."""
+_ALWAYS_SERVED: Final = frozenset({"/healthz", "/readyz", "/metrics"})
+
 Scope = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
 Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
+App = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 
 class _BodyLimit:
     """Reads a request's body, up to the limit, before the app runs, so that no handler has to hold more."""
 
-    def __init__(self, app: Callable[[Scope, Receive, Send], Awaitable[None]], limit: int) -> None:
+    def __init__(self, app: App, limit: int) -> None:
         self._app = app
         self._limit = limit
 
@@ -63,6 +69,36 @@ class _BodyLimit:
             return {"type": "http.request", "body": bytes(body), "more_body": False}
 
         await self._app(scope, replay, send)
+
+
+class _Turns:
+    """Begins one request per turn of the event loop, so that a burst of them holds up nothing else for long.
+
+    Of requests that are open, at most `limit` are served: further ones are answered with 503 and `Retry-After`. Health
+    and metrics are always served.
+    """
+
+    def __init__(self, app: App, limit: int) -> None:
+        self._app = app
+        self._limit = limit
+        self._open = 0
+        self._turn = asyncio.Lock()
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http" or scope["path"] in _ALWAYS_SERVED:
+            await self._app(scope, receive, send)
+            return
+        if self._open >= self._limit:
+            busy = problem(503, f"{self._open} requests are being served: try again", headers=RETRY_AFTER)
+            await busy(scope, receive, send)
+            return
+        self._open += 1
+        try:
+            async with self._turn:
+                await asyncio.sleep(0)
+            await self._app(scope, receive, send)
+        finally:
+            self._open -= 1
 
 
 class Alive(Message, frozen=True, kw_only=True):
@@ -114,6 +150,7 @@ def make_app(title: str, health: Health, tokens: Tokens, *, body_limit: int = BO
     add_problem_handlers(app)
     _add_health(Routes(app, "health"), health)
     app.add_middleware(_BodyLimit, limit=body_limit)
+    app.add_middleware(_Turns, limit=MAX_OPEN_REQUESTS)
     generate = app.openapi
 
     def openapi() -> dict[str, Any]:

@@ -14,6 +14,8 @@ from starlette.routing import Match, Route
 from fog_runtime import logs
 
 PROBLEM: Final = "application/problem+json"
+RETRY_AFTER: Final = {"Retry-After": "1"}
+"""The header of an error that passes by itself."""
 
 _log = logs.get("http")
 

@@ -1,18 +1,16 @@
 """What the REST interfaces of all services with a store have in common: its errors, its recovery, idempotency keys."""
 
-from typing import Annotated, Any, Final, Literal, Protocol
+from typing import Annotated, Any, Literal, Protocol
 
 from fastapi import Header
 
 from fog_contracts.messages import Message
-from fog_runtime.http.problems import ProblemError
+from fog_runtime.http.problems import RETRY_AFTER, ProblemError
 from fog_runtime.http.routes import Body, Routes
 from fog_runtime.http.tokens import Admin, Caller
 from fog_runtime.idempotency import Attempt, IdempotencyError
 from fog_runtime.redis_connection import StoreError, StoreRefusedError
 from fog_runtime.redis_store import RecoveryError
-
-RETRY_AFTER: Final = {"Retry-After": "1"}
 
 IdempotencyKey = Annotated[
     str | None,

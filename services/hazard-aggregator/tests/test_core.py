@@ -49,7 +49,9 @@ class Rig:
         for _ in range(times):
             self.seq += 1
             state = "blocked" if distance < 1.2 else "clear"
-            reading = NodeReading(seq=self.seq, boot=1, uptime_ms=0, range_m=[distance], status=["ok"], state=state)
+            reading = NodeReading(
+                seq=self.seq, boot=1, uptime_ms=round(1000 * self.now), range_m=[distance], status=["ok"], state=state
+            )
             self.deliver(ch.NODE_READING, reading, node="n1")
 
     def states(self) -> list[str]:

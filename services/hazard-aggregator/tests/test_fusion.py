@@ -12,6 +12,7 @@ from fog_contracts.messages import AreaDefinition, AreaHazard, NodeReading, Robo
 from fog_contracts.site import NodeSite, Sonar
 from hazard_aggregator.debounce import DebounceError, RuleFactory
 from hazard_aggregator.fusion import AreaFusion
+from hazard_aggregator.reading_order import ReadingOrder
 from hazard_aggregator.registry import find_rule
 
 SQUARE = [(0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (0.0, 1.0)]
@@ -61,7 +62,7 @@ class Rig:
             reading = NodeReading(
                 seq=self.seq,
                 boot=1,
-                uptime_ms=0,
+                uptime_ms=round(1000 * self.now),
                 range_m=list(ranges),
                 status=["no_echo" if r is None else "ok" for r in ranges],
                 state=reported,
@@ -126,27 +127,104 @@ def test_duplicate_and_outdated_readings_are_ignored():
     rig.read(3.0, 3.0, times=5)
     rig.seq -= 3
     rig.read(0.8, 3.0, times=3)
-    reading = NodeReading(seq=50, boot=1, uptime_ms=0, range_m=[0.8, 3.0], status=["ok", "ok"], state="blocked")
+    reading = NodeReading(seq=50, boot=1, uptime_ms=10**6, range_m=[0.8, 3.0], status=["ok", "ok"], state="blocked")
     for _ in range(20):
         rig.core.on_reading("n1", reading, rig.now, rig.now)
     assert rig.hazard.state == "clear"
+    assert rig.core.pop_rejections() == [("n1", "outdated")] * 2 + [("n1", "duplicate")] + [("n1", "duplicate")] * 19
 
 
 def test_reading_of_an_earlier_boot_is_ignored_until_the_node_is_silent():
     rig = Rig(site("n1"))
     rig.read(3.0, 3.0, times=5)
 
-    def read_from_old_boot(seq: int) -> None:
-        late = NodeReading(seq=seq, boot=0, uptime_ms=0, range_m=[0.8, 3.0], status=["ok", "ok"], state="blocked")
+    def read_from_boot(boot: int, seq: int) -> None:
+        rig.now += PERIOD
+        late = NodeReading(
+            seq=seq, boot=boot, uptime_ms=100 * seq, range_m=[0.8, 3.0], status=["ok", "ok"], state="blocked"
+        )
         rig.core.on_reading("n1", late, rig.now, rig.now)
 
-    for seq in range(10):
-        read_from_old_boot(seq)
-    assert rig.hazard.state == "clear"
+    read_from_boot(9, 0)
+    rig.core.pop_rejections()
+    rig.read(3.0, 3.0)
+    assert rig.core.pop_rejections() == [("n1", "earlier_boot")]
+    for seq in range(1, 5):
+        read_from_boot(9, seq)
+    assert rig.hazard.state == "blocked", "boots are random: one that was never heard is new, whatever its number"
     rig.wait(3.5)
-    for seq in range(10, 15):
-        read_from_old_boot(seq)
+    rig.read(3.0, 3.0, times=5)
+    assert rig.hazard.state == "clear"
+
+
+def test_node_that_counts_from_zero_again_is_heard_after_three_seconds():
+    rig = Rig(site("n1"))
+    rig.seq = 6000
+    rig.read(3.0, 3.0, times=5)
+    rig.seq = -1
+    rig.read(0.8, 3.0, times=29)
+    assert rig.hazard.state == "clear"
+    assert set(rig.core.pop_rejections()) == {("n1", "outdated")}
+    rig.read(0.8, 3.0, times=7)
     assert rig.hazard.state == "blocked"
+
+
+def test_seq_of_32_bits_may_wrap():
+    rig = Rig(site("n1"))
+    rig.seq = 2**32 - 3
+    rig.read(3.0, 3.0, times=2)
+    rig.seq = -1
+    rig.read(3.0, 3.0, times=3)
+    assert rig.core.pop_rejections() == []
+    assert rig.hazard.state == "clear"
+
+
+def test_uptime_may_begin_anew():
+    order = ReadingOrder()
+    for i in range(40):
+        uptime = 2**32 - 1000 + 100 * i
+        placed = order.place(measured(i, uptime_ms=uptime % 2**32), 500.0 + i / 10)
+        assert placed == (pytest.approx(500.0 + i / 10, abs=0.01), True)
+
+
+def measured(seq: int, *, uptime_ms: int, state: str = "clear") -> NodeReading:
+    distance = 0.8 if state == "blocked" else 3.0
+    return NodeReading(seq=seq, boot=1, uptime_ms=uptime_ms, range_m=[distance, 3.0], status=["ok", "ok"], state=state)
+
+
+def test_burst_of_delayed_readings_is_not_taken_for_fresh_ones():
+    rig = Rig(site("n1"))
+    rig.read(0.8, 3.0, times=5)
+    taken = rig.now
+    rig.wait(20.0)
+    assert (rig.hazard.state, rig.hazard.penalty) == ("unknown", 254)
+    for i in range(1, 160):  # the queue of a frozen broker: sixteen seconds, the last four of which are missing
+        reading = measured(rig.seq + i, uptime_ms=round(1000 * (taken + i * PERIOD)))
+        rig.changes += rig.core.on_reading("n1", reading, rig.now, rig.now)
+    assert (rig.hazard.state, rig.hazard.penalty) == ("unknown", 254)
+    assert set(rig.core.pop_rejections()) == {("n1", "late")}
+
+
+def test_silence_counts_from_when_a_reading_was_taken():
+    rig = Rig(site("n1"))
+    rig.read(3.0, 3.0, times=5)
+    rig.now += 2.0
+    reading = measured(rig.seq + 1, uptime_ms=round(1000 * (rig.now - 1.9)))
+    rig.core.on_reading("n1", reading, rig.now, rig.now)
+    rig.wait(0.9)
+    assert rig.hazard.state == "clear"
+    rig.wait(0.5)
+    assert rig.hazard.state == "unknown"
+
+
+def test_readings_closer_together_than_a_node_can_measure_count_as_one():
+    rig = Rig(site("n1"))
+    rig.read(3.0, 3.0, times=5)
+    start = round(1000 * rig.now)
+    for i in range(1, 20):
+        rig.core.on_reading("n1", measured(rig.seq + i, uptime_ms=start + 100 + i, state="blocked"), rig.now, rig.now)
+    assert rig.hazard.state == "clear"
+    assert rig.core.pop_rejections() == [("n1", "too_soon")] * 18
 
 
 @pytest.mark.parametrize(("before", "penalty"), [((3.0, 3.0), 200), ((0.8, 3.0), 254)])
@@ -208,6 +286,35 @@ def test_no_echo_is_clear_only_where_calibration_found_nothing_in_range():
     walled.read(None, None, state="clear", times=20)
     assert walled.hazard.state == "unknown"
     assert "opposite wall" in walled.hazard.cause
+
+
+@pytest.mark.parametrize(("ranges", "state"), [((0.8, 3.0), "blocked"), ((3.0, 3.0), "clear")])
+def test_missing_echoes_between_readings_do_not_restart_the_count(ranges, state):
+    rig = Rig(site("n1", no_echo_is_clear=False))
+    rig.read(*((3.0, 3.0) if state == "blocked" else (0.8, 3.0)), times=5)
+    for _ in range(4):
+        rig.read(*ranges, times=2)
+        rig.read(None, 3.0, state="unknown")
+    assert rig.hazard.state == state
+
+
+def test_missing_echoes_as_frequent_as_clear_readings_clear_nothing():
+    rig = Rig(site("n1", no_echo_is_clear=False))
+    rig.read(0.8, 3.0, times=5)
+    for _ in range(100):
+        rig.read(3.0, 3.0)
+        rig.read(None, 3.0, state="unknown")
+        rig.wait(0.0)
+    assert (rig.hazard.state, rig.hazard.penalty) == ("unknown", 254)
+
+
+def test_trace_begins_with_the_first_of_the_readings_that_block_an_area():
+    rig = Rig(site("n1", no_echo_is_clear=False))
+    rig.read(3.0, 3.0, times=5)
+    rig.read(0.8, 3.0, times=2)
+    rig.read(None, 3.0, state="unknown")
+    rig.read(0.8, 3.0, times=3)
+    assert rig.hazard.trace.confirmed - rig.hazard.trace.first_reading == pytest.approx(5 * PERIOD)
 
 
 def test_flapping_readings_make_the_area_unknown():
@@ -298,7 +405,12 @@ def test_explained_echoes_do_not_depend_on_the_sites_rotation(rotation, distance
         core.on_pose("r1", pose(x, y), 0.0)
         for seq in range(5):
             echo = NodeReading(
-                seq=seq, boot=1, uptime_ms=0, range_m=[max(distance - 0.17, 0.05)], status=["ok"], state="blocked"
+                seq=seq,
+                boot=1,
+                uptime_ms=100 * seq,
+                range_m=[max(distance - 0.17, 0.05)],
+                status=["ok"],
+                state="blocked",
             )
             core.on_reading("n1", echo, 0.0, 0.0)
         return core.hazards()[0].state
@@ -383,6 +495,14 @@ def test_clear_area_is_unknown_after_a_restart_until_readings_confirm_clear():
     assert rig.hazard.state == "clear"
 
 
+@pytest.mark.parametrize(("state", "penalty"), [("blocked", 254), ("unknown", 254), ("unknown", 200)])
+def test_hazard_keeps_its_since_across_a_restart(state, penalty):
+    rig = Rig(site("n1"), restored=[stored(state, penalty)])
+    assert (rig.hazard.state, rig.hazard.penalty, rig.hazard.since) == (state, penalty, 1.0)
+    rig.read(3.0, 3.0, times=5)
+    assert rig.hazard.since > 1.0
+
+
 def test_reading_before_the_first_tick_leaves_the_restored_state():
     core = AreaFusion([area("n1")], [site("n1")], 2, [stored("blocked", 254)], registry=find_rule)
     reading = NodeReading(seq=1, boot=1, uptime_ms=0, range_m=[3.0, 3.0], status=["ok", "ok"], state="clear")
@@ -434,6 +554,18 @@ def test_thesis_nodes_block_their_area():
     assert core.hazards()[0].state == "blocked"
 
 
+def test_stray_thesis_message_holds_an_area_for_a_minute_only():
+    rig = Rig(site("n1"))
+    rig.changes += rig.core.on_thesis_state(7, "clear", rig.now, rig.now)
+    for _ in range(630):
+        rig.read(3.0, 3.0)
+        rig.wait(0.0)
+        if rig.now < 159.0:
+            assert rig.hazard.state == "unknown"
+    assert rig.hazard.state == "clear"
+    assert list(rig.hazard.nodes) == ["n1"]
+
+
 @pytest.mark.parametrize(
     ("choice", "message"),
     [
@@ -475,10 +607,9 @@ def test_debounce_rule_can_use_the_time_of_readings():
     fusion = AreaFusion(
         [definition], [site("n1")], 1, registry={"sustained": factory}.__getitem__, default_rule="sustained"
     )
-    for seq, now in enumerate((100.0, 100.5, 100.99, 101.0)):
+    for seq, now in enumerate((100.0, 100.5, 100.9, 101.01)):
         assert fusion.hazards() == [] or fusion.hazards()[0].state == "unknown"
-        reading = NodeReading(seq=seq, boot=1, uptime_ms=0, range_m=[0.8, 3.0], status=["ok", "ok"], state="blocked")
-        fusion.on_reading("n1", reading, now, now)
+        fusion.on_reading("n1", measured(seq, uptime_ms=round(1000 * now), state="blocked"), now, now)
     assert fusion.hazards()[0].state == "blocked"
 
 
@@ -502,10 +633,10 @@ def test_only_consecutive_clear_readings_clear_a_blocked_area(events):
             clear_in_a_row = 0
         elif event == "no_echo":
             rig.read(None, 3.0, state="unknown")
-            clear_in_a_row = 0
+            clear_in_a_row = max(0, clear_in_a_row - 1)
         elif event == "contradiction":
             rig.read(0.8, 3.0, state="clear")
-            clear_in_a_row = 0
+            clear_in_a_row = max(0, clear_in_a_row - 1)
         elif event == "wait":
             rig.wait(3.5)
             clear_in_a_row = 0

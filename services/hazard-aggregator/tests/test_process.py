@@ -34,7 +34,7 @@ class NodeClient:
             reading = NodeReading(
                 seq=self.seq,
                 boot=self.boot,
-                uptime_ms=self.seq,
+                uptime_ms=100 * self.seq,
                 range_m=[distance, 3.0],
                 status=["ok", "ok"],
                 state="blocked" if distance < 1.5 else "clear",

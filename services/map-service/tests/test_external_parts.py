@@ -87,7 +87,7 @@ async def test_debounce_rule_and_cost_layer_of_an_external_package_work_in_the_r
         async with asyncio.timeout(60):
             while not hazards or hazards[-1].state != "blocked":
                 reading = NodeReading(
-                    seq=seq, boot=1, uptime_ms=0, range_m=[0.8, 3.0], status=["ok", "ok"], state="blocked"
+                    seq=seq, boot=1, uptime_ms=100 * seq, range_m=[0.8, 3.0], status=["ok", "ok"], state="blocked"
                 )
                 await mqtt.publish(ch.NODE_READING, reading, node="n1")
                 seq += 1

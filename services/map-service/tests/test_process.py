@@ -95,7 +95,7 @@ async def test_five_blocked_readings_become_lethal_cells_on_the_robots_map(fog, 
         await fog.ready("hazard_aggregator")
         for seq in range(5):
             reading = NodeReading(
-                seq=seq, boot=1, uptime_ms=0, range_m=[0.8, 3.0], status=["ok", "ok"], state="blocked"
+                seq=seq, boot=1, uptime_ms=100 * seq, range_m=[0.8, 3.0], status=["ok", "ok"], state="blocked"
             )
             await mqtt.publish(ch.NODE_READING, reading, node="n1")
         await until(lambda: robot.cost(3.5, 3.0) == LETHAL, "lethal", lambda: fog.log("map_service"))
@@ -271,7 +271,7 @@ async def test_hazards_arrive_after_malformed_messages_and_a_restart_of_the_brok
             if robot.cost(3.5, 3.0) == LETHAL:
                 break
             reading = NodeReading(
-                seq=seq, boot=1, uptime_ms=0, range_m=[0.8, 3.0], status=["ok", "ok"], state="blocked"
+                seq=seq, boot=1, uptime_ms=100 * seq, range_m=[0.8, 3.0], status=["ok", "ok"], state="blocked"
             )
             await mqtt.publish(ch.NODE_READING, reading, node="n1")
             await asyncio.sleep(0.02)
@@ -292,7 +292,9 @@ async def test_clear_area_becomes_unknown_when_the_aggregator_dies(fog, until):
         for seq in range(300):
             if robot.cost(3.5, 3.0) == 0:
                 break
-            reading = NodeReading(seq=seq, boot=1, uptime_ms=0, range_m=[3, 3], status=["ok", "ok"], state="clear")
+            reading = NodeReading(
+                seq=seq, boot=1, uptime_ms=100 * seq, range_m=[3, 3], status=["ok", "ok"], state="clear"
+            )
             await mqtt.publish(ch.NODE_READING, reading, node="n1")
             await asyncio.sleep(0.02)
         assert robot.cost(3.5, 3.0) == 0

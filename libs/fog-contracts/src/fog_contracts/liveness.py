@@ -17,6 +17,24 @@ LATE_S: Final = 0.25
 """A sender that is not trusted yet must start anew when a heartbeat was this much (s) faster than those before."""
 
 
+class DelayEstimator:
+    """How much longer (s) each message of one sender takes than its fastest one, by the two monotonic clocks."""
+
+    def __init__(self) -> None:
+        self._offset = math.inf
+        self._offset_at = 0.0
+        self.faster_by = 0.0
+        """By how much (s) the latest message was faster than all before; infinite for the first."""
+
+    def update(self, sent: float, now: float) -> float:
+        """Return the delay of a message that was sent at `sent` of the sender's clock (s) and arrives `now`."""
+        offset = now - sent
+        known = self._offset + CLOCK_DRIFT * (now - self._offset_at) if self._offset < math.inf else math.inf
+        self.faster_by = max(0.0, known - offset)
+        self._offset, self._offset_at = min(known, offset), now
+        return offset - self._offset
+
+
 class HeartbeatWatch:
     """Watches one sender, from its first heartbeat on.
 
@@ -27,8 +45,7 @@ class HeartbeatWatch:
     def __init__(self, max_age_s: float, *, trusted_after_s: float) -> None:
         self._max_age_s = max_age_s
         self._trusted_after_s = trusted_after_s
-        self._offset = math.inf
-        self._offset_at = 0.0
+        self._delay = DelayEstimator()
         self._since = math.inf
         self._trusted = False
         self._latest_sent = -math.inf
@@ -39,12 +56,9 @@ class HeartbeatWatch:
         """Handle a heartbeat that was sent at `uptime` of the sender's monotonic clock (s) and arrives `now`."""
         if self.age(now) > self._max_age_s:
             self._trusted, self._since = False, now
-        offset = now - uptime
-        known = self._offset + CLOCK_DRIFT * (now - self._offset_at) if self._offset < math.inf else math.inf
-        if known - offset > LATE_S and not self._trusted:
+        self.delay_s = self._delay.update(uptime, now)
+        if self._delay.faster_by > LATE_S and not self._trusted:
             self._since = now  # this one shows that those before were late
-        self._offset, self._offset_at = min(known, offset), now
-        self.delay_s = offset - self._offset
         self._latest_sent = max(self._latest_sent, now - self.delay_s)
         if self._latest_sent - self._since >= self._trusted_after_s:
             self._trusted = True

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from fog_contracts.messages import AreaDefinition, AreaHazard, NodeReading, RobotPose
     from fog_contracts.site import NodeSite
     from hazard_aggregator.fusion import AreaFusion, NodeReport
+    from hazard_aggregator.reading_order import Rejection
 
 
 _HALF_TICK_S: Final = 0.05
@@ -96,6 +97,10 @@ class Aggregator:
         """Return the messages of others on this aggregator's topics since the last call, for logs and metrics."""
         foreign, self._foreign = self._foreign, []
         return foreign
+
+    def pop_rejections(self) -> list[tuple[str, Rejection]]:
+        """Return nodes whose readings did not count since the last call, each with the reason, for metrics."""
+        return self._fusion.pop_rejections()
 
     @property
     def outranked_by(self) -> int | None:

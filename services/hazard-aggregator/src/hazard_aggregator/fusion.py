@@ -1,80 +1,38 @@
-"""Turns readings into hazards: debounces each node, fuses the nodes of an area; an unobserved area is never clear.
+"""Turns readings into hazards: passes each reading to the areas that its node watches.
 
-Pure: time comes as `now` (s, the receiver's monotonic clock) and `stamp` (s since the epoch, for people and traces).
+`reading_order` decides which readings are news, `plausibility` what one shows, `node_state` with its debounce rule when
+a node's state is confirmed, and `watched_area` what that means for an area. Pure: time comes as `now` (s, the
+receiver's monotonic clock) and `stamp` (s since the epoch, for people and traces).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from msgspec import structs
-
 from fog_contracts.channels import BLOCKED, CLEAR, ROBOT_POSE
-from fog_contracts.costs import LETHAL
-from fog_contracts.messages import SEVERITY, AreaDefinition, AreaHazard, Trace
 from hazard_aggregator.debounce import DEFAULT_RULE, make_rule
+from hazard_aggregator.node_state import NodeState
 from hazard_aggregator.plausibility import Classification, classify_reading
+from hazard_aggregator.reading_order import ReadingOrder, Taken
+from hazard_aggregator.watched_area import WatchedArea
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
     from typing import Final
 
-    from fog_contracts.messages import AreaState, NodeReading, RobotPose
+    from fog_contracts.messages import AreaDefinition, AreaHazard, AreaState, NodeReading, RobotPose
     from fog_contracts.site import NodeSite
     from hazard_aggregator.debounce import Registry, Rule
+    from hazard_aggregator.reading_order import Rejection
 
 LATE_TICK_S: Final = 0.5
 """A longer gap (s) between two ticks means that the process itself was stalled."""
 THESIS_NODE: Final = "thesis-area-{number}"
 """The id of a thesis node, which has none of its own, within its area."""
-
-
-@dataclass
-class _NodeState:
-    """The state of one node of one area."""
-
-    id: str
-    site: NodeSite | None
-    rule: Rule
-    last_reading: float | None = None
-    last_confirmed: float = 0.0
-    state: AreaState = "unknown"
-    reason: str = "no reading received yet"
-    boot: int = -1
-    seq: int = -1
-    online: bool | None = None
-    ever_received: bool = False
-    unconfirmed: bool = True  # no state was confirmed since the last invalidation
-    explained_by: str | None = None
-    run_state: AreaState | None = None
-    run_began: float = 0.0
-    received: int = 0
-    ignored: int = 0
-
-    def silent_for(self, now: float) -> float:
-        """Return the time (s) since the last reading; without one, since the first call."""
-        if self.last_reading is None:
-            self.last_reading = self.last_confirmed = now
-        return now - self.last_reading
-
-    def invalidate(self, reason: str) -> None:
-        """Set the state to unknown until readings confirm another one."""
-        self.state = "unknown"
-        self.reason = reason
-        self.unconfirmed = True
-        self.explained_by = None
-        self.run_state = None
-        self.rule.reset()
-
-
-@dataclass
-class _Area:
-    definition: AreaDefinition
-    nodes: dict[str, _NodeState] = field(default_factory=dict)
-    last_known_blocked: bool = False  # then unknown costs as much as blocked
-    confirmed: bool = False  # whether readings of this run have confirmed a state
-    hazard: AreaHazard | None = None
+THESIS_EXPIRY_S: Final = 60.0
+"""A thesis node that has been silent for so long (s) is gone: no site lists it, and one stray message made it."""
+_MAX_REJECTIONS: Final = 10_000
 
 
 @dataclass(frozen=True)
@@ -114,17 +72,20 @@ class AreaFusion:
         self.nodes = {node.id: node for node in nodes}
         self._registry = registry
         self._default_rule = default_rule
-        self._areas: dict[str, _Area] = {}
+        self._areas: dict[str, WatchedArea] = {}
         self._tombstones: dict[str, AreaDefinition] = {}
         self._poses: dict[str, tuple[float, RobotPose]] = {}
         self._seqs: dict[str, int] = {}
-        self._by_node: dict[str, list[tuple[_Area, _NodeState]]] = {}
+        self._by_node: dict[str, list[tuple[WatchedArea, NodeState]]] = {}
+        self._orders: dict[str, ReadingOrder] = {}
+        self._rejections: list[tuple[str, Rejection]] = []
         self._last_tick: float | None = None
         self._last_tick_skipped = False
         for definition in definitions:
             self._define(definition)
         for hazard in restored:
-            self._restore_at_start(hazard)
+            if (area := self._areas.get(hazard.area)) is not None:
+                area.restore_at_start(hazard)
 
     # --- State ------------------------------------------------------------------------------------------------------
 
@@ -161,20 +122,24 @@ class AreaFusion:
     # --- Inputs -----------------------------------------------------------------------------------------------------
 
     def on_reading(self, node_id: str, reading: NodeReading, now: float, stamp: float) -> list[AreaHazard]:
-        """Apply a reading; duplicate and outdated ones (by boot and seq) are ignored."""
-        changed: list[AreaHazard] = []
-        for area, node in self._by_node.get(node_id, ()):
-            if not _is_newer(node, reading, now, area.definition.unknown.silent_after_s):
+        """Apply a reading; one that is no news (`ReadingOrder`) is ignored."""
+        watched = self._by_node.get(node_id)
+        if not watched:
+            return []
+        taken = self._orders.setdefault(node_id, ReadingOrder()).place(reading, now)
+        if not isinstance(taken, Taken):
+            self._reject(node_id, taken)
+            for _, node in watched:
                 node.ignored += 1
-                continue
-            node.boot, node.seq = reading.boot, reading.seq
-            if node.site is None:
-                classification = Classification(
-                    reading.state, f"the node reports {reading.state} (the site does not define it)"
-                )
-            else:
-                classification = classify_reading(node.site, reading, self._fresh_poses(now))
-            self._apply(node, classification, now, stamp)
+            return []
+        if not taken.counts:
+            self._reject(node_id, "too_soon")
+        classification = self._classify(node_id, reading, now)
+        if classification.state == "unknown":
+            self._reject(node_id, "implausible")
+        changed: list[AreaHazard] = []
+        for area, node in watched:
+            node.apply(classification, taken.at, stamp, counts=taken.counts)
             changed += self._evaluate(area, stamp)
         return changed
 
@@ -187,10 +152,10 @@ class AreaFusion:
             name = THESIS_NODE.format(number=number)
             node = area.nodes.get(name)
             if node is None:
-                node = area.nodes[name] = _NodeState(name, None, self.new_rule(area.definition))
+                node = area.nodes[name] = NodeState(name, None, self.new_rule(area.definition))
             reported: AreaState = BLOCKED if state == BLOCKED else CLEAR if state == CLEAR else "unknown"
             reason = f"it reports {reported}" if reported != "unknown" else f"it reports neither {BLOCKED} nor {CLEAR}"
-            self._apply(node, Classification(reported, reason), now, stamp)
+            node.apply(Classification(reported, reason), now, stamp)
             changed += self._evaluate(area, stamp)
         return changed
 
@@ -222,14 +187,11 @@ class AreaFusion:
             return []
         changed: list[AreaHazard] = []
         for area in self._areas.values():
-            limit = area.definition.unknown.silent_after_s
-            for node in area.nodes.values():
-                if node.silent_for(now) > limit:
-                    reason = f"it has been silent for more than {limit:g} s"
-                    if node.state != "unknown" or node.reason != reason:
-                        node.invalidate(reason)
-                elif now - node.last_confirmed > limit and node.state != "unknown":
-                    node.invalidate("its readings contradict one another")
+            for name, node in list(area.nodes.items()):
+                if self._is_undefined(area, name) and node.silent_for(now) > THESIS_EXPIRY_S:
+                    del area.nodes[name]
+                else:
+                    node.check_silence(area.definition.unknown.silent_after_s, now)
             changed += self._evaluate(area, stamp)
         self._poses = {robot: entry for robot, entry in self._poses.items() if now - entry[0] <= ROBOT_POSE.max_age_s}
         return changed
@@ -242,20 +204,20 @@ class AreaFusion:
 
     def restore(self, hazards: Iterable[AreaHazard], stamp: float) -> list[AreaHazard]:
         """Apply hazards that were unreadable at the start; areas that readings have confirmed since keep theirs."""
-        changed: list[AreaHazard] = []
-        for hazard in hazards:
-            area = self._areas.get(hazard.area)
-            if area is not None and not area.confirmed and _is_impassable(hazard):
-                area.last_known_blocked = True
-                changed += self._evaluate(area, stamp)
-        return changed
+        areas = [(self._areas.get(hazard.area), hazard) for hazard in hazards]
+        dangerous = [area for area, hazard in areas if area is not None and area.restore_late(hazard)]
+        return [changed for area in dangerous for changed in self._evaluate(area, stamp)]
 
     def set_epoch(self, epoch: int) -> None:
         """Give all hazards, those to come too, another epoch."""
         self.epoch = epoch
         for area in self._areas.values():
-            if area.hazard is not None:
-                area.hazard = structs.replace(area.hazard, epoch=epoch)
+            area.set_epoch(epoch)
+
+    def pop_rejections(self) -> list[tuple[str, Rejection]]:
+        """Return nodes whose readings did not count since the last call, each with the reason, for metrics."""
+        rejections, self._rejections = self._rejections, []
+        return rejections
 
     def new_rule(self, definition: AreaDefinition) -> Rule:
         """Return a fresh debounce rule for a node of an area; raises `DebounceError` for invalid settings."""
@@ -271,134 +233,57 @@ class AreaFusion:
             self._tombstones[definition.id] = definition
         else:
             self._tombstones.pop(definition.id, None)
-            area = _Area(definition)
-            if old is not None:
-                area.last_known_blocked, area.confirmed = old.last_known_blocked, old.confirmed
-                area.hazard = old.hazard
-            keep_rules = old is not None and old.definition.debounce == definition.debounce
-            undefined = {name for name in (old.nodes if old else ()) if name not in self.nodes}
-            thesis = {THESIS_NODE.format(number=definition.number)} & undefined
-            for name in [*definition.nodes, *sorted(thesis - set(definition.nodes))]:
-                node = old.nodes.get(name) if old is not None else None
-                if node is None:
-                    node = _NodeState(name, self.nodes.get(name), self.new_rule(definition))
-                elif not keep_rules:
-                    node.rule = self.new_rule(definition)
-                area.nodes[name] = node
-            self._areas[definition.id] = area
+            nodes = self._nodes_of(definition, old)
+            if old is None:
+                self._areas[definition.id] = WatchedArea(definition, nodes)
+            else:
+                old.redefine(definition, nodes)
         self._by_node = {}
         for area in self._areas.values():
             for node in area.nodes.values():
                 self._by_node.setdefault(node.id, []).append((area, node))
 
-    def _restore_at_start(self, hazard: AreaHazard) -> None:
-        area = self._areas.get(hazard.area)
-        if area is None:
-            return
-        area.last_known_blocked = _is_impassable(hazard)
-        if hazard.state == "blocked":
-            for node in area.nodes.values():
-                node.state = hazard.state
-                node.reason = "the area was blocked before the restart"
+    def _nodes_of(self, definition: AreaDefinition, old: WatchedArea | None) -> dict[str, NodeState]:
+        """Return the nodes of an area; those that it had under its `old` definition keep their states."""
+        known = old.nodes if old is not None else {}
+        keep_rules = old is not None and old.definition.debounce == definition.debounce
+        thesis = THESIS_NODE.format(number=definition.number)
+        names = list(dict.fromkeys([*definition.nodes, *({thesis} & known.keys() - self.nodes.keys())]))
+        nodes: dict[str, NodeState] = {}
+        for name in names:
+            node = known.get(name)
+            if node is None:
+                node = NodeState(name, self.nodes.get(name), self.new_rule(definition))
+            elif not keep_rules:
+                node.rule = self.new_rule(definition)
+            nodes[name] = node
+        return nodes
+
+    @staticmethod
+    def _is_undefined(area: WatchedArea, node: str) -> bool:
+        """Whether a node reports only under the area's number on the thesis's topics."""
+        return node not in area.definition.nodes
+
+    def _classify(self, node_id: str, reading: NodeReading, now: float) -> Classification:
+        site = self.nodes.get(node_id)
+        if site is None:
+            return Classification(reading.state, f"the node reports {reading.state} (the site does not define it)")
+        return classify_reading(site, reading, self._fresh_poses(now))
+
+    def _reject(self, node_id: str, reason: Rejection) -> None:
+        if len(self._rejections) < _MAX_REJECTIONS:
+            self._rejections.append((node_id, reason))
 
     def _fresh_poses(self, now: float) -> Iterator[tuple[str, RobotPose]]:
         for robot, (received, pose) in self._poses.items():
             if now - received <= ROBOT_POSE.max_age_s and pose.localized:
                 yield robot, pose
 
-    @staticmethod
-    def _apply(node: _NodeState, classification: Classification, now: float, stamp: float) -> None:
-        """Apply one classified reading to its node."""
-        node.silent_for(now)
-        node.received += 1
-        node.last_reading = now
-        node.ever_received = True
-        node.online = True
-        if classification.explained_by is not None:
-            # Counts neither way: the debounce rule does not see it, and the timer that detects flapping restarts.
-            node.explained_by = classification.explained_by
-            node.last_confirmed = now
-            return
-        if classification.state != node.run_state:
-            node.run_state = classification.state
-            node.run_began = stamp
-        confirmed = node.rule.update(classification.state, now)
-        if confirmed is None:
-            return
-        node.last_confirmed = now
-        node.explained_by = None
-        if confirmed != node.state or node.unconfirmed:
-            # Later readings of the same state leave the reason: the hazard would change with every centimetre.
-            node.state, node.reason, node.unconfirmed = confirmed, classification.reason, False
-
-    def _evaluate(self, area: _Area, stamp: float) -> list[AreaHazard]:
-        """Fuse the nodes; return the area's hazard when it changed."""
-        state, deciding = _fuse(area)
-        if state != "unknown":
-            area.last_known_blocked = state == "blocked"
-            area.confirmed = area.confirmed or (deciding is not None and deciding.ever_received)
-        penalty = LETHAL if state == "blocked" or (state == "unknown" and area.last_known_blocked) else 0
-        if state == "unknown" and not area.last_known_blocked:
-            penalty = area.definition.unknown.penalty
-        explained = next((node.explained_by for node in area.nodes.values() if node.explained_by), None)
-        old = area.hazard
-        same = old is not None and (old.state, old.penalty, old.explained_by) == (state, penalty, explained)
-        if same and state != "unknown":
+    def _evaluate(self, area: WatchedArea, stamp: float) -> list[AreaHazard]:
+        """Return the area's hazard when it changed."""
+        seq = self._seqs.get(area.definition.id, 0) + 1
+        hazard = area.evaluate(self.epoch, seq, stamp)
+        if hazard is None:
             return []
-        cause = _cause(area, state, deciding)
-        if same and old is not None and old.cause == cause:
-            return []
-        seq = self._seqs[area.definition.id] = self._seqs.get(area.definition.id, 0) + 1
-        trace = None
-        if state == "blocked" and (old is None or old.state != state) and deciding and deciding.run_state == state:
-            trace = Trace(
-                area=area.definition.id, epoch=self.epoch, seq=seq, first_reading=deciding.run_began, confirmed=stamp
-            )
-        area.hazard = AreaHazard(
-            area=area.definition.id,
-            state=state,
-            severity=SEVERITY["unknown_after_blocked" if state == "unknown" and area.last_known_blocked else state],
-            penalty=penalty,
-            since=old.since if old is not None and old.state == state else stamp,
-            seq=seq,
-            epoch=self.epoch,
-            cause=cause,
-            nodes={node.id: node.state for node in area.nodes.values()},
-            explained_by=explained,
-            trace=trace,
-        )
-        return [area.hazard]
-
-
-def _is_impassable(hazard: AreaHazard) -> bool:
-    """Whether a hazard makes its area impassable."""
-    return hazard.state == "blocked" or (hazard.state == "unknown" and hazard.penalty >= LETHAL)
-
-
-def _is_newer(node: _NodeState, reading: NodeReading, now: float, silent_after: float) -> bool:
-    """Whether a reading is newer than all before; a lower boot id counts once the node has been silent."""
-    if reading.boot != node.boot:
-        return reading.boot > node.boot or node.silent_for(now) > silent_after
-    return reading.seq > node.seq
-
-
-def _fuse(area: _Area) -> tuple[AreaState, _NodeState | None]:
-    """Return the area's state and the node that decided it: blocked needs one node, clear needs all of them."""
-    nodes = list(area.nodes.values())
-    for state in ("blocked", "unknown"):
-        for node in nodes:
-            if node.state == state:
-                return state, node
-    return ("clear", nodes[0]) if nodes else ("unknown", None)
-
-
-def _cause(area: _Area, state: AreaState, deciding: _NodeState | None) -> str:
-    """Return a sentence on why the area is in its state."""
-    if deciding is None:
-        return "no node watches this area"
-    sentence = f"node {deciding.id}: {deciding.reason}"
-    if state == "clear" and len(area.nodes) > 1:
-        sentence = f"all {len(area.nodes)} nodes agree; {sentence}"
-    if state == "unknown":
-        sentence += "; it was blocked before and stays impassable" if area.last_known_blocked else ""
-    return sentence[:500]
+        self._seqs[area.definition.id] = seq
+        return [hazard]

@@ -38,6 +38,11 @@ HAZARDS = Gauge("fognav_hazards", "Whether an area is announced in this state (1
 WITHHELD = Gauge("fognav_hazards_withheld", "Areas whose relief is withheld until it is stored")
 UNSTORED = Gauge("fognav_hazards_unstored", "Areas whose newest hazard is not stored yet")
 PENDING = Gauge("fognav_mqtt_pending_messages", "Messages that wait for the connection or for the broker's answer")
+REJECTED = Counter(
+    "fognav_readings_rejected_total",
+    "Readings that do not count as measurements, by node and reason",
+    ["node", "reason"],
+)
 FOREIGN = Counter(
     "fognav_foreign_messages_total",
     "Messages on the aggregator's topics that it did not publish itself, by what they are about",
@@ -220,6 +225,8 @@ class Service:
         async for _ in ticker(self._clock, TICK_S):
             self._announce(self.core.tick(self._edges.now()))
             self._report_foreign()
+            for node, reason in self.core.pop_rejections():
+                REJECTED.labels(node, reason).inc()
             PENDING.set(self._mqtt.pending)
             self._health.set(
                 "mqtt", ok=self._mqtt.connected, detail="" if self._mqtt.connected else "not connected to the broker"

@@ -29,9 +29,10 @@ class Rule(Protocol):
     """Debounces the classified readings of one node."""
 
     def update(self, state: AreaState, now: float) -> AreaState | None:
-        """Process the state that one reading shows; `now` is in seconds of a monotonic clock.
+        """Process the state that one reading shows; `now` is when it was taken, in seconds of a monotonic clock.
 
-        Returns the confirmed state, or None while the readings don't confirm one.
+        Delayed readings have the times at which they were taken, not that of their arrival. Returns the confirmed
+        state, or None while the readings don't confirm one.
         """
 
     def reset(self) -> None:

@@ -13,33 +13,41 @@ if TYPE_CHECKING:
 
 
 class Options(Struct, frozen=True, kw_only=True):
-    """How many consecutive readings change a node's state (the thesis: five either way)."""
+    """How many readings change a node's state (the thesis: five consecutive ones either way)."""
 
     to_blocked: Annotated[int, Meta(ge=1, le=1000)] = 5
     to_clear: Annotated[int, Meta(ge=1, le=1000)] = 5
 
 
 class Consecutive:
-    """Counts consecutive readings of the same state; a reading of another state restarts the count.
+    """Counts consecutive readings of the same state; a reading of the opposite state restarts the count.
 
-    Implausible readings confirm `unknown` after as many as confirm `blocked`.
+    An unknown reading says nothing about the area: it leaves a count of blocked readings as it is, and takes one off a
+    count of clear ones, since a relief needs more evidence for it than missing. As many unknown readings in a row as
+    confirm `blocked` confirm `unknown`, and restart both counts.
     """
 
     def __init__(self, options: Options) -> None:
         self._needed = {"blocked": options.to_blocked, "unknown": options.to_blocked, "clear": options.to_clear}
-        self._last: AreaState | None = None
-        self._count = 0
+        self._count = dict.fromkeys(self._needed, 0)
 
     def update(self, state: AreaState, now: float) -> AreaState | None:  # noqa: ARG002  # it counts, whatever the time
-        """Count one reading's state; return the state from its N-th consecutive reading on."""
-        self._count = self._count + 1 if state == self._last else 1
-        self._last = state
-        return state if self._count >= self._needed[state] else None
+        """Count one reading's state; return the state from its N-th reading on."""
+        count = self._count
+        if state == "unknown":
+            count["clear"] = max(0, count["clear"] - 1)
+        else:
+            count["unknown"] = count["clear" if state == "blocked" else "blocked"] = 0
+        count[state] = min(count[state] + 1, self._needed[state])
+        if count[state] < self._needed[state]:
+            return None
+        if state == "unknown":
+            count["blocked"] = count["clear"] = 0
+        return state
 
     def reset(self) -> None:
-        """Restart the count."""
-        self._last = None
-        self._count = 0
+        """Restart all counts."""
+        self._count = dict.fromkeys(self._needed, 0)
 
 
 RULE = RuleFactory(options=Options, make=Consecutive)

@@ -1,0 +1,93 @@
+"""The confirmed state of one node in one area: debounced readings, silence, contradictions. Pure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from fog_contracts.messages import AreaState
+    from fog_contracts.site import NodeSite
+    from hazard_aggregator.debounce import Rule
+    from hazard_aggregator.plausibility import Classification
+
+
+@dataclass
+class NodeState:
+    """One node of one area; a node of the thesis has no `site`."""
+
+    id: str
+    site: NodeSite | None
+    rule: Rule
+    last_reading: float | None = None
+    last_confirmed: float = 0.0
+    state: AreaState = "unknown"
+    reason: str = "no reading received yet"
+    online: bool | None = None
+    ever_received: bool = False
+    unconfirmed: bool = True  # no state was confirmed since the last invalidation
+    explained_by: str | None = None
+    run_state: AreaState | None = None
+    run_began: float = 0.0
+    received: int = 0
+    ignored: int = 0
+
+    def silent_for(self, now: float) -> float:
+        """Return the time (s) since the last reading was taken; without one, since the first call."""
+        if self.last_reading is None:
+            self.last_reading = self.last_confirmed = now
+        return now - self.last_reading
+
+    def invalidate(self, reason: str) -> None:
+        """Set the state to unknown until readings confirm another one."""
+        self.state = "unknown"
+        self.reason = reason
+        self.unconfirmed = True
+        self.explained_by = None
+        self.run_state = None
+        self.rule.reset()
+
+    def restore_blocked(self) -> None:
+        """Set the state in which an earlier run left the node's area."""
+        self.state = "blocked"
+        self.reason = "the area was blocked before the restart"
+
+    def check_silence(self, limit: float, now: float) -> None:
+        """Invalidate the state of a node that was silent, or confirmed nothing, for longer than `limit` (s)."""
+        if self.silent_for(now) > limit:
+            reason = f"it has been silent for more than {limit:g} s"
+            if self.state != "unknown" or self.reason != reason:
+                self.invalidate(reason)
+        elif now - self.last_confirmed > limit and self.state != "unknown":
+            self.invalidate("its readings contradict one another")
+
+    def apply(self, classification: Classification, taken_at: float, stamp: float, *, counts: bool = True) -> None:
+        """Apply one classified reading, taken at `taken_at` (s, the receiver's clock).
+
+        One that does not count is a sign of life, but no measurement of its own.
+        """
+        self.silent_for(taken_at)
+        self.received += 1
+        self.last_reading = taken_at
+        self.ever_received = True
+        self.online = True
+        if classification.explained_by is not None:
+            # Counts neither way: the debounce rule does not see it, and the timer that detects flapping restarts.
+            self.explained_by = classification.explained_by
+            self.last_confirmed = taken_at
+            return
+        if not counts:
+            return
+        if classification.state != self.run_state and not (classification.state == "unknown" and self.run_state):
+            self.run_state = classification.state
+            self.run_began = stamp
+        confirmed = self.rule.update(classification.state, taken_at)
+        if confirmed is None:
+            return
+        self.last_confirmed = taken_at
+        self.explained_by = None
+        if confirmed == "unknown":
+            self.run_state = None
+        if confirmed != self.state or self.unconfirmed:
+            # Later readings of the same state leave the reason: the hazard would change with every centimetre.
+            self.state, self.reason, self.unconfirmed = confirmed, classification.reason, False

@@ -116,3 +116,18 @@ async def test_repeated_put_returns_the_first_result_and_emptied_redis_is_restor
     await fog.ready("hazard_aggregator")
     put = await client.put("/api/v1/areas/hall", json=body, headers=tokens["operator"])
     assert (put.status_code, put.headers["etag"]) == (200, '"2"')
+
+
+async def test_change_of_an_area_before_the_stored_areas_are_loaded_is_refused_without_a_conflict(fog, client, tokens):
+    body = {"polygon": POLYGON, "nodes": ["n1"]}
+    put = await client.put("/api/v1/areas/hall", json=body, headers=tokens["operator"])
+    fog.redis.kill()
+    fog.kill("hazard_aggregator")
+    fog.start("hazard_aggregator")
+    async with httpx.AsyncClient(base_url=await fog.url("hazard_aggregator"), timeout=15) as restarted:
+        headers = {**tokens["operator"], "If-Match": put.headers["etag"]}
+        refused = await restarted.put("/api/v1/areas/hall", json=body, headers=headers)
+        assert (refused.status_code, "not loaded yet" in refused.json()["detail"]) == (503, True)
+        fog.redis.start()
+        await fog.ready("hazard_aggregator")
+        assert (await restarted.put("/api/v1/areas/hall", json=body, headers=headers)).headers["etag"] == '"2"'

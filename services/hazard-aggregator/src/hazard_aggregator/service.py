@@ -14,6 +14,7 @@ from fog_contracts.messages import AreaHazard, AreaState
 from fog_runtime import logs, metrics
 from fog_runtime.clock import ticker
 from fog_runtime.edges import Edges
+from fog_runtime.redis_connection import StoreRefusedError
 from hazard_aggregator.store import Audit, RecoveryError, StoreError, usable_areas
 
 if TYPE_CHECKING:
@@ -132,6 +133,9 @@ class Service:
     @contextmanager
     def _uncertain_write(self) -> Iterator[None]:
         """Reload the areas after a failure: one may have been written although the reply was lost."""
+        if not self._store_loaded.is_set():
+            # Neither versions nor conditions can be judged by the site's definitions alone.
+            raise StoreRefusedError("the stored areas are not loaded yet")
         try:
             yield
         except StoreError as error:

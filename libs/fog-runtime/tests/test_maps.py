@@ -1,6 +1,8 @@
 import json
 import math
 import re
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -210,3 +212,42 @@ def test_rotating_loses_no_occupied_cell_and_adds_no_free_area(tmp_path, cells, 
         c, r = round((x * cos + y * sin) / 0.1 - 0.5), round((-x * sin + y * cos) / 0.1 - 0.5)
         near = cells[max(r - 1, 0) : r + 2, max(c - 1, 0) : c + 2]
         assert (near == 0).any()
+
+
+LARGE = """
+image: map.pgm
+resolution: 0.05
+origin: [0.0, 0.0, 0.0]
+negate: 0
+occupied_thresh: 0.65
+free_thresh: 0.196
+"""
+LOAD = """
+import resource, sys
+from pathlib import Path
+from fog_runtime.maps import load_map, Image
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+static = load_map(Path(sys.argv[1]))
+used = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024
+print(used / static.cells.size, *(int((static.cells == value).sum()) for value in (0, 254, 255)))
+"""
+
+
+def test_loading_a_large_map_takes_at_most_four_bytes_per_cell(tmp_path):
+    side = 4_000
+    rows = np.full((side, side), 254, dtype=np.uint8)
+    rows[: side // 4] = 0
+    rows[-side // 4 :] = 205
+    (tmp_path / "map.pgm").write_bytes(b"P5 %d %d 255\n" % (side, side) + rows.tobytes())
+    (tmp_path / "map.yaml").write_text(LARGE)
+    command = [sys.executable, "-c", LOAD, str(tmp_path / "map.yaml")]
+    printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
+    assert float(printed[0]) <= 4.0
+    assert [int(count) for count in printed[1:]] == [side * side // 2, side * side // 4, side * side // 4]
+
+
+def test_map_over_the_limit_of_cells_is_refused_before_it_is_decoded(tmp_path):
+    (tmp_path / "map.pgm").write_bytes(b"P5 10000 10001 255\n")
+    (tmp_path / "map.yaml").write_text(LARGE)
+    with pytest.raises(MapFileError, match="10000 x 10001 pixels, more than 100000000"):
+        load_map(tmp_path / "map.yaml")

@@ -159,8 +159,8 @@ class AreaDefinition(Message, frozen=True, kw_only=True):
     removed: bool = False
 
 
-MAX_CELLS = 50_000_000
-"""Limit of a map (350 m x 350 m at 5 cm), so that a damaged or hostile snapshot can't exhaust the memory."""
+MAX_CELLS: Final = 100_000_000
+"""Limit of a map (500 m x 500 m at 5 cm), so that a damaged or hostile snapshot can't exhaust the memory."""
 
 # --- Map (zenoh, msgpack) -------------------------------------------------------------------------------------------
 

@@ -113,6 +113,8 @@ class MasterMap:
         self._version = Version(epoch, 0, self._hashes.value)
         self._snapshot: Later[MapSnapshot] | None = None
         self._static_packed: bytes | None = None
+        # Memory for the copies of the next snapshot: on a large floor, fresh memory costs more than the copying.
+        self._spare: list[dict[Layer, Grid]] = [self._new_copies()]
 
     @property
     def version(self) -> Version:
@@ -175,13 +177,18 @@ class MasterMap:
         """Return the whole map as it is now, to be encoded on any thread; the same one until the next version."""
         if self._snapshot is None:
             # The floor plan never changes; the layers are copied, because the next version is written into them.
-            cost, speed = self.layers["cost"].copy(), self.layers["speed"].copy()
-            self._snapshot = Later(partial(self._encode, self._version, cost, speed))
+            copies = self._spare.pop() if self._spare else self._new_copies()
+            for layer, cells in copies.items():
+                np.copyto(cells, self.layers[layer])
+            self._snapshot = Later(partial(self._encode, self._version, copies))
         return self._snapshot
 
-    def _encode(self, version: Version, cost: Grid, speed: Grid) -> MapSnapshot:
+    def _new_copies(self) -> dict[Layer, Grid]:
+        return {layer: cells.copy() for layer, cells in self.layers.items()}
+
+    def _encode(self, version: Version, copies: dict[Layer, Grid]) -> MapSnapshot:
         g = self.geometry
-        return MapSnapshot(
+        snapshot = MapSnapshot(
             site=self.site,
             epoch=version.epoch,
             seq=version.seq,
@@ -189,10 +196,13 @@ class MasterMap:
             geometry=MapGeometry(
                 width=g.width, height=g.height, resolution=g.resolution, origin_x=g.origin_x, origin_y=g.origin_y
             ),
-            cost=zlib.compress(cost.data, 1),
-            speed=zlib.compress(speed.data, 1),
+            cost=zlib.compress(copies["cost"].data, 1),
+            speed=zlib.compress(copies["speed"].data, 1),
             static=self._packed_static(),
         )
+        if not self._spare:
+            self._spare.append(copies)
+        return snapshot
 
     def _packed_static(self) -> bytes:
         if self._static_packed is None:

@@ -2,11 +2,16 @@
 
 Pixels are interpreted as by Nav2's `nav2_map_server/map_io`: the shade is the mean of the colour channels, in trinary
 mode with alpha as one more channel; the occupancy is 1 - shade, or the shade when negated.
+
+An image may have up to MAX_CELLS pixels. Reading a greyscale image of 8 bits takes at most 4 bytes of memory per cell,
+a coloured one 7: it is decoded as a whole, but converted band by band.
 """
 
 import io
 import math
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal, get_args
@@ -18,14 +23,15 @@ from PIL import Image, UnidentifiedImageError
 
 from fog_contracts.costs import FREE, LETHAL, UNKNOWN
 from fog_contracts.grid import GridGeometry, StaticMap
+from fog_contracts.messages import MAX_CELLS
 from fog_runtime.files import atomic_write
 
 Mode = Literal["trinary", "scale", "raw"]
 
 OCCUPIED_PERCENT: Final = 100
 UNKNOWN_PERCENT: Final = -1
-MAX_PIXELS: Final = 50_000_000
-"""Limit of an image (350 m x 350 m at 5 cm), against decompression bombs."""
+_BAND_CELLS: Final = 128 * 1024
+"""About how many cells are converted at a time."""
 
 _EXAMPLES: Final = {"resolution": 0.05, "occupied_thresh": 0.65, "free_thresh": 0.196}
 _WRITTEN_OCCUPIED: Final = 0.65
@@ -143,34 +149,35 @@ def _read_metadata(file: Path) -> _Metadata:
     )
 
 
-def _channels(file: Path, image: Path) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
-    """Return colours (h, w, n) and alpha (h, w) or None, 0..1, row 0 at the top as in the file."""
+@contextmanager
+def _opened(file: Path, image: Path) -> Iterator[Image.Image]:
+    """Open an image of at most MAX_CELLS pixels; whatever goes wrong with it becomes a `MapFileError`."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            # The limit below is the one that counts.
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             picture = Image.open(image)
         with picture:
-            if picture.width * picture.height > MAX_PIXELS:
-                size = f"{image} has {picture.width} x {picture.height} pixels, more than {MAX_PIXELS}"
+            if picture.width * picture.height > MAX_CELLS:
+                size = f"{image} has {picture.width} x {picture.height} pixels, more than {MAX_CELLS}"
                 raise MapFileError(file, "image", size, "Use a coarser resolution")
-            if picture.mode in {"I", "I;16", "I;16B", "I;16L"}:
-                return (np.asarray(picture, dtype=np.float64) / 65_535.0)[:, :, None], None
-            mode = _plain_mode(picture)
-            if mode is None:
-                raise MapFileError(
-                    file, "image", f"{image} has pixels of mode {picture.mode}", "Save it as a greyscale PNG"
-                )
-            pixels = np.asarray(picture.convert(mode), dtype=np.float64) / 255.0
-    except (
-        UnidentifiedImageError, OSError, SyntaxError, ValueError, Image.DecompressionBombWarning,
-        Image.DecompressionBombError,
-    ) as error:  # fmt: skip
+            yield picture
+    except (UnidentifiedImageError, OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         if isinstance(error, MapFileError):
             raise
         raise MapFileError(
             file, "image", f"{image} can't be decoded ({error})", "Save it again as PGM or PNG"
         ) from error
-    return _split_alpha(pixels, mode)
+
+
+def _channels(file: Path, image: Path, band: Image.Image) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+    """Return colours (h, w, n) and alpha (h, w) or None, 0..1, of a part of an image."""
+    if band.mode in {"I", "I;16", "I;16B", "I;16L"}:
+        return (np.asarray(band, dtype=np.float64) / 65_535.0)[:, :, None], None
+    mode = _plain_mode(band)
+    if mode is None:
+        raise MapFileError(file, "image", f"{image} has pixels of mode {band.mode}", "Save it as a greyscale PNG")
+    return _split_alpha(np.asarray(band.convert(mode), dtype=np.float64) / 255.0, mode)
 
 
 def _plain_mode(image: Image.Image) -> str | None:
@@ -196,30 +203,48 @@ def _split_alpha(pixels: NDArray[np.float64], mode: str) -> tuple[NDArray[np.flo
 def load_occupancy(yaml_path: Path) -> Occupancy:
     """Read a map file as map_server does, without applying the yaw; raises `MapFileError`."""
     metadata = _read_metadata(yaml_path)
-    colours, alpha = _channels(yaml_path, metadata.image)
+    with _opened(yaml_path, metadata.image) as picture:
+        width, height = picture.size
+        values = np.empty((height, width), dtype=np.int8)
+        # Whole images of floating-point numbers would take 50 bytes per cell.
+        for rows in _bands(height, width):
+            band = picture.crop((0, rows.start, width, rows.stop))
+            # Row 0 of the image is the top, of the grid the bottom.
+            below, above = height - rows.stop, height - rows.start
+            values[below:above] = _occupancy(*_channels(yaml_path, metadata.image, band), metadata)[::-1]
+    geometry = GridGeometry(width, height, metadata.resolution, metadata.origin[0], metadata.origin[1])
+    return Occupancy(
+        geometry, metadata.origin[2], values, metadata.mode, metadata.occupied_thresh, metadata.free_thresh
+    )
+
+
+def _bands(height: int, width: int) -> Iterator[slice]:
+    """Return slices of consecutive rows of about _BAND_CELLS cells each."""
+    rows = max(1, _BAND_CELLS // width)
+    return (slice(first, min(first + rows, height)) for first in range(0, height, rows))
+
+
+def _occupancy(
+    colours: NDArray[np.float64], alpha: NDArray[np.float64] | None, metadata: _Metadata
+) -> NDArray[np.float64]:
+    """Return the occupancy (0..100, or -1 unknown) of pixels, in their order."""
     if metadata.mode == "trinary" and alpha is not None:
         colours = np.concatenate([colours, alpha[:, :, None]], axis=2)
-    shade = colours.mean(axis=2)
-    occ = shade if metadata.negate else 1.0 - shade
+    shade: NDArray[np.float64] = colours.mean(axis=2)
     if metadata.mode == "raw":
         percent = np.rint(shade * 255.0)
-        values = np.where(percent <= OCCUPIED_PERCENT, percent, UNKNOWN_PERCENT)
+        return np.where(percent <= OCCUPIED_PERCENT, percent, UNKNOWN_PERCENT)
+    occ = shade if metadata.negate else 1.0 - shade
+    if metadata.mode == "scale":
+        between = np.rint((occ - metadata.free_thresh) / (metadata.occupied_thresh - metadata.free_thresh) * 100.0)
     else:
-        if metadata.mode == "scale":
-            between = np.rint((occ - metadata.free_thresh) / (metadata.occupied_thresh - metadata.free_thresh) * 100.0)
-        else:
-            between = np.full(occ.shape, float(UNKNOWN_PERCENT))
-        values = np.where(
-            occ > metadata.occupied_thresh, OCCUPIED_PERCENT, np.where(occ < metadata.free_thresh, 0.0, between)
-        )
-        if metadata.mode == "scale" and alpha is not None:
-            values = np.where(alpha < 1.0, UNKNOWN_PERCENT, values)
-    height, width = values.shape
-    geometry = GridGeometry(width, height, metadata.resolution, metadata.origin[0], metadata.origin[1])
-    bottom_up = np.ascontiguousarray(values[::-1].astype(np.int8))
-    return Occupancy(
-        geometry, metadata.origin[2], bottom_up, metadata.mode, metadata.occupied_thresh, metadata.free_thresh
+        between = np.full(occ.shape, float(UNKNOWN_PERCENT))
+    values = np.where(
+        occ > metadata.occupied_thresh, OCCUPIED_PERCENT, np.where(occ < metadata.free_thresh, 0.0, between)
     )
+    if metadata.mode == "scale" and alpha is not None:
+        values = np.where(alpha < 1.0, UNKNOWN_PERCENT, values)
+    return values
 
 
 def load_map(yaml_path: Path) -> StaticMap:
@@ -230,12 +255,15 @@ def load_map(yaml_path: Path) -> StaticMap:
     by half a cell, and cells outside the original grid are unknown. Yaw 0 keeps every cell.
     """
     occupancy = load_occupancy(yaml_path)
-    values = occupancy.values
-    cells = np.full(values.shape, UNKNOWN, dtype=np.uint8)
     # In the modes trinary and scale the thresholds were applied: only the extreme values are free or occupied.
     raw = occupancy.mode == "raw"
-    cells[(values >= 0) & (values < max(1.0, 100.0 * occupancy.free_thresh if raw else 1.0))] = FREE
-    cells[values > (100.0 * occupancy.occupied_thresh if raw else 99.0)] = LETHAL
+    percent = np.arange(256, dtype=np.uint8).view(np.int8)
+    table = np.full(256, UNKNOWN, dtype=np.uint8)
+    table[(percent >= 0) & (percent < max(1.0, 100.0 * occupancy.free_thresh if raw else 1.0))] = FREE
+    table[percent > (100.0 * occupancy.occupied_thresh if raw else 99.0)] = LETHAL
+    cells = occupancy.values.view(np.uint8)
+    for rows in _bands(*cells.shape):
+        cells[rows] = table[cells[rows]]
     if occupancy.yaw == 0.0:
         return StaticMap(occupancy.geometry, cells)
     return _rotated(StaticMap(occupancy.geometry, cells), occupancy.yaw)
@@ -254,21 +282,24 @@ def _rotated(original: StaticMap, yaw: float) -> StaticMap:
     height = max(1, math.ceil((top - bottom) / old.resolution - 1e-6))
     new = GridGeometry(width, height, old.resolution, old.origin_x + left, old.origin_y + bottom)
 
-    x, y = np.meshgrid(
-        left + (np.arange(width) + 0.5) * old.resolution, bottom + (np.arange(height) + 0.5) * old.resolution
-    )
-    column = np.floor((x * cos + y * sin) / old.resolution).astype(np.int64)
-    row = np.floor((-x * sin + y * cos) / old.resolution).astype(np.int64)
-    inside = (column >= 0) & (column < old.width) & (row >= 0) & (row < old.height)
     cells = np.full((height, width), UNKNOWN, dtype=np.uint8)
-    cells[inside] = original.cells[row[inside], column[inside]]
+    for rows in _bands(height, width):
+        x, y = np.meshgrid(
+            left + (np.arange(width) + 0.5) * old.resolution,
+            bottom + (np.arange(rows.start, rows.stop) + 0.5) * old.resolution,
+        )
+        column = np.floor((x * cos + y * sin) / old.resolution).astype(np.int64)
+        row = np.floor((-x * sin + y * cos) / old.resolution).astype(np.int64)
+        inside = (column >= 0) & (column < old.width) & (row >= 0) & (row < old.height)
+        cells[rows][inside] = original.cells[row[inside], column[inside]]
 
     # An occupied cell may contain none of the new centres: mark also the cell that contains its own centre.
-    rows, columns = np.nonzero(original.cells == LETHAL)
-    px, py = (columns + 0.5) * old.resolution, (rows + 0.5) * old.resolution
-    new_column = np.floor((px * cos - py * sin - left) / old.resolution).astype(np.int64)
-    new_row = np.floor((px * sin + py * cos - bottom) / old.resolution).astype(np.int64)
-    cells[np.clip(new_row, 0, height - 1), np.clip(new_column, 0, width - 1)] = LETHAL
+    for band in _bands(*old.shape):
+        occupied_rows, columns = np.nonzero(original.cells[band] == LETHAL)
+        px, py = (columns + 0.5) * old.resolution, (occupied_rows + band.start + 0.5) * old.resolution
+        new_column = np.floor((px * cos - py * sin - left) / old.resolution).astype(np.int64)
+        new_row = np.floor((px * sin + py * cos - bottom) / old.resolution).astype(np.int64)
+        cells[np.clip(new_row, 0, height - 1), np.clip(new_column, 0, width - 1)] = LETHAL
     return StaticMap(new, cells)
 
 

@@ -135,7 +135,7 @@ class Service:
         """Reload the areas after a failure: one may have been written although the reply was lost."""
         if not self._store_loaded.is_set():
             # Neither versions nor conditions can be judged by the site's definitions alone.
-            raise StoreRefusedError("the stored areas are not loaded yet")
+            raise StoreRefusedError("the stored areas are not loaded yet: /readyz says why")
         try:
             yield
         except StoreError as error:

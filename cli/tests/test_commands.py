@@ -35,6 +35,7 @@ def _warm_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
         ["status"],
         ["goal"],
         ["area", "list"],
+        *(["token", name] for name in ("create", "list", "revoke")),
         *(["zone", name] for name in ("add", "list", "show", "remove")),
         *(
             ["robot", name]
@@ -48,7 +49,7 @@ def test_every_command_has_help_with_an_example(command: list[str]) -> None:
     assert "Example: fognav " + " ".join(command) in done.output
 
 
-@pytest.mark.parametrize("group", [[], ["site"], ["zone"], ["robot"]])
+@pytest.mark.parametrize("group", [[], ["site"], ["token"], ["zone"], ["robot"]])
 def test_list_of_commands_truncates_no_sentence(group: list[str]) -> None:
     done = runner.invoke(app, [*group, "--help"], env={"COLUMNS": "80"})
     commands = done.output.partition("Commands:\n")[2].strip().splitlines()

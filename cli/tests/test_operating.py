@@ -69,7 +69,7 @@ def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     for name in ("AGGREGATOR_PORT", "MAP_PORT", "PLANNER_PORT"):
         monkeypatch.setenv(f"FOGNAV_{name}", "1")
-    for name in ("FOG", "TOKEN", "TOKEN_FILE", "OPERATOR_KEY_FILE"):
+    for name in ("FOG", "TOKEN", "TOKEN_FILE", "TOKENS_FILE", "OPERATOR_KEY_FILE"):
         monkeypatch.delenv(f"FOGNAV_{name}", raising=False)
     return tmp_path / "fognav"
 
@@ -367,3 +367,18 @@ def test_register_is_written_again_only_when_the_system_changes(runtime: Path) -
         current = msgspec.structs.replace(current, pids={"planner": psutil.Process().pid})
         registration.update()
         assert [found.pids for found in registered()] == [{"planner": psutil.Process().pid}]
+
+
+def test_tokens_of_a_running_demo_are_created_listed_and_revoked(demo: Service, tmp_path: Path) -> None:
+    (tmp_path / "tokens.toml").touch()
+    token = json.loads(run("token", "create", "anna", "--role", "operator", "--json"))["token"]
+    assert len(token) > 30
+    assert run("token", "list").startswith("anna: operator, since 20")
+    assert "anna has a token already" in run("token", "create", "anna", code=1)
+    assert run("token", "revoke", "anna") == "the token of anna is revoked"
+    assert json.loads(run("token", "list", "--json"))["tokens"] == []
+    assert "anna has no token" in run("token", "revoke", "anna", code=1)
+
+
+def test_tokens_file_must_be_named_without_a_running_demo() -> None:
+    assert "name the services' tokens file with --file or FOGNAV_TOKENS_FILE" in run("token", "list", code=2)

@@ -1,5 +1,6 @@
 # One image per process, with only its own dependencies. Build arguments: MEMBER (folder), NAME (distribution), MODULE
-# (what `python -m` starts), KERNELS (profile of fog_kernels.warm, or "none").
+# (what `python -m` starts), KERNELS (profile of fog_kernels.warm, or "none"), REVISION (the commit, for the metric
+# fognav_build_info).
 #     docker build -f deploy/images/service.Dockerfile --build-arg MEMBER=services/planner ... .
 FROM python:3.11-slim-bookworm AS wheels
 WORKDIR /src
@@ -27,7 +28,8 @@ RUN set -e; pip install --no-cache-dir --no-deps /tmp/wheels/fog_contracts-*.whl
     python -c "import importlib, sys; importlib.import_module(sys.argv[1])" "${MODULE}"; rm -rf /tmp/wheels
 COPY deploy/images/start /usr/local/bin/fognav-start
 COPY deploy/images/ready /usr/local/bin/fognav-ready
-ENV FOGNAV_MODULE=${MODULE} FOGNAV_KERNELS=${KERNELS} \
+ARG REVISION
+ENV FOGNAV_REVISION=${REVISION} FOGNAV_MODULE=${MODULE} FOGNAV_KERNELS=${KERNELS} \
     FOGNAV_HTTP_HOST=0.0.0.0 FOGNAV_HTTP_PORT=8000 FOGNAV_DATA_DIR=/var/lib/fognav \
     NUMBA_CACHE_DIR=/var/cache/fognav/numba PYTHONUNBUFFERED=1
 USER fognav

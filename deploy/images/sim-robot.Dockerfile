@@ -19,7 +19,8 @@ COPY --from=wheels /wheels /tmp/wheels
 RUN pip install --no-cache-dir --no-deps /tmp/wheels/*.whl && rm -rf /tmp/wheels
 COPY deploy/images/start /usr/local/bin/fognav-start
 COPY deploy/images/ready /usr/local/bin/fognav-ready
-ENV FOGNAV_MODULE=fognav_sim.robot_unit FOGNAV_KERNELS=all FOGNAV_HTTP_HOST=0.0.0.0 FOGNAV_DATA_DIR=/var/lib/fognav \
+ARG REVISION
+ENV FOGNAV_REVISION=${REVISION} FOGNAV_MODULE=fognav_sim.robot_unit FOGNAV_KERNELS=all FOGNAV_HTTP_HOST=0.0.0.0 FOGNAV_DATA_DIR=/var/lib/fognav \
     FOGNAV_RUN_DIR=/tmp/fognav NUMBA_CACHE_DIR=/var/cache/fognav/numba PYTHONUNBUFFERED=1
 USER fognav
 EXPOSE 9100

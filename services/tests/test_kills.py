@@ -141,7 +141,7 @@ class Operators:
             area = await self.request("hazard_aggregator", "GET", "/api/v1/areas/hall")
             if self.area[0]:
                 assert (area.json()["definition"]["label"], area.headers["etag"]) == self.area
-            goal = await self.request("planner", "GET", "/api/v1/robots/r1/goal")
+            goal = await self.request("planner", "GET", "/api/v1/robots/r1/goal", headers=self.headers)
             assert (goal.json()["goal_id"] if goal.status_code == 200 else None) == self.goal
 
     async def verify_audit(self) -> None:

@@ -31,6 +31,7 @@ from fognav.output import (
 )
 from fognav.robot_command import robot_app, robot_goal
 from fognav.status_command import status_command
+from fognav.token_command import token_app
 from fognav.zone_command import zone_app
 from fognav_sim import emulators
 
@@ -47,6 +48,7 @@ app.add_typer(site_app, name="site")
 app.add_typer(zone_app, name="zone")
 app.add_typer(area_app, name="area")
 app.add_typer(robot_app, name="robot")
+app.add_typer(token_app, name="token")
 app.command("status", epilog="Example: fognav status --json")(status_command)
 app.command("goal", context_settings=NUMBERS, epilog="Example: fognav goal b")(robot_goal)
 app.command("channels", epilog="Example: fognav channels --format acl --broker mqtt")(channels_command)

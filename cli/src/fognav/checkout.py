@@ -1,5 +1,6 @@
 """Finds the checkout: sites and tests are there, not in an installed package."""
 
+import subprocess
 from functools import cache
 from pathlib import Path
 
@@ -13,6 +14,17 @@ def root() -> Path:
         if (folder / "fognav").is_file() and (folder / "requirements").is_dir():
             return folder
     raise WrongUseError("this command works only in a checkout of Fognav: clone the repository and run ./fognav there")
+
+
+@cache
+def revision() -> str:
+    """Return the commit of the checkout, or an empty text if it is not known."""
+    try:
+        command = ["git", "-C", str(root()), "rev-parse", "--short=12", "HEAD"]
+        done = subprocess.run(command, check=False, capture_output=True, text=True)
+    except (OSError, WrongUseError):
+        return ""  # no git, or no checkout
+    return done.stdout.strip()
 
 
 def site_folder(name: Path | None) -> Path:

@@ -17,6 +17,7 @@ from fog_runtime.keys import ADMIN_TOKEN, OPERATOR_KEY, TOKENS, make_keys
 from fog_runtime.operator_key import read_operator_key
 from fog_supervisor import net, servers
 from fog_supervisor.supervisor import Event, Program, Supervisor
+from fognav import checkout
 
 BROKER: Final = "mosquitto"
 REDIS: Final = "redis"
@@ -211,6 +212,7 @@ class Stack:
             "MQTT_URL": self.mqtt_url,
             "REDIS_URL": self.redis_url,
             "ZENOH_CONNECT": self.zenoh_endpoint,
+            "REVISION": checkout.revision(),
             "PORT_FILE": str(port_file),
             "DATA_DIR": str(data),
             "TOKENS_FILE": str(self.folder / TOKENS),

@@ -212,7 +212,7 @@ async def test_mission_is_replanned_around_a_hazard_survives_a_kill_and_ends_whe
             path = env.paths[-1]
             assert [trace.area for trace in path.traces] == ["z1"]
             assert path.traces[0].plan_published >= path.traces[0].costmap_published > 0.0
-            (robot,) = (await client.get("/api/v1/robots")).json()
+            (robot,) = (await client.get("/api/v1/robots", headers=OPERATOR)).json()
             assert (robot["id"], robot["goal"]["goal_id"], robot["pose"]["x"]) == ("r1", goal_id, 1.0)
             metrics = (await client.get("/metrics")).text
             assert 'fognav_plans_total{reason="map"} 1.0' in metrics
@@ -229,7 +229,7 @@ async def test_mission_is_replanned_around_a_hazard_survives_a_kill_and_ends_whe
         async with env.ready() as client:
             env.report_reached(goal_id)
             await env.until(lambda: env.goals[-1].pose is None)
-            assert (await client.get("/api/v1/robots/r1/goal")).status_code == 404
+            assert (await client.get("/api/v1/robots/r1/goal", headers=OPERATOR)).status_code == 404
             assert env.stop() == 0
 
 
@@ -259,7 +259,7 @@ async def test_invalid_goals_are_refused_with_a_reason_and_all_goals_without_the
         unstored = await put({"place": "right"})
         assert unstored.status_code == 503
         assert "retry-after" in unstored.headers
-        assert (await client.get(url)).status_code == 404
+        assert (await client.get(url, headers=OPERATOR)).status_code == 404
         env.redis.start()
         assert (await put({"place": "right"})).status_code == 200
         await env.until(lambda: env.paths)

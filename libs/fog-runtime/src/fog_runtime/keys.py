@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from fog_contracts.commands import KEY_BYTES
-from fog_runtime.http import token_hash
+from fog_runtime.token_file import TOKEN_BYTES, token_hash
 
 ADMIN_TOKEN: Final = "admin.token"  # noqa: S105  # a file's name
 TOKENS: Final = "tokens.toml"
@@ -38,7 +38,7 @@ def make_keys(directory: Path, *, mode: int = 0o600) -> list[Path]:
         missing = tokens_file if token_file.exists() else token_file
         raise FileExistsError(f"{existing} exists, but {missing} does not: remove the one or restore the other")
     if not token_file.exists():
-        token = secrets.token_urlsafe(32)
+        token = secrets.token_urlsafe(TOKEN_BYTES)
         _write_new(token_file, token + "\n", mode)
         _write_new(tokens_file, f'[[tokens]]\nname = "admin"\nrole = "admin"\nsha256 = "{token_hash(token)}"\n', mode)
         created += [token_file, tokens_file]

@@ -16,7 +16,7 @@ from prometheus_client import (
 
 from fog_contracts.messages import Trace
 from fog_contracts.stages import SPANS, durations_s
-from fog_runtime.version import VERSION
+from fog_runtime.version import REVISION, VERSION
 
 STAGE_SECONDS: Final = Histogram(
     "fognav_stage_seconds",
@@ -52,8 +52,8 @@ REPLY_SECONDS: Final = Histogram(
 HANDLER_ERRORS: Final = Counter(
     "fognav_handler_errors_total", "Messages whose handler raised an exception, which is a bug", ["channel"]
 )
-BUILD: Final = Info("fognav_build", "Which code runs: its version")
-BUILD.info({"version": VERSION})
+BUILD: Final = Info("fognav_build", "Which code runs: its version, and its revision if that is known")
+BUILD.info({"version": VERSION, "revision": REVISION})
 CONNECTED: Final = Gauge("fognav_connected", "Whether the connection is up (1) or down (0)", ["transport"])
 CONNECTIONS: Final = Counter("fognav_connections_total", "Connections established", ["transport"])
 

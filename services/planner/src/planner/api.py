@@ -1,4 +1,4 @@
-"""REST under /api/v1: robots with their missions, and plans on request. Reading needs no token, writing needs one."""
+"""REST under /api/v1: robots with their missions, and plans on request. Robots need a viewer's or operator's token."""
 
 from fastapi import FastAPI, Request
 
@@ -25,6 +25,7 @@ from fog_runtime.http import (
     ProblemError,
     Routes,
     Tokens,
+    Viewer,
     add_recovery,
     add_store_errors,
     attempt_of,
@@ -172,12 +173,12 @@ def _add_views(routes: Routes, service: Service, robots: _Robots) -> None:
     """Add the routes that read robots and missions."""
 
     @routes.get("/api/v1/robots")
-    async def list_robots() -> list[RobotView]:
+    async def list_robots(_caller: Viewer) -> list[RobotView]:
         """List all robots with pose, state, mission and plan."""
         return [robots.view(robot) for robot in robots.ids()]
 
     @routes.get("/api/v1/robots/{robot}/goal", problems={404: "No robot has this id, or it has no mission"})
-    async def get_goal(robot: str) -> GoalView:
+    async def get_goal(robot: str, _caller: Viewer) -> GoalView:
         """Return a robot's mission."""
         robots.check(robot)
         stored = service.goals.get(robot)

@@ -12,7 +12,8 @@ from fog_runtime.http.store_routes import (
     attempt_of,
     must_be_new,
 )
-from fog_runtime.http.tokens import Admin, Operator, Tokens, TokensError, Viewer, load_tokens, token_hash
+from fog_runtime.http.tokens import Admin, Operator, Tokens, Viewer, load_tokens
+from fog_runtime.token_file import TokensError, token_hash
 
 __all__ = [
     "RETRY_AFTER",

@@ -1,21 +1,21 @@
-"""Authorization: bearer tokens with roles, read from a file with their hashes."""
+"""Authorization: bearer tokens with roles, read from a file with their hashes, again whenever it changes."""
 
-import hashlib
-import tomllib
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Annotated, Final, Literal, get_args
+from typing import Annotated, Final
 
 import msgspec
 from fastapi import Depends, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
+from fog_runtime import logs
 from fog_runtime.http.problems import ProblemError
+from fog_runtime.token_file import ROLES, Role, TokenEntry, TokensError, read_tokens, token_hash
 
-Role = Literal["viewer", "operator", "admin"]
-
-_RANKS: Final = {role: rank for rank, role in enumerate(get_args(Role))}
+_RANKS: Final = {role: rank for rank, role in enumerate(ROLES)}
 _bearer = HTTPBearer(auto_error=False, description="A token of the tokens file")
+_log = logs.get("tokens")
 
 
 class Caller(msgspec.Struct, frozen=True):
@@ -25,55 +25,58 @@ class Caller(msgspec.Struct, frozen=True):
     role: Role
 
 
-class TokensError(ValueError):
-    """A tokens file is missing or invalid; the message names the file, the entry and the remedy."""
-
-
-class _Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    name: Annotated[str, msgspec.Meta(min_length=1, max_length=100)]
-    role: Role
-    sha256: Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{64}$")]
-
-
-class _TokensFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    tokens: list[_Entry] = []
-
-
 class Tokens:
-    """The callers by the SHA-256 of their tokens (tokens are long and random, so a plain hash is enough)."""
+    """The callers by the hashes of their tokens; with a file, as it is at each request. Used from several threads."""
 
-    def __init__(self, callers: dict[str, Caller] | None = None) -> None:
-        self._callers = callers or {}
+    def __init__(self, entries: Iterable[TokenEntry] = (), file: Path | None = None) -> None:
+        self._file = file
+        self._seen = _state(file)
+        self._callers = _callers(entries)
 
     def caller(self, token: str) -> Caller | None:
         """Return the owner of a token, or None for an unknown one."""
+        self._read_again()
         return self._callers.get(token_hash(token))
 
+    def _read_again(self) -> None:
+        """Read the file if it has changed: without one there are no callers, an invalid one changes nothing."""
+        state = _state(self._file)
+        if self._file is None or state == self._seen:
+            return
+        self._seen = state
+        try:
+            callers = _callers(read_tokens(self._file)) if state is not None else {}
+        except TokensError as error:
+            _log.error("tokens_unusable", reason=str(error), kept=len(self._callers))
+            return
+        before, after = set(self._callers.values()), set(callers.values())
+        self._callers = callers
+        _log.info(
+            "tokens_changed",
+            added=sorted(f"{c.name} ({c.role})" for c in after - before),
+            removed=sorted(f"{c.name} ({c.role})" for c in before - after),
+        )
 
-def token_hash(token: str) -> str:
-    """Return the hash of a token, as in the tokens file."""
-    return hashlib.sha256(token.encode()).hexdigest()
+
+def _callers(entries: Iterable[TokenEntry]) -> dict[str, Caller]:
+    return {entry.sha256: Caller(entry.name, entry.role) for entry in entries}
+
+
+def _state(file: Path | None) -> tuple[int, ...] | None:
+    """Return what changes with a file's content or access, None if there is none."""
+    try:
+        found = os.stat(file) if file is not None else None  # noqa: PTH116  # once per request
+    except OSError:
+        return None
+    return (found.st_ino, found.st_mtime_ns, found.st_ctime_ns, found.st_size) if found is not None else None
 
 
 def load_tokens(file: Path | None) -> Tokens:
-    """Read a tokens file (TOML: `[[tokens]]` with name, role, sha256); without a file every write is refused.
+    """Read a tokens file, and again when it changes; without a file every write is refused.
 
-    Raises `TokensError`.
+    Raises `TokensError` for a file that can't be used now.
     """
-    if file is None:
-        return Tokens()
-    try:
-        entries = msgspec.convert(tomllib.loads(file.read_text("utf-8")), _TokensFile).tokens
-    except OSError as error:
-        raise TokensError(f"{file}: can't be read ({error.strerror}). Create it or unset FOGNAV_TOKENS_FILE") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise TokensError(f"{file}: is not valid TOML ({error}). Correct that line") from error
-    except msgspec.ValidationError as error:
-        raise TokensError(f"{file}: {error}. Each of [[tokens]] needs name, role and sha256") from error
-    callers = {entry.sha256: Caller(entry.name, entry.role) for entry in entries}
-    if len(callers) != len(entries):
-        raise TokensError(f"{file}: two entries have the same sha256. Give each caller a token of their own")
-    return Tokens(callers)
+    return Tokens() if file is None else Tokens(read_tokens(file), file)
 
 
 def require(role: Role) -> Callable[..., Caller]:

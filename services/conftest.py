@@ -81,12 +81,16 @@ class Fog:
         }
         self.processes: dict[str, programs.Program] = {}
 
-    def start(self, module: str) -> None:
-        """Start a program, as `python -m module` would; may be called again after a kill."""
-        port_file = self.folder / f"{module}.port"
+    def start(self, module: str, name: str = "", **environment: str) -> None:
+        """Start a program, as `python -m module` would; may be called again after a kill.
+
+        Further copies of it need a `name`; `environment` overrides what all processes get.
+        """
+        name = name or module
+        port_file = self.folder / f"{name}.port"
         port_file.unlink(missing_ok=True)
-        environment = {**self.environment, "FOGNAV_PORT_FILE": str(port_file)}
-        self.processes[module] = programs.start(module, environment, self.folder / f"{module}.log")
+        environment = {**self.environment, "FOGNAV_PORT_FILE": str(port_file), **environment}
+        self.processes[name] = programs.start(module, environment, self.folder / f"{name}.log")
 
     def kill(self, module: str) -> None:
         """Kill a process, as a crash would."""
@@ -148,6 +152,61 @@ class Fog:
             server.stop()
 
 
+class Proxy:
+    """Connects clients to a server, until it is cut: then nothing passes, and nobody is told."""
+
+    def __init__(self, port: int) -> None:
+        self._target = port
+        self._server: asyncio.Server | None = None
+        self._through = asyncio.Event()
+        self._through.set()
+        self._writers: set[asyncio.StreamWriter] = set()
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    async def start(self) -> int:
+        """Listen; return the port."""
+        self._server = await asyncio.start_server(self._serve, "127.0.0.1", 0)
+        return self._server.sockets[0].getsockname()[1]
+
+    def cut(self) -> None:
+        self._through.clear()
+
+    def heal(self) -> None:
+        """Let data pass again; what was connected when it was cut is disconnected, as after a long partition."""
+        self._through.set()
+        for writer in self._writers:
+            writer.close()
+
+    async def close(self) -> None:
+        assert self._server is not None
+        self._server.close()
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await self._through.wait()
+        try:
+            there_reader, there_writer = await asyncio.open_connection("127.0.0.1", self._target)
+        except OSError:
+            writer.close()
+            return
+        self._writers |= {writer, there_writer}
+        for source, sink in ((reader, there_writer), (there_reader, writer)):
+            self._tasks.add(asyncio.create_task(self._pump(source, sink)))
+
+    async def _pump(self, source: asyncio.StreamReader, sink: asyncio.StreamWriter) -> None:
+        try:
+            while data := await source.read(65536):
+                await self._through.wait()
+                sink.write(data)
+                await sink.drain()
+        except OSError:
+            pass
+        finally:
+            sink.close()
+
+
 async def until(condition: Callable[[], object], expected: str, details: Callable[[], str] = str) -> None:
     """Wait until a condition is true; after the deadline, fail with what was `expected` and the `details`."""
     deadline = time.monotonic() + DEADLINE_S
@@ -164,6 +223,14 @@ def until_fixture():
 @pytest.fixture(name="tokens")
 def tokens_fixture() -> dict[str, dict[str, str]]:
     return {role: {"Authorization": f"Bearer {token}"} for _, role, token in TOKENS}
+
+
+@pytest.fixture
+async def proxy(fog: Fog) -> AsyncIterator[Proxy]:
+    """Yield a proxy in front of Redis; it listens once its test starts it."""
+    made = Proxy(fog.redis.port)
+    yield made
+    await made.close()
 
 
 @pytest.fixture

@@ -153,7 +153,7 @@ class Fog:
     def send_robot_to_the_corner(self) -> None:
         self.points = L_PATH[:3]
         x, y = self.points[-1]
-        self.goal = RobotGoal(goal_id="g1", pose=Pose(x=x, y=y, theta=0.0), stamp=self.clock.stamp())
+        self.goal = RobotGoal(goal_id="g1", pose=Pose(x=x, y=y, theta=0.0), stamp=self.clock.stamp(), planner_epoch=3)
         self.plan()
 
     async def command(self, kind: str, *, key: bytes = KEY) -> CommandReply | None:

@@ -142,7 +142,7 @@ class LittleWorld:
 
     def drive_to(self, points, goal_id="g1", plan_id=1, released=None, theta=None, traces=()):
         x, y = points[-1]
-        self.goal = RobotGoal(goal_id=goal_id, pose=Pose(x=x, y=y, theta=theta or 0.0))
+        self.goal = RobotGoal(goal_id=goal_id, pose=Pose(x=x, y=y, theta=theta or 0.0), planner_epoch=3)
         self.path = RobotPath(
             plan_id=plan_id,
             planner_epoch=3,

@@ -319,6 +319,7 @@ def hazard(state, polygon):
         ),
         polygon=polygon,
         label="Z4",
+        epoch=7,
     )
 
 

@@ -47,7 +47,8 @@ def drive_through_most_situations(world):
     area = AreaHazard(
         area="z4", state="unknown", severity=1, penalty=200, since=0.0, seq=1, epoch=1, cause="t", nodes={}
     )
-    world.send(ch.HAZARD, HazardArea(hazard=area, polygon=[(0.0, 0.0), (3.4, 0.0), (3.4, 3.0), (0.0, 3.0)], label="Z4"))
+    corners = [(0.0, 0.0), (3.4, 0.0), (3.4, 3.0), (0.0, 3.0)]
+    world.send(ch.HAZARD, HazardArea(hazard=area, polygon=corners, label="Z4", epoch=7))
     shape = PolygonShape(points=[(9.0, 1.0), (10.0, 1.0), (10.0, 2.0)])
     world.send(ch.ZONES, ZoneSet(epoch=7, seq=1, zones=[Zone(id="wet", kind="BLOCKED", shape=shape, reason="mopped")]))
     world.drive_to([(world.x, world.y), (3.5, 2.0), (3.5, 3.8)], plan_id=2, traces=[trace()])

@@ -260,10 +260,11 @@ class LiveServices:
         for name, loop in (
             ("aggregator write", self.aggregator.write_loop()),
             ("map store", self.map.store_loop()),
-            ("planner store", self.planner.store_loop()),
             ("planner plan", self.planner.plan_loop()),
         ):
             await self._begin(name, loop)
+        await self.map.lead(1, confirmed=True)
+        await self.planner.lead(1, confirmed=True)
         await self.edges["hazard-aggregator"].connect()
         await self.run_until_idle()
 

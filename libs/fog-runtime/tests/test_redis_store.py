@@ -7,6 +7,9 @@ import pytest
 from redis.asyncio import Redis
 
 from fog_contracts.messages import Message
+from fog_runtime.lease import Request
+from fog_runtime.lease_store import LeaseStore
+from fog_runtime.redis_connection import StoreRefusedError
 from fog_runtime.redis_store import ANY, Audit, RedisStore, StoreError, Table
 from fog_supervisor.servers import Server, start_redis
 
@@ -85,20 +88,49 @@ async def test_unreadable_record_raises_or_is_left_out(redis: Server):
             await store._records("things", Thing)
 
 
-async def test_epochs_grow_after_a_clock_reset_and_without_redis(redis: Server):
+async def test_epoch_is_above_every_earlier_one_though_the_clock_was_reset(redis: Server):
     async with RedisStore(redis.url, "test") as store, Redis.from_url(redis.url) as raw:
-        first = await store.begin_epoch("map")
-        assert await store.begin_epoch("map") > first
+        first = await store.claim_epoch("map")
+        assert await store.claim_epoch("map") > first
         await raw.set("fog:test:map:epoch", first + 10**9)
         assert await store.claim_epoch("map") == first + 10**9 + 1
         assert await store.claim_epoch("map", floor=first) == first + 10**9 + 2
         assert await store.claim_epoch("map", floor=first + 2 * 10**9) == first + 2 * 10**9 + 1
         assert await store.durability_warning() == ""
         await asyncio.to_thread(redis.kill)
-        assert await store.begin_epoch("map") >= first
         for attempt in (store.check(), store.claim_epoch("map"), store._swap(THINGS, "a", None, ANY, AUDIT)):
             with pytest.raises(StoreError, match="Redis: "):
                 await attempt
+
+
+async def test_writer_whose_epoch_is_not_the_granted_one_is_refused(redis: Server):
+    async with (
+        RedisStore(redis.url, "test", service="map") as old,
+        RedisStore(redis.url, "test", service="map") as new,
+        LeaseStore(redis.url, "test", "map") as keeper,
+    ):
+        request = Request(epoch=0, floor=0, confirmed=False, sent_at=0.0)
+        granted = await keeper.acquire("a", request)
+        assert granted is not None
+        old.epoch = granted.epoch
+        assert await old._swap(THINGS, "a", Thing(label="x"), ABSENT, AUDIT) == "ok"
+        await old._write_records("things", {"b": Thing(label="y")})
+        await keeper.release("a")
+        taken = await keeper.acquire("b", request)
+        assert taken is not None
+        new.epoch = taken.epoch
+        assert await new._swap(THINGS, "c", Thing(label="z"), ABSENT, AUDIT) == "ok"
+        before = await new._records("things", Thing)
+        for late in (old.epoch, taken.epoch + 1):
+            old.epoch = late
+            for attempt in (
+                old._swap(THINGS, "a", Thing(label="late", version=2), "1", AUDIT),
+                old._swap(THINGS, "a", None, ANY, AUDIT),
+                old._write_records("things", {"b": Thing(label="late")}),
+            ):
+                with pytest.raises(StoreRefusedError, match="not that of the map"):
+                    await attempt
+        assert await new._records("things", Thing) == before
 
 
 async def test_redis_without_durable_writes_is_reported(redis: Server):

@@ -101,7 +101,8 @@ async def test_emptied_redis_is_noticed_and_the_zones_are_restored_from_memory(f
         assert refused.status_code == 503
         assert refused.json()["detail"].startswith("nothing was changed: Redis ")
         assert RECOVERY in refused.json()["detail"]
-    assert await raw.keys("*") == [], "nothing was written into the emptied store"
+    records = [key for key in await raw.keys("*") if not key.endswith((b":lease", b":epoch"))]
+    assert records == [], "nothing was written into the emptied store"
     assert (await client.post(RECOVERY, json={"action": "restore"}, headers=tokens["operator"])).status_code == 403
     assert (await client.post(RECOVERY, json={"action": "restore"}, headers=tokens["admin"])).status_code == 204
     await fog.ready("map_service")

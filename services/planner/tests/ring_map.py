@@ -81,7 +81,7 @@ class RingMap:
         hazard = AreaHazard(
             area=name, state=state, severity=2, penalty=penalty, since=0.0, seq=1, epoch=1, cause="test"
         )
-        return HazardArea(hazard=hazard, polygon=polygon(self.areas[name]))
+        return HazardArea(hazard=hazard, polygon=polygon(self.areas[name]), epoch=self.epoch)
 
 
 def polygon(box: Box) -> list[tuple[float, float]]:

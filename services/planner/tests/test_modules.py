@@ -234,7 +234,7 @@ def test_blocked_path_is_replaced_and_a_refusal_is_kept_while_it_is_the_same() -
 
 
 def published(mission: Mission, at: Moment) -> tuple[object, object]:
-    return mission.due_goal(at, CONFIG), mission.due_path(at, CONFIG, 7, Version(1, 2, 3))
+    return mission.due_goal(at, CONFIG, 7), mission.due_path(at, CONFIG, 7, Version(1, 2, 3))
 
 
 def test_goal_and_path_are_published_at_once_and_again_after_their_periods() -> None:
@@ -242,7 +242,7 @@ def test_goal_and_path_are_published_at_once_and_again_after_their_periods() -> 
     assert published(mission, NOW) == (None, None)
     mission.begin(goal(*RIGHT), any_heading=True)
     mission.plan = plan(LEFT, (1.0, 9.0), (9.0, 9.0))
-    sent, path = mission.due_goal(NOW, CONFIG), mission.due_path(NOW, CONFIG, 7, Version(1, 2, 3))
+    sent, path = mission.due_goal(NOW, CONFIG, 7), mission.due_path(NOW, CONFIG, 7, Version(1, 2, 3))
     assert sent
     assert path
     assert (sent.goal_id, sent.stamp) == ("g1", 5000.0)
@@ -269,7 +269,7 @@ def test_ended_goal_is_published_without_a_pose_and_has_no_path() -> None:
     mission.begin(goal(*RIGHT), any_heading=False)
     mission.plan = plan(LEFT, (1.0, 9.0))
     mission.end()
-    sent = mission.due_goal(NOW, CONFIG)
+    sent = mission.due_goal(NOW, CONFIG, 7)
     assert sent
     assert (sent.goal_id, sent.pose) == ("g1", None)
     assert mission.due_path(NOW, CONFIG, 7, Version(1, 2, 3)) is None

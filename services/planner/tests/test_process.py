@@ -162,7 +162,7 @@ class Environment:
         hazard = AreaHazard(
             area="z1", state="blocked", severity=2, penalty=254, since=0.0, seq=1, epoch=1, cause="test"
         )
-        self.edge.publish(ch.HAZARD, HazardArea(hazard=hazard, polygon=UPPER), area="z1")
+        self.edge.publish(ch.HAZARD, HazardArea(hazard=hazard, polygon=UPPER, epoch=5), area="z1")
 
     def report_reached(self, goal_id: str) -> None:
         state = RobotState(

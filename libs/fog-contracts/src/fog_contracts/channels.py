@@ -82,6 +82,8 @@ class Channel:
     """The payloads of a text channel with a fixed set of them."""
     about: str = ""
     """Description of the payload of a channel without a message type."""
+    epoch: str = ""
+    """The message's field with its publisher's epoch: one copy leads at a time, and receivers refuse the others."""
     fields: tuple[str, ...] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -195,15 +197,15 @@ HOME_ASSISTANT    = _text( "home_assistant",    "homeassistant/device/{node}/con
 
 # The map, and the hazards and zones in it: zenoh, msgpack
 MAP_DELTA         = _pub(  "map_delta",         FOG + "map/delta",      m.MapDelta,     limit=DELTA_LIMIT,
-    publishers=(MAP,), subscribers=(PLANNER, ROBOT), durability=RECOVERED)
+    publishers=(MAP,), subscribers=(PLANNER, ROBOT), durability=RECOVERED, epoch="epoch")
 MAP_HEARTBEAT     = _pub(  "map_heartbeat",     FOG + "map/heartbeat",  m.MapHeartbeat, limit=256,
-    publishers=(MAP,), subscribers=(PLANNER, ROBOT), durability=VOLATILE, rate_hz=10, max_age_s=1)
+    publishers=(MAP,), subscribers=(PLANNER, ROBOT), durability=VOLATILE, rate_hz=10, max_age_s=1, epoch="epoch")
 MAP_SNAPSHOT      = _query("map_snapshot",      FOG + "map/snapshot",   None,           limit=0,
     publishers=(MAP,), subscribers=(PLANNER, ROBOT), reply=m.MapSnapshot, reply_limit=64 * MIB)
 HAZARD            = _pub(  "hazard",            FOG + "hazards/{area}", m.HazardArea,   limit=64 * KIB,
-    publishers=(MAP,), subscribers=(PLANNER, ROBOT, CONSOLE), durability=LATEST)
+    publishers=(MAP,), subscribers=(PLANNER, ROBOT, CONSOLE), durability=LATEST, epoch="epoch")
 ZONES             = _pub(  "zones",             FOG + "zones",          m.ZoneSet,      limit=4 * MIB,
-    publishers=(MAP,), subscribers=(PLANNER, ROBOT), durability=LATEST)
+    publishers=(MAP,), subscribers=(PLANNER, ROBOT), durability=LATEST, epoch="epoch")
 
 # Planner and robots: zenoh, msgpack
 PLANNER_PLAN      = _query("planner_plan",      FOG + "planner/plan",             m.PlanRequest,    limit=KIB,
@@ -211,17 +213,21 @@ PLANNER_PLAN      = _query("planner_plan",      FOG + "planner/plan",           
 PLANNER_EGRESS    = _query("planner_egress",    FOG + "planner/egress",           m.EgressRequest,  limit=KIB,
     publishers=(PLANNER,), subscribers=(ROBOT,),           reply=m.PlanReply, reply_limit=4 * MIB)
 ROBOT_GOAL        = _pub(  "robot_goal",        FOG + "robots/{robot}/goal",      m.RobotGoal,      limit=KIB,
-    publishers=(PLANNER,), subscribers=(ROBOT, CONSOLE),   durability=VOLATILE, rate_hz=1)
+    publishers=(PLANNER,), subscribers=(ROBOT, CONSOLE),   durability=VOLATILE, rate_hz=1, epoch="planner_epoch")
 ROBOT_PATH        = _pub(  "robot_path",        FOG + "robots/{robot}/path",      m.RobotPath,      limit=MIB,
-    publishers=(PLANNER,), subscribers=(ROBOT, CONSOLE),   durability=VOLATILE, rate_hz=2, max_age_s=1.5)
+    publishers=(PLANNER,), subscribers=(ROBOT, CONSOLE),   durability=VOLATILE, rate_hz=2, max_age_s=1.5,
+    epoch="planner_epoch")
 ROBOT_POSE        = _pub(  "robot_pose",        FOG + "robots/{robot}/pose",      m.RobotPose,      limit=KIB,
     publishers=(ROBOT,), subscribers=(AGGREGATOR, MAP, PLANNER, CONSOLE), durability=VOLATILE, rate_hz=10, max_age_s=1)
 ROBOT_STATE       = _pub(  "robot_state",       FOG + "robots/{robot}/state",     m.RobotState,     limit=16 * KIB,
-    publishers=(ROBOT,),   subscribers=(PLANNER, CONSOLE), durability=VOLATILE, rate_hz=1, max_age_s=3)
+    publishers=(ROBOT,), subscribers=(MAP, PLANNER, CONSOLE), durability=VOLATILE, rate_hz=1, max_age_s=3)
 ROBOT_OBSTACLES   = _pub(  "robot_obstacles",   FOG + "robots/{robot}/obstacles", m.RobotObstacles, limit=64 * KIB,
     publishers=(ROBOT,),   subscribers=(MAP, CONSOLE),     durability=VOLATILE, rate_hz=1)
 ROBOT_COMMAND     = _query("robot_command",     FOG + "robots/{robot}/command",   m.RobotCommand,   limit=KIB,
     publishers=(ROBOT,),   subscribers=(CONSOLE,),         reply=m.CommandReply, reply_limit=2 * KIB)
+LEADER            = _pub(  "leader",            FOG + "leaders/{role}", m.Leader, limit=KIB,
+    publishers=(AGGREGATOR, MAP, PLANNER), subscribers=(AGGREGATOR, MAP, PLANNER), durability=VOLATILE, rate_hz=4,
+    max_age_s=1.5)
 LIVE              = _live( "live",              FOG + "live/{role}/{id}", about="presence, no safety signal",
     publishers=(AGGREGATOR, MAP, PLANNER, ROBOT), subscribers=(CONSOLE,))
 

@@ -20,8 +20,7 @@ class MapFollower:
     """Keeps a replica at the newest known version of the map.
 
     The newest version is the highest that a heartbeat, a delta or a snapshot announced: higher epoch first, then higher
-    seq. Heartbeats that announce an older one for longer than `grace_s` mean that the writer restarted with lower
-    numbers (its clock or its store was reset); the version that they announce is then the newest.
+    seq. It never goes back: a writer with a lower epoch was replaced (`fog_contracts.fencing`).
 
     Deltas that can't be applied yet are held, the latest `max_held` of them, and applied as soon as the missing ones
     or a snapshot arrive.
@@ -34,8 +33,6 @@ class MapFollower:
         self._held: dict[tuple[int, int, int], MapDelta] = {}
         """Deltas by epoch, seq and part, oldest arrival first."""
         self._newest: Version | None = None
-        self._contradicted_since: float | None = None
-        """Since when heartbeats have announced only versions older than `_newest`."""
         self._behind_since: float | None = None
         self._confirmed_at = -math.inf
 
@@ -45,7 +42,7 @@ class MapFollower:
         """Apply a delta and all held deltas that it completes; return what changed, or None if nothing did."""
         announced = Version(delta.epoch, delta.seq, delta.hash)
         if self._newest is None or _order(announced) > _order(self._newest):
-            self._newest, self._contradicted_since = announced, None
+            self._newest = announced
         self._hold(delta, self._newest)
         applied = _merged(self._apply_held())
         self._update_freshness(now, confirmed=applied is not None)
@@ -55,14 +52,7 @@ class MapFollower:
         """Record which version the writer has."""
         announced = Version(heartbeat.epoch, heartbeat.seq, heartbeat.hash)
         if self._newest is None or _order(announced) >= _order(self._newest):
-            self._newest, self._contradicted_since = announced, None
-        elif self._contradicted_since is None:
-            self._contradicted_since = now  # it may only be late
-        elif now - self._contradicted_since > self._grace_s:
-            self._newest, self._contradicted_since = announced, None
-            self._held.clear()
-            if announced != self._replica.version:
-                self._replica.invalidate()
+            self._newest = announced
         self._update_freshness(now, confirmed=announced == self._newest)
 
     def on_snapshot(self, snapshot: MapSnapshot | DecodedMap, now: float) -> Applied:
@@ -75,7 +65,7 @@ class MapFollower:
         self._check_not_outdated(announced)
         loaded = self._replica.load(snapshot)
         if self._newest is None or _order(loaded.version) > _order(self._newest):
-            self._newest, self._contradicted_since = loaded.version, None
+            self._newest = loaded.version
         self._held = {key: delta for key, delta in self._held.items() if delta.epoch == announced.epoch}
         applied = _merged([loaded, *self._apply_held()])
         assert applied is not None
@@ -154,10 +144,7 @@ class MapFollower:
             return
         if snapshot.epoch < newest.epoch:
             raise MapError(f"the snapshot has epoch {snapshot.epoch}, but the map-service is at epoch {newest.epoch}")
-        restarted = version is not None and _order(newest) < _order(version)
-        if version is None or restarted or snapshot.epoch != version.epoch:
-            return
-        if snapshot.seq < version.seq:
+        if version is not None and snapshot.epoch == version.epoch and snapshot.seq < version.seq:
             raise MapError(f"the snapshot has version {snapshot.seq}, older than the copy's {version.seq}")
 
     def _update_freshness(self, now: float, *, confirmed: bool) -> None:

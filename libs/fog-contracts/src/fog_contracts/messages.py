@@ -45,6 +45,18 @@ class Pose(Message, frozen=True, kw_only=True):
     theta: Radians
 
 
+Epochs = dict[Id, Count]
+"""The highest epoch received of each service, by its role: whoever leads it next needs a higher one."""
+
+
+class Leader(Message, frozen=True, kw_only=True):
+    """The announcement of the one process of a service that acts; `holder` identifies it."""
+
+    epoch: Count
+    holder: Annotated[str, Meta(min_length=1, max_length=100)]
+    epochs: Epochs = {}
+
+
 # --- Sensor side (MQTT, JSON) ---------------------------------------------------------------------------------------
 
 
@@ -145,7 +157,8 @@ class UnknownPolicy(Message, frozen=True, kw_only=True):
 class AreaDefinition(Message, frozen=True, kw_only=True):
     """An area: its polygon, the nodes that watch it, and how their readings are debounced.
 
-    `number` identifies it on the thesis's topics. `debounce` holds the rule's name (`rule`) and its options.
+    `number` identifies it on the thesis's topics. `debounce` holds the rule's name (`rule`) and its options. `epoch` is
+    that of the aggregator that publishes it.
     """
 
     id: Id
@@ -157,6 +170,7 @@ class AreaDefinition(Message, frozen=True, kw_only=True):
     unknown: UnknownPolicy = UnknownPolicy()
     version: Count = 0
     removed: bool = False
+    epoch: Count = 0
 
 
 MAX_CELLS: Final = 100_000_000
@@ -240,7 +254,7 @@ class MapSnapshot(Message, frozen=True, kw_only=True):
 
 
 class HazardArea(Message, frozen=True, kw_only=True):
-    """A hazard with its area's polygon: the reason for costs inside it.
+    """A hazard with its area's polygon: the reason for costs inside it; `epoch` is the map-service's.
 
     `confirmed`: the aggregator lives and confirms the hazard; if not, the area may have changed since.
     """
@@ -249,6 +263,7 @@ class HazardArea(Message, frozen=True, kw_only=True):
     polygon: Ring
     label: str = ""
     confirmed: bool = True
+    epoch: Count = 0
 
 
 ZoneKind = Literal["BLOCKED", "PENALTY", "SPEED_LIMIT"]
@@ -369,6 +384,7 @@ class RobotGoal(Message, frozen=True, kw_only=True):
     pose: Pose | None
     place: Id | None = None
     stamp: Stamp = 0.0
+    planner_epoch: Count = 0
 
 
 class RobotPath(Message, frozen=True, kw_only=True):
@@ -421,7 +437,7 @@ class LoopHealth(Message, frozen=True, kw_only=True):
 
 
 class RobotState(Message, frozen=True, kw_only=True):
-    """A robot's mode with its reasons, and the map version and plan that it follows."""
+    """A robot's mode with its reasons, the map version and plan that it follows, and the epochs that it received."""
 
     mode: Mode
     reasons: list[Sentence]
@@ -437,6 +453,7 @@ class RobotState(Message, frozen=True, kw_only=True):
     loop: LoopHealth = LoopHealth()
     traces: list[Trace] = []
     stamp: Stamp = 0.0
+    epochs: Epochs = {}
 
 
 VIEW_SECTORS: Final = 180

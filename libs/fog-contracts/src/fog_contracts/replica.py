@@ -169,6 +169,11 @@ class MasterMap:
             for part, (layer, window, packing, data) in enumerate(pieces)
         ]
 
+    def set_epoch(self, epoch: int) -> None:
+        """Continue as another history, with the same cells: readers fetch a snapshot of it."""
+        self._version = Version(epoch, self._version.seq, self._version.hash)
+        self._snapshot = None
+
     def snapshot(self) -> MapSnapshot:
         """Return the whole map; it is encoded once per version."""
         return self.snapshot_later().make()

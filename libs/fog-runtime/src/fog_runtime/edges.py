@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING, Any, Protocol
 
 from fog_contracts.codec import ContractError
 from fog_contracts.handlers import Later, Moment
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from fog_runtime.mqtt_edge import MqttEdge
     from fog_runtime.zenoh_edge import ZenohEdge
 
-    Answer = Message | Awaitable[Message]
+    Answer = Message | None | Awaitable[Message | None]
     Reply = Callable[[dict[str, str], Any], Answer]
     OnReply = Callable[[Channel, Message | None, Message], object]
 
@@ -27,11 +28,30 @@ if TYPE_CHECKING:
 _log = logs.get("edges")
 
 
-class Edges:
-    """The MQTT and zenoh connections of one process; each channel uses that of its transport."""
+class Gate(Protocol):
+    """Whether this process may act (`fog_runtime.leadership`)."""
 
-    def __init__(self, clock: Clock, *, mqtt: MqttEdge | None = None, zenoh: ZenohEdge | None = None) -> None:
+    def admit(self, channel: Channel, message: object, send: Callable[[], None]) -> None:
+        """Send a message now, later or never."""
+
+    def answers(self) -> bool:
+        """Whether this process answers queries."""
+
+    def on_message(self, channel: Channel, message: object) -> None:
+        """Hear a message before its handler does."""
+
+
+class Edges:
+    """The MQTT and zenoh connections of one process; each channel uses that of its transport.
+
+    A `gate` decides what is published and whether queries are answered; without one, everything is.
+    """
+
+    def __init__(
+        self, clock: Clock, *, mqtt: MqttEdge | None = None, zenoh: ZenohEdge | None = None, gate: Gate | None = None
+    ) -> None:
         self._clock = clock
+        self._gate = gate
         self._mqtt = mqtt
         self._zenoh = zenoh
         self._served_when_published: dict[Channel, Reply] = {}
@@ -58,7 +78,7 @@ class Edges:
         Raises `ValueError` for a channel whose transport this process does not have.
         """
         for channel, handler in handlers.items():
-            self._subscribe(channel, self._delivery(handler, publish), numbers, only or {})
+            self._subscribe(channel, self._delivery(channel, handler, publish), numbers, only or {})
 
     def serve(
         self,
@@ -88,14 +108,20 @@ class Edges:
 
         It must not end the loop of a process: the others of its publications still matter.
         """
+        if self._gate is None:
+            self._publish_now(publication)
+        else:
+            self._gate.admit(publication.channel, publication.message, partial(self._publish_now, publication))
+
+    def _publish_now(self, publication: Publication) -> None:
         try:
-            self._publish(publication)
+            self._send(publication)
         except ContractError as error:
             metrics.UNPUBLISHABLE.labels(publication.channel.name).inc()
             key = publication.channel.pattern(**publication.ids)
             self._limited.warning("message_unpublishable", key, self._clock.now(), key=key, reason=error.reason)
 
-    def _publish(self, publication: Publication) -> None:
+    def _send(self, publication: Publication) -> None:
         channel, message = publication.channel, publication.message
         if channel.transport == "mqtt":
             if self._mqtt is None:
@@ -118,23 +144,29 @@ class Edges:
             self._zenoh.serve(channel, reply, **ids)
 
     def _delivery(
-        self, handler: Handler, publish: Callable[[Sequence[Publication]], object]
+        self, channel: Channel, handler: Handler, publish: Callable[[Sequence[Publication]], object]
     ) -> Callable[[dict[str, str], Any], None]:
         def deliver(ids: dict[str, str], message: object) -> None:
+            if self._gate is not None:
+                self._gate.on_message(channel, message)
             publish(handler(ids, message, self.now()))
 
         return deliver
 
     def _reply(self, channel: Channel, query_handler: QueryHandler, on_reply: OnReply | None) -> Reply:
-        def replied(request: Any, message: Message) -> Message:  # noqa: ANN401  # of the channel's type
+        def replied(request: Any, message: Message) -> Message | None:  # noqa: ANN401  # of the channel's type
+            if self._gate is not None and not self._gate.answers():
+                return None
             if on_reply is not None:
                 on_reply(channel, request, message)
             return message
 
-        async def later(request: Any, answer: Later[Message]) -> Message:  # noqa: ANN401
+        async def later(request: Any, answer: Later[Message]) -> Message | None:  # noqa: ANN401
             return replied(request, await self._made(channel, answer))
 
         def reply(ids: dict[str, str], request: Any) -> Answer:  # noqa: ANN401
+            if self._gate is not None and not self._gate.answers():
+                return None
             answer = query_handler(ids, request, self.now())
             return later(request, answer) if isinstance(answer, Later) else replied(request, answer)
 

@@ -16,7 +16,7 @@ from fog_contracts.messages import Message
 from fog_runtime import logs, store_scripts
 from fog_runtime.audit import KINDS, AuditPage, read_page
 from fog_runtime.idempotency import LIFETIME_S, IdempotencyError
-from fog_runtime.redis_connection import RedisConnection, StoreError
+from fog_runtime.redis_connection import RedisConnection, StoreError, StoreRefusedError
 from fog_runtime.store_identity import StoreIdentity, StoreLostError
 
 if TYPE_CHECKING:
@@ -75,7 +75,8 @@ class RedisStore:
     """The site's keys; every call may raise `StoreError` and may be repeated.
 
     `data_dir` is a folder that survives restarts: in it the service `service` remembers which store it uses, so that it
-    notices at its start that Redis was emptied. Without it, only a running service notices.
+    notices at its start that Redis was emptied. Without it, only a running service notices. Set `epoch` to that with
+    which the service leads (`fog_runtime.lease`): Redis refuses writes unless it granted that one last.
     """
 
     def __init__(
@@ -86,6 +87,7 @@ class RedisStore:
         self._service = service
         self._identity = StoreIdentity(None if data_dir is None else data_dir / f"{service}.{site}.store")
         self._floors: dict[str, int] = {}
+        self.epoch = 0
 
     async def __aenter__(self) -> Self:
         """Return the store; it connects with the first command."""
@@ -102,9 +104,11 @@ class RedisStore:
         """
         # Redis checks whether it may write (a read-only replica, full, too few replicas, a broken disk) before it finds
         # that an empty text changes nothing: a probe that neither changes anything nor waits for the disk.
+        # Asked before Redis is: another call may mark the store meanwhile.
+        used_before = self._identity.used_before
         commands = [("SETRANGE", self._key("probe"), 0, ""), *self._read_identity()]
         *_, generation, writes = await self._redis.write(*commands)
-        if generation is None and not self._identity.used_before:
+        if generation is None and not used_before:
             mark = ("SET", self._key("generation"), secrets.token_hex(8), "NX")
             *_, generation, writes = await self._redis.write(mark, *self._read_identity())
         self._identity.verify(_text(generation or b""), _pairs(writes))
@@ -131,15 +135,6 @@ class RedisStore:
         epoch = max(last + 1, floor + 1, _now_ms())
         await self._redis.write(("SET", key, epoch))
         return epoch
-
-    async def begin_epoch(self, service: str) -> int:
-        """Return an epoch (ms) larger than that of every earlier start; without Redis it is taken from the clock."""
-        try:
-            return await self.claim_epoch(service)
-        except StoreError as error:
-            epoch = _now_ms()
-            _log.warning("epoch_from_clock", epoch=epoch, reason=str(error))
-            return epoch
 
     async def recall(self, attempt: Attempt | None, kind: type[M]) -> M | None:
         """Return the result of an earlier attempt under the same idempotency key; None if there was none.
@@ -189,7 +184,7 @@ class RedisStore:
     async def _write_records(self, table: str, records: Mapping[str, Message]) -> None:
         """Write records durably, overwriting what is stored, without audit entries."""
         encoded = [part for name, record in records.items() for part in (name, msgspec.json.encode(record))]
-        keys = [self._key(name) for name in ("generation", "writes", table)]
+        keys = [self._key(name) for name in ("generation", "writes", table, self._epoch_key)]
         await self._run(store_scripts.WRITE, keys, table, {}, *encoded)
 
     async def _adopt(self, tables: Mapping[str, Mapping[str, Message]], audit: Audit) -> None:
@@ -230,7 +225,7 @@ class RedisStore:
         """
         data, attempt = b"" if record is None else msgspec.json.encode(record), audit.attempt
         names = ("generation", "writes", table.name, f"audit:{table.subject}", "floors")
-        keys = [self._key(part) for part in (*names, attempt.name if attempt else "no-attempt")]
+        keys = [self._key(part) for part in (*names, attempt.name if attempt else "no-attempt", self._epoch_key)]
         arguments = {
             "id": name,
             "expected": expected,
@@ -262,6 +257,11 @@ class RedisStore:
     def _key(self, name: str) -> str:
         return f"fog:{self._site}:{name}"
 
+    @property
+    def _epoch_key(self) -> str:
+        """The key of the highest epoch of the service (`lease_store`)."""
+        return f"{self._service}:epoch"
+
     # --- Inside -----------------------------------------------------------------------------------------------------
 
     async def _decoded(self, table: str, kind: type[M]) -> tuple[dict[str, M], dict[str, str]]:
@@ -288,10 +288,12 @@ class RedisStore:
         """Run a script that begins with the guard; return its outcome and details. Raises `StoreLostError`."""
         if not self._identity.generation:
             await self.check()
-        request = msgspec.json.encode({**self._identity.guard(table), **arguments})
+        request = msgspec.json.encode({**self._identity.guard(table), "epoch": self.epoch, **arguments})
         ((outcome, writes, details),) = await self._redis.write(("EVAL", script, len(keys), *keys, request, *data))
         if outcome == b"lost":
             raise StoreLostError("Redis lost acknowledged records")
+        if outcome == b"fenced":
+            raise StoreRefusedError(f"the epoch {self.epoch} is not that of the {self._service} that Redis lets lead")
         self._identity.acknowledge(table, int(writes))
         return _text(outcome), details
 

@@ -51,6 +51,7 @@ class LargeReplies:
     """The latest large replies under one key."""
 
     def __init__(self) -> None:
+        self._id = secrets.token_hex(4)
         self._kept: OrderedDict[str, bytes] = OrderedDict()
 
     def announce(self, data: bytes) -> Announcement:
@@ -59,13 +60,17 @@ class LargeReplies:
             if kept is data:
                 self._kept.move_to_end(name)
                 return Announcement(name, len(data))
-        name = secrets.token_hex(8)
+        name = self._id + secrets.token_hex(8)
         self._kept[name] = data
         while len(self._kept) > KEPT_REPLIES or (
             len(self._kept) > 1 and sum(map(len, self._kept.values())) > KEPT_BYTES
         ):
             self._kept.popitem(last=False)
         return Announcement(name, len(data))
+
+    def announced(self, reply: str) -> bool:
+        """Whether a reply of this name was announced here, and not by another process under the same key."""
+        return reply.startswith(self._id)
 
     def part(self, reply: str, number: str) -> bytes | None:
         """Return a part, or None when the reply is not kept or has no such part."""

@@ -1,7 +1,9 @@
 """The scripts that write to the store. Each is one atomic step of Redis: after a crash all of it is stored, or nothing.
 
 Every script begins with the guard: it writes nothing into a store that was emptied, replaced, or went back to an older
-state. Its first argument is a JSON object; it returns an outcome, the number of writes of the table, and details.
+state, nor for a process that another one has replaced: the last key holds the epoch that was granted last, and
+`request.epoch` is the writer's (0: it leads no service). Its first argument is a JSON object; it returns an outcome,
+the number of writes of the table, and details.
 """
 
 from typing import Final
@@ -14,13 +16,16 @@ local request = cjson.decode(ARGV[1])
 if redis.call('GET', KEYS[1]) ~= request.generation then return {'lost', 0, ''} end
 local writes = tonumber(redis.call('HGET', KEYS[2], request.table) or '0')
 if writes < request.acknowledged then return {'lost', 0, ''} end
+if request.epoch > 0 and redis.call('GET', KEYS[#KEYS]) ~= string.format('%.0f', request.epoch) then
+  return {'fenced', 0, ''}
+end
 """
 
 WRITE: Final = f"""{_GUARD}
 for i = 2, #ARGV, 2 do redis.call('HSET', KEYS[3], ARGV[i], ARGV[i + 1]) end
 return {{'ok', redis.call('HINCRBY', KEYS[2], request.table, 1), ''}}
 """
-"""Overwrite records: keys `generation`, `writes`, table; further arguments: ids and records, alternating."""
+"""Overwrite records: keys `generation`, `writes`, table, epoch; further arguments: ids and records, alternating."""
 
 SWAP: Final = f"""{_GUARD}
 local id, expected, data = request.id, request.expected, ARGV[2]
@@ -69,8 +74,9 @@ return {{outcome, writes, string.format('%d', floor)}}
 """
 """Write or delete one record if its version is the expected one, with its audit entry.
 
-Keys: `generation`, `writes`, table, audit trail, `floors`, idempotency key. Further arguments: the record (empty:
-delete), the value before for the audit entry if none is stored, and the result to remember for the idempotency key.
+Keys: `generation`, `writes`, table, audit trail, `floors`, idempotency key, epoch. Further arguments: the record
+(empty: delete), the value before for the audit entry if none is stored, and the result to remember for the idempotency
+key.
 A deleted record leaves its version as the table's floor, above which every new record's version must be, so that a
 version never names two states. It is idempotent: a record that is already stored is left unchanged.
 """

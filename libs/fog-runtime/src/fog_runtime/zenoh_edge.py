@@ -192,7 +192,8 @@ class _Subscription(Generic[M]):
             _log.error("handler_failed", error=error, channel=self._channel.name, key=key)
 
 
-Answer = Message | Awaitable[Message]
+Answer = Message | None | Awaitable[Message | None]
+"""The reply to a query; None leaves it to another process that serves the same key."""
 
 
 class _Queryable:
@@ -239,6 +240,8 @@ class _Queryable:
             try:
                 answer = self._handler(self._ids, request)
                 message = await answer if inspect.isawaitable(answer) else answer
+                if message is None:
+                    return
                 data = self._encoded(message)
             except Exception as error:  # noqa: BLE001  # as for messages: the querier gets an error, the bug is logged
                 metrics.HANDLER_ERRORS.labels(self._channel.name).inc()
@@ -256,6 +259,8 @@ class _Queryable:
             _finish(query)
 
     async def _send_part(self, query: zenoh.Query, reply: str, number: str) -> None:
+        if not self._large.announced(reply):
+            return
         part = self._large.part(reply, number)
         if part is None:
             await self._edge.in_thread(partial(query.reply_err, GONE))

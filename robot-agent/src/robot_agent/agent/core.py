@@ -15,6 +15,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from fog_contracts import channels as ch
+from fog_contracts.fencing import Fence
 from fog_contracts.follower import MapFollower
 from fog_contracts.messages import LoopHealth
 from robot_agent.agent.blocked_places import BlockedPlaces
@@ -67,6 +68,7 @@ class AgentCore:
         self._lidar = LidarSource()
         self._localizer = Localizer(config.localization, seed)
         self._pose_keeper = PoseKeeper(self._localizer)
+        self._fence = Fence()
         self._map = MapFollower()
         self._places = BlockedPlaces()
         self._driving = PathDriving(config)
@@ -85,13 +87,15 @@ class AgentCore:
 
     def handlers(self) -> Mapping[ch.Channel, Handler]:
         """Return the handlers of all subscribed channels; of channels with `{robot}` the robot's own only."""
-        return {
-            ch.MAP_DELTA: self._on_delta,
-            ch.MAP_HEARTBEAT: self._on_heartbeat,
-            **self._places.handlers(),
-            ch.ROBOT_GOAL: self._on_goal,
-            ch.ROBOT_PATH: self._on_path,
-        }
+        return self._fence.guarded(
+            {
+                ch.MAP_DELTA: self._on_delta,
+                ch.MAP_HEARTBEAT: self._on_heartbeat,
+                **self._places.handlers(),
+                ch.ROBOT_GOAL: self._on_goal,
+                ch.ROBOT_PATH: self._on_path,
+            }
+        )
 
     def query_handlers(self) -> Mapping[ch.Channel, QueryHandler]:
         """Return the handlers of all served queries."""
@@ -126,6 +130,7 @@ class AgentCore:
     def load(self, snapshot: MapSnapshot, now: float) -> None:
         """Load a snapshot, from the map-service or from disk; raises `MapError` when it is invalid."""
         self._map.on_snapshot(snapshot, now)
+        self._fence.raise_to(ch.MAP, snapshot.epoch)
         self._pose_keeper.load_map(self.replica)
         self._driving.check_path(self.replica, now)
 
@@ -237,6 +242,7 @@ class AgentCore:
             hindrances=hindrances(mission, self._driving.wheels.decision, stuck_after, at.now) if may_drive else [],
             traces=self._driving.traces.recent,
             loop=self._loop_health,
+            epochs=self._fence.epochs,
             stamp=at.stamp,
         )
 

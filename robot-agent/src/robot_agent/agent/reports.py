@@ -54,9 +54,13 @@ def robot_state(  # noqa: PLR0913  # a message gathers from all parts of the age
     hindrances: list[str],
     traces: list[Trace],
     loop: LoopHealth,
+    epochs: dict[str, int],
     stamp: float,
 ) -> RobotState:
-    """Return mode, reasons, goal, path and map version; `hindrances` are reasons besides the safety gate's."""
+    """Return mode, reasons, goal, path, map version and the `epochs` received of each service.
+
+    `hindrances` are reasons besides the safety gate's.
+    """
     path = mission.path
     return RobotState(
         mode=safety.mode,
@@ -73,6 +77,7 @@ def robot_state(  # noqa: PLR0913  # a message gathers from all parts of the age
         loop=loop,
         traces=list(traces),
         stamp=stamp,
+        epochs=epochs,
     )
 
 

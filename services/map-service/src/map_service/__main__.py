@@ -9,6 +9,8 @@ from fog_runtime import logs, process
 from fog_runtime.clock import SystemClock
 from fog_runtime.health import Health
 from fog_runtime.http import load_tokens, serve
+from fog_runtime.leadership import Leadership, process_id
+from fog_runtime.lease_store import LeaseStore
 from fog_runtime.mqtt_edge import MqttEdge
 from fog_runtime.settings import describe, load
 from fog_runtime.site import load_site
@@ -32,26 +34,35 @@ async def main() -> None:
     site = settings.site or loaded.site.id
     clock = SystemClock(settings.speed)
     health = Health("store", "zones", "mqtt", "map")
-    async with Store(settings.redis_url, site, service="map-service", data_dir=settings.data_dir) as store:
+    async with (
+        Store(settings.redis_url, site, service="map-service", data_dir=settings.data_dir) as store,
+        LeaseStore(settings.redis_url, site, "map-service") as keeper,
+    ):
         core = MapCore(
             site,
             loaded.map,
-            await store.begin_epoch("map"),
-            settings.inflation,
+            inflation=settings.inflation,
             layers=make_layers(loaded.map, loaded.site.layers),
             definitions=loaded.site.definitions(),
             hazards_wait_s=settings.hazards_wait_s,
         )
-        mqtt = MqttEdge(settings.mqtt_url, "map-service", clock, site=site)
+        mqtt = MqttEdge(settings.mqtt_url, process_id("map-service"), clock, site=site)
         async with ZenohEdge.open(
             connect=settings.zenoh_endpoints, clock=clock, role="map-service", id=site, site=site
         ) as zenoh:
-            service = Service(core, store, mqtt, zenoh, clock, health)
+            leadership = Leadership(
+                "map-service", keeper, zenoh, health,
+                connected=lambda: zenoh.connected, epochs=lambda: core.fence.epochs,
+            )  # fmt: skip
+            service = Service(core, store, mqtt, zenoh, clock, health, leadership)
             service.subscribe()
+            leadership.subscribe()
             zenoh.declare_liveliness("map-service", site)
-            app = make_api(service, loaded.site, clock, health, load_tokens(settings.tokens_file))
+            tokens = load_tokens(settings.tokens_file)
+            app = make_api(service, loaded.site, clock, health, tokens, leadership.standby_reason)
             async with asyncio.TaskGroup() as tasks:
                 tasks.create_task(mqtt.run(), name="mqtt")
+                tasks.create_task(leadership.run(service), name="lease")
                 tasks.create_task(service.store_loop(), name="store")
                 tasks.create_task(service.tick_loop(), name="tick")
                 tasks.create_task(service.commit_loop(), name="commit")

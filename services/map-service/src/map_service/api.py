@@ -6,6 +6,7 @@ Reading needs no token, except for the audit log; writing needs the role operato
 import asyncio
 import io
 import secrets
+from collections.abc import Callable
 from typing import Annotated, Final, Literal
 from urllib.parse import urlencode
 
@@ -102,9 +103,11 @@ class MapInfo(Message, frozen=True, kw_only=True):
     seq: int
 
 
-def make_api(service: Service, site: Site, clock: Clock, health: Health, tokens: Tokens) -> FastAPI:
-    """Return the app over a running service."""
-    app = make_app("Fognav map-service", health, tokens)
+def make_api(  # the process's parts
+    service: Service, site: Site, clock: Clock, health: Health, tokens: Tokens, standby: Callable[[], str] = str
+) -> FastAPI:
+    """Return the app over a running service; while `standby` returns a reason, nothing can be written."""
+    app = make_app("Fognav map-service", health, tokens, standby=standby)
     _add_zones(Routes(app, "zones"), service, clock)
     _add_views(Routes(app, "map"), service, site)
     recovery = Routes(app, "store")

@@ -7,12 +7,16 @@ Pure: every input comes with its `Moment`, and everything to be published is ret
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, TypeVar
+
+from msgspec import structs
 
 from fog_contracts import channels as ch
 from fog_contracts.costs import DEFAULT_INFLATION
+from fog_contracts.fencing import Fence
 from fog_contracts.handlers import Moment, Publication
-from fog_contracts.messages import ZoneSet
+from fog_contracts.messages import HazardArea, ZoneSet
 from map_service.costmap import LayeredCostmap
 from map_service.layers.hazards import HazardsLayer
 from map_service.layers.zones import ZonesLayer
@@ -25,7 +29,7 @@ if TYPE_CHECKING:
     from fog_contracts.costs import Inflation
     from fog_contracts.grid import StaticMap
     from fog_contracts.handlers import Handler, Ids, Later, QueryHandler
-    from fog_contracts.messages import AreaDefinition, HazardArea, MapSnapshot, Zone
+    from fog_contracts.messages import AreaDefinition, MapSnapshot, RobotState, Zone
     from fog_contracts.raster import Spans
     from map_service.aggregator_monitor import AggregatorMonitor
     from map_service.layers.base import CostLayer
@@ -51,7 +55,7 @@ class MapCore:
         self,
         site: str,
         static: StaticMap,
-        epoch: int,
+        epoch: int = 0,
         inflation: Inflation = DEFAULT_INFLATION,
         *,
         layers: Sequence[CostLayer],
@@ -64,6 +68,7 @@ class MapCore:
         for definition in definitions:
             self._hazards.define(definition, Moment(0.0, 0.0))
         self.costmap = LayeredCostmap(site, static, layers, inflation, epoch)
+        self.fence = Fence()
         self._zones_loaded = False
         self._hazards_wait_s = hazards_wait_s
         self._serving = False
@@ -119,7 +124,8 @@ class MapCore:
 
     def hazards(self) -> list[HazardArea]:
         """Return every area with its hazard."""
-        return self._hazards.hazards()
+        epoch = self.costmap.version.epoch
+        return [structs.replace(area, epoch=epoch) for area in self._hazards.hazards()]
 
     # --- Channels ---------------------------------------------------------------------------------------------------
 
@@ -129,7 +135,8 @@ class MapCore:
         for layer in self._layers:
             for channel, handler in layer.handlers().items():
                 subscribed.setdefault(channel, []).append(handler)
-        return {channel: self._combined(handlers) for channel, handlers in subscribed.items()}
+        combined = {channel: self._combined(handlers) for channel, handlers in subscribed.items()}
+        return self.fence.guarded({ch.ROBOT_STATE: self._on_state, **combined})
 
     def query_handlers(self) -> Mapping[Channel, QueryHandler]:
         """Return the handler of every query; queries are answered once the map is served."""
@@ -146,8 +153,15 @@ class MapCore:
             if not self._is_complete(at.now):
                 return requests
             self._serving = True
-            publications = [*self._hazards.publications(), Publication(ch.ZONES, self.zone_set())]
+            publications = self._everything()
         return [*requests, *publications, Publication(ch.MAP_HEARTBEAT, self.costmap.heartbeat(at.stamp))]
+
+    # --- Leading and standing by: one of several map-services leads, the others follow all inputs -------------------
+
+    def lead(self, epoch: int) -> list[Publication]:
+        """Continue with this epoch; return hazards and zones again. Readers fetch the map itself."""
+        self.costmap.set_epoch(epoch)
+        return self._everything() if self._serving else []
 
     # --- Inputs without a channel -----------------------------------------------------------------------------------
 
@@ -184,6 +198,10 @@ class MapCore:
 
         return handle
 
+    def _on_state(self, _ids: Ids, _state: RobotState, _at: Moment) -> list[Publication]:
+        """Do nothing: of a robot's state only the epochs that it received matter, which the edges pass on."""
+        return []
+
     def _commit(self, publications: list[Publication], at: Moment) -> list[Publication]:
         """Make a version of the layers' changes; return its deltas and all publications, once the map is served.
 
@@ -194,7 +212,7 @@ class MapCore:
         if not self._serving:
             self._zones.pop_changed()
             return []
-        return [*deltas, *publications, *self._changed_zones(at.now)]
+        return [*deltas, *self._with_epoch(publications), *self._changed_zones(at.now)]
 
     def _changed_zones(self, now: float) -> list[Publication]:
         """Return the publication of the zones when they changed and are on the map; many of them not too often."""
@@ -204,6 +222,17 @@ class MapCore:
             return []
         self._zones_published_at = now
         return [Publication(ch.ZONES, self.zone_set())]
+
+    def _everything(self) -> list[Publication]:
+        return [*self._with_epoch(self._hazards.publications()), Publication(ch.ZONES, self.zone_set())]
+
+    def _with_epoch(self, publications: Iterable[Publication]) -> list[Publication]:
+        """Return the layers' publications with the map's epoch."""
+        epoch = self.costmap.version.epoch
+        return [
+            replace(p, message=structs.replace(p.message, epoch=epoch)) if isinstance(p.message, HazardArea) else p
+            for p in publications
+        ]
 
     def _is_complete(self, now: float) -> bool:
         """Whether zones and all hazards have arrived; areas whose hazard is missing after the wait are unknown."""
@@ -217,7 +246,7 @@ class MapCore:
         return self.zone_set()
 
     def _answer_hazard(self, ids: Ids, _request: None, _at: Moment) -> HazardArea:
-        return self._hazards.hazard(ids["area"])
+        return structs.replace(self._hazards.hazard(ids["area"]), epoch=self.costmap.version.epoch)
 
 
 def _find_layer(layers: Iterable[CostLayer], kind: type[L]) -> L:

@@ -71,6 +71,10 @@ class LayeredCostmap:
         """The floor plan, uint8 (height, width)."""
         return self._master.static
 
+    def set_epoch(self, epoch: int) -> None:
+        """Continue with another epoch; cells and seq stay."""
+        self._master.set_epoch(epoch)
+
     def heartbeat(self, stamp: float) -> MapHeartbeat:
         """Return the message that carries the version."""
         return self._master.heartbeat(stamp)

@@ -16,7 +16,7 @@ from fog_runtime import logs, metrics
 from fog_runtime.clock import ticker
 from fog_runtime.edges import Edges
 from fog_runtime.work import Worker
-from map_service.store import Audit, RecoveryError, StoreError
+from map_service.store import Audit, RecoveryError, StoreError, StoreLostError
 from map_service.zone_validation import check_list_size, check_room, list_size, prepare_zone, zones_spans
 
 if TYPE_CHECKING:
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from fog_contracts.handlers import Publication
     from fog_runtime.audit import AuditPage
     from fog_runtime.clock import Clock
+    from fog_runtime.edges import Gate
     from fog_runtime.health import Health
     from fog_runtime.idempotency import Attempt
     from fog_runtime.mqtt_edge import MqttEdge
@@ -87,15 +88,23 @@ class ConflictError(Exception):
 class Service:
     """The running map-service; its loops are tasks of the process."""
 
-    def __init__(
-        self, core: MapCore, store: Store, mqtt: MqttEdge, zenoh: ZenohEdge, clock: Clock, health: Health
+    def __init__(  # noqa: PLR0913  # the process's parts
+        self,
+        core: MapCore,
+        store: Store,
+        mqtt: MqttEdge,
+        zenoh: ZenohEdge,
+        clock: Clock,
+        health: Health,
+        gate: Gate | None = None,
     ) -> None:
+        """Prepare; `gate` decides whether this process leads or stands by."""
         self.core = core
         self._store = store
         self._mqtt = mqtt
         self._clock = clock
         self._health = health
-        self._edges = Edges(clock, mqtt=mqtt, zenoh=zenoh)
+        self._edges = Edges(clock, mqtt=mqtt, zenoh=zenoh, gate=gate)
         self._zone_lock = asyncio.Lock()
         self._zone_worker = Worker("zones", limit=MAX_PREPARING)
         self._changes_wait = asyncio.Event()
@@ -104,6 +113,7 @@ class Service:
         self._last_heartbeat: float | None = None
         core.costmap.measure = lambda step: COMMIT_SECONDS.labels(step).time()
         self._reload_zones = False
+        self._leading = False
         self._serving_queries = False
         self._aggregator_alive = False
 
@@ -134,6 +144,29 @@ class Service:
                 await asyncio.sleep(0)
             self._changes_wait.clear()
             self._all_on_map.set()
+
+    # --- Leading and standing by ------------------------------------------------------------------------------------
+
+    async def lead(self, epoch: int, *, confirmed: bool) -> None:
+        """Load the stored zones and continue with this epoch; raises `StoreError` for a confirmed one.
+
+        With a provisional epoch, while the store can't be read, or when it lost records, the known zones stay; the map
+        is not served before zones were loaded once.
+        """
+        self._store.epoch = epoch
+        try:
+            await self.load_zones()
+        except StoreError as error:
+            if confirmed and not isinstance(error, StoreLostError):
+                raise
+            self._reload_zones = True
+        await self._all_on_map.wait()
+        self._leading = True
+        self._publish(self.core.lead(epoch))
+
+    def stand_by(self) -> None:
+        """Follow the inputs, and the stored zones, which another process changes now."""
+        self._leading = False
 
     # --- Zones: stored first, then put on the map -------------------------------------------------------------------
 
@@ -243,19 +276,20 @@ class Service:
             raise ConflictError(outcome, zone_id)
 
     async def load_zones(self) -> None:
-        """Replace the map's zones by the stored ones; raises `StoreError`."""
+        """Replace the map's zones by the stored ones, where they differ; raises `StoreError`."""
         async with self._zone_lock:
             await self._load_zones()
 
     async def _load_zones(self) -> None:
         zones = await self._store.zones()
-        known = {zone.id: zone.shape for zone in self.core.zones()}
-        changed = [zone for zone in zones if known.get(zone.id) != zone.shape]
-        try:
-            spans = await self._zone_worker.run(zones_spans, changed, self.core.costmap.geometry)
-            self._publish(self.core.load_zones(zones, self._edges.now(), spans))
-        except ShapeError as error:
-            raise StoreError(f"a stored zone is invalid: {error}; repair or delete it") from error
+        known = {zone.id: zone for zone in self.core.zones()}
+        if not self.core.zones_loaded or {zone.id: zone for zone in zones} != known:
+            changed = [zone for zone in zones if zone.id not in known or known[zone.id].shape != zone.shape]
+            try:
+                spans = await self._zone_worker.run(zones_spans, changed, self.core.costmap.geometry)
+                self._publish(self.core.load_zones(zones, self._edges.now(), spans))
+            except ShapeError as error:
+                raise StoreError(f"a stored zone is invalid: {error}; repair or delete it") from error
         self._reload_zones = False
         detail = f"{len(zones)} loaded"
         if (excess := list_size(zones) - ch.ZONES.limit) > 0:
@@ -265,10 +299,15 @@ class Service:
         self._health.set("store", ok=True)
 
     async def store_loop(self) -> None:
-        """Load the zones, retrying until the store answers; then monitor it, and reload after an uncertain write."""
+        """Load the zones, retrying until the store answers; then monitor it, and reload after an uncertain write.
+
+        On standby the zones follow the stored ones.
+        """
         while True:
             try:
-                if self._reload_zones or not self.core.zones_loaded:
+                if not self._leading and self.core.zones_loaded:
+                    await self.load_zones()
+                elif self._reload_zones or not self.core.zones_loaded:
                     await self.load_zones()
                     if warning := await self._store.durability_warning():
                         _log.warning("store_not_durable", remedy=warning)

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Final
 from msgspec import structs
 
 from fog_contracts.messages import Zone
-from fog_runtime.redis_store import Audit, Outcome, RecoveryError, RedisStore, StoreError, Table
+from fog_runtime.redis_store import Audit, Outcome, RecoveryError, RedisStore, StoreError, StoreLostError, Table
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from fog_runtime.idempotency import Attempt
 
-__all__ = ["Audit", "Outcome", "RecoveryError", "Store", "StoreError"]
+__all__ = ["Audit", "Outcome", "RecoveryError", "Store", "StoreError", "StoreLostError"]
 
 _ZONES: Final = Table("zones", "zone")
 

@@ -9,6 +9,8 @@ from fog_runtime import logs, process
 from fog_runtime.clock import SystemClock
 from fog_runtime.health import Health
 from fog_runtime.http import load_tokens, serve
+from fog_runtime.leadership import Leadership
+from fog_runtime.lease_store import LeaseStore
 from fog_runtime.settings import describe, load
 from fog_runtime.site import load_site
 from fog_runtime.zenoh_edge import ZenohEdge
@@ -34,14 +36,21 @@ async def main() -> None:
     config = PlannerConfig(inflation=settings.inflation, release_length=settings.release_m)
     async with (
         Store(settings.redis_url, site, service="planner", data_dir=settings.data_dir) as store,
+        LeaseStore(settings.redis_url, site, "planner") as keeper,
         ZenohEdge.open(connect=settings.zenoh_endpoints, clock=clock, role="planner", id=site, site=site) as zenoh,
     ):
-        service = Service(PlannerCore(await store.begin_epoch("planner"), config), store, zenoh, clock, health)
+        core = PlannerCore(config=config)
+        leadership = Leadership(
+            "planner", keeper, zenoh, health, connected=lambda: zenoh.connected, epochs=lambda: core.fence.epochs
+        )
+        service = Service(core, store, zenoh, clock, health, leadership)
         service.subscribe()
+        leadership.subscribe()
         zenoh.declare_liveliness("planner", site)
-        app = make_api(service, loaded.site, health, load_tokens(settings.tokens_file))
+        app = make_api(service, loaded.site, health, load_tokens(settings.tokens_file), leadership.standby_reason)
         try:
             async with asyncio.TaskGroup() as tasks:
+                tasks.create_task(leadership.run(service), name="lease")
                 tasks.create_task(service.store_loop(), name="store")
                 tasks.create_task(service.snapshot_loop(), name="snapshot")
                 tasks.create_task(service.tick_loop(), name="tick")

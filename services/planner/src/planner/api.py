@@ -1,5 +1,7 @@
 """REST under /api/v1: robots with their missions, and plans on request. Robots need a viewer's or operator's token."""
 
+from collections.abc import Callable
+
 from fastapi import FastAPI, Request
 
 from fog_contracts.messages import (
@@ -154,9 +156,9 @@ def _goal_pose(body: GoalBody, site: Site) -> tuple[Pose, bool]:
     return Pose(x=place.x, y=place.y, theta=place.theta or 0.0), place.theta is None
 
 
-def make_api(service: Service, site: Site, health: Health, tokens: Tokens) -> FastAPI:
-    """Return the app over a running service."""
-    app = make_app("Fognav planner", health, tokens)
+def make_api(service: Service, site: Site, health: Health, tokens: Tokens, standby: Callable[[], str] = str) -> FastAPI:
+    """Return the app over a running service; while `standby` returns a reason, nothing can be written."""
+    app = make_app("Fognav planner", health, tokens, standby=standby)
     robots = _Robots(service, site)
     routes = Routes(app, "robots")
     add_store_errors(routes)

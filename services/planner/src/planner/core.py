@@ -16,6 +16,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from fog_contracts import channels as ch
+from fog_contracts.fencing import Fence
 from fog_contracts.handlers import Publication
 from planner.blocked_regions import BlockedRegions, cover
 from planner.config import PlannerConfig
@@ -56,8 +57,12 @@ class PlannerCore:
     URGENT: Final = frozenset({ch.MAP_DELTA})
     """Channels whose messages call for an immediate `tick`."""
 
-    def __init__(self, epoch: int, config: PlannerConfig | None = None) -> None:
+    def __init__(self, epoch: int = 0, config: PlannerConfig | None = None) -> None:
+        """Prepare a planner that leads with this epoch, or with 0 stands by."""
         self.epoch = epoch
+        self.fence = Fence()
+        self._knows_missions = epoch > 0
+        """Whether the missions are all that are stored, so that a robot's other goal is none any more."""
         self.config = config or PlannerConfig()
         self._map = MapTracker(
             self.config.inflation, grace_s=self.config.delta_grace_s, max_age_s=self.config.max_map_age_s
@@ -76,13 +81,15 @@ class PlannerCore:
 
     def handlers(self) -> Mapping[ch.Channel, Handler]:
         """Return the handler of every channel that the planner subscribes to."""
-        return {
-            ch.MAP_DELTA: self._on_delta,
-            ch.MAP_HEARTBEAT: self._on_heartbeat,
-            **self._regions.handlers(),
-            ch.ROBOT_POSE: self._on_pose,
-            ch.ROBOT_STATE: self._on_state,
-        }
+        return self.fence.guarded(
+            {
+                ch.MAP_DELTA: self._on_delta,
+                ch.MAP_HEARTBEAT: self._on_heartbeat,
+                **self._regions.handlers(),
+                ch.ROBOT_POSE: self._on_pose,
+                ch.ROBOT_STATE: self._on_state,
+            }
+        )
 
     def _on_delta(self, _ids: Ids, delta: MapDelta, at: Moment) -> Sequence[Publication]:
         changes = self._map.on_delta(delta, at.now)
@@ -119,7 +126,21 @@ class PlannerCore:
     def _on_state(self, ids: Ids, state: RobotState, _at: Moment) -> Sequence[Publication]:
         if state.goal_reached and state.goal_id is not None:
             self.missions.reach(ids["robot"], state.goal_id)
+        elif state.goal_id is not None and self._knows_missions:
+            self.missions.of(ids["robot"]).end_unknown(state.goal_id)
         return ()
+
+    # --- Leading and standing by: one of several planners leads, the others follow all inputs -----------------------
+
+    def lead(self, epoch: int, *, knows_missions: bool) -> None:
+        """Continue with this epoch and publish everything again; `knows_missions`: all stored ones are set."""
+        self.epoch, self._knows_missions = epoch, knows_missions
+        self.missions.publish_all_now()
+
+    def stand_by(self) -> None:
+        """Forget all missions, without a word to the robots: another planner leads."""
+        self.epoch, self._knows_missions = 0, False
+        self.missions.drop()
 
     # --- The map ----------------------------------------------------------------------------------------------------
 
@@ -135,6 +156,7 @@ class PlannerCore:
         loaded = self._map.load(snapshot, now)
         planning_map = self._map.current
         assert planning_map is not None
+        self.fence.raise_to(ch.MAP, planning_map.version.epoch)
         self._fields.set_lower_bound(planning_map.lower_bound)
         for _, mission in self.missions.active():
             refused = mission.plan is not None and mission.plan.route is None
@@ -190,7 +212,7 @@ class PlannerCore:
         """Return the goal, and the path or refusal, of one robot, as far as they are due."""
         mission, planning_map, ids = self.missions.of(robot), self._map.current, {"robot": robot}
         publications: list[Publication] = []
-        if (goal := mission.due_goal(at, self.config)) is not None:
+        if (goal := mission.due_goal(at, self.config, self.epoch)) is not None:
             publications.append(Publication(ch.ROBOT_GOAL, goal, ids))
         if planning_map is None or robot not in self._served or mission.path_is_outdated:
             return publications

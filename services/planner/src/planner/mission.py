@@ -128,12 +128,27 @@ class Mission:
         """Make the path due, new or kept: it was compared with the newest map."""
         self.path_due = -math.inf
 
-    def due_goal(self, at: Moment, config: PlannerConfig) -> RobotGoal | None:
+    def end_unknown(self, goal_id: str) -> None:
+        """End a goal that the robot has and nobody stored any more: it was cancelled, or replaced, unheard by it."""
+        if self.target is None and (self.goal is None or self.goal.goal_id != goal_id):
+            self.goal = RobotGoal(goal_id=goal_id, pose=None)
+            self.goal_due = -math.inf
+
+    def drop(self) -> None:
+        """Forget the goal and its plan, without telling the robot."""
+        self.goal = self.plan = self.replan = None
+        self.traces = []
+
+    def publish_all_now(self) -> None:
+        """Make goal and path due."""
+        self.goal_due = self.path_due = -math.inf
+
+    def due_goal(self, at: Moment, config: PlannerConfig, epoch: int) -> RobotGoal | None:
         """Return the goal when it is due for publication."""
         if self.goal is None or at.now < self.goal_due:
             return None
         self.goal_due = at.now + config.goal_republish_s
-        return structs.replace(self.goal, stamp=at.stamp)
+        return structs.replace(self.goal, stamp=at.stamp, planner_epoch=epoch)
 
     def due_path(self, at: Moment, config: PlannerConfig, epoch: int, version: Version) -> RobotPath | None:
         """Return the path or refusal, with the released length, when it is due for publication; `version` is the map's.

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from fog_contracts.messages import RobotGoal
 from fog_runtime import logs
 from fog_runtime.redis_connection import StoreRefusedError
-from planner.store import Audit, RecoveryError, StoredGoal, StoreError
+from planner.store import Audit, RecoveryError, StoredGoal, StoreError, StoreLostError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -48,9 +48,34 @@ class MissionKeeper:
         self._loaded = asyncio.Event()
         self._lock = asyncio.Lock()
         self._reload = True
+        self._leading = False
         self._reached: dict[str, str] = {}
         self.goals: dict[str, StoredGoal] = {}
         """The missions by robot."""
+
+    async def lead(self, epoch: int, *, confirmed: bool) -> None:
+        """Load the stored missions and continue with this epoch; raises `StoreError` for a confirmed one.
+
+        With a provisional epoch, while the store can't be read, or when it lost records, only the known missions go on.
+        """
+        self._store.epoch = epoch
+        try:
+            await self._load()
+        except StoreError as error:
+            if confirmed and not isinstance(error, StoreLostError):
+                raise
+            self._reload = True
+        self._leading = True
+        self._change_core(partial(self._core.lead, epoch, knows_missions=not self._reload))
+
+    def stand_by(self) -> None:
+        """Forget the missions: another planner changes them until this one leads again."""
+        self._leading, self._reload = False, True
+        self._loaded.clear()
+        self.goals.clear()
+        self._reached.clear()
+        self._change_core(self._core.stand_by)
+        self._health.set("goals", ok=True, detail="loaded when this process leads")
 
     async def earlier_result(self, attempt: Attempt | None) -> StoredGoal | None:
         """Return the mission that an earlier attempt stored, which is in force; None for a first attempt.
@@ -121,8 +146,9 @@ class MissionKeeper:
         """Load the missions, retrying until the store answers; then delete ended ones, and monitor the store."""
         while True:
             try:
-                if self._reload:
+                if self._leading and self._reload:
                     await self._load()
+                    self._change_core(partial(self._core.lead, self._store.epoch, knows_missions=True))
                 for robot, goal_id in list(self._reached.items()):
                     await self._store.delete(robot, goal_id, Audit(self._clock.stamp(), robot, "reached"))
                     if self._reached.get(robot) == goal_id:
@@ -133,7 +159,7 @@ class MissionKeeper:
                 # What was stored but never acknowledged may have gone with a failed primary.
                 self._reload = True
                 self._health.set("store", ok=False, detail=str(error))
-                if not self._loaded.is_set():
+                if self._leading and not self._loaded.is_set():
                     self._health.set("goals", ok=False, detail=f"not loaded yet: {error}")
             await asyncio.sleep(STORE_PERIOD_S)
 

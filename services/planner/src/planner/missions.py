@@ -59,6 +59,17 @@ class Missions:
             self.of(robot).end()
             self._reached.append((robot, goal_id))
 
+    def publish_all_now(self) -> None:
+        """Make all goals and paths due."""
+        for mission in self._missions.values():
+            mission.publish_all_now()
+
+    def drop(self) -> None:
+        """Forget all goals and plans, without telling the robots."""
+        self._reached.clear()
+        for mission in self._missions.values():
+            mission.drop()
+
     def pop_reached(self) -> list[tuple[str, str]]:
         """Return (robot, goal id) of the goals that were reached since the last call."""
         reached, self._reached = self._reached, []

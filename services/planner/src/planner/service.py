@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from fog_contracts.handlers import Handler, Ids, Moment, Publication
     from fog_contracts.messages import EgressRequest, Message, PlanRequest, Pose, Refusal
     from fog_runtime.clock import Clock
+    from fog_runtime.edges import Gate
     from fog_runtime.health import Health
     from fog_runtime.idempotency import Attempt
     from fog_runtime.zenoh_edge import ZenohEdge
@@ -58,10 +59,20 @@ _log = logs.get("planner")
 class Service:
     """The running planner; its loops are tasks of the process."""
 
-    def __init__(self, core: PlannerCore, store: Store, zenoh: ZenohEdge, clock: Clock, health: Health) -> None:
+    def __init__(
+        self,
+        core: PlannerCore,
+        store: Store,
+        zenoh: ZenohEdge,
+        clock: Clock,
+        health: Health,
+        gate: Gate | None = None,
+    ) -> None:
+        """Prepare; `gate` decides whether this process leads or stands by."""
         self._core = core
         self._zenoh = zenoh
-        self._edges = Edges(clock, zenoh=zenoh)
+        self._gate = gate
+        self._edges = Edges(clock, zenoh=zenoh, gate=gate)
         self._clock = clock
         self._health = health
         self._wake = asyncio.Event()
@@ -143,13 +154,22 @@ class Service:
 
         return enqueue
 
-    async def _serve_plan(self, _ids: Ids, request: PlanRequest) -> PlanReply:
+    @property
+    def _answers(self) -> bool:
+        """Whether this process answers queries; else another planner does."""
+        return self._gate is None or self._gate.answers()
+
+    async def _serve_plan(self, _ids: Ids, request: PlanRequest) -> PlanReply | None:
+        if not self._answers:
+            return None
         try:
             return await self.preview(request, "zenoh")
         except BusyError as error:
             return PlanReply(refusal=busy(str(error)), retry_after=error.retry_after)
 
-    async def _serve_egress(self, _ids: Ids, request: EgressRequest) -> PlanReply:
+    async def _serve_egress(self, _ids: Ids, request: EgressRequest) -> PlanReply | None:
+        if not self._answers:
+            return None
         try:
             return await self._queue.run("egress", request.robot, partial(self._answer, ch.PLANNER_EGRESS, request))
         except BusyError as error:
@@ -159,6 +179,16 @@ class Service:
         """Answer a query on what the core knows now, which the core's thread only copies."""
         view = await self._threads.run("core", lambda: self._core.view(self._edges.now()))
         return await self._threads.run("query", partial(self._core.answers()[channel], view, request))
+
+    # --- Leading and standing by ------------------------------------------------------------------------------------
+
+    async def lead(self, epoch: int, *, confirmed: bool) -> None:
+        """Load the stored missions and continue with this epoch; raises `StoreError`."""
+        await self._missions.lead(epoch, confirmed=confirmed)
+
+    def stand_by(self) -> None:
+        """Follow all inputs, without missions."""
+        self._missions.stand_by()
 
     # --- Loops ------------------------------------------------------------------------------------------------------
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from fog_contracts.messages import Message, RobotGoal
-from fog_runtime.redis_store import ANY, Audit, Outcome, RecoveryError, RedisStore, StoreError, Table
+from fog_runtime.redis_store import ANY, Audit, Outcome, RecoveryError, RedisStore, StoreError, StoreLostError, Table
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from fog_runtime.idempotency import Attempt
 
-__all__ = ["Audit", "RecoveryError", "Store", "StoreError", "StoredGoal"]
+__all__ = ["Audit", "RecoveryError", "Store", "StoreError", "StoreLostError", "StoredGoal"]
 
 _GOALS: Final = Table("goals", "mission", version="goal.goal_id")
 

@@ -141,12 +141,18 @@ def _add_health(routes: Routes, health: Health) -> None:
         return Response(text, media_type=kind)
 
 
-def make_app(title: str, health: Health, tokens: Tokens, *, body_limit: int = BODY_LIMIT) -> FastAPI:
-    """Build an app with health, metrics, problem documents, roles and a body limit; OpenAPI is at /openapi.json."""
+def make_app(
+    title: str, health: Health, tokens: Tokens, *, body_limit: int = BODY_LIMIT, standby: Callable[[], str] = str
+) -> FastAPI:
+    """Build an app with health, metrics, problem documents, roles and a body limit; OpenAPI is at /openapi.json.
+
+    While `standby` returns a reason, routes that write answer 503 with it.
+    """
     # FastAPI's interactive pages would load scripts from the internet.
     app = FastAPI(title=title, version=VERSION, docs_url=None, redoc_url=None)
     app.state.tokens = tokens
     app.state.schemas = {}
+    app.state.standby = standby
     add_problem_handlers(app)
     _add_health(Routes(app, "health"), health)
     app.add_middleware(_BodyLimit, limit=body_limit)

@@ -128,9 +128,13 @@ class Routes:
             described = {status: text for kind in raises for status, text in self._raised[kind].items()} | dict(
                 problems or {}
             )
+            standby: Callable[[], str] = str
+            if signature.needs_token and method != "GET":
+                standby = self._app.state.standby
+                described = {503: "This process stands by: another one leads"} | described
             self._app.add_api_route(
                 path,
-                _endpoint(handler, signature, statuses[0]),
+                _endpoint(handler, signature, statuses[0], standby),
                 methods=[method],
                 tags=[self._tag],
                 status_code=statuses[0],
@@ -199,12 +203,14 @@ class _Signature:
 
 
 def _endpoint(
-    handler: Callable[..., Awaitable[object]], signature: _Signature, status: int
+    handler: Callable[..., Awaitable[object]], signature: _Signature, status: int, standby: Callable[[], str]
 ) -> Callable[..., Awaitable[Response]]:
     """Return the function that FastAPI calls: it decodes the body, calls the handler and encodes its answer."""
 
     @functools.wraps(handler)
     async def endpoint(**arguments: Any) -> Response:
+        if reason := standby():
+            raise ProblemError(503, f"{reason}; send the request there", headers={"Retry-After": "1"})
         answer = await handler(**arguments)
         if isinstance(answer, Response):
             return answer

@@ -1,0 +1,59 @@
+"""Fencing: receivers refuse messages of an epoch below the highest that they received from that service. Pure.
+
+A service has one leader at a time, whose epoch is larger than that of every leader before it (`fog_runtime.lease`). A
+leader that was replaced without knowing it, because it was stopped or cut off, still sends its own epoch.
+"""
+
+from __future__ import annotations
+
+from functools import wraps
+from typing import TYPE_CHECKING
+
+from fog_contracts.handlers import RefusedMessageError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from fog_contracts.channels import Channel
+    from fog_contracts.handlers import Handler, Ids, Moment, Publication
+
+
+class Fence:
+    """The highest epoch received of each service, by its role."""
+
+    def __init__(self) -> None:
+        self._highest: dict[str, int] = {}
+
+    @property
+    def epochs(self) -> dict[str, int]:
+        """The highest epoch received of each service."""
+        return dict(self._highest)
+
+    def raise_to(self, service: str, epoch: int) -> None:
+        """Refuse messages of the service below an epoch that came another way, as the reply to a query."""
+        self._highest[service] = max(epoch, self._highest.get(service, 0))
+
+    def guarded(self, handlers: Mapping[Channel, Handler]) -> dict[Channel, Handler]:
+        """Return the handlers, refusing messages of lower epochs on the channels that carry one (`Channel.epoch`)."""
+        return {
+            channel: self._guarded(channel, handler) if channel.epoch else handler
+            for channel, handler in handlers.items()
+        }
+
+    def _guarded(self, channel: Channel, handler: Handler) -> Handler:
+        @wraps(handler)
+        def handle(ids: Ids, message: object, at: Moment) -> Sequence[Publication]:
+            service, epoch = channel.publishers[0], getattr(message, channel.epoch)
+            self.raise_to(service, epoch)
+            if epoch < (highest := self._highest[service]):
+                raise RefusedMessageError(f"its epoch {epoch} is below {highest}: another {service} has taken over")
+            return handler(ids, message, at)
+
+        return handle
+
+
+def epoch_in(channel: Channel, message: object, service: str) -> int:
+    """Return the highest epoch of a service that a message shows: its own one, or one that its sender received."""
+    own = getattr(message, channel.epoch) if channel.epoch and service in channel.publishers else 0
+    seen: Mapping[str, int] = getattr(message, "epochs", {})
+    return max(own, seen.get(service, 0))

@@ -1,0 +1,222 @@
+"""Which of several copies of a service may act: one holds a lease, and its epoch is the fencing number. Pure, no I/O.
+
+Redis grants the lease for a short time and draws an epoch with it, larger than every one before (`lease_store`). Every
+message carries its sender's epoch and receivers refuse a lower one (`fog_contracts.fencing`), so a process that wakes
+up after another took over can do no harm. Times are seconds of the process's own monotonic clock.
+
+The holder may act until a deadline, counted from *before* its last request was sent:
+
+- a grant moves the deadline by the lease's duration, less a margin for clocks that run at different rates;
+- so does a request that Redis, out of order or out of reach, promptly failed to answer: a store must not stop the
+  fleet, and nobody takes over through a Redis that does not answer. If it answers somebody else, that one's epoch is
+  heard soon, and receivers refuse ours;
+- a process that did not run for a while (it was stopped, swapped out, or its computer slept) learns nothing from an
+  answer that it was too late to read: the deadline has passed, and it waits for the answer to its next request.
+
+Whoever hears an epoch above its own stops acting at once and asks Redis. If it still holds the lease, the other epoch
+is an old one, or was made without Redis: it continues with one above. Without Redis it gives way to a leader that is
+alive, and else makes a provisional epoch above all that it heard, which Redis confirms or corrects later.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final, Literal
+
+LEASE_S: Final = 1.2
+"""Duration of the lease in Redis."""
+RENEW_S: Final = 0.3
+"""Period of the holder's requests; three may be lost."""
+ATTEMPT_S: Final = 0.4
+"""How long a request waits for Redis."""
+ANNOUNCE_S: Final = 0.25
+"""Period of the leader's announcements."""
+LEADER_LOST_S: Final = 1.5
+"""Without Redis: how long no leader must have been heard until a process leads with a provisional epoch."""
+_LISTEN_S: Final = 2 * ANNOUNCE_S + 0.1
+"""Without Redis: how long a leader listens, after it did not run or could not hear, until it acts again."""
+_RATE_MARGIN: Final = 0.9
+"""The holder uses this share of the lease: its clock and that of Redis may run at rates 10 % apart."""
+_PROMPT_S: Final = ATTEMPT_S + 0.2
+"""An attempt that took longer shows that this process did not run, and not that Redis does not answer."""
+_RETRY_S: Final = 0.02
+"""Shortest time between two requests for a lease that is about to end."""
+_PAUSE_S: Final = 1.0
+"""A time between two calls of `tick`, which come ten times a second, that shows that this process did not run."""
+
+Permission = Literal["granted", "pending", "refused"]
+"""Whether the process may act: yes, not before Redis has answered, or no because another one leads (standby)."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """What to ask of Redis: the lease, with this epoch if it is still the highest (0: a new one), above `floor`.
+
+    `confirmed`: Redis has granted the epoch before. `sent_at` is the time just before the request is sent.
+    """
+
+    epoch: int
+    floor: int
+    confirmed: bool
+    sent_at: float
+
+
+@dataclass(frozen=True)
+class Granted:
+    """Redis granted the lease with this epoch."""
+
+    epoch: int
+
+
+@dataclass(frozen=True)
+class Held:
+    """Another process holds the lease, for `remaining_s` unless it renews it."""
+
+    epoch: int
+    holder: str
+    remaining_s: float
+
+
+Reply = Granted | Held | None
+"""The answer of Redis; None when there was none."""
+
+
+@dataclass(frozen=True)
+class Leader:
+    """The other process that leads, as last heard."""
+
+    epoch: int
+    holder: str
+    heard_at: float
+
+
+class Lease:
+    """The state of one process; `holder` is its id, unique among all processes that ever were."""
+
+    def __init__(self, holder: str, now: float) -> None:
+        self.holder = holder
+        self.epoch = 0
+        """The epoch with which this process leads; 0 on standby."""
+        self.confirmed = False
+        """Whether Redis has granted the epoch; else it is provisional."""
+        self.leader: Leader | None = None
+        """The other process that leads, if one was heard since this one last led."""
+        self._floor = 0
+        self._deadline = -math.inf
+        self._request_due = now
+        self._silent_since: float | None = None
+        self._listening_since = now
+        self._ticked_at = now
+
+    # --- State out --------------------------------------------------------------------------------------------------
+
+    def permission(self, now: float) -> Permission:
+        """Return whether the process may act now; ask at the moment of each act, never before."""
+        if self.epoch == 0:
+            return "refused"
+        return "granted" if now < self._deadline and not self._contested else "pending"
+
+    @property
+    def redis_silent(self) -> bool:
+        """Whether Redis did not answer the last request."""
+        return self._silent_since is not None
+
+    @property
+    def _contested(self) -> bool:
+        """Whether an epoch was heard that is not below ours."""
+        return self._floor >= self.epoch
+
+    # --- Redis ------------------------------------------------------------------------------------------------------
+
+    def request(self, now: float) -> Request | None:
+        """Return the request that is due, if any; its outcome must come before the next call (`on_reply`)."""
+        if now < self._request_due and not (self.epoch and self._contested):
+            return None
+        self._request_due = now + RENEW_S
+        return Request(self.epoch, self._floor, self.confirmed, now)
+
+    def on_reply(self, request: Request, reply: Reply, now: float) -> None:
+        """Apply the outcome of a request."""
+        if reply is None:
+            self._on_no_reply(request, now)
+            return
+        self._silent_since = None
+        if isinstance(reply, Granted):
+            self._lead(reply.epoch, request.sent_at, confirmed=True)
+            return
+        self._request_due = min(self._request_due, now + max(_RETRY_S, reply.remaining_s))
+        self._stand_by(Leader(reply.epoch, reply.holder, now))
+
+    def _on_no_reply(self, request: Request, now: float) -> None:
+        if now - request.sent_at > _PROMPT_S:
+            return
+        if self._silent_since is None:
+            self._silent_since = request.sent_at
+        if self.epoch == 0:
+            return
+        if self._contested:
+            if self._hears_leader(now):
+                self._stand_by(self.leader)
+        elif request.sent_at - self._listening_since >= _LISTEN_S:
+            self._extend(request.sent_at)
+
+    def _extend(self, sent_at: float) -> None:
+        self._deadline = max(self._deadline, sent_at + LEASE_S * _RATE_MARGIN)
+
+    # --- Epochs heard -----------------------------------------------------------------------------------------------
+
+    def on_leader(self, epoch: int, holder: str, now: float) -> None:
+        """Handle the announcement of a process that leads; our own is ignored."""
+        if holder == self.holder:
+            return
+        if self.leader is None or epoch >= self.leader.epoch:
+            self.leader = Leader(epoch, holder, now)
+        if epoch >= self.epoch:
+            self._floor = max(self._floor, epoch)
+
+    def on_epoch(self, epoch: int) -> None:
+        """Handle an epoch of this service that others have seen, whoever sent it and when; our own is no news."""
+        if epoch > self.epoch:
+            self._floor = max(self._floor, epoch)
+
+    def _leader_heard_at(self) -> float:
+        """When a leader with an epoch not below ours was last heard."""
+        return self.leader.heard_at if self.leader is not None and self.leader.epoch >= self.epoch else -math.inf
+
+    def _hears_leader(self, now: float) -> bool:
+        return now - self._leader_heard_at() <= LEADER_LOST_S
+
+    # --- Without Redis ----------------------------------------------------------------------------------------------
+
+    def tick(self, now: float, proposal: int, *, connected: bool) -> None:
+        """Lead with a provisional epoch if nobody else does; call it ten times a second.
+
+        `proposal` is used if it is higher than all epochs heard; two processes must not propose the same. `connected`:
+        whether this process could hear a leader.
+        """
+        if not connected or now - self._ticked_at > _PAUSE_S:
+            self._listening_since = now
+        self._ticked_at = now
+        if self._silent_since is None or (self.epoch and not self._contested):
+            return
+        quiet_since = max(self._listening_since, self._silent_since, self._leader_heard_at())
+        if now - quiet_since > LEADER_LOST_S:
+            # The distance keeps two processes apart that heard the same epochs.
+            self._lead(max(proposal, self._floor + 1 + proposal % 1000), now, confirmed=False)
+
+    def give_up(self) -> None:
+        """Stop acting for good: the process ends, and gives the lease back."""
+        self._stand_by(None)
+
+    # --- Changes ----------------------------------------------------------------------------------------------------
+
+    def _lead(self, epoch: int, since: float, *, confirmed: bool) -> None:
+        if epoch != self.epoch:
+            self._deadline = -math.inf
+        self.epoch, self.confirmed, self.leader = epoch, confirmed, None
+        self._extend(since)
+
+    def _stand_by(self, leader: Leader | None) -> None:
+        self._floor = max(self._floor, self.epoch, leader.epoch if leader is not None else 0)
+        self.epoch, self.confirmed, self.leader, self._deadline = 0, False, leader, -math.inf

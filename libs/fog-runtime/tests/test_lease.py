@@ -1,0 +1,395 @@
+"""The lease's state machine: single steps, and a model of processes with pauses and partitions, and a lossy Redis."""
+
+import math
+
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
+
+from fog_runtime.lease import Granted, Held, Lease
+
+LEASE_S, ATTEMPT_S, STEP_S = 1.2, 0.4, 0.05
+TAKEOVER_S = 2.0
+
+
+def leading(epoch: int = 5, at: float = 0.0) -> Lease:
+    lease = Lease("a", at - 10.0)
+    request = lease.request(at)
+    assert request is not None
+    lease.on_reply(request, Granted(epoch), at + 0.01)
+    return lease
+
+
+def test_permission_ends_before_the_lease_does_counted_from_before_the_request():
+    lease = leading(at=100.0)
+    assert lease.permission(101.0) == "granted"
+    assert lease.permission(101.1) == "pending"
+    assert lease.permission(101.0) == "granted"
+
+
+def test_grant_that_was_read_too_late_permits_nothing():
+    lease = leading(at=100.0)
+    request = lease.request(100.3)
+    lease.on_reply(request, Granted(5), 103.0)
+    assert lease.permission(103.0) == "pending"
+    request = lease.request(103.0)
+    lease.on_reply(request, Granted(5), 103.1)
+    assert lease.permission(103.1) == "granted"
+
+
+def test_leader_acts_on_while_redis_promptly_fails_to_answer():
+    lease = leading(at=100.0)
+    for step in range(40):
+        now = 100.3 + 0.4 * step
+        request = lease.request(now)
+        lease.on_reply(request, None, now + 0.4)
+        assert lease.permission(now + 0.4) == "granted"
+
+
+def test_attempt_during_which_the_process_did_not_run_permits_nothing():
+    lease = leading(at=100.0)
+    request = lease.request(100.3)
+    lease.on_reply(request, None, 103.0)
+    assert lease.permission(103.0) == "pending"
+
+
+def test_process_that_finds_the_lease_held_by_another_stands_by():
+    lease = leading(5, at=100.0)
+    request = lease.request(100.3)
+    lease.on_reply(request, Held(6, "b", 1.0), 100.4)
+    assert lease.permission(100.4) == "refused"
+    assert lease.leader is not None
+    assert (lease.leader.holder, lease.leader.epoch) == ("b", 6)
+
+
+def test_higher_epoch_stops_the_leader_at_once_until_redis_gives_it_one_above():
+    lease = leading(5, at=100.0)
+    lease.on_epoch(9)
+    assert lease.permission(100.1) == "pending"
+    request = lease.request(100.1)
+    assert request is not None, "it asks at once"
+    assert request.floor == 9
+    lease.on_reply(request, Granted(10), 100.2)
+    assert (lease.epoch, lease.permission(100.2)) == (10, "granted")
+
+
+def test_same_epoch_of_another_process_stops_the_leader():
+    lease = leading(5, at=100.0)
+    lease.on_leader(5, "a", 100.1)
+    assert lease.permission(100.1) == "granted"
+    lease.on_leader(5, "b", 100.1)
+    assert lease.permission(100.1) == "pending"
+
+
+def test_epoch_heard_while_the_grant_was_on_its_way_is_answered_with_a_further_request():
+    lease = Lease("a", 0.0)
+    request = lease.request(0.0)
+    lease.on_epoch(50)
+    lease.on_reply(request, Granted(7), 0.1)
+    assert lease.permission(0.1) == "pending"
+    assert lease.request(0.1).floor == 50
+
+
+def test_standby_asks_again_when_the_lease_of_the_other_is_about_to_end():
+    lease = Lease("a", 0.0)
+    lease.on_reply(lease.request(0.0), Held(3, "b", 0.1), 0.05)
+    assert lease.request(0.1) is None
+    assert lease.request(0.16) is not None
+
+
+def without_redis(lease: Lease, begin: float, end: float, *, connected: bool = True, proposal: int = 1000) -> None:
+    """Let a process run without an answer from Redis."""
+    for step in range(round((end - begin) / 0.1)):
+        now = begin + 0.1 * step
+        lease.tick(now, proposal, connected=connected)
+        if (request := lease.request(now)) is not None:
+            lease.on_reply(request, None, now + 0.01)
+
+
+def test_process_without_redis_and_without_a_leader_leads_above_all_that_it_heard():
+    lease = Lease("a", 0.0)
+    lease.on_epoch(5000)
+    without_redis(lease, 0.0, 1.4)
+    assert lease.epoch == 0
+    without_redis(lease, 1.4, 2.2)
+    assert lease.epoch > 5000
+    assert not lease.confirmed
+    assert lease.permission(2.2) == "granted"
+
+
+def test_provisional_epoch_is_corrected_above_one_that_is_heard_later():
+    lease = Lease("a", 0.0)
+    without_redis(lease, 0.0, 2.2)
+    assert lease.epoch == 1000
+    lease.on_epoch(2000)
+    assert lease.permission(2.2) == "pending"
+    without_redis(lease, 2.2, 2.5)
+    assert lease.epoch > 2000
+    assert lease.permission(2.5) == "granted"
+
+
+def test_provisional_epoch_is_confirmed_or_corrected_when_redis_answers():
+    lease = Lease("a", 0.0)
+    without_redis(lease, 0.0, 2.2)
+    request = lease.request(2.5)
+    assert (request.epoch, request.confirmed) == (1000, False)
+    lease.on_reply(request, Granted(7777), 2.6)
+    assert (lease.epoch, lease.confirmed) == (7777, True)
+
+
+def test_process_without_redis_follows_a_leader_that_is_alive():
+    lease = Lease("a", 0.0)
+    for second in range(10):
+        lease.on_leader(5, "b", float(second))
+        without_redis(lease, float(second), second + 1.0)
+    assert lease.epoch == 0
+    without_redis(lease, 10.0, 12.0)
+    assert lease.epoch == 1000
+
+
+def test_process_that_can_hear_nobody_does_not_lead_without_redis():
+    lease = Lease("a", 0.0)
+    without_redis(lease, 0.0, 10.0, connected=False)
+    assert lease.epoch == 0
+
+
+def test_process_that_did_not_run_listens_before_it_leads_or_acts_without_redis():
+    standby = Lease("a", 0.0)
+    without_redis(standby, 0.0, 1.0)
+    without_redis(standby, 60.0, 61.0)
+    assert standby.epoch == 0
+    leader = leading(5, at=0.0)
+    without_redis(leader, 0.3, 3.0)
+    assert leader.permission(3.0) == "granted"
+    without_redis(leader, 60.0, 60.4)
+    assert leader.permission(60.4) == "pending"
+    without_redis(leader, 60.4, 61.5)
+    assert leader.permission(61.5) == "granted"
+
+
+def test_leader_without_redis_gives_way_to_a_living_leader_with_a_higher_epoch_only():
+    lease = leading(5, at=0.0)
+    lease.on_leader(4, "b", 0.3)
+    without_redis(lease, 0.3, 1.0)
+    assert lease.permission(1.0) == "granted"
+    lease.on_leader(6, "c", 1.0)
+    without_redis(lease, 1.0, 1.5)
+    assert (lease.epoch, lease.permission(1.5)) == (0, "refused")
+
+
+# --- A model: three processes, Redis, one receiver ------------------------------------------------------------------
+
+
+class FakeRedis:
+    """What the script of `lease_store` does, which `test_lease_store` compares with the real one."""
+
+    def __init__(self) -> None:
+        self.stored = 0
+        self.lease: tuple[int, str, float] | None = None
+
+    def acquire(self, holder: str, request, now: float, clock: int = 0):
+        held = self.lease if self.lease is not None and now < self.lease[2] else None
+        if held is not None and held[1] != holder:
+            return Held(held[0], held[1], held[2] - now)
+        epoch, confirmed = request.epoch, request.confirmed
+        if epoch == 0 and held is not None:
+            epoch, confirmed = held[0], True
+        if epoch <= request.floor or epoch < self.stored or (epoch == self.stored and not confirmed):
+            epoch = max(self.stored + 1, request.floor + 1, clock)
+        self.stored = epoch
+        self.lease = (epoch, holder, now + LEASE_S)
+        return Granted(epoch)
+
+
+class Process:
+    """A process that runs its loop every 50 ms, unless it is stopped; `rate` is that of its clock."""
+
+    def __init__(self, name: str, now: float, rate: float) -> None:
+        self.name, self.rate, self.offset = name, rate, 1000.0 * (ord(name[0]) - 96) - now * rate
+        self.lease = Lease(name, self.clock(now))
+        self.stopped_until = -1.0
+        self.redis_cut = self.network_cut = False
+        self.pending = None
+        """The request on its way: (request, when it reaches Redis or None, reply, when the reply is here)."""
+        self.inbox: list[tuple[int, str]] = []
+
+    def clock(self, now: float) -> float:
+        return now * self.rate + self.offset
+
+
+class Cluster(RuleBasedStateMachine):
+    """Never two in the eyes of a receiver, and soon one again."""
+
+    @initialize(rates=st.tuples(*[st.sampled_from([0.96, 1.0, 1.04])] * 3))
+    def start(self, rates):
+        self.now = 0.0
+        self.redis, self.redis_up = FakeRedis(), True
+        self.names = 0
+        self.rates = rates
+        self.processes = [self.process(index) for index in range(3)]
+        self.owners: dict[int, str] = {}
+        self.highest = 0
+        self.accepted: list[tuple[float, int]] = []
+        self.delay = 0.0
+        self.lost_at = -math.inf
+        """When Redis last lost its data, and with them the lease of who held it."""
+
+    def process(self, index: int) -> Process:
+        self.names += 1
+        return Process(f"{'abc'[index]}{self.names}", self.now, self.rates[index])
+
+    # --- Disturbances ---
+
+    @rule(which=st.integers(0, 2), seconds=st.sampled_from([0.2, 0.5, 1.0, 1.4, 3.0, 6.0]))
+    def stop(self, which, seconds):
+        self.processes[which].stopped_until = self.now + seconds
+
+    @rule(which=st.integers(0, 2))
+    def crash(self, which):
+        self.processes[which] = self.process(which)
+
+    @rule(which=st.integers(0, 2), cut=st.booleans())
+    def cut_from_redis(self, which, cut):
+        self.processes[which].redis_cut = cut
+
+    @rule(which=st.integers(0, 2), cut=st.booleans())
+    def cut_from_network(self, which, cut):
+        self.processes[which].network_cut = cut
+
+    @rule(up=st.booleans(), lost=st.booleans())
+    def redis_restarts(self, up, lost):
+        self.redis_up = up
+        if lost:
+            self.redis = FakeRedis()
+            self.lost_at = self.now
+
+    @rule(delay=st.sampled_from([0.0, 0.1, 0.3, 0.6]))
+    def redis_is_slow(self, delay):
+        self.delay = delay
+
+    @rule(steps=st.integers(1, 60))
+    def run(self, steps):
+        for _ in range(steps):
+            self.step()
+
+    @rule()
+    def heal(self):
+        """Without disturbances, one leads within 2 s, and only one."""
+        self.redis_up, self.delay = True, 0.0
+        for process in self.processes:
+            process.redis_cut = process.network_cut = False
+            process.stopped_until = -1.0
+        for _ in range(round(2 * TAKEOVER_S / STEP_S)):
+            self.step()
+        leaders = [p for p in self.processes if p.lease.permission(p.clock(self.now)) == "granted"]
+        assert len(leaders) == 1
+        assert leaders[0].lease.epoch == self.highest, "receivers accept its messages"
+        assert leaders[0].lease.confirmed
+        assert self.accepted[-1][0] > self.now - 2 * STEP_S
+
+    @rule(death=st.sampled_from(["crash", "stop", "cut"]), steps=st.integers(0, 7), awake=st.booleans())
+    def takeover(self, death, steps, awake):
+        """After the leader's death, hang or partition another one's messages are accepted within 2 s."""
+        self.heal()
+        for _ in range(steps):
+            self.step()
+        leader = next(p for p in self.processes if p.lease.epoch)
+        began, old = self.now, leader.lease.epoch
+        if death == "crash":
+            self.processes.remove(leader)
+        elif death == "stop":
+            leader.stopped_until = self.now + 10.0
+        else:
+            leader.redis_cut = leader.network_cut = True
+        while self.highest == old:
+            self.step()
+            assert self.now - began <= TAKEOVER_S
+        if death == "crash":
+            self.processes.insert("abc".index(leader.name[0]), self.process("abc".index(leader.name[0])))
+        elif awake:
+            self.heal()
+
+    # --- The world ---
+
+    def step(self) -> None:
+        self.now = round(self.now + STEP_S, 6)
+        for process in self.processes:
+            self.transport(process)
+            if self.now >= process.stopped_until:
+                self.loop(process)
+
+    def transport(self, process: Process) -> None:
+        """Let a request reach Redis, which answers also who does not run."""
+        if process.pending is None:
+            return
+        request, arrives, reply, back = process.pending
+        if reply is None and self.redis_up and not process.redis_cut and self.now >= arrives:
+            reply = self.redis.acquire(process.name, request, self.now, self.wall_clock())
+            back = self.now + self.delay / 2
+            process.pending = request, arrives, reply, back
+
+    def loop(self, process: Process) -> None:
+        lease, clock = process.lease, process.clock(self.now)
+        # A process that did not run acts before it has read what came meanwhile, and reads the oldest news last.
+        self.act(process, clock)
+        if process.pending is not None:
+            request, _, reply, back = process.pending
+            if reply is not None and self.now >= back:
+                lease.on_reply(request, reply, clock)
+                process.pending = None
+            elif clock - request.sent_at >= ATTEMPT_S:
+                lease.on_reply(request, None, clock)
+                process.pending = None
+        self.act(process, clock)
+        if not process.network_cut:
+            for epoch, holder in process.inbox:
+                lease.on_leader(epoch, holder, clock)
+            lease.on_epoch(self.highest)  # the robots' states tell it
+        process.inbox.clear()
+        lease.tick(clock, self.wall_clock() + ord(process.name[0]), connected=not process.network_cut)
+        if process.pending is None and (request := lease.request(clock)) is not None:
+            process.pending = request, self.now + self.delay / 2, None, 0.0
+        self.act(process, clock)
+
+    def wall_clock(self) -> int:
+        """Milliseconds; it may be wrong, as long as it is not wrong when everything else is lost."""
+        return round(self.now * 1000)
+
+    def act(self, process: Process, clock: float) -> None:
+        lease = process.lease
+        if lease.permission(clock) != "granted":
+            return
+        assert self.owners.setdefault(lease.epoch, process.name) == process.name, "an epoch has one owner"
+        others = [p for p in self.processes if p is not process]
+        both_reach_redis = self.redis_up and not process.redis_cut
+        for other in others:
+            if both_reach_redis and not other.redis_cut and lease.confirmed and other.lease.confirmed:
+                assert not self.rivals(process, other), "two hold the lease of one Redis"
+        if process.network_cut:
+            return
+        if lease.epoch >= self.highest:
+            self.highest = lease.epoch
+            self.accepted.append((self.now, lease.epoch))
+        for other in others:
+            if not other.network_cut:
+                other.inbox.append((lease.epoch, lease.holder))
+
+    def rivals(self, process: Process, other: Process) -> bool:
+        return (
+            not process.lease.redis_silent
+            and not other.lease.redis_silent
+            and other.lease.permission(other.clock(self.now)) == "granted"
+            and self.now >= other.stopped_until
+            and self.now - self.lost_at > LEASE_S
+        )
+
+    @invariant()
+    def receiver_never_goes_back(self):
+        epochs = [epoch for _, epoch in getattr(self, "accepted", [])]
+        assert epochs == sorted(epochs)
+
+
+TestCluster = Cluster.TestCase
+TestCluster.settings = settings(
+    max_examples=30, stateful_step_count=25, deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)

@@ -1,0 +1,107 @@
+"""The lease in a real Redis: the same decisions as the model of the state machine's tests, and one holder of many."""
+
+import asyncio
+import importlib.util
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from fog_runtime.lease import ATTEMPT_S, Granted, Held, Request
+from fog_runtime.lease_store import LeaseStore
+from fog_supervisor.servers import Server, start_redis
+
+pytestmark = pytest.mark.live
+
+
+def model():
+    spec = importlib.util.spec_from_file_location("lease_model", Path(__file__).with_name("test_lease.py"))
+    assert spec is not None
+    assert spec.loader is not None
+    made = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(made)
+    return made.FakeRedis()
+
+
+@pytest.fixture(scope="module")
+def redis(tmp_path_factory: pytest.TempPathFactory):
+    with start_redis(tmp_path_factory.mktemp("redis")) as server:
+        yield server
+
+
+NEW = Request(epoch=0, floor=0, confirmed=False, sent_at=0.0)
+STEPS = st.lists(
+    st.tuples(
+        st.sampled_from(["a", "b", "expire", "forget"]),
+        st.integers(0, 6),
+        st.integers(0, 8),
+        st.booleans(),
+    ),
+    max_size=12,
+)
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(steps=STEPS)
+def test_redis_decides_as_the_model_does(redis: Server, steps, monkeypatch):
+    monkeypatch.setattr("fog_runtime.lease_store._now_ms", lambda: 3)
+    asyncio.run(compare(redis, steps))
+
+
+async def compare(redis: Server, steps) -> None:
+    expected = model()
+    async with LeaseStore(redis.url, "test", "planner") as store:
+        await store._redis.write(("FLUSHALL",))
+        for who, epoch, floor, confirmed in steps:
+            if who == "expire":
+                await store._redis.write(("DEL", "fog:test:planner:lease"))
+                expected.lease = None
+            elif who == "forget":
+                await store._redis.write(("FLUSHALL",))
+                expected.lease, expected.stored = None, 0
+            else:
+                request = Request(epoch, floor, confirmed, 0.0)
+                reply, wanted = await store.acquire(who, request), expected.acquire(who, request, 0.0, clock=3)
+                assert type(reply) is type(wanted)
+                assert reply is not None
+                assert reply.epoch == wanted.epoch
+                if isinstance(reply, Held):
+                    assert reply.holder == wanted.holder
+                    assert 0.0 < reply.remaining_s <= 1.2
+        stored = await store._redis.read("GET", "fog:test:planner:epoch")
+        assert int(stored or 0) == expected.stored
+
+
+async def test_one_of_many_is_granted_the_lease_and_its_epoch_outlives_it(redis: Server):
+    async with LeaseStore(redis.url, "many", "map-service") as store:
+        replies = await asyncio.gather(*(store.acquire(f"p{n}", NEW) for n in range(8)))
+        granted = [reply for reply in replies if isinstance(reply, Granted)]
+        assert len(granted) == 1
+        assert {reply.epoch for reply in replies} == {granted[0].epoch}
+        await asyncio.sleep(1.25)
+        later = await store.acquire("late", NEW)
+        assert isinstance(later, Granted)
+        assert later.epoch > granted[0].epoch
+
+
+async def test_released_lease_is_free_at_once_and_nobody_releases_that_of_another(redis: Server):
+    async with LeaseStore(redis.url, "released", "planner") as store:
+        await store.acquire("a", NEW)
+        await store.release("b")
+        assert isinstance(await store.acquire("b", NEW), Held)
+        await store.release("a")
+        assert isinstance(await store.acquire("b", NEW), Granted)
+
+
+async def test_redis_that_hangs_or_is_away_gives_no_reply_in_time(tmp_path: Path):
+    with start_redis(tmp_path) as server:
+        async with LeaseStore(server.url, "away", "planner") as store:
+            assert await store.acquire("a", NEW) is not None
+            await store._redis.write(("CLIENT", "PAUSE", 1000))
+            began = asyncio.get_running_loop().time()
+            assert await store.acquire("a", NEW) is None
+            assert asyncio.get_running_loop().time() - began >= ATTEMPT_S * 0.9
+            server.kill()
+            assert await store.acquire("a", NEW) is None
+            await store.release("a")

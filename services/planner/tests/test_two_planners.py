@@ -1,0 +1,214 @@
+"""Two planners with one Redis: one leads, the other takes over within 2 s, and robots follow one of them only."""
+
+import asyncio
+import contextlib
+import re
+import signal
+import time
+
+import httpx
+import pytest
+
+from fog_contracts import channels as ch
+from fog_contracts.fencing import Fence
+from fog_contracts.handlers import Moment, RefusedMessageError
+from fog_contracts.messages import RobotGoal, RobotPath, RobotPose
+from fog_runtime.clock import SystemClock, ticker
+
+pytestmark = pytest.mark.live
+
+TAKEOVER_S = 2.0
+PLANNERS = ("planner", "planner-2")
+GOAL = {"pose": {"x": 6.0, "y": 4.0}}
+
+
+class Robot:
+    """A robot that stands still, and accepts goals and paths as an agent does."""
+
+    def __init__(self, zenoh) -> None:
+        self.zenoh = zenoh
+        self.accepted: list[tuple[float, RobotGoal | RobotPath]] = []
+        self.received: list[tuple[float, RobotGoal | RobotPath]] = []
+        self.handlers = Fence().guarded({ch.ROBOT_GOAL: self._accept, ch.ROBOT_PATH: self._accept})
+        for channel, kind in ((ch.ROBOT_GOAL, RobotGoal), (ch.ROBOT_PATH, RobotPath)):
+            zenoh.subscribe(channel, kind, self._receiver(channel), robot="r1")
+
+    def _receiver(self, channel):
+        def receive(ids, message) -> None:
+            now = time.monotonic()
+            self.received.append((now, message))
+            with contextlib.suppress(RefusedMessageError):
+                self.handlers[channel](ids, message, Moment(now, 0.0))
+
+        return receive
+
+    def _accept(self, _ids, message, at):
+        self.accepted.append((at.now, message))
+        return ()
+
+    @property
+    def epochs(self) -> list[int]:
+        return [message.planner_epoch for _, message in self.accepted]
+
+    def last(self, kind):
+        return next((message for _, message in reversed(self.accepted) if isinstance(message, kind)), None)
+
+    async def publish_pose(self) -> None:
+        async for _ in ticker(SystemClock(), 0.1):
+            pose = RobotPose(
+                x=1.0, y=1.0, theta=0.0, covariance=[0.0] * 9, v=0.0, w=0.0, radius=0.17, height=0.1, stamp=1.0
+            )
+            self.zenoh.publish(ch.ROBOT_POSE, pose, robot="r1")
+
+
+@contextlib.asynccontextmanager
+async def robot_on_the_floor(fog):
+    async with fog.edges() as (_, zenoh, _connect):
+        robot = Robot(zenoh)
+        publishing = asyncio.create_task(robot.publish_pose())
+        try:
+            yield robot
+        finally:
+            publishing.cancel()
+            await asyncio.gather(publishing, return_exceptions=True)
+
+
+class Planners:
+    """REST clients of both."""
+
+    def __init__(self, fog, clients: dict[str, httpx.AsyncClient]) -> None:
+        self.fog, self.clients = fog, clients
+
+    async def lease(self, name: str) -> str:
+        """Return what a planner says about its lease; empty if it does not answer or is not ready."""
+        try:
+            answer = await self.clients[name].get("/readyz")
+        except httpx.HTTPError:
+            return ""
+        return answer.json()["parts"]["lease"]["detail"] if answer.status_code == 200 else ""
+
+    async def roles(self) -> tuple[str, str]:
+        """Return the names of leader and standby once there are both."""
+        deadline = time.monotonic() + 60.0
+        while True:
+            details = {name: await self.lease(name) for name in PLANNERS}
+            leading = [name for name, detail in details.items() if detail.startswith("leads with epoch")]
+            standing = [name for name, detail in details.items() if "stands by: planner-" in detail]
+            if len(leading) == len(standing) == 1:
+                return leading[0], standing[0]
+            assert time.monotonic() < deadline, (details, [self.fog.log(name)[-3000:] for name in PLANNERS])
+            await asyncio.sleep(0.05)
+
+    async def call(self, method: str, tokens, name: str, **body) -> httpx.Response:
+        return await self.clients[name].request(method, "/api/v1/robots/r1/goal", headers=tokens["operator"], **body)
+
+
+@contextlib.asynccontextmanager
+async def two_planners(fog, **environment):
+    for name in PLANNERS:
+        fog.start("planner", name, **environment.get(name.replace("-", "_"), {}))
+    async with contextlib.AsyncExitStack() as stack:
+        clients = {
+            name: await stack.enter_async_context(httpx.AsyncClient(base_url=await fog.url(name), timeout=5.0))
+            for name in PLANNERS
+        }
+        yield Planners(fog, clients)
+
+
+def silence_before_takeover(robot: Robot, old: int) -> float:
+    """Return the seconds between the last accepted message of an epoch and the first of a higher one."""
+    last = max(at for at, message in robot.accepted if message.planner_epoch == old)
+    first = min(at for at, message in robot.accepted if message.planner_epoch > old)
+    return first - last
+
+
+async def test_mission_survives_the_leaders_death_and_its_hang_and_is_never_doubled(fog, until, tokens):
+    fog.start("map_service")
+    async with robot_on_the_floor(fog) as robot, two_planners(fog) as planners:
+        leader, standby = await planners.roles()
+        refused = await planners.call("PUT", tokens, standby, json=GOAL)
+        assert refused.status_code == 503
+        assert re.search(r"stands by: planner-\S+ leads with epoch \d+", refused.json()["detail"])
+        await until(lambda: fog.processes, "running")
+        goal_id = await sent(planners, tokens, leader)
+        await until(lambda: robot.last(RobotPath), "a path")
+        old = robot.epochs[-1]
+
+        fog.kill(leader)
+        killed = time.monotonic()
+        await until(lambda: robot.epochs[-1] > old and robot.last(RobotPath).planner_epoch > old, "a path of the other")
+        assert silence_before_takeover(robot, old) <= TAKEOVER_S, fog.log(standby)
+        assert robot.accepted[-1][0] > killed
+        assert {message.goal_id for _, message in robot.accepted} == {goal_id}, "neither doubled nor lost"
+
+        fog.start("planner", leader)
+        planners.clients[leader] = httpx.AsyncClient(base_url=await fog.url(leader), timeout=5.0)
+        hung, other = await planners.roles()
+        assert (hung, other) == (standby, leader)
+        old = robot.epochs[-1]
+        fog.processes[hung].send_signal(signal.SIGSTOP)
+        await until(lambda: robot.epochs[-1] > old, "the other's goal")
+        assert silence_before_takeover(robot, old) <= TAKEOVER_S, fog.log(other)
+        await until(lambda: robot.last(RobotPath).planner_epoch > old, "the other's path")
+        assert (await planners.call("DELETE", tokens, other)).status_code == 204
+        await until(lambda: robot.last(RobotGoal).pose is None, "the robot hears that its mission has ended")
+
+        before = len(robot.accepted)
+        woken = time.monotonic()
+        fog.processes[hung].send_signal(signal.SIGCONT)
+        await until(lambda: len(robot.accepted) > before + 2, "more messages")
+        assert await planners.roles() == (other, hung)
+        late = [message for at, message in robot.received if at > woken + 0.05 and message.planner_epoch == old]
+        assert late == [], "the planner that woke up says nothing more"
+        assert robot.epochs == sorted(robot.epochs)
+        assert not [m for at, m in robot.accepted if at > woken and (m.planner_epoch == old or m.pose is not None)]
+        assert {message.goal_id for _, message in robot.accepted} == {goal_id}
+        await planners.clients[leader].aclose()
+
+
+async def sent(planners: Planners, tokens, leader: str) -> str:
+    """Send the robot to the goal, once the leader has heard of it; return the mission's id."""
+    answer = await planners.call("PUT", tokens, leader, json=GOAL)
+    for _ in range(600):
+        if answer.status_code != 404:
+            break
+        await asyncio.sleep(0.05)
+        answer = await planners.call("PUT", tokens, leader, json=GOAL)
+    assert answer.status_code == 200, answer.text
+    return answer.json()["goal_id"]
+
+
+async def test_leader_that_is_cut_off_from_redis_gives_way_to_the_other(fog, proxy, until, tokens):
+    fog.start("map_service")
+    url = f"redis://127.0.0.1:{await proxy.start()}/0"
+    async with robot_on_the_floor(fog) as robot:
+        fog.start("planner", "planner", FOGNAV_REDIS_URL=url)
+        await fog.ready("planner")
+        async with two_planners_joining(fog) as planners:
+            assert await planners.roles() == ("planner", "planner-2")
+            goal_id = await sent(planners, tokens, "planner")
+            await until(lambda: robot.last(RobotPath), "a path")
+            old = robot.epochs[-1]
+            proxy.cut()
+            await until(lambda: robot.epochs[-1] > old, "the other's goal")
+            assert silence_before_takeover(robot, old) <= TAKEOVER_S, fog.log("planner-2")
+            taken = next(at for at, message in robot.received if message.planner_epoch > old)
+            refused = await planners.call("DELETE", tokens, "planner")
+            assert refused.status_code == 503, "neither of them loses a mission"
+            assert not [m for at, m in robot.received if at > taken + 1.0 and m.planner_epoch == old]
+            proxy.heal()
+            assert await planners.roles() == ("planner-2", "planner")
+            assert robot.epochs == sorted(robot.epochs)
+            assert {message.goal_id for _, message in robot.accepted} == {goal_id}
+
+
+@contextlib.asynccontextmanager
+async def two_planners_joining(fog):
+    """Start the second planner beside the first."""
+    fog.start("planner", "planner-2")
+    async with contextlib.AsyncExitStack() as stack:
+        clients = {
+            name: await stack.enter_async_context(httpx.AsyncClient(base_url=await fog.url(name), timeout=5.0))
+            for name in PLANNERS
+        }
+        yield Planners(fog, clients)

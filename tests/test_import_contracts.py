@@ -48,8 +48,9 @@ EDGES = {
 """What may touch the world: packages and modules of I/O, clocks, threads and processes."""
 
 PURE_LIBRARIES = {
-    "__future__", "abc", "binascii", "collections", "dataclasses", "enum", "functools", "hashlib", "heapq", "hmac",
-    "itertools", "json", "math", "msgspec", "numba", "numpy", "random", "re", "struct", "typing", "zlib",
+    "__future__", "abc", "binascii", "collections", "contextlib", "dataclasses", "enum", "functools", "hashlib",
+    "heapq", "hmac", "itertools", "json", "math", "msgspec", "numba", "numpy", "random", "re", "struct", "typing",
+    "zlib",
 }  # fmt: skip
 """What pure modules may import besides each other: no clock, file, process or hidden state; `random` only seeded."""
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec import structs
 from PIL import Image
 from playwright.async_api import Page, async_playwright
 from rich.console import Console
@@ -142,6 +143,17 @@ def test_terminal_shows_mode_reason_hazard_and_latency(demo: Demo) -> None:
     text = console.export_text()
     for expected in ("HOLD", "the map is 3.2 s old", "Hall <b>", "blocked", "450 ms", "504 ms", "planner", "plan 4"):
         assert expected in text
+
+
+def test_terminal_and_page_mark_areas_that_no_living_aggregator_confirms(demo: Demo) -> None:
+    assert demo.scene.live_view()["unconfirmed"] == []
+    demo.scene.hazards["z1"] = structs.replace(demo.scene.hazards["z1"], confirmed=False)
+    assert demo.scene.live_view()["unconfirmed"] == ["z1"]
+    console = Console(width=140, record=True, file=io.StringIO())
+    console.print(render(demo.scene, 40))
+    text = console.export_text()
+    assert "blocked?" in text
+    assert "not confirmed" in text
 
 
 @pytest.fixture

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
@@ -119,7 +120,7 @@ async def evaluate_in_demo(
     scene = Scene(site, plan.robot, SEED, 1.0)
     edge, clock = ReplayedEdge(), ManualClock()
     attempt = Attempt(plan, scene)
-    operator = Operator(cast("ZenohEdge", edge), cast("Stack", None), scene, clock)
+    operator = Operator(cast("ZenohEdge", edge), cast("Stack", SimpleNamespace(operator_key=b"")), scene, clock)
     placement = None
     for observation in observations:
         if placement is None and observation.now > started_at:

@@ -7,7 +7,7 @@ import httpx
 import pytest
 
 from fog_contracts import channels as ch
-from fog_contracts.messages import AreaDefinition, AreaHazard, NodeConfig, NodeReading, RobotPose
+from fog_contracts.messages import AggregatorHeartbeat, AreaDefinition, AreaHazard, NodeConfig, NodeReading, RobotPose
 
 pytestmark = pytest.mark.live
 
@@ -21,11 +21,13 @@ class NodeClient:
         self.definitions: list[AreaDefinition] = []
         self.configs: list[NodeConfig] = []
         self.lines: list[str] = []
+        self.heartbeats: list[AggregatorHeartbeat] = []
         self.seq = 0
         self.boot = 1
         mqtt.on(ch.AREA_HAZARD, lambda _, m: self.hazards.append(m), AreaHazard)
         mqtt.on(ch.AREA_DEFINITION, lambda _, m: self.definitions.append(m), AreaDefinition)
         mqtt.on(ch.NODE_CONFIG, lambda _, m: self.configs.append(m), NodeConfig)
+        mqtt.on(ch.AGGREGATOR_HEARTBEAT, lambda _, m: self.heartbeats.append(m), AggregatorHeartbeat)
         mqtt.on(ch.THESIS_WSN, lambda _, text: self.lines.append(text))
 
     async def read(self, distance: float, times: int = 1) -> None:
@@ -193,3 +195,28 @@ async def test_malformed_messages_are_refused_and_the_aggregator_goes_on(fog, un
         metrics = (await client.get(f"{url}/metrics")).text
         assert 'fognav_refused_messages_total{channel="node_reading"} 4.0' in metrics
         assert 'fognav_refused_messages_total{channel="node_availability"} 1.0' in metrics
+
+
+async def test_messages_and_metrics_of_an_area_that_nobody_lists_are_deleted(fog, until, tokens):
+    gone = AreaHazard(area="gone", state="blocked", severity=3, penalty=254, since=0, seq=1, epoch=1, cause="")
+    square = [(1.0, 1.0), (2.0, 1.0), (2.0, 2.0), (1.0, 2.0)]
+    async with connected_node(fog) as (node, _):
+        assert await node.mqtt.publish(ch.AREA_HAZARD, gone, wait=True, area="gone")
+        definition = AreaDefinition(id="gone", polygon=square)
+        assert await node.mqtt.publish(ch.AREA_DEFINITION, definition, wait=True, area="gone")
+    fog.start("hazard_aggregator")
+    url = await fog.ready("hazard_aggregator")
+    async with connected_node(fog) as (node, _), httpx.AsyncClient() as client:
+        await until(lambda: node.heartbeats, "a heartbeat", lambda: fog.log("hazard_aggregator"))
+        assert (list(node.heartbeats[-1].areas), node.heartbeats[-1].complete) == (["hall"], True)
+        await until(lambda: "hall" in {hazard.area for hazard in node.hazards}, "the hazard")
+        assert 'fognav_hazards{area="hall"' in (await client.get(f"{url}/metrics")).text
+        body = {"polygon": square, "removed": True}
+        put = await client.put(f"{url}/api/v1/areas/hall", json=body, headers=tokens["operator"])
+        assert put.status_code == 200, put.text
+        await until(lambda: node.heartbeats[-1].areas == {}, "no area is listed", lambda: fog.log("hazard_aggregator"))
+        assert 'fognav_hazards{area="hall"' not in (await client.get(f"{url}/metrics")).text
+    async with connected_node(fog) as (late, _):
+        await until(lambda: late.configs, "retained messages")
+        await until(lambda: late.heartbeats, "what was retained has arrived")
+        assert {hazard.area for hazard in late.hazards} | {area.id for area in late.definitions} == set()

@@ -53,6 +53,7 @@ class Operator:
         self._policy = OperatorPolicy(clock.now())
         self._mode = ""
         self._reported_areas: set[str] = set()
+        self._unconfirmed = False
         self._last_refusal = ""
         self._enabled_once = False
         robot = {"robot": self._robot}
@@ -109,7 +110,15 @@ class Operator:
                 self._scene.log_event(f"area {area}: {state} ({hazard.hazard.cause})")
             if state != "unknown":
                 self._reported_areas.add(area)
-            self._scene.hazards[area] = hazard
+        self._scene.hazards[area] = hazard
+        unconfirmed = any(not known.confirmed for known in self._scene.hazards.values())
+        if unconfirmed != self._unconfirmed and area in self._reported_areas:
+            self._unconfirmed = unconfirmed
+            self._scene.log_event(
+                "the aggregator does not confirm all areas"
+                if unconfirmed
+                else "the aggregator confirms all areas again"
+            )
         if hazard.hazard.trace is not None:
             self._scene.traces.update([hazard.hazard.trace])
 

@@ -129,6 +129,7 @@ class Scene:
             "released": path.released_length if path else 0.0,
             "refusal": path.refusal.reason if path and path.refusal else "",
             "hazards": {area: hazard.hazard.state for area, hazard in self.hazards.items()},
+            "unconfirmed": [area for area, hazard in self.hazards.items() if not hazard.confirmed],
             "obstacles": [[round(x, 2), round(y, 2)] for x, y in self.obstacles.points] if self.obstacles else [],
             "stages": durations_ms(self.trace),
             "hazard_to_path": hazard_to_path_ms(self.trace),

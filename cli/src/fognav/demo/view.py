@@ -67,7 +67,10 @@ def _hazards(scene: Scene) -> Panel:
     for area in scene.site.site.areas:
         hazard = scene.hazards.get(area.id)
         state = hazard.hazard.state if hazard else "no state"
-        table.add_row(area.label or area.id, Text(state, style=_STATE_STYLES.get(state, "dim")))
+        mark = "?" if hazard is not None and not hazard.confirmed else ""
+        table.add_row(area.label or area.id, Text(state + mark, style=_STATE_STYLES.get(state, "dim")))
+    if any(not hazard.confirmed for hazard in scene.hazards.values()):
+        table.add_row("?: not confirmed by the aggregator", "")
     trace = scene.trace
     durations = durations_ms(trace)
     if durations:

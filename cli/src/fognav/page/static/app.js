@@ -67,8 +67,15 @@ function drawAreas() {
     context.globalAlpha = 1;
     context.strokeStyle = colour;
     context.lineWidth = state === "blocked" ? 2.5 : 1;
+    context.setLineDash(confirmed(area) ? [] : [6, 4]);
     context.stroke();
+    context.setLineDash([]);
   }
+}
+
+// Whether a living aggregator confirms the area's state.
+function confirmed(area) {
+  return !latest || !latest.unconfirmed.includes(area.id);
 }
 
 // Drawn last and above the areas, so that labels are visible and hide nothing; ids when zoomed out.
@@ -78,7 +85,8 @@ function drawLabels() {
     const xs = area.polygon.map(([x]) => x);
     const top = Math.max(...area.polygon.map(([, y]) => y));
     const colour = { blocked: colours.blocked, unknown: colours.unknown, clear: colours.clear }[state] || colours.muted;
-    label(view.scale < 6 ? area.id : area.label, px((Math.min(...xs) + Math.max(...xs)) / 2), py(top) - 11, colour);
+    const name = (view.scale < 6 ? area.id : area.label) + (confirmed(area) ? "" : " (not confirmed)");
+    label(name, px((Math.min(...xs) + Math.max(...xs)) / 2), py(top) - 11, colour);
   }
   for (const place of layout.places) label(view.scale < 6 ? place.id : place.label, px(place.x), py(place.y) - 17, colours.text);
 }

@@ -584,7 +584,7 @@ def test_robots_that_are_cut_off_from_their_goals_share_one_look_at_the_map(monk
     search = Planner.plan
 
     def counted(self: Planner, *args: object, **kwargs: object) -> object:
-        found = search(self, *args, **kwargs)  # type: ignore[arg-type]
+        found = search(self, *args, **kwargs)  # type: ignore[arg-type]  # passed on as they came
         searches.append(found.expansions)
         return found
 

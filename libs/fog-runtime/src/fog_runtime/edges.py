@@ -161,10 +161,10 @@ class Edges:
                 on_reply(channel, request, message)
             return message
 
-        async def later(request: Any, answer: Later[Message]) -> Message | None:  # noqa: ANN401
+        async def later(request: Any, answer: Later[Message]) -> Message | None:  # noqa: ANN401  # as above
             return replied(request, await self._made(channel, answer))
 
-        def reply(ids: dict[str, str], request: Any) -> Answer:  # noqa: ANN401
+        def reply(ids: dict[str, str], request: Any) -> Answer:  # noqa: ANN401  # as above
             if self._gate is not None and not self._gate.answers():
                 return None
             answer = query_handler(ids, request, self.now())

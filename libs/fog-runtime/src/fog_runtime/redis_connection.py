@@ -108,7 +108,7 @@ class RedisConnection:
     async def read(self, *command: Argument) -> Any:  # noqa: ANN401  # redis does not type its replies
         """Execute a command that changes nothing, and return its reply."""
         try:
-            return await self._client.execute_command(*command)  # type: ignore[no-untyped-call]
+            return await self._client.execute_command(*command)  # type: ignore[no-untyped-call]  # redis types it not
         except (RedisError, OSError) as error:
             raise self._failure(error) from error
 
@@ -180,5 +180,5 @@ def _connect(address: RedisAddress, timeout_s: float) -> tuple[Redis, Sentinel |
         return Redis(host=host, port=port, ssl=address.tls, **options), None
     sentinels: Sequence[tuple[str, int]] = address.hosts
     once = {**timeouts, "retry": Retry(NoBackoff(), 0)}
-    sentinel = Sentinel(sentinels, sentinel_kwargs=once, **options)  # type: ignore[no-untyped-call]
+    sentinel = Sentinel(sentinels, sentinel_kwargs=once, **options)  # type: ignore[no-untyped-call]  # redis types it not
     return sentinel.master_for(address.sentinel_name), sentinel

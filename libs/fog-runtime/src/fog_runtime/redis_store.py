@@ -314,5 +314,5 @@ def _items(reply: Any) -> list[tuple[bytes, bytes]]:  # noqa: ANN401  # redis do
     return list(reply.items()) if isinstance(reply, dict) else list(zip(reply[::2], reply[1::2], strict=True))
 
 
-def _pairs(reply: Any) -> dict[str, int]:  # noqa: ANN401
+def _pairs(reply: Any) -> dict[str, int]:  # noqa: ANN401  # redis does not type its replies
     return {_text(name): int(value) for name, value in _items(reply)}

@@ -1,4 +1,5 @@
 import math
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -9,17 +10,20 @@ from fog_contracts.costs import DEFAULT_INFLATION
 from fog_contracts.grid import GridGeometry, StaticMap
 from fog_contracts.messages import SimObstacle
 from fog_contracts.raster import rasterize
-from fog_contracts.site import AreaSite
+from fog_contracts.site import AreaSite, Site
 from fog_kernels.astar import Planner
 from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.raycast import cast
-from fog_runtime.maps import save_map
+from fog_runtime.maps import load_map, save_map
 from fog_runtime.site import load_site
 from fognav.output import WrongUseError
 from fognav.site_command import check_site, identifier, new_site
 from fognav.site_proposal import NoSiteError, propose
 from fognav_sim.barrier import barrier_across
 from fognav_sim.drive.hazard import draw_hazard
+from fognav_sim.floor import Floor
+from fognav_sim.node import classify, default_config
+from fognav_sim.sensors import Noise, Robot, measure_sonar
 
 RESOLUTION = 0.05
 
@@ -96,13 +100,73 @@ def test_written_site_is_valid_and_equals_the_proposal(tmp_path: Path) -> None:
     geometry, cells = ring_of_corridors()
     save_map(tmp_path / "maps" / "floor", StaticMap(geometry, cells))
     made = new_site(tmp_path / "maps" / "floor.yaml", tmp_path / "sites" / "My Floor (2)", seed=1)
+    shutil.rmtree(tmp_path / "maps")  # a site is complete without the files that it was made from
     loaded = load_site(tmp_path / "sites" / "My Floor (2)")
     assert loaded.site.id == made["site"] == "my-floor-2"
-    assert loaded.site.map == "../../maps/floor.yaml"
+    assert loaded.site.map == "map.yaml"
+    assert loaded.map.geometry == geometry
+    assert (loaded.map.cells == cells).all()
     proposed = propose("my-floor-2", loaded.site.map, geometry, loaded.map.cells, seed=1)
     assert loaded.site.areas == proposed.areas
     assert loaded.site.nodes == proposed.nodes
     assert check_site(tmp_path / "sites" / "My Floor (2)")["ok"] is True
+
+
+def test_map_that_is_in_the_site_s_folder_already_is_used_as_it_is(tmp_path: Path) -> None:
+    geometry, cells = ring_of_corridors()
+    save_map(tmp_path / "floor", StaticMap(geometry, cells))
+    before = (tmp_path / "floor.yaml").stat().st_mtime_ns
+    new_site(tmp_path / "floor.yaml", tmp_path, seed=1)
+    assert load_site(tmp_path).site.map == "floor.yaml"
+    assert (tmp_path / "floor.yaml").stat().st_mtime_ns == before
+    assert not (tmp_path / "map.yaml").exists()
+
+
+def test_another_map_in_the_site_s_folder_is_not_overwritten(tmp_path: Path) -> None:
+    geometry, cells = ring_of_corridors()
+    save_map(tmp_path / "floor", StaticMap(geometry, cells))
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / "map.yaml").write_text("# mine\n")
+    with pytest.raises(WrongUseError, match=r"map\.yaml already exists"):
+        new_site(tmp_path / "floor.yaml", tmp_path / "site", seed=1)
+    assert (tmp_path / "site" / "map.yaml").read_text() == "# mine\n"
+
+
+def states(site: Site, cells: NDArray[np.uint8], geometry: GridGeometry) -> list[str]:
+    """What each node reports on the floor, over a hundred noisy measurements."""
+    floor, generator = Floor(geometry, cells), np.random.default_rng(3)
+    robot, noise = Robot(x=-1e3, y=-1e3, radius=0.17, height=0.1), Noise(sonar_spike=0.0)
+    return [
+        classify(
+            [measure_sonar(floor, robot, node, index, noise, generator) for index in range(len(node.sonars))],
+            default_config(node),
+        )
+        for node in site.nodes
+        for _ in range(100)
+    ]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_every_proposed_node_reports_clear_on_the_empty_floor(seed: int) -> None:
+    geometry, cells = ring_of_corridors()
+    # One block's sides are known as not free only, as in a recorded map: nothing echoes there.
+    cells[44:-44, 44:220][cells[44:-44, 44:220] == 254] = 255
+    site = propose("ring", "map.yaml", geometry, cells, seed)
+    assert set(states(site, cells, geometry)) <= {"clear"}
+
+
+def test_no_node_is_proposed_where_no_wall_echoes() -> None:
+    geometry, cells = ring_of_corridors()
+    cells[cells == 254] = 255
+    assert propose("ring", "map.yaml", geometry, cells, 1).nodes == []
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", ["ipa/Freiburg52_scan.yaml", "ipa/NLB.yaml", "ipa/lab_intel.yaml", "utexas/2.yaml"])
+def test_every_node_proposed_on_a_recorded_floor_reports_clear(maps_dir: Path, name: str) -> None:
+    static = load_map(maps_dir / name)
+    site = propose("floor", "map.yaml", static.geometry, static.cells, 1)
+    assert set(states(site, static.cells, static.geometry)) <= {"clear"}
 
 
 def test_existing_site_is_not_overwritten(tmp_path: Path) -> None:

@@ -289,7 +289,7 @@ def replay_command(
 )
 def site_new(
     *,
-    map_file: Annotated[Path, typer.Option("--map", metavar="MAP.yaml", help="map_server YAML; it is not copied.")],
+    map_file: Annotated[Path, typer.Option("--map", metavar="MAP.yaml", help="map_server YAML; it is copied to DIR.")],
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder to create, without a site in it.")],
     seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Each seed proposes other places.")] = 1,
     json: JsonOption = False,

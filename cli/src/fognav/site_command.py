@@ -1,15 +1,16 @@
 """`fognav site`: reads and writes the files of a proposed or checked site."""
 
-import os
 import re
 from pathlib import Path
+from typing import Final
 
 from fog_runtime.files import atomic_write
-from fog_runtime.maps import MapFileError, load_map
+from fog_runtime.maps import MapFileError, load_map, save_map
 from fog_runtime.site import SITE_FILE, SiteError, load_site
 from fognav.output import WrongUseError
 
 _ID_LENGTH = 32
+_MAP: Final = "map.yaml"
 
 
 def identifier(name: str) -> str:
@@ -18,21 +19,38 @@ def identifier(name: str) -> str:
     return plain[:_ID_LENGTH].strip("-") or "site"
 
 
+def _map_in(out: Path, map_file: Path) -> str:
+    """Return the name of the site's map in its own folder, where it is copied to unless it is there already.
+
+    A site must not depend on files elsewhere: containers get nothing but its folder. Raises `WrongUseError` if another
+    map is in the way.
+    """
+    if map_file.resolve().parent == out.resolve():
+        return map_file.name
+    for name in (_MAP, f"{Path(_MAP).stem}.pgm"):
+        if (out / name).exists():
+            raise WrongUseError(f"{out / name} already exists: name another folder with --out, or remove it")
+    return _MAP
+
+
 def new_site(map_file: Path, out: Path, seed: int) -> dict[str, object]:
-    """Write `out`/site.toml for a map; raises `WrongUseError`, and then writes nothing."""
+    """Write `out`/site.toml for a map, and copy the map there; raises `WrongUseError`, and then writes nothing."""
     # Checking a site must not wait for the kernels, which only a proposal needs.
     from fognav.site_proposal import NoSiteError, propose, to_toml  # noqa: PLC0415  # see above
 
     target = out / SITE_FILE
     if target.exists():
         raise WrongUseError(f"{target} already exists: name another folder with --out, or remove it")
+    map_name = _map_in(out, map_file)
+    copied = None if (out / map_name).exists() else out / map_name
     try:
         static = load_map(map_file)
-        relative = os.path.relpath(map_file.resolve(), out.resolve())
-        site = propose(identifier(out.resolve().name), relative, static.geometry, static.cells, seed)
+        site = propose(identifier(out.resolve().name), map_name, static.geometry, static.cells, seed)
     except (MapFileError, NoSiteError) as error:
         raise WrongUseError(str(error)) from error
     try:
+        if copied is not None:
+            save_map(copied.with_suffix(""), static)
         atomic_write(target, to_toml(site).encode())
     except OSError as error:
         raise WrongUseError(f"{target} can't be written: {error.strerror}. Name another folder with --out") from error

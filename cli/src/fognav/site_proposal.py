@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from fog_contracts.costs import DEFAULT_INFLATION, FREE, LETHAL
 from fog_contracts.geometry import Point
 from fog_contracts.grid import GridGeometry, StaticMap
-from fog_contracts.messages import Pose
+from fog_contracts.messages import AreaState, Pose
 from fog_contracts.raster import rasterize
 from fog_contracts.site import AreaSite, DemoPlan, NodeSite, Place, RobotSite, Site, Sonar
 from fog_kernels.astar import Planner
@@ -24,6 +24,9 @@ from fog_kernels.distance import squared_distance_capped
 from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.raycast import cast
 from fognav_sim.barrier import BarrierError, barrier_across
+from fognav_sim.floor import Floor
+from fognav_sim.node import classify, default_config
+from fognav_sim.sensors import Noise, Robot, measure_sonar
 
 PLACE_CLEARANCE_M: Final = 0.45
 DRIVE_M: Final = (15.0, 60.0)
@@ -46,6 +49,8 @@ _MAX_AREAS: Final = 3
 _PAIRS: Final = 60
 _HEADINGS: Final = 36
 _BARRIERS: Final = 8
+_NO_NOISE: Final = Noise(sonar_sigma=0.0, sonar_spike=0.0)
+_NO_ROBOT: Final = Robot(x=-1e6, y=-1e6, radius=0.1, height=0.1)
 
 
 class NoSiteError(ValueError):
@@ -61,6 +66,8 @@ class _Floor:
     walls: NDArray[np.uint8]
     cost: NDArray[np.uint8]
     clearance: NDArray[np.float64]
+    echoing: Floor
+    """What a sonar would meet: only what the map shows as occupied echoes, unknown cells do not."""
 
     def inflated(self, raw: NDArray[np.uint8]) -> NDArray[np.uint8]:
         table = inflation_table(self.geometry.resolution, DEFAULT_INFLATION)
@@ -127,8 +134,9 @@ def _floor(geometry: GridGeometry, cells: NDArray[np.uint8]) -> _Floor:
     walls = (raw == LETHAL).astype(np.uint8)
     cap = max(1, math.ceil(2.0 / geometry.resolution))
     clearance = np.sqrt(squared_distance_capped(walls, cap).astype(np.float64)) * geometry.resolution
-    half = _Floor(geometry, raw, walls, raw, clearance)
-    return _Floor(geometry, raw, walls, half.inflated(raw), clearance)
+    echoing = Floor(geometry, cells)
+    half = _Floor(geometry, raw, walls, raw, clearance, echoing)
+    return _Floor(geometry, raw, walls, half.inflated(raw), clearance, echoing)
 
 
 def _drives(floor: _Floor, generator: random.Random) -> Iterator[_Drive]:
@@ -174,7 +182,7 @@ def _areas(
         if travelled > length - _ENDS_M[1] or travelled - last < _AREA_SPACING_M:
             continue
         candidate = _area_at(floor, point, len(found) + 1)
-        if candidate is None or not _can_be_closed(floor, *candidate):
+        if candidate is None or not _is_sensed(floor, *candidate):
             continue
         detour = _detour(floor, planner, candidate[0].polygon, start, goal)
         if detour is None or detour > _MAX_DETOUR * length:
@@ -238,16 +246,36 @@ def _area_at(floor: _Floor, spot: Point, number: int) -> tuple[AreaSite, NodeSit
     return area, node
 
 
-def _can_be_closed(floor: _Floor, area: AreaSite, node: NodeSite) -> bool:
-    """Whether a barrier that the node sees fits in for several seeds: walls may be too irregular."""
+def _is_sensed(floor: _Floor, area: AreaSite, node: NodeSite) -> bool:
+    """Whether the simulated node is sure that its area is clear, and that one with a barrier is blocked.
+
+    A wall may be too irregular, too oblique or unknown to echo; and no barrier may fit in for several seeds.
+    """
+    if _state_of(floor, node) != "clear":
+        return False
     alone = Site(id="site", areas=[area], nodes=[node])
     static = StaticMap(floor.geometry, floor.raw)
-    try:
-        for seed in range(_BARRIERS):
-            barrier_across(area, alone, static, seed)
-    except BarrierError:
-        return False
+    for seed in range(_BARRIERS):
+        try:
+            barrier = barrier_across(area, alone, static, seed)
+        except BarrierError:
+            return False
+        floor.echoing.place(barrier)
+        try:
+            if _state_of(floor, node) != "blocked":
+                return False
+        finally:
+            floor.echoing.remove(barrier.id)
     return True
+
+
+def _state_of(floor: _Floor, node: NodeSite) -> AreaState:
+    """Return what a node reports on the floor without a robot, measured without noise."""
+    generator = np.random.default_rng(0)
+    ranges = [
+        measure_sonar(floor.echoing, _NO_ROBOT, node, index, _NO_NOISE, generator) for index in range(len(node.sonars))
+    ]
+    return classify(ranges, default_config(node))
 
 
 def _detour(

@@ -226,6 +226,7 @@ async def kill_and_restart(fog: Any, targets: tuple[str, ...], chance: random.Ra
             fog.start(target)
 
 
+@pytest.mark.timeout(180 + 150 * KILLS)
 async def test_nothing_acknowledged_is_lost_in_kills_under_load(fog, tokens):
     chance = random.Random(SEED)
     kills = sequence(chance)

@@ -9,6 +9,7 @@ have it in memory (`WAIT`), so that it survives the loss of the primary.
 
 from __future__ import annotations
 
+import asyncio
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 from urllib.parse import parse_qsl, unquote, urlsplit
 
@@ -159,6 +160,23 @@ def _code(error: Exception) -> str:
     return code or ("READONLY" if "now a slave" in str(error) else str(error).partition(" ")[0])
 
 
+class _Sentinels(Sentinel):
+    """Asks the Sentinels for the primary, one question at a time.
+
+    The client moves the Sentinel that answers to the front of its list. Two questions at once move two, after which one
+    may be in the list twice and another one not at all.
+    """
+
+    def __init__(self, hosts: Sequence[tuple[str, int]], **options: object) -> None:
+        super().__init__(hosts, **options)  # type: ignore[no-untyped-call]  # redis types it not
+        self._asking = asyncio.Lock()
+
+    async def discover_master(self, service_name: str) -> tuple[str, int]:
+        async with self._asking:
+            host, port = await super().discover_master(service_name)
+            return host, port
+
+
 def _host(text: str, default_port: int) -> tuple[str, int]:
     parts = urlsplit(f"//{text.strip()}")
     if not parts.hostname:
@@ -180,5 +198,5 @@ def _connect(address: RedisAddress, timeout_s: float) -> tuple[Redis, Sentinel |
         return Redis(host=host, port=port, ssl=address.tls, **options), None
     sentinels: Sequence[tuple[str, int]] = address.hosts
     once = {**timeouts, "retry": Retry(NoBackoff(), 0)}
-    sentinel = Sentinel(sentinels, sentinel_kwargs=once, **options)  # type: ignore[no-untyped-call]  # redis types it not
+    sentinel = _Sentinels(sentinels, sentinel_kwargs=once, **options)
     return sentinel.master_for(address.sentinel_name), sentinel

@@ -102,16 +102,15 @@ class RedisStore:
 
         A store that nobody has used yet is marked as this site's.
         """
+        expected = self._identity.expectation()
         # Redis checks whether it may write (a read-only replica, full, too few replicas, a broken disk) before it finds
         # that an empty text changes nothing: a probe that neither changes anything nor waits for the disk.
-        # Asked before Redis is: another call may mark the store meanwhile.
-        used_before = self._identity.used_before
         commands = [("SETRANGE", self._key("probe"), 0, ""), *self._read_identity()]
         *_, generation, writes = await self._redis.write(*commands)
-        if generation is None and not used_before:
+        if generation is None and not expected.generation:
             mark = ("SET", self._key("generation"), secrets.token_hex(8), "NX")
             *_, generation, writes = await self._redis.write(mark, *self._read_identity())
-        self._identity.verify(_text(generation or b""), _pairs(writes))
+        self._identity.verify(expected, _text(generation or b""), _pairs(writes))
 
     async def durability_warning(self) -> str:
         """Return why acknowledged writes are not durable, or an empty text; also empty if Redis hides its settings."""

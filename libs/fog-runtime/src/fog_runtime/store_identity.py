@@ -6,7 +6,7 @@ both, and in a file the generation of the store that it used last, so that it no
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from prometheus_client import Gauge
 
@@ -35,6 +35,13 @@ class StoreLostError(StoreRefusedError):
         LOST.set(1)
 
 
+class Expectation(NamedTuple):
+    """What a store must have: its generation, empty if this service used none before, and at least these writes."""
+
+    generation: str
+    writes: Mapping[str, int]
+
+
 class StoreIdentity:
     """What a service knows of the store that it uses; `marker` is the file that outlives the service, if there is one.
 
@@ -55,27 +62,29 @@ class StoreIdentity:
         """Record that Redis acknowledged a write; `writes` is the table's count of them."""
         self._acknowledged[table] = max(writes, self._acknowledged.get(table, 0))
 
-    def verify(self, generation: str, writes: Mapping[str, int]) -> None:
-        """Compare the store (`generation` is empty if it has none) with what was acknowledged.
+    def expectation(self) -> Expectation:
+        """Return what the store must have from now on; raises `StoreError` when the marker file can't be read.
+
+        Take it before Redis is asked: a write that is acknowledged while the answer travels is not in that answer.
+        """
+        return Expectation(self.generation or self._remembered(), dict(self._acknowledged))
+
+    def verify(self, expected: Expectation, generation: str, writes: Mapping[str, int]) -> None:
+        """Compare the store (`generation` is empty if it has none) with what was expected of it.
 
         Raises `StoreLostError`, and `StoreError` when the marker file can't be read or written.
         """
-        known = self.generation or self._remembered()
-        if known and generation != known:
+        if expected.generation and generation != expected.generation:
             kind = "was emptied" if not generation else "was replaced by another store"
             raise StoreLostError(f"Redis {kind}, so acknowledged records are lost")
-        for table, acknowledged in self._acknowledged.items():
+        for table, acknowledged in expected.writes.items():
             if (found := writes.get(table, 0)) < acknowledged:
                 raise StoreLostError(
                     f"Redis went back to an older state: it has {found} of {acknowledged} writes of {table}"
                 )
         if generation and not self.generation:
             self.adopt(generation, writes)
-
-    @property
-    def used_before(self) -> bool:
-        """Whether this service used a store before, in this run or an earlier one; raises `StoreError`."""
-        return bool(self.generation or self._remembered())
+        LOST.set(0)
 
     def adopt(self, generation: str, writes: Mapping[str, int]) -> None:
         """Use this store from now on; raises `StoreError` when the marker file can't be written."""

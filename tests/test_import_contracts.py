@@ -24,7 +24,8 @@ SOURCES = sorted({path.parent for path in ROOT.glob("*/src/*/__init__.py")} | {
 
 EDGES = {
     "fog_runtime", "fog_supervisor", "fognav_experiments.lockstep", "fognav_experiments.rigs",
-    "fognav.__main__", "fognav.area_command", "fognav.channels_command", "fognav.checkout", "fognav.checks",
+    "fognav.__main__", "fognav.bench", "fognav.bench_command",
+    "fognav.area_command", "fognav.channels_command", "fognav.checkout", "fognav.checks",
     "fognav.demo.attempt", "fognav.demo.background", "fognav.demo.operator", "fognav.demo.options",
     "fognav.demo.placement", "fognav.demo.preparation", "fognav.demo.presence", "fognav.demo.report", "fognav.demo.run",
     "fognav.demo.scene", "fognav.demo.usage", "fognav.demo.view", "fognav.demo_command", "fognav.doctor",

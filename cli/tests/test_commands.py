@@ -33,6 +33,7 @@ def _warm_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
         ["record"],
         ["replay"],
         ["status"],
+        ["bench", "fleet"],
         ["goal"],
         ["area", "list"],
         *(["token", name] for name in ("create", "list", "revoke")),

@@ -15,6 +15,7 @@ from fog_runtime import parts
 from fog_runtime.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fognav import __version__, checkout, doctor, kernels, system
 from fognav.area_command import area_app
+from fognav.bench_command import bench_app
 from fognav.channels_command import channels_command
 from fognav.operate.options import NUMBERS, JsonOption
 from fognav.output import (
@@ -49,6 +50,7 @@ app.add_typer(zone_app, name="zone")
 app.add_typer(area_app, name="area")
 app.add_typer(robot_app, name="robot")
 app.add_typer(token_app, name="token")
+app.add_typer(bench_app, name="bench")
 app.command("status", epilog="Example: fognav status --json")(status_command)
 app.command("goal", context_settings=NUMBERS, epilog="Example: fognav goal b")(robot_goal)
 app.command("channels", epilog="Example: fognav channels --format acl --broker mqtt")(channels_command)

@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from planner.store import Store, StoredGoal
 
 TICK_S: Final = 0.1
+BUSY_PAUSE_S: Final = 0.25
 
 PLANS = Counter("fognav_plans_total", "Replans, by reason", ["reason"])
 REFUSALS = Counter("fognav_plan_refusals_total", "Replans that ended in a refusal, by Nav2's code", ["code"])
@@ -127,8 +128,15 @@ class Service:
         await self._missions.recover_store(action, who)
 
     async def preview(self, request: PlanRequest, asker: str) -> PlanReply:
-        """Plan a path without side effects; raises `BusyError` when too many queries are waiting, or of this asker."""
-        return await self._queue.run("plan", asker, partial(self._answer, ch.PLANNER_PLAN, request))
+        """Plan a path without side effects; raises `BusyError` when too many queries are waiting, or of this asker.
+
+        The error comes after a pause: clients that ask again at once would keep the event loop from robots' messages.
+        """
+        try:
+            return await self._queue.run("plan", asker, partial(self._answer, ch.PLANNER_PLAN, request))
+        except BusyError:
+            await asyncio.sleep(BUSY_PAUSE_S)
+            raise
 
     # --- Messages and queries ---------------------------------------------------------------------------------------
 

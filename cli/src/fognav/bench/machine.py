@@ -1,0 +1,31 @@
+"""What a figure was measured on and with."""
+
+from __future__ import annotations
+
+import os
+import platform
+from importlib.metadata import version
+
+
+def describe() -> dict[str, object]:
+    """Return the machine and the versions that a benchmark's figures depend on."""
+    return {
+        "machine": {
+            "processor": _processor(),
+            "architecture": platform.machine(),
+            "cores": os.cpu_count(),
+            "load": round(os.getloadavg()[0], 1),
+            "system": platform.platform(terse=True),
+        },
+        "versions": {"python": platform.python_version()} | {name: version(name) for name in ("numba", "numpy")},
+    }
+
+
+def _processor() -> str:
+    """Return the processor's name; an empty text where the system does not tell it."""
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8") as file:  # noqa: PTH123  # a device of the kernel
+            lines = [line for line in file if line.startswith("model name")]
+    except OSError:
+        return platform.processor()
+    return lines[0].partition(":")[2].strip() if lines else platform.processor()

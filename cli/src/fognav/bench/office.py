@@ -1,0 +1,72 @@
+"""A floor for benchmarks, the same for the same seed: corridors in a grid, with furnished rooms along them."""
+
+from __future__ import annotations
+
+import itertools
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from fog_contracts.costs import FREE, LETHAL
+from fog_contracts.grid import GridGeometry, StaticMap
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+RESOLUTION: Final = 0.05
+CORRIDOR: Final = 2.4
+"""Width (m) of the corridors."""
+_SPACING: Final = (23.0, 14.0)
+"""Between the middles (m) of vertical and of horizontal corridors."""
+_ROOM_DEPTH: Final = 5.2
+_DOOR: Final = 1.0
+_WALL: Final = 0.2
+
+
+class _Floor:
+    def __init__(self, geometry: GridGeometry) -> None:
+        self.cells: NDArray[np.uint8] = np.full(geometry.shape, LETHAL, np.uint8)
+
+    def fill(self, left: float, bottom: float, right: float, top: float, value: int) -> None:
+        """Fill a rectangle (m)."""
+        x0, y0, x1, y1 = (max(0, round(value / RESOLUTION)) for value in (left, bottom, right, top))
+        self.cells[y0:y1, x0:x1] = value
+
+
+def corridor_rows(height: float) -> NDArray[np.float64]:
+    """Return the y (m) of the middles of the horizontal corridors of an office."""
+    return np.arange(8.0, height - 2.0, _SPACING[1])
+
+
+def make_office(width: float = 100.0, height: float = 60.0, seed: int = 1) -> StaticMap:
+    """Return an office of `width` x `height` (m) at 5 cm per cell: by default 2000 x 1200 cells."""
+    geometry = GridGeometry(round(width / RESOLUTION), round(height / RESOLUTION), RESOLUTION, 0.0, 0.0)
+    floor, rng = _Floor(geometry), np.random.default_rng(seed)
+    rows = corridor_rows(height)
+    columns = np.arange(3.0, width - 2.0, _SPACING[0])
+    half = CORRIDOR / 2
+    for y in rows:
+        floor.fill(2.0, y - half, width - 2.0, y + half, FREE)
+    for x in columns:
+        floor.fill(x - half, rows[0] - half, x + half, rows[-1] + half, FREE)
+    for y in rows:
+        for left, right in itertools.pairwise(columns):
+            _add_rooms(floor, rng, left + half + 2 * _WALL, right - half - 2 * _WALL, float(y))
+    return StaticMap(geometry, floor.cells)
+
+
+def _add_rooms(floor: _Floor, rng: np.random.Generator, left: float, right: float, y: float) -> None:
+    """Add rooms on both sides of a part of a horizontal corridor, each with a door and two pieces of furniture."""
+    while left + 4.0 < right:
+        end = min(left + rng.uniform(4.0, 6.0), right)
+        for side in (1.0, -1.0):
+            near, far = y + side * (CORRIDOR / 2 + _WALL), y + side * (CORRIDOR / 2 + _WALL + _ROOM_DEPTH)
+            bottom, top = min(near, far), max(near, far)
+            floor.fill(left, bottom, end - _WALL, top, FREE)
+            door = rng.uniform(left + 0.3, end - 0.3 - _DOOR)
+            sill = y + side * CORRIDOR / 2
+            floor.fill(door, min(sill, near), door + _DOOR, max(sill, near), FREE)
+            for _ in range(2):
+                x, low = rng.uniform(left + 0.5, end - 1.5), rng.uniform(bottom + 1.2, top - 1.2)
+                floor.fill(x, low, x + 0.7, low + 0.5, LETHAL)
+        left = end

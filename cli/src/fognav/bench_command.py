@@ -1,0 +1,56 @@
+"""`fognav bench`: measure parts of the system on this machine."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+from rich.progress import Progress
+
+from fognav import kernels
+from fognav.output import console, print_json
+
+bench_app = typer.Typer(help="Measure parts of the system on this machine.", no_args_is_help=True)
+
+
+@bench_app.callback()
+def _bench() -> None:
+    """Keep `fleet` a command of the group while it is the only one."""
+
+
+@bench_app.command("fleet", epilog="Example: fognav bench fleet --robots 50 --goals 50 --zones 300 --json")
+def fleet_command(
+    *,
+    robots: Annotated[int, typer.Option("--robots", metavar="N", min=1, max=500, help="Robots with a goal.")] = 50,
+    goals: Annotated[int, typer.Option("--goals", metavar="G", min=1, max=500, help="Different goals.")] = 50,
+    zones: Annotated[int, typer.Option("--zones", metavar="Z", min=0, max=5000, help="No-go zones.")] = 300,
+    trials: Annotated[int, typer.Option("--trials", metavar="T", min=1, help="Hazards of each kind.")] = 5,
+    seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of floor, places and zones.")] = 1,
+    json: Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")] = False,
+) -> None:
+    """Measure the planner with many robots.
+
+    One hazard lies across all paths, then one cuts all goals off, then they are reachable again. The map is an office
+    of 100 x 60 m at 5 cm. Times are in ms, from a change of the map to each robot's path or refusal.
+    """
+    import numpy as np  # noqa: PLC0415  # keeps the other commands fast
+
+    from fognav.bench import machine  # noqa: PLC0415  # same
+    from fognav.bench.fleet import Fleet, FleetMap, measure  # noqa: PLC0415  # same
+    from fognav.bench.office import make_office  # noqa: PLC0415  # same
+
+    kernels.warm_cache(lambda text: console.print(text, markup=False))
+    rng = np.random.default_rng(seed)
+    with Progress(console=console, disable=not console.is_terminal) as progress:
+        task = progress.add_task("planning the first paths", total=trials)
+        map_ = FleetMap(make_office(seed=seed), zones, rng)
+        fleet = Fleet(map_, robots, goals, rng)
+        figures = measure(
+            map_, fleet, trials, lambda done, _: progress.update(task, completed=done, description="hazards")
+        )
+    asked = {"robots": robots, "goals": goals, "zones": zones, "trials": trials, "seed": seed}
+    if json:
+        print_json({"bench": "fleet", **asked, **figures, **machine.describe()})
+        return
+    for name, value in (asked | figures).items():
+        console.print(f"{name:22} {value}", markup=False)

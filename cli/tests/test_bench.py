@@ -1,0 +1,51 @@
+"""`fognav bench`: the figures that others rely on are there, and those that can be checked are right."""
+
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from fog_kernels.components import Components
+from fognav.__main__ import app
+from fognav.bench import fleet, office
+
+
+def test_office_is_connected_and_the_same_for_the_same_seed() -> None:
+    floor = office.make_office(60.0, 40.0, seed=3)
+    assert floor.geometry.shape == (800, 1200)
+    assert np.array_equal(floor.cells, office.make_office(60.0, 40.0, seed=3).cells)
+    labels = Components(floor.cells).labels(*floor.geometry.whole)
+    counts = np.bincount(labels[labels >= 0])
+    assert counts.max() > 0.95 * counts.sum()
+
+
+def test_every_robot_of_a_fleet_is_planned_refused_and_planned_again() -> None:
+    rng = np.random.default_rng(1)
+    map_ = fleet.FleetMap(office.make_office(60.0, 40.0), 10, rng)
+    robots = fleet.Fleet(map_, 4, 3, rng)
+    seen: list[tuple[int, int]] = []
+    figures = fleet.measure(map_, robots, 1, lambda done, total: seen.append((done, total)))
+    assert seen == [(1, 1)]
+    assert robots.core.replanner.refusals == {208: 4}
+    assert figures["replans"] == 4
+    for key in ("replan_p50_ms", "replan_p99_ms", "cut_off_ms", "back_ms", "rss_mb", "bytes_per_robot"):
+        assert isinstance(figures[key], float | int)
+        assert figures[key] > 0
+    path = robots.core.missions.of("r0").plan
+    assert path is not None
+    assert path.route is not None
+
+
+def test_figures_come_with_schema_machine_and_versions(monkeypatch: pytest.MonkeyPatch) -> None:
+    small = office.make_office(60.0, 40.0)
+    monkeypatch.setattr(office, "make_office", lambda **_: small)
+    done = CliRunner().invoke(
+        app, ["bench", "fleet", "--robots", "2", "--goals", "1", "--zones", "2", "--trials", "1", "--json"]
+    )
+    assert done.exit_code == 0, done.output
+    printed = json.loads(done.stdout)
+    assert (printed["schema"], printed["bench"], printed["robots"]) == (1, "fleet", 2)
+    assert printed["machine"]["cores"] >= 1
+    assert set(printed["versions"]) == {"python", "numba", "numpy"}
+    assert {"replan_p50_ms", "replan_p99_ms", "cut_off_ms", "rss_mb", "bytes_per_robot"} <= printed.keys()

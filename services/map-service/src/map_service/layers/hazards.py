@@ -202,22 +202,25 @@ class HazardsLayer(CostLayer):
         area.confirmed = confirmed or upheld
         if accepted is not None and (accepted.state != "clear" or area.confirmed):
             area.shown = accepted
-        elif accepted is None or area.shown.state != "unknown" or area.shown.penalty != area.definition.unknown.penalty:
-            area.shown = _unknown(area.definition, accepted, at.stamp)
+            return
+        unknown = _unknown(area.definition, received, at.stamp)
+        if (area.shown.state, area.shown.cause) == (unknown.state, unknown.cause):
+            unknown = structs.replace(unknown, since=area.shown.since)
+        area.shown = unknown
 
 
-def _unknown(definition: AreaDefinition, accepted: AreaHazard | None, stamp: float) -> AreaHazard:
+def _unknown(definition: AreaDefinition, received: AreaHazard | None, stamp: float) -> AreaHazard:
     """Return the hazard of an area that nobody confirms to be clear, since `stamp`."""
     return AreaHazard(
         area=definition.id,
         state="unknown",
         severity=SEVERITY["unknown"],
         penalty=definition.unknown.penalty,
-        since=stamp if accepted else 0.0,
-        seq=accepted.seq if accepted else 0,
-        epoch=accepted.epoch if accepted else 0,
+        since=stamp if received else 0.0,
+        seq=received.seq if received else 0,
+        epoch=received.epoch if received else 0,
         cause="the hazard aggregator does not confirm that the area is clear"
-        if accepted
+        if received
         else "no hazard received from the hazard aggregator yet",
     )
 

@@ -96,6 +96,17 @@ async def test_put_with_if_none_match_creates_a_zone_once(client, tokens):
         assert (refused.status_code, refused.json()["errors"][0]["field"]) == (422, field)
 
 
+async def test_repeated_put_returns_the_first_result_though_its_condition_is_false_now(client, tokens):
+    operator = tokens["operator"]
+    await client.post("/api/v1/zones", json={**CIRCLE, "id": "wet"}, headers=operator)
+    headers = {**operator, "If-Match": '"1"', "Idempotency-Key": "p1"}
+    answers = [await client.put("/api/v1/zones/wet", json=CIRCLE, headers=headers) for _ in range(2)]
+    assert [(answer.status_code, answer.headers["etag"]) for answer in answers] == 2 * [(200, '"2"')]
+    headers = {**operator, "If-None-Match": "*", "Idempotency-Key": "p2"}
+    answers = [await client.put("/api/v1/zones/dry", json=CIRCLE, headers=headers) for _ in range(2)]
+    assert [answer.status_code for answer in answers] == [201, 201]
+
+
 async def test_emptied_redis_is_noticed_and_the_zones_are_restored_from_memory(fog, client, raw, tokens):
     await client.post("/api/v1/zones", json={**CIRCLE, "id": "wet"}, headers=tokens["operator"])
     refused = await client.post(RECOVERY, json={"action": "restore"}, headers=tokens["admin"])

@@ -52,7 +52,7 @@ from fog_runtime.http import (
     must_be_new,
 )
 from fog_runtime.http.routes import InvalidBodyError
-from fog_runtime.idempotency import IdempotencyError
+from fog_runtime.idempotency import Attempt, IdempotencyError
 from fog_runtime.work import BusyError, Worker
 from map_service.costmap import LayeredCostmap
 from map_service.layers.base import Grid
@@ -161,15 +161,13 @@ def _add_zones(routes: Routes, service: Service, clock: Clock) -> None:
                 422, f"the path names zone {zone_id}: leave the id out, or give the same id", field="body.id"
             )
         attempt = attempt_of(idempotency_key, caller, f"PUT /api/v1/zones/{zone_id}", body)
+        new = must_be_new(if_none_match)
+        # Before the condition, which the first attempt may have made false.
+        if (earlier := await service.earlier_result(attempt)) is not None:
+            return Answer(earlier, etag(earlier.version), status=201 if new else None)
         zone = _zone_from_body(body, zone_id, caller.name, clock.stamp())
-        if must_be_new(if_none_match):
-            _require_zones(service)
-            _check_id(zone_id)
-            try:
-                zone = await service.create(zone, caller.name, attempt)
-            except ConflictError as error:
-                raise ProblemError(412, f"zone {zone_id} exists already: PUT it with If-Match") from error
-            return Answer(zone, etag(zone.version), status=201)
+        if new:
+            return await _put_new(service, zone, caller.name, attempt)
         old = _find_matching(service, zone_id, if_match)
         zone = await service.replace(zone, old.version, caller.name, attempt)
         return Answer(zone, etag(zone.version))
@@ -299,12 +297,19 @@ def _require_zones(service: Service) -> None:
         )
 
 
-def _check_id(zone_id: str) -> None:
+async def _put_new(service: Service, zone: Zone, who: str, attempt: Attempt | None) -> Answer[Zone]:
+    """Add a zone whose id comes from the path, if there is none."""
+    _require_zones(service)
     try:
-        msgspec.convert(zone_id, Id)
+        msgspec.convert(zone.id, Id)
     except msgspec.ValidationError as error:
-        detail = f"{zone_id!r} is no valid id: use a to z, 0 to 9 and -, at most 32"
+        detail = f"{zone.id!r} is no valid id: use a to z, 0 to 9 and -, at most 32"
         raise ProblemError(422, detail, field="path") from error
+    try:
+        zone = await service.create(zone, who, attempt)
+    except ConflictError as error:
+        raise ProblemError(412, f"zone {zone.id} exists already: PUT it with If-Match") from error
+    return Answer(zone, etag(zone.version), status=201)
 
 
 def _find_zone(service: Service, zone_id: str) -> Zone:

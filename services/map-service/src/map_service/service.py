@@ -251,6 +251,14 @@ class Service:
                 )
         await self.load_zones()
 
+    async def earlier_result(self, attempt: Attempt | None) -> Zone | None:
+        """Return the zone that an earlier attempt stored, once it is on the map; None for a first attempt.
+
+        Raises `IdempotencyError` for another request's attempt, and `StoreError`.
+        """
+        async with self._zone_lock:
+            return await self._earlier_result(attempt)
+
     async def _earlier_result(self, attempt: Attempt | None) -> Zone | None:
         """Return the zone that an earlier attempt stored, once it is on the map."""
         earlier = await self._store.earlier_result(attempt)

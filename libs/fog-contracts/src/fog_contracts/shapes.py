@@ -1,7 +1,7 @@
 """The shapes of zones: validation, containment of points, and rasterization.
 
 To add a shape, define its message in `fog_contracts.messages` (and name it in `Shape`), write its class here and add
-both to `KINDS`. Nobody else asks which shape it has before them.
+both to `KINDS`. No other module distinguishes the kinds of shapes.
 """
 
 import math

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 _URGENCY: Final[dict[ReplanReason, int]] = {
     "map": 0, "off_path": 1, "epoch": 2, "goal": 3, "clearing": 4, "refused": 5,
 }  # fmt: skip
-"""Whose path is searched first; among equals the robot that meets the change soonest."""
+"""Whose path is searched first; among equals the robot nearest to the change along its path."""
 
 
 class Missions:

@@ -36,6 +36,7 @@ def _warm_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
         ["bench", "fleet"],
         ["goal"],
         ["area", "list"],
+        ["area", "override"],
         *(["token", name] for name in ("create", "list", "revoke")),
         *(["zone", name] for name in ("add", "list", "show", "remove")),
         *(

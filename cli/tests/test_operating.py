@@ -280,6 +280,18 @@ def test_areas_are_listed_with_their_state(demo: Service) -> None:
     assert json.loads(run("area", "list", "--json"))["areas"] == areas
 
 
+def test_area_is_blocked_by_a_zone_over_it_for_a_time(demo: Service) -> None:
+    polygon = [[0, 0], [1, 0], [1, 1]]
+    demo.answers["GET", "/api/v1/areas/hall"] = (200, {"definition": {"id": "hall", "polygon": polygon}})
+    demo.answers["PUT", "/api/v1/zones/area-hall"] = (201, {**ZONE, "id": "area-hall"})
+    override = ["area", "override", "hall", "blocked", "--ttl", "60", "--reason", "wax"]
+    assert run(*override) == "area hall is blocked for 60 s by zone area-hall"
+    shape = {"type": "polygon", "points": polygon}
+    assert demo.requests[-1][2] == {"kind": "BLOCKED", "shape": shape, "reason": "wax", "ttl_s": 60.0}
+    assert run("area", "override", "hall", "clear", "--ttl", "60", "--reason", "x", code=2)
+    assert "there is no such" in run("area", "override", "nix", "blocked", "--ttl", "6", "--reason", "x", code=1)
+
+
 @pytest.mark.parametrize(
     ("goal", "body"),
     [

@@ -177,7 +177,7 @@ async def test_openapi_describes_responses_errors_and_tokens_by_the_signature(cl
     put = paths["/zones/{zone}"]["put"]
     assert set(put["responses"]) == {"200", "413", "422", "500"}
     assert "security" not in put
-    assert set(paths["/zones/{zone}"]["delete"]["responses"]) == {"204", "401", "403", "422", "500"}
+    assert set(paths["/zones/{zone}"]["delete"]["responses"]) == {"204", "401", "403", "422", "500", "503"}
     assert "content" not in paths["/zones/{zone}"]["delete"]["responses"]["204"]
 
 

@@ -171,6 +171,9 @@ class MemoryStore:
     async def zones(self) -> list[Any]:
         return []
 
+    async def zone_times(self) -> dict[str, Any]:
+        return {}
+
     async def goals(self) -> dict[str, Any]:
         return {}
 

@@ -3,6 +3,9 @@
 import asyncio
 import io
 import json
+import subprocess
+import sys
+import time
 from contextlib import asynccontextmanager
 from functools import partial
 
@@ -300,3 +303,61 @@ async def test_clear_area_becomes_unknown_when_the_aggregator_dies(fog, until):
         assert robot.cost(3.5, 3.0) == 0
         fog.kill("hazard_aggregator")
         await until(lambda: robot.cost(3.5, 3.0) == 200, "unknown", lambda: fog.log("map_service"))
+
+
+STEPPED_CLOCK = """
+import sys, time
+from pathlib import Path
+real, error = time.time, Path(sys.argv[1])
+time.time = lambda: real() + float(error.read_text())
+from fog_runtime import process
+from map_service.__main__ import main
+process.run(main)
+"""
+
+
+async def test_steps_of_the_wall_clock_end_no_zone_and_a_boot_without_a_clock_puts_all_in_force(fog, until, tokens):
+    error = fog.folder / "clock-error"
+    error.write_text("0.0")
+
+    def start() -> None:
+        port_file = fog.folder / "map_service.port"
+        port_file.unlink(missing_ok=True)
+        environment = {**fog.environment, "FOGNAV_PORT_FILE": str(port_file), "FOGNAV_WALL_CLOCK": "trusted"}
+        with (fog.folder / "map_service.log").open("ab") as log:
+            command = [sys.executable, "-c", STEPPED_CLOCK, str(error)]
+            fog.processes["map_service"] = subprocess.Popen(command, env=environment, stdout=log, stderr=log)
+
+    async def zones(client) -> dict[str, bool]:
+        listed = (await client.get("/api/v1/zones")).json()
+        return {zone["id"]: zone["id"] in listed["active"] for zone in listed["zones"]}
+
+    await asyncio.to_thread(start)
+    now = time.time()
+    times = {
+        "started": {"starts_at": now - 10.0, "expires_at": now + 1800.0},
+        "limited": {"ttl_s": 1800.0},
+        "later": {"starts_at": now + 7 * 86_400.0},
+    }
+    async with httpx.AsyncClient(base_url=await fog.ready("map_service"), timeout=15) as client:
+        for name, fields in times.items():
+            body = {**CIRCLE, "id": name, **fields}
+            answer = await client.post("/api/v1/zones", json=body, headers=tokens["operator"])
+            assert answer.status_code == 201, answer.text
+        expected = {"started": True, "limited": True, "later": False}
+        for step in (0.0, 3600.0, -3600.0):
+            error.write_text(str(step))
+            # Half a second: several ticks of the map-service.
+            for _ in range(5):
+                assert await zones(client) == expected, step
+                await asyncio.sleep(0.1)
+    fog.kill("map_service")
+    error.write_text(str(60.0 - now))
+    await asyncio.to_thread(start)
+    async with httpx.AsyncClient(base_url=await fog.ready("map_service"), timeout=15) as client:
+        assert "time of day" in (await client.get("/readyz")).json()["parts"]["clock"]["detail"]
+        assert await zones(client) == {"started": True, "limited": True, "later": True}
+        error.write_text("0.0")
+        expected = {"started": True, "limited": True, "later": False}
+        await poll(partial(zones, client), lambda found: found == expected)
+        assert (await client.get("/readyz")).json()["parts"]["clock"]["detail"] == ""

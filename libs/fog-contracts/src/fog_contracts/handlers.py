@@ -23,11 +23,13 @@ Ids = Mapping[str, str]
 class Moment:
     """When an input is handled: `now` in seconds of the receiver's monotonic clock, `stamp` in seconds since the epoch.
 
-    Ages and timeouts are computed from `now` alone; `stamp` is for traces and people.
+    Ages and timeouts are computed from `now` alone; `stamp` is for traces and people. `synchronized` says whether the
+    clock that `stamp` is of can be believed.
     """
 
     now: float
     stamp: float
+    synchronized: bool = True
 
 
 @dataclass(frozen=True, slots=True)

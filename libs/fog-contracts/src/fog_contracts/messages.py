@@ -267,6 +267,7 @@ class HazardArea(Message, frozen=True, kw_only=True):
 
 
 ZoneKind = Literal["BLOCKED", "PENALTY", "SPEED_LIMIT"]
+TimeToLive = Annotated[float, Meta(gt=0.0, le=1e9, extra={"unit": "s"})]
 PenaltyFactor = Annotated[float, Meta(ge=1.0, le=PENALTY_FACTOR_MAX)]
 
 
@@ -300,8 +301,32 @@ class CorridorShape(Message, frozen=True, kw_only=True, tag="corridor", tag_fiel
 Shape = PolygonShape | RectangleShape | CircleShape | CorridorShape
 
 
+WEEKDAYS: Final = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
+Weekday = Literal["mon", "tue", "wed", "thu", "fri", "sat", "sun"]
+TimeOfDay = Annotated[str, Meta(pattern=r"^([01][0-9]|2[0-3]):[0-5][0-9]$(?!\n)")]
+
+
+class WeeklyTime(Message, frozen=True, kw_only=True):
+    """A window on some days of each week, from `begin` to `end` (HH:MM); an end not later is of the next day."""
+
+    days: Annotated[list[Weekday], Meta(min_length=1, max_length=7)]
+    begin: TimeOfDay
+    end: TimeOfDay
+
+
+class WeeklySchedule(Message, frozen=True, kw_only=True):
+    """The windows of each week, in the local time of a time zone (such as Europe/Lisbon)."""
+
+    time_zone: Annotated[str, Meta(min_length=1, max_length=64)]
+    times: Annotated[list[WeeklyTime], Meta(min_length=1, max_length=20)]
+
+
 class Zone(Message, frozen=True, kw_only=True):
-    """An operator's zone: shape, effect (factor for PENALTY, m/s for SPEED_LIMIT), reason, author and validity."""
+    """An operator's zone: shape, effect (factor for PENALTY, m/s for SPEED_LIMIT), reason, author and validity.
+
+    With `ttl_s` (s from its start) the zone ends by a monotonic clock, and `expires_at` only says when that will be.
+    With a `schedule` it is in force in the schedule's windows only.
+    """
 
     id: Id
     kind: ZoneKind
@@ -312,6 +337,8 @@ class Zone(Message, frozen=True, kw_only=True):
     author: Annotated[str, Meta(max_length=100)] = ""
     starts_at: Stamp | None = None
     expires_at: Stamp | None = None
+    ttl_s: TimeToLive | None = None
+    schedule: WeeklySchedule | None = None
     enabled: bool = True
     version: Count = 1
 

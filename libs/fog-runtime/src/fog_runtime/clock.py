@@ -1,13 +1,21 @@
 """Injectable clocks: the system's, the same sped up, and a manual one for tests and lockstep runs."""
 
 import asyncio
+import ctypes
 import heapq
 import itertools
 import time
 from collections import deque
 from collections.abc import AsyncIterator
-from typing import Final, Protocol
+from pathlib import Path
+from typing import Final, Literal, Protocol, get_args
 
+WallClockSource = Literal["kernel", "trusted"]
+_EARLIEST: Final = 1_735_689_600.0
+"""2025-01-01: earlier than this software."""
+_SYNCHRONIZED_S: Final = 1.0
+_TIME_ERROR: Final = 5
+"""What adjtimex(2) returns for a clock that nothing keeps synchronized."""
 _LATENESS_SAMPLES: Final = 1000
 """Ticks over which a ticker's lateness is measured: 50 s at 20 Hz."""
 
@@ -63,6 +71,46 @@ class SystemClock:
     async def sleep(self, seconds: float) -> None:
         """Wait for `seconds` of this clock."""
         await asyncio.sleep(max(0.0, self.real(seconds)))
+
+
+class WallClock:
+    """Tells whether the machine's time of day can be believed; raises `ValueError` for an unknown source.
+
+    By `kernel`, it can while the kernel says that something (NTP, PTP, GNSS) keeps it synchronized; by `trusted`,
+    always: for machines whose clock is kept right by other means. It never can before 2025, the time that a machine
+    without a battery for its clock boots in.
+    """
+
+    def __init__(self, source: WallClockSource = "kernel") -> None:
+        if source not in get_args(WallClockSource):
+            raise ValueError(f"the source must be one of {', '.join(get_args(WallClockSource))}, not {source!r}")
+        self._source = source
+        self._known = False
+        self._read_at = -_SYNCHRONIZED_S
+
+    def synchronized(self) -> bool:
+        """Whether the time of day can be believed, read at most once a second."""
+        now = time.monotonic()
+        if now >= self._read_at + _SYNCHRONIZED_S:
+            self._read_at = now
+            self._known = time.time() >= _EARLIEST and (self._source == "trusted" or _kernel_is_synchronized())
+        return self._known
+
+
+def _kernel_is_synchronized() -> bool:
+    """Return what adjtimex(2) says; False where it can't be asked."""
+    library = ctypes.CDLL(None, use_errno=True)
+    # struct timex is smaller than this; with its `modes` 0 the call only reads.
+    state = library.adjtimex(ctypes.create_string_buffer(512)) if hasattr(library, "adjtimex") else -1
+    return 0 <= state < _TIME_ERROR
+
+
+def boot_id() -> str:
+    """Return what identifies the run of the monotonic clock, the same for all processes; empty where nothing does."""
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_text("ascii").strip()
+    except OSError:
+        return ""
 
 
 class ManualClock:

@@ -6,7 +6,7 @@ import asyncio
 import os
 
 from fog_runtime import logs, process
-from fog_runtime.clock import SystemClock
+from fog_runtime.clock import SystemClock, WallClock, boot_id
 from fog_runtime.health import Health
 from fog_runtime.http import load_tokens, serve
 from fog_runtime.leadership import Leadership, process_id
@@ -54,7 +54,11 @@ async def main() -> None:
                 "map-service", keeper, zenoh, health,
                 connected=lambda: zenoh.connected, epochs=lambda: core.fence.epochs,
             )  # fmt: skip
-            service = Service(core, store, mqtt, zenoh, clock, health, leadership)
+            # A clock of another speed tells no time of day.
+            synchronized = WallClock(settings.wall_clock if settings.speed == 1.0 else "trusted").synchronized
+            service = Service(
+                core, store, mqtt, zenoh, clock, health, leadership, synchronized=synchronized, boot=boot_id()
+            )
             service.subscribe()
             leadership.subscribe()
             zenoh.declare_liveliness("map-service", site)

@@ -24,6 +24,8 @@ from fog_contracts.messages import (
     Sentence,
     Shape,
     Stamp,
+    TimeToLive,
+    WeeklySchedule,
     Zone,
     ZoneKind,
 )
@@ -71,7 +73,7 @@ _NO_SUCH_ZONE: Final = {404: "No zone has this id", **_ZONES_NOT_LOADED}
 
 
 class ZoneBody(Message, frozen=True, kw_only=True):
-    """A zone that an operator draws; without `id` one is generated; `ttl_s` (s from now) may replace `expires_at`."""
+    """A zone that an operator draws; without `id` one is generated; `ttl_s` (s from its start) or `expires_at`."""
 
     id: Id | None = None
     kind: ZoneKind
@@ -81,7 +83,8 @@ class ZoneBody(Message, frozen=True, kw_only=True):
     reason: Sentence = ""
     starts_at: Stamp | None = None
     expires_at: Stamp | None = None
-    ttl_s: Annotated[float, msgspec.Meta(gt=0.0, le=1e9)] | None = None
+    ttl_s: TimeToLive | None = None
+    schedule: WeeklySchedule | None = None
     enabled: bool = True
 
 
@@ -340,7 +343,9 @@ def _zone_from_body(body: ZoneBody, zone_id: str, author: str, stamp: float) -> 
         reason=body.reason,
         author=author,
         starts_at=body.starts_at,
-        expires_at=body.expires_at if body.ttl_s is None else stamp + body.ttl_s,
+        expires_at=body.expires_at if body.ttl_s is None else max(stamp, body.starts_at or 0.0) + body.ttl_s,
+        ttl_s=body.ttl_s,
+        schedule=body.schedule,
         enabled=body.enabled,
     )
 

@@ -20,6 +20,7 @@ from fog_contracts.messages import HazardArea, ZoneSet
 from map_service.costmap import LayeredCostmap
 from map_service.layers.hazards import HazardsLayer
 from map_service.layers.zones import ZonesLayer
+from map_service.zone_times import StoredState
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -33,9 +34,11 @@ if TYPE_CHECKING:
     from fog_contracts.raster import Spans
     from map_service.aggregator_monitor import AggregatorMonitor
     from map_service.layers.base import CostLayer
+    from map_service.zone_times import Progress
 
 L = TypeVar("L", bound="CostLayer")
 
+NOTHING_STORED: Final = StoredState()
 COMMIT_CELLS: Final = 512 * 1024
 """About how many cells one commit recomputes, so that the next heartbeat, hazard or request need not wait for long."""
 MANY_ZONES: Final = 200
@@ -165,20 +168,19 @@ class MapCore:
 
     # --- Inputs without a channel -----------------------------------------------------------------------------------
 
-    def load_zones(
-        self, zones: Iterable[Zone], at: Moment, spans: Mapping[str, Spans] | None = None
-    ) -> list[Publication]:
-        """Replace the map's zones by the stored ones; raises `ShapeError`, and changes nothing, for an invalid one.
-
-        `spans` are the cells of zones, by id, where they were computed before.
-        """
-        self._zones.replace_all(zones, at.stamp, spans)
+    def load_zones(self, zones: Iterable[Zone], at: Moment, stored: StoredState = NOTHING_STORED) -> list[Publication]:
+        """Replace the map's zones by the stored ones; raises `ShapeError`, and changes nothing, for an invalid one."""
+        self._zones.replace_all(zones, at, stored)
         self._zones_loaded = True
         return self._commit([], at)
 
+    def zone_progress(self, boot: str, now: float) -> dict[str, Progress]:
+        """Return, by id, what must be stored of the times of zones; `boot` identifies the run of the clock."""
+        return self._zones.progress(boot, now)
+
     def put_zone(self, zone: Zone, at: Moment, spans: Spans | None = None) -> list[Publication]:
         """Add or replace a stored zone, whose cells may be given; raises `ShapeError` for an invalid shape."""
-        self._zones.put(zone, at.stamp, spans)
+        self._zones.put(zone, at, spans)
         return self._commit([], at)
 
     def remove_zone(self, zone_id: str, at: Moment) -> list[Publication]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
@@ -17,13 +18,15 @@ from fog_runtime.clock import ticker
 from fog_runtime.edges import Edges
 from fog_runtime.work import Worker
 from map_service.store import Audit, RecoveryError, StoreError, StoreLostError
+from map_service.times_keeper import TimesKeeper
+from map_service.zone_times import StoredState
 from map_service.zone_validation import check_list_size, check_room, list_size, prepare_zone, zones_spans
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
     from typing import Literal
 
-    from fog_contracts.handlers import Publication
+    from fog_contracts.handlers import Moment, Publication
     from fog_runtime.audit import AuditPage
     from fog_runtime.clock import Clock
     from fog_runtime.edges import Gate
@@ -70,6 +73,10 @@ HEARTBEAT_GAP = Histogram(
     buckets=(0.09, 0.11, 0.125, 0.15, 0.2, 0.25, 0.3, 0.5, 1.0, 2.0, 5.0),
 )
 EPOCH = Gauge("fognav_map_epoch", "Epoch of the map: when this process claimed it, in ms since 1970")
+CLOCK_UNKNOWN = (
+    "nothing keeps the time of day synchronized: zones with a start, an end or a schedule are in force until it is"
+    " known (FOGNAV_WALL_CLOCK=trusted if the machine's clock is right)"
+)
 MAX_PREPARING = 64
 """Most zones that are validated or wait for it; further requests are answered with 503."""
 
@@ -97,9 +104,17 @@ class Service:
         clock: Clock,
         health: Health,
         gate: Gate | None = None,
+        *,
+        synchronized: Callable[[], bool] = lambda: True,
+        boot: str = "",
     ) -> None:
-        """Prepare; `gate` decides whether this process leads or stands by."""
+        """Prepare; `gate` decides whether this process leads or stands by.
+
+        `synchronized` tells whether the time of day is right; `boot` is `clock.boot_id`.
+        """
         self.core = core
+        self._synchronized = synchronized
+        self._times = TimesKeeper(core, store, boot)
         self._store = store
         self._mqtt = mqtt
         self._clock = clock
@@ -117,6 +132,9 @@ class Service:
         self._serving_queries = False
         self._aggregator_alive = False
 
+    def _now(self) -> Moment:
+        return dataclasses.replace(self._edges.now(), synchronized=self._synchronized())
+
     def subscribe(self) -> None:
         """Register the core's handlers; call before the connections run."""
         self._edges.subscribe(self.core.handlers(), self._publish)
@@ -124,7 +142,7 @@ class Service:
     async def tick_loop(self) -> None:
         """Tick the core, and answer queries once it serves the map."""
         async for _ in ticker(self._clock, TICK_S):
-            connected, at = self._mqtt.connected, self._edges.now()
+            connected, at = self._mqtt.connected, self._now()
             publications = self.core.tick(at)
             if self.core.serving and not self._serving_queries:
                 # Before the first publication: channels with a key for each area are served as these are published.
@@ -132,6 +150,7 @@ class Service:
                 self._edges.serve(self.core.query_handlers())
             self._publish(publications)
             self._observe_aggregator(at.now)
+            self._health.set("clock", ok=True, detail="" if at.synchronized else CLOCK_UNKNOWN)
             self._health.set("map", ok=self.core.serving, detail=self.core.missing())
             self._health.set("mqtt", ok=connected, detail="" if connected else "not connected to the broker")
 
@@ -140,7 +159,7 @@ class Service:
         while True:
             await self._changes_wait.wait()
             while self.core.pending:
-                self._publish(self.core.continue_commit(self._edges.now()))
+                self._publish(self.core.continue_commit(self._now()))
                 await asyncio.sleep(0)
             self._changes_wait.clear()
             self._all_on_map.set()
@@ -187,7 +206,7 @@ class Service:
             with self._uncertain_write():
                 outcome, zone = await self._store.create(zone, audit)
             self._require_ok(outcome, zone.id)
-            self._publish(self.core.put_zone(zone, self._edges.now(), spans))
+            self._publish(self.core.put_zone(zone, self._now(), spans))
         await self._all_on_map.wait()
         return zone
 
@@ -208,7 +227,7 @@ class Service:
             with self._uncertain_write():
                 outcome = await self._store.replace(zone, expected=expected, audit=audit)
             self._require_ok(outcome, zone.id)
-            self._publish(self.core.put_zone(zone, self._edges.now(), spans))
+            self._publish(self.core.put_zone(zone, self._now(), spans))
         await self._all_on_map.wait()
         return zone
 
@@ -218,11 +237,12 @@ class Service:
             with self._uncertain_write():
                 outcome = await self._store.delete(zone, Audit(self._clock.stamp(), who, "delete"))
             self._require_ok(outcome, zone.id)
-            self._publish(self.core.remove_zone(zone.id, self._edges.now()))
+            self._publish(self.core.remove_zone(zone.id, self._now()))
         await self._all_on_map.wait()
 
     async def _prepare(self, zone: Zone, stamp: float) -> PreparedZone:
         """Validate and rasterize a zone on the worker thread; raises `ZoneError`, and `BusyError` if too many wait."""
+        stamp = stamp if self._synchronized() else 0.0
         geometry, others = self.core.costmap.geometry, self.core.zones_besides(zone.id)
         prepared = await self._zone_worker.run(prepare_zone, zone, geometry, stamp)
         check_room(prepared, *others, geometry)
@@ -295,7 +315,8 @@ class Service:
             changed = [zone for zone in zones if zone.id not in known or known[zone.id].shape != zone.shape]
             try:
                 spans = await self._zone_worker.run(zones_spans, changed, self.core.costmap.geometry)
-                self._publish(self.core.load_zones(zones, self._edges.now(), spans))
+                stored = StoredState(spans=spans, progress=await self._times.load(), boot=self._times.boot)
+                self._publish(self.core.load_zones(zones, self._now(), stored))
             except ShapeError as error:
                 raise StoreError(f"a stored zone is invalid: {error}; repair or delete it") from error
         self._reload_zones = False
@@ -321,6 +342,7 @@ class Service:
                         _log.warning("store_not_durable", remedy=warning)
                 else:
                     await self._store.check()
+                    await self._times.save(self._clock.now())
                     self._health.set("store", ok=True)
             except StoreError as error:
                 # What was stored but never acknowledged may have gone with a failed primary.

@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Final
 
 from msgspec import structs
 
-from fog_contracts.messages import Zone
+from fog_contracts.messages import Message, Zone
 from fog_runtime.redis_store import Audit, Outcome, RecoveryError, RedisStore, StoreError, StoreLostError, Table
+from map_service.zone_times import Progress
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -17,6 +18,14 @@ if TYPE_CHECKING:
 __all__ = ["Audit", "Outcome", "RecoveryError", "Store", "StoreError", "StoreLostError"]
 
 _ZONES: Final = Table("zones", "zone")
+
+
+_TIMES: Final = "zone_times"
+_ALL: Final = "all"
+
+
+class _AllTimes(Message, frozen=True, kw_only=True):
+    zones: dict[str, Progress]
 
 
 class Store(RedisStore):
@@ -47,6 +56,15 @@ class Store(RedisStore):
         outcome = await self._swap(_ZONES, zone.id, None, str(zone.version), audit)
         # The zone is deleted already: by an attempt whose reply was lost, or by somebody else.
         return "ok" if outcome == "missing" else outcome
+
+    async def zone_times(self) -> dict[str, Progress]:
+        """Return the stored times of zones by id."""
+        stored = (await self._readable_records(_TIMES, _AllTimes)).get(_ALL)
+        return {} if stored is None else stored.zones
+
+    async def write_zone_times(self, times: dict[str, Progress]) -> None:
+        """Replace the stored times of all zones."""
+        await self._write_records(_TIMES, {_ALL: _AllTimes(zones=times)})
 
     async def earlier_result(self, attempt: Attempt | None) -> Zone | None:
         """Return the zone that an earlier attempt with the same idempotency key stored."""

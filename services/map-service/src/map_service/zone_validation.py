@@ -10,6 +10,7 @@ from msgspec import structs
 from fog_contracts import channels as ch
 from fog_contracts.messages import ZoneSet
 from fog_contracts.shapes import ShapeError, normalized_shape, shape_spans
+from map_service.zone_times import is_time_zone
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -43,7 +44,8 @@ class PreparedZone(NamedTuple):
 def prepare_zone(zone: Zone, geometry: GridGeometry, stamp: float) -> PreparedZone:
     """Validate and rasterize a zone; raises `ZoneError` that names field and remedy.
 
-    It takes some ten milliseconds for the largest shapes: a service runs it on another thread.
+    `stamp` is the time (s since the epoch), or 0 while that is not known. Large shapes take some ten milliseconds: a
+    service runs it on another thread.
     """
     if zone.kind == "PENALTY" and zone.factor is None:
         raise ZoneError("factor", "a PENALTY zone needs a factor from 1 to 5: how many free cells a cell counts")
@@ -53,6 +55,9 @@ def prepare_zone(zone: Zone, geometry: GridGeometry, stamp: float) -> PreparedZo
         raise ZoneError("factor", f"a {zone.kind} zone has no factor: leave it out or make the kind PENALTY")
     if zone.kind != "SPEED_LIMIT" and zone.speed is not None:
         raise ZoneError("speed", f"a {zone.kind} zone has no speed: leave it out or make the kind SPEED_LIMIT")
+    if zone.schedule is not None and not is_time_zone(zone.schedule.time_zone):
+        problem = f"{zone.schedule.time_zone!r} is no time zone that this machine knows"
+        raise ZoneError("schedule.time_zone", f"{problem}: name one such as Europe/Lisbon or UTC")
     if zone.expires_at is not None and zone.expires_at <= max(stamp, zone.starts_at or 0.0):
         raise ZoneError("expires_at", "the zone would end before it starts: give a later time, or leave it out")
     try:

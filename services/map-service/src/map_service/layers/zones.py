@@ -1,4 +1,4 @@
-"""Operators' zones: no-go, penalty and speed limit, each while it is enabled and between its start and expiry."""
+"""Operators' zones: no-go, penalty and speed limit, each while it is enabled and its time has come (`zone_times`)."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from fog_contracts.messages import Cause
 from fog_contracts.shapes import shape_spans
 from fog_kernels.spans import lower_speeds, raise_costs
 from map_service.layers.base import CostLayer, LayerFactory, NoOptions
+from map_service.zone_times import Progress, StoredState, ZoneTimes
 from map_service.zone_validation import named_spans
 
 if TYPE_CHECKING:
@@ -31,18 +32,12 @@ def speed_layer_value(speed: float) -> int:
     return max(1, min(254, int(speed * 100.0 + 1e-6)))
 
 
-def is_active(zone: Zone, stamp: float) -> bool:
-    """Whether a zone is in force at a time (s since the epoch): from `starts_at` on, until before `expires_at`."""
-    started = zone.starts_at is None or zone.starts_at <= stamp
-    expired = zone.expires_at is not None and zone.expires_at <= stamp
-    return zone.enabled and started and not expired
-
-
 @dataclass
 class _ZoneEntry:
     zone: Zone
     spans: Spans
     cells: int
+    times: ZoneTimes
     active: bool
 
 
@@ -54,12 +49,13 @@ class ZonesLayer(CostLayer):
         self._geometry = geometry
         self._entries: dict[str, _ZoneEntry] = {}
         self._changed = False
+        self._timed: list[_ZoneEntry] | None = None
         self._zones: list[Zone] | None = None
         self._active: tuple[list[_ZoneEntry], NDArray[np.int64]] | None = None
 
-    def put(self, zone: Zone, stamp: float, spans: Spans | None = None) -> None:
+    def put(self, zone: Zone, at: Moment, spans: Spans | None = None) -> None:
         """Add or replace a zone, whose cells may be given; raises `ShapeError` for an invalid shape."""
-        self._put(zone, spans or shape_spans(zone.shape, self._geometry), stamp)
+        self._put(zone, spans or shape_spans(zone.shape, self._geometry), ZoneTimes(zone), at)
 
     def remove(self, zone_id: str) -> None:
         """Remove a zone, if it exists."""
@@ -69,17 +65,22 @@ class ZonesLayer(CostLayer):
             if old.active:
                 self._mark(old, "removed")
 
-    def replace_all(self, zones: Iterable[Zone], stamp: float, spans: Mapping[str, Spans] | None = None) -> None:
-        """Replace all zones, whose cells may be given by id; those that are the same already keep theirs.
+    def replace_all(self, zones: Iterable[Zone], at: Moment, stored: StoredState) -> None:
+        """Replace all zones; those that are the same already keep their cells and times.
 
         For an invalid shape, raises `ShapeError`, which names the zone, and changes nothing.
         """
-        prepared = [(zone, self._known_spans(zone, spans or {}) or named_spans(zone, self._geometry)) for zone in zones]
+        prepared = [(z, self._known_spans(z, stored.spans) or named_spans(z, self._geometry)) for z in zones]
         kept = {zone.id for zone, _ in prepared}
         for name in [name for name in self._entries if name not in kept]:
             self.remove(name)
         for zone, cells in prepared:
-            self._put(zone, cells, stamp)
+            times = ZoneTimes(zone, stored.progress.get(zone.id), boot=stored.boot, now=at.now)
+            self._put(zone, cells, times, at)
+
+    def progress(self, boot: str, now: float) -> dict[str, Progress]:
+        """Return, by id, what must be stored of the zones that begin or end."""
+        return {name: entry.times.progress(boot, now) for name, entry in self._entries.items() if _is_timed(entry.zone)}
 
     def zones(self) -> list[Zone]:
         """Return all zones, active or not, by id."""
@@ -103,8 +104,10 @@ class ZonesLayer(CostLayer):
 
     def tick(self, at: Moment) -> list[Publication]:
         """Activate and end zones by their times."""
-        for entry in self._entries.values():
-            active = is_active(entry.zone, at.stamp)
+        if self._timed is None:
+            self._timed = [entry for entry in self._entries.values() if _is_timed(entry.zone)]
+        for entry in self._timed:
+            active = entry.times.is_active(at)
             if active != entry.active:
                 entry.active = active
                 self._set_changed()
@@ -137,11 +140,11 @@ class ZonesLayer(CostLayer):
         old = self._entries.get(zone.id)
         return old.spans if old is not None and old.zone.shape == zone.shape else given.get(zone.id)
 
-    def _put(self, zone: Zone, spans: Spans, stamp: float) -> None:
+    def _put(self, zone: Zone, spans: Spans, times: ZoneTimes, at: Moment) -> None:
         old = self._entries.get(zone.id)
         if old is not None and old.zone == zone:
             return
-        entry = _ZoneEntry(zone, spans, spans.cells, is_active(zone, stamp))
+        entry = _ZoneEntry(zone, spans, spans.cells, times, times.is_active(at))
         self._entries[zone.id] = entry
         self._set_changed()
         if old is not None and old.active:
@@ -151,10 +154,15 @@ class ZonesLayer(CostLayer):
 
     def _set_changed(self) -> None:
         self._changed = True
-        self._zones = self._active = None
+        self._zones = self._active = self._timed = None
 
     def _mark(self, entry: _ZoneEntry, state: str) -> None:
         self.mark_updated(entry.spans.window, Cause(kind="zone", id=entry.zone.id, state=state))
+
+
+def _is_timed(zone: Zone) -> bool:
+    """Whether time decides if the zone is in force."""
+    return any(value is not None for value in (zone.starts_at, zone.expires_at, zone.ttl_s, zone.schedule))
 
 
 LAYER = LayerFactory(options=NoOptions, make=lambda plan, _options: ZonesLayer(plan.geometry))

@@ -1,0 +1,193 @@
+"""When a zone is in force: its start, its end, its time to live and its weekly schedule (ADR 14). Pure.
+
+The clock on the wall may be wrong, and is set while the process runs. It only names moments for people: what it says
+counts while the time is synchronized, and nothing ends by it alone. A zone that has started stays started, and ends
+once as much time has passed by the monotonic clock as remained when its end became known; while the time is not known,
+the zone is in force, which is the safe side.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from dataclasses import dataclass, field
+from datetime import UTC, date, datetime, time, timedelta
+from typing import TYPE_CHECKING, Final
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
+
+from fog_contracts.messages import WEEKDAYS, Message, WeeklySchedule, Zone
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from fog_contracts.handlers import Moment
+    from fog_contracts.raster import Spans
+
+_UNKNOWN_S: Final = 60.0
+_DAYS_AHEAD: Final = 8
+"""For how many days the windows of a schedule are computed at a time."""
+
+
+class Progress(Message, frozen=True, kw_only=True):
+    """What must survive a restart: whether this version of a zone has started or ended, and the time that remains.
+
+    `rest_s` is what remained of its time to live, or until its end, when this was written; `deadline` is the same as a
+    time of the monotonic clock of the boot `boot`, so that within a boot no restart prolongs it.
+    """
+
+    version: int
+    started: bool
+    ended: bool
+    boot: str
+    rest_s: float | None
+    deadline: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class StoredState:
+    """What is known of stored zones besides themselves, by id: their cells, and their times as stored.
+
+    `boot` identifies the run of this machine's clock.
+    """
+
+    spans: Mapping[str, Spans] = field(default_factory=dict)
+    progress: Mapping[str, Progress] = field(default_factory=dict)
+    boot: str = ""
+
+
+class ZoneTimes:
+    """Follows one version of a zone through time."""
+
+    def __init__(self, zone: Zone, progress: Progress | None = None, *, boot: str = "", now: float = 0.0) -> None:
+        self._zone = zone
+        self._schedule = None if zone.schedule is None else _Windows(zone.schedule)
+        self._started = self._ended = False
+        self._deadline: float | None = None
+        """When it ends at the earliest, by the monotonic clock; None while that is not known."""
+        self._window_deadline = -math.inf
+        """Until when the schedule's latest window lasts at least, by the monotonic clock."""
+        if progress is not None and progress.version == zone.version:
+            self._restore(progress, boot, now)
+
+    def is_active(self, at: Moment) -> bool:
+        """Advance to `at`; return whether the zone is in force."""
+        if not self._zone.enabled or self._ended:
+            return False
+        if not self._started and not self._start(at):
+            return not at.synchronized
+        if self._end(at):
+            return False
+        return self._schedule is None or self._is_scheduled(self._schedule, at)
+
+    def progress(self, boot: str, now: float) -> Progress:
+        """Return what is to be stored."""
+        rest = None if self._deadline is None else max(0.0, self._deadline - now)
+        return Progress(
+            version=self._zone.version,
+            started=self._started,
+            ended=self._ended,
+            boot=boot,
+            rest_s=rest,
+            deadline=self._deadline,
+        )
+
+    def _restore(self, progress: Progress, boot: str, now: float) -> None:
+        self._started, self._ended = progress.started, progress.ended
+        if boot and progress.boot == boot:
+            self._deadline = progress.deadline
+        elif self._zone.ttl_s is not None and progress.rest_s is not None:
+            # Nobody knows how long the machine was off.
+            self._deadline = now + progress.rest_s
+
+    def _start(self, at: Moment) -> bool:
+        """Start the zone if its time has come; return whether it has started."""
+        starts_at = self._zone.starts_at
+        self._started = starts_at is None or (at.synchronized and starts_at <= at.stamp)
+        if self._started and self._zone.ttl_s is not None:
+            self._deadline = at.now + self._zone.ttl_s
+        return self._started
+
+    def _end(self, at: Moment) -> bool:
+        """End the zone if its time has come; return whether it has ended."""
+        if self._zone.ttl_s is not None:
+            self._ended = self._deadline is not None and at.now >= self._deadline
+        elif self._zone.expires_at is not None and at.synchronized:
+            rest = self._zone.expires_at - at.stamp
+            if self._deadline is None:
+                self._deadline = at.now + max(0.0, rest)
+            self._ended = rest <= 0.0 and at.now >= self._deadline
+        return self._ended
+
+    def _is_scheduled(self, windows: _Windows, at: Moment) -> bool:
+        if not at.synchronized:
+            return True
+        end = windows.end_of_current(at.stamp)
+        if end is not None:
+            self._window_deadline = max(self._window_deadline, at.now + end - at.stamp)
+        return end is not None or at.now < self._window_deadline
+
+
+class _Windows:
+    """The windows of a weekly schedule as moments (s since the epoch), computed for some days at a time."""
+
+    def __init__(self, schedule: WeeklySchedule) -> None:
+        self._schedule = schedule
+        self._valid = (math.inf, -math.inf)
+        self._begins: list[float] = []
+        self._ends: list[float] = []
+
+    def end_of_current(self, stamp: float) -> float | None:
+        """Return when the window that contains a moment ends; None outside. In an unknown time zone, all are inside."""
+        if not self._valid[0] <= stamp < self._valid[1]:
+            try:
+                self._compute(stamp)
+            except (ZoneInfoNotFoundError, ValueError, OverflowError, OSError):
+                return stamp + _UNKNOWN_S
+        index = bisect_right(self._begins, stamp) - 1
+        return self._ends[index] if index >= 0 and stamp < self._ends[index] else None
+
+    def _compute(self, stamp: float) -> None:
+        zone = ZoneInfo(self._schedule.time_zone)
+        today = datetime.fromtimestamp(stamp, tz=zone).date()
+        days = [today + timedelta(days=offset) for offset in range(-2, _DAYS_AHEAD + 1)]
+        windows = sorted(
+            window_of(day, span.begin, span.end, zone)
+            for day in days
+            for span in self._schedule.times
+            if WEEKDAYS[day.weekday()] in span.days
+        )
+        self._begins, self._ends = [], []
+        for begin, end in windows:
+            if self._ends and begin <= self._ends[-1]:
+                self._ends[-1] = max(self._ends[-1], end)
+            else:
+                self._begins.append(begin)
+                self._ends.append(end)
+        # A day before and after is certain, whatever the offset from UTC.
+        begin_of = datetime.combine(today - timedelta(days=1), time(), tzinfo=UTC).timestamp()
+        self._valid = begin_of + 86_400.0, begin_of + 86_400.0 * (_DAYS_AHEAD - 2)
+
+
+def window_of(day: date, begin: str, end: str, zone: ZoneInfo) -> tuple[float, float]:
+    """Return a window that begins on a day (local time, "HH:MM"), as moments; an end not later is of the next day.
+
+    A local time that occurs twice (clocks set back) is the earlier one for the begin and the later one for the end; of
+    one that does not occur (clocks set forward), likewise the earlier and the later reading: a window is rather too
+    long than too short.
+    """
+    first, last = time.fromisoformat(begin), time.fromisoformat(end)
+    end_day = day if last > first else day + timedelta(days=1)
+    begins, ends = (
+        [datetime.combine(on, at.replace(fold=fold), tzinfo=zone).timestamp() for fold in (0, 1)]
+        for on, at in ((day, first), (end_day, last))
+    )
+    return min(begins), max(ends)
+
+
+def is_time_zone(name: str) -> bool:
+    """Whether this machine knows a time zone (such as Europe/Lisbon)."""
+    try:
+        ZoneInfo(name)
+    except (ZoneInfoNotFoundError, ValueError, OSError):
+        return False
+    return True

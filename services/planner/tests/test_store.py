@@ -1,13 +1,17 @@
 """Missions in a real Redis: repeated requests, deletions of older missions, a loss."""
 
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from redis.asyncio import Redis
 
 from fog_contracts.messages import Pose, RobotGoal
+from fog_runtime.clock import SystemClock
+from fog_runtime.health import Health
 from fog_runtime.idempotency import Attempt, IdempotencyError
 from fog_supervisor.servers import Server, start_redis
+from planner.mission_keeper import MissionKeeper
 from planner.store import Audit, RecoveryError, Store, StoredGoal, StoreError
 
 pytestmark = pytest.mark.live
@@ -62,3 +66,16 @@ async def test_restore_replaces_what_redis_has_and_later_writes_are_accepted(red
         assert await store.goals() == {"r1": goal("first")}
         assert await store.put("r1", goal("second"), AUDIT) == "ok"
         assert [entry.action for entry in (await store.audit()).entries] == ["goal", "restore"]
+
+
+async def test_mission_that_was_stored_although_its_request_failed_can_be_cancelled(redis: Server):
+    async with Store(redis.url, "test") as store:
+        keeper = MissionKeeper(Mock(), store, SystemClock(), Health(), lambda _change: None)
+        with pytest.raises(StoreError, match="not loaded yet"):
+            await keeper.cancel("r1", "anna")
+        await keeper.lead(0, confirmed=True)
+        assert not await keeper.cancel("r1", "anna")
+        await store.put("r1", goal("unacknowledged"), AUDIT)
+        keeper._reload = True  # as after any write that failed
+        assert await keeper.cancel("r1", "anna")
+        assert await store.goals() == {}

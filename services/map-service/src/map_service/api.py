@@ -171,6 +171,7 @@ def _add_zones(routes: Routes, service: Service, clock: Clock) -> None:
         zone = _zone_from_body(body, zone_id, caller.name, clock.stamp())
         if new:
             return await _put_new(service, zone, caller.name, attempt)
+        await service.reload_after_uncertain_write()
         old = _find_matching(service, zone_id, if_match)
         zone = await service.replace(zone, old.version, caller.name, attempt)
         return Answer(zone, etag(zone.version))
@@ -178,6 +179,7 @@ def _add_zones(routes: Routes, service: Service, clock: Clock) -> None:
     @routes.delete("/api/v1/zones/{zone_id}", raises=[ConflictError, StoreError], problems=_NO_SUCH_ZONE)
     async def delete_zone(zone_id: str, caller: Operator, if_match: IfMatch = None) -> None:
         """Delete a zone; with If-Match, only if it is unchanged."""
+        await service.reload_after_uncertain_write()
         await service.delete(_find_matching(service, zone_id, if_match), caller.name)
 
     @routes.get("/api/v1/audit", raises=[CursorError, StoreError])

@@ -271,6 +271,14 @@ class Service:
                 )
         await self.load_zones()
 
+    async def reload_after_uncertain_write(self) -> None:
+        """Load the zones if a failed write may have been stored, so that what is missing here is missing there, too.
+
+        Raises `StoreError`.
+        """
+        if self.core.zones_loaded and self._reload_zones:
+            await self.load_zones()
+
     async def earlier_result(self, attempt: Attempt | None) -> Zone | None:
         """Return the zone that an earlier attempt stored, once it is on the map; None for a first attempt.
 

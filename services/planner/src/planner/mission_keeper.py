@@ -106,6 +106,10 @@ class MissionKeeper:
 
     async def cancel(self, robot: str, who: str) -> bool:
         """End a robot's mission; False when it has none. Raises `StoreError`."""
+        with self._uncertain_write():
+            if self._reload:
+                # It may have one that was stored although its request failed: "none" would be wrong.
+                await self._load()
         async with self._lock:
             stored = self.goals.get(robot)
             if stored is None:

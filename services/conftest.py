@@ -165,7 +165,7 @@ class Proxy:
 
     async def start(self) -> int:
         """Listen; return the port."""
-        self._server = await asyncio.start_server(self._serve, "127.0.0.1", 0)
+        self._server = await asyncio.start_server(self._accept, "127.0.0.1", 0)
         return self._server.sockets[0].getsockname()[1]
 
     def cut(self) -> None:
@@ -180,9 +180,17 @@ class Proxy:
     async def close(self) -> None:
         assert self._server is not None
         self._server.close()
-        for task in self._tasks:
+        while self._tasks:
+            task = self._tasks.pop()
             task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
+            await asyncio.gather(task, return_exceptions=True)
+        for writer in self._writers:
+            writer.transport.abort()
+        await asyncio.sleep(0)
+
+    def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self._writers.add(writer)
+        self._tasks.add(asyncio.create_task(self._serve(reader, writer)))
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         await self._through.wait()
@@ -191,7 +199,7 @@ class Proxy:
         except OSError:
             writer.close()
             return
-        self._writers |= {writer, there_writer}
+        self._writers.add(there_writer)
         for source, sink in ((reader, there_writer), (there_reader, writer)):
             self._tasks.add(asyncio.create_task(self._pump(source, sink)))
 

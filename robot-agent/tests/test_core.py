@@ -11,6 +11,7 @@ from little_world import KEY, L_PATH, START, LittleWorld, trace
 
 from fog_contracts import channels as ch
 from fog_contracts.commands import sign
+from fog_contracts.handlers import RefusedMessageError
 from fog_contracts.messages import (
     AreaHazard,
     Cause,
@@ -369,8 +370,10 @@ def test_a_path_of_another_goal_or_an_older_plan_is_not_followed(world):
     followed = world.state().plan_id
     older = msgspec.structs.replace(world.path, plan_id=4)
     other_goal = msgspec.structs.replace(world.path, plan_id=9, goal_id="g0")
-    for path in (older, other_goal, msgspec.structs.replace(world.path, planner_epoch=2, plan_id=99)):
+    for path in (older, other_goal):
         world.send(ch.ROBOT_PATH, path)
+    with pytest.raises(RefusedMessageError, match="another planner has taken over"):
+        world.send(ch.ROBOT_PATH, msgspec.structs.replace(world.path, planner_epoch=2, plan_id=99))
     assert world.state().plan_id == followed == 5
     restarted = msgspec.structs.replace(world.path, planner_epoch=4, plan_id=1)
     world.send(ch.ROBOT_PATH, restarted)

@@ -18,6 +18,7 @@ from hazard_aggregator.core import Aggregator
 from hazard_aggregator.fusion import AreaFusion
 from hazard_aggregator.registry import find_rule
 from hazard_aggregator.service import Service as AggregatorService
+from hazard_aggregator.store import Stored
 from map_service.core import MapCore
 from map_service.registry import make_layers
 from map_service.service import Service as MapService
@@ -146,6 +147,8 @@ class BusEdge:
     def refuse(self, _channel: Channel, key: str, reason: str) -> None:
         self._live.bus.refused.append(f"{key}: {reason}")
 
+    async def add_number(self, channel: Channel, number: str | int) -> None: ...
+
     def on_connect(self, callback: Callable[[], Awaitable[None]]) -> None:
         self._on_connect.append(callback)
 
@@ -173,6 +176,9 @@ class MemoryStore:
 
     async def zone_times(self) -> dict[str, Any]:
         return {}
+
+    async def load(self) -> Stored:
+        return Stored([], [])
 
     async def goals(self) -> dict[str, Any]:
         return {}
@@ -266,6 +272,7 @@ class LiveServices:
             ("planner plan", self.planner.plan_loop()),
         ):
             await self._begin(name, loop)
+        await self.aggregator.lead(1, confirmed=True)
         await self.map.lead(1, confirmed=True)
         await self.planner.lead(1, confirmed=True)
         await self.edges["hazard-aggregator"].connect()

@@ -12,9 +12,7 @@ LED = {ch.AGGREGATOR, ch.MAP, ch.PLANNER}
 WITHOUT_EPOCH = {
     "leader",  # the announcement itself
     "node_config",  # constant, from the site's files
-    # The aggregator's, which has no lease yet.
-    "area_hazard", "area_definition", "aggregator_heartbeat",
-}  # fmt: skip
+}
 
 
 def goal(epoch: int) -> RobotGoal:

@@ -124,7 +124,7 @@ def test_reconnected_broker_gets_definitions_announced_hazards_and_node_configs(
     rig.read(0.8)
     rig.read(3.0)
     republished = rig.core.republish_all()
-    assert [p.message for p in republished if p.channel is ch.AREA_DEFINITION] == [AREA]
+    assert [p.message for p in republished if p.channel is ch.AREA_DEFINITION] == [structs.replace(AREA, epoch=5)]
     assert [p.message.state for p in republished if p.channel is ch.AREA_HAZARD] == ["blocked"], "relief not stored"
     (config,) = [p.message for p in republished if p.channel is ch.NODE_CONFIG]
     assert isinstance(config, NodeConfig)
@@ -147,7 +147,7 @@ def test_removed_area_is_published_as_removed_and_leaves_nothing_to_store():
     removed = AreaDefinition(id="hall", polygon=SQUARE, removed=True, version=1)
     publications = rig.core.put_area(removed, rig.at)
     assert [(p.channel.name, p.message) for p in publications] == [
-        ("area_definition", removed),
+        ("area_definition", structs.replace(removed, epoch=5)),
         ("area_hazard", None),
         ("area_definition", None),
     ]

@@ -176,12 +176,13 @@ NODE_VALUE        = _mqtt( "node_value",        V1 + "nodes/{node}/value",      
 NODE_CONFIG       = _mqtt( "node_config",       V1 + "nodes/{node}/config",           m.NodeConfig,     limit=KIB,
     publishers=(AGGREGATOR,),    subscribers=(NODE,),             durability=LATEST,   qos=1)
 AREA_HAZARD       = _mqtt( "area_hazard",       V1 + "areas/{area}/hazard",           m.AreaHazard,     limit=4 * KIB,
-    publishers=(AGGREGATOR,),    subscribers=(AGGREGATOR, MAP),   durability=LATEST,   qos=1)
+    publishers=(AGGREGATOR,),    subscribers=(AGGREGATOR, MAP),   durability=LATEST,   qos=1, epoch="epoch")
 AREA_DEFINITION   = _mqtt( "area_definition",   V1 + "areas/{area}/definition",       m.AreaDefinition, limit=32 * KIB,
-    publishers=(AGGREGATOR,),    subscribers=(MAP,),              durability=LATEST,   qos=1)
+    publishers=(AGGREGATOR,),    subscribers=(MAP,),              durability=LATEST,   qos=1, epoch="epoch")
 AGGREGATOR_HEARTBEAT = _mqtt("aggregator_heartbeat", V1 + "aggregator/heartbeat", m.AggregatorHeartbeat,
     limit=64 * KIB,
-    publishers=(AGGREGATOR,),    subscribers=(AGGREGATOR, MAP),   durability=VOLATILE, qos=0, rate_hz=5, max_age_s=1.5)
+    publishers=(AGGREGATOR,),    subscribers=(AGGREGATOR, MAP),   durability=VOLATILE, qos=0, rate_hz=5,
+    max_age_s=1.5, epoch="epoch")
 AGGREGATOR_REQUEST = _text("aggregator_request", V1 + "aggregator/request",                             limit=16,
     publishers=(MAP,),           subscribers=(AGGREGATOR,),       durability=VOLATILE, qos=0,
     values=(REPUBLISH,), about="asks the aggregator to publish all areas again: a subscriber has missed some")

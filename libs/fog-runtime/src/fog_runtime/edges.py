@@ -40,6 +40,9 @@ class Gate(Protocol):
     def on_message(self, channel: Channel, message: object) -> None:
         """Hear a message before its handler does."""
 
+    def on_rival(self, epoch: int) -> None:
+        """Hear that another process sent a message of this service with this epoch."""
+
 
 class Edges:
     """The MQTT and zenoh connections of one process; each channel uses that of its transport.

@@ -119,11 +119,10 @@ class Leadership:
     def admit(self, channel: Channel, message: object, send: Callable[[], None]) -> None:
         """Send a message of this service: now, once the lease is certain, or never.
 
-        A message with an epoch is sent only if it is the current one, another message only if the service publishes
-        with it already.
+        A message with an epoch is sent only if it is the current one: a core may not have taken it yet.
         """
         permission = self._lease.permission(time.monotonic())
-        epoch = getattr(message, channel.epoch) if channel.epoch and message is not None else self._serving
+        epoch = getattr(message, channel.epoch) if channel.epoch and message is not None else self._lease.epoch
         if permission == "refused" or epoch != self._lease.epoch:
             return
         if permission == "granted":
@@ -141,6 +140,10 @@ class Leadership:
     def on_message(self, channel: Channel, message: object) -> None:
         """Hear which epochs of this service others know."""
         self._lease.on_epoch(epoch_in(channel, message, self._service))
+
+    def on_rival(self, epoch: int) -> None:
+        """Hear that another process sent a message of this service with this epoch."""
+        self._lease.on_rival(epoch)
 
     # --- For the service and its REST interface ---------------------------------------------------------------------
 

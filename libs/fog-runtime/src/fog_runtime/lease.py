@@ -180,6 +180,10 @@ class Lease:
         if epoch > self.epoch:
             self._floor = max(self._floor, epoch)
 
+    def on_rival(self, epoch: int) -> None:
+        """Handle a message of another process of this service that leads, or did; ours must be above its epoch."""
+        self._floor = max(self._floor, epoch)
+
     def _leader_heard_at(self) -> float:
         """When a leader with an epoch not below ours was last heard."""
         return self.leader.heard_at if self.leader is not None and self.leader.epoch >= self.epoch else -math.inf

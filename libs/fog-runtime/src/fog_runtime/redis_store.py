@@ -123,18 +123,6 @@ class RedisStore:
             return "run Redis with `appendonly yes` and `appendfsync always`: it may lose acknowledged writes"
         return ""
 
-    async def claim_epoch(self, service: str, floor: int = 0) -> int:
-        """Store and return an epoch (ms) larger than every one before, and than `floor`.
-
-        `floor` is the highest epoch that was heard or used while Redis did not answer.
-        """
-        await self.check()
-        key = self._key(f"{service}:epoch")
-        last = int(await self._redis.read("GET", key) or b"0")
-        epoch = max(last + 1, floor + 1, _now_ms())
-        await self._redis.write(("SET", key, epoch))
-        return epoch
-
     async def recall(self, attempt: Attempt | None, kind: type[M]) -> M | None:
         """Return the result of an earlier attempt under the same idempotency key; None if there was none.
 

@@ -9,6 +9,8 @@ from fog_runtime import logs, process
 from fog_runtime.clock import SystemClock
 from fog_runtime.health import Health
 from fog_runtime.http import load_tokens, serve
+from fog_runtime.leadership import Leadership, process_id
+from fog_runtime.lease_store import LeaseStore
 from fog_runtime.mqtt_edge import MqttEdge
 from fog_runtime.settings import describe, load
 from fog_runtime.site import load_site
@@ -34,27 +36,37 @@ async def main() -> None:
     site = settings.site or loaded.site.id
     clock = SystemClock(settings.speed)
     health = Health("store", "mqtt")
-    async with Store(settings.redis_url, site, service="hazard-aggregator", data_dir=settings.data_dir) as store:
+    async with (
+        Store(settings.redis_url, site, service="hazard-aggregator", data_dir=settings.data_dir) as store,
+        LeaseStore(settings.redis_url, site, "hazard-aggregator") as keeper,
+    ):
         stored, loaded_from_store = await load_at_start(store)
         usable = usable_areas(
             stored.definitions, lambda area: make_rule(area.id, area.debounce, find_rule, settings.debounce)
         )
         definitions = {d.id: d for d in [*loaded.site.definitions(), *usable]}
         fusion = AreaFusion(
-            definitions.values(), loaded.site.nodes, stored.epoch, stored.hazards,
+            definitions.values(), loaded.site.nodes, 0, stored.hazards,
             registry=find_rule, default_rule=settings.debounce,
         )  # fmt: skip
-        mqtt = MqttEdge(settings.mqtt_url, "hazard-aggregator", clock, site=site)
+        mqtt = MqttEdge(settings.mqtt_url, process_id("hazard-aggregator"), clock, site=site)
         async with ZenohEdge.open(
             connect=settings.zenoh_endpoints, clock=clock, role="hazard-aggregator", id=site, site=site
         ) as zenoh:
-            service = Service(Aggregator(fusion, complete=loaded_from_store), store, mqtt, zenoh, clock, health)
+            leadership = Leadership(
+                "hazard-aggregator", keeper, zenoh, health, connected=lambda: zenoh.connected or mqtt.connected
+            )
+            core = Aggregator(fusion, complete=loaded_from_store)
+            service = Service(core, store, mqtt, zenoh, clock, health, leadership)
             if loaded_from_store:
                 service.mark_store_loaded()
             service.subscribe()
+            leadership.subscribe()
             zenoh.declare_liveliness("hazard-aggregator", site)
-            app = make_api(service, loaded.map.geometry, clock, health, load_tokens(settings.tokens_file))
+            tokens = load_tokens(settings.tokens_file)
+            app = make_api(service, loaded.map.geometry, clock, health, tokens, leadership.standby_reason)
             async with asyncio.TaskGroup() as tasks:
+                tasks.create_task(leadership.run(service), name="lease")
                 tasks.create_task(mqtt.run(), name="mqtt")
                 tasks.create_task(service.tick_loop(), name="tick")
                 tasks.create_task(service.write_loop(), name="write")

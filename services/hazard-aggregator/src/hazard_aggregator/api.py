@@ -1,5 +1,6 @@
 """REST under /api/v1: areas with their state, and the health of nodes. Reading needs no token, PUT an operator's."""
 
+from collections.abc import Callable
 from typing import Annotated, Any
 
 import msgspec
@@ -75,9 +76,19 @@ class NodeView(Message, frozen=True, kw_only=True):
     ignored: int
 
 
-def make_api(service: Service, geometry: GridGeometry, clock: Clock, health: Health, tokens: Tokens) -> FastAPI:
-    """Return the app over a running service; areas must lie on the map of this geometry."""
-    app = make_app("Fognav hazard-aggregator", health, tokens)
+def make_api(
+    service: Service,
+    geometry: GridGeometry,
+    clock: Clock,
+    health: Health,
+    tokens: Tokens,
+    standby: Callable[[], str] = str,
+) -> FastAPI:
+    """Return the app over a running service; areas must lie on the map of this geometry.
+
+    While `standby` returns a reason, nothing can be written.
+    """
+    app = make_app("Fognav hazard-aggregator", health, tokens, standby=standby)
     _add_areas(Routes(app, "areas"), service, geometry)
     _add_nodes(Routes(app, "nodes"), service, clock)
     recovery = Routes(app, "store")

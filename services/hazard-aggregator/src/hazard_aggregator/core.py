@@ -154,8 +154,8 @@ class Aggregator:
         changed = self._fusion.put_area(definition, at.stamp)
         if definition.removed:
             self._outbox.forget(definition.id)
-            return [_definition_publication(definition), *_deletions(definition.id)]
-        return [_definition_publication(definition), *self._announce(changed)]
+            return [self._definition_publication(definition), *_deletions(definition.id)]
+        return [self._definition_publication(definition), *self._announce(changed)]
 
     def restore(
         self, definitions: Iterable[AreaDefinition], hazards: Iterable[AreaHazard], at: Moment
@@ -178,7 +178,7 @@ class Aggregator:
             publication
             for definition in self.definitions()
             for publication in (
-                _deletions(definition.id) if definition.removed else [_definition_publication(definition)]
+                _deletions(definition.id) if definition.removed else [self._definition_publication(definition)]
             )
         ]
         return [*definitions, *self._hazard_publications(self._outbox.announced()), *configs]
@@ -258,6 +258,11 @@ class Aggregator:
     def _announce(self, changed: Iterable[AreaHazard]) -> list[Publication]:
         return self._hazard_publications(self._outbox.offer(changed))
 
+    def _definition_publication(self, definition: AreaDefinition) -> Publication:
+        return Publication(
+            ch.AREA_DEFINITION, msgspec.structs.replace(definition, epoch=self.epoch), {"area": definition.id}
+        )
+
     def _hazard_publications(self, hazards: Iterable[AreaHazard]) -> list[Publication]:
         """Return the publications of hazards, each with its line for the thesis's robots."""
         publications: list[Publication] = []
@@ -269,10 +274,6 @@ class Aggregator:
                 if line := wsn_line(definition, hazard, node):
                     publications.append(Publication(ch.THESIS_WSN, line))
         return publications
-
-
-def _definition_publication(definition: AreaDefinition) -> Publication:
-    return Publication(ch.AREA_DEFINITION, definition, {"area": definition.id})
 
 
 def _deletions(area: str) -> list[Publication]:

@@ -15,7 +15,7 @@ from fog_runtime import logs, metrics
 from fog_runtime.clock import ticker
 from fog_runtime.edges import Edges
 from fog_runtime.redis_connection import StoreRefusedError
-from hazard_aggregator.store import Audit, RecoveryError, StoreError, usable_areas
+from hazard_aggregator.store import Audit, RecoveryError, StoreError, StoreLostError, usable_areas
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from fog_contracts.handlers import Publication
     from fog_contracts.messages import AreaDefinition
     from fog_runtime.clock import Clock
+    from fog_runtime.edges import Gate
     from fog_runtime.health import Health
     from fog_runtime.idempotency import Attempt
     from fog_runtime.mqtt_edge import MqttEdge
@@ -63,20 +64,29 @@ class ConflictError(Exception):
 class Service:
     """The running aggregator; its loops are tasks of the process."""
 
-    def __init__(
-        self, core: Aggregator, store: Store, mqtt: MqttEdge, zenoh: ZenohEdge, clock: Clock, health: Health
+    def __init__(  # noqa: PLR0913  # the process's parts
+        self,
+        core: Aggregator,
+        store: Store,
+        mqtt: MqttEdge,
+        zenoh: ZenohEdge,
+        clock: Clock,
+        health: Health,
+        gate: Gate | None = None,
     ) -> None:
+        """Prepare; `gate` decides whether this process leads or stands by."""
         self.core = core
         self._store = store
         self._mqtt = mqtt
-        self._edges = Edges(clock, mqtt=mqtt, zenoh=zenoh)
+        self._gate = gate
+        self._edges = Edges(clock, mqtt=mqtt, zenoh=zenoh, gate=gate)
         self._clock = clock
         self._health = health
         self._write_pending = asyncio.Event()
         self._store_loaded = asyncio.Event()
         self._area_lock = asyncio.Lock()
         self._reload_areas = False
-        self._epoch_provisional = False
+        self._leading = asyncio.Event()
         self._limited = logs.RateLimited(_log)
         self._logged: dict[str, int] = {}  # the seq of each area's last hazard in the log
 
@@ -207,7 +217,13 @@ class Service:
             self._write_pending.set()
 
     def _report_foreign(self) -> None:
-        for foreign in self.core.pop_foreign():
+        """Report what others say on our topics; on standby it is the leader."""
+        found = self.core.pop_foreign()
+        if not self._leading.is_set():
+            return
+        if self._gate is not None and (outranked_by := self.core.outranked_by) is not None:
+            self._gate.on_rival(outranked_by)
+        for foreign in found:
             FOREIGN.labels(foreign.kind).inc()
             self._limited.warning(
                 "foreign_message",
@@ -244,9 +260,10 @@ class Service:
         if warning := await self._store.durability_warning():
             _log.warning("store_not_durable", remedy=warning)
         while True:
+            await self._leading.wait()
             await self._write_pending.wait()
             self._write_pending.clear()
-            while unstored := self.core.to_store():
+            while self._leading.is_set() and (unstored := self.core.to_store()):
                 try:
                     await self._store.save_hazards(unstored)
                 except StoreError as error:
@@ -262,7 +279,7 @@ class Service:
         self._health.set("store", ok=True)
 
     async def store_loop(self) -> None:
-        """Monitor Redis; after a start without it, load its records as soon as it answers, before any write."""
+        """Monitor Redis; load its records as soon as it answers, before any write."""
         while True:
             await asyncio.sleep(STORE_RETRY_S)
             try:
@@ -271,33 +288,49 @@ class Service:
                 # What was stored but never acknowledged may have gone with a failed primary.
                 self._reload_areas = True
                 self._health.set("store", ok=False, detail=str(error))
-                if (outranked_by := self.core.outranked_by) is not None:
-                    self._epoch_provisional = True
-                    self._set_epoch(outranked_by + 1)
 
     async def _use_store(self) -> None:
-        if not self._store_loaded.is_set():
-            await self._load_late()
-            return
-        if self._reload_areas:
+        if self._leading.is_set() and not self._store_loaded.is_set():
+            self._publish(await self._load())
+            self.mark_store_loaded()
+        if self._leading.is_set() and self._reload_areas:
             await self._reload_stored_areas()
-        if self.core.outranked_by is not None or self._epoch_provisional:
-            self._set_epoch(await self._store.new_epoch(max(self.core.epoch, self.core.outranked_by or 0)))
-            self._epoch_provisional = False
         await self._store.check()
         self._health.set("store", ok=True)
 
-    async def _load_late(self) -> None:
-        """Load what could not be loaded at the start, and replace the epoch that was made without Redis."""
-        stored = await self._store.load(max(self.core.epoch, self.core.outranked_by or 0))
-        usable = usable_areas(stored.definitions, self.core.check)
-        self._set_epoch(stored.epoch)
-        self._publish(self.core.restore(usable, stored.hazards, self._edges.now()))
+    async def _load(self) -> Sequence[Publication]:
+        """Put the stored areas and hazards into force; return everything, to be published."""
+        async with self._area_lock:
+            stored = await self._store.load()
+            usable = usable_areas(stored.definitions, self.core.check)
+            publications = self.core.restore(usable, stored.hazards, self._edges.now())
         await self._subscribe_numbers()
-        self.mark_store_loaded()
+        return publications
 
-    def _set_epoch(self, epoch: int) -> None:
-        """Continue with a higher epoch, unless a still higher one was set meanwhile."""
+    # --- Leading and standing by ------------------------------------------------------------------------------------
+
+    async def lead(self, epoch: int, *, confirmed: bool) -> None:
+        """Load what is stored and continue with this epoch; raises `StoreError` for a confirmed one.
+
+        With a provisional epoch, while the store can't be read, or when it lost records, the known areas go on.
+        """
+        self._store.epoch = epoch
+        restored: Sequence[Publication] = []
+        try:
+            restored = await self._load()
+        except StoreError as error:
+            if confirmed and not isinstance(error, StoreLostError):
+                raise
+            self._health.set("store", ok=False, detail=str(error))
+        else:
+            self.mark_store_loaded()
         if epoch > self.core.epoch:
-            _log.warning("epoch_changed", epoch=epoch, before=self.core.epoch, outranked_by=self.core.outranked_by)
             self._publish(self.core.set_epoch(epoch))
+        # All but the deletions of what other aggregators left is published with the new epoch already.
+        self._publish([publication for publication in restored if publication.message is None])
+        self._leading.set()
+        self._write_pending.set()
+
+    def stand_by(self) -> None:
+        """Follow the nodes, and the hazards of the aggregator that leads; announce and store nothing."""
+        self._leading.clear()

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import time
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from fog_contracts.messages import AreaDefinition, AreaHazard
 from fog_runtime import logs
-from fog_runtime.redis_store import Audit, Outcome, RecoveryError, RedisStore, StoreError, Table
+from fog_runtime.redis_store import Audit, Outcome, RecoveryError, RedisStore, StoreError, StoreLostError, Table
 from hazard_aggregator.area_size import AreaError, check_size
 
 if TYPE_CHECKING:
@@ -15,19 +14,27 @@ if TYPE_CHECKING:
 
     from fog_runtime.idempotency import Attempt
 
-__all__ = ["Audit", "Outcome", "RecoveryError", "Store", "StoreError", "Stored", "load_at_start", "usable_areas"]
+__all__ = [
+    "Audit",
+    "Outcome",
+    "RecoveryError",
+    "Store",
+    "StoreError",
+    "StoreLostError",
+    "Stored",
+    "load_at_start",
+    "usable_areas",
+]
 
 _AREAS: Final = Table("areas", "area")
 _HAZARDS: Final = "hazards"
-_SERVICE: Final = "aggregator"
 
 _log = logs.get("store")
 
 
 class Stored(NamedTuple):
-    """What an aggregator loads at its start; `epoch` is its own, larger than every one before."""
+    """What an aggregator loads when it starts, and when it begins to lead."""
 
-    epoch: int
     definitions: list[AreaDefinition]
     hazards: list[AreaHazard]
 
@@ -35,15 +42,10 @@ class Stored(NamedTuple):
 class Store(RedisStore):
     """The aggregator's keys."""
 
-    async def load(self, floor: int = 0) -> Stored:
-        """Claim an epoch above all earlier ones and `floor`, and return all readable records."""
-        epoch = await self.new_epoch(floor)
+    async def load(self) -> Stored:
+        """Return all readable records."""
         hazards = await self._readable_records(_HAZARDS, AreaHazard)
-        return Stored(epoch, await self.areas(), list(hazards.values()))
-
-    async def new_epoch(self, floor: int) -> int:
-        """Claim and return an epoch above all earlier ones and `floor`."""
-        return await self.claim_epoch(_SERVICE, floor)
+        return Stored(await self.areas(), list(hazards.values()))
 
     async def areas(self) -> list[AreaDefinition]:
         """Return the stored areas; an unreadable one is left out, so the site's definition of it stays in force."""
@@ -73,13 +75,12 @@ class Store(RedisStore):
 
 
 async def load_at_start(store: Store) -> tuple[Stored, bool]:
-    """Return the stored records, and whether Redis answered; if not, no records and an epoch (ms) from the clock."""
+    """Return the stored records, and whether Redis answered; if not, none."""
     try:
         return await store.load(), True
     except StoreError as error:
-        epoch = int(time.time() * 1000)
-        _log.warning("started_without_store", epoch=epoch, reason=str(error))
-        return Stored(epoch, [], []), False
+        _log.warning("started_without_store", reason=str(error))
+        return Stored([], []), False
 
 
 def usable_areas(

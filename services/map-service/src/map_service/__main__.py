@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 
+from fog_contracts import channels as ch
 from fog_runtime import logs, process
 from fog_runtime.clock import SystemClock, WallClock, boot_id
 from fog_runtime.health import Health
@@ -52,7 +53,7 @@ async def main() -> None:
         ) as zenoh:
             leadership = Leadership(
                 "map-service", keeper, zenoh, health,
-                connected=lambda: zenoh.connected, epochs=lambda: core.fence.epochs,
+                connected=lambda: zenoh.connected, epochs=lambda: {ch.AGGREGATOR: core.aggregator.epoch or 0},
             )  # fmt: skip
             # A clock of another speed tells no time of day.
             synchronized = WallClock(settings.wall_clock if settings.speed == 1.0 else "trusted").synchronized

@@ -14,7 +14,6 @@ from msgspec import structs
 
 from fog_contracts import channels as ch
 from fog_contracts.costs import DEFAULT_INFLATION
-from fog_contracts.fencing import Fence
 from fog_contracts.handlers import Moment, Publication
 from fog_contracts.messages import HazardArea, ZoneSet
 from map_service.costmap import LayeredCostmap
@@ -71,7 +70,6 @@ class MapCore:
         for definition in definitions:
             self._hazards.define(definition, Moment(0.0, 0.0))
         self.costmap = LayeredCostmap(site, static, layers, inflation, epoch)
-        self.fence = Fence()
         self._zones_loaded = False
         self._hazards_wait_s = hazards_wait_s
         self._serving = False
@@ -139,7 +137,7 @@ class MapCore:
             for channel, handler in layer.handlers().items():
                 subscribed.setdefault(channel, []).append(handler)
         combined = {channel: self._combined(handlers) for channel, handlers in subscribed.items()}
-        return self.fence.guarded({ch.ROBOT_STATE: self._on_state, **combined})
+        return {ch.ROBOT_STATE: self._on_state, **combined}
 
     def query_handlers(self) -> Mapping[Channel, QueryHandler]:
         """Return the handler of every query; queries are answered once the map is served."""

@@ -76,7 +76,8 @@ class HazardsLayer(CostLayer):
 
     def _on_definition(self, _ids: Ids, definition: AreaDefinition, at: Moment) -> list[Publication]:
         try:
-            return self.define(definition, at)
+            # Who publishes it does not change an area.
+            return self.define(structs.replace(definition, epoch=0), at)
         except GeometryError as error:
             raise RefusedMessageError(f"area {definition.id}: {error}") from error
 

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from fog_kernels.components import Components
 from fognav.__main__ import app
-from fognav.bench import fleet, office
+from fognav.bench import costmap, fleet, office
 
 
 def test_office_is_connected_and_the_same_for_the_same_seed() -> None:
@@ -49,3 +49,12 @@ def test_figures_come_with_schema_machine_and_versions(monkeypatch: pytest.Monke
     assert printed["machine"]["cores"] >= 1
     assert set(printed["versions"]) == {"python", "numba", "numpy"}
     assert {"replan_p50_ms", "replan_p99_ms", "cut_off_ms", "rss_mb", "bytes_per_robot"} <= printed.keys()
+
+
+def test_costmap_figures_are_of_the_whole_floor_and_of_legal_zones() -> None:
+    floor = office.make_office(60.0, 40.0)
+    figures = costmap.measure(floor, 50, 1)
+    assert figures["cells"] == 800 * 1200
+    assert figures["portions"] >= 4, "a zone over the whole floor, put and removed"
+    for key in ("full_ms", "window_ms", "worst_zone_ms", "worst_portion_ms", "load_zones_ms", "snapshot_ms"):
+        assert figures[key] > 0

@@ -17,6 +17,8 @@ SERVICES: dict[Role, str] = {
     "planner": "services/planner/src",
     "robot-agent": "robot-agent/src",
 }
+OPERATOR_COMMANDS = "libs/fog-runtime/src/fog_runtime/robot_commands.py"
+"""Used by the operators' tools alone."""
 TOOLS = ("cli/src", "sim/src", "experiments/src")
 
 
@@ -42,7 +44,7 @@ def role_of(use: Any) -> Role:
 def used_by_tools() -> set[tuple[str, str, Role]]:
     return {
         (use.channel.name, use.side, role_of(use))
-        for folder in ("cli/src", "sim/src", "libs/fog-runtime/src")
+        for folder in ("cli/src", "sim/src", OPERATOR_COMMANDS)
         for use in usage.uses(folder)
     }
 

@@ -33,7 +33,7 @@ def start(body="pass", seconds=60.0):
     )
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT])
 def test_signal_cancels_main_and_exits_with_status_zero(number):
     with start() as child:
         assert child.stdout.readline() == "up\n"
@@ -50,3 +50,29 @@ def test_crash_is_logged_once_and_exits_with_status_one():
     (line,) = err.splitlines()
     assert (out, child.returncode) == ("up\ncleaned\n", 1)
     assert json.loads(line)["reason"] == "ValueError: the reason"
+
+
+def test_hang_up_ends_no_process_that_nohup_started():
+    with subprocess.Popen(
+        ["nohup", sys.executable, "-c", PROGRAM.format(body="pass", seconds=60.0)],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as child:
+        assert child.stdout.readline() == "up\n"
+        child.send_signal(signal.SIGHUP)
+        child.send_signal(signal.SIGTERM)
+        _, err = child.communicate(timeout=20)
+    assert [json.loads(line).get("signal") for line in err.splitlines() if "stopping" in line] == ["SIGTERM"]
+
+
+def test_second_hang_up_does_not_cut_the_orderly_end_short():
+    body = "pass\n    except asyncio.CancelledError:\n        await asyncio.sleep(0.5)\n        raise"
+    with start(body) as child:
+        assert child.stdout.readline() == "up\n"
+        child.send_signal(signal.SIGHUP)
+        assert "stopping" in child.stderr.readline()
+        child.send_signal(signal.SIGHUP)
+        out, _ = child.communicate(timeout=20)
+    assert (out, child.returncode) == ("cleaned\n", 0)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import os
 
-from fog_runtime import logs, process
+from fog_runtime import logs, process, signals
 from fog_runtime.clock import SystemClock
 from fog_runtime.health import Health, serve_health
 from fog_runtime.settings import describe, load
@@ -64,4 +64,5 @@ async def main() -> None:
 
 
 if __name__ == "__main__":
+    signals.ignore_terminal_stops()
     process.run(main)

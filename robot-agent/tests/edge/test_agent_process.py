@@ -12,6 +12,7 @@ from agent_rig import Robot, until
 from guardian_rig import STOP_S
 
 from fog_contracts.grid import Window
+from fog_runtime.signals import TERMINAL_STOPS
 from fog_supervisor.servers import start_router
 from robot_agent.agent.replay import replay
 from robot_agent.localization.localizer import SavedPose
@@ -80,6 +81,19 @@ async def test_wheels_stop_when_the_agent_is_killed_and_the_next_one_asks_for_an
     assert robot.body.pose == stopped_at
     await enabled(robot)
     await until(lambda: robot.body.pose[0] > stopped_at[0] + 0.3, "it drives on")
+
+
+async def test_stop_signals_of_a_terminal_do_not_freeze_a_driving_agent_and_a_hang_up_ends_it_in_order(robot):
+    await enabled(robot)
+    robot.fog.send_robot_to_the_corner()
+    await until(lambda: robot.body.moving, "it drives")
+    for number in TERMINAL_STOPS:
+        robot.agent.process.send_signal(number)
+    reached = robot.body.pose[0]
+    await until(lambda: robot.body.pose[0] > reached + 0.2, "it drives on")
+    robot.agent.process.send_signal(signal.SIGHUP)
+    assert robot.body.stopped_within(time.monotonic()) < STOP_S
+    assert robot.agent.process.wait(10.0) == 0
 
 
 async def test_wheels_stop_when_the_agent_hangs_or_the_lidar_is_silent_and_continue_afterwards(robot):

@@ -14,6 +14,7 @@ import guardian_rig as rigs
 import pytest
 from guardian_rig import STOP_S, wait_for
 
+from fog_runtime.signals import ENDING, TERMINAL_STOPS
 from robot_agent.bases.diffdrive.emulator import DiffDriveEmulator
 
 pytestmark = [pytest.mark.live, pytest.mark.reaction, pytest.mark.timeout(120)]
@@ -75,6 +76,10 @@ def test_wheels_stop_when_the_agent_falls_silent(rig):
     rig.drive()
 
 
+def children(pid: int) -> list[int]:
+    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
 AGENT = """
 import socket, sys, time
 from robot_agent.guardian.link import WheelCommand, encode
@@ -83,6 +88,12 @@ with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as link:
     for seq in range(10_000):
         link.send(encode(WheelCommand(seq=seq, left=0.2, right=0.2)))
         time.sleep(0.05)
+"""
+PATIENT_AGENT = f"""
+import pathlib, sys, time
+while not pathlib.Path(sys.argv[1]).exists():
+    time.sleep(0.01)
+{AGENT}
 """
 
 
@@ -111,7 +122,7 @@ def test_wheels_stop_and_the_guardian_ends_when_the_watchdog_is_killed(rig):
     rig.drive()
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", ENDING)
 def test_a_signal_ends_both_processes_cleanly_with_the_wheels_at_rest(rig, number):
     rig.drive()
     guardian = rig.watchdog.guardian()
@@ -120,6 +131,53 @@ def test_a_signal_ends_both_processes_cleanly_with_the_wheels_at_rest(rig, numbe
     assert rig.watchdog.process.wait(10.0) == 0
     assert not alive(guardian)
     assert rig.watchdog.events[-1]["event"] == "ended"
+
+
+@pytest.mark.parametrize("number", ENDING)
+def test_a_signal_ends_the_guardian_with_stop_bytes_and_the_watchdog_starts_another(rig, number):
+    rig.drive()
+    begun = rig.end_guardian(number)
+    assert rig.base.stopped_within(begun) < STOP_S
+    wait_for(lambda: rig.watchdog.count("guardian_lost"), "its end is logged")
+    assert rig.watchdog.events[-1]["exit_code"] == 0
+    rig.drive()
+
+
+def test_stop_signals_of_a_terminal_leave_watchdog_and_guardian_in_control(rig):
+    rig.drive()
+    guardian = rig.watchdog.guardian()
+    for pid in (guardian, rig.watchdog.process.pid):
+        for number in TERMINAL_STOPS:
+            os.kill(pid, number)
+    rig.agent.wheels = None
+    assert rig.base.stopped_within(time.monotonic()) < STOP_S
+    rig.drive()
+    assert rig.watchdog.guardian() == guardian
+    rig.end_guardian(signal.SIGKILL)
+    assert rig.base.stopped_within(time.monotonic()) < STOP_S
+
+
+def test_wheels_stop_whatever_signal_the_group_of_a_login_shell_receives(rig):
+    """As the manual starts them: watchdog and agent from one script, whose terminal goes away or stops it."""
+    script = '"$0" -m robot_agent.guardian.watchdog & exec "$0" -c "$1" "$2"'
+    rig.agent.__exit__()
+    rig.watchdog.__exit__()
+    for number in (*ENDING, *TERMINAL_STOPS):
+        rig.watchdog.socket.unlink(missing_ok=True)
+        with rig.watchdog.log_file.open("ab") as log, subprocess.Popen(
+            ["/bin/sh", "-c", script, sys.executable, PATIENT_AGENT, str(rig.watchdog.socket)],
+            env=rig.watchdog.environment, stderr=log, stdout=log, process_group=0,
+        ) as shell:  # fmt: skip
+            watchdog = wait_for(lambda pid=shell.pid: children(pid), "the watchdog runs")[0]
+            try:
+                wait_for(lambda: rig.base.speeds == (0.2, 0.2), "the base drives")
+                os.killpg(shell.pid, number)
+                assert rig.base.stopped_within(time.monotonic()) < STOP_S, number.name
+            finally:
+                shell.kill()
+                os.kill(watchdog, signal.SIGTERM)
+                wait_for(lambda pid=watchdog: not alive(pid), "the watchdog ends")
+    rig.watchdog.start()
 
 
 def test_lost_port_is_reopened(rig):

@@ -5,7 +5,7 @@ import os
 import signal
 from collections.abc import Awaitable, Callable
 
-from fog_runtime import logs
+from fog_runtime import logs, signals
 
 _log = logs.get("process")
 
@@ -17,6 +17,8 @@ async def _supervise(main: Callable[[], Awaitable[None]]) -> None:
 
     def stop(number: int) -> None:
         nonlocal stopping
+        if stopping and number == signal.SIGHUP:
+            return  # a shell repeats the kernel's hang-up
         if stopping:
             _log.warning("forced_exit", signal=signal.Signals(number).name)
             os._exit(1)
@@ -24,7 +26,8 @@ async def _supervise(main: Callable[[], Awaitable[None]]) -> None:
         _log.info("stopping", signal=signal.Signals(number).name)
         task.cancel()
 
-    for number in (signal.SIGTERM, signal.SIGINT):
+    numbers = tuple(signals.ending())
+    for number in numbers:
         loop.add_signal_handler(number, stop, number)
     try:
         await task
@@ -32,15 +35,15 @@ async def _supervise(main: Callable[[], Awaitable[None]]) -> None:
         if not stopping:
             raise
     finally:
-        for number in (signal.SIGTERM, signal.SIGINT):
+        for number in numbers:
             loop.remove_signal_handler(number)
 
 
 def run(main: Callable[[], Awaitable[None]]) -> None:
-    """Run `main` until it returns, or until SIGTERM or SIGINT cancels it; both end the process with status 0.
+    """Run `main` until it returns, or until a signal of `signals.ENDING` cancels it; all end the process with status 0.
 
     An exception from `main` is logged as one event, and the process exits with status 1. A second signal ends the
-    process at once.
+    process at once, except a second hang-up.
     """
     try:
         asyncio.run(_supervise(main))

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import msgspec
 
-from fog_runtime import logs
+from fog_runtime import logs, signals
 from fog_runtime.clock import SystemClock
 from fog_runtime.default_parts import DEFAULT_BASE
 from fog_runtime.logs import Level
@@ -226,8 +226,9 @@ def main() -> int:
         return BAD_SETTINGS
     logs.configure("guardian", settings.log_level, settings.log_format)
     guardian = Guardian(settings, driver, listener)
-    signal.signal(signal.SIGTERM, guardian.end)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for number in signals.ENDING:
+        signal.signal(number, guardian.end)
+    signals.ignore_terminal_stops()
     priority = set_realtime_priority(settings.realtime_priority)
     logs.get("guardian").info("started", base=settings.base, port=settings.base_port, priority=priority)
     return guardian.run()

@@ -18,7 +18,7 @@ import time
 from contextlib import suppress
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from fog_runtime import parts
+from fog_runtime import parts, signals
 from fog_runtime.default_parts import DEFAULT_BASE
 from robot_agent.serial_port import Port, PortLost, open_port
 from robot_agent.stop_command import StopCommand
@@ -46,7 +46,7 @@ STOPS: Final = "fognav.base_stops"
 
 
 class _Terminated(Exception):  # noqa: N818  # an end, not an error
-    """SIGTERM or SIGINT arrived."""
+    """A signal that ends the process arrived."""
 
 
 class _BadSettings(Exception):  # noqa: N818  # an end, too
@@ -63,7 +63,7 @@ def _log(event: str, **fields: object) -> None:
 
 def _terminate(signum: int, _frame: FrameType | None) -> None:
     # A second signal must not interrupt the stop that the first one requested.
-    for number in (signal.SIGTERM, signal.SIGINT):
+    for number in signals.ENDING:
         signal.signal(number, signal.SIG_IGN)
     raise _Terminated(signal.Signals(signum).name)
 
@@ -103,6 +103,8 @@ def _start_guardian(port: Port, heartbeat_write: int, alive_read: int) -> subpro
         [sys.executable, "-m", "robot_agent.guardian"],
         env=environment,
         pass_fds=(port.fileno(), heartbeat_write, alive_read),
+        # No signal to a group reaches both processes: the one that remains stops the wheels.
+        start_new_session=True,
     )
 
 
@@ -242,12 +244,21 @@ def _guard_always(settings: _Settings) -> int:
         time.sleep(REOPEN_S / settings.speed)
 
 
+def _own_session() -> None:
+    """Leave the session of terminal and agent: what ends or freezes their group leaves this process alone."""
+    # Refused to the leader of a group, such as a job of an interactive shell or a service: it shares no group anyhow.
+    with suppress(PermissionError):
+        os.setsid()
+
+
 def main() -> int:
     """Guard until a signal ends the process."""
     try:
+        _own_session()
+        signals.ignore_terminal_stops()
         settings = _settings()
-        signal.signal(signal.SIGTERM, _terminate)
-        signal.signal(signal.SIGINT, _terminate)
+        for number in signals.ending():
+            signal.signal(number, _terminate)
         return _guard_always(settings)
     except _BadSettings as error:
         _log("bad_settings", reason=str(error))

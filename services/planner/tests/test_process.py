@@ -295,7 +295,7 @@ async def test_queries_are_answered_over_zenoh_and_http_without_side_effects(tmp
         assert snapshot.seq == out.map_seq
 
 
-async def test_anonymous_previews_delay_no_robot_and_are_refused_when_too_many_wait(tmp_path: Path) -> None:
+async def test_anonymous_previews_delay_no_robot(tmp_path: Path) -> None:
     body = {"start": {"x": 1.0, "y": 7.0, "theta": 0.0}, "goal": {"x": 19.0, "y": 7.0, "theta": 0.0}}
     async with running_planner(tmp_path) as env, env.ready() as client:
         await client.put("/api/v1/robots/r1/goal", json={"place": "right"}, headers=OPERATOR)
@@ -305,41 +305,18 @@ async def test_anonymous_previews_delay_no_robot_and_are_refused_when_too_many_w
 
         async def ask() -> None:
             while not stop.is_set():
-                answer = await client.post("/api/v1/plan", json=body, timeout=30.0)
-                statuses.append(answer.status_code)
-                if answer.status_code == 503:
-                    assert answer.headers["content-type"] == "application/problem+json"
-                    assert "waiting" in answer.json()["detail"]
-                    assert float(answer.headers["retry-after"]) > 0.0
-
-        async def previews_over_zenoh() -> list[PlanReply]:
-            request = PlanRequest(start=Pose(x=1.0, y=7.0, theta=0.0), goal=Pose(x=19.0, y=7.0, theta=0.0))
-            asked = [env.edge.query(ch.PLANNER_PLAN, request, PlanReply, 10.0) for _ in range(12)]
-            return [reply for reply in await asyncio.gather(*asked) if reply]
+                statuses.append((await client.post("/api/v1/plan", json=body, timeout=DEADLINE_S)).status_code)
 
         clients = [asyncio.create_task(ask()) for _ in range(32)]
         try:
-
-            def busy_and_answered() -> bool:
-                for task in clients:
-                    if task.done():
-                        task.result()
-                return 503 in statuses and 200 in statuses
-
-            await env.until(busy_and_answered)
+            await env.until(lambda: len(statuses) > 32)
             env.block_upper_corridor()
             await env.until(lambda: via(env.paths[-1]) == "lower")
             # The robot had its path before it would have slowed down because the planner is silent.
             path = env.paths[-1]
             assert path.traces[0].plan_published - path.traces[0].costmap_published < ch.ROBOT_PATH.max_age_s
-            replies = await previews_over_zenoh()
         finally:
             stop.set()
             await asyncio.gather(*clients)
-        assert set(statuses) == {200, 503}
-        busy = [reply for reply in replies if reply.retry_after is not None]
-        assert busy
-        assert all(reply.refusal and reply.refusal.code == 207 for reply in busy)
-        metrics = (await client.get("/metrics")).text
-        assert 'fognav_planner_queries_refused_total{kind="plan"}' in metrics
-        assert 'fognav_planner_queries_waiting{kind="plan"} 0.0' in metrics
+        assert 200 in statuses
+        assert set(statuses) <= {200, 503}

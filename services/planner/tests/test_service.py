@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
+import httpx
 import pytest
 from ring_map import LEFT, RIGHT, RingMap, goal, pose
 
+import planner.service
 from fog_contracts import channels as ch
 from fog_contracts.handlers import Moment, Publication, RefusedMessageError
-from fog_contracts.messages import RobotGoal, RobotPath
+from fog_contracts.messages import EgressRequest, PlanRequest, Pose, RobotGoal, RobotPath
 from fog_runtime.clock import ManualClock
 from fog_runtime.health import Health
+from fog_runtime.http import Tokens
+from planner.api import make_api
 from planner.core import PlannerCore
 from planner.cycle import MOST_SEARCHING_S, CycleResult
+from planner.query_queue import BusyError
 from planner.service import Service
 
 if TYPE_CHECKING:
@@ -214,3 +220,32 @@ def test_paths_are_published_one_by_one_and_a_long_cycle_leaves_the_rest_for_the
     assert rig.service._cycle.run(rig.service._edges.now, emit).unfinished
     assert not rig.service._cycle.run(rig.service._edges.now, emit).unfinished
     assert core.searched == robots
+
+
+class FullQueue:
+    """Refuses every query."""
+
+    async def run(self, _kind: str, _asker: str, _work: object) -> object:
+        raise BusyError("4 of your queries are waiting already")
+
+
+async def test_queries_that_do_not_fit_are_answered_with_503_and_over_zenoh_with_when_to_ask_again(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(planner.service, "BUSY_PAUSE_S", 0.0)
+    monkeypatch.setattr(rig.service, "_queue", FullQueue())
+    at = Pose(x=1.0, y=7.0, theta=0.0)
+    for reply in (
+        await rig.service._serve_plan({}, PlanRequest(start=at, goal=at)),
+        await rig.service._serve_egress({}, EgressRequest(robot="r1", pose=at)),
+    ):
+        assert reply.retry_after
+        assert reply.refusal
+        assert "waiting" in reply.refusal.reason
+    app = make_api(rig.service, cast("Any", SimpleNamespace(robots=[], places={})), Health(), Tokens())
+    async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://planner") as client:
+        place = {"x": 1.0, "y": 7.0, "theta": 0.0}
+        answer = await client.post("/api/v1/plan", json={"start": place, "goal": place})
+    assert (answer.status_code, answer.headers["content-type"]) == (503, "application/problem+json")
+    assert answer.headers["retry-after"] == "1"
+    assert "waiting" in answer.json()["detail"]

@@ -102,15 +102,10 @@ class RedisStore:
 
         A store that nobody has used yet is marked as this site's.
         """
-        expected = self._identity.expectation()
         # Redis checks whether it may write (a read-only replica, full, too few replicas, a broken disk) before it finds
         # that an empty text changes nothing: a probe that neither changes anything nor waits for the disk.
-        commands = [("SETRANGE", self._key("probe"), 0, ""), *self._read_identity()]
-        *_, generation, writes = await self._redis.write(*commands)
-        if generation is None and not expected.generation:
-            mark = ("SET", self._key("generation"), secrets.token_hex(8), "NX")
-            *_, generation, writes = await self._redis.write(mark, *self._read_identity())
-        self._identity.verify(expected, _text(generation or b""), _pairs(writes))
+        await self._redis.write(("SETRANGE", self._key("probe"), 0, ""))
+        await self._verify()
 
     async def durability_warning(self) -> str:
         """Return why acknowledged writes are not durable, or an empty text; also empty if Redis hides its settings."""
@@ -251,9 +246,19 @@ class RedisStore:
 
     # --- Inside -----------------------------------------------------------------------------------------------------
 
+    async def _verify(self) -> None:
+        """Compare the store with what was acknowledged; this needs no right to write, except in a new store."""
+        expected = self._identity.expectation()
+        generation = await self._redis.read("GET", self._key("generation"))
+        if generation is None and not expected.generation:
+            await self._redis.write(("SET", self._key("generation"), secrets.token_hex(8), "NX"))
+            generation = await self._redis.read("GET", self._key("generation"))
+        writes = await self._redis.read("HGETALL", self._key("writes"))
+        self._identity.verify(expected, _text(generation or b""), _pairs(writes))
+
     async def _decoded(self, table: str, kind: type[M]) -> tuple[dict[str, M], dict[str, str]]:
         """Return the records of a table, and why others are unreadable."""
-        await self.check()
+        await self._verify()
         records: dict[str, M] = {}
         failures: dict[str, str] = {}
         for name, data in _items(await self._redis.read("HGETALL", self._key(table))):

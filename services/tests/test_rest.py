@@ -20,14 +20,15 @@ CONFIGURATION = Path(__file__).with_name("schemathesis.toml")
 SERVICES = ("hazard_aggregator", "map_service", "planner")
 
 
-def run_schemathesis(url: str, token: str) -> subprocess.CompletedProcess[str]:
+def run_schemathesis(url: str, token: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """Check a service; `folder` gets what schemathesis keeps between runs."""
     command = [
         sys.executable, "-m", "schemathesis.cli", "--config-file", str(CONFIGURATION), "run", f"{url}/openapi.json",
         "--header", f"Authorization: {token}", "--checks", "all", "--max-examples", EXAMPLES or "2",
         "--phases", "coverage,fuzzing,stateful" if EXAMPLES else "coverage,stateful", "--seed", "1", "--no-shrink",
         "--warnings", "off",
     ]  # fmt: skip
-    return subprocess.run(command, capture_output=True, text=True, check=False)
+    return subprocess.run(command, capture_output=True, text=True, check=False, cwd=folder)
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +55,7 @@ def test_openapi_declares_a_type_for_every_answer_and_a_problem_for_every_error(
 
 
 @pytest.mark.parametrize("service", SERVICES)
-def test_service_answers_as_its_openapi_says(urls, tokens, service):
-    done = run_schemathesis(urls[service], tokens["admin"]["Authorization"])
+def test_service_answers_as_its_openapi_says(urls, tokens, tmp_path, service):
+    done = run_schemathesis(urls[service], tokens["admin"]["Authorization"], tmp_path)
     assert done.returncode == 0, done.stdout
     assert httpx.get(f"{urls[service]}/readyz").json()["missing"] == [], "no request may end a service's readiness"

@@ -1,6 +1,10 @@
-"""The lease's state machine: single steps, and a model of processes with pauses and partitions, and a lossy Redis."""
+"""The lease's state machine: single steps, and a model of processes with pauses and partitions, and a lossy Redis.
+
+`FOGNAV_HISTORIES` sets how many random histories of the model are tried.
+"""
 
 import math
+import os
 
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
@@ -391,5 +395,8 @@ class Cluster(RuleBasedStateMachine):
 
 TestCluster = Cluster.TestCase
 TestCluster.settings = settings(
-    max_examples=30, stateful_step_count=25, deadline=None, suppress_health_check=[HealthCheck.too_slow]
+    max_examples=int(os.environ.get("FOGNAV_HISTORIES", "30")),
+    stateful_step_count=25,
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow],
 )

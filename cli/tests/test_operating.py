@@ -326,7 +326,12 @@ def test_robot_must_be_named_where_there_are_several(service: Service) -> None:
         assert "an id has only a to z" in run("goal", "b", "--robot", "R 2", code=2)
 
 
-@pytest.mark.parametrize("command", ["enable", "disable", "reset"])
+@pytest.mark.parametrize("command", ["disable", "stop"])
+def test_stop_needs_no_key(demo: Service, command: str) -> None:
+    assert "the zenoh router tcp/127.0.0.1:1 can't be reached" in run("robot", command, code=1)
+
+
+@pytest.mark.parametrize("command", ["enable", "reset"])
 def test_signed_command_needs_a_key_and_a_router(demo: Service, tmp_path, monkeypatch, command: str) -> None:
     assert "set FOGNAV_OPERATOR_KEY_FILE to the site's operator.key" in run("robot", command, code=2)
     monkeypatch.setenv("FOGNAV_OPERATOR_KEY_FILE", str(tmp_path / "key"))

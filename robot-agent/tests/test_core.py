@@ -470,7 +470,7 @@ def test_obstacle_that_others_put_on_the_map_is_not_reported(world):
     ],
 )
 def test_command_with_wrong_signature_or_robot_changes_nothing(world, change, word):
-    command = RobotCommand(kind="disable", robot="r1", operator="ann", nonce="n" * 16, issued_at=world.stamp)
+    command = RobotCommand(kind="reset", robot="r1", operator="ann", nonce="n" * 16, issued_at=world.stamp)
     bad = msgspec.structs.replace(sign(command, KEY), **change)
     reply = world.ask(bad)
     assert not reply.accepted
@@ -479,7 +479,7 @@ def test_command_with_wrong_signature_or_robot_changes_nothing(world, change, wo
 
 
 def test_too_old_command_changes_nothing(world):
-    command = RobotCommand(kind="disable", robot="r1", operator="ann", nonce="n" * 16, issued_at=world.stamp - 6.0)
+    command = RobotCommand(kind="enable", robot="r1", operator="ann", nonce="n" * 16, issued_at=world.stamp - 6.0)
     reply = world.ask(sign(command, KEY))
     assert not reply.accepted
     assert "6.0 s old" in reply.reason
@@ -487,9 +487,21 @@ def test_too_old_command_changes_nothing(world):
 
 
 def test_command_is_executed_once(world):
-    command = sign(RobotCommand(kind="disable", robot="r1", operator="ann", nonce="n" * 16, issued_at=world.stamp), KEY)
+    command = sign(RobotCommand(kind="enable", robot="r1", operator="ann", nonce="n" * 16, issued_at=world.stamp), KEY)
     assert world.ask(command).accepted
     assert "already" in world.ask(command).reason
+
+
+@pytest.mark.parametrize("issued_at", [0.0, 1e9, 1e12])
+def test_driving_robot_is_stopped_by_anyone_with_any_clock(world, issued_at):
+    world.drive_to(L_PATH)
+    assert world.run(5.0, lambda w: w.wheels[0] > 0.1)
+    stop = RobotCommand(kind="disable", robot="r1", operator="guest", nonce="n" * 16, issued_at=issued_at)
+    assert world.ask(stop).accepted
+    world.run(0.6)
+    assert world.state().mode == "INIT"
+    assert world.wheels == (0.0, 0.0)
+    assert world.ask(stop).accepted
 
 
 def test_egress_is_refused_with_a_plain_reason(world):

@@ -38,7 +38,7 @@ def drive_through_most_situations(world):
     world.ready()
     world.drive_to(L_PATH)
     world.run(4.0)
-    forged = RobotCommand(kind="disable", robot="r1", operator="eve", nonce="n" * 16, issued_at=world.stamp)
+    forged = RobotCommand(kind="enable", robot="r1", operator="eve", nonce="n" * 16, issued_at=world.stamp)
     assert not world.ask(forged).accepted
     assert not world.ask(sign(forged, log.LOG_KEY)).accepted
     world.block(world.x + 1.5, 1.0, world.x + 2.0, 3.0, solid=True)
@@ -163,7 +163,7 @@ def test_a_log_holds_no_operators_key_and_none_of_its_signatures(drive):
     assert AGENT.operator_key == KEY
     commands = [entry for entry in entries_of(path) if isinstance(entry, log.QueryReceived)]
     kinds = [entry.request["kind"] for entry in commands]
-    assert kinds == ["initial_pose", "enable", "disable", "disable", "reset", "enable", "cancel"]
+    assert kinds == ["initial_pose", "enable", "enable", "enable", "reset", "enable", "cancel"]
     for entry in commands:
         command = msgspec.convert(entry.request, RobotCommand)
         assert command.signature in {b"", sign(command, log.LOG_KEY).signature}

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import msgspec
 import typer
 
+from fog_contracts.commands import STOPS
 from fog_contracts.messages import CommandKind, Pose, RobotPose, RobotState
 from fog_runtime import logs
 from fognav.operate.fog import Fog, RefusedError, find_fog
@@ -157,7 +158,8 @@ async def _command(fog: Fog, robot: str, kind: CommandKind, pose: Pose | None = 
     from fognav.operate.robots import connect  # noqa: PLC0415  # zenoh: keeps the other commands fast
 
     logs.configure("fognav", "error", "text")
-    key = fog.operator_key  # a command that can't be signed is refused before anything is connected
+    # A command that can't be signed is refused before anything is connected; a stop needs no signature.
+    key = None if kind in STOPS else fog.operator_key
     async with connect(fog, robot) as connected:
         return await connected.command(kind, key, pose)
 

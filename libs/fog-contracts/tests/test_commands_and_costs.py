@@ -8,7 +8,7 @@ from hypothesis.extra import numpy as hnp
 from fog_contracts import messages as m
 from fog_contracts.channels import ROBOT_COMMAND
 from fog_contracts.codec import decode, encode
-from fog_contracts.commands import VALID_S, CommandGate, sign
+from fog_contracts.commands import STOPS, VALID_S, CommandGate, sign, unsigned_stop
 from fog_contracts.costs import (
     LETHAL,
     UNKNOWN,
@@ -74,6 +74,22 @@ def test_command_with_wrong_key_or_wrong_robot_is_refused_and_short_key_raises()
     assert "r2" in gate.refusal(sign(command(robot="r2"), KEY), 100.0)
     with pytest.raises(ValueError, match="32 bytes"):
         sign(command(), b"short")
+
+
+@given(stamp=st.floats(0.0, 1e10), kind=st.sampled_from(sorted(STOPS)), signature=st.binary(max_size=64))
+def test_stop_passes_unsigned_repeatedly_and_from_any_clock(stamp, kind, signature):
+    gate = CommandGate("r1", KEY)
+    stop = command(kind=kind, signature=signature)
+    assert gate.refusal(stop, stamp) is None
+    assert gate.refusal(stop, stamp) is None
+    assert "r2" in gate.refusal(command(kind=kind, robot="r2"), stamp)
+
+
+@pytest.mark.parametrize("kind", ["enable", "reset", "initial_pose", "egress"])
+def test_nothing_but_a_stop_may_be_unsigned(kind):
+    with pytest.raises(ValueError, match="must be signed"):
+        unsigned_stop(kind, robot="r1", operator="op", nonce="n" * 16)
+    assert "signature" in CommandGate("r1", KEY).refusal(command(kind=kind), 100.0)
 
 
 def test_nonces_of_expired_commands_are_dropped():

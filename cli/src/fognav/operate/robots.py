@@ -51,8 +51,11 @@ class Robot:
             return None
         return self.state
 
-    async def command(self, kind: CommandKind, key: bytes, pose: Pose | None = None) -> Outcome:
-        """Send a command signed with the operators' `key`; raises `FailedError` when the robot does not answer."""
+    async def command(self, kind: CommandKind, key: bytes | None, pose: Pose | None = None) -> Outcome:
+        """Send a command signed with the operators' `key`; a stop needs none.
+
+        Raises `FailedError` when the robot does not answer.
+        """
         commands = RobotCommands(self._edge, self._clock, operator=getpass.getuser(), key=key)
         try:
             # The timeout is in the clock's seconds, of which more pass in a fast simulation.

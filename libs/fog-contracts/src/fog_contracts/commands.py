@@ -1,4 +1,7 @@
-"""Signing and validation of operators' commands to a robot (HMAC-SHA256 over the encoded command without signature)."""
+"""Signing and validation of operators' commands to a robot (HMAC-SHA256 over the encoded command without signature).
+
+A command that only stops a robot needs no signature: whoever reaches the robot may stop it, with any clock and no key.
+"""
 
 import hmac
 from typing import Final
@@ -10,6 +13,8 @@ from fog_contracts.messages import CommandKind, Pose, RobotCommand
 VALID_S: Final = 5.0
 """Seconds after `issued_at` during which a command is valid."""
 KEY_BYTES: Final = 32
+STOPS: Final[frozenset[CommandKind]] = frozenset({"disable", "cancel"})
+"""Commands that pass unsigned, at any age and repeatedly: a refused stop is worse than an unwanted one."""
 
 
 def _signature(command: RobotCommand, key: bytes) -> bytes:
@@ -22,6 +27,13 @@ def _signature(command: RobotCommand, key: bytes) -> bytes:
 def sign(command: RobotCommand, key: bytes) -> RobotCommand:
     """Return the command with its signature; raises `ValueError` when the key is too short."""
     return msgspec.structs.replace(command, signature=_signature(command, key))
+
+
+def unsigned_stop(kind: CommandKind, *, robot: str, operator: str, nonce: str) -> RobotCommand:
+    """Return a command that stops a robot, for who has no key; raises `ValueError` for any other kind."""
+    if kind not in STOPS:
+        raise ValueError(f"a command to {kind} must be signed with the site's operator key")
+    return RobotCommand(kind=kind, robot=robot, operator=operator, nonce=nonce, issued_at=0.0)
 
 
 def signed_command(  # noqa: PLR0913  # the fields of a command
@@ -45,6 +57,7 @@ def signed_command(  # noqa: PLR0913  # the fields of a command
 class CommandGate:
     """Accepts a command once: for this robot, correctly signed, at most 5 s old, with a nonce that was not used before.
 
+    Of a command that stops the robot only the robot's id is checked.
     A nonce is kept only while its command could still be valid, so the command rate bounds the memory.
     """
 
@@ -54,9 +67,11 @@ class CommandGate:
         self._nonce_expiry: dict[str, float] = {}
 
     def refusal(self, command: RobotCommand, stamp: float) -> str | None:
-        """Return why the command is refused at `stamp`, or None to accept it; each command is accepted at most once."""
+        """Return why the command is refused at `stamp`, or None to accept it; each is accepted once, a stop always."""
         if command.robot != self._robot:
             return f"this robot is {self._robot}, the command is for {command.robot}"
+        if command.kind in STOPS:
+            return None
         if not hmac.compare_digest(command.signature, _signature(command, self._key)):
             return "the signature does not match: sign the command with the site's operator key"
         age = stamp - command.issued_at

@@ -514,7 +514,10 @@ CommandKind = Literal["enable", "disable", "cancel", "egress", "reset", "initial
 
 
 class RobotCommand(Message, frozen=True, kw_only=True):
-    """An operator's command: single-use (`nonce`), valid 5 s from `issued_at`, signed (`fog_contracts.commands`)."""
+    """An operator's command: single-use (`nonce`), valid 5 s from `issued_at`, signed (`fog_contracts.commands`).
+
+    What stops the robot (`disable`, `cancel`) is carried out unsigned, too, and whatever `issued_at` says.
+    """
 
     kind: CommandKind
     robot: Id

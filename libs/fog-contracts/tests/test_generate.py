@@ -68,7 +68,7 @@ def test_field_limits_and_choices_are_those_of_its_values():
 
 
 def test_message_parts_are_found_in_lists_and_unions():
-    assert parts(m.Zone) == list(get_args(m.Shape))
+    assert parts(m.Zone) == [*get_args(m.Shape), m.WeeklySchedule]
     assert parts(m.RobotState) == [m.LoopHealth, m.Trace]
 
 

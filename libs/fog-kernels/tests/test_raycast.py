@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from compiler import examples
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from fog_kernels.raycast import cast
@@ -30,7 +30,12 @@ def walk(occupied: NDArray[np.bool_], x: float, y: float, angle: float, reach: f
 
 
 def box_distance(x: float, y: float, angle: float, column: int, row: int) -> float:
-    """Return the exact distance at which a ray enters a cell; touching its border in one point does not count."""
+    """Return the exact distance at which a ray enters a cell; touching its border in one point does not count.
+
+    A ray that starts in the cell, whose lower borders belong to it, has entered it wherever it goes.
+    """
+    if column <= x < column + 1 and row <= y < row + 1:
+        return 0.0
     dx, dy = math.cos(angle), math.sin(angle)
     enter, leave = 0.0, math.inf
     for start, direction, low in ((x, dx, column), (y, dy, row)):
@@ -44,6 +49,9 @@ def box_distance(x: float, y: float, angle: float, column: int, row: int) -> flo
 
 
 @settings(max_examples=examples(120), deadline=None)
+@example(seed=504, height=1, width=1, x=0.0, y=0.0, angle=2.0, density=0.02).via(
+    "a ray that leaves the cell on whose border it starts"
+)
 @given(
     st.integers(0, 2**32 - 1),
     st.integers(1, 14),

@@ -31,7 +31,9 @@ COMPILED = "libs/fog-kernels"
 MESSAGES = "libs/fog-contracts/src/fog_contracts/messages.py"
 CHANNELS = "libs/fog-contracts/src/fog_contracts/channels.py"
 SHAPES = "libs/fog-contracts/src/fog_contracts/shapes.py"
-ZONE_COMMAND = "cli/src/fognav/zone_command.py"
+DRAWING_COMMANDS = {
+    f"cli/src/fognav/{name}.py" for name in ("area_command", "zone_command", "bench/costmap", "bench/fleet")
+}
 AGGREGATOR = "services/hazard-aggregator/src/hazard_aggregator/core.py"
 MAP_API = "services/map-service/src/map_service/api.py"
 
@@ -252,13 +254,13 @@ def test_zone_shape_is_added_by_its_message_and_its_class(checkout: Path, checke
     assert_passed("shape", checked)
 
 
-def test_only_messages_shapes_and_the_command_that_draws_them_distinguish_kinds_of_shapes() -> None:
+def test_only_messages_shapes_and_the_commands_that_draw_them_distinguish_kinds_of_shapes() -> None:
     names = [kind.__name__ for kind in get_args(Shape)]
     tags = [str(kind.__struct_config__.tag) for kind in get_args(Shape)]
     asking = re.compile(rf"\b({'|'.join(names)})\b|\btype\b\W+({'|'.join(tags)})\b")
     files = [file for source in SOURCES for suffix in ("py", "js") for file in source.parent.rglob(f"*.{suffix}")]
     found = {str(file.relative_to(ROOT)) for file in files if asking.search(file.read_text("utf-8"))}
-    assert found == {MESSAGES, SHAPES, ZONE_COMMAND}
+    assert found == {MESSAGES, SHAPES, *DRAWING_COMMANDS}
 
 
 # --- The document ---------------------------------------------------------------------------------------------------

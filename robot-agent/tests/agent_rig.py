@@ -34,6 +34,7 @@ from fog_contracts.messages import (
     RobotObstacles,
     RobotPath,
     RobotPose,
+    RobotRelease,
     RobotState,
 )
 from fog_contracts.replica import MasterMap
@@ -148,7 +149,16 @@ class Fog:
             released_length=1e3,
             stamp=self.clock.stamp(),
         )
-        self.edge.publish(ch.ROBOT_PATH, path, robot=ROBOT)
+        if self.state is None or self.state.plan_id != path.plan_id or self.state.goal_id != path.goal_id:
+            self.edge.publish(ch.ROBOT_PATH, path, robot=ROBOT)
+        release = RobotRelease(
+            plan_id=path.plan_id,
+            planner_epoch=path.planner_epoch,
+            released_length=path.released_length,
+            map_epoch=version.epoch,
+            map_seq=version.seq,
+        )
+        self.edge.publish(ch.ROBOT_RELEASE, release, robot=ROBOT)
 
     def send_robot_to_the_corner(self) -> None:
         self.points = L_PATH[:3]

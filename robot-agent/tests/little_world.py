@@ -16,7 +16,7 @@ from fog_contracts.commands import sign
 from fog_contracts.costs import Inflation
 from fog_contracts.grid import GridGeometry, Window
 from fog_contracts.handlers import Moment
-from fog_contracts.messages import Pose, RobotCommand, RobotGoal, RobotPath, RobotState, Trace
+from fog_contracts.messages import Pose, RobotCommand, RobotGoal, RobotPath, RobotRelease, RobotState, Trace
 from fog_contracts.replica import MasterMap
 from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.raycast import cast
@@ -214,8 +214,7 @@ class LittleWorld:
         if self.heartbeats_on and self.steps % 10 == 0:
             self.send(ch.MAP_HEARTBEAT, self.master.heartbeat(self.stamp))
         if self.path is not None and self.path_on and self.steps % 50 == 0:
-            self.send(ch.ROBOT_GOAL, self.goal)
-            self.send(ch.ROBOT_PATH, self.path)
+            self._publish_as_planner()
         if self.decide_on and self.steps % 20 == 0 and (job := self.agent.control_job(self.now)) is not None:
             self.agent.accept(decide(job))
         if self.steps % 5 == 0:
@@ -229,6 +228,13 @@ class LittleWorld:
                 self.worst_error = tuple(max(pair) for pair in zip(self.worst_error, self.error(), strict=True))
         if self.steps % 10 == 0:
             self.published.extend(self.agent.tick(self.moment))
+
+    def _publish_as_planner(self):
+        """Publish goal and release, and the path while the robot does not name it."""
+        self.send(ch.ROBOT_GOAL, self.goal)
+        if (self.state().planner_epoch, self.state().plan_id) != (self.path.planner_epoch, self.path.plan_id):
+            self.send(ch.ROBOT_PATH, self.path)
+        self.send(ch.ROBOT_RELEASE, release_of(self.path))
 
     def _move(self):
         left, right = self.wheels
@@ -279,6 +285,12 @@ class LittleWorld:
             self.agent.on_scan(scan, self.now)
             self.beams = []
             self.scan_started = self.now
+
+
+def release_of(path, **changes):
+    """Return the release of a path as it is, with some changes."""
+    fields = {name: getattr(path, name) for name in RobotRelease.__struct_fields__}
+    return RobotRelease(**fields | changes)
 
 
 def trace(area="z4"):

@@ -7,7 +7,7 @@ import math
 import msgspec
 import numpy as np
 import pytest
-from little_world import KEY, L_PATH, START, LittleWorld, trace
+from little_world import KEY, L_PATH, START, LittleWorld, release_of, trace
 
 from fog_contracts import channels as ch
 from fog_contracts.commands import sign
@@ -388,6 +388,23 @@ def test_silent_planner_lets_the_robot_drive_slowly_to_the_released_end(world):
     world.run(25.0)
     assert world.state().mode == "HOLD"
     assert 4.5 < world.x < 5.05
+
+
+def test_releases_of_a_plan_that_the_robot_lacks_do_not_keep_its_older_path_alive(world):
+    world.drive_to(L_PATH)
+    world.run(2.0)
+    assert world.state().mode == "NORMAL"
+    world.path_on = False
+    for _ in range(5):
+        world.send(ch.ROBOT_RELEASE, release_of(world.path, plan_id=2))
+        world.run(0.5)
+    assert world.state().mode == "DEGRADED"
+    assert world.state().plan_id == 1
+    world.send(ch.ROBOT_PATH, msgspec.structs.replace(world.path, plan_id=2))
+    for _ in range(7):
+        world.send(ch.ROBOT_RELEASE, release_of(world.path, plan_id=2))
+        world.run(0.5)
+    assert (world.state().mode, world.state().plan_id) == ("NORMAL", 2)
 
 
 def test_a_decision_for_a_path_that_was_replaced_is_dropped(driving):

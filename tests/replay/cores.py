@@ -188,18 +188,38 @@ def replay_planner(messages: list[RecordedMessage], site: LoadedSite) -> list[Ro
     return [message for message in replay.published if isinstance(message, (RobotPath, RobotGoal))]
 
 
+def before_newer_maps(messages: list[RecordedMessage]) -> list[RecordedMessage]:
+    """Return the messages with each path before the deltas of later versions than its own.
+
+    They are published on channels of their own, and a delta may overtake a path.
+    """
+    ordered: list[RecordedMessage] = []
+    for event in messages:
+        at, channel, ids, path = event
+        newer = len(ordered)
+        if isinstance(path, RobotPath):
+            newer = next((index for index, (*_, m) in enumerate(ordered) if _is_newer(m, path)), newer)
+        ordered.insert(newer, (ordered[newer][0] if newer < len(ordered) else at, channel, ids, path))
+    return ordered
+
+
+def _is_newer(message: Message | str, path: RobotPath) -> bool:
+    return isinstance(message, MapDelta) and message.epoch == path.map_epoch and message.seq > path.map_seq
+
+
 def recompute_plans(messages: list[RecordedMessage], site: LoadedSite) -> list[RobotPath]:
     """Return each recorded plan computed again, from its first point on its map version."""
+    messages = before_newer_maps(messages)
     replay = Replay(messages, site, "planner", messages[0][0])
-    planner, plans, known, goal = new_planner(messages, site, replay), [], 0, None
+    planner, plans, known = new_planner(messages, site, replay), [], 0
+    # A path may be recorded before the goal to which it leads: each is published on a channel of its own.
+    goals = {m.goal_id: m.pose for _, _, _, m in messages if isinstance(m, RobotGoal) and m.pose is not None}
 
     def plan(event: RecordedMessage, at: Moment) -> None:
-        nonlocal known, goal
+        nonlocal known
         message = event[3]
-        if isinstance(message, RobotGoal):
-            goal = message.pose or goal
-        elif isinstance(message, RobotPath) and message.plan_id != known and message.points and goal is not None:
-            known = message.plan_id
+        if isinstance(message, RobotPath) and message.plan_id != known and message.points:
+            known, goal = message.plan_id, goals[message.goal_id]
             x, y = message.points[0]
             request = PlanRequest(start=Pose(x=x, y=y, theta=0.0), goal=goal)
             reply = replay.bus.query(ch.PLANNER_PLAN, request, PlanReply, at)

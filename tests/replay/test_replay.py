@@ -23,7 +23,6 @@ from __future__ import annotations
 import asyncio
 import itertools
 import json
-import math
 import os
 import subprocess
 import sys
@@ -33,11 +32,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import msgspec
+import numpy as np
 import pytest
 from mcap.reader import make_reader
 
 from fog_contracts import channels as ch
-from fog_contracts.geometry import contains_point
+from fog_contracts.geometry import PATH_SPACING_M, sampled
 from fog_contracts.messages import (
     AreaHazard,
     CommandReply,
@@ -64,6 +64,7 @@ from fognav.demo.speed import SpeedWatch
 from fognav.output import WrongUseError
 from fognav.recording import recording, summary
 from fognav.stack import AGENT, MAP_SERVICE, SERVERS, SERVICES, SIMULATOR, WATCHDOG, Stack, StackConfig
+from fognav_sim.drive.hazard import entry_distance
 from robot_agent.agent.replay import replay
 
 if TYPE_CHECKING:
@@ -306,17 +307,16 @@ def test_every_recorded_plan_is_recomputed_point_by_point(recorded, replayed):
     for path in recomputed:
         live = plans[path.plan_id]
         assert (path.map_epoch, path.map_seq, path.refusal) == (live.map_epoch, live.map_seq, None)
-        assert len(path.points) == len(live.points)
-        # Recorded points are rounded to 0.1 mm, including the first one, from which the plan is recomputed.
-        deviation = max(math.dist(a, b) for a, b in zip(path.points, live.points, strict=True))
-        assert deviation < 0.001, path.plan_id
+        points = sampled(np.array(live.points), PATH_SPACING_M)
+        assert len(path.points) == len(points)
+        assert np.hypot(*(np.array(path.points) - points).T).max() < 0.001, path.plan_id
 
 
 def test_replayed_planner_replans_around_the_blocked_area_for_the_recorded_hazard(recorded, replayed):
     area = next(area for area in load_site(SITE).site.areas if area.id == recorded.blocked)
 
     def crosses(path: RobotPath) -> bool:
-        return any(contains_point(area.polygon, *point) for point in path.points)
+        return entry_distance(path.points, area.polygon) is not None
 
     live = recorded.of(ch.ROBOT_PATH)
     replay_paths = [

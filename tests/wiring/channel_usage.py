@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 ROOT: Final = Path(__file__).parents[2]
 SIDES: Final = {
     "subscribe": "subscribers", "latest": "subscribers", "on": "subscribers",
-    "query": "subscribers", "_query": "subscribers",
+    "query": "subscribers", "_query": "subscribers", "on_message": "subscribers",
     "publish": "publishers", "publish_nowait": "publishers", "Will": "publishers", "serve": "publishers",
 }  # fmt: skip
 """Which side of a channel's row a call belongs to, by the name of what is called."""

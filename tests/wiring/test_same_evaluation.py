@@ -44,7 +44,7 @@ _spec.loader.exec_module(ring)
 
 SEED = 3
 INSIDE_Z1 = (7.5, 1.5)
-OBSERVED = (ch.SIM_TRUTH, ch.ROBOT_STATE, ch.ROBOT_PATH)
+OBSERVED = (ch.SIM_TRUTH, ch.ROBOT_STATE, ch.ROBOT_PATH, ch.ROBOT_RELEASE)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from prometheus_client import REGISTRY
 
 from fog_contracts import channels as ch
 from fog_contracts import messages as m
-from fog_contracts.codec import ContractError
+from fog_contracts.codec import ContractError, encode
 from fog_contracts.handlers import RefusedMessageError
 from fog_runtime.clock import SystemClock
 from fog_runtime.reply_parts import PART_BYTES, decode_announcement
@@ -63,6 +63,10 @@ def zones(seq):
 
 def counter(name, channel):
     return REGISTRY.get_sample_value(name, {"channel": channel.name}) or 0.0
+
+
+def bytes_of(channel, direction):
+    return REGISTRY.get_sample_value("fognav_bytes_total", {"channel": channel.name, "direction": direction}) or 0.0
 
 
 async def publish_until(publisher, channel, make, condition, failure, **ids):
@@ -399,3 +403,25 @@ async def test_large_reply_without_flow_control_is_only_announced(router):
             assert b"ask again" in bytes((await fetch(announced.reply[:-1] + "x", "0")).err.payload)
             selector = zenoh.Selector(key, {"reply": "of-another-process", "part": "0"})
             assert not await asyncio.to_thread(lambda: list(session.get(selector))), "which may answer it"
+
+
+async def test_bytes_of_messages_requests_and_replies_are_counted_by_channel_and_direction(router):
+    async with edge(router.endpoint, "a") as a, edge(router.endpoint, "b") as b:
+        got = []
+        b.subscribe(ch.ZONES, m.ZoneSet, lambda _, message: got.append(message))
+        a.serve(ch.PLANNER_PLAN, lambda _, request: m.PlanReply(length=request.goal.x))
+        await query_until_answered(b, 4.0)
+        before = {(c, d): bytes_of(c, d) for c in (ch.ZONES, ch.PLANNER_PLAN) for d in ("sent", "received")}
+        a.publish(ch.ZONES, zones(1))
+        await until(lambda: got, "no message")
+        request, reply = plan(3.0), m.PlanReply(length=3.0)
+        assert await b.query(ch.PLANNER_PLAN, request, m.PlanReply, 5.0) == reply
+        both = len(encode(ch.PLANNER_PLAN, request)) + len(encode(ch.PLANNER_PLAN, reply, reply=True))
+        counted = {key: bytes_of(*key) - count for key, count in before.items()}
+        message = len(encode(ch.ZONES, zones(1)))
+        assert counted == {
+            (ch.ZONES, "sent"): message,
+            (ch.ZONES, "received"): message,
+            (ch.PLANNER_PLAN, "sent"): both,
+            (ch.PLANNER_PLAN, "received"): both,
+        }

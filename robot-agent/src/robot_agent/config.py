@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
-from fog_contracts.channels import MAP_HEARTBEAT, ROBOT_PATH
+from fog_contracts.channels import MAP_HEARTBEAT, ROBOT_RELEASE
 from fog_contracts.costs import DEFAULT_INFLATION, DEGRADED_SPEED, ROBOT_RADIUS, Inflation
 from fog_kernels.dwa import DwaLimits, DwaSettings
 from robot_agent.hardware import DriveTrain  # noqa: TC001  # read at run time, when a configuration is decoded
@@ -41,7 +41,7 @@ class SafetyConfig:
     map_late: float = MAP_HEARTBEAT.max_age_s
     map_lost: float = 3.0
     gap_lost: float = 1.0
-    plan_late: float = ROBOT_PATH.max_age_s
+    plan_late: float = ROBOT_RELEASE.max_age_s
     released_end: float = 0.15
     """With less released path ahead (m) the robot has come to its end, within the goal tolerance."""
     lidar_lost: float = 0.3

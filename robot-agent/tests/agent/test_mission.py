@@ -1,9 +1,15 @@
 from __future__ import annotations
 
 import msgspec
+import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from fog_contracts.messages import Pose, Refusal, RobotGoal, RobotPath
+from fog_contracts import channels as ch
+from fog_contracts.bus import roundtrip
+from fog_contracts.geometry import PATH_SPACING_M, sampled
+from fog_contracts.messages import Pose, Refusal, RobotGoal, RobotPath, RobotRelease
 from robot_agent.agent.mission import Mission
 
 GOAL = RobotGoal(goal_id="g1", pose=Pose(x=5.0, y=0.0, theta=0.0))
@@ -42,12 +48,58 @@ def test_planner_age_counts_from_its_last_new_goal_or_path(mission):
     assert mission.planner_age(10.0) == 6.5
 
 
-def test_an_extension_releases_more_of_the_path_and_keeps_the_progress(mission):
+def release(path=PATH, **changes):
+    fields = {name: getattr(path, name) for name in RobotRelease.__struct_fields__}
+    return RobotRelease(**fields | changes)
+
+
+@pytest.mark.parametrize("repeated", [False, True])
+def test_a_release_extends_the_path_as_its_repetition_does_and_keeps_the_progress(mission, repeated):
     mission.follower.advance(1.0, 0.0, 2.0)
     follower = mission.follower
-    assert not mission.on_path(changed(PATH, released_length=4.0), 3.0)
+    if repeated:
+        assert not mission.on_path(changed(PATH, released_length=4.0, map_seq=9), 3.0)
+    else:
+        mission.on_release(release(released_length=4.0, map_seq=9), 3.0)
     assert mission.follower is follower
     assert follower.released_remaining == pytest.approx(3.0)
+    assert (mission.path.released_length, mission.path.map_seq) == (4.0, 9)
+    assert mission.planner_age(4.0) == 1.0
+
+
+@pytest.mark.parametrize("other", [{"plan_id": 4}, {"plan_id": 6}, {"planner_epoch": 4}])
+def test_a_release_of_a_path_that_the_robot_lacks_extends_nothing_and_keeps_nothing_alive(mission, other):
+    mission.on_release(release(released_length=4.0, **other), 3.0)
+    assert mission.follower.released == 2.0
+    assert mission.path is PATH
+    assert mission.planner_age(4.0) == 2.0
+    mission.drop_path()
+    mission.on_release(release(**other), 5.0)
+    assert (mission.path, mission.planner_age(6.0)) == (None, 5.0)
+
+
+def test_a_release_keeps_a_refusal_alive(mission):
+    refusal = changed(PATH, plan_id=6, points=[], refusal=Refusal(code=208, reason="cut off", causes=[]))
+    mission.on_path(refusal, 3.0)
+    mission.on_release(release(refusal, map_seq=3, released_length=0.0), 9.0)
+    assert (mission.follower, mission.path.map_seq, mission.planner_age(9.5)) == (None, 3, 0.5)
+
+
+METRES = st.floats(-20, 20)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.lists(st.tuples(METRES, METRES), min_size=1, max_size=5))
+def test_the_followed_line_is_the_planners_to_the_last_bit(corners):
+    sent = roundtrip(ch.ROBOT_PATH, changed(PATH, points=corners))
+    mission = Mission()
+    mission.on_goal(GOAL, 1.0)
+    mission.on_path(sent, 2.0)
+    points = mission.follower.points
+    assert points.tolist() == sampled(np.array(corners), PATH_SPACING_M).tolist()
+    steps = np.hypot(*np.diff(points, axis=0).T)
+    assert steps.max(initial=0.0) <= PATH_SPACING_M + 1e-9
+    assert {tuple(corner) for corner in corners} <= {tuple(point) for point in points.tolist()}
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from fog_contracts import channels as ch
 from fog_contracts.costs import DEFAULT_INFLATION
 from fog_contracts.grid import GridGeometry
 from fog_contracts.handlers import Moment
-from fog_contracts.messages import PointXY, RectangleShape, Refusal, Trace, Zone, ZoneSet
+from fog_contracts.messages import PointXY, RectangleShape, Refusal, RobotRelease, Trace, Zone, ZoneSet
 from fog_contracts.replica import MapError, Version
 from fog_contracts.shapes import rasterize_shape
 from fog_kernels.astar import Planner
@@ -251,8 +251,32 @@ def test_goal_and_path_are_published_at_once_and_again_after_their_periods() -> 
     soon, later = Moment(100.4, 5000.4), Moment(101.01, 5001.01)
     assert published(mission, soon) == (None, None)
     assert all(published(mission, later))
-    mission.publish_path_now()
-    assert published(mission, later)[1]
+    mission.received = (7, 1)
+    mission.replace_refusal(refuse(208, "cut by z1"))
+    assert published(mission, later)[1], "a changed refusal is published although the robot has the plan"
+    assert published(mission, Moment(109.0, 5009.0))[1] is None
+
+
+def test_release_is_published_at_its_period_at_once_on_request_and_never_before_the_path() -> None:
+    mission = Mission()
+    mission.begin(goal(*RIGHT), any_heading=True)
+    mission.plan = plan(LEFT, (1.0, 9.0), (9.0, 9.0))
+
+    def release(now: float) -> RobotRelease | None:
+        return mission.due_release(Moment(now, 5000.0 + now), CONFIG, 7, Version(1, 2, 3))
+
+    assert release(100.0) is None
+    assert mission.due_path(NOW, CONFIG, 7, Version(1, 1, 3))
+    assert release(100.4) is None
+    found = release(100.5)
+    assert found == RobotRelease(
+        plan_id=1, planner_epoch=7, released_length=pytest.approx(10.0), map_epoch=1, map_seq=2
+    )
+    assert release(100.9) is None
+    mission.release_now()
+    assert release(100.9)
+    mission.end()
+    assert release(102.0) is None
 
 
 def test_traces_are_stamped_when_the_path_is_first_published_and_never_again() -> None:

@@ -29,6 +29,7 @@ from fog_contracts.messages import (
     RobotGoal,
     RobotPath,
     RobotPose,
+    RobotState,
     Zone,
     ZoneSet,
 )
@@ -187,20 +188,34 @@ class Fleet:
         for _ in range(4):
             self.now += _QUIET_S / 4
             self._refresh()
-            self.core.tick(self._moment)
+            self._receive(self.core.tick(self._moment))
             run_jobs(self.core, self._moment)
         self.now += 0.1
         self._refresh()
-        self.core.tick(self._moment)
+        self._receive(self.core.tick(self._moment))
+
+    def _receive(self, publications: Sequence[Publication]) -> None:
+        """Let robots name the paths that they receive in their states: the planner then does not repeat them."""
+        for publication in publications:
+            path = publication.message
+            if isinstance(path, RobotPath):
+                state = RobotState(
+                    mode="NORMAL", reasons=[], enabled=True, battery=None, goal_id=path.goal_id,
+                    map_epoch=path.map_epoch, map_seq=path.map_seq, plan_id=path.plan_id,
+                    planner_epoch=path.planner_epoch,
+                )  # fmt: skip
+                self._deliver(ch.ROBOT_STATE, state, **publication.ids)
 
     def trial(self, deltas: Sequence[MapDelta], hazard: HazardArea) -> Times:
         """Deliver a change of the map; return when each robot had its answer."""
         times, answered = Times(), set[str]()
+        sent: list[Publication] = []
         self.now += 0.1
         self._refresh()
         begun = time.perf_counter()
 
         def send(publications: Sequence[Publication]) -> None:
+            sent.extend(publications)
             for publication in publications:
                 message = publication.message
                 if not isinstance(message, RobotPath):
@@ -217,6 +232,7 @@ class Fleet:
         run_jobs(self.core, self._moment)
         run_cycle(self.core, self._moment, send)
         times.explained = 1000.0 * (time.perf_counter() - begun)
+        self._receive(sent)
         return times
 
 

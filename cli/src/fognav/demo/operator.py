@@ -16,6 +16,7 @@ from fog_contracts.messages import (
     RobotObstacles,
     RobotPath,
     RobotPose,
+    RobotRelease,
     RobotState,
     SimCommand,
     SimTruth,
@@ -60,6 +61,7 @@ class Operator:
         edge.subscribe(ch.ROBOT_POSE, RobotPose, self._on_pose, **robot)
         edge.subscribe(ch.ROBOT_STATE, RobotState, self._on_state, **robot)
         edge.subscribe(ch.ROBOT_PATH, RobotPath, self._on_path, **robot)
+        edge.subscribe(ch.ROBOT_RELEASE, RobotRelease, self._on_release, **robot)
         edge.subscribe(ch.ROBOT_GOAL, RobotGoal, self._on_goal, **robot)
         edge.subscribe(ch.ROBOT_OBSTACLES, RobotObstacles, self._on_obstacles, **robot)
         edge.subscribe(ch.SIM_TRUTH, SimTruth, self._on_truth, **robot)
@@ -100,6 +102,10 @@ class Operator:
         self._scene.traces.update(path.traces)
         if self.drive is not None:
             self.drive.on_path(path, self._clock.now())
+
+    def _on_release(self, _ids: Mapping[str, str], release: RobotRelease) -> None:
+        if self._scene.path is not None:
+            self._scene.path = self._scene.path.after(release)
 
     def _on_hazard(self, ids: Mapping[str, str], hazard: HazardArea) -> None:
         area, state = ids["area"], hazard.hazard.state

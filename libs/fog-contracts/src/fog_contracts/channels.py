@@ -216,6 +216,8 @@ PLANNER_EGRESS    = _query("planner_egress",    FOG + "planner/egress",         
 ROBOT_GOAL        = _pub(  "robot_goal",        FOG + "robots/{robot}/goal",      m.RobotGoal,      limit=KIB,
     publishers=(PLANNER,), subscribers=(ROBOT, CONSOLE),   durability=VOLATILE, rate_hz=1, epoch="planner_epoch")
 ROBOT_PATH        = _pub(  "robot_path",        FOG + "robots/{robot}/path",      m.RobotPath,      limit=MIB,
+    publishers=(PLANNER,), subscribers=(ROBOT, CONSOLE),   durability=LATEST, epoch="planner_epoch")
+ROBOT_RELEASE     = _pub(  "robot_release",     FOG + "robots/{robot}/release",   m.RobotRelease,   limit=128,
     publishers=(PLANNER,), subscribers=(ROBOT, CONSOLE),   durability=VOLATILE, rate_hz=2, max_age_s=1.5,
     epoch="planner_epoch")
 ROBOT_POSE        = _pub(  "robot_pose",        FOG + "robots/{robot}/pose",      m.RobotPose,      limit=KIB,

@@ -1,5 +1,6 @@
-"""Plane geometry of areas and zones: polygons as sequences of (x, y) in metres, frame `map`."""
+"""Plane geometry of areas, zones and paths: polygons as sequences of (x, y), lines as arrays, metres, frame `map`."""
 
+import itertools
 import math
 from collections.abc import Sequence
 from typing import Final
@@ -11,12 +12,24 @@ Point = tuple[float, float]
 Polygon = Sequence[Point]
 _Floats = NDArray[np.float64]
 
+PATH_SPACING_M: Final = 0.10
+"""How far apart the points of a path are, where it is followed or checked point by point."""
 _COLLINEAR: Final = 1e-12
 """Twice a triangle's area, relative to the square of its size, below which its sign is only rounding."""
 
 
 class GeometryError(ValueError):
     """A shape is invalid; the message says what is wrong."""
+
+
+def sampled(corners: _Floats, spacing: float) -> _Floats:
+    """Return the polyline through the corners (n, 2) as points (m, 2) at most `spacing` apart, all corners included."""
+    parts: list[_Floats] = [corners[:1]]
+    for a, b in itertools.pairwise(corners):
+        count = max(1, math.ceil(math.hypot(*(b - a)) / spacing))
+        fraction = np.arange(1, count)[:, None] / count
+        parts += [a + fraction * (b - a), b[None, :]]
+    return np.concatenate(parts)
 
 
 def signed_area(polygon: Polygon) -> float:

@@ -7,6 +7,7 @@ people. Freshness is never computed from them but from the receiver's own monoto
 from typing import Annotated, Any, Final, Literal
 
 from msgspec import Meta, Struct
+from msgspec.structs import replace
 
 from fog_contracts.costs import PENALTY_FACTOR_MAX
 
@@ -414,11 +415,25 @@ class RobotGoal(Message, frozen=True, kw_only=True):
     planner_epoch: Count = 0
 
 
-class RobotPath(Message, frozen=True, kw_only=True):
-    """The path to the goal, or why there is none.
+class RobotRelease(Message, frozen=True, kw_only=True):
+    """How much of a path the robot may drive (m), twice a second: the path is still good on this version of the map.
 
-    The robot may drive the first `released_length` metres of `points` without hearing from the planner again; the
-    planner publishes the same `plan_id` again with more of it released while all is well.
+    It keeps the path of this plan alive, and no other: a robot that does not have it hears nothing from its planner.
+    """
+
+    plan_id: Count
+    planner_epoch: Count
+    released_length: Annotated[float, Meta(ge=0.0, le=1e6, extra={"unit": "m"})]
+    map_epoch: Count
+    map_seq: Count
+
+
+class RobotPath(Message, frozen=True, kw_only=True):
+    """The path to the goal, or why there is none; published once per plan, and again until the robot names its plan.
+
+    `points` are the corners, joined by straight lines (`fog_contracts.geometry.sampled` puts points between them). The
+    robot may drive the first `released_length` metres without hearing from the planner again; `RobotRelease` extends
+    that while all is well.
     """
 
     plan_id: Count
@@ -432,6 +447,17 @@ class RobotPath(Message, frozen=True, kw_only=True):
     refusal: Refusal | None = None
     traces: list[Trace] = []
     stamp: Stamp = 0.0
+
+    def after(self, release: RobotRelease) -> "RobotPath":
+        """Return the path with a release of its plan; that of another plan changes nothing."""
+        if (release.planner_epoch, release.plan_id) != (self.planner_epoch, self.plan_id):
+            return self
+        return replace(
+            self,
+            released_length=release.released_length,
+            map_epoch=release.map_epoch,
+            map_seq=release.map_seq,
+        )
 
 
 # --- Robot (zenoh, msgpack) -----------------------------------------------------------------------------------------

@@ -1,7 +1,7 @@
 """Prometheus metrics common to all processes; CPU and memory come from prometheus-client's process collector."""
 
 from collections.abc import Collection
-from typing import Final
+from typing import Final, Literal
 
 from prometheus_client import (
     CONTENT_TYPE_LATEST,
@@ -39,6 +39,11 @@ UNPUBLISHABLE: Final = Counter(
 )
 RECEIVED: Final = Counter("fognav_received_messages_total", "Messages received and decoded", ["channel"])
 PUBLISHED: Final = Counter("fognav_published_messages_total", "Messages published", ["channel"])
+BYTES: Final = Counter(
+    "fognav_bytes_total",
+    "Bytes of zenoh messages, requests and replies, without keys and headers; direction: sent, received",
+    ["channel", "direction"],
+)
 DROPPED: Final = Counter(
     "fognav_dropped_messages_total", "Messages dropped without a connection or because a queue was full", ["channel"]
 )
@@ -56,6 +61,11 @@ BUILD: Final = Info("fognav_build", "Which code runs: its version, and its revis
 BUILD.info({"version": VERSION, "revision": REVISION})
 CONNECTED: Final = Gauge("fognav_connected", "Whether the connection is up (1) or down (0)", ["transport"])
 CONNECTIONS: Final = Counter("fognav_connections_total", "Connections established", ["transport"])
+
+
+def count_bytes(channel: str, direction: Literal["sent", "received"], size: int) -> None:
+    """Count the bytes of a payload."""
+    BYTES.labels(channel, direction).inc(size)
 
 
 def observe_trace(trace: Trace, stages: Collection[str] = tuple(SPANS)) -> None:

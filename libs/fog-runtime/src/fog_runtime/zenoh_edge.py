@@ -98,16 +98,20 @@ class _Publisher:
         else:
             self._put = session.declare_publisher(self._key, congestion_control=drop).put
         while self._pending:
-            self._put(self._pending.popleft())
+            self._send(self._put, self._pending.popleft())
 
     def put(self, data: bytes) -> None:
         if self._put is not None:
-            self._put(data)
-            metrics.PUBLISHED.labels(self._channel.name).inc()
+            self._send(self._put, data)
         elif self._depth:
             self._pending.append(data)
         else:
             metrics.DROPPED.labels(self._channel.name).inc()
+
+    def _send(self, put: Callable[[bytes], object], data: bytes) -> None:
+        put(data)
+        metrics.PUBLISHED.labels(self._channel.name).inc()
+        metrics.count_bytes(self._channel.name, "sent", len(data))
 
 
 class _Subscription(Generic[M]):
@@ -144,6 +148,7 @@ class _Subscription(Generic[M]):
             return
         key = str(sample.key_expr)
         size = len(sample.payload)
+        metrics.count_bytes(self._channel.name, "received", size)
         if size > self._channel.limit:
             self._edge.refuse(self._channel, key, f"{size} bytes are over the limit of {self._channel.limit}")
             return
@@ -253,6 +258,7 @@ class _Queryable:
                 await self._edge.in_thread(partial(query.reply, self._key, b"", attachment=announcement))
             else:
                 await self._edge.in_thread(partial(query.reply, self._key, data))
+                metrics.count_bytes(self._channel.name, "sent", len(data))
             metrics.ANSWERED.labels(self._channel.name).inc()
         finally:
             self._pending -= 1
@@ -266,12 +272,14 @@ class _Queryable:
             await self._edge.in_thread(partial(query.reply_err, GONE))
         else:
             await self._edge.in_thread(partial(query.reply, self._key, part))
+            metrics.count_bytes(self._channel.name, "sent", len(part))
 
     def _request(self, query: zenoh.Query) -> Message | None:
         if self._channel.kind != "query" or self._channel.message is None:
             return None
         payload = query.payload
         size = 0 if payload is None else len(payload)
+        metrics.count_bytes(self._channel.name, "received", size)
         if size > self._channel.limit:
             raise ContractError(self._channel.name, f"{size} bytes are over the limit of {self._channel.limit}")
         return decode(self._channel, b"" if payload is None else payload.to_bytes(), self._channel.message)
@@ -384,6 +392,8 @@ class ZenohEdge:
         if session is None:
             return None
         result = await ask(self, session, channel, key, data, max(0.001, self._clock.real(timeout_s)))
+        metrics.count_bytes(channel.name, "sent", len(data or b""))
+        metrics.count_bytes(channel.name, "received", len(result or b""))
         return None if result is None else decode(channel, result, kind, reply=channel.kind == "query")
 
     def serve(self, channel: Channel, handler: Callable[[Ids, Any], Answer], **ids: str) -> None:

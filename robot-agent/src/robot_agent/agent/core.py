@@ -46,6 +46,7 @@ if TYPE_CHECKING:
         RobotObstacles,
         RobotPath,
         RobotPose,
+        RobotRelease,
         RobotState,
         Trace,
     )
@@ -94,6 +95,7 @@ class AgentCore:
                 **self._places.handlers(),
                 ch.ROBOT_GOAL: self._on_goal,
                 ch.ROBOT_PATH: self._on_path,
+                ch.ROBOT_RELEASE: self._on_release,
             }
         )
 
@@ -116,6 +118,10 @@ class AgentCore:
 
     def _on_path(self, _ids: Ids, path: RobotPath, at: Moment) -> Sequence[Publication]:
         self._driving.on_path(path, self._localizer.pose(at.now), self.replica, at)
+        return ()
+
+    def _on_release(self, _ids: Ids, release: RobotRelease, at: Moment) -> Sequence[Publication]:
+        self._driving.on_release(release, self.replica, at.now)
         return ()
 
     def _on_command(self, _ids: Ids, command: RobotCommand, at: Moment) -> CommandReply:

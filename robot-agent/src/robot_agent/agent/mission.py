@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from fog_contracts.geometry import PATH_SPACING_M, sampled
 from robot_agent.motion.path_follower import PathFollower
 
 if TYPE_CHECKING:
-    from fog_contracts.messages import RobotGoal, RobotPath
+    from fog_contracts.messages import RobotGoal, RobotPath, RobotRelease
 
 _NEVER: Final = -math.inf
 
@@ -58,7 +59,7 @@ class Mission:
         return None if self.path is None else (self.path.planner_epoch, self.path.plan_id)
 
     def planner_age(self, now: float) -> float:
-        """Return the age (s) of the planner's last message about this goal; infinite without one."""
+        """Return the age (s) of the planner's last word on goal, path or refusal; infinite without one."""
         return now - max(self._path_at, self._goal_at)
 
     def on_goal(self, goal: RobotGoal, now: float) -> bool:
@@ -74,7 +75,7 @@ class Mission:
         return True
 
     def on_path(self, path: RobotPath, now: float) -> bool:
-        """Handle a path, its extension or a refusal; return whether a new path is followed from now on.
+        """Handle a path, the same one again or a refusal; return whether a new path is followed from now on.
 
         A path for another goal, or older than the current one, is ignored.
         """
@@ -90,8 +91,17 @@ class Mission:
         if new == current and self.follower is not None:
             self.follower.release(path.released_length)
             return False
-        self.follower = PathFollower(np.array(path.points, dtype=np.float64), path.released_length)
+        corners = np.array(path.points, dtype=np.float64)
+        self.follower = PathFollower(sampled(corners, PATH_SPACING_M), path.released_length)
         return True
+
+    def on_release(self, release: RobotRelease, now: float) -> None:
+        """Extend the path; the release of one that the robot does not have keeps nothing alive."""
+        if self.path is None or self.path_id != (release.planner_epoch, release.plan_id):
+            return
+        self.path, self._path_at = self.path.after(release), now
+        if self.follower is not None:
+            self.follower.release(release.released_length)
 
     def reach(self) -> None:
         """Record that the robot has reached its goal."""

@@ -14,7 +14,7 @@ from robot_agent.motion.local_planner import make_job, twist
 
 if TYPE_CHECKING:
     from fog_contracts.handlers import Moment
-    from fog_contracts.messages import RobotGoal, RobotPath
+    from fog_contracts.messages import RobotGoal, RobotPath, RobotRelease
     from fog_contracts.replica import Replica
     from robot_agent.config import AgentConfig
     from robot_agent.guardian.link import WheelCommand
@@ -45,7 +45,7 @@ class PathDriving:
             self._stop_following()
 
     def on_path(self, path: RobotPath, pose: Pose2 | None, replica: Replica, at: Moment) -> None:
-        """Follow a new path from where the robot is, extend the current one, or record a refusal."""
+        """Follow a new path from where the robot is, extend the current one that is repeated, or record a refusal."""
         mission = self.mission
         if mission.on_path(path, at.now):
             if pose is not None and mission.follower is not None:
@@ -53,6 +53,11 @@ class PathDriving:
             self.traces.begin(path.traces, at.stamp)
             self._monitor.begin()
         self.check_path(replica, at.now)
+
+    def on_release(self, release: RobotRelease, replica: Replica, now: float) -> None:
+        """Extend the path that the planner releases."""
+        self.mission.on_release(release, now)
+        self.check_path(replica, now)
 
     def check_path(self, replica: Replica, now: float) -> None:
         """Look for blockages along the path; call it whenever the map may have changed."""

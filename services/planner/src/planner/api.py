@@ -66,7 +66,7 @@ class GoalView(Message, frozen=True, kw_only=True):
 
 
 class PlanView(Message, frozen=True, kw_only=True):
-    """The current plan: version, number of points, released length (m), or refusal."""
+    """The current plan: version, number of corners, released length (m), or refusal."""
 
     plan_id: int
     map_epoch: int

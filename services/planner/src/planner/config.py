@@ -2,8 +2,9 @@
 
 from dataclasses import dataclass
 
-from fog_contracts.channels import MAP_HEARTBEAT, ROBOT_GOAL, ROBOT_PATH, ROBOT_POSE
+from fog_contracts.channels import MAP_HEARTBEAT, ROBOT_GOAL, ROBOT_POSE, ROBOT_RELEASE
 from fog_contracts.costs import DEFAULT_INFLATION, Inflation
+from fog_contracts.geometry import PATH_SPACING_M
 
 
 @dataclass(frozen=True)
@@ -21,10 +22,12 @@ class PlannerConfig:
     """Farther from its path, a robot gets a new one."""
     escape_distance: float = 0.5
     """How far a robot on an impassable cell may be from the nearest traversable one."""
-    point_spacing: float = 0.10
+    point_spacing: float = PATH_SPACING_M
     release_length: float = 15.0
     """How far ahead the path is released: the robot may drive this far without a message from the planner."""
-    republish_s: float = ROBOT_PATH.period_s
+    release_period_s: float = ROBOT_RELEASE.period_s
+    path_retry_s: float = 1.0
+    """How often a path is published again while the robot's state does not name its plan."""
     goal_republish_s: float = ROBOT_GOAL.period_s
     max_pose_age_s: float = 3.0 * ROBOT_POSE.max_age_s
     """Nothing is planned for a robot whose last pose is older: it is disconnected.

@@ -21,6 +21,7 @@ from fog_contracts.handlers import Publication
 from planner.blocked_regions import BlockedRegions, cover
 from planner.config import PlannerConfig
 from planner.goal_fields import FieldJob, GoalFields
+from planner.mission import received_path
 from planner.missions import Missions
 from planner.path_monitor import effect_of_change, reason_from_pose
 from planner.planning_map import MapTracker
@@ -124,6 +125,7 @@ class PlannerCore:
         return ()
 
     def _on_state(self, ids: Ids, state: RobotState, _at: Moment) -> Sequence[Publication]:
+        self.missions.of(ids["robot"]).received = received_path(state)
         if state.goal_reached and state.goal_id is not None:
             self.missions.reach(ids["robot"], state.goal_id)
         elif state.goal_id is not None and self._knows_missions:
@@ -209,7 +211,7 @@ class PlannerCore:
         return [publication for robot, _ in self.missions.items() for publication in self.publish_for(robot, at)]
 
     def publish_for(self, robot: str, at: Moment) -> Sequence[Publication]:
-        """Return the goal, and the path or refusal, of one robot, as far as they are due."""
+        """Return the goal, the path or refusal, and the release of one robot, as far as they are due."""
         mission, planning_map, ids = self.missions.of(robot), self._map.current, {"robot": robot}
         publications: list[Publication] = []
         if (goal := mission.due_goal(at, self.config, self.epoch)) is not None:
@@ -218,6 +220,8 @@ class PlannerCore:
             return publications
         if (path := mission.due_path(at, self.config, self.epoch, planning_map.version)) is not None:
             publications.append(Publication(ch.ROBOT_PATH, path, ids))
+        if (release := mission.due_release(at, self.config, self.epoch, planning_map.version)) is not None:
+            publications.append(Publication(ch.ROBOT_RELEASE, release, ids))
         return publications
 
     # --- Jobs: run on other threads ---------------------------------------------------------------------------------
@@ -245,8 +249,8 @@ class PlannerCore:
             refusal = job.answers.get(robot)
             mission = self.missions.of(robot)
             if refusal is not None and mission.plan is plan and refusal != plan.refusal:
-                plan.refusal, changed = refusal, True
-                mission.publish_path_now()
+                mission.replace_refusal(refusal)
+                changed = True
         return changed
 
     def _explain_job(self, at: Moment, planning_map: PlanningMap) -> ExplainJob | None:

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Literal
 
 from msgspec import structs
 
-from fog_contracts.messages import PointXY, Refusal, RobotGoal, RobotPath, RobotPose, Trace
+from fog_contracts.messages import PointXY, Refusal, RobotGoal, RobotPath, RobotPose, RobotRelease, Trace
 from planner.switch_limiter import SwitchLimiter
 
 if TYPE_CHECKING:
     from fog_contracts.handlers import Moment
-    from fog_contracts.messages import Pose
+    from fog_contracts.messages import Pose, RobotState
     from fog_contracts.replica import Version
     from planner.config import PlannerConfig
     from planner.path_search import Question
@@ -24,6 +24,8 @@ ReplanReason = Literal["goal", "map", "epoch", "off_path", "clearing", "refused"
 
 
 Explained = tuple["Version", int]
+PathId = tuple[int, int]
+"""Identity of a path: the planner's epoch and the plan's number."""
 
 
 @dataclass
@@ -39,9 +41,15 @@ class Plan:
     """What the refusal leaves open."""
     progress: float = 0.0
     published: bool = False
+    path_due: float = -math.inf
+    """When the path, or refusal, is published next, unless the robot has it: -inf for one that is new or changed."""
     explained_at: float = -math.inf
     explained_for: Explained | None = None
     """The versions of map and regions for which the refusal was last explained."""
+
+    def released_length(self, config: PlannerConfig) -> float:
+        """Return how much of the path (m) the robot may drive; 0 for a refusal."""
+        return min(self.route.length, self.progress + config.release_length) if self.route else 0.0
 
 
 @dataclass
@@ -64,7 +72,9 @@ class Mission:
     """When a search was last repeated after a refusal."""
     switches: SwitchLimiter = field(default_factory=SwitchLimiter)
     goal_due: float = math.inf
-    path_due: float = -math.inf
+    release_due: float = -math.inf
+    received: PathId | None = None
+    """The path that the robot has, by its last state."""
 
     @property
     def target(self) -> Pose | None:
@@ -124,9 +134,14 @@ class Mission:
         """Whether the path must not be published again before its replan."""
         return self.replan not in (None, "clearing", "refused")
 
-    def publish_path_now(self) -> None:
-        """Make the path due, new or kept: it was compared with the newest map."""
-        self.path_due = -math.inf
+    def release_now(self) -> None:
+        """Make the release of the path due, new or kept: it was compared with the newest map."""
+        self.release_due = -math.inf
+
+    def replace_refusal(self, refusal: Refusal) -> None:
+        """Publish another wording of the plan's refusal."""
+        assert self.plan is not None
+        self.plan.refusal, self.plan.path_due = refusal, -math.inf
 
     def end_unknown(self, goal_id: str) -> None:
         """End a goal that the robot has and nobody stored any more: it was cancelled, or replaced, unheard by it."""
@@ -140,8 +155,10 @@ class Mission:
         self.traces = []
 
     def publish_all_now(self) -> None:
-        """Make goal and path due."""
-        self.goal_due = self.path_due = -math.inf
+        """Make goal, path and release due."""
+        self.goal_due = self.release_due = -math.inf
+        if self.plan is not None:
+            self.plan.path_due = -math.inf
 
     def due_goal(self, at: Moment, config: PlannerConfig, epoch: int) -> RobotGoal | None:
         """Return the goal when it is due for publication."""
@@ -151,28 +168,51 @@ class Mission:
         return structs.replace(self.goal, stamp=at.stamp, planner_epoch=epoch)
 
     def due_path(self, at: Moment, config: PlannerConfig, epoch: int, version: Version) -> RobotPath | None:
-        """Return the path or refusal, with the released length, when it is due for publication; `version` is the map's.
+        """Return the path or refusal when it is new, has changed, or its robot has not received it for a while.
 
-        The first publication stamps the plan's traces; later ones leave them unchanged.
+        The first publication stamps the plan's traces; later ones leave them unchanged. `version` is the map's.
         """
         goal, plan, target = self.goal, self.plan, self.target
-        if goal is None or plan is None or target is None or at.now < self.path_due:
+        if goal is None or plan is None or target is None or at.now < plan.path_due:
             return None
-        self.path_due = at.now + config.republish_s
+        if not math.isinf(plan.path_due) and self.received == (epoch, plan.plan_id):
+            return None
+        plan.path_due = at.now + config.path_retry_s
+        self.release_due = at.now + config.release_period_s
         if not plan.published:
             plan.published = True
             plan.traces = [structs.replace(trace, plan_published=at.stamp) for trace in plan.traces]
-        route = plan.route
         return RobotPath(
             plan_id=plan.plan_id,
             planner_epoch=epoch,
             goal_id=goal.goal_id,
-            points=route.rounded_points if route else [],
+            points=plan.route.corner_points if plan.route else [],
             map_epoch=version.epoch,
             map_seq=version.seq,
-            released_length=min(route.length, plan.progress + config.release_length) if route else 0.0,
+            released_length=plan.released_length(config),
             goal_theta=None if self.any_heading else target.theta,
             refusal=plan.refusal,
             traces=plan.traces,
             stamp=at.stamp,
         )
+
+    def due_release(self, at: Moment, config: PlannerConfig, epoch: int, version: Version) -> RobotRelease | None:
+        """Return the release of the published path, or refusal, when it is due; `version` is the map's."""
+        plan = self.plan
+        if plan is None or self.target is None or not plan.published or at.now < self.release_due:
+            return None
+        self.release_due = at.now + config.release_period_s
+        return RobotRelease(
+            plan_id=plan.plan_id,
+            planner_epoch=epoch,
+            released_length=plan.released_length(config),
+            map_epoch=version.epoch,
+            map_seq=version.seq,
+        )
+
+
+def received_path(state: RobotState) -> PathId | None:
+    """Return the path that a robot has by its state."""
+    if state.plan_id is None or state.planner_epoch is None:
+        return None
+    return state.planner_epoch, state.plan_id

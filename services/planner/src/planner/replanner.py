@@ -47,7 +47,7 @@ class Replanner:
         assert pose is not None
         assert target is not None
         traces = mission.begin_replan(reason, now)
-        mission.publish_path_now()
+        mission.release_now()
         found = self._find(planning_map, covers, pose, target)
         self.plans[reason] = self.plans.get(reason, 0) + 1
         if found.refusal is not None:

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from fog_contracts.geometry import sampled
 from fog_contracts.grid import GridGeometry, Window
 from fog_contracts.messages import PointXY
 from fog_kernels.astar import line_cost
@@ -27,17 +28,12 @@ class Route:
     @cached_property
     def points(self) -> Floats:
         """The polyline (n, 2), sampled at most `spacing` apart; every corner is a sample."""
-        parts: list[Floats] = [self.corners[:1]]
-        for a, b in zip(self.corners[:-1], self.corners[1:], strict=True):
-            count = max(1, math.ceil(math.hypot(*(b - a)) / self.spacing))
-            fraction = np.arange(1, count + 1)[:, None] / count
-            parts.append(a + fraction * (b - a))
-        return np.concatenate(parts)
+        return sampled(self.corners, self.spacing)
 
-    @cached_property
-    def rounded_points(self) -> list[PointXY]:
-        """The points rounded to 0.1 mm, as they are published."""
-        return [(x, y) for x, y in np.round(self.points, 4).tolist()]
+    @property
+    def corner_points(self) -> list[PointXY]:
+        """The corners as they are published; whoever samples them at the same spacing gets `points`, bit for bit."""
+        return [(x, y) for x, y in self.corners.tolist()]
 
     @cached_property
     def along(self) -> Floats:

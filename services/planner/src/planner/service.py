@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 from prometheus_client import Counter, Gauge
 
 from fog_contracts import channels as ch
-from fog_contracts.messages import PlanReply, RobotPath, RobotPose, RobotState
+from fog_contracts.messages import PlanReply, RobotPath, RobotPose, RobotRelease, RobotState
 from fog_runtime import logs, metrics
 from fog_runtime.clock import ticker
 from fog_runtime.edges import Edges
@@ -96,7 +96,7 @@ class Service:
         return self._missions.goals
 
     def path(self, robot: str) -> RobotPath | None:
-        """Return the last published path or refusal for the robot's current goal."""
+        """Return the last published path or refusal for the robot's current goal, as last released."""
         path, stored = self._paths.get(robot), self.goals.get(robot)
         return path if path and stored and path.goal_id == stored.goal.goal_id else None
 
@@ -262,8 +262,11 @@ class Service:
 
     def _publish(self, publications: Sequence[Publication]) -> None:
         for publication in publications:
-            if isinstance(path := publication.message, RobotPath):
-                self._record_path(publication.ids["robot"], path)
+            message = publication.message
+            if isinstance(message, RobotPath):
+                self._record_path(publication.ids["robot"], message)
+            elif isinstance(message, RobotRelease):
+                self._record_release(publication.ids["robot"], message)
             self._edges.publish(publication)
 
     def _record_path(self, robot: str, path: RobotPath) -> None:
@@ -278,8 +281,12 @@ class Service:
         if path.refusal is not None:
             _log.warning("plan_refused", robot=robot, plan=path.plan_id, reason=path.refusal.reason)
         else:
-            _log.info("plan_published", robot=robot, plan=path.plan_id, points=len(path.points), map_seq=path.map_seq,
+            _log.info("plan_published", robot=robot, plan=path.plan_id, corners=len(path.points), map_seq=path.map_seq,
                       hazards=[trace.area for trace in path.traces])  # fmt: skip
+
+    def _record_release(self, robot: str, release: RobotRelease) -> None:
+        if (path := self._paths.get(robot)) is not None:
+            self._paths[robot] = path.after(release)
 
     def _update_metrics(self) -> None:
         ROBOTS.set(len(self.goals))

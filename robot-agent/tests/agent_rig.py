@@ -111,6 +111,7 @@ class Fog:
         self.goal: RobotGoal | None = None
         self.points: list[tuple[float, float]] = []
         self.serves = True
+        self.sent: RobotCommand | None = None
         self.snapshots = 0
         self.states: list[RobotState] = []
         self.poses: Slot[RobotPose] = edge.latest(ch.ROBOT_POSE, RobotPose, robot=ROBOT)
@@ -168,9 +169,19 @@ class Fog:
 
     async def command(self, kind: str, *, key: bytes = KEY) -> CommandReply | None:
         unsigned = RobotCommand(
-            kind=kind, robot=ROBOT, operator="ann", nonce=uuid.uuid4().hex, issued_at=self.clock.stamp()
+            kind=kind,
+            robot=ROBOT,
+            operator="ann",
+            nonce=uuid.uuid4().hex,
+            boot=self.state.boot,
+            issued_at=self.state.clock,
         )
-        return await self.edge.query(ch.ROBOT_COMMAND, sign(unsigned, key), CommandReply, 3.0, robot=ROBOT)
+        self.sent = sign(unsigned, key)
+        return await self.repeat_command()
+
+    async def repeat_command(self) -> CommandReply | None:
+        """Send the last command again, byte by byte, as one who recorded it would."""
+        return await self.edge.query(ch.ROBOT_COMMAND, self.sent, CommandReply, 3.0, robot=ROBOT)
 
 
 class AgentProcess:

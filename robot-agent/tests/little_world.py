@@ -7,7 +7,7 @@ another while the robot moves, decisions at 5 Hz, wheel commands at 20 Hz. Every
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -33,7 +33,7 @@ DT = 0.01
 BEAMS = 360
 SCAN_S = 0.18
 LIDAR = LidarTraits(range_min_m=0.15, range_max_m=12.0, scan_period_s=SCAN_S)
-AGENT = agent_config("r1", KEY, DRIVE_TRAIN, LIDAR)
+AGENT = agent_config("r1", KEY, DRIVE_TRAIN, LIDAR, boot="b1")
 START = 1_000.0
 STAMP = 1_700_000_000.0
 
@@ -91,6 +91,7 @@ class LittleWorld:
         self.frozen_scan = None
         self.decide_on = True
         self.resets = 0
+        self.restarts = 0
         self.published = []
         self.worst_error = (0.0, 0.0)
 
@@ -123,9 +124,15 @@ class LittleWorld:
     def command(self, kind, **more):
         self.nonce += 1
         unsigned = RobotCommand(
-            kind=kind, robot="r1", operator="ann", nonce=f"nonce-{self.nonce:016d}", issued_at=self.stamp, **more
+            kind=kind, robot="r1", operator="ann", nonce=f"nonce-{self.nonce:016d}", **self.run_and_clock, **more
         )
         return self.ask(sign(unsigned, KEY))
+
+    @property
+    def run_and_clock(self):
+        """The fields of a command that come from the robot's latest state."""
+        state = self.state()
+        return {"boot": state.boot, "issued_at": state.clock}
 
     def ready(self):
         """Bring a new agent to NORMAL, as an operator would."""
@@ -175,7 +182,8 @@ class LittleWorld:
         """Kill the agent and start another one with the pose that it had saved."""
         saved = self.agent.pose_to_store(self.now)
         self.wheels = (0.0, 0.0)
-        self.agent = self.start_agent(AGENT, self.seed + 1)
+        self.restarts += 1
+        self.agent = self.start_agent(replace(AGENT, boot=f"b{1 + self.restarts}"), self.seed + self.restarts)
         if saved is not None:
             self.agent.restore(saved)
         return saved

@@ -11,7 +11,7 @@ from little_world import KEY, L_PATH, START, LittleWorld, release_of, trace
 
 from fog_contracts import channels as ch
 from fog_contracts.commands import sign
-from fog_contracts.handlers import RefusedMessageError
+from fog_contracts.handlers import Moment, RefusedMessageError
 from fog_contracts.messages import (
     AreaHazard,
     Cause,
@@ -487,7 +487,7 @@ def test_obstacle_that_others_put_on_the_map_is_not_reported(world):
     ],
 )
 def test_command_with_wrong_signature_or_robot_changes_nothing(world, change, word):
-    command = RobotCommand(kind="reset", robot="r1", operator="ann", nonce="n" * 16, issued_at=world.stamp)
+    command = RobotCommand(kind="reset", robot="r1", operator="ann", nonce="n" * 16, **world.run_and_clock)
     bad = msgspec.structs.replace(sign(command, KEY), **change)
     reply = world.ask(bad)
     assert not reply.accepted
@@ -496,7 +496,8 @@ def test_command_with_wrong_signature_or_robot_changes_nothing(world, change, wo
 
 
 def test_too_old_command_changes_nothing(world):
-    command = RobotCommand(kind="enable", robot="r1", operator="ann", nonce="n" * 16, issued_at=world.stamp - 6.0)
+    command = RobotCommand(kind="enable", robot="r1", operator="ann", nonce="n" * 16, **world.run_and_clock)
+    world.run(6.0)
     reply = world.ask(sign(command, KEY))
     assert not reply.accepted
     assert "6.0 s old" in reply.reason
@@ -504,9 +505,31 @@ def test_too_old_command_changes_nothing(world):
 
 
 def test_command_is_executed_once(world):
-    command = sign(RobotCommand(kind="enable", robot="r1", operator="ann", nonce="n" * 16, issued_at=world.stamp), KEY)
+    command = sign(RobotCommand(kind="enable", robot="r1", operator="ann", nonce="n" * 16, **world.run_and_clock), KEY)
     assert world.ask(command).accepted
     assert "already" in world.ask(command).reason
+
+
+def test_command_replayed_to_a_restarted_agent_is_refused(world):
+    command = RobotCommand(kind="enable", robot="r1", operator="ann", nonce="n" * 16, **world.run_and_clock)
+    assert world.ask(sign(command, KEY)).accepted
+    world.restart()
+    world.agent.load(world.master.snapshot(), world.now)
+    world.run(3.0)
+    reply = world.ask(sign(command, KEY))
+    assert not reply.accepted
+    assert "restarted" in reply.reason
+    assert world.state().mode == "INIT"
+    assert world.command("enable").accepted
+
+
+def test_command_of_the_future_is_refused_and_wall_clocks_do_not_matter(world):
+    now = world.run_and_clock
+    command = RobotCommand(kind="enable", robot="r1", operator="ann", nonce="n" * 16, **now)
+    ahead = msgspec.structs.replace(command, issued_at=now["issued_at"] + 4.0)
+    assert "future" in world.ask(sign(ahead, KEY)).reason
+    query = world.agent.query_handlers()[ch.ROBOT_COMMAND]
+    assert query({"robot": "r1"}, sign(command, KEY), Moment(world.now, 17.0)).accepted
 
 
 @pytest.mark.parametrize("issued_at", [0.0, 1e9, 1e12])

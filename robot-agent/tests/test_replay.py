@@ -38,7 +38,7 @@ def drive_through_most_situations(world):
     world.ready()
     world.drive_to(L_PATH)
     world.run(4.0)
-    forged = RobotCommand(kind="enable", robot="r1", operator="eve", nonce="n" * 16, issued_at=world.stamp)
+    forged = RobotCommand(kind="enable", robot="r1", operator="eve", nonce="n" * 16, **world.run_and_clock)
     assert not world.ask(forged).accepted
     assert not world.ask(sign(forged, log.LOG_KEY)).accepted
     world.block(world.x + 1.5, 1.0, world.x + 2.0, 3.0, solid=True)

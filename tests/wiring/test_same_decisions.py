@@ -41,7 +41,7 @@ from fog_contracts.messages import (
     ZoneSet,
 )
 from fog_contracts.site import AreaSite
-from fognav_experiments.rigs import OPERATOR_KEY, System, moment
+from fognav_experiments.rigs import BOOT, OPERATOR_KEY, System, moment
 from fognav_sim.barrier import barrier_across
 from hazard_aggregator.core import Aggregator
 from hazard_aggregator.fusion import AreaFusion
@@ -156,7 +156,7 @@ def comparable(message: Any) -> Any:
 
 
 def enable(now: float) -> RobotCommand:
-    unsigned = RobotCommand(kind="enable", robot="r1", operator="test", nonce="n" * 16, issued_at=moment(now).stamp)
+    unsigned = RobotCommand(kind="enable", robot="r1", operator="test", nonce="n" * 16, boot=BOOT, issued_at=now)
     return sign(unsigned, OPERATOR_KEY)
 
 

@@ -46,6 +46,8 @@ if TYPE_CHECKING:
 STAMP: Final = 1_700_000_000.0
 """The emulated wall clock at time zero: results must not depend on the date of a run."""
 OPERATOR_KEY: Final = b"lockstep operator key, no secret"
+BOOT: Final = "lockstep"
+"""Id of the agent's run: always the same, so that a run repeats itself exactly."""
 _INITIAL_WHEEL_TRAVEL_M: Final = (28.9, 0.04)
 """How far (m) the wheels have rolled before the start: a 16-bit encoder counter wraps during the drive."""
 _GUARDIAN_STEPS: Final = 2
@@ -87,7 +89,7 @@ class RobotRig:
             world, base_emulator, lidar_emulator, start, initial_wheel_travel_m=_INITIAL_WHEEL_TRAVEL_M
         )
         self.guardian = GuardianCore(driver)
-        config = agent_config(robot.id, OPERATOR_KEY, driver.drive_train, self._lidar_driver.traits, robot)
+        config = agent_config(robot.id, OPERATOR_KEY, driver.drive_train, self._lidar_driver.traits, robot, boot=BOOT)
         self.agent = make_agent(config, seed)
         self.agent.restore(start_pose(site.site.id, robot))
         self.process = AgentProcess(self.agent, robot.id, bus)
@@ -153,7 +155,8 @@ class RobotRig:
             robot=self.id,
             operator="lockstep",
             nonce=f"lockstep-{self._nonce:08d}",
-            issued_at=STAMP + self.now,
+            boot=BOOT,
+            issued_at=self.now,
             key=OPERATOR_KEY,
         )
         reply = self._bus.query(ch.ROBOT_COMMAND, command, CommandReply, moment(self.now), robot=self.id)

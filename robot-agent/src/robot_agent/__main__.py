@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import secrets
 
 from fog_runtime import logs, process, signals
 from fog_runtime.clock import SystemClock
@@ -36,7 +37,13 @@ async def main() -> None:
     base = make_base(settings.base, settings.base_options)
     lidar_driver = make_lidar(settings.lidar, settings.lidar_options)
     config = agent_config(
-        settings.robot, key, base.drive_train, lidar_driver.traits, body, obstacle_ttl=settings.obstacle_memory_s
+        settings.robot,
+        key,
+        base.drive_train,
+        lidar_driver.traits,
+        body,
+        boot=secrets.token_hex(8),
+        obstacle_ttl=settings.obstacle_memory_s,
     )
     clock = SystemClock(settings.speed)
     health = Health("map", "pose", "lidar", "base")

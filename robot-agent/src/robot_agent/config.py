@@ -102,6 +102,8 @@ class AgentConfig:
 
     robot: str
     operator_key: bytes
+    boot: str
+    """Id of this run of the agent: operators' commands name it."""
     drive_train: DriveTrain
     motion: MotionConfig
     radius: float = ROBOT_RADIUS
@@ -114,17 +116,19 @@ class AgentConfig:
     localization: LocalizationConfig = field(default_factory=LocalizationConfig)
 
 
-def agent_config(
+def agent_config(  # noqa: PLR0913  # what the process knows about its robot
     robot: str,
     operator_key: bytes,
     drive_train: DriveTrain,
     lidar: LidarTraits,
     body: RobotSite | None = None,
     *,
+    boot: str,
     obstacle_ttl: float | None = None,
 ) -> AgentConfig:
     """Return the configuration of a robot with this id, base and lidar, and the radius and height that its site gives.
 
+    boot: id of this run of the agent, never used before.
     obstacle_ttl: how long (s) a reported obstacle counts while no lidar looks there again; None for the default.
     """
     limits = DwaLimits(axle=drive_train.axle_m, wheel_max=min(_WHEEL_SPEED_MAX, drive_train.wheel_speed_max_m_s))
@@ -132,6 +136,7 @@ def agent_config(
     config = AgentConfig(
         robot=robot,
         operator_key=operator_key,
+        boot=boot,
         drive_train=drive_train,
         motion=MotionConfig(limits=limits),
         localization=LocalizationConfig(range_min=lidar.range_min_m, range_max=lidar.range_max_m),

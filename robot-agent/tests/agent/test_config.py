@@ -18,21 +18,21 @@ LIDAR = LidarTraits(range_min_m=0.1, range_max_m=8.0, scan_period_s=0.2)
 
 
 def test_site_sets_radius_height_and_inscribed_radius():
-    config = agent_config("r1", KEY, BASE, LIDAR, BODY, obstacle_ttl=30.0)
+    config = agent_config("r1", KEY, BASE, LIDAR, BODY, boot="b1", obstacle_ttl=30.0)
     assert (config.robot, config.operator_key, config.obstacle_ttl) == ("r1", KEY, 30.0)
     assert (config.radius, config.height, config.motion.inflation.inscribed_radius) == (0.25, 0.5, 0.25)
 
 
 def test_hardware_sets_axle_top_speed_ranges_and_how_long_a_scan_may_take():
-    config = agent_config("r1", KEY, BASE, LIDAR)
+    config = agent_config("r1", KEY, BASE, LIDAR, boot="b1")
     assert config.drive_train == BASE
     assert (config.motion.limits.axle, config.motion.limits.wheel_max) == (0.3, 0.4)
     assert (config.localization.range_min, config.localization.range_max) == (0.1, 8.0)
     assert config.safety.scan_lost == pytest.approx(2.4 * 0.2)
-    fast = agent_config("r1", KEY, replace(BASE, wheel_speed_max_m_s=2.0), replace(LIDAR, scan_period_s=0.1))
+    fast = agent_config("r1", KEY, replace(BASE, wheel_speed_max_m_s=2.0), replace(LIDAR, scan_period_s=0.1), boot="b1")
     assert (fast.motion.limits.wheel_max, fast.safety.scan_lost) == (0.5, 0.45)
 
 
 def test_defaults_apply_without_a_site():
-    config = agent_config("r1", KEY, BASE, LIDAR)
+    config = agent_config("r1", KEY, BASE, LIDAR, boot="b1")
     assert (config.radius, config.height, config.obstacle_ttl) == (0.17, 0.35, 600.0)

@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from little_world import AGENT, KEY
 
 from fog_contracts.commands import sign
 from fog_contracts.grid import GridGeometry
@@ -11,7 +12,6 @@ from fog_contracts.handlers import Moment
 from fog_contracts.messages import Pose, RobotCommand
 from robot_agent.agent.operator_commands import OperatorCommands, initial_pose_refusal
 
-KEY = b"k" * 32
 AT = Moment(10.0, 1_000.0)
 
 
@@ -37,8 +37,10 @@ class FakeRobot:
 
 
 def answer(robot, kind, *, key=KEY, at=AT, **more):
-    command = RobotCommand(kind=kind, robot="r1", operator="ann", nonce="n" * 16, issued_at=AT.stamp, **more)
-    return OperatorCommands("r1", KEY, robot).answer(sign(command, key), at)
+    command = RobotCommand(
+        kind=kind, robot="r1", operator="ann", nonce="n" * 16, boot=AGENT.boot, issued_at=AT.now, **more
+    )
+    return OperatorCommands(AGENT, robot).answer(sign(command, key), at)
 
 
 @pytest.mark.parametrize("kind", ["enable", "disable", "reset"])
@@ -65,7 +67,7 @@ def test_an_initial_pose_is_passed_on_with_its_refusal():
     assert answer(FakeRobot(refusal="off the map"), "initial_pose", pose=pose).reason == "off the map"
 
 
-@pytest.mark.parametrize("more", [{"key": b"x" * 32}, {"at": Moment(10.0, 1_005.1)}])
+@pytest.mark.parametrize("more", [{"key": b"x" * 32}, {"at": Moment(15.1, 1_000.0)}, {"at": Moment(9.9, 1_000.0)}])
 def test_command_with_wrong_key_or_age_is_not_executed(more):
     robot = FakeRobot()
     assert not answer(robot, "enable", **more).accepted

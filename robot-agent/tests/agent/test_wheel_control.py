@@ -11,6 +11,7 @@ from robot_agent.safety.gate import SafetyOutputs
 CONFIG = agent_config(
     "r1", b"k" * 32, DriveTrain(axle_m=0.235, wheel_speed_max_m_s=0.5),
     LidarTraits(range_min_m=0.15, range_max_m=12.0, scan_period_s=0.18),
+    boot="b1",
 )  # fmt: skip
 DT = 0.05
 

@@ -79,6 +79,9 @@ async def test_wheels_stop_when_the_agent_is_killed_and_the_next_one_asks_for_an
     assert robot.fog.state.mode == "INIT"
     assert robot.error() < 0.15
     assert robot.body.pose == stopped_at
+    replayed = await robot.fog.repeat_command()
+    assert not replayed.accepted
+    assert "restarted" in replayed.reason
     await enabled(robot)
     await until(lambda: robot.body.pose[0] > stopped_at[0] + 0.3, "it drives on")
 

@@ -107,7 +107,7 @@ def test_every_query_of_the_core_is_served_and_commands_are_logged(rig, monkeypa
     assert rig.fog.served.keys() == rig.core.query_handlers().keys()
     handler, ids = rig.fog.served[ch.ROBOT_COMMAND]
     assert ids == {"robot": AGENT.robot}
-    command = RobotCommand(kind="enable", robot=AGENT.robot, operator="ann", nonce="n" * 16, issued_at=1.0)
+    command = RobotCommand(kind="enable", robot=AGENT.robot, operator="ann", nonce="n" * 16)
     logged = []
     monkeypatch.setattr(service_module._log, "info", lambda event, **fields: logged.append((event, fields)))
     reply = handler(ids, command)

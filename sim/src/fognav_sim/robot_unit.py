@@ -52,7 +52,7 @@ class _Operator:
         self._clock = SystemClock(settings.speed)
         assert settings.operator_key_file is not None
         key = read_operator_key(settings.operator_key_file)
-        self._commands = RobotCommands(edge, self._clock, operator="sim-robot", key=key)
+        self._commands = RobotCommands(edge, operator="sim-robot", key=key)
         self._token = settings.token_file.read_text("ascii").strip()
         self._state: RobotState | None = None
         self._policy = OperatorPolicy(self._clock.now())
@@ -67,7 +67,7 @@ class _Operator:
                 continue
             self._policy.on_state(state, now)
             if (command := self._policy.command_due(now)) is not None:
-                await self._send_command(command)
+                await self._send_command(command, state)
             if (place := self._shuttle.goal_due(state)) is not None:
                 await self._send_goal(place)
 
@@ -77,9 +77,9 @@ class _Operator:
         if (place := self._shuttle.on_state(state)) is not None:
             _log.info("arrived", place=place, legs=self._shuttle.legs)
 
-    async def _send_command(self, kind: OperatorCommand) -> None:
+    async def _send_command(self, kind: OperatorCommand, state: RobotState) -> None:
         try:
-            reply = await self._commands.send(kind, self._robot, timeout_s=_TIMEOUT_S)
+            reply = await self._commands.send(kind, self._robot, state, timeout_s=_TIMEOUT_S)
         except ContractError as error:
             _log.warning("command_failed", kind=kind, reason=str(error))
             return

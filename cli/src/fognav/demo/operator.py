@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 from fog_contracts import channels as ch
 from fog_contracts.codec import ContractError
+from fog_contracts.commands import STOPS
 from fog_contracts.messages import (
     CommandKind,
     CommandReply,
@@ -47,7 +48,7 @@ class Operator:
         self._scene = scene
         self._clock = clock
         self._robot = scene.robot
-        self._commands = RobotCommands(edge, clock, operator="demo", key=stack.operator_key)
+        self._commands = RobotCommands(edge, operator="demo", key=stack.operator_key)
         self.drive: Drive | None = None
         self.enabling_paused = False
         """While this is true, the robot is not enabled."""
@@ -136,9 +137,12 @@ class Operator:
     # --- commands ---------------------------------------------------------------------------------------------------
 
     async def command(self, kind: CommandKind, pose: Pose | None = None) -> CommandReply | None:
-        """Send the robot a signed command (`initial_pose` with a pose); return None if it did not reply."""
+        """Send the robot a command (`initial_pose` with a pose); None if it did not reply or is not known yet."""
+        state = self._scene.state
+        if state is None and kind not in STOPS:
+            return None
         try:
-            return await self._commands.send(kind, self._robot, pose)
+            return await self._commands.send(kind, self._robot, state, pose)
         except ContractError as error:
             self._log_invalid_reply(error)
             return None

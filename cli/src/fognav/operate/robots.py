@@ -8,6 +8,7 @@ from typing import Final
 
 from fog_contracts import channels as ch
 from fog_contracts.codec import ContractError
+from fog_contracts.commands import STOPS
 from fog_contracts.messages import CommandKind, Pose, RobotPose, RobotState
 from fog_runtime.clock import SystemClock
 from fog_runtime.robot_commands import REPLY_TIMEOUT_S, RobotCommands
@@ -56,11 +57,17 @@ class Robot:
 
         Raises `FailedError` when the robot does not answer.
         """
-        commands = RobotCommands(self._edge, self._clock, operator=getpass.getuser(), key=key)
+        state = self.state
+        if kind not in STOPS and state is None and (state := await self.next_state()) is None:
+            raise FailedError(
+                f"robot {self.id} publishes no state. Check its id, that its agent runs, and that it is connected to "
+                f"{router(self._fog)}"
+            )
+        commands = RobotCommands(self._edge, operator=getpass.getuser(), key=key)
         try:
             # The timeout is in the clock's seconds, of which more pass in a fast simulation.
             timeout_s = REPLY_TIMEOUT_S * max(1.0, self._clock.speed)
-            reply = await commands.send(kind, self.id, pose, timeout_s)
+            reply = await commands.send(kind, self.id, state, pose, timeout_s)
         except ContractError as error:
             raise FailedError(f"robot {self.id} gave an invalid reply: {error}. Check that versions match") from error
         if reply is None:
@@ -68,8 +75,8 @@ class Robot:
                 f"robot {self.id} did not answer within {REPLY_TIMEOUT_S:.0f} s. Check its id, that its agent runs, "
                 f"and that it is connected to {router(self._fog)}"
             )
-        state = await self.next_state()
-        return Outcome(accepted=reply.accepted, reason=reply.reason, mode=state.mode if state is not None else None)
+        after = await self.next_state()
+        return Outcome(accepted=reply.accepted, reason=reply.reason, mode=after.mode if after is not None else None)
 
 
 @asynccontextmanager

@@ -11,7 +11,7 @@ import msgspec
 from fog_contracts.messages import CommandKind, Pose, RobotCommand
 
 VALID_S: Final = 5.0
-"""Seconds after `issued_at` during which a command is valid."""
+"""Seconds of the robot's clock after `issued_at` during which a command is valid."""
 KEY_BYTES: Final = 32
 STOPS: Final[frozenset[CommandKind]] = frozenset({"disable", "cancel"})
 """Commands that pass unsigned, at any age and repeatedly: a refused stop is worse than an unwanted one."""
@@ -33,7 +33,7 @@ def unsigned_stop(kind: CommandKind, *, robot: str, operator: str, nonce: str) -
     """Return a command that stops a robot, for who has no key; raises `ValueError` for any other kind."""
     if kind not in STOPS:
         raise ValueError(f"a command to {kind} must be signed with the site's operator key")
-    return RobotCommand(kind=kind, robot=robot, operator=operator, nonce=nonce, issued_at=0.0)
+    return RobotCommand(kind=kind, robot=robot, operator=operator, nonce=nonce)
 
 
 def signed_command(  # noqa: PLR0913  # the fields of a command
@@ -42,46 +42,58 @@ def signed_command(  # noqa: PLR0913  # the fields of a command
     robot: str,
     operator: str,
     nonce: str,
+    boot: str,
     issued_at: float,
     key: bytes,
     pose: Pose | None = None,
 ) -> RobotCommand:
     """Return an operator's signed command; raises `ValueError` when the key is too short.
 
-    `nonce` must never repeat, `issued_at` is in seconds since the epoch; `pose` belongs to `initial_pose` only.
+    `nonce` must never repeat; `boot` and `issued_at` are `boot` and `clock` of the robot's latest state; `pose` belongs
+    to `initial_pose` only.
     """
-    unsigned = RobotCommand(kind=kind, pose=pose, robot=robot, operator=operator, nonce=nonce, issued_at=issued_at)
+    unsigned = RobotCommand(
+        kind=kind, pose=pose, robot=robot, operator=operator, nonce=nonce, boot=boot, issued_at=issued_at
+    )
     return sign(unsigned, key)
 
 
 class CommandGate:
-    """Accepts a command once: for this robot, correctly signed, at most 5 s old, with a nonce that was not used before.
+    """Accepts a command once: for this run of this robot, correctly signed, at most 5 s old, with an unused nonce.
 
-    Of a command that stops the robot only the robot's id is checked.
+    Of a command that stops the robot only the robot's id is checked. Ages are of the robot's monotonic clock.
     A nonce is kept only while its command could still be valid, so the command rate bounds the memory.
     """
 
-    def __init__(self, robot: str, key: bytes) -> None:
+    def __init__(self, robot: str, key: bytes, boot: str) -> None:
         self._robot = robot
         self._key = key
+        self._boot = boot
         self._nonce_expiry: dict[str, float] = {}
 
-    def refusal(self, command: RobotCommand, stamp: float) -> str | None:
-        """Return why the command is refused at `stamp`, or None to accept it; each is accepted once, a stop always."""
+    def refusal(self, command: RobotCommand, now: float) -> str | None:
+        """Return why the command is refused at `now`, or None to accept it; each is accepted once, a stop always."""
         if command.robot != self._robot:
             return f"this robot is {self._robot}, the command is for {command.robot}"
         if command.kind in STOPS:
             return None
         if not hmac.compare_digest(command.signature, _signature(command, self._key)):
             return "the signature does not match: sign the command with the site's operator key"
-        age = stamp - command.issued_at
-        if not -VALID_S <= age <= VALID_S:
-            return (
-                f"the command is {age:.1f} s old, more than {VALID_S:.0f} s: issue it again, and check that the clocks "
-                "of both hosts agree"
-            )
-        self._nonce_expiry = {nonce: expiry for nonce, expiry in self._nonce_expiry.items() if expiry >= stamp}
+        if command.boot != self._boot:
+            return "the command was issued to another run of the agent, which restarted: issue it again"
+        return _age_refusal(now - command.issued_at) or self._use(command, now)
+
+    def _use(self, command: RobotCommand, now: float) -> str | None:
+        self._nonce_expiry = {nonce: expiry for nonce, expiry in self._nonce_expiry.items() if expiry >= now}
         if command.nonce in self._nonce_expiry:
             return "this command was already carried out: issue a new one"
         self._nonce_expiry[command.nonce] = command.issued_at + 2 * VALID_S
         return None
+
+
+def _age_refusal(age: float) -> str | None:
+    if age < 0.0:
+        return f"the command was issued {-age:.1f} s in the future of the robot's clock: take `clock` from its state"
+    if age > VALID_S:
+        return f"the command is {age:.1f} s old, more than {VALID_S:.0f} s: issue it again"
+    return None

@@ -21,6 +21,10 @@ Radians = Annotated[float, Meta(ge=-1_000.0, le=1_000.0, extra={"unit": "rad"})]
 Speed = Annotated[float, Meta(ge=-10.0, le=10.0, extra={"unit": "m/s"})]
 AngularSpeed = Annotated[float, Meta(ge=-10.0, le=10.0, extra={"unit": "rad/s"})]
 Stamp = Annotated[float, Meta(ge=0.0, le=1e12, extra={"unit": "s"})]
+Seconds = Annotated[float, Meta(ge=0.0, le=1e12, extra={"unit": "s"})]
+"""A reading of a monotonic clock, which means nothing to another host."""
+Boot = Annotated[str, Meta(max_length=32)]
+"""Id of one run of a process: random, so that no other run has it."""
 Count = Annotated[int, Meta(ge=0, le=2**53)]
 Hash = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Cells = Annotated[int, Meta(ge=0, le=65_535, extra={"unit": "cells"})]
@@ -490,7 +494,10 @@ class LoopHealth(Message, frozen=True, kw_only=True):
 
 
 class RobotState(Message, frozen=True, kw_only=True):
-    """A robot's mode with its reasons, the map version and plan that it follows, and the epochs that it received."""
+    """A robot's mode with its reasons, the map version and plan that it follows, and the epochs that it received.
+
+    `boot` is the id of this run of its agent, `clock` the agent's own monotonic clock: a command names both.
+    """
 
     mode: Mode
     reasons: list[Sentence]
@@ -507,6 +514,8 @@ class RobotState(Message, frozen=True, kw_only=True):
     traces: list[Trace] = []
     stamp: Stamp = 0.0
     epochs: Epochs = {}
+    boot: Boot = ""
+    clock: Seconds = 0.0
 
 
 VIEW_SECTORS: Final = 180
@@ -542,14 +551,17 @@ CommandKind = Literal["enable", "disable", "cancel", "egress", "reset", "initial
 class RobotCommand(Message, frozen=True, kw_only=True):
     """An operator's command: single-use (`nonce`), valid 5 s from `issued_at`, signed (`fog_contracts.commands`).
 
-    What stops the robot (`disable`, `cancel`) is carried out unsigned, too, and whatever `issued_at` says.
+    `boot` and `issued_at` are `boot` and `clock` of the robot's latest state: the command's age is measured by the
+    robot's clock alone, and another run of the agent refuses it. What stops the robot (`disable`,
+    `cancel`) is carried out unsigned, too, and whatever the other fields say.
     """
 
     kind: CommandKind
     robot: Id
     operator: Annotated[str, Meta(min_length=1, max_length=100)]
     nonce: Annotated[str, Meta(min_length=16, max_length=64)]
-    issued_at: Stamp
+    issued_at: Seconds = 0.0
+    boot: Boot = ""
     pose: Pose | None = None
     signature: Annotated[bytes, Meta(max_length=64)] = b""
 

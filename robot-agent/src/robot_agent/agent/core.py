@@ -75,7 +75,7 @@ class AgentCore:
         self._driving = PathDriving(config)
         self._safety = SafetySupervisor(config.safety)
         self._reporter = ObstacleReporter(config.obstacle_ttl, config.obstacle_limit)
-        self._commands = OperatorCommands(config.robot, config.operator_key, self)
+        self._commands = OperatorCommands(config, self)
         self._publishing = PublishingPolicy(config.robot)
         self._loop_health = LoopHealth()
 
@@ -249,7 +249,8 @@ class AgentCore:
             traces=self._driving.traces.recent,
             loop=self._loop_health,
             epochs=self._fence.epochs,
-            stamp=at.stamp,
+            boot=self._config.boot,
+            at=at,
         )
 
     def finished_traces(self) -> list[Trace]:

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from fog_contracts.handlers import Moment
     from fog_contracts.messages import Pose, RobotCommand
     from fog_contracts.replica import Replica
+    from robot_agent.config import AgentConfig
     from robot_agent.safety.gate import Request, SafetyOutputs
 
 _REASON_LIMIT: Final = 500
@@ -33,13 +34,13 @@ class CommandTarget(Protocol):
 class OperatorCommands:
     """Checks commands and executes them on one robot."""
 
-    def __init__(self, robot: str, key: bytes, robot_actions: CommandTarget) -> None:
-        self._gate = CommandGate(robot, key)
+    def __init__(self, config: AgentConfig, robot_actions: CommandTarget) -> None:
+        self._gate = CommandGate(config.robot, config.operator_key, config.boot)
         self._robot = robot_actions
 
     def answer(self, command: RobotCommand, at: Moment) -> CommandReply:
         """Execute a command, or refuse it with a reason."""
-        refusal = self._gate.refusal(command, at.stamp)
+        refusal = self._gate.refusal(command, at.now)
         if refusal is not None:
             return _refused(refusal)
         match command.kind:

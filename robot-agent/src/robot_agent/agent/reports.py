@@ -55,11 +55,12 @@ def robot_state(  # noqa: PLR0913  # a message gathers from all parts of the age
     traces: list[Trace],
     loop: LoopHealth,
     epochs: dict[str, int],
-    stamp: float,
+    boot: str,
+    at: Moment,
 ) -> RobotState:
     """Return mode, reasons, goal, path, map version and the `epochs` received of each service.
 
-    `hindrances` are reasons besides the safety gate's.
+    `hindrances` are reasons besides the safety gate's; `boot` is the id of this run of the agent.
     """
     path = mission.path
     return RobotState(
@@ -76,8 +77,10 @@ def robot_state(  # noqa: PLR0913  # a message gathers from all parts of the age
         goal_distance=mission.follower.remaining if mission.follower else None,
         loop=loop,
         traces=list(traces),
-        stamp=stamp,
+        stamp=at.stamp,
         epochs=epochs,
+        boot=boot,
+        clock=at.now,
     )
 
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from fognav_sim.pty_port import PtyPort
 from robot_agent.bases.roomba600.emulator import RoombaEmulator
-from robot_agent.guardian.link import WheelCommand, decode_feedback, encode
+from robot_agent.guardian.link import WheelCommand, decode_reply, encode
 
 if TYPE_CHECKING:
     import signal
@@ -154,6 +154,7 @@ class Agent:
         self.path = path
         self.wheels: tuple[float, float] | None = (0.0, 0.0)
         self.reset = False
+        self.refused: str | None = None
         self.feedback = None
         self._ends = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -187,7 +188,11 @@ class Agent:
                             continue
                         if not data:
                             break
-                        self.feedback = decode_feedback(data)
+                        reply = decode_reply(data)
+                        if isinstance(reply, str):
+                            self.refused = reply
+                        else:
+                            self.feedback = reply
                 except OSError:
                     pass
             self._ends.wait(0.05)

@@ -121,6 +121,18 @@ async def test_bad_feedback_is_ignored_and_a_silent_base_is_reported(rig):
     guardian.close()
 
 
+async def test_refusal_by_the_guardian_is_the_reason_and_the_agent_asks_again(rig):
+    guardian = Guardian(rig.path)
+    for _ in range(2):
+        await guardian.accept()
+        guardian.link.send(encode("another agent is connected"))
+        rig.losses.clear()
+        await rig.until(lambda: rig.losses)
+        assert rig.losses[0] == "the guardian refuses this agent: another agent is connected"
+        guardian.link.close()
+    guardian.close()
+
+
 async def test_reset_without_a_guardian_is_passed_on_soon_after_or_expires(rig):
     rig.client.send(command(reset=True))
     guardian = Guardian(rig.path)

@@ -223,7 +223,25 @@ def test_bumper_fault_survives_a_new_agent_until_a_reset(rig):
         wait_for(lambda: rig.base.moving, "the reset lets it drive")
 
 
-def test_the_newest_agent_drives_and_bad_packets_are_refused(rig):
+def test_second_agent_is_refused_while_the_first_lives_and_takes_over_when_it_hangs(rig):
+    rig.drive()
+    with rigs.Agent(rig.watchdog.socket) as second:
+        second.wheels = (0.2, 0.2)
+        refusal = wait_for(lambda: second.refused, "the second agent is told")
+        assert "another agent is connected" in refusal
+        for _ in range(50):
+            time.sleep(0.01)
+            assert rig.base.speeds != (0.2, 0.2)
+        wait_for(lambda: rig.base.speeds == (0.3, 0.3), "the first agent drives on")
+        assert not any("another agent connected" in line.get("reason", "") for line in rig.watchdog.events)
+        rig.agent.wheels = None
+        wait_for(lambda: rig.base.speeds == (0.2, 0.2), "the second agent drives")
+        rig.agent.refused, rig.agent.wheels = None, (0.3, 0.3)
+        wait_for(lambda: rig.agent.refused, "the first agent is told")
+        assert rig.base.speeds != (0.3, 0.3)
+
+
+def test_agent_that_sends_nothing_gives_way_and_bad_packets_are_refused(rig):
     rig.drive()
     rig.agent.__exit__()
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as old:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from fog_runtime import logs
-from robot_agent.guardian.link import PACKET_LIMIT, BaseFeedback, WheelCommand, decode_feedback, encode
+from robot_agent.guardian.link import PACKET_LIMIT, BaseFeedback, WheelCommand, decode_reply, encode
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -75,8 +75,7 @@ class GuardianClient:
                 with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as link:
                     link.settimeout(0)
                     await asyncio.get_running_loop().sock_connect(link, str(self._path))
-                    self._socket, self._feedback_at, self._last_logged = link, self._clock.now(), ""
-                    _log.info("guardian_connected", socket=str(self._path))
+                    self._socket, self._feedback_at = link, self._clock.now()
                     reason = await self._read(link)
             except OSError as error:
                 reason = f"{self._path}: {error.strerror or error}; does the watchdog run?"
@@ -88,16 +87,22 @@ class GuardianClient:
     async def _read(self, link: socket.socket) -> str:
         """Pass feedback on until the link breaks; return the reason."""
         loop = asyncio.get_running_loop()
+        accepted = False
         while True:
             data = await loop.sock_recv(link, PACKET_LIMIT + 1)
             if not data:
                 return "the guardian closed the link"
             now = self._clock.now()
             try:
-                feedback = decode_feedback(data)
+                feedback = decode_reply(data)
             except (msgspec.DecodeError, UnicodeDecodeError) as error:
                 self._limited.warning("feedback_refused", "feedback_refused", now, reason=str(error))
                 continue
+            if isinstance(feedback, str):
+                return f"the guardian refuses this agent: {feedback}"
+            if not accepted:
+                accepted = True
+                _log.info("guardian_connected", socket=str(self._path))
             self._feedback_at, self._last_logged = now, ""
             self._on_feedback(feedback, now)
 

@@ -1,4 +1,7 @@
-"""Messages between agent and guardian on their Unix socket (SOCK_SEQPACKET, msgpack, one message a packet)."""
+"""Messages between agent and guardian on their Unix socket (SOCK_SEQPACKET, msgpack, one message a packet).
+
+To an agent that it refuses the guardian sends one sentence, the reason, and closes the link.
+"""
 
 from typing import Annotated, Final
 
@@ -44,8 +47,10 @@ class BaseFeedback(Struct, frozen=True, kw_only=True):
 
 
 encode = msgspec.msgpack.Encoder().encode
-"""Encode either message."""
+"""Encode either message, or the reason of a refusal."""
 decode_command = msgspec.msgpack.Decoder(WheelCommand).decode
 """Decode a command; raises `msgspec.DecodeError`."""
 decode_feedback = msgspec.msgpack.Decoder(BaseFeedback).decode
 """Decode feedback; raises `msgspec.DecodeError`."""
+decode_reply = msgspec.msgpack.Decoder(BaseFeedback | Sentence).decode
+"""Decode what the guardian sent: feedback, or the reason why it refuses this agent; raises `msgspec.DecodeError`."""

@@ -2,7 +2,8 @@
 
 Started by the watchdog, which passes the open serial port (FOGNAV_BASE_FD), the pipe for the guardian's heartbeats
 (FOGNAV_HEARTBEAT_FD) and a pipe that closes when the watchdog ends (FOGNAV_WATCHDOG_FD). The agent connects to the Unix
-socket FOGNAV_GUARDIAN_SOCKET; the newest connection is the agent, an older one is dropped.
+socket FOGNAV_GUARDIAN_SOCKET. While one lives, any other is refused: two that took turns would share the wheels. One
+that has sent no command for a second is dropped as soon as another connects.
 """
 
 from __future__ import annotations
@@ -35,6 +36,8 @@ if TYPE_CHECKING:
 
 TICK_S: Final = 0.02
 HEARTBEAT_S: Final = 0.05
+AGENT_LIVES_S: Final = 1.0
+"""An agent sends a command every 0.05 s; one that was silent for longer than this hangs: another may take its place."""
 PACKETS_PER_CYCLE: Final = 64
 """Limit per cycle: a flood of packets must not block the sensors."""
 
@@ -66,6 +69,7 @@ class Guardian:
         self._port = Port.from_fd(settings.base_fd, settings.base_port or None)
         self._selector = selectors.DefaultSelector()
         self._agent: socket.socket | None = None
+        self._agent_heard_at = -1.0
         self._heartbeat_at = -1.0
         self._latched: str | None = None
         self._corrupted = 0
@@ -117,10 +121,22 @@ class Guardian:
         except (BlockingIOError, ConnectionError):
             return  # it disconnected already
         agent.settimeout(0)
-        self._drop_agent("another agent connected")
-        self._agent = agent
+        now = self._clock.now()
+        if self._agent is not None and now - self._agent_heard_at <= AGENT_LIVES_S:
+            self._refuse(agent, now)
+            return
+        self._drop_agent(f"another agent connected, and this one has sent no command for {AGENT_LIVES_S:g} s")
+        self._agent, self._agent_heard_at = agent, now
         self._selector.register(agent, selectors.EVENT_READ, lambda: self._read_agent(agent))
         self._log.info("agent_connected")
+
+    def _refuse(self, agent: socket.socket, now: float) -> None:
+        reason = "another agent is connected and drives: end one of the two"
+        self._limited_log.warning("agent_refused", "agent_refused", now, reason=reason)
+        with agent, suppress(BlockingIOError, ConnectionError):
+            agent.send(encode(reason))
+            # A command left unread would reset the link, and the reason with it.
+            agent.recv(PACKET_LIMIT)
 
     def _read_agent(self, agent: socket.socket) -> None:
         if agent is not self._agent:
@@ -146,7 +162,8 @@ class Guardian:
             reset = reset or newest.reset
         if newest is not None:
             command = msgspec.structs.replace(newest, reset=reset)
-            self._apply(self._core.on_command(command, self._clock.now()))
+            self._agent_heard_at = self._clock.now()
+            self._apply(self._core.on_command(command, self._agent_heard_at))
 
     def _drop_agent(self, reason: str) -> None:
         if self._agent is None:

@@ -188,19 +188,23 @@ def replay_planner(messages: list[RecordedMessage], site: LoadedSite) -> list[Ro
     return [message for message in replay.published if isinstance(message, (RobotPath, RobotGoal))]
 
 
-def before_newer_maps(messages: list[RecordedMessage]) -> list[RecordedMessage]:
-    """Return the messages with each path before the deltas of later versions than its own.
+def paths_by_map(messages: list[RecordedMessage]) -> list[RecordedMessage]:
+    """Return the messages with each path at the end of the time of its version of the map.
 
-    They are published on channels of their own, and a delta may overtake a path.
+    They are published on channels of their own, so a path and a delta may overtake one another.
     """
-    ordered: list[RecordedMessage] = []
-    for event in messages:
-        at, channel, ids, path = event
-        newer = len(ordered)
+    others = [event for event in messages if not isinstance(event[3], RobotPath)]
+    placed: dict[int, list[RecordedMessage]] = {}
+    for _, channel, ids, path in messages:
         if isinstance(path, RobotPath):
-            newer = next((index for index, (*_, m) in enumerate(ordered) if _is_newer(m, path)), newer)
-        ordered.insert(newer, (ordered[newer][0] if newer < len(ordered) else at, channel, ids, path))
-    return ordered
+            newer = (index for index, event in enumerate(others) if _is_newer(event[3], path))
+            place = next(newer, len(others))
+            at = others[min(place, len(others) - 1)][0]
+            placed.setdefault(place, []).append((at, channel, ids, path))
+    ordered: list[RecordedMessage] = []
+    for index, event in enumerate(others):
+        ordered += [*placed.get(index, ()), event]
+    return ordered + placed.get(len(others), [])
 
 
 def _is_newer(message: Message | str, path: RobotPath) -> bool:
@@ -209,7 +213,7 @@ def _is_newer(message: Message | str, path: RobotPath) -> bool:
 
 def recompute_plans(messages: list[RecordedMessage], site: LoadedSite) -> list[RobotPath]:
     """Return each recorded plan computed again, from its first point on its map version."""
-    messages = before_newer_maps(messages)
+    messages = paths_by_map(messages)
     replay = Replay(messages, site, "planner", messages[0][0])
     planner, plans, known = new_planner(messages, site, replay), [], 0
     # A path may be recorded before the goal to which it leads: each is published on a channel of its own.

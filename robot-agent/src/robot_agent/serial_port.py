@@ -59,6 +59,19 @@ class Port:
         """Descriptor for select, asyncio or a child process; -1 once closed."""
         return self._fd
 
+    @property
+    def device(self) -> str:
+        """The terminal behind the path, such as /dev/ttyUSB0 behind a symbolic link.
+
+        Raises:
+            PortLost: when the device is lost.
+
+        """
+        try:
+            return os.ttyname(self._fd)
+        except OSError as error:
+            raise PortLost(self.path, _reason(error)) from error
+
     def read_available(self) -> bytes:
         """Return the bytes that have arrived, without waiting; b"" if none have.
 
@@ -165,6 +178,17 @@ def _set_up(fd: int, path: str, baud: int) -> None:
         termios.tcsetattr(fd, termios.TCSAFLUSH, [0, 0, mode, 0, speed, speed, control])
     except termios.error as error:
         raise PortLost(path, f"not a serial device ({error.args[-1]})") from error
+
+
+def refuse_speed(speed: float, device: str) -> str | None:
+    """Return why this device must not be used on a clock of this speed; None when it may.
+
+    All limits are in seconds of the clock. On a simulated device, a pty, the clock may be faster or slower; on a real
+    one a slow clock would let the wheels turn, and old scans count, for longer than the limits allow.
+    """
+    if speed == 1.0 or device.startswith("/dev/pts/"):
+        return None
+    return f"FOGNAV_SPEED is {speed:g}, but {device} is no simulated device: unset it, a real robot needs real time"
 
 
 def _reason(error: OSError) -> str:

@@ -97,6 +97,7 @@ async def test_stop_signals_of_a_terminal_do_not_freeze_a_driving_agent_and_a_ha
     robot.agent.process.send_signal(signal.SIGHUP)
     assert robot.body.stopped_within(time.monotonic()) < STOP_S
     assert robot.agent.process.wait(10.0) == 0
+    await until(lambda: not robot.body.scanner.scanning, "the lidar stands")
 
 
 async def test_wheels_stop_when_the_agent_hangs_or_the_lidar_is_silent_and_continue_afterwards(robot):

@@ -8,11 +8,13 @@ import pytest
 from guardian_rig import DEADLINE_S
 
 from fog_runtime.clock import SystemClock
+from fog_runtime.settings import SettingsError
 from fognav_sim.pty_port import PtyPort
 from robot_agent.agent.lidar_edge import LidarEdge
 from robot_agent.lidars.rplidar_a1 import protocol as rplidar
 from robot_agent.lidars.rplidar_a1.driver import ANSWER_TIMEOUT_S, RESET_S, SAMPLES_TIMEOUT_S, STOP_S, RplidarA1Driver
 from robot_agent.lidars.rplidar_a1.emulator import RplidarEmulator
+from robot_agent.serial_port import Port
 
 STEP = 0.02
 
@@ -98,6 +100,37 @@ def test_lidar_in_error_is_reset_and_restarted():
     line.device.health = 0
     line.run(RESET_S + 1.0)
     assert line.scans
+
+
+@pytest.mark.live
+async def test_laser_and_motor_are_stopped_when_the_edge_ends(tmp_path, monkeypatch):
+    lines = []  # of DTR, which a pty does not have
+    monkeypatch.setattr(Port, "set_dtr", lambda _port, *, on: lines.append(on))
+    device, scans = RplidarEmulator(wavy_room), []
+    with PtyPort(tmp_path / "lidar") as port:
+        edge = LidarEdge(str(port.path), RplidarA1Driver(), SystemClock(), lambda _: None, lambda s, _: scans.append(s))
+        task = asyncio.create_task(edge.run())
+        end = time.monotonic() + DEADLINE_S
+        while not scans:
+            assert time.monotonic() < end
+            await asyncio.sleep(0.01)
+            device.receive(port.read(), time.monotonic())
+            port.write(device.outgoing(time.monotonic()))
+        assert lines == [False]
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+        assert port.read() == rplidar.stop()
+    assert lines == [False, True]
+
+
+@pytest.mark.live
+async def test_simulated_speed_is_refused_on_a_real_port(tmp_path, monkeypatch):
+    monkeypatch.setattr(Port, "device", "/dev/ttyUSB1")
+    with PtyPort(tmp_path / "lidar") as port:
+        edge = LidarEdge(str(port.path), RplidarA1Driver(), SystemClock(5.0), lambda _: None, lambda *_: None)
+        with pytest.raises(SettingsError, match="FOGNAV_SPEED is 5, but /dev/ttyUSB1 is no simulated device"):
+            await edge.run()
+        assert port.read() == b""
 
 
 @pytest.mark.live

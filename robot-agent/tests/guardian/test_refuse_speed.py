@@ -1,6 +1,6 @@
 import pytest
 
-from robot_agent.guardian.watchdog import refuse_speed
+from robot_agent.serial_port import refuse_speed
 
 
 @pytest.mark.parametrize("speed", [0.1, 0.99, 1.01, 5.0])

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Final
 
 from fog_runtime import logs
 from fog_runtime.clock import ticker
-from robot_agent.serial_port import Port, PortLost, open_port
+from fog_runtime.settings import SettingsError
+from robot_agent.serial_port import Port, PortLost, open_port, refuse_speed
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -42,10 +43,17 @@ class LidarEdge:
         self.problem = "the lidar's port was not opened yet"
 
     async def run(self) -> None:
-        """Open the port, scan, and start over when it is lost, until cancelled."""
+        """Open the port, scan, and start over when it is lost, until cancelled.
+
+        Raises:
+            SettingsError: when the clock's speed is a simulation's and the port a real one.
+
+        """
         while True:
             try:
                 with open_port(self._path, self._driver.serial.baud) as port:
+                    if (refusal := refuse_speed(self._clock.speed, port.device)) is not None:
+                        raise SettingsError(refusal)
                     _log.info("port_open", path=self._path)
                     await self._scan(port)
             except PortLost as error:
@@ -68,9 +76,12 @@ class LidarEdge:
                 port.write(events.data + driver.tick(now))
                 self._report(driver.problem)
         finally:
-            # The lidar must not go on scanning after an orderly end; a lost port can't be written to.
+            # Laser and motor must not go on after an orderly end; a lost port can't be written to. The DTR line keeps
+            # its state when the port is closed.
             with suppress(PortLost):
                 port.write(driver.stop_command)
+                if driver.serial.dtr is not None:
+                    port.set_dtr(on=not driver.serial.dtr)
 
     def _report(self, problem: str) -> None:
         self.problem = problem

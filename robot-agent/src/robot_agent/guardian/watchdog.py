@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from fog_runtime import parts, signals
 from fog_runtime.default_parts import DEFAULT_BASE
-from robot_agent.serial_port import Port, PortLost, open_port
+from robot_agent.serial_port import Port, PortLost, open_port, refuse_speed
 from robot_agent.stop_command import StopCommand
 
 if TYPE_CHECKING:
@@ -166,17 +166,6 @@ def _end(guardian: subprocess.Popen[bytes]) -> int:
         return guardian.wait()
 
 
-def refuse_speed(speed: float, device: str) -> str | None:
-    """Return why this device must not be guarded on a clock of this speed; None when it may.
-
-    All limits are in seconds of the clock. On a simulated base, a pty, the clock may be faster or slower; on a real
-    one a slow clock would let the wheels turn longer than the limits allow.
-    """
-    if speed == 1.0 or device.startswith("/dev/pts/"):
-        return None
-    return f"FOGNAV_SPEED is {speed:g}, but {device} is no simulated device: unset it, a real base needs real time"
-
-
 class _Settings(NamedTuple):
     """Settings from the environment: the base's port, its stop command, and the ratio of simulated to wall time."""
 
@@ -219,7 +208,7 @@ def _guard(port: Port, settings: _Settings) -> int:
     base, speed = settings.base, settings.speed
     # Before anything else: a blocked log must not keep the wheels turning.
     stop_wheels(port, base.stop)
-    if (refusal := refuse_speed(speed, os.ttyname(port.fileno()))) is not None:
+    if (refusal := refuse_speed(speed, port.device)) is not None:
         raise _BadSettings(refusal)
     _log("port_open", path=settings.path)
     silence_s = max(SILENCE_S / speed, SILENCE_MIN_S)

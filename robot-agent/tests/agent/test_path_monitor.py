@@ -8,7 +8,7 @@ from fog_contracts.grid import GridGeometry, Window
 from fog_contracts.messages import Pose, Refusal, RobotGoal, RobotPath
 from fog_contracts.replica import MasterMap, Replica, Version
 from robot_agent.agent.mission import Mission
-from robot_agent.agent.path_monitor import BLOCK_NEAR_M, PLANNER_GRACE_S, PathMonitor
+from robot_agent.agent.path_monitor import BLOCK_NEAR_M, MAP_GRACE_S, PLANNER_GRACE_S, PathMonitor
 
 GEOMETRY = GridGeometry(200, 20, 0.1, 0.0, 0.0)
 PATH = RobotPath(
@@ -53,6 +53,38 @@ def rig():
 def test_a_free_path_has_no_problem(rig):
     assert rig.problem(0.0) is None
     assert rig.problem(99.0) is None
+
+
+def test_path_of_a_map_version_that_the_robot_does_not_get_is_a_problem_after_a_second(rig):
+    rig.follow(msgspec.structs.replace(PATH, plan_id=2, map_seq=2))
+    assert rig.problem(1.0) is None
+    assert rig.problem(1.0 + MAP_GRACE_S) is None
+    assert "planned on version 2 of the map; the robot has version 0" in rig.problem(1.1 + MAP_GRACE_S)
+    rig.set(12.0, 100)
+    assert "version 1" in rig.problem(2.2)
+    rig.set(12.0, 101)
+    assert rig.problem(2.3) is None
+    assert rig.problem(99.0) is None
+
+
+def test_path_on_the_robots_own_map_is_driven_although_an_earlier_one_was_on_a_newer_map(rig):
+    rig.follow(msgspec.structs.replace(PATH, plan_id=2, map_seq=9))
+    rig.problem(0.0)
+    assert rig.problem(5.0) is not None
+    rig.follow(msgspec.structs.replace(PATH, plan_id=3), 5.0)
+    assert rig.problem(5.0) is None
+    rig.follow(msgspec.structs.replace(PATH, plan_id=4, map_seq=9), 6.0)
+    assert rig.problem(6.0) is None
+
+
+def test_map_that_follows_the_paths_within_a_second_is_no_problem_however_often_they_change(rig):
+    for cycle in range(20):
+        now = 0.6 * cycle
+        rig.follow(msgspec.structs.replace(PATH, plan_id=2 + cycle, map_seq=cycle + 2), now)
+        assert rig.problem(now) is None
+        rig.set(12.0, 100 + cycle)
+        assert rig.problem(now + 0.1) is None
+    assert rig.problem(now + 0.2 + MAP_GRACE_S) is not None
 
 
 def test_near_blockage_is_a_problem_immediately_and_until_it_is_cleared(rig):

@@ -1,7 +1,7 @@
 """Whether the path may still be driven: the fog's plan may be older than the robot's replica of the map.
 
 A path must not be driven when it is blocked near the robot, or for longer than the planner needs to replan, or when it
-was planned on another map.
+was planned on another map, or on a version of the map that does not reach the robot.
 """
 
 from __future__ import annotations
@@ -21,6 +21,8 @@ BLOCK_NEAR_M: Final = 3.0
 """A blocked path this near stops the robot at once; farther away the planner gets `PLANNER_GRACE_S` to replan."""
 PLANNER_GRACE_S: Final = 1.0
 """How long the planner may take for a path on the newest map."""
+MAP_GRACE_S: Final = 1.0
+"""How long the version of the map that a path was planned on may take to reach the robot."""
 
 
 class _Blockage(NamedTuple):
@@ -28,6 +30,14 @@ class _Blockage(NamedTuple):
 
     position: float
     reason: str
+
+
+class _Awaited(NamedTuple):
+    """A version of the map that a path names and the robot lacks, and since when (s)."""
+
+    epoch: int
+    seq: int
+    since: float
 
 
 class PathMonitor:
@@ -38,6 +48,7 @@ class PathMonitor:
         self._blockage: _Blockage | None = None
         self._blocked_since: float | None = None
         self._other_map_since: float | None = None
+        self._awaited: _Awaited | None = None
 
     def begin(self) -> None:
         """Begin to monitor a new path. One that replaces a blocked path gets no new grace period."""
@@ -45,7 +56,7 @@ class PathMonitor:
 
     def reset(self) -> None:
         """Forget the path: there is none to monitor."""
-        self._blockage = self._blocked_since = self._other_map_since = None
+        self._blockage = self._blocked_since = self._other_map_since = self._awaited = None
 
     def check(self, mission: Mission, replica: Replica, now: float) -> None:
         """Look for a blockage along the path whenever path or map may have changed; cheap when neither did."""
@@ -71,6 +82,8 @@ class PathMonitor:
             return f"the planner finds no path: {path.refusal.reason}"
         if self._is_of_other_map(path, version, now):
             return "the path was planned on another map than the robot's"
+        if version is not None and self._is_ahead_of_map(path, version, now):
+            return f"the path was planned on version {path.map_seq} of the map; the robot has version {version.seq}"
         if self._blockage is None or self._blocked_since is None:
             return None
         progress = mission.follower.progress if mission.follower else 0.0
@@ -88,13 +101,25 @@ class PathMonitor:
             self._other_map_since = now
         return now - self._other_map_since > PLANNER_GRACE_S
 
+    def _is_ahead_of_map(self, path: RobotPath, version: Version, now: float) -> bool:
+        """Return whether the robot's map lacks a version of its path for too long.
+
+        Newer paths may name newer versions meanwhile: each is awaited from when the one before has arrived.
+        """
+        if path.map_epoch != version.epoch or path.map_seq <= version.seq:
+            self._awaited = None
+            return False
+        if self._awaited is None or self._awaited.epoch != version.epoch or self._awaited.seq <= version.seq:
+            self._awaited = _Awaited(version.epoch, path.map_seq, now)
+        return now - self._awaited.since > MAP_GRACE_S
+
 
 def _find_blockage(path: RobotPath, follower: PathFollower, replica: Replica, version: Version) -> _Blockage | None:
     """Return the first blockage of the rest of the path on the robot's map; None without one."""
     assert replica.geometry is not None
     same_map = path.map_epoch == version.epoch
     if same_map and path.map_seq > version.seq:
-        # Checked as soon as the robot's map has caught up; the safety gate limits how long it may lag.
+        # Checked as soon as the robot's map has caught up; `problem` limits how long it may lag.
         return None
     # A planner that knew this map may lead the robot out through cells that its lidar reported as an obstacle.
     known = same_map and path.map_seq == version.seq

@@ -137,7 +137,7 @@ async def test_zone_reaches_the_robot_and_survives_a_kill_of_the_map_service(fog
         fog.kill("map_service")
         fog.start("map_service")
         await fog.ready("map_service")
-        await until(lambda: robot.heartbeats[-1].epoch > epoch, "a new epoch")
+        await until(lambda: robot.heartbeats and robot.heartbeats[-1].epoch > epoch, "a new epoch")
         assert robot.replica.version.epoch == epoch
         await robot.load()
         assert robot.cost(6.0, 3.0) == LETHAL

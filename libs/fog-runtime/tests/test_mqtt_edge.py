@@ -311,3 +311,42 @@ async def test_sites_that_share_a_broker_receive_only_their_own_messages(broker)
             await ours.publish(ch.NODE_READING, reading(1), site="other", node="n1")
     assert [seq for ids, seq in our_messages if ids == {"area": "shared"}] == [1]
     assert their_messages == [({"area": "shared"}, 2)]
+
+
+class VanishingBroker:
+    """A broker that is lost at the moment when its client disconnects, and then can't be reached."""
+
+    def __init__(self) -> None:
+        self.connections = 0
+
+    @contextlib.asynccontextmanager
+    async def client(self, *_):
+        self.connections += 1
+        try:
+            yield self
+        except asyncio.CancelledError:
+            raise aiomqtt.MqttError("Unexpected disconnection") from None
+
+    @property
+    async def messages(self):
+        await asyncio.Event().wait()
+        yield
+
+    async def publish(self, *_args, **_options):
+        with contextlib.suppress(asyncio.CancelledError):  # as asyncio.wait_for does when its wait has just ended
+            await asyncio.Event().wait()
+
+
+async def test_cancellation_ends_a_connection_that_is_lost_meanwhile(broker):
+    edge, vanishing = make_edge(broker, "n1"), VanishingBroker()
+    edge._brokers[0] = vanishing
+    running = asyncio.create_task(edge.run())
+    async with asyncio.timeout(60):
+        await edge.wait_connected()
+        publishing = asyncio.create_task(edge.publish(ch.NODE_READING, reading(1), node="n1"))
+        await asyncio.sleep(0)
+        for task in (publishing, running):
+            task.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await task
+    assert vanishing.connections == 1

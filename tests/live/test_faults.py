@@ -93,7 +93,8 @@ async def test_person_in_the_beam_beside_the_robot_blocks_the_area(system: LiveS
     assert reply.accepted, reply.reason
     await system.until(lambda: system.hazard("z1") == "clear", 20, "the area is clear again")
     await system.wait_progress()
-    assert system.localization_error < 0.3
+    # Scans from before it was carried away may have been on their way when the pose was given.
+    await system.until(lambda: system.localization_error < 0.3, 30, "the robot knows where it is")
     assert system.truth.contacts == 0
 
 

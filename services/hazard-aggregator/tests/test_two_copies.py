@@ -14,6 +14,8 @@ from fog_contracts.messages import AreaHazard, MapHeartbeat, NodeReading
 pytestmark = pytest.mark.live
 
 TAKEOVER_S = 2.0
+BUSY_S = 0.5
+"""How much later everything may come on a busy machine."""
 COPIES = {"aggregator": "hazard_aggregator", "map": "map_service"}
 
 
@@ -95,14 +97,14 @@ async def test_second_copy_takes_over_after_death_hang_and_partition(fog, proxy,
         old, killed = heard.epochs(service)[-1], time.monotonic()
         fog.kill(first)
         await until(lambda: heard.epochs(service)[-1] > old, "the second copy")
-        assert time.monotonic() - killed <= TAKEOVER_S, fog.log(second)
+        assert time.monotonic() - killed <= TAKEOVER_S + BUSY_S, fog.log(second)
 
         fog.start(module, first)
         await waits(fog, first, "this process stands by: ")
         old, stopped = heard.epochs(service)[-1], time.monotonic()
         fog.processes[second].send_signal(signal.SIGSTOP)
         await until(lambda: heard.epochs(service)[-1] > old, "the first copy")
-        assert time.monotonic() - stopped <= TAKEOVER_S, fog.log(first)
+        assert time.monotonic() - stopped <= TAKEOVER_S + BUSY_S, fog.log(first)
         woken = time.monotonic()
         fog.processes[second].send_signal(signal.SIGCONT)
         await waits(fog, second, "this process stands by: ")
@@ -115,7 +117,7 @@ async def test_second_copy_takes_over_after_death_hang_and_partition(fog, proxy,
         old, cut = heard.epochs(service)[-1], time.monotonic()
         proxy.cut()
         await until(lambda: heard.epochs(service)[-1] > old, "the first copy")
-        assert time.monotonic() - cut <= TAKEOVER_S, fog.log(first)
+        assert time.monotonic() - cut <= TAKEOVER_S + BUSY_S, fog.log(first)
         taken = time.monotonic()
         await waits(fog, second, "this process stands by: ")
         assert not [m for m in heard.since(service, taken + 1.0) if m.epoch == old]

@@ -18,6 +18,8 @@ from fog_runtime.clock import SystemClock, ticker
 pytestmark = pytest.mark.live
 
 TAKEOVER_S = 2.0
+BUSY_S = 0.5
+"""How much later everything may come on a busy machine."""
 FromPlanner = RobotGoal | RobotPath | RobotRelease
 PLANNERS = ("planner", "planner-2")
 GOAL = {"pose": {"x": 6.0, "y": 4.0}}
@@ -147,7 +149,7 @@ async def test_mission_survives_the_leaders_death_and_its_hang_and_is_never_doub
         fog.kill(leader)
         killed = time.monotonic()
         await until(lambda: robot.epochs[-1] > old and robot.last(RobotPath).planner_epoch > old, "a path of the other")
-        assert silence_before_takeover(robot, old) <= TAKEOVER_S, fog.log(standby)
+        assert silence_before_takeover(robot, old) <= TAKEOVER_S + BUSY_S, fog.log(standby)
         assert robot.accepted[-1][0] > killed
         assert robot.goal_ids == {goal_id}, "neither doubled nor lost"
 
@@ -158,7 +160,7 @@ async def test_mission_survives_the_leaders_death_and_its_hang_and_is_never_doub
         old = robot.epochs[-1]
         fog.processes[hung].send_signal(signal.SIGSTOP)
         await until(lambda: robot.epochs[-1] > old, "the other's goal")
-        assert silence_before_takeover(robot, old) <= TAKEOVER_S, fog.log(other)
+        assert silence_before_takeover(robot, old) <= TAKEOVER_S + BUSY_S, fog.log(other)
         await until(lambda: robot.last(RobotPath).planner_epoch > old, "the other's path")
         assert (await planners.call("DELETE", tokens, other)).status_code == 204
         await until(lambda: robot.last(RobotGoal).pose is None, "the robot hears that its mission has ended")
@@ -201,7 +203,7 @@ async def test_leader_that_is_cut_off_from_redis_gives_way_to_the_other(fog, pro
             old = robot.epochs[-1]
             proxy.cut()
             await until(lambda: robot.epochs[-1] > old, "the other's goal")
-            assert silence_before_takeover(robot, old) <= TAKEOVER_S, fog.log("planner-2")
+            assert silence_before_takeover(robot, old) <= TAKEOVER_S + BUSY_S, fog.log("planner-2")
             taken = next(at for at, message in robot.received if message.planner_epoch > old)
             refused = await planners.call("DELETE", tokens, "planner")
             assert refused.status_code == 503, "neither of them loses a mission"

@@ -43,6 +43,20 @@ def test_signal_cancels_main_and_exits_with_status_zero(number):
     assert [json.loads(line)["event"] for line in err.splitlines()] == ["stopping", "stopped"]
 
 
+def test_process_that_does_not_end_after_a_signal_shows_where_it_hangs_and_exits_with_status_one():
+    program = PROGRAM.format(body="pass", seconds=60.0).replace(
+        'print("cleaned", flush=True)', "await asyncio.Event().wait()"
+    )
+    command = [sys.executable, "-c", program.replace("process.run(main)", "process.ENDING_S = 0.3; process.run(main)")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as child:
+        assert child.stdout.readline() == "up\n"
+        child.send_signal(signal.SIGTERM)
+        _, err = child.communicate(timeout=60)
+    assert child.returncode == 1
+    assert "Timeout (0:00:00.300000)!" in err
+    assert "_run_once" in err
+
+
 def test_crash_is_logged_once_and_exits_with_status_one():
     body = "raise ExceptionGroup('many', [ValueError('the reason')])"
     with start(body, seconds=0.0) as child:

@@ -19,6 +19,7 @@ from fog_contracts.channels import Channel
 from fog_contracts.codec import ContractError, encode, encode_text
 from fog_contracts.messages import Message
 from fog_runtime import logs, metrics
+from fog_runtime.cancellation import raise_if_cancelled
 from fog_runtime.clock import Clock
 from fog_runtime.mqtt_broker import Broker
 from fog_runtime.mqtt_subscriptions import Ids, Subscriptions
@@ -172,7 +173,7 @@ class MqttEdge:
                     failures = 0
                     await self._serve(client, broker)
             except aiomqtt.MqttError as error:
-                _raise_if_cancelled()
+                raise_if_cancelled()
                 reason = str(error) or type(error).__name__
                 now = self._clock.now()
                 self._limited.warning("broker_disconnected", str(broker), now, broker=str(broker), reason=reason)
@@ -246,21 +247,10 @@ class MqttEdge:
         try:
             await client.publish(topic, data, qos=channel.qos, retain=channel.retained)
         except aiomqtt.MqttError as error:
-            _raise_if_cancelled()
+            raise_if_cancelled()
             metrics.DROPPED.labels(channel.name).inc()
             self._limited.warning("message_dropped", channel.name, self._clock.now(), topic=topic, reason=str(error))
             return False
         metrics.PUBLISHED.labels(channel.name).inc()
-        _raise_if_cancelled()
+        raise_if_cancelled()
         return True
-
-
-def _raise_if_cancelled() -> None:
-    """Go on with a cancellation that got lost.
-
-    The client replaces it by an error while it disconnects, and `asyncio.wait_for` (Python 3.11) swallows one that
-    comes as its wait ends.
-    """
-    task = asyncio.current_task()
-    if task is not None and task.cancelling():
-        raise asyncio.CancelledError

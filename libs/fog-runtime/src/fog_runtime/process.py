@@ -1,11 +1,16 @@
 """The main function of a process: run until a signal, then end cleanly."""
 
 import asyncio
+import faulthandler
 import os
 import signal
 from collections.abc import Awaitable, Callable
+from typing import Final
 
 from fog_runtime import logs, signals
+
+ENDING_S: Final = 9.0
+"""How long an orderly end may take: less than container engines and service managers wait before they kill."""
 
 _log = logs.get("process")
 
@@ -24,6 +29,7 @@ async def _supervise(main: Callable[[], Awaitable[None]]) -> None:
             os._exit(1)
         stopping = True
         _log.info("stopping", signal=signal.Signals(number).name)
+        faulthandler.dump_traceback_later(ENDING_S, exit=True)
         task.cancel()
 
     numbers = tuple(signals.ending())
@@ -43,7 +49,8 @@ def run(main: Callable[[], Awaitable[None]]) -> None:
     """Run `main` until it returns, or until a signal of `signals.ENDING` cancels it; all end the process with status 0.
 
     An exception from `main` is logged as one event, and the process exits with status 1. A second signal ends the
-    process at once, except a second hang-up.
+    process at once, except a second hang-up. An end that takes longer than `ENDING_S` is cut short: the stacks of all
+    threads are written to standard error, and the process exits with status 1.
     """
     try:
         asyncio.run(_supervise(main))

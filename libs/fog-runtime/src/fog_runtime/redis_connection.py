@@ -20,6 +20,8 @@ from redis.backoff import NoBackoff
 from redis.exceptions import BusyLoadingError, OutOfMemoryError, ReadOnlyError, RedisError
 from redis.exceptions import TimeoutError as RedisTimeoutError
 
+from fog_runtime.cancellation import raise_if_cancelled
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -111,6 +113,7 @@ class RedisConnection:
         try:
             return await self._client.execute_command(*command)  # type: ignore[no-untyped-call]  # redis types it not
         except (RedisError, OSError) as error:
+            raise_if_cancelled()
             raise self._failure(error) from error
 
     async def write(self, *commands: Command) -> list[Any]:
@@ -130,7 +133,9 @@ class RedisConnection:
             # Not raised by the pipeline, which would put the whole command into the message.
             replies: list[Any] = await pipeline.execute(raise_on_error=False)
         except (RedisError, OSError) as error:
+            raise_if_cancelled()
             raise self._failure(error) from error
+        raise_if_cancelled()
         if (failed := next((reply for reply in replies if isinstance(reply, Exception)), None)) is not None:
             raise self._failure(failed) from failed
         if wait and (have := int(replies.pop())) < wait:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from redis.asyncio import Redis
+from redis.exceptions import RedisError
 
 from fog_contracts.messages import Message
 from fog_runtime.redis_connection import RedisAddress, parse_address
@@ -79,7 +80,7 @@ class Cluster:
         """Return the port of the primary, once two replicas follow it and the Sentinels know one another."""
         async with asyncio.timeout(60):
             while True:
-                with contextlib.suppress(OSError, Exception):
+                with contextlib.suppress(OSError, RedisError):
                     async with Redis.from_url(self.sentinel, socket_timeout=1.0) as sentinel:
                         state = await sentinel.sentinel_master("fognav")
                     async with Redis(host=LOOPBACK, port=state["port"], socket_timeout=1.0) as primary:

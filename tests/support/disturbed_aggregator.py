@@ -15,6 +15,6 @@ import hazard_aggregator.__main__  # noqa: F401  # with all its imports, before 
 if __name__ == "__main__":
     real_time = time.time
     file, hang_s = Path(os.environ["FAULT_CLOCK"]), float(os.environ["FAULT_HANG_S"])
-    time.time = lambda: real_time() + float(file.read_text() or 0.0)
+    time.time = lambda: real_time() + float(file.read_text())
     signal.signal(signal.SIGUSR1, lambda *_: time.sleep(hang_s))
     runpy.run_module("hazard_aggregator", run_name="__main__", alter_sys=True)

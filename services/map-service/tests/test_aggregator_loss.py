@@ -19,6 +19,7 @@ import programs
 import pytest
 import pytest_asyncio
 from msgspec import structs
+from text_file import replace_text
 
 from fog_contracts import channels as ch
 from fog_contracts.messages import AggregatorHeartbeat, AreaHazard, HazardArea, MapDelta, MapSnapshot, NodeReading
@@ -127,7 +128,7 @@ class System:
 
     def start_aggregator(self, clock: float = 0.0) -> None:
         """Start the aggregator; its wall clock is ahead by `clock` seconds."""
-        self.clock.write_text(str(clock))
+        replace_text(self.clock, str(clock))
         environment = {
             **self.fog.environment,
             "FOGNAV_MQTT_URL": f"mqtt://127.0.0.1:{self.proxy.port}",
@@ -253,7 +254,7 @@ async def test_killed_broker(system: System) -> None:
 async def test_steps_of_the_aggregators_clock(system: System) -> None:
     published = len(system.shown)
     for step in (-3600.0, 7200.0):
-        system.clock.write_text(str(step))
+        replace_text(system.clock, str(step))
         await system.until(
             lambda step=step: abs(system.heartbeat.stamp - time.time() - step) < 60.0,
             "the heartbeat's clock has stepped",

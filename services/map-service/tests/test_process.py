@@ -13,6 +13,7 @@ import httpx
 import numpy as np
 import pytest
 from PIL import Image
+from text_file import replace_text
 
 from fog_contracts import channels as ch
 from fog_contracts.costs import LETHAL
@@ -318,7 +319,7 @@ process.run(main)
 
 async def test_steps_of_the_wall_clock_end_no_zone_and_a_boot_without_a_clock_puts_all_in_force(fog, until, tokens):
     error = fog.folder / "clock-error"
-    error.write_text("0.0")
+    replace_text(error, "0.0")
 
     def start() -> None:
         port_file = fog.folder / "map_service.port"
@@ -346,18 +347,18 @@ async def test_steps_of_the_wall_clock_end_no_zone_and_a_boot_without_a_clock_pu
             assert answer.status_code == 201, answer.text
         expected = {"started": True, "limited": True, "later": False}
         for step in (0.0, 3600.0, -3600.0):
-            error.write_text(str(step))
+            replace_text(error, str(step))
             # Half a second: several ticks of the map-service.
             for _ in range(5):
                 assert await zones(client) == expected, step
                 await asyncio.sleep(0.1)
     fog.kill("map_service")
-    error.write_text(str(60.0 - now))
+    replace_text(error, str(60.0 - now))
     await asyncio.to_thread(start)
     async with httpx.AsyncClient(base_url=await fog.ready("map_service"), timeout=15) as client:
         assert "time of day" in (await client.get("/readyz")).json()["parts"]["clock"]["detail"]
         assert await zones(client) == {"started": True, "limited": True, "later": True}
-        error.write_text("0.0")
+        replace_text(error, "0.0")
         expected = {"started": True, "limited": True, "later": False}
         await poll(partial(zones, client), lambda found: found == expected)
         assert (await client.get("/readyz")).json()["parts"]["clock"]["detail"] == ""

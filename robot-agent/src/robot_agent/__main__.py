@@ -19,7 +19,7 @@ from robot_agent.agent.guardian_client import GuardianClient
 from robot_agent.agent.input_writer import open_core
 from robot_agent.agent.lidar_edge import LidarEdge
 from robot_agent.agent.service import Service
-from robot_agent.agent.settings import Settings, read_operator_key, read_site
+from robot_agent.agent.settings import Settings, read_footprint, read_operator_key, read_site
 from robot_agent.agent.store import Store
 from robot_agent.config import agent_config
 from robot_agent.registry import make_base, make_lidar
@@ -44,6 +44,7 @@ async def main() -> None:
         body,
         boot=secrets.token_hex(8),
         obstacle_ttl=settings.obstacle_memory_s,
+        footprint=read_footprint(settings),
     )
     clock = SystemClock(settings.speed)
     health = Health("map", "pose", "lidar", "base")

@@ -6,11 +6,13 @@ Lengths in m, angles in rad, times in s.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from fog_contracts.channels import MAP_HEARTBEAT, ROBOT_RELEASE
 from fog_contracts.costs import DEFAULT_INFLATION, DEGRADED_SPEED, ROBOT_RADIUS, Inflation
 from fog_kernels.dwa import DwaLimits, DwaSettings
+from robot_agent.footprint import Footprint
 from robot_agent.hardware import DriveTrain  # noqa: TC001  # read at run time, when a configuration is decoded
 
 if TYPE_CHECKING:
@@ -106,7 +108,9 @@ class AgentConfig:
     """Id of this run of the agent: operators' commands name it."""
     drive_train: DriveTrain
     motion: MotionConfig
+    footprint: Footprint = field(default_factory=partial(Footprint.circle, ROBOT_RADIUS))
     radius: float = ROBOT_RADIUS
+    """Radius of a circle around the body, which the robot tells others."""
     height: float = 0.35
     decision_max_age: float = 0.4
     obstacle_ttl: float = 600.0
@@ -125,11 +129,13 @@ def agent_config(  # noqa: PLR0913  # what the process knows about its robot
     *,
     boot: str,
     obstacle_ttl: float | None = None,
+    footprint: Footprint | None = None,
 ) -> AgentConfig:
     """Return the configuration of a robot with this id, base and lidar, and the radius and height that its site gives.
 
     boot: id of this run of the agent, never used before.
     obstacle_ttl: how long (s) a reported obstacle counts while no lidar looks there again; None for the default.
+    footprint: outline of the body; None for the circle of the site's radius.
     """
     limits = DwaLimits(axle=drive_train.axle_m, wheel_max=min(_WHEEL_SPEED_MAX, drive_train.wheel_speed_max_m_s))
     scan_lost = max(SafetyConfig().scan_lost, _LOST_AFTER_REVOLUTIONS * lidar.scan_period_s)
@@ -144,7 +150,12 @@ def agent_config(  # noqa: PLR0913  # what the process knows about its robot
     )
     if obstacle_ttl is not None:
         config = replace(config, obstacle_ttl=obstacle_ttl)
-    if body is None:
-        return config
-    inflation = replace(config.motion.inflation, inscribed_radius=body.radius)
-    return replace(config, radius=body.radius, height=body.height, motion=replace(config.motion, inflation=inflation))
+    if body is not None:
+        config = replace(config, height=body.height)
+    if footprint is not None:
+        radius, inscribed = footprint.circumscribed_radius, footprint.inscribed_radius
+    else:
+        radius = inscribed = config.radius if body is None else body.radius
+        footprint = Footprint.circle(radius)
+    inflation = replace(config.motion.inflation, inscribed_radius=inscribed)
+    return replace(config, footprint=footprint, radius=radius, motion=replace(config.motion, inflation=inflation))

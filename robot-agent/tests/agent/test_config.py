@@ -9,6 +9,7 @@ import pytest
 from fog_contracts.messages import Pose
 from fog_contracts.site import RobotSite
 from robot_agent.config import agent_config
+from robot_agent.footprint import Footprint
 from robot_agent.hardware import DriveTrain, LidarTraits
 
 KEY = b"k" * 32
@@ -21,6 +22,15 @@ def test_site_sets_radius_height_and_inscribed_radius():
     config = agent_config("r1", KEY, BASE, LIDAR, BODY, boot="b1", obstacle_ttl=30.0)
     assert (config.robot, config.operator_key, config.obstacle_ttl) == ("r1", KEY, 30.0)
     assert (config.radius, config.height, config.motion.inflation.inscribed_radius) == (0.25, 0.5, 0.25)
+
+
+def test_footprint_of_the_settings_replaces_the_circle_of_the_site():
+    box = Footprint(((0.2, 0.15), (-0.1, 0.15), (-0.1, -0.15), (0.2, -0.15)))
+    config = agent_config("r1", KEY, BASE, LIDAR, BODY, boot="b1", footprint=box)
+    assert (config.footprint, config.height) == (box, 0.5)
+    assert config.radius == pytest.approx(0.25)
+    assert config.motion.inflation.inscribed_radius == pytest.approx(0.1)
+    assert agent_config("r1", KEY, BASE, LIDAR, BODY, boot="b1").footprint == Footprint.circle(0.25)
 
 
 def test_hardware_sets_axle_top_speed_ranges_and_how_long_a_scan_may_take():

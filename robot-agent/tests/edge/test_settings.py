@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from fog_runtime.settings import SettingsError, load
-from robot_agent.agent.settings import Settings, read_operator_key, read_site
+from robot_agent.agent.settings import Settings, read_footprint, read_operator_key, read_site
 
 SITE = """
 id = "lab"
@@ -71,3 +71,12 @@ def test_the_operators_key_is_hexadecimal_and_long_enough(tmp_path):
     for missing in (None, tmp_path / "nowhere"):
         with pytest.raises(SettingsError, match="openssl rand"):
             read_operator_key(missing)
+
+
+def test_footprint_is_a_polygon_in_metres_and_a_wrong_one_is_named(tmp_path):
+    assert read_footprint(settings(tmp_path)) is None
+    box = read_footprint(settings(tmp_path, footprint="[[0.2, 0.15], [-0.1, 0.15], [-0.1, -0.15], [0.2, -0.15]]"))
+    assert box.inscribed_radius == pytest.approx(0.1)
+    for text in ("200, 150", "[[0.2, 0.15], [0.2, -0.15], [-0.1, 0.15]]"):
+        with pytest.raises(SettingsError, match="FOGNAV_FOOTPRINT: "):
+            read_footprint(settings(tmp_path, footprint=text))

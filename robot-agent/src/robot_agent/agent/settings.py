@@ -16,9 +16,11 @@ from fog_runtime.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fog_runtime.operator_key import OperatorKeyError
 from fog_runtime.operator_key import read_operator_key as read_key
 from fog_runtime.settings import CommonSettings, SettingsError
+from robot_agent.footprint import FootprintError, parse_footprint
 
 if TYPE_CHECKING:
     from fog_contracts.site import RobotSite
+    from robot_agent.footprint import Footprint
 
 SITE_FILE: Final = "site.toml"
 
@@ -34,6 +36,9 @@ class Settings(CommonSettings, frozen=True, kw_only=True):
 
     `obstacle_memory_s`: how long (s) a reported obstacle counts while no lidar looks there again.
 
+    `footprint`: outline of the body, a JSON array of [x, y] in m in the frame `base`, counter-clockwise; empty for the
+    circle of the site's `radius`.
+
     `site_dir` is optional here: a robot without the site's folder needs `site`, and an initial pose or a global search.
     """
 
@@ -48,6 +53,7 @@ class Settings(CommonSettings, frozen=True, kw_only=True):
     seed: Annotated[int, Meta(ge=0)] = 0
     input_log: Path | None = None
     obstacle_memory_s: Annotated[float, Meta(gt=0.0, le=600.0)] = 600.0
+    footprint: str = ""
 
 
 def read_site(settings: Settings) -> tuple[str, RobotSite | None]:
@@ -71,6 +77,16 @@ def read_site(settings: Settings) -> tuple[str, RobotSite | None]:
             return settings.site or site.id, robot
     known = ", ".join(robot.id for robot in site.robots) or "none"
     raise SettingsError(f"{file}: robots: there is no {settings.robot!r} (known: {known}). Add it, or set FOGNAV_ROBOT")
+
+
+def read_footprint(settings: Settings) -> Footprint | None:
+    """Return the footprint of the settings, None for the site's circle; raises `SettingsError`."""
+    if not settings.footprint:
+        return None
+    try:
+        return parse_footprint(settings.footprint)
+    except FootprintError as error:
+        raise SettingsError(f"FOGNAV_FOOTPRINT: {error}") from error
 
 
 def read_operator_key(file: Path | None) -> bytes:

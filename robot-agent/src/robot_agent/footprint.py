@@ -1,0 +1,134 @@
+"""The robot's footprint: the outline of its body on the floor, a convex polygon in the frame `base`."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING, Final
+
+import msgspec
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+Vertex = tuple[float, float]
+
+_VERTICES_MAX: Final = 64
+_REACH_MAX_M: Final = 2.0
+"""No vertex is farther from the axle's centre: a number in mm or cm is noticed."""
+_INSCRIBED_MIN_M: Final = 0.01
+_CIRCLE_SIDES: Final = 32
+
+
+class FootprintError(ValueError):
+    """A footprint is refused; the message names the vertex and the remedy."""
+
+
+@dataclass(frozen=True, slots=True)
+class Footprint:
+    """A convex polygon around the origin of `base`, which is the point between the driven wheels.
+
+    vertices: (x, y) in m, x forward, y to the left, counter-clockwise, the last one joined to the first.
+
+    Raises:
+        FootprintError: when the vertices are no such polygon.
+
+    """
+
+    vertices: tuple[Vertex, ...]
+
+    def __post_init__(self) -> None:
+        """Validate the vertices."""
+        if not 3 <= len(self.vertices) <= _VERTICES_MAX:
+            raise FootprintError(
+                f"a footprint has 3 to {_VERTICES_MAX} vertices, not {len(self.vertices)}. Give its outline's corners"
+            )
+        for number, (x, y) in enumerate(self.vertices, 1):
+            if not math.hypot(x, y) <= _REACH_MAX_M:
+                raise FootprintError(
+                    f"vertex {number} ({x}, {y}) is more than {_REACH_MAX_M:.0f} m from the axle's centre. "
+                    "Give metres in the frame `base`"
+                )
+        self._check_convex()
+        if not self.inscribed_radius >= _INSCRIBED_MIN_M:
+            raise FootprintError(
+                f"the axle's centre (0, 0) is not at least {_INSCRIBED_MIN_M} m inside the footprint. "
+                "Give the vertices relative to the point between the driven wheels"
+            )
+
+    def _check_convex(self) -> None:
+        ring = (*self.vertices, *self.vertices[:2])
+        for number, (a, b) in enumerate(pairwise(ring[:-1]), 1):
+            if math.dist(a, b) < 1e-6:
+                raise FootprintError(f"vertices {number} and {number % len(self.vertices) + 1} are equal. Remove one")
+        headings = [math.atan2(b[1] - a[1], b[0] - a[0]) for a, b in pairwise(ring)]
+        total = 0.0
+        for number, (before, after) in enumerate(pairwise(headings), 1):
+            turn = math.remainder(after - before, math.tau)
+            if turn < -1e-9:
+                raise FootprintError(
+                    f"the footprint turns right at vertex {number % len(self.vertices) + 1}. List the vertices "
+                    "counter-clockwise, and leave out those in a recess of the outline: a footprint is convex"
+                )
+            total += turn
+        if abs(total - math.tau) > 1e-6:
+            raise FootprintError("the footprint crosses itself. List the vertices in order along the outline")
+
+    @classmethod
+    def circle(cls, radius: float) -> Footprint:
+        """Return a regular polygon that contains the circle of `radius` (m) and exceeds it by 0.5 % at its corners.
+
+        Its inscribed radius is the circle's.
+        """
+        corner = radius / math.cos(math.pi / _CIRCLE_SIDES)
+        angles = [(2 * side + 1) * math.pi / _CIRCLE_SIDES for side in range(_CIRCLE_SIDES)]
+        return cls(tuple((corner * math.cos(angle), corner * math.sin(angle)) for angle in angles))
+
+    @property
+    def polygon(self) -> NDArray[np.float64]:
+        """The vertices as an array, float64 (n, 2)."""
+        return np.array(self.vertices, dtype=np.float64)
+
+    @property
+    def inscribed_radius(self) -> float:
+        """Radius (m) of the largest circle around the axle's centre inside the footprint; negative if it is outside."""
+        ring = (*self.vertices, self.vertices[0])
+        return min((a[0] * b[1] - a[1] * b[0]) / math.dist(a, b) for a, b in pairwise(ring))
+
+    @property
+    def circumscribed_radius(self) -> float:
+        """Radius (m) of the smallest circle around the axle's centre that contains the footprint."""
+        return max(math.hypot(x, y) for x, y in self.vertices)
+
+    def padded(self, distance: float) -> Footprint:
+        """Return the footprint with each side moved outwards by `distance` (m, not negative); corners stay sharp.
+
+        It contains every point within `distance` of this footprint.
+        """
+        if not 0.0 <= distance < math.inf:
+            raise FootprintError(f"a footprint is padded by 0 m or more, not {distance}")
+        ring = (self.vertices[-1], *self.vertices, self.vertices[0])
+        moved: list[Vertex] = []
+        for (ax, ay), (bx, by), (cx, cy) in zip(ring, ring[1:], ring[2:], strict=False):
+            # The corner moves along the bisector of its sides' normals n and m: by distance (n + m) / (1 + n m).
+            before, after = math.hypot(bx - ax, by - ay), math.hypot(cx - bx, cy - by)
+            nx, ny = (by - ay) / before, (ax - bx) / before
+            mx, my = (cy - by) / after, (bx - cx) / after
+            scale = distance / (1.0 + nx * mx + ny * my)
+            moved.append((bx + scale * (nx + mx), by + scale * (ny + my)))
+        return Footprint(tuple(moved))
+
+
+def parse_footprint(text: str) -> Footprint:
+    """Return the footprint in a JSON array of vertices such as `[[0.2, 0.15], [-0.2, 0.15], [-0.2, -0.15], ...]`.
+
+    Raises:
+        FootprintError: when the text is no such array, or its vertices are no convex polygon around (0, 0).
+
+    """
+    try:
+        return Footprint(msgspec.json.decode(text, type=tuple[Vertex, ...]))
+    except msgspec.DecodeError as error:
+        raise FootprintError(f"a footprint is a JSON array of [x, y] in metres: {error}") from error

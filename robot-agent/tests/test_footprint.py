@@ -1,0 +1,100 @@
+"""The footprint: which polygons are refused and how, its radii, and padding."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robot_agent.config import AgentConfig
+from robot_agent.footprint import Footprint, FootprintError, parse_footprint
+
+BOX = ((0.2, 0.15), (-0.1, 0.15), (-0.1, -0.15), (0.2, -0.15))
+
+
+def distances_outside(footprint, points):
+    """How far (m) points lie outside the sides' lines: negative inside."""
+    corners = footprint.polygon
+    sides = np.roll(corners, -1, axis=0) - corners
+    normals = np.column_stack((sides[:, 1], -sides[:, 0])) / np.hypot(*sides.T)[:, None]
+    return ((points[:, None, :] - corners) * normals).sum(axis=2).max(axis=1)
+
+
+def test_radii_of_a_box_around_an_axle_off_its_middle():
+    box = Footprint(BOX)
+    assert box.inscribed_radius == pytest.approx(0.1)
+    assert box.circumscribed_radius == pytest.approx(0.25)
+    assert box.polygon.shape == (4, 2)
+
+
+@pytest.mark.parametrize("radius", [0.05, 0.17, 0.5])
+def test_circle_lies_inside_its_polygon_which_exceeds_it_by_half_a_percent(radius):
+    footprint = Footprint.circle(radius)
+    assert footprint.inscribed_radius == pytest.approx(radius)
+    assert radius < footprint.circumscribed_radius < 1.005 * radius
+
+
+@pytest.mark.parametrize(
+    ("vertices", "words"),
+    [
+        (BOX[:2], "3 to 64 vertices, not 2"),
+        (BOX * 17, "3 to 64 vertices, not 68"),
+        (((200.0, 150.0), *BOX[1:]), r"vertex 1 \(200.0, 150.0\) is more than 2 m"),
+        ((*BOX[:2], (math.nan, 0.0), BOX[3]), "vertex 3"),
+        (BOX[::-1], "counter-clockwise"),
+        ((*BOX[:2], (-0.05, 0.0), *BOX[2:]), "turns right at vertex 3"),
+        (((0.2, 0.15), (0.2, 0.15), *BOX[1:]), "vertices 1 and 2 are equal"),
+        (((0.2, 0.15), *BOX[1:], (0.2, 0.15)), "vertices 5 and 1 are equal"),
+        (
+            tuple((0.2 * math.cos(4 * k * math.pi / 5), 0.2 * math.sin(4 * k * math.pi / 5)) for k in range(5)),
+            "crosses",
+        ),
+        (tuple((x + 0.3, y) for x, y in BOX), r"the axle's centre \(0, 0\) is not"),
+    ],
+)
+def test_a_wrong_polygon_is_refused_by_name_of_its_fault(vertices, words):
+    with pytest.raises(FootprintError, match=words):
+        Footprint(vertices)
+
+
+@pytest.mark.parametrize("distance", [-0.01, math.inf, math.nan])
+def test_padding_by_less_than_nothing_is_refused(distance):
+    with pytest.raises(FootprintError, match="padded"):
+        Footprint(BOX).padded(distance)
+
+
+@given(
+    st.sampled_from([BOX, Footprint.circle(0.17).vertices, ((0.4, 0.0), (-0.2, 0.3), (-0.2, -0.3))]),
+    st.floats(0.0, 0.1),
+    st.integers(0, 2**32 - 1),
+)
+def test_padding_moves_each_side_by_the_distance_and_contains_all_that_is_so_near(vertices, distance, seed):
+    footprint = Footprint(vertices)
+    padded = footprint.padded(distance)
+    assert np.allclose(distances_outside(footprint, padded.polygon), distance)
+    assert padded.inscribed_radius == pytest.approx(footprint.inscribed_radius + distance)
+    rng = np.random.default_rng(seed)
+    weights = rng.dirichlet(np.ones(len(vertices)), 50)
+    angles = rng.uniform(0.0, math.tau, 50)
+    near = weights @ footprint.polygon + distance * np.column_stack((np.cos(angles), np.sin(angles)))
+    assert distances_outside(padded, near).max() <= 1e-9
+
+
+def test_footprint_of_a_setting_is_parsed_and_its_errors_say_what_is_expected():
+    assert parse_footprint("[[0.2, 0.15], [-0.1, 0.15], [-0.1, -0.15], [0.2, -0.15]]") == Footprint(BOX)
+    for text in ("round", "[[1, 2, 3]]", '{"radius": 0.2}', "[[0.2, 0.1]]"):
+        with pytest.raises(FootprintError, match="footprint"):
+            parse_footprint(text)
+
+
+def test_configuration_with_a_footprint_survives_json():
+    config = AgentConfig(
+        robot="r1", operator_key=b"", boot="b", drive_train=None, motion=None, footprint=Footprint(BOX)
+    )
+    encoded = msgspec.json.encode(config.footprint)
+    assert msgspec.json.decode(encoded, type=Footprint) == config.footprint
+    assert msgspec.json.decode(msgspec.json.encode(Footprint.circle(0.17)), type=Footprint) == Footprint.circle(0.17)

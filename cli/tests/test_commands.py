@@ -34,6 +34,7 @@ def _warm_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
         ["replay"],
         ["status"],
         ["bench", "fleet"],
+        ["bench", "robot"],
         ["goal"],
         ["area", "list"],
         ["area", "override"],

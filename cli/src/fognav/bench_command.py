@@ -8,7 +8,7 @@ import typer
 from rich.progress import Progress
 
 from fognav import kernels
-from fognav.output import console, print_json
+from fognav.output import console, exit_codes, print_json
 
 bench_app = typer.Typer(help="Measure parts of the system on this machine.", no_args_is_help=True)
 
@@ -73,4 +73,34 @@ def costmap_command(
         print_json({"bench": "costmap", "repeats": repeats, "seed": seed, **figures, **machine.describe()})
         return
     for name, value in figures.items():
+        console.print(f"{name:22} {value}", markup=False)
+
+
+@bench_app.command("robot", epilog="Example: fognav bench robot --seconds 30 --cpu-quota 0.2 --json")
+def robot_command(
+    *,
+    seconds: Annotated[
+        float, typer.Option("--seconds", metavar="S", min=1.0, max=120.0, help="Length of each measurement.")
+    ] = 30.0,
+    cpu_quota: Annotated[
+        float | None,
+        typer.Option("--cpu-quota", metavar="SHARE", min=0.01, max=4.0, help="Limit the robot to a share of a core."),
+    ] = None,
+    json: Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")] = False,
+) -> None:
+    """Measure what the robot's processes cost.
+
+    Agent, guardian and watchdog, standing by and driving on a map of 2000 x 1140 cells. Fog, simulator and emulated
+    devices are processes of their own, which do not count. CPU is in percent of one core.
+    """
+    from fognav.bench import machine, robot  # noqa: PLC0415  # keeps the other commands fast
+
+    kernels.warm_cache(lambda text: console.print(text, markup=False))
+    with exit_codes():
+        figures = robot.measure(seconds, cpu_quota, lambda phase: console.print(phase, markup=False))
+    asked = {"seconds": seconds, "cpu_quota": cpu_quota}
+    if json:
+        print_json({"bench": "robot", **asked, **figures, **machine.describe()})
+        return
+    for name, value in (asked | figures).items():
         console.print(f"{name:22} {value}", markup=False)

@@ -265,7 +265,7 @@ class LiveServices:
         self.agent.restore(body)
         for service in (self.aggregator, self.map, self.planner, self.agent):
             service.subscribe()
-        self.aggregator.mark_store_loaded()
+        self.aggregator.records.mark_loaded()
         for name, loop in (
             ("aggregator write", self.aggregator.write_loop()),
             ("map store", self.map.store_loop()),

@@ -8,8 +8,9 @@ from fog_contracts.handlers import Moment, Publication, RefusedMessageError
 from fog_contracts.hazards import digest
 from fog_contracts.messages import AggregatorHeartbeat, AreaDefinition, AreaHazard, NodeConfig, NodeReading, RobotPose
 from fog_contracts.site import NodeSite, Sonar
-from hazard_aggregator.core import Aggregator, wsn_line
+from hazard_aggregator.core import Aggregator
 from hazard_aggregator.fusion import AreaFusion
+from hazard_aggregator.publications import wsn_line
 from hazard_aggregator.registry import find_rule
 
 SQUARE = [(0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (0.0, 1.0)]

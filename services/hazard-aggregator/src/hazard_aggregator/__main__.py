@@ -59,7 +59,7 @@ async def main() -> None:
             core = Aggregator(fusion, complete=loaded_from_store)
             service = Service(core, store, mqtt, zenoh, clock, health, leadership)
             if loaded_from_store:
-                service.mark_store_loaded()
+                service.records.mark_loaded()
             service.subscribe()
             leadership.subscribe()
             zenoh.declare_liveliness("hazard-aggregator", site)

@@ -39,7 +39,8 @@ from fog_runtime.http import (
 )
 from fog_runtime.idempotency import IdempotencyError
 from hazard_aggregator.area_size import AreaError, check_size
-from hazard_aggregator.service import ConflictError, Service
+from hazard_aggregator.area_writer import ConflictError
+from hazard_aggregator.service import Service
 from hazard_aggregator.store import StoreError
 
 
@@ -93,7 +94,7 @@ def make_api(
     _add_nodes(Routes(app, "nodes"), service, clock)
     recovery = Routes(app, "store")
     add_store_errors(recovery)
-    add_recovery(recovery, service)
+    add_recovery(recovery, service.records)
     return app
 
 
@@ -139,7 +140,7 @@ def _add_areas(routes: Routes, service: Service, geometry: GridGeometry) -> None
 
         With If-Match, only if it is unchanged; with `If-None-Match: *`, only if there is none.
         """
-        definition = await service.put_area(
+        definition = await service.areas.put_area(
             _validated(area_id, body, service, geometry),
             caller.name,
             expected=expected_version(if_match),

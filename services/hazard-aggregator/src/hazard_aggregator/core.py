@@ -7,17 +7,16 @@ states. `outbox` withholds a relief until it is stored: the process writes `to_s
 from __future__ import annotations
 
 import math
-import zlib
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple
-
-import msgspec
+from typing import TYPE_CHECKING, Final
 
 from fog_contracts import channels as ch
 from fog_contracts.handlers import Publication, RefusedMessageError
 from fog_contracts.hazards import digest
-from fog_contracts.messages import AggregatorHeartbeat, NodeConfig
+from fog_contracts.messages import AggregatorHeartbeat
+from hazard_aggregator.foreign_messages import ForeignMessages
 from hazard_aggregator.outbox import Outbox
 from hazard_aggregator.own_messages import OwnMessages
+from hazard_aggregator.publications import definition_publication, deletions, hazard_publications, node_publication
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -25,24 +24,12 @@ if TYPE_CHECKING:
     from fog_contracts.channels import Channel
     from fog_contracts.handlers import Handler, Ids, Moment, QueryHandler
     from fog_contracts.messages import AreaDefinition, AreaHazard, NodeReading, RobotPose
-    from fog_contracts.site import NodeSite
+    from hazard_aggregator.foreign_messages import ForeignMessage
     from hazard_aggregator.fusion import AreaFusion, NodeReport
     from hazard_aggregator.reading_order import Rejection
 
 
 _HALF_TICK_S: Final = 0.05
-_MAX_FOREIGN: Final = 100
-"""Messages of others between two calls of `pop_foreign`; further ones are not counted."""
-
-ForeignKind = Literal["area", "hazard", "heartbeat"]
-
-
-class ForeignMessage(NamedTuple):
-    """A message of another sender on our topics: about an area that we don't list, or above our epoch."""
-
-    kind: ForeignKind
-    epoch: int
-    area: str
 
 
 class Aggregator:
@@ -59,8 +46,7 @@ class Aggregator:
         self._own = OwnMessages()
         self._complete = complete
         self._unlisted: set[str] = set()
-        self._foreign: list[ForeignMessage] = []
-        self._foreign_epoch = 0
+        self._foreign = ForeignMessages()
         self._heartbeat_at = -math.inf
 
     # --- State ------------------------------------------------------------------------------------------------------
@@ -95,8 +81,7 @@ class Aggregator:
 
     def pop_foreign(self) -> list[ForeignMessage]:
         """Return the messages of others on this aggregator's topics since the last call, for logs and metrics."""
-        foreign, self._foreign = self._foreign, []
-        return foreign
+        return self._foreign.pop()
 
     def pop_rejections(self) -> list[tuple[str, Rejection]]:
         """Return nodes whose readings did not count since the last call, each with the reason, for metrics."""
@@ -108,7 +93,7 @@ class Aggregator:
 
         The map believes that sender, or no one: this aggregator needs an epoch above it (`set_epoch`).
         """
-        return self._foreign_epoch if self._foreign_epoch >= self.epoch else None
+        return self._foreign.epoch if self._foreign.epoch >= self.epoch else None
 
     # --- Inputs -----------------------------------------------------------------------------------------------------
 
@@ -154,7 +139,7 @@ class Aggregator:
         changed = self._fusion.put_area(definition, at.stamp)
         if definition.removed:
             self._outbox.forget(definition.id)
-            return [self._definition_publication(definition), *_deletions(definition.id)]
+            return [self._definition_publication(definition), *deletions(definition.id)]
         return [self._definition_publication(definition), *self._announce(changed)]
 
     def restore(
@@ -169,16 +154,16 @@ class Aggregator:
         self._outbox.offer(self._fusion.restore(hazards, at.stamp))
         self._complete = True
         unlisted, self._unlisted = self._unlisted - set(self._listed()), set()
-        return [*self.republish_all(), *(deletion for area in sorted(unlisted) for deletion in _deletions(area))]
+        return [*self.republish_all(), *(deletion for area in sorted(unlisted) for deletion in deletions(area))]
 
     def republish_all(self) -> list[Publication]:
         """Return all retained messages, for a broker that has (re)connected and may have lost its own copies."""
-        configs = [Publication(ch.NODE_CONFIG, node_config(node), {"node": node.id}) for node in self.nodes.values()]
+        configs = [node_publication(node) for node in self.nodes.values()]
         definitions = [
             publication
             for definition in self.definitions()
             for publication in (
-                _deletions(definition.id) if definition.removed else [self._definition_publication(definition)]
+                deletions(definition.id) if definition.removed else [self._definition_publication(definition)]
             )
         ]
         return [*definitions, *self._hazard_publications(self._outbox.announced()), *configs]
@@ -208,21 +193,21 @@ class Aggregator:
         if self._own.contains(hazard):
             return []
         if hazard.area not in self._listed():
-            self._hear_foreign("area", hazard.epoch, hazard.area)
+            self._foreign.add("area", hazard.epoch, hazard.area)
             if self._complete:
-                return _deletions(hazard.area)
+                return deletions(hazard.area)
             self._unlisted.add(hazard.area)
             return []
         changed = self._announce(self._fusion.restore([hazard], at.stamp))
         if hazard.epoch >= self.epoch:
-            self._hear_foreign("hazard", hazard.epoch, hazard.area)
+            self._foreign.add("hazard", hazard.epoch, hazard.area)
             return changed
         announced = self.announced().get(hazard.area)
         return changed or self._hazard_publications([announced] if announced else [])
 
     def _on_heartbeat(self, _ids: Ids, heartbeat: AggregatorHeartbeat, _at: Moment) -> list[Publication]:
         if heartbeat.epoch >= self.epoch and not self._own.contains_heartbeat(heartbeat):
-            self._hear_foreign("heartbeat", heartbeat.epoch, "")
+            self._foreign.add("heartbeat", heartbeat.epoch, "")
         return []
 
     def _on_request(self, _ids: Ids, text: str, _at: Moment) -> list[Publication]:
@@ -235,11 +220,6 @@ class Aggregator:
 
     def _listed(self) -> list[str]:
         return [definition.id for definition in self.definitions() if not definition.removed]
-
-    def _hear_foreign(self, kind: ForeignKind, epoch: int, area: str) -> None:
-        self._foreign_epoch = max(self._foreign_epoch, epoch)
-        if len(self._foreign) < _MAX_FOREIGN:
-            self._foreign.append(ForeignMessage(kind, epoch, area))
 
     def _heartbeat(self, at: Moment) -> AggregatorHeartbeat:
         announced = self.announced()
@@ -259,51 +239,14 @@ class Aggregator:
         return self._hazard_publications(self._outbox.offer(changed))
 
     def _definition_publication(self, definition: AreaDefinition) -> Publication:
-        return Publication(
-            ch.AREA_DEFINITION, msgspec.structs.replace(definition, epoch=self.epoch), {"area": definition.id}
-        )
+        return definition_publication(definition, self.epoch)
 
     def _hazard_publications(self, hazards: Iterable[AreaHazard]) -> list[Publication]:
         """Return the publications of hazards, each with its line for the thesis's robots."""
         publications: list[Publication] = []
         for hazard in hazards:
             self._own.add(hazard)
-            publications.append(Publication(ch.AREA_HAZARD, hazard, {"area": hazard.area}))
-            if (definition := self._fusion.definition(hazard.area)) is not None:
-                node = self.nodes.get(definition.nodes[0]) if definition.nodes else None
-                if line := wsn_line(definition, hazard, node):
-                    publications.append(Publication(ch.THESIS_WSN, line))
+            definition = self._fusion.definition(hazard.area)
+            node = self.nodes.get(definition.nodes[0]) if definition is not None and definition.nodes else None
+            publications += hazard_publications(hazard, definition, node)
         return publications
-
-
-def _deletions(area: str) -> list[Publication]:
-    """Return the publications that delete an area's retained messages from the broker."""
-    return [Publication(channel, None, {"area": area}) for channel in (ch.AREA_HAZARD, ch.AREA_DEFINITION)]
-
-
-def node_config(node: NodeSite) -> NodeConfig:
-    """Return the configuration of a node; its version is a checksum of its content."""
-    config = NodeConfig(
-        version=0,
-        range_limit_m=[sonar.range_limit for sonar in node.sonars],
-        no_echo_is_clear=[sonar.no_echo_is_clear for sonar in node.sonars],
-    )
-    return msgspec.structs.replace(config, version=zlib.crc32(msgspec.json.encode(config)))
-
-
-def wsn_line(definition: AreaDefinition, hazard: AreaHazard, node: NodeSite | None = None) -> str | None:
-    """Return the line for the thesis's robots: `n,x,y`, or `n,-999,-999` when clear; None for an area without number.
-
-    (x, y) is the node's position (m, frame `map`), or the mean of the area's corners when it has no node. Those robots
-    have no third state: an unknown area is sent as blocked (Mendes 2022, section 3.4).
-    """
-    if definition.number is None:
-        return None
-    if hazard.state == "clear":
-        return f"{definition.number},-999,-999"
-    if node is not None:
-        x, y = node.x, node.y
-    else:
-        x = sum(point[0] for point in definition.polygon) / len(definition.polygon)
-        y = sum(point[1] for point in definition.polygon) / len(definition.polygon)
-    return f"{definition.number},{x:.3f},{y:.3f}"

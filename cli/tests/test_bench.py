@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from fog_kernels.components import Components
 from fognav.__main__ import app
-from fognav.bench import costmap, fleet, office
+from fognav.bench import costmap, fleet, office, rest
 
 
 def test_office_is_connected_and_the_same_for_the_same_seed() -> None:
@@ -58,3 +58,19 @@ def test_costmap_figures_are_of_the_whole_floor_and_of_legal_zones() -> None:
     assert figures["portions"] >= 4, "a zone over the whole floor, put and removed"
     for key in ("full_ms", "window_ms", "worst_zone_ms", "worst_portion_ms", "load_zones_ms", "snapshot_ms"):
         assert figures[key] > 0
+
+
+@pytest.mark.live
+async def test_clients_of_every_kind_are_answered_while_the_heartbeat_is_timed(tmp_path) -> None:
+    floor = office.make_office(60.0, 40.0)
+    rest.write_site(tmp_path, floor)
+    figures = await rest.measure(tmp_path, floor, zones=50, clients=10, seconds=3.0, idle_s=0.5)
+    assert (
+        {"200", "201", "204", "413", "422"}
+        <= figures["requests"].keys()
+        <= {*["200", "201", "204", "413", "422", "503"]}
+    )
+    for key in ("heartbeat_gap_p50_ms", "heartbeat_gap_p99_ms", "heartbeat_gap_max_ms"):
+        assert figures[f"idle_{key}"] > 0
+        assert figures[key] > 0
+    assert figures["rss_mb"] > 50

@@ -85,7 +85,7 @@ def _calls(folder: str) -> Iterator[tuple[str, ast.Call]]:
     """Yield every call below a folder, or in a file, with its file and the function around it (`file.py:function`)."""
     path = ROOT / folder
     for file in [path] if path.is_file() else sorted(path.rglob("*.py")):
-        if "bench" in file.parts:  # it feeds cores in its own process, and connects to nothing
+        if "bench" in file.parts:  # it measures, and is no part of the system
             continue
         tree = ast.parse(file.read_text(encoding="utf-8"))
         functions = [n for n in ast.walk(tree) if isinstance(n, ast.FunctionDef | ast.AsyncFunctionDef)]

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated
 
 import typer
@@ -104,3 +107,32 @@ def robot_command(
         return
     for name, value in (asked | figures).items():
         console.print(f"{name:22} {value}", markup=False)
+
+
+@bench_app.command("rest", epilog="Example: fognav bench rest --clients 32 --seconds 60 --json")
+def rest_command(
+    *,
+    clients: Annotated[int, typer.Option("--clients", metavar="N", min=1, max=128, help="Clients at once.")] = 32,
+    seconds: Annotated[float, typer.Option("--seconds", metavar="S", min=1.0, help="How long they ask.")] = 30.0,
+    zones: Annotated[int, typer.Option("--zones", metavar="Z", min=0, max=4900, help="Zones of 5 x 5 m.")] = 4900,
+    json: Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")] = False,
+) -> None:
+    """Measure how steady the map's heartbeat is under load.
+
+    Clients send a map-service the costliest zones, read all zones and pictures, send invalid and oversized bodies, or
+    send and read slowly; another process times the heartbeat (100 ms), without clients (`idle_`) and with them.
+    """
+    from fognav.bench import machine, rest  # noqa: PLC0415  # keeps the other commands fast
+    from fognav.bench.office import make_office  # noqa: PLC0415  # same
+
+    kernels.warm_cache(lambda text: console.print(text, markup=False))
+    floor = make_office()
+    with TemporaryDirectory(prefix="fognav-") as folder:
+        rest.write_site(Path(folder), floor)
+        figures = asyncio.run(rest.measure(Path(folder), floor, zones=zones, clients=clients, seconds=seconds))
+    asked = {"clients": clients, "seconds": seconds, "zones": zones}
+    if json:
+        print_json({"bench": "rest", **asked, **figures, **machine.describe()})
+        return
+    for name, value in (asked | figures).items():
+        console.print(f"{name:26} {value}", markup=False)

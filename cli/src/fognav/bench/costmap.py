@@ -48,7 +48,7 @@ def worst_shapes(floor: StaticMap) -> list[Shape]:
 def measure(floor: StaticMap, zones: int, repeats: int) -> dict[str, float | int]:
     """Return the figures, in ms, medians of `repeats` unless they are named worst."""
     core = MapCore("bench", floor, 1, layers=make_layers(floor))
-    stored = _random_zones(floor, zones)
+    stored = random_zones(floor, zones)
 
     def load() -> None:
         core.load_zones(stored, _AT, StoredState(spans=zones_spans(stored, floor.geometry)))
@@ -100,7 +100,8 @@ def _small_changes(core: MapCore, floor: StaticMap, repeats: int) -> list[float]
     return [_timed(change) for _ in range(repeats) for change in (put, remove)]
 
 
-def _random_zones(floor: StaticMap, count: int) -> list[Zone]:
+def random_zones(floor: StaticMap, count: int) -> list[Zone]:
+    """Return zones of 5 x 5 m, anywhere on the floor, the same at each call."""
     rng = np.random.default_rng(1)
     left, bottom, right, top = floor.geometry.bounds
     corners = rng.uniform((left, bottom), (right - 5.0, top - 5.0), (count, 2)).tolist()

@@ -102,11 +102,11 @@ class MapCore:
         return ""
 
     def zones(self) -> list[Zone]:
-        """Return all zones by id."""
+        """Return all zones by id; the same list, which nobody may change, as long as they are the same."""
         return self._zones.zones()
 
     def active_zones(self) -> list[str]:
-        """Return the ids of the zones that are in force now."""
+        """Return the ids of the zones that are in force now; the same list as long as they are the same."""
         return self._zones.active()
 
     def zones_besides(self, zone_id: str) -> tuple[int, int]:

@@ -51,6 +51,7 @@ class ZonesLayer(CostLayer):
         self._changed = False
         self._timed: list[_ZoneEntry] | None = None
         self._zones: list[Zone] | None = None
+        self._active_ids: list[str] | None = None
         self._active: tuple[list[_ZoneEntry], NDArray[np.int64]] | None = None
 
     def put(self, zone: Zone, at: Moment, spans: Spans | None = None) -> None:
@@ -83,14 +84,16 @@ class ZonesLayer(CostLayer):
         return {name: entry.times.progress(boot, now) for name, entry in self._entries.items() if _is_timed(entry.zone)}
 
     def zones(self) -> list[Zone]:
-        """Return all zones, active or not, by id."""
+        """Return all zones, active or not, by id; the same list as long as nothing changes."""
         if self._zones is None:
             self._zones = [self._entries[name].zone for name in sorted(self._entries)]
         return self._zones
 
     def active(self) -> list[str]:
-        """Return the ids of the active zones."""
-        return sorted(name for name, entry in self._entries.items() if entry.active)
+        """Return the ids of the active zones; the same list as long as nothing changes."""
+        if self._active_ids is None:
+            self._active_ids = sorted(name for name, entry in self._entries.items() if entry.active)
+        return self._active_ids
 
     def size(self, without: str) -> tuple[int, int]:
         """Return how many zones there are besides the one with this id, and how many cells they cover in sum."""
@@ -154,7 +157,7 @@ class ZonesLayer(CostLayer):
 
     def _set_changed(self) -> None:
         self._changed = True
-        self._zones = self._active = self._timed = None
+        self._zones = self._active_ids = self._active = self._timed = None
 
     def _mark(self, entry: _ZoneEntry, state: str) -> None:
         self.mark_updated(entry.spans.window, Cause(kind="zone", id=entry.zone.id, state=state))

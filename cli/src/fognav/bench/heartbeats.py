@@ -1,0 +1,37 @@
+"""Measures the time between the heartbeats of a map, as a process of its own: `python -m fognav.bench.heartbeats`.
+
+Nothing else runs in this process, so that no other work delays what it measures. Each line on standard input ends a
+measurement, whose gaps (s) are written as one JSON list.
+"""
+
+from __future__ import annotations
+
+import itertools
+import sys
+import time
+
+import msgspec
+import zenoh
+
+from fog_contracts import channels as ch
+from fog_runtime.zenoh_edge import session_config
+
+
+def main() -> None:
+    """Listen to the site and endpoint that the command line names, until standard input ends."""
+    site, endpoint = sys.argv[1:]
+    times: list[float] = []
+    with zenoh.open(session_config("client", connect=[endpoint])) as session:
+        session.declare_subscriber(ch.MAP_HEARTBEAT.key(site=site), lambda _: times.append(time.monotonic()))
+        begin = time.monotonic()
+        for _ in sys.stdin:
+            end = time.monotonic()
+            inside = [begin, *(at for at in times.copy() if begin < at < end), end]
+            gaps = [later - earlier for earlier, later in itertools.pairwise(inside)]
+            sys.stdout.buffer.write(msgspec.json.encode(gaps) + b"\n")
+            sys.stdout.flush()
+            begin = end
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,109 @@
+"""Measures how steadily a map-service sends its heartbeat while clients ask it for all that costs it time.
+
+A real process with Redis, broker and router of its own; the heartbeat is timed by another process. The same run
+measures it without clients first: on a busy machine only the two together mean something.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import subprocess
+import sys
+from contextlib import asynccontextmanager, contextmanager
+from typing import TYPE_CHECKING, Final
+
+import msgspec
+import numpy as np
+import psutil
+
+from fog_runtime.maps import save_map
+from fog_runtime.redis_store import Audit
+from fognav.bench.costmap import random_zones, worst_shapes
+from fognav.bench.rest_clients import Load
+from fognav.stack import MAP_SERVICE, SERVERS, Stack, StackConfig
+from map_service.store import Store
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Iterator
+    from pathlib import Path
+
+    from fog_contracts.grid import StaticMap
+    from fog_contracts.messages import Zone
+
+SITE: Final = "bench"
+IDLE_S: Final = 5.0
+"""How long the heartbeat is measured without clients, unless told otherwise."""
+_READY_S: Final = 120.0
+
+
+def write_site(folder: Path, floor: StaticMap) -> None:
+    """Write a site without areas and robots."""
+    save_map(folder / "map", floor)
+    (folder / "site.toml").write_text(f'id = "{SITE}"\nmap = "map.yaml"\n', "utf-8")
+
+
+async def measure(  # all that a run consists of, by name
+    folder: Path, floor: StaticMap, *, zones: int, clients: int, seconds: float, idle_s: float = IDLE_S
+) -> dict[str, float | int | dict[str, int]]:
+    """Return the gaps between heartbeats (ms), without clients (`idle_`) and with them, and what these were answered.
+
+    `folder` holds a site (`write_site`) of this floor; `zones` are stored before.
+    """
+    config = StackConfig(site_dir=folder, robot="none", extra={"HAZARDS_WAIT_S": "0"})
+    async with _map_service(config, random_zones(floor, zones)) as stack:
+        pid, port = stack.pids()[MAP_SERVICE], stack.port(MAP_SERVICE)
+        assert port is not None
+        load = Load(port, stack.token, worst_shapes(floor))
+        with _listener(stack.zenoh_endpoint) as listener:
+            await asyncio.sleep(idle_s)
+            idle = _gaps(listener)
+            begun = psutil.Process(pid).cpu_times()
+            await load.run(clients, seconds)
+            loaded = _gaps(listener)
+            ended = psutil.Process(pid)
+        return {
+            **_figures("idle_heartbeat_gap", idle),
+            **_figures("heartbeat_gap", loaded),
+            "requests": dict(sorted(load.answers.items())),
+            "cpu_s": round(sum(ended.cpu_times()[:2]) - sum(begun[:2]), 1),
+            "rss_mb": round(ended.memory_info().rss / 1e6, 1),
+        }
+
+
+def _figures(name: str, gaps: list[float]) -> dict[str, float]:
+    p50, p99 = np.percentile(gaps, [50, 99])
+    return {
+        f"{name}_p50_ms": round(float(p50) * 1000.0, 1),
+        f"{name}_p99_ms": round(float(p99) * 1000.0, 1),
+        f"{name}_max_ms": round(max(gaps) * 1000.0, 1),
+    }
+
+
+@asynccontextmanager
+async def _map_service(config: StackConfig, zones: list[Zone]) -> AsyncIterator[Stack]:
+    """Run a map-service that has these zones, and its servers."""
+    async with Stack(config) as stack:
+        await stack.start_servers(_READY_S)
+        async with Store(stack.redis_url, SITE) as store:
+            await store.restore(zones, Audit(0.0, "bench", "restore"))
+        stack.supervisor.start(MAP_SERVICE)
+        await stack.supervisor.wait_ready([*SERVERS, MAP_SERVICE], _READY_S)
+        yield stack
+
+
+@contextmanager
+def _listener(endpoint: str) -> Iterator[subprocess.Popen[bytes]]:
+    command = (sys.executable, "-m", "fognav.bench.heartbeats", SITE, endpoint)
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        _gaps(process)  # once it listens
+        yield process
+        process.terminate()
+
+
+def _gaps(listener: subprocess.Popen[bytes]) -> list[float]:
+    """Return the gaps (s) since the last call."""
+    assert listener.stdin is not None
+    assert listener.stdout is not None
+    listener.stdin.write(b"\n")
+    listener.stdin.flush()
+    return msgspec.json.decode(listener.stdout.readline(), type=list[float])

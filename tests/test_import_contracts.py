@@ -30,7 +30,8 @@ EDGES = {
     "fognav.demo.placement", "fognav.demo.preparation", "fognav.demo.presence", "fognav.demo.report", "fognav.demo.run",
     "fognav.demo.scene", "fognav.demo.usage", "fognav.demo.view", "fognav.demo_command", "fognav.doctor",
     "fognav.generated", "fognav.kernels", "fognav.operate", "fognav.output", "fognav.page.app",
-    "fognav.pytest_progress", "fognav.recording", "fognav.robot_command", "fognav.site_command", "fognav.stack",
+    "fognav.pytest_progress", "fognav.recording", "fognav.robot_command", "fognav.robot_file_command",
+    "fognav.site_command", "fognav.stack",
     "fognav.status_command", "fognav.system", "fognav.testing", "fognav.token_command", "fognav.zone_command",
     "fog_kernels.warm",
     "hazard_aggregator.__main__", "hazard_aggregator.api", "hazard_aggregator.registry", "hazard_aggregator.service",
@@ -52,7 +53,7 @@ EDGES = {
 PURE_LIBRARIES = {
     "__future__", "abc", "binascii", "bisect", "collections", "contextlib", "dataclasses", "enum", "functools",
     "hashlib", "heapq", "hmac", "itertools", "json", "math", "msgspec", "numba", "numpy", "random", "re", "struct",
-    "typing", "zlib",
+    "textwrap", "typing", "zlib",
 }  # fmt: skip
 """What pure modules may import besides each other: no clock, file, process or hidden state; `random` only seeded."""
 

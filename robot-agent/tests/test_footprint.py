@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robot_agent.config import AgentConfig
-from robot_agent.footprint import Footprint, FootprintError, parse_footprint
+from robot_agent.footprint import Footprint, FootprintError
 
 BOX = ((0.2, 0.15), (-0.1, 0.15), (-0.1, -0.15), (0.2, -0.15))
 
@@ -82,13 +82,6 @@ def test_padding_moves_each_side_by_the_distance_and_contains_all_that_is_so_nea
     angles = rng.uniform(0.0, math.tau, 50)
     near = weights @ footprint.polygon + distance * np.column_stack((np.cos(angles), np.sin(angles)))
     assert distances_outside(padded, near).max() <= 1e-9
-
-
-def test_footprint_of_a_setting_is_parsed_and_its_errors_say_what_is_expected():
-    assert parse_footprint("[[0.2, 0.15], [-0.1, 0.15], [-0.1, -0.15], [0.2, -0.15]]") == Footprint(BOX)
-    for text in ("round", "[[1, 2, 3]]", '{"radius": 0.2}', "[[0.2, 0.1]]"):
-        with pytest.raises(FootprintError, match="footprint"):
-            parse_footprint(text)
 
 
 def test_configuration_with_a_footprint_survives_json():

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fog_runtime import parts
+from fog_runtime.robot_file import default_robot, load_robot
 from fog_runtime.settings import SettingsError
 from fognav_sim import devices, emulators
 from robot_agent import registry
@@ -34,23 +35,35 @@ def test_every_base_and_lidar_has_its_stop_command_and_emulator():
     assert parts.names(emulators.LIDARS) == LIDARS
 
 
-@pytest.mark.parametrize("make", [registry.make_base, registry.make_lidar])
+def make_base(name):
+    return registry.make_base(default_robot(base=name))
+
+
+def make_lidar(name):
+    return registry.make_lidar(default_robot(lidar=name))
+
+
+@pytest.mark.parametrize("make", [make_base, make_lidar])
 def test_an_unknown_name_is_refused_with_the_known_ones(make):
-    with pytest.raises(SettingsError, match=r"FOGNAV_(BASE|LIDAR): .*'tank' \(known: "):
+    with pytest.raises(SettingsError, match=r"(base|lidar)\.driver: .*'tank' \(known: "):
         make("tank")
 
 
-@pytest.mark.parametrize(("make", "name"), [(registry.make_base, "diffdrive"), (registry.make_lidar, "ld19")])
-def test_a_wrong_option_is_refused_by_its_name(make, name):
-    with pytest.raises(SettingsError, match=r"FOGNAV_(BASE|LIDAR)_OPTIONS: .*wings"):
-        make(name, '{"wings": 2}')
+@pytest.mark.parametrize(
+    ("make", "part", "name"),
+    [(registry.make_base, "BASE", "diffdrive"), (registry.make_lidar, "LIDAR", "ld19")],
+)
+def test_a_wrong_option_is_refused_by_its_name(make, part, name):
+    robot = load_robot({f"FOGNAV_{part}": name, f"FOGNAV_{part}_OPTIONS": '{"wings": 2}'})
+    with pytest.raises(SettingsError, match=rf"FOGNAV_{part}_OPTIONS.wings: there is no such setting. Its options: "):
+        make(robot)
 
 
 class Wire:
     """A guardian, a driver and an emulator on one line, in emulated time."""
 
     def __init__(self, name: str) -> None:
-        self.driver = registry.make_base(name)
+        self.driver = make_base(name)
         self.core = GuardianCore(self.driver)
         self.base = devices.make_base(name)
         self.stop: StopCommand = parts.load(STOPS, name, StopCommand)
@@ -159,7 +172,7 @@ def test_a_base_that_was_stopped_by_the_watchdog_is_woken_by_the_next_guardian(n
     wire = Wire(name).ready()
     wire.run(0.5, (0.3, 0.3))
     wire.base.receive(wire.stop.stop, wire.now)
-    wire.core = GuardianCore(registry.make_base(name))
+    wire.core = GuardianCore(make_base(name))
     wire.ready()
     wire.run(0.6, (0.2, 0.2))
     assert wire.base.wheel_speeds_m_s == (0.2, 0.2)
@@ -170,7 +183,7 @@ def test_a_base_that_was_stopped_by_the_watchdog_is_woken_by_the_next_guardian(n
 @settings(max_examples=20, deadline=None)
 def test_base_frames_parse_in_pieces_of_any_size_and_damaged_ones_are_counted(name, seed, sizes):
     rng = np.random.default_rng(seed)
-    base, whole, cut, damaged = devices.make_base(name), *(registry.make_base(name) for _ in range(3))
+    base, whole, cut, damaged = devices.make_base(name), *(make_base(name) for _ in range(3))
     base.receive(whole.wake(), 0.0)
     base.add_wheel_travel(3.0, 2.0)
     clean, dirty, now = b"", b"", 0.0
@@ -206,7 +219,7 @@ def box(angles, now):
 
 
 def scans_of(name, lidar, seconds, *, pieces=lambda data: [data], begin=0.0):
-    driver = registry.make_lidar(name)
+    driver = make_lidar(name)
     lidar.receive(driver.begin(begin), begin)
     scans = []
     for number in range(1, round(seconds / STEP) + 1):
@@ -262,7 +275,7 @@ def test_lidar_that_already_scans_gives_whole_scans(name):
 @every_lidar
 def test_stuck_link_gives_identical_scans(name):
     lidar = devices.make_lidar(name, box)
-    driver = registry.make_lidar(name)
+    driver = make_lidar(name)
     lidar.receive(driver.begin(0.0), 0.0)
     repeats = []
     for number in range(300):
@@ -278,7 +291,7 @@ def test_stuck_link_gives_identical_scans(name):
 @every_lidar
 def test_silent_lidar_is_a_problem_until_it_sends_again(name):
     lidar = devices.make_lidar(name, box)
-    driver = registry.make_lidar(name)
+    driver = make_lidar(name)
     lidar.receive(driver.begin(0.0), 0.0)
     problems = []
     for number in range(500):
@@ -304,7 +317,7 @@ def test_no_bytes_raise_and_damaged_scans_stay_finite(name, garbage, seed):
             damaged[rng.integers(len(damaged))] ^= int(rng.integers(1, 256))
         return [bytes(damaged)]
 
-    lidar, driver = devices.make_lidar(name, box), registry.make_lidar(name)
+    lidar, driver = devices.make_lidar(name, box), make_lidar(name)
     driver.begin(0.0)
     driver.receive(garbage, 0.0)
     driver.tick(0.1)

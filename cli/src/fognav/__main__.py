@@ -12,7 +12,6 @@ import typer
 from rich.table import Table
 
 from fog_runtime import parts
-from fog_runtime.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fognav import __version__, checkout, doctor, kernels, system
 from fognav.area_command import area_app
 from fognav.bench_command import bench_app
@@ -31,6 +30,7 @@ from fognav.output import (
     write_report,
 )
 from fognav.robot_command import robot_app, robot_goal
+from fognav.robot_file_command import robot_check, robot_new
 from fognav.status_command import status_command
 from fognav.token_command import token_app
 from fognav.zone_command import zone_app
@@ -53,6 +53,10 @@ app.add_typer(token_app, name="token")
 app.add_typer(bench_app, name="bench")
 app.command("status", epilog="Example: fognav status --json")(status_command)
 app.command("goal", context_settings=NUMBERS, epilog="Example: fognav goal b")(robot_goal)
+robot_app.command("new", epilog="Example: fognav robot new --base roomba600 --lidar rplidar-a1 --out robot.toml")(
+    robot_new
+)
+robot_app.command("check", epilog="Example: fognav robot check robot.toml")(robot_check)
 app.command("channels", epilog="Example: fognav channels --format acl --broker mqtt")(channels_command)
 
 Yes = Annotated[bool, typer.Option("--yes", help="Install missing system packages without asking (as does CI=true).")]
@@ -167,11 +171,18 @@ def demo_command(  # noqa: PLR0913  # each option is an argument
     ] = 1.0,
     no_hazard: Annotated[bool, typer.Option("--no-hazard", help="Place no barrier on the path.")] = False,
     base: Annotated[
-        str, typer.Option("--base", metavar="NAME", help=f"The robot's base: {_known_parts(emulators.BASES)}.")
-    ] = DEFAULT_BASE,
+        str | None, typer.Option("--base", metavar="NAME", help=f"The robot's base: {_known_parts(emulators.BASES)}.")
+    ] = None,
     lidar: Annotated[
-        str, typer.Option("--lidar", metavar="NAME", help=f"The robot's lidar: {_known_parts(emulators.LIDARS)}.")
-    ] = DEFAULT_LIDAR,
+        str | None,
+        typer.Option("--lidar", metavar="NAME", help=f"The robot's lidar: {_known_parts(emulators.LIDARS)}."),
+    ] = None,
+    robot_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--robot-file", metavar="F", help="Settings of the robot, from fognav robot new; its ports do not count."
+        ),
+    ] = None,
     keep_running: Annotated[
         bool, typer.Option("--keep-running", help="Keep the system running after the drive, until Ctrl-C.")
     ] = False,
@@ -189,8 +200,9 @@ def demo_command(  # noqa: PLR0913  # each option is an argument
     The exit code is 0 if the robot reached the goal without contact and avoided the blocked area; 1 if it did not, or
     the demo was interrupted (see the report); 2 if an option or file can't be used.
     """
+    from fog_runtime.settings import SettingsError  # noqa: PLC0415  # same
     from fog_runtime.site import SiteError, load_site  # noqa: PLC0415  # keeps the other commands fast
-    from fognav.demo.options import Options  # noqa: PLC0415  # same
+    from fognav.demo.options import Options, hardware  # noqa: PLC0415  # same
     from fognav.demo_command import run_demo  # noqa: PLC0415  # same
 
     try:
@@ -198,7 +210,8 @@ def demo_command(  # noqa: PLR0913  # each option is an argument
         load_site(folder)  # a site that can't be used is refused before anything is installed or compiled
         for file in (report, record):
             check_writable(file)
-    except (WrongUseError, SiteError) as error:
+        base, lidar = hardware(robot_file, base, lidar)
+    except (WrongUseError, SiteError, SettingsError) as error:
         fail(str(error), WRONG_USE)
     _prepare(yes=yes)
     options = Options(
@@ -207,6 +220,7 @@ def demo_command(  # noqa: PLR0913  # each option is an argument
         hazard=not no_hazard,
         base=base,
         lidar=lidar,
+        robot_file=robot_file and robot_file.resolve(),
         keep_running=keep_running,
         record=record,
     )

@@ -1,21 +1,28 @@
-"""The files that the channel table generates, each with its path in the checkout; the REST routes come from OpenAPI.
+"""The files that the channel table and the settings' types generate, each with its path in the checkout.
 
-The services' apps are created without a service behind them: describing the routes calls no service.
+The REST routes come from OpenAPI. The services' apps are created without a service behind them: describing the routes
+calls no service.
 """
 
 from collections.abc import Callable, Mapping
+from importlib.metadata import distribution
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
 from fog_contracts.generate.header import firmware_header
 from fog_contracts.generate.markdown import OpenApi, channels_markdown
 from fog_contracts.generate.mqtt_acl import mqtt_acl
+from fog_contracts.generate.robot_toml import robot_settings_markdown
 from fog_contracts.generate.zenoh_acl import zenoh_acl
 from fog_runtime.clock import SystemClock
 from fog_runtime.health import Health
 from fog_runtime.http import Tokens
+from fog_runtime.robot_file import default_robot
 from fog_runtime.site import load_site
 from fognav import checkout
+
+if TYPE_CHECKING:
+    import msgspec
 
 WRITE: Final = "./fognav channels --write"
 """The command that updates all generated files."""
@@ -50,8 +57,22 @@ def markdown() -> str:
     return channels_markdown(rest_routes())
 
 
+def robot_settings() -> str:
+    """Return `docs/robot-settings.md`."""
+    from robot_agent import registry  # noqa: PLC0415  # drivers need numpy: only this function waits for it
+
+    own = distribution("robot-agent").entry_points
+    drivers: list[tuple[str, msgspec.Struct]] = []
+    for part, group in (("base", registry.BASES), ("lidar", registry.LIDARS)):
+        for name in sorted(point.name for point in own if point.group == group):
+            robot = default_robot(**{part: name})
+            drivers.append((f"`[{part}.options]` of `{name}`", registry.options(robot)[part == "lidar"]))
+    return robot_settings_markdown(default_robot().settings, drivers)
+
+
 FILES: Final[Mapping[str, Callable[[], str]]] = {
     "docs/channels.md": markdown,
+    "docs/robot-settings.md": robot_settings,
     "deploy/mosquitto/acl": mqtt_acl,
     "deploy/zenoh/acl.json5": zenoh_acl,
     "firmware/include/fognav_contract.h": firmware_header,

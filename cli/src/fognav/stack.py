@@ -43,14 +43,15 @@ Ready = Callable[[], Awaitable[str | None]]
 class StackConfig:
     """Configuration of a stack.
 
-    `robot` is the id of the site's robot, `base` and `lidar` name its hardware; `extra` contains further FOGNAV_
-    settings for every process.
+    `robot` is the id of the site's robot, `base` and `lidar` name its hardware, and `robot_file` has its settings, of
+    which the ports do not count; `extra` contains further FOGNAV_ settings for every process.
     """
 
     site_dir: Path
     robot: str
     base: str = DEFAULT_BASE
     lidar: str = DEFAULT_LIDAR
+    robot_file: Path | None = None
     seed: int = 1
     speed: float = 1.0
     extra: Mapping[str, str] | None = None
@@ -166,7 +167,8 @@ class Stack:
         for name in ("logs", "ports", "data", "sim"):
             (self.folder / name).mkdir(mode=0o700)
         self._add_servers()
-        hardware = {"BASE": self.config.base, "LIDAR": self.config.lidar}
+        robot_file = {"ROBOT_FILE": str(self.config.robot_file)} if self.config.robot_file else {}
+        hardware = {"BASE": self.config.base, "LIDAR": self.config.lidar, **robot_file}
         self._add_python(SIMULATOR, "fognav_sim", {**hardware, "RUN_DIR": str(self.folder / "sim")})
         for name, module in zip(SERVICES, ("hazard_aggregator", "map_service", "planner"), strict=True):
             self._add_python(name, module, {})

@@ -14,6 +14,7 @@ from fog_contracts.commands import signed_command
 from fog_contracts.handlers import Moment, Publication
 from fog_contracts.messages import CommandReply
 from fog_runtime.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
+from fog_runtime.robot_file import default_robot
 from fognav_experiments.processes import AgentProcess, Fog
 from fognav_sim import devices
 from fognav_sim.floor import Floor
@@ -83,7 +84,8 @@ class RobotRig:
         """Assemble the robot around its emulated base; `base` names its driver, `lidar` driver and emulator."""
         self.id = robot.id
         self._bus = bus
-        driver, self._lidar_driver = make_base(base), make_lidar(lidar)
+        mounted = default_robot(base, lidar)
+        driver, self._lidar_driver = make_base(mounted), make_lidar(mounted)
         lidar_emulator = devices.make_lidar(lidar, world.lidar)
         self.hardware = Hardware(
             world, base_emulator, lidar_emulator, start, initial_wheel_travel_m=_INITIAL_WHEEL_TRAVEL_M

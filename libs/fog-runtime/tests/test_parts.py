@@ -1,10 +1,8 @@
 from __future__ import annotations
 
-import msgspec
 import pytest
 
 from fog_runtime import parts
-from fog_runtime.settings import SettingsError, load_options
 
 GROUP = "fognav.test_parts"
 
@@ -63,26 +61,3 @@ def test_part_of_the_wrong_type_is_refused(install):
     install("one", "pi = math:pi")
     with pytest.raises(parts.PartError, match="is not a str"):
         parts.load(GROUP, "pi", str)
-
-
-class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    axle_m: float = 0.2
-    counts: int = 100
-
-
-def test_json_options_override_the_defaults():
-    assert load_options(Options, "", variable="X") == Options()
-    assert load_options(Options, '{"counts": 7}', variable="X") == Options(counts=7)
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ('{"axle_m": "wide"}', r"FOGNAV_X: Expected `float`, got `str` - at `\$.axle_m`. Give .*: axle_m, counts"),
-        ('{"axel_m": 0.3}', "FOGNAV_X: .*axel_m"),
-        ("axle_m=0.3", "FOGNAV_X: JSON is malformed"),
-    ],
-)
-def test_invalid_options_are_refused_by_variable_and_field(text, words):
-    with pytest.raises(SettingsError, match=words):
-        load_options(Options, text, variable="FOGNAV_X")

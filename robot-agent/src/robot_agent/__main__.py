@@ -13,16 +13,17 @@ import secrets
 from fog_runtime import logs, process, signals
 from fog_runtime.clock import SystemClock
 from fog_runtime.health import Health, serve_health
+from fog_runtime.robot_file import describe_robot, load_robot
 from fog_runtime.settings import describe, load
 from fog_runtime.zenoh_edge import ZenohEdge
+from robot_agent import registry
 from robot_agent.agent.guardian_client import GuardianClient
 from robot_agent.agent.input_writer import open_core
 from robot_agent.agent.lidar_edge import LidarEdge
 from robot_agent.agent.service import Service
-from robot_agent.agent.settings import Settings, read_footprint, read_operator_key, read_site
+from robot_agent.agent.settings import Settings, read_footprint, read_operator_key, read_port, read_site
 from robot_agent.agent.store import Store
 from robot_agent.config import agent_config
-from robot_agent.registry import make_base, make_lidar
 
 _log = logs.get("agent")
 
@@ -34,8 +35,9 @@ async def main() -> None:
     _log.info("settings_loaded", **describe(settings))
     site, body = read_site(settings)
     key = read_operator_key(settings.operator_key_file)
-    base = make_base(settings.base, settings.base_options)
-    lidar_driver = make_lidar(settings.lidar, settings.lidar_options)
+    robot = load_robot(os.environ)
+    base, lidar_driver = registry.make_base(robot), registry.make_lidar(robot)
+    _log.info("robot_settings", **describe_robot(robot, *registry.options(robot)))
     config = agent_config(
         settings.robot,
         key,
@@ -44,7 +46,8 @@ async def main() -> None:
         body,
         boot=secrets.token_hex(8),
         obstacle_ttl=settings.obstacle_memory_s,
-        footprint=read_footprint(settings),
+        footprint=read_footprint(robot),
+        settings=robot.settings,
     )
     clock = SystemClock(settings.speed)
     health = Health("map", "pose", "lidar", "base")
@@ -57,7 +60,7 @@ async def main() -> None:
         ):
             agent = Service(core, zenoh, Store(settings.data_dir), clock, health, site=site)
             guardian = GuardianClient(settings.guardian_socket, clock, agent.on_feedback, agent.on_base_lost)
-            lidar = LidarEdge(settings.lidar_port, lidar_driver, clock, core.on_lidar_samples, agent.on_scan)
+            lidar = LidarEdge(read_port(robot), lidar_driver, clock, core.on_lidar_samples, agent.on_scan)
             agent.restore(body)
             agent.subscribe()
             zenoh.declare_liveliness("robot-agent", settings.robot)

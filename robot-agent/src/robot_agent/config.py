@@ -16,6 +16,7 @@ from robot_agent.footprint import Footprint
 from robot_agent.hardware import DriveTrain  # noqa: TC001  # read at run time, when a configuration is decoded
 
 if TYPE_CHECKING:
+    from fog_contracts.robot import RobotSettings
     from fog_contracts.site import RobotSite
     from robot_agent.hardware import LidarTraits
 
@@ -130,12 +131,14 @@ def agent_config(  # noqa: PLR0913  # what the process knows about its robot
     boot: str,
     obstacle_ttl: float | None = None,
     footprint: Footprint | None = None,
+    settings: RobotSettings | None = None,
 ) -> AgentConfig:
     """Return the configuration of a robot with this id, base and lidar, and the radius and height that its site gives.
 
     boot: id of this run of the agent, never used before.
     obstacle_ttl: how long (s) a reported obstacle counts while no lidar looks there again; None for the default.
     footprint: outline of the body; None for the circle of the site's radius.
+    settings: the robot's own settings; None for the defaults.
     """
     limits = DwaLimits(axle=drive_train.axle_m, wheel_max=min(_WHEEL_SPEED_MAX, drive_train.wheel_speed_max_m_s))
     scan_lost = max(SafetyConfig().scan_lost, _LOST_AFTER_REVOLUTIONS * lidar.scan_period_s)
@@ -158,4 +161,31 @@ def agent_config(  # noqa: PLR0913  # what the process knows about its robot
         radius = inscribed = config.radius if body is None else body.radius
         footprint = Footprint.circle(radius)
     inflation = replace(config.motion.inflation, inscribed_radius=inscribed)
-    return replace(config, footprint=footprint, radius=radius, motion=replace(config.motion, inflation=inflation))
+    config = replace(config, footprint=footprint, radius=radius, motion=replace(config.motion, inflation=inflation))
+    return config if settings is None else _with_settings(config, settings)
+
+
+def _with_settings(config: AgentConfig, settings: RobotSettings) -> AgentConfig:
+    """Return the configuration with the speeds, the lidar's pose and the odometry's noise of the robot's settings."""
+    motion, lidar = settings.motion, settings.lidar
+    limits = replace(
+        config.motion.limits,
+        v_max=motion.speed_m_s,
+        w_max=motion.turn_rad_s,
+        acc_v=motion.acceleration_m_s2,
+        acc_w=motion.turn_acceleration_rad_s2,
+    )
+    safety = replace(
+        config.safety,
+        speed_normal=motion.speed_m_s,
+        speed_degraded=motion.degraded_speed_m_s,
+        speed_egress=min(config.safety.speed_egress, motion.degraded_speed_m_s),
+    )
+    localization = replace(
+        config.localization,
+        alphas=settings.odometry.alphas,
+        lidar_x=lidar.x_m,
+        lidar_y=lidar.y_m,
+        lidar_yaw=lidar.yaw_rad,
+    )
+    return replace(config, motion=replace(config.motion, limits=limits), safety=safety, localization=localization)

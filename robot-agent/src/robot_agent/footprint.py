@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Final
 
-import msgspec
 import numpy as np
 
 if TYPE_CHECKING:
@@ -119,16 +118,3 @@ class Footprint:
             scale = distance / (1.0 + nx * mx + ny * my)
             moved.append((bx + scale * (nx + mx), by + scale * (ny + my)))
         return Footprint(tuple(moved))
-
-
-def parse_footprint(text: str) -> Footprint:
-    """Return the footprint in a JSON array of vertices such as `[[0.2, 0.15], [-0.2, 0.15], [-0.2, -0.15], ...]`.
-
-    Raises:
-        FootprintError: when the text is no such array, or its vertices are no convex polygon around (0, 0).
-
-    """
-    try:
-        return Footprint(msgspec.json.decode(text, type=tuple[Vertex, ...]))
-    except msgspec.DecodeError as error:
-        raise FootprintError(f"a footprint is a JSON array of [x, y] in metres: {error}") from error

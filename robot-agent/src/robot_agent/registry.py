@@ -1,33 +1,62 @@
-"""The robot's base and lidar by their names in settings (FOGNAV_BASE, FOGNAV_LIDAR), with their own options."""
+"""The robot's base and lidar by the names of their drivers in its settings, with the drivers' own options."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Final
 
 from fog_runtime import parts
-from fog_runtime.settings import SettingsError, load_options
 from robot_agent.hardware import BaseFactory, LidarFactory
 
 if TYPE_CHECKING:
+    import msgspec
+
+    from fog_runtime.robot_file import RobotFile
     from robot_agent.hardware import BaseDriver, LidarDriver
 
 BASES: Final = "fognav.bases"
 LIDARS: Final = "fognav.lidars"
 
 
-def make_base(name: str, options: str = "") -> BaseDriver:
-    """Make the driver of a base; `options` is a JSON object, empty for the defaults. Raises `SettingsError`."""
+def base_factory(robot: RobotFile) -> BaseFactory[Any]:
+    """Return what the base's package registered under its name; raises `SettingsError`."""
     try:
-        factory: BaseFactory[Any] = parts.load(BASES, name, BaseFactory)
+        factory: BaseFactory[Any] = parts.load(BASES, robot.settings.base.driver, BaseFactory)
     except parts.PartError as error:
-        raise SettingsError(f"FOGNAV_BASE: {error}") from error
-    return factory.make(load_options(factory.options, options, variable="FOGNAV_BASE_OPTIONS"))
+        raise robot.error("base.driver", str(error).rstrip(".")) from error
+    return factory
 
 
-def make_lidar(name: str, options: str = "") -> LidarDriver:
-    """Make the driver of a lidar; `options` is a JSON object, empty for the defaults. Raises `SettingsError`."""
+def lidar_factory(robot: RobotFile) -> LidarFactory[Any]:
+    """Return what the lidar's package registered under its name; raises `SettingsError`."""
     try:
-        factory: LidarFactory[Any] = parts.load(LIDARS, name, LidarFactory)
+        factory: LidarFactory[Any] = parts.load(LIDARS, robot.settings.lidar.driver, LidarFactory)
     except parts.PartError as error:
-        raise SettingsError(f"FOGNAV_LIDAR: {error}") from error
-    return factory.make(load_options(factory.options, options, variable="FOGNAV_LIDAR_OPTIONS"))
+        raise robot.error("lidar.driver", str(error).rstrip(".")) from error
+    return factory
+
+
+def options(robot: RobotFile) -> tuple[msgspec.Struct, msgspec.Struct]:
+    """Return the options of base and lidar, each as its driver's own type; raises `SettingsError`."""
+    return (
+        robot.options("base", base_factory(robot).options),
+        robot.options("lidar", lidar_factory(robot).options),
+    )
+
+
+def make_base(robot: RobotFile) -> BaseDriver:
+    """Make the driver of the robot's base; raises `SettingsError`."""
+    factory = base_factory(robot)
+    return factory.make(robot.options("base", factory.options))
+
+
+def make_lidar(robot: RobotFile) -> LidarDriver:
+    """Make the driver of the robot's lidar, as it is mounted; raises `SettingsError`."""
+    from robot_agent.lidar_mounting import MountedLidar, Mounting  # noqa: PLC0415  # numpy: the guardian needs none
+
+    factory = lidar_factory(robot)
+    driver = factory.make(robot.options("lidar", factory.options))
+    given = robot.settings.lidar
+    mounting = Mounting(
+        yaw_rad=given.yaw_rad, mirrored=given.mirrored, latency_s=given.latency_s, masks=tuple(given.masks)
+    )
+    return driver if mounting.plain else MountedLidar(driver, mounting)

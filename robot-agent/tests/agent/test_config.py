@@ -7,9 +7,13 @@ from dataclasses import replace
 import pytest
 
 from fog_contracts.messages import Pose
+from fog_contracts.robot import BaseSettings, LidarSettings, MotionSettings, OdometrySettings, RobotSettings
 from fog_contracts.site import RobotSite
+from fog_runtime.robot_file import default_robot
 from robot_agent.config import agent_config
 from robot_agent.footprint import Footprint
+from robot_agent.guardian.core import Limits
+from robot_agent.guardian.process import limits_of
 from robot_agent.hardware import DriveTrain, LidarTraits
 
 KEY = b"k" * 32
@@ -41,6 +45,37 @@ def test_hardware_sets_axle_top_speed_ranges_and_how_long_a_scan_may_take():
     assert config.safety.scan_lost == pytest.approx(2.4 * 0.2)
     fast = agent_config("r1", KEY, replace(BASE, wheel_speed_max_m_s=2.0), replace(LIDAR, scan_period_s=0.1), boot="b1")
     assert (fast.motion.limits.wheel_max, fast.safety.scan_lost) == (0.5, 0.45)
+
+
+def test_every_setting_of_the_robot_file_reaches_the_configuration():
+    settings = RobotSettings(
+        base=BaseSettings(driver="b"),
+        lidar=LidarSettings(driver="l", x_m=0.1, y_m=-0.02, yaw_rad=1.5),
+        odometry=OdometrySettings(alphas=(0.1, 0.2, 0.3, 0.4)),
+        motion=MotionSettings(
+            speed_m_s=0.2,
+            degraded_speed_m_s=0.08,
+            turn_rad_s=1.5,
+            acceleration_m_s2=0.5,
+            turn_acceleration_rad_s2=0.9,
+        ),
+    )
+    config = agent_config("r1", KEY, BASE, LIDAR, BODY, boot="b1", settings=settings)
+    limits, where = config.motion.limits, config.localization
+    assert (limits.v_max, limits.w_max, limits.acc_v, limits.acc_w) == (0.2, 1.5, 0.5, 0.9)
+    assert (limits.axle, limits.wheel_max) == (0.3, 0.4)
+    safety = config.safety
+    assert (safety.speed_normal, safety.speed_degraded, safety.speed_egress) == (0.2, 0.08, 0.08)
+    assert (where.lidar_x, where.lidar_y, where.lidar_yaw, where.alphas) == (0.1, -0.02, 1.5, (0.1, 0.2, 0.3, 0.4))
+    assert limits_of(settings.motion) == Limits(linear=0.21, acceleration=0.6)
+
+
+def test_default_settings_are_the_defaults_of_agent_and_guardian():
+    settings = default_robot().settings
+    assert agent_config("r1", KEY, BASE, LIDAR, BODY, boot="b1", settings=settings) == agent_config(
+        "r1", KEY, BASE, LIDAR, BODY, boot="b1"
+    )
+    assert limits_of(settings.motion) == Limits()
 
 
 def test_defaults_apply_without_a_site():

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import pytest
 
+from fog_runtime.robot_file import load_robot
 from fog_runtime.settings import SettingsError, load
 from robot_agent.agent.settings import Settings, read_footprint, read_operator_key, read_site
 
@@ -17,7 +18,6 @@ radius = 0.2
 def settings(tmp_path, **more):
     environ = {
         "FOGNAV_ROBOT": "r1",
-        "FOGNAV_LIDAR_PORT": "/dev/null",
         "FOGNAV_GUARDIAN_SOCKET": str(tmp_path / "socket"),
         "FOGNAV_DATA_DIR": str(tmp_path),
         **{f"FOGNAV_{name.upper()}": str(value) for name, value in more.items()},
@@ -73,10 +73,10 @@ def test_the_operators_key_is_hexadecimal_and_long_enough(tmp_path):
             read_operator_key(missing)
 
 
-def test_footprint_is_a_polygon_in_metres_and_a_wrong_one_is_named(tmp_path):
-    assert read_footprint(settings(tmp_path)) is None
-    box = read_footprint(settings(tmp_path, footprint="[[0.2, 0.15], [-0.1, 0.15], [-0.1, -0.15], [0.2, -0.15]]"))
+def test_footprint_is_a_polygon_in_metres_and_a_wrong_one_is_named():
+    assert read_footprint(load_robot({})) is None
+    box = read_footprint(load_robot({"FOGNAV_FOOTPRINT": "[[0.2, 0.15], [-0.1, 0.15], [-0.1, -0.15], [0.2, -0.15]]"}))
     assert box.inscribed_radius == pytest.approx(0.1)
     for text in ("200, 150", "[[0.2, 0.15], [0.2, -0.15], [-0.1, 0.15]]"):
         with pytest.raises(SettingsError, match="FOGNAV_FOOTPRINT: "):
-            read_footprint(settings(tmp_path, footprint=text))
+            read_footprint(load_robot({"FOGNAV_FOOTPRINT": text}))

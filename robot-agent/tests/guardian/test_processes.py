@@ -261,6 +261,21 @@ def test_agent_that_sends_nothing_gives_way_and_bad_packets_are_refused(rig):
     assert rig.watchdog.count("guardian_lost") == 0
 
 
+def test_robot_file_names_base_and_port_and_limits_the_speed(tmp_path):
+    file = tmp_path / "robot.toml"
+    file.write_text(
+        f'[base]\ndriver = "diffdrive"\nport = "{tmp_path / "base"}"\n[lidar]\ndriver = "ld19"\n'
+        "[motion]\nspeed_m_s = 0.2\ndegraded_speed_m_s = 0.1\n"
+    )
+    with rigs.Base(tmp_path / "base", DiffDriveEmulator()) as base:
+        watchdog = rigs.Watchdog(tmp_path, base.link)
+        del watchdog.environment["FOGNAV_BASE_PORT"]
+        watchdog.environment["FOGNAV_ROBOT_FILE"] = str(file)
+        with watchdog, rigs.Agent(watchdog.socket) as agent:
+            agent.wheels = (0.3, 0.3)
+            wait_for(lambda: base.speeds == pytest.approx((0.21, 0.21), abs=0.001), "the base drives at its own limit")
+
+
 def test_second_watchdog_does_not_open_a_port_in_use(rig, tmp_path):
     rig.drive()
     folder = tmp_path / "second"
@@ -274,10 +289,12 @@ def test_second_watchdog_does_not_open_a_port_in_use(rig, tmp_path):
 @pytest.mark.parametrize(
     ("setting", "value", "reason"),
     [
-        ("BASE_PORT", "", "FOGNAV_BASE_PORT is not set"),
+        ("BASE_PORT", "", "the base's serial port is not set"),
+        ("ROBOT_FILE", "/none/robot.toml", "/none/robot.toml"),
+        ("FOOTPRINT", "round", "FOGNAV_FOOTPRINT: "),
         ("SPEED", "fast", "positive number"),
         ("BASE", "tank", "no 'tank' (known: "),
-        ("BASE_OPTIONS", '{"axle_m": 3.0}', "$.axle_m"),
+        ("BASE_OPTIONS", '{"axle_m": 3.0}', "FOGNAV_BASE_OPTIONS.axle_m"),
         ("GUARDIAN_SOCKET", "", "FOGNAV_GUARDIAN_SOCKET"),
         ("GUARDIAN_SOCKET", "/tmp/nowhere/guardian.sock", "No such file or directory. Name a path"),
         ("LOG_LEVEL", "loud", "FOGNAV_LOG_LEVEL"),

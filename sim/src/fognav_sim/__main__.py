@@ -6,11 +6,13 @@ ground truth.
 
 import asyncio
 import os
+from functools import partial
 
 from fog_contracts.site import RobotSite
 from fog_runtime import logs, process
 from fog_runtime.clock import SystemClock
 from fog_runtime.health import Health, serve_health
+from fog_runtime.robot_file import load_robot
 from fog_runtime.settings import SettingsError, describe, load
 from fog_runtime.site import LoadedSite, load_site
 from fog_runtime.zenoh_edge import ZenohEdge
@@ -19,6 +21,7 @@ from fognav_sim.floor import Floor
 from fognav_sim.hardware import Hardware
 from fognav_sim.live import LiveWorld, VirtualNode, run_nodes
 from fognav_sim.node import SonarNode
+from fognav_sim.sensors import LidarPlace
 from fognav_sim.settings import Settings
 from fognav_sim.world import World
 
@@ -44,9 +47,14 @@ async def main() -> None:
     loaded = load_site(settings.site_dir)
     robot = _find_robot(loaded, settings.robot)
     clock = SystemClock(settings.speed)
-    base = devices.make_base(settings.base)
-    world = World(Floor(loaded.map.geometry, loaded.map.cells), robot, settings.seed, axle_m=base.axle_m)
-    lidar = devices.make_lidar(settings.lidar, world.lidar)
+    mounted = load_robot(os.environ).settings
+    base = devices.make_base(mounted.base.driver)
+    place = LidarPlace(
+        x=mounted.lidar.x_m, y=mounted.lidar.y_m, yaw=mounted.lidar.yaw_rad, mirrored=mounted.lidar.mirrored
+    )
+    floor = Floor(loaded.map.geometry, loaded.map.cells)
+    world = World(floor, robot, settings.seed, axle_m=base.axle_m)
+    lidar = devices.make_lidar(mounted.lidar.driver, partial(world.lidar_at, place))
     hardware = Hardware(world, base, lidar, clock.now(), initial_wheel_travel_m=_INITIAL_WHEEL_TRAVEL_M)
     boot = int(clock.stamp())
     health = Health("devices", "zenoh")

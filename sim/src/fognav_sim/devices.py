@@ -21,7 +21,7 @@ def make_base(name: str) -> BaseEmulator:
     try:
         emulator: BaseEmulator = parts.load(BASES, name, type)()
     except parts.PartError as error:
-        raise SettingsError(f"FOGNAV_BASE: {error}") from error
+        raise SettingsError(f"base.driver: {error}") from error
     return emulator
 
 
@@ -30,5 +30,5 @@ def make_lidar(name: str, measure: Measure) -> LidarEmulator:
     try:
         emulator: LidarEmulator = parts.load(LIDARS, name, type)(measure)
     except parts.PartError as error:
-        raise SettingsError(f"FOGNAV_LIDAR: {error}") from error
+        raise SettingsError(f"lidar.driver: {error}") from error
     return emulator

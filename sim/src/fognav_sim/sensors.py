@@ -58,6 +58,25 @@ class Robot:
     height: float
 
 
+@dataclass(frozen=True, kw_only=True)
+class LidarPlace:
+    """Where a lidar is mounted: its axis (m) and the direction of its zero (rad) in the robot's frame.
+
+    A `mirrored` one hangs upside down: its angles grow clockwise, seen from above.
+    """
+
+    x: float = 0.0
+    y: float = 0.0
+    yaw: float = 0.0
+    mirrored: bool = False
+
+    def pose(self, robot: tuple[float, float, float]) -> tuple[float, float, float]:
+        """Return the lidar's pose on the floor for the robot's (m, m, rad)."""
+        x, y, theta = robot
+        cos, sin = math.cos(theta), math.sin(theta)
+        return x + cos * self.x - sin * self.y, y + sin * self.x + cos * self.y, theta + self.yaw
+
+
 def measure_lidar(
     floor: Floor,
     pose: tuple[float, float, float],

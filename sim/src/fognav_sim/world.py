@@ -15,7 +15,7 @@ import numpy as np
 from fog_contracts.geometry import distance_to_polygon, normalized_polygon
 from fog_contracts.messages import SimObstacle, SimTruth
 from fognav_sim.floor import MAX_CLEARANCE_M
-from fognav_sim.sensors import Noise, Robot, measure_lidar, measure_sonar
+from fognav_sim.sensors import LidarPlace, Noise, Robot, measure_lidar, measure_sonar
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -190,8 +190,13 @@ class World:
 
         The robot does not move during a call; `now` is unused, because the world has only its current state.
         """
+        return self.lidar_at(LidarPlace(), angles, now)
+
+    def lidar_at(self, place: LidarPlace, angles: NDArray[np.float64], now: float) -> NDArray[np.float64]:
+        """Measure as `lidar` does, with a lidar that is mounted elsewhere than on the robot's axis."""
         del now
-        return measure_lidar(self._floor, self.pose, angles, self.noise, self._rng)
+        seen_along = -angles if place.mirrored else angles
+        return measure_lidar(self._floor, place.pose(self.pose), seen_along, self.noise, self._rng)
 
     def sonar(self, node: NodeSite, index: int) -> float | None:
         """Measure with one sonar of a node: range of the nearest echo (m), None without an echo."""

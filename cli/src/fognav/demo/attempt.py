@@ -60,6 +60,7 @@ class Attempt:
             robot=self.plan.robot,
             base=options.base,
             lidar=options.lidar,
+            robot_file=options.robot_file,
             seed=options.seed,
             speed=self.scene.speed,
         )

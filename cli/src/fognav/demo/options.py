@@ -6,6 +6,7 @@ from pathlib import Path
 from fog_contracts.site import Place
 from fog_runtime import parts
 from fog_runtime.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
+from fog_runtime.robot_file import ROBOT_FILE, default_robot, load_robot
 from fog_runtime.site import LoadedSite
 from fognav.output import WrongUseError
 from fognav_sim import emulators
@@ -20,8 +21,15 @@ class Options:
     hazard: bool = True
     base: str = DEFAULT_BASE
     lidar: str = DEFAULT_LIDAR
+    robot_file: Path | None = None
     keep_running: bool = False
     record: Path | None = None
+
+
+def hardware(robot_file: Path | None, base: str | None, lidar: str | None) -> tuple[str, str]:
+    """Return the names of base and lidar: those given, else the robot file's; raises `SettingsError` for the file."""
+    robot = (load_robot({ROBOT_FILE: str(robot_file)}) if robot_file else default_robot()).settings
+    return base or robot.base.driver, lidar or robot.lidar.driver
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -147,18 +147,6 @@ def load(cls: type[S], *, prefix: str = "FOGNAV_", file: Path | None = None, env
         raise SettingsError(f"the settings are inconsistent: {error}") from error
 
 
-def load_options(cls: type[S], text: str, *, variable: str) -> S:
-    """Read the options of a part from the JSON object in an environment variable; empty text means the defaults.
-
-    Raises `SettingsError` that names the variable and the field.
-    """
-    try:
-        return msgspec.json.decode(text or "{}", type=cls)
-    except (msgspec.DecodeError, UnicodeEncodeError) as error:
-        known = ", ".join(field.name for field in msgspec.structs.fields(cls)) or "none"
-        raise SettingsError(f"{variable}: {error}. Give a JSON object with any of: {known}") from error
-
-
 def _shown(kind: object, text: str) -> str:
     return "***" if kind is Secret or kind == Secret | None else repr(_PASSWORD.sub(r"\1:***@", text))
 

@@ -12,48 +12,36 @@ from msgspec import Meta
 from fog_contracts.commands import KEY_BYTES
 from fog_contracts.messages import Id
 from fog_contracts.site import Site
-from fog_runtime.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fog_runtime.operator_key import OperatorKeyError
 from fog_runtime.operator_key import read_operator_key as read_key
+from fog_runtime.robot_file import VARIABLES
 from fog_runtime.settings import CommonSettings, SettingsError
-from robot_agent.footprint import FootprintError, parse_footprint
+from robot_agent.footprint import Footprint, FootprintError
 
 if TYPE_CHECKING:
     from fog_contracts.site import RobotSite
-    from robot_agent.footprint import Footprint
+    from fog_runtime.robot_file import RobotFile
 
 SITE_FILE: Final = "site.toml"
 
 
 class Settings(CommonSettings, frozen=True, kw_only=True):
-    """The robot's id, its base and lidar with their ports, the seed of its particle filter, and its memory.
-
-    `base`, `lidar`: names in the entry points `fognav.bases` and `fognav.lidars`; the base must be the guardian's.
-    `base_options`, `lidar_options`: a JSON object with the driver's own options; empty for its defaults.
+    """The robot's id, the seed of its particle filter, and its memory; what is mounted on it is in its robot file.
 
     `input_log`: file for the log of the core's inputs, for `python -m robot_agent.agent.replay`; some 1.5 MB a minute.
     The log of the previous run is kept beside it.
 
     `obstacle_memory_s`: how long (s) a reported obstacle counts while no lidar looks there again.
 
-    `footprint`: outline of the body, a JSON array of [x, y] in m in the frame `base`, counter-clockwise; empty for the
-    circle of the site's `radius`.
-
     `site_dir` is optional here: a robot without the site's folder needs `site`, and an initial pose or a global search.
     """
 
     robot: Id
-    base: str = DEFAULT_BASE
-    base_options: str = ""
-    lidar: str = DEFAULT_LIDAR
-    lidar_options: str = ""
-    lidar_port: str
     guardian_socket: Path
     site_dir: Path = Path()
     seed: Annotated[int, Meta(ge=0)] = 0
     input_log: Path | None = None
     obstacle_memory_s: Annotated[float, Meta(gt=0.0, le=600.0)] = 600.0
-    footprint: str = ""
 
 
 def read_site(settings: Settings) -> tuple[str, RobotSite | None]:
@@ -79,14 +67,21 @@ def read_site(settings: Settings) -> tuple[str, RobotSite | None]:
     raise SettingsError(f"{file}: robots: there is no {settings.robot!r} (known: {known}). Add it, or set FOGNAV_ROBOT")
 
 
-def read_footprint(settings: Settings) -> Footprint | None:
-    """Return the footprint of the settings, None for the site's circle; raises `SettingsError`."""
-    if not settings.footprint:
+def read_footprint(robot: RobotFile) -> Footprint | None:
+    """Return the footprint of the robot's settings, None for the site's circle; raises `SettingsError`."""
+    if not robot.settings.body.footprint:
         return None
     try:
-        return parse_footprint(settings.footprint)
+        return Footprint(tuple(robot.settings.body.footprint))
     except FootprintError as error:
-        raise SettingsError(f"FOGNAV_FOOTPRINT: {error}") from error
+        raise robot.error("body.footprint", str(error).rstrip("."), "Correct it") from error
+
+
+def read_port(robot: RobotFile) -> str:
+    """Return the lidar's serial port; raises `SettingsError` if none is set."""
+    if not robot.settings.lidar.port:
+        raise robot.error("lidar.port", "the lidar's serial port is not set", f"Set it, or {VARIABLES['lidar.port']}")
+    return robot.settings.lidar.port
 
 
 def read_operator_key(file: Path | None) -> bytes:

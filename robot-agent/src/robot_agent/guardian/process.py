@@ -20,10 +20,10 @@ import msgspec
 
 from fog_runtime import logs, signals
 from fog_runtime.clock import SystemClock
-from fog_runtime.default_parts import DEFAULT_BASE
 from fog_runtime.logs import Level
+from fog_runtime.robot_file import load_robot
 from fog_runtime.settings import SettingsError, load
-from robot_agent.guardian.core import GuardianCore, Output
+from robot_agent.guardian.core import GuardianCore, Limits, Output
 from robot_agent.guardian.link import PACKET_LIMIT, WheelCommand, decode_command, encode
 from robot_agent.guardian.watchdog import BAD_SETTINGS, PORT_LOST
 from robot_agent.registry import make_base
@@ -32,7 +32,7 @@ from robot_agent.serial_port import Port, PortLost
 if TYPE_CHECKING:
     from types import FrameType
 
-    from robot_agent.hardware import BaseDriver
+    from fog_contracts.robot import MotionSettings
 
 TICK_S: Final = 0.02
 HEARTBEAT_S: Final = 0.05
@@ -48,8 +48,6 @@ class GuardianSettings(msgspec.Struct, frozen=True, kw_only=True):
     base_fd: int
     heartbeat_fd: int
     watchdog_fd: int
-    base: str = DEFAULT_BASE
-    base_options: str = ""
     base_port: str = ""
     guardian_socket: str
     speed: float = 1.0
@@ -61,11 +59,11 @@ class GuardianSettings(msgspec.Struct, frozen=True, kw_only=True):
 class Guardian:
     """The loop around the core: one serial port, one agent, one watchdog."""
 
-    def __init__(self, settings: GuardianSettings, driver: BaseDriver, listener: socket.socket) -> None:
+    def __init__(self, settings: GuardianSettings, core: GuardianCore, listener: socket.socket) -> None:
         self._settings = settings
         self._listener = listener
         self._clock = SystemClock(settings.speed)
-        self._core = GuardianCore(driver)
+        self._core = core
         self._port = Port.from_fd(settings.base_fd, settings.base_port or None)
         self._selector = selectors.DefaultSelector()
         self._agent: socket.socket | None = None
@@ -231,21 +229,27 @@ def set_realtime_priority(priority: int) -> str:
     return f"SCHED_RR {priority}"
 
 
+def limits_of(motion: MotionSettings) -> Limits:
+    """Return the guardian's limits of a robot that may move so: a little above what its agent asks for."""
+    return Limits(linear=round(motion.speed_m_s + 0.01, 3), acceleration=round(1.2 * motion.acceleration_m_s2, 3))
+
+
 def main() -> int:
     """Run one guardian for the watchdog that started it."""
     try:
         settings = load(GuardianSettings, environ=os.environ)
-        driver = make_base(settings.base, settings.base_options)
+        robot = load_robot(os.environ)
+        core = GuardianCore(make_base(robot), limits_of(robot.settings.motion))
         listener = _listen(settings.guardian_socket)
     except SettingsError as error:
         logs.configure("guardian", "info", "json")
         logs.get("guardian").error("bad_settings", reason=str(error))
         return BAD_SETTINGS
     logs.configure("guardian", settings.log_level, settings.log_format)
-    guardian = Guardian(settings, driver, listener)
+    guardian = Guardian(settings, core, listener)
     for number in signals.ENDING:
         signal.signal(number, guardian.end)
     signals.ignore_terminal_stops()
     priority = set_realtime_priority(settings.realtime_priority)
-    logs.get("guardian").info("started", base=settings.base, port=settings.base_port, priority=priority)
+    logs.get("guardian").info("started", base=robot.settings.base.driver, port=settings.base_port, priority=priority)
     return guardian.run()

@@ -2,8 +2,8 @@
 
 A base may keep its last velocity when its host falls silent, so this process must outlive the guardian. It does
 nothing else and imports almost nothing, so that almost nothing can end it. Run it as a service; it restarts the
-guardian whenever that ends. Settings (environment): FOGNAV_BASE, FOGNAV_BASE_PORT, FOGNAV_SPEED, and those of the
-guardian.
+guardian whenever that ends. Settings: driver and port of the base in the robot file (FOGNAV_ROBOT_FILE) or in
+FOGNAV_BASE and FOGNAV_BASE_PORT, FOGNAV_SPEED, and those of the guardian, which validates the whole file.
 """
 
 from __future__ import annotations
@@ -15,7 +15,9 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from contextlib import suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from fog_runtime import parts, signals
@@ -174,6 +176,25 @@ class _Settings(NamedTuple):
     speed: float
 
 
+def _base() -> tuple[str, str]:
+    """Return driver and port of the base, from the variables or from the robot file.
+
+    Raises:
+        _BadSettings: when the file can't be read.
+
+    """
+    table: object = None
+    if file := os.environ.get("FOGNAV_ROBOT_FILE"):
+        try:
+            with Path(file).open("rb") as opened:
+                table = tomllib.load(opened).get("base")
+        except (OSError, ValueError) as error:
+            raise _BadSettings(f"FOGNAV_ROBOT_FILE: {file}: {error}. Check it with `fognav robot check`") from error
+    base = table if isinstance(table, dict) else {}
+    driver = os.environ.get("FOGNAV_BASE") or base.get("driver") or DEFAULT_BASE
+    return str(driver), str(os.environ.get("FOGNAV_BASE_PORT") or base.get("port") or "")
+
+
 def _settings() -> _Settings:
     """Read the environment.
 
@@ -181,9 +202,12 @@ def _settings() -> _Settings:
         _BadSettings: when a variable is missing or invalid.
 
     """
-    path = os.environ.get("FOGNAV_BASE_PORT", "")
+    driver, path = _base()
     if not path:
-        raise _BadSettings("FOGNAV_BASE_PORT is not set: name the base's serial device, e.g. /dev/ttyUSB0")
+        raise _BadSettings(
+            "the base's serial port is not set: set `port` in [base] of the robot file, or FOGNAV_BASE_PORT, to its "
+            "name in /dev/serial/by-id or /dev/serial/by-path"
+        )
     try:
         speed = float(os.environ.get("FOGNAV_SPEED", "1"))
     except ValueError:
@@ -191,9 +215,9 @@ def _settings() -> _Settings:
     if not 0 < speed < 1000:
         raise _BadSettings("FOGNAV_SPEED must be a positive number such as 1 (simulated over wall time)")
     try:
-        base = parts.load(STOPS, os.environ.get("FOGNAV_BASE") or DEFAULT_BASE, StopCommand)
+        base = parts.load(STOPS, driver, StopCommand)
     except parts.PartError as error:
-        raise _BadSettings(f"FOGNAV_BASE: {error}") from error
+        raise _BadSettings(f"base.driver: {error}") from error
     return _Settings(path, base, speed)
 
 

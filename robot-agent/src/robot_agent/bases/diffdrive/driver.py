@@ -17,12 +17,16 @@ from robot_agent.hardware import BaseFactory, BaseReading, BaseStatus, BaseTimin
 class DiffDriveOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Geometry and battery of the robot around the board; README.md beside this file lists the options."""
 
-    counts_per_turn: Annotated[float, Meta(gt=0.0, le=1e6)] = 1440.0
-    wheel_diameter_m: Annotated[float, Meta(ge=0.02, le=0.5)] = 0.09
-    axle_m: Annotated[float, Meta(ge=0.05, le=1.0)] = 0.28
-    wheel_speed_max_m_s: Annotated[float, Meta(gt=0.0, le=protocol.SPEED_MAX_MM_S / 1000.0)] = 0.6
-    battery_empty_v: Annotated[float, Meta(ge=0.0, le=60.0)] = 10.5
-    battery_full_v: Annotated[float, Meta(ge=0.0, le=60.0)] = 12.6
+    counts_per_turn: Annotated[float, Meta(gt=0.0, le=1e6, description="encoder counts of one turn of a wheel")] = (
+        1440.0
+    )
+    wheel_diameter_m: Annotated[float, Meta(ge=0.02, le=0.5, description="diameter of a driven wheel")] = 0.09
+    axle_m: Annotated[float, Meta(ge=0.05, le=1.0, description="distance between the driven wheels")] = 0.28
+    wheel_speed_max_m_s: Annotated[
+        float, Meta(gt=0.0, le=protocol.SPEED_MAX_MM_S / 1000.0, description="top speed of a wheel")
+    ] = 0.6
+    battery_empty_v: Annotated[float, Meta(ge=0.0, le=60.0, description="voltage of the empty battery")] = 10.5
+    battery_full_v: Annotated[float, Meta(ge=0.0, le=60.0, description="voltage of the full battery")] = 12.6
 
     def __post_init__(self) -> None:
         if self.battery_full_v <= self.battery_empty_v:

@@ -26,9 +26,16 @@ class Roomba600Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
     length depends on the floor.
     """
 
-    ticks_per_turn: Annotated[float, Meta(ge=100.0, le=2000.0)] = 508.8
-    wheel_diameter_m: Annotated[float, Meta(ge=0.05, le=0.1)] = 0.072
-    axle_m: Annotated[float, Meta(ge=0.15, le=0.35)] = 0.235
+    ticks_per_turn: Annotated[float, Meta(ge=100.0, le=2000.0, description="encoder ticks of one turn of a wheel")] = (
+        508.8
+    )
+    wheel_diameter_m: Annotated[
+        float, Meta(ge=0.05, le=0.1, description="diameter of a driven wheel; measure it by a drive of some metres")
+    ] = 0.072
+    axle_m: Annotated[
+        float,
+        Meta(ge=0.15, le=0.35, description="distance between the driven wheels; measure it by some turns on the spot"),
+    ] = 0.235
 
 
 class Roomba600Driver:

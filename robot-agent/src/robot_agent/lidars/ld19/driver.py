@@ -14,10 +14,12 @@ SAMPLES_TIMEOUT_S: Final = 1.0
 
 
 class Ld19Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """`range_max_m`: returns beyond it are ignored. `intensity_min`: a weaker return (0..255) is ignored."""
+    """An LD19."""
 
-    range_max_m: Annotated[float, Meta(ge=1.0, le=protocol.RANGE_MAX_M)] = protocol.RANGE_MAX_M
-    intensity_min: Annotated[int, Meta(ge=0, le=255)] = 0
+    range_max_m: Annotated[
+        float, Meta(ge=1.0, le=protocol.RANGE_MAX_M, description="returns beyond it are ignored")
+    ] = protocol.RANGE_MAX_M
+    intensity_min: Annotated[int, Meta(ge=0, le=255, description="a weaker return is ignored")] = 0
 
 
 class Ld19Driver:

@@ -18,9 +18,16 @@ RESET_S: Final = 2.0
 
 
 class RplidarA1Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """`range_max_m`: returns beyond it are ignored (early A1 see 6 m far, later ones 12 m)."""
+    """An RPLidar A1."""
 
-    range_max_m: Annotated[float, Meta(ge=1.0, le=rplidar.RANGE_MAX_M)] = rplidar.RANGE_MAX_M
+    range_max_m: Annotated[
+        float,
+        Meta(
+            ge=1.0,
+            le=rplidar.RANGE_MAX_M,
+            description="returns beyond it are ignored (early A1 see 6 m far, later ones 12 m)",
+        ),
+    ] = rplidar.RANGE_MAX_M
 
 
 class RplidarA1Driver:

@@ -1,0 +1,84 @@
+"""`fognav robot new` and `check`: write a commented robot file, and show the settings that one gives."""
+
+import os
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fog_runtime.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
+from fog_runtime.files import atomic_write
+from fog_runtime.robot_file import ROBOT_FILE, RobotFile, default_robot, describe_robot, load_robot
+from fog_runtime.settings import SettingsError
+from fognav.operate.options import JsonOption
+from fognav.output import NOT_TRUE, WrongUseError, exit_codes, fail, print_json, print_line
+
+
+def robot_new(
+    *,
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="File to write, e.g. robot.toml.")],
+    base: Annotated[str, typer.Option("--base", metavar="NAME", help="The robot's base.")] = DEFAULT_BASE,
+    lidar: Annotated[str, typer.Option("--lidar", metavar="NAME", help="The robot's lidar.")] = DEFAULT_LIDAR,
+    json: JsonOption = False,
+) -> None:
+    """Write a commented settings file for a robot, with every default.
+
+    Set the ports of base and lidar in it, then what you have measured; docs/robot-setup.md leads through it.
+    """
+    with exit_codes():
+        if out.exists():
+            raise WrongUseError(f"{out} already exists: name another file with --out, or remove it")
+        try:
+            text = robot_text(default_robot(base, lidar))
+            atomic_write(out, text.encode())
+        except SettingsError as error:
+            raise WrongUseError(str(error)) from error
+        except OSError as error:
+            raise WrongUseError(f"{out} can't be written: {error.strerror}. Name another file with --out") from error
+        if json:
+            print_json({"file": str(out), "base": base, "lidar": lidar})
+        else:
+            print_line(f"wrote {out}: set the ports in it, then check it with: fognav robot check {out}")
+
+
+def robot_check(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="The robot's settings file.")],
+    *,
+    json: JsonOption = False,
+) -> None:
+    """Check a robot's settings file, and print what it sets.
+
+    FOGNAV_ variables that override single settings count, as they do for the robot's processes.
+    """
+    try:
+        values = effective(load_robot({**os.environ, ROBOT_FILE: str(file)}))
+    except SettingsError as error:
+        if json:
+            print_json({"ok": False, "problem": str(error)})
+            raise typer.Exit(NOT_TRUE) from error
+        fail(str(error))
+    if json:
+        print_json({"ok": True, **values})
+        return
+    for name, value in values.items():
+        print_line(f"{name} = {value}")
+
+
+def robot_text(robot: RobotFile) -> str:
+    """Return a commented robot file with these settings; raises `SettingsError` for unknown hardware."""
+    # Drivers need numpy: only this command waits for it.
+    from fog_contracts.generate.robot_toml import robot_toml  # noqa: PLC0415  # see above
+    from robot_agent import registry  # noqa: PLC0415  # same
+
+    return robot_toml(robot.settings, *registry.options(robot))
+
+
+def effective(robot: RobotFile) -> dict[str, object]:
+    """Return all effective settings by their dotted names; raises `SettingsError` for what no process would accept."""
+    from robot_agent import registry  # noqa: PLC0415  # drivers need numpy: the other commands don't wait for it
+    from robot_agent.agent.settings import read_footprint  # noqa: PLC0415  # same
+
+    registry.make_base(robot)
+    registry.make_lidar(robot)
+    read_footprint(robot)
+    return describe_robot(robot, *registry.options(robot))

@@ -1,0 +1,84 @@
+from __future__ import annotations
+
+import json
+import tomllib
+from itertools import pairwise
+
+import msgspec
+import pytest
+from typer.testing import CliRunner
+
+from fog_runtime import parts
+from fog_runtime.robot_file import default_robot, parse_robot
+from fog_runtime.settings import SettingsError
+from fognav.__main__ import app
+from fognav.demo.options import hardware
+from fognav.robot_file_command import effective, robot_text
+from robot_agent import registry
+
+run = CliRunner().invoke
+
+
+@pytest.mark.parametrize("base", parts.names(registry.BASES))
+@pytest.mark.parametrize("lidar", parts.names(registry.LIDARS))
+def test_the_file_that_new_writes_loads_and_equals_the_defaults(tmp_path, base, lidar):
+    file = tmp_path / "robot.toml"
+    assert run(app, ["robot", "new", "--base", base, "--lidar", lidar, "--out", str(file)]).exit_code == 0
+    written = parse_robot(file.read_text(), file, {})
+    defaults = default_robot(base, lidar)
+    assert registry.options(written) == registry.options(defaults)
+    assert (
+        msgspec.structs.replace(
+            written.settings,
+            base=msgspec.structs.replace(written.settings.base, options={}),
+            lidar=msgspec.structs.replace(written.settings.lidar, options={}),
+        )
+        == defaults.settings
+    )
+    everything = {name: value for name, value in effective(defaults).items() if name != "file"}
+    assert set(flat(tomllib.loads(file.read_text()))) == set(everything)
+
+
+def flat(tree, prefix=""):
+    for key, value in tree.items():
+        yield from flat(value, f"{prefix}{key}.") if isinstance(value, dict) else [prefix + key]
+
+
+def test_every_setting_has_a_comment_that_says_what_it_means():
+    lines = pairwise(robot_text(default_robot()).splitlines())
+    assert [line for before, line in lines if " = " in line and line[0] != "#" and not before.startswith("#")] == []
+
+
+def test_check_prints_the_effective_settings_or_the_line_of_a_mistake(tmp_path):
+    file = tmp_path / "robot.toml"
+    text = robot_text(default_robot("diffdrive", "ld19"))
+    file.write_text(text.replace("x_m = 0.0", "x_m = 0.12"))
+    values = json.loads(run(app, ["robot", "check", str(file), "--json"]).stdout)
+    assert (values["ok"], values["lidar.x_m"], values["base.options.axle_m"]) == (True, 0.12, 0.28)
+    file.write_text(text.replace("axle_m = 0.28", "axle_m = 28"))
+    result = run(app, ["robot", "check", str(file), "--json"])
+    line = text.splitlines().index("axle_m = 0.28") + 1
+    assert result.exit_code == 1
+    assert f"robot.toml:{line}: base.options.axle_m" in json.loads(result.stdout)["problem"]
+    file.write_text(text.replace("footprint = []", "footprint = [[1, 1], [0.5, 1], [1, 2]]"))
+    problem = json.loads(run(app, ["robot", "check", str(file), "--json"]).stdout)["problem"]
+    assert "robot.toml:61: body.footprint: " in problem
+
+
+def test_new_overwrites_nothing_and_knows_its_parts(tmp_path):
+    file = tmp_path / "robot.toml"
+    file.write_text("mine")
+    assert run(app, ["robot", "new", "--out", str(file)]).exit_code == 2
+    assert run(app, ["robot", "new", "--base", "tank", "--out", str(tmp_path / "other.toml")]).exit_code == 2
+    assert sorted(tmp_path.iterdir()) == [file]
+    assert file.read_text() == "mine"
+
+
+def test_hardware_of_a_demo_is_that_of_its_robot_file_unless_named(tmp_path):
+    file = tmp_path / "robot.toml"
+    file.write_text(robot_text(default_robot("diffdrive", "ld19")))
+    assert hardware(file, None, None) == ("diffdrive", "ld19")
+    assert hardware(file, None, "rplidar-a1") == ("diffdrive", "rplidar-a1")
+    assert hardware(None, None, "ld19") == ("roomba600", "ld19")
+    with pytest.raises(SettingsError, match="can't be read"):
+        hardware(tmp_path / "none", None, None)

@@ -1,0 +1,103 @@
+"""A lidar as it is mounted: upside down, behind the robot's own posts, with a delay. Pure."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from robot_agent.hardware import LaserScan, LidarDriver, LidarEvents, LidarTraits, SerialSettings
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Mounting:
+    """How a lidar is mounted.
+
+    `yaw_rad`: direction of the lidar's zero in the robot's frame. `mirrored`: it hangs upside down. `latency_s`: time
+    from a measurement to its arrival. `masks`: sectors (from, to) in rad, counter-clockwise in the robot's frame, in
+    which it sees only the robot.
+    """
+
+    yaw_rad: float = 0.0
+    mirrored: bool = False
+    latency_s: float = 0.0
+    masks: tuple[tuple[float, float], ...] = ()
+
+    @property
+    def plain(self) -> bool:
+        """Whether scans are right as the driver gives them."""
+        return not (self.mirrored or self.latency_s or self.masks)
+
+    def apply(self, scan: LaserScan) -> LaserScan:
+        """Return the scan with true angles and times, without the samples of masked directions.
+
+        A masked sample is left out and is not one without a return, which would mean that nothing is there.
+        """
+        angles = _wrapped(-scan.angles_rad) if self.mirrored else scan.angles_rad
+        seen = ~self.masked(angles)
+        return replace(
+            scan,
+            angles_rad=angles[seen],
+            ranges_m=scan.ranges_m[seen],
+            quality=scan.quality[seen],
+            started_at=scan.started_at - self.latency_s,
+            ended_at=scan.ended_at - self.latency_s,
+        )
+
+    def masked(self, angles_rad: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return which of these angles (float64[n], frame of the lidar the right way up) lie in a masked sector."""
+        masked = np.zeros(angles_rad.shape, np.bool_)
+        for begin, end in self.masks:
+            masked |= (angles_rad + self.yaw_rad - begin) % math.tau <= (end - begin) % math.tau
+        return masked
+
+
+class MountedLidar:
+    """A driver whose scans are those of the mounted lidar; see `robot_agent.hardware.LidarDriver`."""
+
+    def __init__(self, driver: LidarDriver, mounting: Mounting) -> None:
+        self._driver = driver
+        self._mounting = mounting
+
+    @property
+    def serial(self) -> SerialSettings:
+        """Settings of its serial port."""
+        return self._driver.serial
+
+    @property
+    def traits(self) -> LidarTraits:
+        """Rated ranges and scan period."""
+        return self._driver.traits
+
+    @property
+    def problem(self) -> str:
+        """Why there is no scan; empty while scans arrive."""
+        return self._driver.problem
+
+    @property
+    def stop_command(self) -> bytes:
+        """Bytes that end the scan."""
+        return self._driver.stop_command
+
+    def begin(self, now: float) -> bytes:
+        """Begin (again), after the port was opened; return the bytes to send."""
+        return self._driver.begin(now)
+
+    def receive(self, data: bytes, now: float) -> LidarEvents:
+        """Parse bytes received at `now`."""
+        events = self._driver.receive(data, now)
+        return events._replace(scans=tuple(map(self._mounting.apply, events.scans)))
+
+    def tick(self, now: float) -> bytes:
+        """Advance time; return the bytes to send."""
+        return self._driver.tick(now)
+
+
+def _wrapped(angles_rad: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the angles in (-pi, pi]."""
+    return np.where(angles_rad <= -math.pi, angles_rad + math.tau, angles_rad)

@@ -1,0 +1,89 @@
+"""A lidar mounted anywhere, upside down or behind posts gives the scan of one that is mounted plainly."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fog_contracts.robot import BaseSettings, LidarSettings, RobotSettings
+from fog_runtime.robot_file import RobotFile
+from fognav_sim.sensors import LidarPlace
+from robot_agent.config import LocalizationConfig
+from robot_agent.hardware import LaserScan
+from robot_agent.lidar_mounting import MountedLidar, Mounting
+from robot_agent.lidars.rplidar_a1.emulator import RplidarEmulator
+from robot_agent.localization.deskew import deskew
+from robot_agent.localization.odometry_buffer import OdometryBuffer
+from robot_agent.registry import make_lidar
+
+ANGLES = np.linspace(-math.pi + 0.001, math.pi, 360)
+
+
+def scan_of(angles=ANGLES, ranges=None):
+    ranges = np.full(angles.size, 2.0) if ranges is None else ranges
+    return LaserScan(angles, ranges, np.full(angles.size, 9, np.uint8), started_at=1.0, ended_at=1.18, repeats=1)
+
+
+def test_a_mask_removes_its_sector_in_the_frame_of_the_robot_also_across_the_back():
+    mounting = Mounting(yaw_rad=0.5, masks=((3.0, -3.0), (0.4, 0.6)))
+    scan = mounting.apply(scan_of())
+    bearings = np.remainder(scan.angles_rad + 0.5 + math.pi, math.tau) - math.pi
+    assert not ((bearings > 3.0) | (bearings < -3.0) | ((bearings > 0.4) & (bearings < 0.6))).any()
+    lost = ANGLES.size - bearings.size
+    assert lost == pytest.approx(360 * (math.tau - 6.0 + 0.2) / math.tau, abs=2)
+    assert len(scan.ranges_m) == len(scan.quality) == len(bearings)
+
+
+def test_latency_moves_the_times_of_a_scan():
+    scan = Mounting(latency_s=0.05).apply(scan_of())
+    assert (scan.started_at, scan.ended_at) == pytest.approx((0.95, 1.13))
+
+
+@given(st.lists(st.floats(-math.pi, math.pi, exclude_min=True), min_size=1, max_size=20))
+def test_a_mirrored_scan_keeps_its_angles_in_range_and_twice_mirrored_is_unchanged(angles):
+    upside_down = Mounting(mirrored=True)
+    once = upside_down.apply(scan_of(np.array(angles)))
+    assert ((once.angles_rad > -math.pi) & (once.angles_rad <= math.pi)).all()
+    assert upside_down.apply(once).angles_rad == pytest.approx(np.array(angles))
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        LidarSettings(driver="rplidar-a1", x_m=0.1, y_m=-0.05, yaw_rad=0.7),
+        LidarSettings(driver="rplidar-a1", x_m=-0.12, yaw_rad=-2.0, mirrored=True),
+    ],
+)
+def test_walls_stand_where_they_are_however_the_lidar_is_mounted(settings):
+    """A wall at x = 3 m, seen by the emulated lidar at its place, through driver, mounting and deskewing."""
+    place = LidarPlace(x=settings.x_m, y=settings.y_m, yaw=settings.yaw_rad, mirrored=settings.mirrored)
+    x, _, yaw = place.pose((0.0, 0.0, 0.0))
+
+    def measure(angles, _now):
+        cosines = np.cos((-angles if place.mirrored else angles) + yaw)
+        with np.errstate(divide="ignore"):
+            return np.where(cosines > 0.3, (3.0 - x) / cosines, np.nan)
+
+    robot = RobotFile(settings=RobotSettings(base=BaseSettings(driver="roomba600"), lidar=settings))
+    driver, device = make_lidar(robot), RplidarEmulator(measure)
+    assert isinstance(driver, MountedLidar) is settings.mirrored
+    now, scans = 10.0, []
+    device.receive(driver.begin(now), now)
+    odometry = OdometryBuffer()
+    while not scans:
+        now += 0.02
+        odometry.add(now, 0.0, 0.0, 0.0)
+        events = driver.receive(device.outgoing(now), now)
+        scans += events.scans
+        device.receive(events.data + driver.tick(now), now)
+    odometry.add(now + 0.1, 0.0, 0.0, 0.0)
+    config = LocalizationConfig(lidar_x=settings.x_m, lidar_y=settings.y_m, lidar_yaw=settings.yaw_rad)
+    points = deskew(scans[-1], odometry, config).points
+    assert len(points) > 50
+    assert points[:, 0] == pytest.approx(3.0, abs=0.03)
+    assert driver.stop_command
+    assert driver.problem == ""

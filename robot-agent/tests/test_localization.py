@@ -141,6 +141,7 @@ def test_global_localization_fails_when_places_look_alike():
         localizer.on_scan(scan, 0.1)
     assert localizer.status == "lost"
     assert "look like this one" in localizer.detail
+    assert len(localizer.hypotheses) > 1
 
 
 def test_pose_stays_good_with_people_around_the_robot():

@@ -76,9 +76,13 @@ class LocalizationConfig:
     field_reach: float = 2.0
     sharpness: float = 12.0
     """Logarithm of the weight ratio between a pose that all beams fit and one that none fits."""
-    alphas: tuple[float, float, float, float] = (0.2, 0.2, 0.2, 0.2)
-    update_distance: float = 0.25
-    update_angle: float = 0.2
+    alphas: tuple[float, float, float, float] = (0.05, 0.05, 0.05, 0.05)
+    """Variances of the odometry's noise per squared motion, over steps of `update_distance` and `update_angle`:
+    rotation from rotation, rotation from translation, translation from translation, translation from rotation."""
+    update_distance: float = 0.1
+    update_angle: float = 0.1
+    match_sigma: float = 0.08
+    """Standard deviation (m) of a beam's end when the estimate is refined by matching the scan."""
     recovery_slow: float = 0.001
     recovery_fast: float = 0.1
     range_min: float = 0.15

@@ -20,17 +20,6 @@ class Reading:
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
-    """A plausible step: travel of the wheels in metres, and the pose (x, y in metres, theta in radians) after it."""
-
-    left_m: float
-    right_m: float
-    x: float
-    y: float
-    theta: float
-
-
-@dataclass(frozen=True, slots=True)
 class EncoderFault:
     """A step that no wheel can make. It does not change the pose."""
 
@@ -44,6 +33,22 @@ class EncoderFault:
             f"encoders jumped by left {self.left_m:+.3f} m and right {self.right_m:+.3f} m in {self.elapsed_s:.3f} s, "
             f"{self.possible_m:.3f} m is possible: a damaged frame, a base that restarted, or a gap in its frames"
         )
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """A plausible step: travel of the wheels in metres, and the pose (x, y in metres, theta in radians) after it.
+
+    `skipped`: the jump before this step, if the readings since agree with it. It is not part of the pose: the base
+    restarted, or the robot moved unobserved.
+    """
+
+    left_m: float
+    right_m: float
+    x: float
+    y: float
+    theta: float
+    skipped: EncoderFault | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,15 +97,17 @@ def advance(state: OdometryState, reading: Reading, drive: DriveTrain) -> tuple[
     if state.trusted is None:
         return replace(state, trusted=reading), Motion(0.0, 0.0, state.x, state.y, state.theta)
     left_m, right_m, possible_m = _step(state.trusted, reading, drive)
+    skipped = None
     if max(abs(left_m), abs(right_m)) > possible_m:
         fault = EncoderFault(left_m, right_m, possible_m, reading.timestamp - state.trusted.timestamp)
+        skipped = fault
         if state.suspect is None:
             return replace(state, suspect=reading), fault
         left_m, right_m, possible_m = _step(state.suspect, reading, drive)
         if max(abs(left_m), abs(right_m)) > possible_m:
             return replace(state, suspect=reading), fault
     x, y, theta = integrate(state.x, state.y, state.theta, left_m, right_m, drive.axle_m)
-    return OdometryState(x, y, theta, trusted=reading), Motion(left_m, right_m, x, y, theta)
+    return OdometryState(x, y, theta, trusted=reading), Motion(left_m, right_m, x, y, theta, skipped)
 
 
 def _step(old: Reading, new: Reading, drive: DriveTrain) -> tuple[float, float, float]:
@@ -111,6 +118,22 @@ def _step(old: Reading, new: Reading, drive: DriveTrain) -> tuple[float, float, 
         possible = -1.0
     wrap = drive.travel_wrap_m
     return wheel_travel(new.left_m, old.left_m, wrap), wheel_travel(new.right_m, old.right_m, wrap), possible
+
+
+_UNMEASURED_M: Final = (0.1, 2.0)
+_UNMEASURED_RAD: Final = (0.1, 0.8)
+"""Least and greatest motion expected behind a jump: a base that restarted jumps by any amount without moving."""
+
+
+def possible_motion(jump: EncoderFault, drive: DriveTrain) -> tuple[float, float, str]:
+    """Return how far (m, rad) the robot may have moved during a jump of its encoders, and the reason in words."""
+    distance = max(abs(jump.left_m), abs(jump.right_m))
+    angle = abs(jump.right_m - jump.left_m) / drive.axle_m
+    return (
+        min(max(distance, _UNMEASURED_M[0]), _UNMEASURED_M[1]),
+        min(max(angle, _UNMEASURED_RAD[0]), _UNMEASURED_RAD[1]),
+        str(jump),
+    )
 
 
 class Odometry:

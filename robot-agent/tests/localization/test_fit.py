@@ -14,6 +14,7 @@ from robot_agent.config import LocalizationConfig
 from robot_agent.localization.fit import Fit, FitMonitor, evaluate_fit, grade_fit
 from robot_agent.localization.map_fields import map_fields
 from robot_agent.localization.pose import Pose2
+from robot_agent.localization.uncertainty import Uncertainty
 
 FIELDS = map_fields(*grid_of(L_ROOMS, 15.0, 12.0), LocalizationConfig())
 PLACE = Pose2(5.0, 2.0, 1.0)
@@ -22,7 +23,7 @@ FAIR = Fit(agree=0.9, explained=0.8, contradict=0.12, informative=80)
 VAGUE = Fit(agree=0.9, explained=0.1, contradict=0.0, informative=4)
 CONTRADICTED = Fit(agree=0.6, explained=0.5, contradict=0.3, informative=80)
 WRONG = Fit(agree=0.2, explained=0.2, contradict=0.6, informative=80)
-SURE = (0.05, 0.02)
+SURE = Uncertainty(0.05, 0.03, 0.02)
 
 
 def points_at(pose: Pose2, *, shorten: float = 0.0):
@@ -36,7 +37,7 @@ def monitor_after(*fits: Fit, trial: int = 0) -> FitMonitor:
     monitor = FitMonitor()
     monitor.begin("checking", trial)
     for fit in fits:
-        monitor.add(fit, *SURE)
+        monitor.add(fit, SURE)
     return monitor
 
 
@@ -61,19 +62,20 @@ def test_scan_without_beams_counts_as_contradiction():
 
 
 @pytest.mark.parametrize(
-    ("fit", "sigmas", "grade", "reason"),
+    ("fit", "spread", "grade", "reason"),
     [
         (GOOD, SURE, "good", ""),
         (CONTRADICTED, SURE, "weak", "pass through walls"),
         (WRONG, SURE, "lost", "pass through walls"),
         (VAGUE, SURE, "weak", "too few beams"),
-        (GOOD, (1.2, 0.1), "lost", "uncertain by 1.2 m"),
-        (GOOD, (0.4, 0.1), "weak", "0.40 m"),
-        (GOOD, (0.1, 0.4), "weak", "0.40 rad"),
+        (GOOD, Uncertainty(2.0, 1.2, 0.1), "lost", "uncertain by 1.2 m in every direction"),
+        (GOOD, Uncertainty(9.0, 0.1, 0.1), "weak", "9.00 m in one direction"),
+        (GOOD, Uncertainty(0.4, 0.3, 0.1), "weak", "0.40 m"),
+        (GOOD, Uncertainty(0.1, 0.1, 0.4), "weak", "0.40 rad"),
     ],
 )
-def test_grade_and_reason(fit, sigmas, grade, reason):
-    found = grade_fit(fit, *sigmas)
+def test_grade_and_reason(fit, spread, grade, reason):
+    found = grade_fit(fit, spread)
     assert found[0] == grade
     assert reason in found[1]
 
@@ -100,6 +102,18 @@ def test_lasting_contradiction_loses_the_pose():
     assert monitor_after(GOOD, GOOD, *[CONTRADICTED] * 25).status == "lost"
 
 
+def test_doubtful_pose_is_weak_until_two_scans_fit_well():
+    monitor = monitor_after(GOOD, GOOD)
+    monitor.doubt("the encoders jumped")
+    assert (monitor.status, monitor.detail) == ("weak", "the encoders jumped")
+    monitor.add(FAIR, SURE)
+    monitor.add(FAIR, SURE)
+    assert monitor.status == "weak"
+    monitor.add(GOOD, SURE)
+    monitor.add(GOOD, SURE)
+    assert (monitor.status, monitor.detail) == ("good", "")
+
+
 def test_four_weak_scans_make_a_new_pose_weak_but_not_one_on_trial():
     assert monitor_after(*[VAGUE] * 3).status == "none"
     assert monitor_after(*[VAGUE] * 4).status == "weak"
@@ -111,9 +125,9 @@ def test_trial_ends_with_a_good_pose_or_fails_when_its_scans_are_used_up():
     assert not passed.trial_failed
     monitor = monitor_after(*[FAIR] * 4, trial=5)
     assert not monitor.trial_failed
-    monitor.add(FAIR, *SURE)
+    monitor.add(FAIR, SURE)
     assert monitor.trial_failed
-    monitor.add(FAIR, *SURE)
+    monitor.add(FAIR, SURE)
     assert not monitor.trial_failed
 
 
@@ -122,9 +136,9 @@ def test_lost_pose_stays_lost_while_the_map_is_searched():
     monitor.begin_search()
     assert monitor.status == "lost"
     monitor.restart()
-    monitor.add(GOOD, *SURE)
+    monitor.add(GOOD, SURE)
     assert monitor.status == "lost"
-    monitor.add(GOOD, *SURE)
+    monitor.add(GOOD, SURE)
     assert monitor.status == "good"
 
 
@@ -132,5 +146,5 @@ def test_lost_pose_stays_lost_while_the_map_is_searched():
 def test_any_status_but_good_has_a_reason(fits):
     monitor = FitMonitor()
     for fit in fits:
-        monitor.add(fit, *SURE)
+        monitor.add(fit, SURE)
         assert bool(monitor.detail) == (monitor.status != "good")

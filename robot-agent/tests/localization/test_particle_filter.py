@@ -49,7 +49,8 @@ def test_given_pose_is_refined_by_the_first_scan():
     found = one.pose(ORIGIN)
     assert math.hypot(found.x - START.x, found.y - START.y) < 0.06
     assert abs(found.theta) < 0.03
-    assert one.sigmas() == pytest.approx((0.08 * math.sqrt(2.0), 0.04))
+    assert one.uncertainty.along < 0.1
+    assert one.uncertainty.heading < 0.04
 
 
 def test_scan_with_too_few_points_leaves_the_given_pose():
@@ -58,24 +59,24 @@ def test_scan_with_too_few_points_leaves_the_given_pose():
     one.add(DeskewedScan(np.ones((3, 2)), ORIGIN, 0.0), FIELDS, recover=False)
     assert one.pose(ORIGIN) == START
     one.add(scan_at(START, ORIGIN), FIELDS, recover=False)
-    assert one.sigmas()[0] < 0.2
+    assert one.uncertainty.along < 0.2
 
 
 def test_between_updates_the_pose_follows_the_odometry():
     one = ParticleFilter(CONFIG, 1)
     assert one.pose(ORIGIN) is None
-    one.place(START, Pose2(9.0, 9.0, 1.0), 0.1, 0.05)
+    assert not one.has_pose
+    one.start(START, Pose2(9.0, 9.0, 1.0), 0.1, 0.05)
     step = Pose2(0.2, -0.1, 0.3)
     assert one.pose(Pose2(9.0, 9.0, 1.0).compose(step)) == pytest.approx(START.compose(step))
-    one.forget()
-    assert not one.has_pose
 
 
 def test_standing_robot_is_not_updated():
     one = ParticleFilter(CONFIG, 1)
-    one.place(START, ORIGIN, 0.1, 0.05)
+    one.start(START, ORIGIN, 0.1, 0.05)
+    one.add(scan_at(START, ORIGIN), FIELDS, recover=False)
     before, covariance = one.pose(ORIGIN), one.covariance
-    one.add(scan_at(START, Pose2(0.1, 0.0, 0.1)), FIELDS, recover=False)
+    one.add(scan_at(START, Pose2(0.05, 0.0, 0.05)), FIELDS, recover=False)
     assert one.pose(ORIGIN) == before
     assert one.covariance is covariance
 
@@ -105,3 +106,92 @@ def test_random_particles_are_added_only_when_allowed_and_the_fit_declines():
             one.add(scan_at(Pose2(12.0, 8.0, -2.0), odom), FIELDS, recover=recover)
         spreads.append(float(np.ptp(one._x)))
     assert spreads[1] > spreads[0] + 3.0
+
+
+CORRIDOR = map_fields(*grid_of([(1, 1, 41, 3)], 42.0, 4.0), CONFIG)
+MIDDLE = Pose2(20.0, 2.0, 0.0)
+
+
+def corridor_scan(pose: Pose2, odom: Pose2) -> DeskewedScan:
+    """Return a scan in a plain corridor whose ends are beyond the lidar's range."""
+    angles = np.linspace(-math.pi, math.pi, 180, endpoint=False)
+    ranges = CORRIDOR.ranges(pose.x, pose.y, angles + pose.theta, 8.0)
+    hit = np.isfinite(ranges)
+    points = np.column_stack((ranges[hit] * np.cos(angles[hit]), ranges[hit] * np.sin(angles[hit])))
+    return DeskewedScan(points, odom, 0.0)
+
+
+@pytest.mark.parametrize("sigma", [0.3, 0.5, 1.0])
+def test_pose_given_in_a_plain_corridor_stays_as_uncertain_along_it_as_it_was_given(sigma):
+    one = ParticleFilter(CONFIG, 1)
+    one.start(MIDDLE, ORIGIN, sigma, 0.2)
+    one.add(corridor_scan(MIDDLE, ORIGIN), CORRIDOR, recover=False)
+    assert one.uncertainty.along > 0.9 * sigma
+    assert one.uncertainty.across < 0.1
+    assert abs(one.pose(ORIGIN).x - MIDDLE.x) < 0.15 * sigma + 0.05  # nothing was observed that could move it
+
+
+def test_uncertainty_along_a_plain_corridor_grows_as_the_odometry_and_covers_its_error():
+    one = ParticleFilter(CONFIG, 1)
+    true = Pose2(10.0, 2.0, 0.0)
+    one.start(true, ORIGIN, 0.05, 0.02)
+    odom = ORIGIN
+    one.add(corridor_scan(true, odom), CORRIDOR, recover=False)
+    for _ in range(100):
+        true, odom = true.compose(Pose2(0.2, 0.0, 0.0)), odom.compose(Pose2(0.208, 0.0, 0.001))  # 4 % too long
+        one.add(corridor_scan(true, odom), CORRIDOR, recover=False)
+    found = one.pose(odom)
+    assert abs(found.y - true.y) < 0.1
+    assert one.uncertainty.across < 0.1
+    assert 0.3 < abs(found.x - true.x) < 3.0 * one.uncertainty.along
+
+
+def test_widened_estimate_finds_a_robot_that_moved_without_its_odometry():
+    one = ParticleFilter(CONFIG, 1)
+    one.start(START, ORIGIN, 0.05, 0.03)
+    one.add(scan_at(START, ORIGIN), FIELDS, recover=False)
+    moved = START.compose(Pose2(0.9, 0.0, 0.2))
+    one.widen(ORIGIN, 0.9, 0.3)
+    assert one.uncertainty.along > 0.9
+    one.add(scan_at(moved, ORIGIN), FIELDS, recover=False)
+    found = one.pose(ORIGIN)
+    assert math.hypot(found.x - moved.x, found.y - moved.y) < 0.08
+
+
+def test_motion_in_one_step_or_many_spreads_the_particles_alike():
+    spreads = []
+    for pieces in (1, 10):
+        one = ParticleFilter(CONFIG, 3)
+        one.start(START, ORIGIN, 1e-6, 1e-6)
+        step = Pose2(0.96 / pieces, 0.0, 0.0)
+        odom = ORIGIN
+        for _ in range(pieces):
+            before, odom = odom, odom.compose(step).compose(Pose2(0.0, 0.0, 0.3 / pieces))
+            one._anchor = before
+            one._move(odom, 10 / pieces)
+        spreads.append((np.std(one._x), np.std(one._y), np.std(one._theta)))
+    assert spreads[0] == pytest.approx(spreads[1], rel=0.3)  # 3 times as wide without the steps
+
+
+def test_particles_without_noise_end_where_the_odometry_does():
+    config = LocalizationConfig(alphas=(0.0, 0.0, 0.0, 0.0))
+    for step in (Pose2(1.0, 0.4, 1.2), Pose2(-0.5, 0.05, 0.1), Pose2(0.0, 0.0, 2.0), Pose2(0.3, 0.0, -3.0)):
+        one = ParticleFilter(config, 1)
+        one.start(START, ORIGIN, 0.0, 0.0)
+        one._move(step, 7.0)
+        end = START.compose(step)
+        assert (one._x[0], one._y[0]) == pytest.approx((end.x, end.y), abs=1e-3)
+        assert math.remainder(one._theta[0] - end.theta, 2 * math.pi) == pytest.approx(0.0, abs=1e-3)
+
+
+def test_absolute_observation_is_fused_by_its_covariance_or_replaces_what_it_contradicts():
+    one = ParticleFilter(CONFIG, 1)
+    sure = np.diag([1e-4, 1e-4, 1e-4])
+    assert not one.observe(START, sure, ORIGIN)
+    assert one.pose(ORIGIN) == pytest.approx(START)
+    one.start(START, ORIGIN, 0.3, 0.1)
+    assert one.observe(Pose2(3.2, 2.0, 0.05), np.diag([0.09, 0.09, 0.01]), ORIGIN)
+    assert one.pose(ORIGIN) == pytest.approx((3.1, 2.0, 0.025))
+    assert one.covariance[0, 0] == pytest.approx(0.045)
+    assert not one.observe(Pose2(9.0, 2.0, 0.0), sure, ORIGIN)
+    assert one.pose(ORIGIN).x == pytest.approx(9.0)

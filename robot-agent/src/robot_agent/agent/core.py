@@ -12,7 +12,7 @@ Values and times go in, values come out. `now` is the robot's own monotonic cloc
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from fog_contracts import channels as ch
 from fog_contracts.fencing import Fence
@@ -29,7 +29,7 @@ from robot_agent.agent.safety_supervisor import SafetySupervisor, safety_inputs
 from robot_agent.agent.sensors import BaseSource, LidarSource
 from robot_agent.localization.localizer import Localizer, SavedPose
 from robot_agent.motion.local_planner import Decision, Job, decide
-from robot_agent.odometry import EncoderFault, Odometry
+from robot_agent.odometry import EncoderFault, Odometry, possible_motion
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -54,7 +54,11 @@ if TYPE_CHECKING:
     from robot_agent.config import AgentConfig
     from robot_agent.guardian.link import BaseFeedback, WheelCommand
     from robot_agent.hardware import LaserScan
+    from robot_agent.localization.absolute import AbsoluteObservation
     from robot_agent.safety.gate import Request, SafetyOutputs
+
+POSSIBLE_WHILE_SUSPENDED: Final = (0.5, 0.5)
+"""How far (m, rad) a robot is expected to be moved by others while its computer is suspended."""
 
 __all__ = ["AgentCore", "Decision", "Job", "SavedPose", "decide"]
 
@@ -146,8 +150,21 @@ class AgentCore:
         """Handle feedback of the base."""
         self._base.on_feedback(feedback, now)
         motion = self._odometry.update(feedback.odometry, now)
-        if not isinstance(motion, EncoderFault):
-            self._localizer.on_odometry(now, motion.x, motion.y, motion.theta)
+        if isinstance(motion, EncoderFault):
+            return
+        self._localizer.on_odometry(now, motion.x, motion.y, motion.theta)
+        if motion.skipped is not None:
+            self._localizer.on_unmeasured_motion(*possible_motion(motion.skipped, self._config.drive_train))
+
+    def on_suspension(self, seconds: float) -> None:
+        """Record that the computer was suspended: the robot may have been pushed or carried since."""
+        self._localizer.on_unmeasured_motion(
+            *POSSIBLE_WHILE_SUSPENDED, f"the computer was suspended for {seconds:.1f} s"
+        )
+
+    def on_absolute_observation(self, observation: AbsoluteObservation) -> bool:
+        """Handle a pose that was measured without the lidar (dock, marker); False when it is too old to be used."""
+        return self._localizer.on_absolute_observation(observation)
 
     def on_base_lost(self, now: float, reason: str) -> None:
         """Record that the link to the guardian broke."""
@@ -273,6 +290,11 @@ class AgentCore:
     def localizer(self) -> Localizer:
         """The pose estimator."""
         return self._localizer
+
+    @property
+    def encoder_faults(self) -> int:
+        """Number of encoder readings that no motion of the wheels explains."""
+        return self._odometry.faults
 
     @property
     def replica(self) -> Replica:

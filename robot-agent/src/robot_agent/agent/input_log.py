@@ -26,7 +26,9 @@ from robot_agent.agent.core import AgentCore
 from robot_agent.config import AgentConfig
 from robot_agent.guardian.link import BaseFeedback, WheelCommand
 from robot_agent.hardware import LaserScan
+from robot_agent.localization.absolute import AbsoluteObservation
 from robot_agent.localization.localizer import SavedPose
+from robot_agent.localization.pose import Pose2
 from robot_agent.motion.local_planner import Decision
 
 if TYPE_CHECKING:
@@ -105,6 +107,24 @@ class BaseLost(Input, frozen=True, kw_only=True):
 
     reason: str
     now: float
+
+
+class SuspensionNoticed(Input, frozen=True, kw_only=True):
+    """The computer was suspended for `seconds`."""
+
+    seconds: float
+
+
+class PoseObserved(Input, frozen=True, kw_only=True):
+    """A pose in `map` (x, y, theta) that was measured without the lidar, with its covariance by rows."""
+
+    pose: tuple[float, float, float]
+    covariance: tuple[float, ...]
+    observed_at: float
+
+    def observation(self) -> AbsoluteObservation:
+        """Return the observation."""
+        return AbsoluteObservation(Pose2(*self.pose), np.array(self.covariance).reshape(3, 3), self.observed_at)
 
 
 class LidarSamplesReceived(Input, frozen=True, kw_only=True):
@@ -221,9 +241,9 @@ class EntriesLost(Entry, frozen=True, kw_only=True):
 
 
 _KINDS: Final[tuple[type[Entry], ...]] = (
-    Started, PoseRestored, SnapshotLoaded, MessageReceived, QueryReceived, BaseReceived, BaseLost, LidarSamplesReceived,
-    ScanReceived, LoopHealthReceived, ControlCycle, DecisionMade, StreamCycle, Tick, StorageCheck,
-    WheelsCommanded, Published, Answered, PoseStored, EntriesLost,
+    Started, PoseRestored, SnapshotLoaded, MessageReceived, QueryReceived, BaseReceived, BaseLost, SuspensionNoticed,
+    PoseObserved, LidarSamplesReceived, ScanReceived, LoopHealthReceived, ControlCycle, DecisionMade, StreamCycle, Tick,
+    StorageCheck, WheelsCommanded, Published, Answered, PoseStored, EntriesLost,
 )  # fmt: skip
 ENTRY_OF_TOPIC: Final[Mapping[str, type[Entry]]] = {f"agent/{kind.__name__}": kind for kind in _KINDS}
 TOPIC_OF_ENTRY: Final[Mapping[type[Entry], str]] = {kind: topic for topic, kind in ENTRY_OF_TOPIC.items()}
@@ -288,6 +308,18 @@ class LoggedAgent(AgentCore):
         """Log that the link broke, and record it."""
         self._write(BaseLost(reason=reason, now=now))
         super().on_base_lost(now, reason)
+
+    def on_suspension(self, seconds: float) -> None:
+        """Log the suspension and record it."""
+        self._write(SuspensionNoticed(seconds=seconds))
+        super().on_suspension(seconds)
+
+    def on_absolute_observation(self, observation: AbsoluteObservation) -> bool:
+        """Log the observation and handle it."""
+        pose = (observation.pose.x, observation.pose.y, observation.pose.theta)
+        covariance = tuple(float(value) for value in observation.covariance.ravel())
+        self._write(PoseObserved(pose=pose, covariance=covariance, observed_at=observation.stamp))
+        return super().on_absolute_observation(observation)
 
     def on_lidar_samples(self, now: float) -> None:
         """Log that lidar samples arrived, and record it."""

@@ -149,6 +149,10 @@ class _Run:
                 self._load(entry)
             case log.BaseReceived() | log.BaseLost() | log.LidarSamplesReceived() | log.ScanReceived():
                 self._from_hardware(entry)
+            case log.SuspensionNoticed():
+                self._agent.on_suspension(entry.seconds)
+            case log.PoseObserved():
+                self._agent.on_absolute_observation(entry.observation())
             case log.LoopHealthReceived():
                 self._agent.on_loop_health(entry.health)
             case log.ControlCycle() | log.DecisionMade() | log.StreamCycle() | log.Tick() | log.StorageCheck():

@@ -17,6 +17,7 @@ from fog_contracts.replica import MapError
 from fog_runtime import logs, metrics
 from fog_runtime.clock import Ticker
 from fog_runtime.edges import Edges
+from fog_runtime.suspension import SuspensionMonitor
 from robot_agent.agent.core import decide
 from robot_agent.agent.pose_keeper import start_pose
 
@@ -45,6 +46,12 @@ SNAPSHOT_TIMEOUT_S: Final = 3.0
 
 SCANS = Counter("fognav_lidar_scans_total", "Whole scans of the lidar")
 LATENESS = Gauge("fognav_loop_lateness_p99_seconds", "99th percentile of a loop's lateness", ["loop"])
+ENCODER_FAULTS = Counter("fognav_encoder_faults_total", "Readings of the wheel encoders that no motion explains")
+SUSPENSIONS = Counter("fognav_suspensions_total", "Times that the robot's computer was suspended and resumed")
+POSE_SIGMA = Gauge(
+    "fognav_pose_sigma_meters", "Standard deviation of the position, in its least and its most certain direction",
+    ["direction"],
+)  # fmt: skip
 MODE = Gauge("fognav_robot_mode", "1 for the mode that the robot is in", ["mode"])
 
 _log = logs.get("agent")
@@ -68,6 +75,7 @@ class Service:
         self._control = Ticker(clock, CONTROL_S)
         self._mode = ""
         self._searching = False
+        self._encoder_faults = 0
         self._last_feedback_at = -math.inf
         self._last_scan_at = -math.inf
         self._base_reason = "the guardian is not connected yet"
@@ -111,6 +119,11 @@ class Service:
         health.set("base", base_ok, "" if base_ok else self._base_reason)
         LATENESS.labels("stream").set(self._stream.p99_s)
         LATENESS.labels("control").set(self._control.p99_s)
+        ENCODER_FAULTS.inc(core.encoder_faults - self._encoder_faults)
+        self._encoder_faults = core.encoder_faults
+        spread = core.localizer.uncertainty
+        POSE_SIGMA.labels("along").set(spread.along)
+        POSE_SIGMA.labels("across").set(spread.across)
         if core.localizer.searching and not self._searching:
             _log.info("global_search_started", reason=core.localizer.detail)
         self._searching = core.localizer.searching
@@ -135,7 +148,12 @@ class Service:
 
     async def stream_loop(self, guardian: GuardianClient) -> None:
         """Stream wheel commands at 20 Hz."""
+        suspension = SuspensionMonitor()
         async for now in self._stream:
+            if seconds := suspension.suspended():
+                SUSPENSIONS.inc()
+                _log.warning("computer_was_suspended", seconds=round(seconds, 1))
+                self._core.on_suspension(seconds)
             guardian.send(self._core.stream(now, self._clock.stamp()))
 
     async def control_loop(self) -> None:

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
     from robot_agent.localization.map_fields import MapFields
     from robot_agent.localization.pose import Pose2
+    from robot_agent.localization.uncertainty import Uncertainty
     from robot_agent.safety.gate import Localization
 
 _NEAR_M: Final = 0.25
@@ -23,6 +24,12 @@ _CONTRADICTION_LIMIT: Final = 0.2
 """Share of contradicting beams above which a pose is no longer good."""
 _CONTRADICTION_LIMIT_UNPROVEN: Final = 0.08
 """The same for a new pose: corridors look alike, and nine tenths of the beams may fit a wrong pose."""
+_GOOD_ALONG_M: Final = 0.35
+_GOOD_ACROSS_M: Final = 0.2
+_GOOD_HEADING_RAD: Final = 0.2
+"""Standard deviations up to which a pose may be good."""
+_LOST_ACROSS_M: Final = 1.0
+"""Across its least certain direction a pose must be more certain than this; along a plain corridor it need not be."""
 _CONTRADICTED_SCANS_LIMIT: Final = 25
 """After this many contradicted scans in a row (some 4.5 s) the pose is lost, however the rest fits."""
 
@@ -103,9 +110,16 @@ class FitMonitor:
         """Set the status to lost, with its reason."""
         self.status, self.detail = "lost", detail
 
-    def add(self, fit: Fit, sigma_xy: float, sigma_theta: float) -> None:
-        """Add the fit of the newest scan, with the pose's standard deviations (m, rad)."""
-        grade, reason = grade_fit(fit, sigma_xy, sigma_theta)
+    def doubt(self, detail: str) -> None:
+        """Let a good pose be weak until scans prove it again."""
+        self.restart()
+        if self.status == "good":
+            self.status = "weak"
+        self.detail = detail
+
+    def add(self, fit: Fit, spread: Uncertainty) -> None:
+        """Add the fit of the newest scan, with the pose's standard deviations."""
+        grade, reason = grade_fit(fit, spread)
         if grade == "good" and not self._proven and fit.contradict > _CONTRADICTION_LIMIT_UNPROVEN:
             grade, reason = "weak", _contradiction(fit)
         self._contradicted = self._contradicted + 1 if fit.contradict > _CONTRADICTION_LIMIT else 0
@@ -148,20 +162,26 @@ class FitMonitor:
             self.trial_failed = True
 
 
-def grade_fit(fit: Fit, sigma_xy: float, sigma_theta: float) -> tuple[Localization, str]:
-    """Grade a pose by one scan and its standard deviations (m, rad); return the grade and its reason."""
+def grade_fit(fit: Fit, spread: Uncertainty) -> tuple[Localization, str]:
+    """Grade a pose by one scan and its standard deviations; return the grade and its reason."""
     # Measured on maps with random poses: contradiction of a right pose is 0.1 at most, also in a crowd; that of a wrong
     # one has a median of 0.3, and few beams agree.
     if fit.contradict > 0.45 or (fit.contradict > _CONTRADICTION_LIMIT and fit.agree < 0.4):
         return "lost", _contradiction(fit)
-    if sigma_xy > 1.0:
-        return "lost", f"the position is uncertain by {sigma_xy:.1f} m"
+    if spread.across > _LOST_ACROSS_M:
+        return "lost", f"the position is uncertain by {spread.across:.1f} m in every direction"
     if fit.contradict > _CONTRADICTION_LIMIT:
         return "weak", _contradiction(fit)
     if fit.informative < 8:
         return "weak", "too few beams reach a wall of the map"
-    if sigma_xy > 0.35 or sigma_theta > 0.3:
-        return "weak", f"the pose is uncertain by {sigma_xy:.2f} m and {sigma_theta:.2f} rad"
+    return _grade_spread(spread)
+
+
+def _grade_spread(spread: Uncertainty) -> tuple[Localization, str]:
+    if spread.across > _GOOD_ACROSS_M or spread.heading > _GOOD_HEADING_RAD:
+        return "weak", f"the pose is uncertain by {spread.along:.2f} m and {spread.heading:.2f} rad"
+    if spread.along > _GOOD_ALONG_M:
+        return "weak", f"the position is uncertain by {spread.along:.2f} m in one direction, as in a plain corridor"
     return "good", ""
 
 

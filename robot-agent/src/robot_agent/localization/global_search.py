@@ -7,11 +7,12 @@ robot is at rest.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from robot_agent.localization.fit import Fit, evaluate_fit
+from robot_agent.localization.fit import evaluate_fit
+from robot_agent.localization.hypotheses import Hypotheses, Hypothesis, apart, fits, quality
 from robot_agent.localization.pose import Pose2, wrap
 
 if TYPE_CHECKING:
@@ -25,20 +26,8 @@ _SPACING_M: Final = 0.3
 _HEADINGS: Final = 36
 _REFINED: Final = 400
 """Candidates that are refined."""
-_PLACES: Final = 8
-"""Places that are compared at the end, ..."""
-_APART_M: Final = 0.6
-_APART_RAD: Final = 0.5
-"""... apart from one another by this distance or this angle."""
-_AMBIGUOUS: Final = 0.85
-"""A second place that fits this well, as a share of the best, makes the search ambiguous."""
-
-
-class SearchResult(NamedTuple):
-    """The pose in `map` that was found, or None and the reason."""
-
-    pose: Pose2 | None
-    detail: str
+_PLACES: Final = 24
+"""Places that are compared at the end."""
 
 
 class GlobalSearch:
@@ -57,8 +46,8 @@ class GlobalSearch:
         self.odom = odom
         """Pose in `odom` to which the result belongs."""
 
-    def advance(self, fields: MapFields) -> SearchResult | None:
-        """Do one share of the work; return the result once there is one."""
+    def advance(self, fields: MapFields) -> Hypotheses | None:
+        """Do one share of the work; return the places that explain the scan once all candidates are scored."""
         if self._scored < len(self._candidates):
             part = slice(self._scored, self._scored + _CHUNK)
             self._scores[part] = fields.scores(self._candidates[part], self._points, fields.coarse)
@@ -81,19 +70,15 @@ class GlobalSearch:
             step *= 0.6
         return poses, scores
 
-    def _conclude(self, fields: MapFields, poses: NDArray[np.float64], scores: NDArray[np.float64]) -> SearchResult:
-        """Return the best place unless another one explains the scan nearly as well."""
-        fitting: list[tuple[float, Pose2]] = []
+    def _conclude(self, fields: MapFields, poses: NDArray[np.float64], scores: NDArray[np.float64]) -> Hypotheses:
+        """Return the places that explain the scan, with how well they do."""
+        places: list[Hypothesis] = []
         for score, pose in _places(poses, scores):
             fit = evaluate_fit(fields, pose, self._points, self._range_max)
-            if _fits(fit):
-                fitting.append((score * (1.0 - fit.contradict) * fit.explained, pose))
-        if not fitting:
-            return SearchResult(None, "the scan fits no place of the map: give the initial pose")
-        fitting.sort(key=lambda entry: -entry[0])
-        if len(fitting) > 1 and fitting[1][0] > _AMBIGUOUS * fitting[0][0]:
-            return SearchResult(None, "several places of the map look like this one: give the initial pose")
-        return SearchResult(fitting[0][1], "")
+            if fits(fit):
+                value = quality(score / fields.best_likelihood, fit)
+                places.append(Hypothesis(pose, math.log(max(value, 1e-3))))
+        return Hypotheses(places, self.odom)
 
 
 def _places(poses: NDArray[np.float64], scores: NDArray[np.float64]) -> list[tuple[float, Pose2]]:
@@ -101,17 +86,8 @@ def _places(poses: NDArray[np.float64], scores: NDArray[np.float64]) -> list[tup
     places: list[tuple[float, Pose2]] = []
     for index in np.argsort(-scores, kind="stable"):
         pose = Pose2(float(poses[index, 0]), float(poses[index, 1]), wrap(float(poses[index, 2])))
-        if all(_apart(pose, other) for _, other in places):
+        if all(apart(pose, other) for _, other in places):
             places.append((float(scores[index]), pose))
         if len(places) == _PLACES:
             break
     return places
-
-
-def _apart(pose: Pose2, other: Pose2) -> bool:
-    far = math.hypot(pose.x - other.x, pose.y - other.y) > _APART_M
-    return far or abs(wrap(pose.theta - other.theta)) > _APART_RAD
-
-
-def _fits(fit: Fit) -> bool:
-    return fit.contradict < 0.2 and fit.agree > 0.4

@@ -3,12 +3,12 @@
 Frames: `odom` is the frame of the wheels' odometry since start, `map` is the site's, `base` the robot's centre. Between
 corrections the pose follows the odometry, so it is smooth and never older than the last feedback.
 Pure: times are arguments, randomness comes from the seed. The parts are modules of their own: `odometry_buffer`,
-`deskew`, `map_fields`, `particle_filter`, `fit` (how a scan fits the map, and the status) and `global_search`.
+`deskew`, `map_fields`, `particle_filter`, `scan_match`, `fit` (how a scan fits the map, and the status), and
+`relocalization` with `global_search` and `hypotheses` for a robot that does not know where it is.
 """
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Final
 
 import msgspec
@@ -17,26 +17,31 @@ import numpy as np
 from robot_agent.config import LocalizationConfig
 from robot_agent.localization.deskew import DeskewedScan, deskew
 from robot_agent.localization.fit import FitMonitor, evaluate_fit
-from robot_agent.localization.global_search import GlobalSearch
 from robot_agent.localization.map_fields import MapFields, map_fields
 from robot_agent.localization.odometry_buffer import OdometryBuffer
 from robot_agent.localization.particle_filter import ParticleFilter
 from robot_agent.localization.pose import Pose2
+from robot_agent.localization.relocalization import Relocalization
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from fog_contracts.grid import GridGeometry
     from robot_agent.hardware import LaserScan
+    from robot_agent.localization.absolute import AbsoluteObservation
+    from robot_agent.localization.hypotheses import Hypothesis
+    from robot_agent.localization.uncertainty import Uncertainty
     from robot_agent.safety.gate import Localization
 
 _FIT_BEAMS: Final = 120
-_SEARCH_POINTS_MIN: Final = 10
-_SEARCH_EVERY_S: Final = 10.0
 _TRIAL_SCANS: Final = 8
 """A saved pose must become good within so many scans."""
-_FOUND_SIGMAS: Final = (0.1, 0.05)
-"""Standard deviations (m, rad) of a pose that a global search found."""
+_FOUND_SIGMAS: Final = (0.2, 0.1)
+"""Standard deviations (m, rad) of a place that a search found, which the next scan narrows."""
+_LOCAL_SIGMAS: Final = (1.0, 0.5)
+"""Standard deviations (m, rad) within which a lost robot is looked for first."""
+_LOCAL_SCANS: Final = 5
+"""After this many scans that do not fit there either, the whole map is searched."""
 
 
 class SavedPose(msgspec.Struct, frozen=True, kw_only=True):
@@ -59,8 +64,9 @@ class Localizer:
         self._filter = ParticleFilter(self._config, seed)
         self._monitor = FitMonitor()
         self._fields: MapFields | None = None
-        self._search: GlobalSearch | None = None
-        self._search_again_at = -math.inf
+        self._relocalization = Relocalization(self._config)
+        self._local_scans = 0
+        """Scans since a lost robot was looked for near its last pose; 0 while it is not lost."""
         self.scan: DeskewedScan | None = None
         """The newest scan, without its skew."""
 
@@ -70,26 +76,55 @@ class Localizer:
         """Load the static map (h, w; 0 free, 254 occupied, 255 unknown); the pose is kept."""
         if self._fields is None or not self._fields.matches(static, geometry):
             self._fields = map_fields(static, geometry, self._config)
+            self._relocalization.cancel()
 
     def on_odometry(self, timestamp: float, x: float, y: float, theta: float) -> None:
         """Add the pose in `odom` (m, rad; theta not wrapped) that arrived at `timestamp` (s)."""
         self._odometry.add(timestamp, x, y, theta)
+
+    def on_unmeasured_motion(self, distance: float, angle: float, detail: str) -> None:
+        """Take notice that the robot may have moved this far (m, rad) without its odometry; `detail` says why.
+
+        The pose is weak until scans prove it.
+        """
+        odom = self._odometry.latest()
+        if odom is not None and self._filter.has_pose:
+            self._filter.widen(odom, distance, angle)
+            self._monitor.doubt(detail)
+
+    def on_absolute_observation(self, observation: AbsoluteObservation) -> bool:
+        """Fuse a pose that was measured without the scanner; False: there is no odometry from its time.
+
+        One that contradicts the estimate replaces it. Scans decide whether the pose is good.
+        """
+        if not self._odometry.reaches_back_to(observation.stamp):
+            return False
+        odom = self._odometry.pose(observation.stamp)
+        assert odom is not None
+        self._relocalization.cancel()
+        if not self._filter.observe(observation.pose, observation.covariance, odom):
+            self._monitor.begin("checking the pose that was measured")
+        return True
 
     def on_scan(self, scan: LaserScan, now: float) -> None:
         """Process a whole scan: correct the pose when the robot has moved, and evaluate the fit."""
         self.scan = deskew(scan, self._odometry, self._config)
         if self.scan is None or self._fields is None:
             return
-        if self._search is not None:
-            self._continue_search(self._search, self._fields, now)
-        elif self._filter.has_pose:
+        if self._filter.has_pose:
             self._filter.add(self.scan, self._fields, recover=self._monitor.status != "good")
             self._evaluate(self.scan, self._fields, now)
-        elif self._may_search(now):
+        if self._relocalization.active:
+            self._relocalization.on_scan(self.scan, self._fields)
+            self._settle(self.scan, self._fields, now)
+        elif not self._filter.has_pose and self._may_search(now):
             self.global_localization()
 
     def initial_pose(self, x: float, y: float, theta: float, sigma_xy: float = 0.5, sigma_theta: float = 0.35) -> None:
-        """Start at a pose in `map` (m, rad) given by an operator; the next scan refines it within 3 sigma."""
+        """Start at a pose in `map` (m, rad) given by an operator, with its standard deviations.
+
+        The next scan narrows them in the directions that it observes.
+        """
         self._start(Pose2(x, y, theta), sigma_xy, sigma_theta)
         self._monitor.begin("checking the given pose")
 
@@ -100,12 +135,9 @@ class Localizer:
         self._monitor.begin("checking the saved pose", _TRIAL_SCANS)
 
     def global_localization(self) -> bool:
-        """Search the whole map, a share with each scan, at rest; False: no map or no scan yet."""
-        scan, fields = self.scan, self._fields
-        if fields is None or scan is None or not len(fields.free_places) or len(scan.points) < _SEARCH_POINTS_MIN:
+        """Search the whole map, a share with each scan, keeping the estimate; False: no map or no scan yet."""
+        if self._fields is None or self.scan is None or not self._relocalization.begin(self.scan, self._fields):
             return False
-        self._search = GlobalSearch(fields, scan.beams(self._config.beams), scan.odom, self._config.range_max)
-        self._filter.forget()
         self._monitor.begin_search()
         return True
 
@@ -124,7 +156,12 @@ class Localizer:
     @property
     def searching(self) -> bool:
         """Whether a global search is in progress."""
-        return self._search is not None
+        return self._relocalization.searching
+
+    @property
+    def hypotheses(self) -> list[Hypothesis]:
+        """Places between which the scans so far do not decide; empty outside of a relocalization."""
+        return self._relocalization.places
 
     @property
     def particles(self) -> int:
@@ -143,6 +180,11 @@ class Localizer:
     def covariance(self) -> NDArray[np.float64]:
         """Covariance (3, 3) over (x, y, theta) in `map`, as of the last filter update."""
         return self._filter.covariance
+
+    @property
+    def uncertainty(self) -> Uncertainty:
+        """Standard deviations of the pose along and across its least certain direction, as of the last update."""
+        return self._filter.uncertainty
 
     def twist(self) -> tuple[float, float]:
         """Measured forward speed (m/s) and turning rate (rad/s) over the last 0.15 s or more; zeros without that."""
@@ -166,42 +208,53 @@ class Localizer:
         pose = self.pose(timestamp)
         if pose is None or self.status not in {"good", "weak"}:
             return None
-        sigma_xy, sigma_theta = self._filter.sigmas()
-        return SavedPose(site=site, x=pose.x, y=pose.y, theta=pose.theta, sigma_xy=sigma_xy, sigma_theta=sigma_theta)
+        spread = self._filter.uncertainty
+        return SavedPose(
+            site=site, x=pose.x, y=pose.y, theta=pose.theta, sigma_xy=spread.along, sigma_theta=spread.heading
+        )
 
     # --- internals ---
 
     def _start(self, pose: Pose2, sigma_xy: float, sigma_theta: float) -> None:
-        self._search = None
+        self._relocalization.cancel()
+        self._local_scans = 0
         odom = self._odometry.latest() or Pose2(0.0, 0.0, 0.0)
         self._filter.start(pose, odom, sigma_xy, sigma_theta)
 
     def _evaluate(self, scan: DeskewedScan, fields: MapFields, now: float) -> None:
-        """Evaluate how the scan fits at the corrected pose; search the whole map when the pose is lost."""
+        """Evaluate how the scan fits at the corrected pose; look for the robot when the pose is lost."""
         pose = self._filter.pose(scan.odom)
         assert pose is not None
         fit = evaluate_fit(fields, pose, scan.beams(_FIT_BEAMS), self._config.range_max)
-        self._monitor.add(fit, *self._filter.sigmas())
-        if self._monitor.trial_failed:
-            self.global_localization()
-        elif self._may_search(now):
-            self._search_again_at = now + _SEARCH_EVERY_S
+        self._monitor.add(fit, self._filter.uncertainty)
+        if self._monitor.status != "lost":
+            self._local_scans = 0
+            if self._monitor.trial_failed:
+                self.global_localization()
+            elif self._monitor.status in {"good", "weak"}:
+                self._relocalization.cancel()
+            return
+        self._local_scans += 1
+        if self._local_scans == 1:
+            # Most poses are lost nearby, by a slip or a push.
+            self._filter.widen(scan.odom, *_LOCAL_SIGMAS)
+            self._monitor.restart()
+        elif self._local_scans > _LOCAL_SCANS and not self._relocalization.active and self._may_search(now):
             self.global_localization()
 
     def _may_search(self, now: float) -> bool:
-        """Whether the pose is lost, the robot is at rest, and the last search is long enough ago."""
-        v, w = self._odometry.twist()
-        at_rest = abs(v) < 0.01 and abs(w) < 0.02
-        return self._monitor.status == "lost" and now >= self._search_again_at and at_rest
+        """Whether the pose is lost and the last search is long enough ago."""
+        return self._monitor.status == "lost" and self._relocalization.may_begin(now)
 
-    def _continue_search(self, search: GlobalSearch, fields: MapFields, now: float) -> None:
-        result = search.advance(fields)
-        if result is None:
+    def _settle(self, scan: DeskewedScan, fields: MapFields, now: float) -> None:
+        """Start at the place that the relocalization has decided for, if it has."""
+        outcome = self._relocalization.outcome(now)
+        if outcome is None:
             return
-        self._search = None
-        self._search_again_at = now + _SEARCH_EVERY_S
-        if result.pose is None:
-            self._monitor.lose(result.detail)
+        if outcome.pose is None:
+            self._monitor.lose(outcome.detail)
             return
         self._monitor.restart()
-        self._filter.place(result.pose, search.odom, *_FOUND_SIGMAS)
+        self._filter.start(outcome.pose, outcome.odom, *_FOUND_SIGMAS)
+        self._filter.add(scan, fields, recover=False)
+        self._evaluate(scan, fields, now)

@@ -34,7 +34,8 @@ class MapFields:
     """Tables over the cells of a static map, all (height, width) of `geometry`.
 
     occupied: uint8, 1 where the map has a wall. fine, coarse: float32, the likelihood of a beam that ends there, the
-    coarse one blurred twice as wide. best_likelihood: the highest value of either. wall_distance: float32, m to the
+    coarse one blurred twice as wide; sharp: the same for matching, exp(-d^2 / 2 sigma^2). best_likelihood: the highest
+    value of fine and coarse. wall_distance: float32, m to the
     nearest face of a wall, at most 1. free_places: float64 (n, 2), m in `map`, centres of the cells where a robot fits.
     """
 
@@ -42,6 +43,7 @@ class MapFields:
     occupied: NDArray[np.uint8]
     fine: NDArray[np.float32]
     coarse: NDArray[np.float32]
+    sharp: NDArray[np.float32]
     best_likelihood: float
     wall_distance: NDArray[np.float32]
     free_places: NDArray[np.float64]
@@ -69,6 +71,12 @@ class MapFields:
             poses[:, 0], poses[:, 1], poses[:, 2], field, g.resolution, g.origin_x, g.origin_y, angles, ranges
         )
 
+    def agreements(
+        self, poses: NDArray[np.float64], points: NDArray[np.float64], field: NDArray[np.float32]
+    ) -> NDArray[np.float64]:
+        """Return the same for `fine` or `coarse` as shares (n,) of the value that perfect agreement has."""
+        return self.scores(poses, points, field) / self.best_likelihood
+
 
 def map_fields(static: NDArray[np.uint8], geometry: GridGeometry, config: LocalizationConfig) -> MapFields:
     """Compute the fields of a static map (height, width; 0 free, 254 occupied, 255 unknown)."""
@@ -89,6 +97,10 @@ def map_fields(static: NDArray[np.uint8], geometry: GridGeometry, config: Locali
         occupied=occupied,
         fine=field(config.sigma_hit),
         coarse=field(2.0 * config.sigma_hit),
+        # The field holds cubes: the cube of a Gaussian is one that is narrower by the root of 3.
+        sharp=likelihood_field(
+            faces, geometry.resolution, math.sqrt(3.0) * config.match_sigma, config.field_reach, 1.0, 0.0
+        ),
         best_likelihood=(config.z_hit + config.z_rand / config.range_max) ** 3,
         wall_distance=wall_distance,
         free_places=geometry.centres(np.column_stack((columns, rows))),

@@ -1,6 +1,7 @@
 """Monte Carlo localization over the likelihood field of the static map.
 
-Methods: augmented recovery (Thrun, Burgard and Fox 2005, chapters 8.2 and 8.3), sample size by KLD (Fox 2003).
+Methods: augmented recovery (Thrun, Burgard and Fox 2005, chapters 8.2 and 8.3), sample size by KLD (Fox 2003), the
+estimate refined by scan matching. The particles never see the refinement: it would make them too sure.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ import numpy as np
 
 from fog_kernels import amcl
 from robot_agent.localization.pose import Pose2, wrap
+from robot_agent.localization.scan_match import match_scan
+from robot_agent.localization.uncertainty import Uncertainty, uncertainty
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -20,14 +23,28 @@ if TYPE_CHECKING:
     from robot_agent.localization.deskew import DeskewedScan
     from robot_agent.localization.map_fields import MapFields
 
-_REFINE_SAMPLES: Final = 4000
-"""Poses tried per round of refining a given pose, ..."""
-_REFINE_SHRINK: Final = 0.4
-"""... each round within this share of the spread of the one before."""
-_REFINE_BEAMS_MIN: Final = 5
-_REFINED_SIGMAS: Final = (0.08, 0.04)
-"""Standard deviations (m, rad) of a refined pose."""
+_SPREAD_SAMPLES: Final = 16_000
+"""Poses drawn around a given or doubtful pose: enough that some hundred of them fit."""
+_SPREAD_JITTER: Final = 0.15
+"""Their noise between the coarse and the fine field, as a share of the smallest spread."""
+_SPREAD_SHARPNESS: Final = 3.0
+"""Their weights are this many times as sharp as those of an update: one scan must do what many updates do."""
+_SPREAD_BEAMS_MIN: Final = 5
+_WIDEN_FROM: Final = (0.1, 0.1, 0.05)
+"""Least standard deviations (m, m, rad) of an estimate in doubt."""
+_MATCH_BEAMS: Final = 180
 _RANDOM_SHARE_MAX: Final = 0.1
+_STEPS_MAX: Final = 20
+_SKIP_M: Final = 0.5
+"""A beam that ends farther than this from any wall of the map hit something unknown, ..."""
+_SKIP_SHARE_MAX: Final = 0.6
+"""... unless that holds for more than this share of the beams: then the pose is wrong."""
+_OTHER_CLUSTER: Final = 1.5
+"""The estimate moves to another cluster of particles when that weighs this many times as much as its own."""
+_SAME_CLUSTER_M: Final = 0.75
+_STRAIGHT_RAD: Final = 1e-6
+_GATE: Final = 11.345
+"""Squared Mahalanobis distance (0.99 quantile, 3 degrees of freedom) beyond which two poses contradict each other."""
 
 
 class ParticleFilter:
@@ -47,8 +64,8 @@ class ParticleFilter:
         self._estimate: Pose2 | None = None
         self._anchor = Pose2(0.0, 0.0, 0.0)
         """Odometry at which the estimate was made."""
-        self._unrefined_sigmas: tuple[float, float] | None = None
-        """Standard deviations (m, rad) of a given pose that no scan has refined yet."""
+        self._spread: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
+        """Smallest and largest standard deviations (m, m, rad) around the estimate that no scan has narrowed yet."""
         self._slow = self._fast = 0.0
         self.covariance: NDArray[np.float64] = np.zeros((3, 3))
         """Over (x, y, theta) in `map` (m, rad), as of the last update."""
@@ -63,87 +80,177 @@ class ParticleFilter:
         """Whether there is an estimate."""
         return self._estimate is not None
 
+    @property
+    def uncertainty(self) -> Uncertainty:
+        """Standard deviations of the pose as of the last update."""
+        return uncertainty(self.covariance)
+
     def pose(self, odom: Pose2) -> Pose2 | None:
         """Return the pose in `map` when the odometry says `odom`; None without an estimate."""
         return None if self._estimate is None else self._estimate.compose(odom.relative_to(self._anchor))
 
-    def sigmas(self) -> tuple[float, float]:
-        """Return the standard deviations of position (m) and heading (rad)."""
-        return (
-            math.sqrt(max(0.0, self.covariance[0, 0] + self.covariance[1, 1])),
-            math.sqrt(max(0.0, self.covariance[2, 2])),
-        )
-
     def start(self, pose: Pose2, odom: Pose2, sigma_xy: float, sigma_theta: float) -> None:
-        """Start at a pose in `map` with these standard deviations (m, rad), which the next scan refines by search."""
-        self.place(pose, odom, sigma_xy, sigma_theta)
-        self._unrefined_sigmas = (sigma_xy, sigma_theta)
+        """Start at a pose in `map` with these standard deviations (m, rad), which the next scan narrows."""
+        sigmas = np.array((sigma_xy, sigma_xy, sigma_theta))
+        self._start(pose, odom, sigmas, sigmas)
 
-    def place(self, pose: Pose2, odom: Pose2, sigma_xy: float, sigma_theta: float) -> None:
-        """Start at a pose in `map` that was found by search, with these standard deviations (m, rad)."""
-        self._anchor = odom
-        self._unrefined_sigmas = None
+    def widen(self, odom: Pose2, sigma_xy: float, sigma_theta: float) -> None:
+        """Let the estimate be wrong by up to these standard deviations (m, rad), which the next scan narrows again.
+
+        Smaller errors stay as likely as they were: the cause may have moved the robot or not.
+        """
+        pose = self.pose(odom)
+        if pose is not None:
+            sigmas = np.maximum(np.sqrt(np.diag(self.covariance)), _WIDEN_FROM)
+            self._start(pose, odom, sigmas, np.hypot(sigmas, (sigma_xy, sigma_xy, sigma_theta)))
+
+    def _start(self, pose: Pose2, odom: Pose2, least: NDArray[np.float64], most: NDArray[np.float64]) -> None:
+        self._anchor, self._estimate = odom, pose
         self._slow = self._fast = 0.0
-        self._spread(pose, sigma_xy, sigma_theta)
+        self._spread = (least, most)
+        self.covariance = np.diag(most**2)
+        self._set_particles(np.array(pose) + self._rng.standard_normal((self._config.particles_start, 3)) * most)
 
-    def forget(self) -> None:
-        """Discard the estimate."""
-        self._estimate = None
+    def observe(self, pose: Pose2, covariance: NDArray[np.float64], odom: Pose2) -> bool:
+        """Fuse a pose in `map` with its covariance (3, 3), measured at `odom`, without the scanner.
+
+        False: there was no estimate, or it contradicted the measured pose, which has replaced it.
+        """
+        mine, agrees = self.pose(odom), False
+        if mine is not None:
+            offset = np.array((pose.x - mine.x, pose.y - mine.y, wrap(pose.theta - mine.theta)))
+            total = self.covariance + covariance
+            agrees = bool(offset @ np.linalg.solve(total, offset) <= _GATE)
+            if agrees:
+                gain = np.linalg.solve(total, self.covariance).T
+                pose = Pose2(*(float(v) for v in np.array(mine) + gain @ offset))
+                covariance = self.covariance - gain @ self.covariance
+        self._anchor, self._estimate = odom, Pose2(pose.x, pose.y, wrap(pose.theta))
+        self._spread = None
+        self.covariance = 0.5 * (covariance + covariance.T)
+        count = self._config.particles_start
+        self._set_particles(self._rng.multivariate_normal(np.array(self._estimate), self.covariance, count))
+        return agrees
 
     def add(self, scan: DeskewedScan, fields: MapFields, *, recover: bool) -> None:
         """Correct the estimate by a scan when the robot moved since the last one; there must be an estimate.
 
         `recover`: whether random particles may be added over the map when scans fit less and less.
         """
-        if self._unrefined_sigmas is not None:
-            self._refine(scan, fields)
+        if self._spread is not None:
+            self._narrow(scan, fields, *self._spread)
         else:
             self._update(scan, fields, recover=recover)
 
-    def _spread(self, pose: Pose2, sigma_xy: float, sigma_theta: float) -> None:
-        count = self._config.particles_start
-        self._estimate = pose
-        self.covariance = np.diag([sigma_xy**2, sigma_xy**2, sigma_theta**2])
-        self._x = (pose.x + sigma_xy * self._rng.standard_normal(count)).astype(np.float32)
-        self._y = (pose.y + sigma_xy * self._rng.standard_normal(count)).astype(np.float32)
-        self._theta = (pose.theta + sigma_theta * self._rng.standard_normal(count)).astype(np.float32)
-        self._weights = np.full(count, 1.0 / count)
+    def _set_particles(self, poses: NDArray[np.float64]) -> None:
+        self._x, self._y, self._theta = (np.ascontiguousarray(poses[:, i], np.float32) for i in range(3))
+        self._weights = np.full(len(poses), 1.0 / len(poses))
 
-    def _refine(self, scan: DeskewedScan, fields: MapFields) -> None:
-        """Search the best pose within the given deviations; a single weighting would leave too few particles."""
+    def _narrow(
+        self, scan: DeskewedScan, fields: MapFields, least: NDArray[np.float64], most: NDArray[np.float64]
+    ) -> None:
+        """Weight many poses within the given deviations by a scan.
+
+        What the scan does not observe keeps the deviation that it was given with.
+        """
         pose = self.pose(scan.odom)
         assert pose is not None
-        assert self._unrefined_sigmas is not None
-        self._anchor = scan.odom
+        self._anchor, self._estimate = scan.odom, pose
         points = scan.beams(self._config.beams)
-        if len(points) < _REFINE_BEAMS_MIN:
-            self._estimate = pose
+        if len(points) < _SPREAD_BEAMS_MIN:
             return
-        sigma_xy, sigma_theta = self._unrefined_sigmas
-        for field in (fields.coarse, fields.fine, fields.fine, fields.fine):
-            noise = self._rng.standard_normal((_REFINE_SAMPLES, 3)) * (sigma_xy, sigma_xy, sigma_theta)
-            tried = np.array(pose) + noise
-            tried[0] = pose
-            pose = Pose2(*(float(v) for v in tried[int(np.argmax(fields.scores(tried, points, field)))]))
-            sigma_xy, sigma_theta = _REFINE_SHRINK * sigma_xy, _REFINE_SHRINK * sigma_theta
-        self._unrefined_sigmas = None
-        self._spread(Pose2(pose.x, pose.y, wrap(pose.theta)), *_REFINED_SIGMAS)
+        sharpness = self._config.sharpness
+        spread = least + (most - least) * self._rng.random((_SPREAD_SAMPLES, 1)) ** 2
+        poses = np.array(pose) + self._rng.standard_normal((_SPREAD_SAMPLES, 3)) * spread
+        poses = self._drawn(poses, sharpness * fields.agreements(poses, points, fields.coarse))
+        poses += self._rng.standard_normal(poses.shape) * (_SPREAD_JITTER * least)
+        log_weights = _SPREAD_SHARPNESS * sharpness * fields.agreements(poses, points, fields.fine)
+        self._spread = None
+        self._set_particles(poses)
+        self._weights = np.exp(log_weights - log_weights.max())
+        self._weights /= self._weights.sum()
+        self._conclude(scan, fields)
+        self._resample(fields, 0.0)
+
+    def _drawn(self, poses: NDArray[np.float64], log_weights: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return as many poses, drawn with low variance by their weights."""
+        cumulated = np.cumsum(np.exp(log_weights - log_weights.max()))
+        targets = (np.arange(len(poses)) + self._rng.random()) * (cumulated[-1] / len(poses))
+        return np.asarray(poses[np.minimum(np.searchsorted(cumulated, targets), len(poses) - 1)])
 
     def _update(self, scan: DeskewedScan, fields: MapFields, *, recover: bool) -> None:
         config = self._config
         step = scan.odom.relative_to(self._anchor)
-        if math.hypot(step.x, step.y) < config.update_distance and abs(step.theta) < config.update_angle:
+        length, angle = math.hypot(step.x, step.y), abs(step.theta)
+        if length < config.update_distance and angle < config.update_angle:
             return
-        delta = amcl.odometry_delta(self._anchor, scan.odom)
-        amcl.motion_update(self._x, self._y, self._theta, *delta, config.alphas, self._state)
+        self._move(scan.odom, max(length / config.update_distance, angle / config.update_angle))
+        self._estimate = self.pose(scan.odom)
         self._anchor = scan.odom
         random_share = self._update_weights(scan, fields)
-        if not recover:
-            # Unknown objects lower the average too: random particles are added only while the pose is not good.
-            random_share = 0.0
-        found = amcl.estimate(self._x, self._y, self._theta, self._weights)
-        self._estimate = Pose2(found.x, found.y, found.theta)
-        self.covariance = np.asarray(found.covariance)
+        self._conclude(scan, fields)
+        # Unknown objects lower the average too: random particles are added only while the pose is not good.
+        self._resample(fields, random_share if recover else 0.0)
+
+    def _move(self, odom: Pose2, steps: float) -> None:
+        """Move the particles along the odometry, in steps of the size that the noise is given for."""
+        count = min(max(1, round(steps)), _STEPS_MAX)
+        rot1, trans, rot2 = amcl.odometry_delta(self._anchor, odom)
+        turn = wrap(rot1 + rot2)
+        half = turn / (2.0 * count)
+        # Equal chords of one arc, which the first rotation aims so that they end where the odometry does.
+        aim = rot1 - 0.5 * turn
+        length = trans * math.sin(half) / math.sin(0.5 * turn) if abs(turn) > _STRAIGHT_RAD else trans / count
+        for number in range(count):
+            before = half + (aim if number == 0 else 0.0)
+            after = half - (aim if number == count - 1 else 0.0)
+            amcl.motion_update(self._x, self._y, self._theta, before, length, after, self._config.alphas, self._state)
+
+    def _update_weights(self, scan: DeskewedScan, fields: MapFields) -> float:
+        """Weight the particles by a scan; return the share of random ones that augmented recovery asks for."""
+        config = self._config
+        points = self._explained(scan.beams(config.beams), fields)
+        average = 0.0
+        if len(points):
+            poses = np.column_stack((self._x, self._y, self._theta)).astype(np.float64)
+            agreements = fields.agreements(poses, points, fields.fine)
+            average = float(self._weights @ agreements)
+            # AMCL's weight, 1 + sum of p^3, spans one order of magnitude at most and leaves the cloud three times as
+            # wide as need be at this odometry noise. The exponent here is linear in the same sum.
+            self._weights = self._weights * np.exp(config.sharpness * (agreements - agreements.max()))
+            self._weights /= self._weights.sum()
+        self._slow += (config.recovery_slow if self._slow else 1.0) * (average - self._slow)
+        self._fast += (config.recovery_fast if self._fast else 1.0) * (average - self._fast)
+        if self._slow <= 0.0:
+            return 0.0
+        return min(_RANDOM_SHARE_MAX, max(0.0, 1.0 - self._fast / self._slow))
+
+    def _explained(self, points: NDArray[np.float64], fields: MapFields) -> NDArray[np.float64]:
+        """Return the beams (n, 2) without those that end far from every wall: persons and other unknown objects."""
+        assert self._estimate is not None
+        near = fields.wall_distances(self._estimate.transform(points)) <= _SKIP_M
+        return points[near] if near.sum() > (1.0 - _SKIP_SHARE_MAX) * len(points) else points
+
+    def _conclude(self, scan: DeskewedScan, fields: MapFields) -> None:
+        """Estimate pose and covariance from the weighted particles, and refine them by matching the scan."""
+        mean = self._cluster()
+        matched = match_scan(fields, Pose2(mean.x, mean.y, mean.theta), mean.covariance, scan.beams(_MATCH_BEAMS))
+        self._estimate, self.covariance = matched
+
+    def _cluster(self) -> amcl.Estimate:
+        """Return the cluster of particles around the estimate, or the heaviest one if that weighs clearly more."""
+        config = self._config
+        groups = amcl.clusters(self._x, self._y, self._theta, self._weights, config.bin_xy, config.bin_theta)
+        heaviest, before = groups[0], self._estimate
+        assert before is not None
+        for group in groups:
+            offset = math.hypot(group.estimate.x - before.x, group.estimate.y - before.y)
+            if offset < _SAME_CLUSTER_M and heaviest.share < _OTHER_CLUSTER * group.share:
+                return group.estimate
+        return heaviest.estimate
+
+    def _resample(self, fields: MapFields, random_share: float) -> None:
+        config = self._config
         self._x, self._y, self._theta, self._weights = amcl.resample(
             self._x,
             self._y,
@@ -160,22 +267,3 @@ class ParticleFilter:
             free_xy=fields.free_places if random_share else None,
             jitter=fields.geometry.resolution,
         )
-
-    def _update_weights(self, scan: DeskewedScan, fields: MapFields) -> float:
-        """Weight the particles by a scan; return the share of random ones that augmented recovery asks for."""
-        config = self._config
-        points = scan.beams(config.beams)
-        average = 0.0
-        if len(points):
-            poses = np.column_stack((self._x, self._y, self._theta)).astype(np.float64)
-            scores = fields.scores(poses, points, fields.fine) / fields.best_likelihood
-            average = float(self._weights @ scores)
-            # AMCL's weight, 1 + sum of p^3, spans one order of magnitude at most and leaves the cloud three times as
-            # wide as need be at this odometry noise. The exponent here is linear in the same sum.
-            self._weights = self._weights * np.exp(config.sharpness * (scores - scores.max()))
-            self._weights /= self._weights.sum()
-        self._slow += (config.recovery_slow if self._slow else 1.0) * (average - self._slow)
-        self._fast += (config.recovery_fast if self._fast else 1.0) * (average - self._fast)
-        if self._slow <= 0.0:
-            return 0.0
-        return min(_RANDOM_SHARE_MAX, max(0.0, 1.0 - self._fast / self._slow))

@@ -1,0 +1,108 @@
+"""Places where the robot may be, kept from scan to scan until one of them explains the scans clearly best."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from robot_agent.localization.fit import Fit, evaluate_fit
+from robot_agent.localization.pose import Pose2, wrap
+from robot_agent.localization.scan_match import match_scan
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from numpy.typing import NDArray
+
+    from robot_agent.localization.deskew import DeskewedScan
+    from robot_agent.localization.map_fields import MapFields
+
+_AMBIGUOUS: Final = 0.85
+"""A second place that explains the scans this well, as a share of the best, leaves the search ambiguous."""
+_AMBIGUOUS_LATER: Final = 0.6
+"""The same after more than one scan, for the product over all scans."""
+_APART_M: Final = 0.6
+_APART_RAD: Final = 0.5
+_MISFITS_MAX: Final = 2
+"""A place that so many scans in a row contradict is dropped."""
+_NEWS_M: Final = 0.2
+_NEWS_RAD: Final = 0.2
+"""Scans count as independent when the robot has moved this far between them."""
+_MATCH_COVARIANCE: Final = np.diag(np.square((0.2, 0.2, 0.1)))
+_BEAMS: Final = 180
+
+
+@dataclass(frozen=True, slots=True)
+class Hypothesis:
+    """A pose in `map`, the product (as logarithm) of how well it explains the scans, and the misfits in a row."""
+
+    pose: Pose2
+    log_quality: float
+    misfits: int = 0
+
+
+def quality(score: float, fit: Fit) -> float:
+    """Return how well a place explains a scan, from the beams' mean likelihood and the fit."""
+    return score * (1.0 - fit.contradict) * fit.explained
+
+
+def fits(fit: Fit) -> bool:
+    """Whether a place is possible at all, by how a scan fits there."""
+    return fit.contradict < 0.2 and fit.agree > 0.4
+
+
+def apart(pose: Pose2, other: Pose2) -> bool:
+    """Whether two poses are different places, as opposed to two estimates of one."""
+    far = math.hypot(pose.x - other.x, pose.y - other.y) > _APART_M
+    return far or abs(wrap(pose.theta - other.theta)) > _APART_RAD
+
+
+class Hypotheses:
+    """The places that are left, each tied to the odometry of the last scan that counted."""
+
+    def __init__(self, places: Iterable[Hypothesis], odom: Pose2) -> None:
+        self._places = sorted(places, key=lambda place: -place.log_quality)
+        self._scans = 1
+        self.odom = odom
+        """Pose in `odom` to which the poses belong."""
+
+    @property
+    def places(self) -> list[Hypothesis]:
+        """The places, best first."""
+        return list(self._places)
+
+    @property
+    def decided(self) -> Pose2 | None:
+        """The pose of the best place, if no other explains the scans nearly as well."""
+        if not self._places:
+            return None
+        limit = _AMBIGUOUS if self._scans == 1 else _AMBIGUOUS_LATER
+        if len(self._places) > 1 and self._places[1].log_quality > self._places[0].log_quality + math.log(limit):
+            return None
+        return self._places[0].pose if self._places[0].misfits == 0 else None
+
+    def add(self, scan: DeskewedScan, fields: MapFields, range_max: float) -> None:
+        """Weigh the places by a scan, if the robot has moved since the last one that counted."""
+        step = scan.odom.relative_to(self.odom)
+        if math.hypot(step.x, step.y) < _NEWS_M and abs(step.theta) < _NEWS_RAD:
+            return
+        points = scan.beams(_BEAMS)
+        moved = (self._weighed(place, place.pose.compose(step), points, fields, range_max) for place in self._places)
+        left: list[Hypothesis] = []
+        for place in sorted(moved, key=lambda one: -one.log_quality):
+            if place.misfits < _MISFITS_MAX and all(apart(place.pose, other.pose) for other in left):
+                left.append(place)
+        self._places, self.odom = left, scan.odom
+        self._scans += 1
+
+    def _weighed(
+        self, place: Hypothesis, pose: Pose2, points: NDArray[np.float64], fields: MapFields, range_max: float
+    ) -> Hypothesis:
+        matched = match_scan(fields, pose, _MATCH_COVARIANCE, points).pose
+        fit = evaluate_fit(fields, matched, points, range_max)
+        score = float(fields.agreements(np.array([matched]), points, fields.fine)[0])
+        log_quality = place.log_quality + math.log(max(quality(score, fit), 1e-3))
+        return Hypothesis(matched, log_quality, 0 if fits(fit) else place.misfits + 1)

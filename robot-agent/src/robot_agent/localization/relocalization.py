@@ -1,0 +1,99 @@
+"""Finding a robot that does not know where it is: a search of the whole map, then the places that it left."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from robot_agent.localization.global_search import GlobalSearch
+from robot_agent.localization.pose import Pose2  # noqa: TC001  # a named tuple's fields are read at run time
+
+if TYPE_CHECKING:
+    from robot_agent.config import LocalizationConfig
+    from robot_agent.localization.deskew import DeskewedScan
+    from robot_agent.localization.hypotheses import Hypotheses, Hypothesis
+    from robot_agent.localization.map_fields import MapFields
+
+_POINTS_MIN: Final = 10
+_SEARCH_EVERY_S: Final = 10.0
+"""Least time between the end of a search without any place and the next one."""
+
+
+class Outcome(NamedTuple):
+    """The pose in `map` that was found, when the odometry said `odom`; or None, and why."""
+
+    pose: Pose2 | None
+    odom: Pose2
+    detail: str = ""
+
+
+class Relocalization:
+    """A search of the whole map, and the hypotheses that later scans decide between."""
+
+    def __init__(self, config: LocalizationConfig) -> None:
+        self._config = config
+        self._search: GlobalSearch | None = None
+        self._hypotheses: Hypotheses | None = None
+        self._again_at = -math.inf
+
+    @property
+    def active(self) -> bool:
+        """Whether there is a search in progress, or places between which it did not decide."""
+        return self._search is not None or self._hypotheses is not None
+
+    @property
+    def searching(self) -> bool:
+        """Whether a search is in progress."""
+        return self._search is not None
+
+    @property
+    def places(self) -> list[Hypothesis]:
+        """The places that are left, best first."""
+        return self._hypotheses.places if self._hypotheses is not None else []
+
+    def may_begin(self, now: float) -> bool:
+        """Whether the last search without success is long enough ago."""
+        return now >= self._again_at
+
+    def cancel(self) -> None:
+        """End the search and forget all places."""
+        self._search = self._hypotheses = None
+
+    def begin(self, scan: DeskewedScan, fields: MapFields) -> bool:
+        """Begin a search with a scan; False if the map has no free place, or the scan too few points."""
+        if not len(fields.free_places) or len(scan.points) < _POINTS_MIN:
+            return False
+        self._hypotheses = None
+        self._search = GlobalSearch(fields, scan.beams(self._config.beams), scan.odom, self._config.range_max)
+        return True
+
+    def advance(self, fields: MapFields) -> None:
+        """Do one share of the search."""
+        assert self._search is not None
+        self._hypotheses = self._search.advance(fields)
+        if self._hypotheses is not None:
+            self._search = None
+
+    def on_scan(self, scan: DeskewedScan, fields: MapFields) -> None:
+        """Do one share of the search, or weigh the places by the scan."""
+        if self._search is not None:
+            self.advance(fields)
+        elif self._hypotheses is not None:
+            self._hypotheses.add(scan, fields, self._config.range_max)
+
+    def outcome(self, now: float) -> Outcome | None:
+        """Return what is known now; None while a search is in progress or nothing was searched."""
+        hypotheses = self._hypotheses
+        if hypotheses is None:
+            return None
+        count = len(hypotheses.places)
+        if not count:
+            self._again_at = now + _SEARCH_EVERY_S
+            self.cancel()
+            return Outcome(None, hypotheses.odom, "the scan fits no place of the map: give the initial pose")
+        found = hypotheses.decided
+        if found is None:
+            detail = f"{count} places of the map look like this one: move or turn the robot, or give the initial pose"
+            return Outcome(None, hypotheses.odom, detail)
+        self.cancel()
+        return Outcome(found, hypotheses.odom)

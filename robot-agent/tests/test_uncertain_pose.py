@@ -1,0 +1,92 @@
+"""The whole agent when its pose is in doubt: encoders that jump, suspension, and corridors without features."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from little_world import LittleWorld
+
+from fog_contracts.messages import Pose
+from robot_agent.localization.absolute import AbsoluteObservation
+from robot_agent.localization.pose import Pose2
+
+PLAIN_CORRIDOR = {"rooms": [(1.0, 1.0, 61.0, 3.0)], "size": (62.0, 4.0)}
+TICKS_PER_M = 508.8 / (math.pi * 0.072)
+
+
+def push(world, distance, *, counted):
+    """Move the robot forward at once; the encoders count it if the wheels rolled."""
+    world.x += distance * math.cos(world.theta)
+    world.y += distance * math.sin(world.theta)
+    if counted:
+        world.ticks = [ticks + distance * TICKS_PER_M for ticks in world.ticks]
+
+
+def test_jump_of_the_encoders_makes_the_pose_weak_until_the_lidar_has_found_the_robot_again():
+    world = LittleWorld().ready()
+    push(world, 0.9, counted=True)
+    world.run(0.1)
+    assert world.error()[0] > 0.8
+    assert world.agent.localizer.status == "weak"
+    assert world.agent.encoder_faults == 1
+    world.run(0.1)
+    assert world.state().mode == "DEGRADED"
+    assert any("encoders jumped" in reason for reason in world.state().reasons)
+    assert world.run(6.0, lambda w: w.state().mode == "NORMAL"), world.state().reasons
+    assert world.error()[0] < 0.1
+
+
+def test_robot_that_was_moved_while_its_computer_was_suspended_finds_its_place_again():
+    world = LittleWorld().ready()
+    push(world, 0.5, counted=False)
+    world.agent.on_suspension(30.0)
+    assert world.agent.localizer.status == "weak"
+    assert "suspended for 30.0 s" in world.agent.localizer.detail
+    assert world.run(6.0, lambda w: w.agent.localizer.status == "good")
+    assert world.error()[0] < 0.1
+
+
+@pytest.mark.parametrize("offset", [0.0, 6.0])
+def test_pose_given_in_a_plain_corridor_is_never_good_since_the_lidar_cannot_confirm_it(offset):
+    world = LittleWorld(**PLAIN_CORRIDOR, pose=(28.0, 2.0, 0.0))
+    world.agent.load(world.master.snapshot(), world.now)
+    world.run(0.6)
+    assert world.command("initial_pose", pose=Pose(x=world.x + offset, y=2.1, theta=0.05)).accepted
+    for _ in range(10):
+        world.run(0.3)
+        assert world.agent.localizer.status != "good"
+    assert world.error()[0] == pytest.approx(offset, abs=0.2)
+    covariance = world.agent.localizer.covariance()
+    assert math.sqrt(covariance[0, 0]) > 0.45
+    assert math.sqrt(covariance[1, 1]) < 0.1
+    assert world.command("enable").accepted
+    world.run(0.2)
+    assert world.state().mode == "DEGRADED"
+    assert any("in one direction" in reason for reason in world.state().reasons)
+
+
+def test_mission_along_a_plain_corridor_arrives_and_its_error_stays_within_the_stated_covariance():
+    world = LittleWorld(**PLAIN_CORRIDOR, pose=(14.0, 2.0, 0.0))
+    world.agent.load(world.master.snapshot(), world.now)
+    world.run(0.6)
+    observation = AbsoluteObservation(Pose2(14.0, 2.0, 0.0), np.diag([0.01, 0.01, 0.001]), world.now)
+    assert world.agent.on_absolute_observation(observation)
+    world.run(3.0)
+    assert world.command("enable").accepted
+    world.drive_to([(14.0, 2.0), (46.0, 2.0)])
+    modes = set()
+
+    def arrived(one):
+        modes.add(one.state().mode)
+        sigma = math.sqrt(one.agent.localizer.covariance()[0, 0])
+        assert one.error()[0] < 3.0 * sigma + 0.1
+        return one.state().goal_reached
+
+    while not (reached := arrived(world)) and world.travelled < 40.0:
+        world.run(1.0)
+    assert reached
+    assert modes <= {"NORMAL", "DEGRADED"}
+    assert not world.collided
+    assert abs(world.agent.pose(world.moment).y - world.y) < 0.1

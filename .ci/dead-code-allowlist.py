@@ -41,6 +41,7 @@ _.log_message
 _.pending_calls_threshold  # aiomqtt
 type_cells  # numba: a name that compiled signatures close over
 _.FACTORY  # bases, lidars, debounce rules and cost layers are found by their entry points
+_.SIGNATURE
 _.RULE
 _.LAYER
 _.RoombaEmulator

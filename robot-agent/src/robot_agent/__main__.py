@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import os
 import secrets
+from functools import partial
 
 from fog_runtime import logs, process, signals
 from fog_runtime.clock import SystemClock
@@ -24,6 +25,7 @@ from robot_agent.agent.service import Service
 from robot_agent.agent.settings import Settings, read_footprint, read_operator_key, read_port, read_site
 from robot_agent.agent.store import Store
 from robot_agent.config import agent_config
+from robot_agent.device_signature import LineCheck
 
 _log = logs.get("agent")
 
@@ -49,6 +51,7 @@ async def main() -> None:
         footprint=read_footprint(robot),
         settings=robot.settings,
     )
+    port = read_port(robot)
     clock = SystemClock(settings.speed)
     health = Health("map", "pose", "lidar", "base")
     async with ZenohEdge.open(
@@ -60,7 +63,14 @@ async def main() -> None:
         ):
             agent = Service(core, zenoh, Store(settings.data_dir), clock, health, site=site)
             guardian = GuardianClient(settings.guardian_socket, clock, agent.on_feedback, agent.on_base_lost)
-            lidar = LidarEdge(read_port(robot), lidar_driver, clock, core.on_lidar_samples, agent.on_scan)
+            lidar = LidarEdge(
+                port,
+                lidar_driver,
+                clock,
+                core.on_lidar_samples,
+                agent.on_scan,
+                check=partial(LineCheck, port, robot.settings.lidar.driver, registry.signatures()),
+            )
             agent.restore(body)
             agent.subscribe()
             zenoh.declare_liveliness("robot-agent", settings.robot)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Final
 
 from fog_runtime import parts
+from fog_runtime.settings import SettingsError
+from robot_agent.device_signature import Signature
 from robot_agent.hardware import BaseFactory, LidarFactory
 
 if TYPE_CHECKING:
@@ -15,6 +17,7 @@ if TYPE_CHECKING:
 
 BASES: Final = "fognav.bases"
 LIDARS: Final = "fognav.lidars"
+SIGNATURES: Final = "fognav.device_signatures"
 
 
 def base_factory(robot: RobotFile) -> BaseFactory[Any]:
@@ -33,6 +36,14 @@ def lidar_factory(robot: RobotFile) -> LidarFactory[Any]:
     except parts.PartError as error:
         raise robot.error("lidar.driver", str(error).rstrip(".")) from error
     return factory
+
+
+def signatures() -> dict[str, Signature]:
+    """Return how each installed device sounds on its line; raises `SettingsError`."""
+    try:
+        return {name: parts.load(SIGNATURES, name, Signature) for name in parts.names(SIGNATURES)}
+    except parts.PartError as error:
+        raise SettingsError(str(error)) from error
 
 
 def options(robot: RobotFile) -> tuple[msgspec.Struct, msgspec.Struct]:

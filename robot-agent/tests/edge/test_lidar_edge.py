@@ -2,18 +2,23 @@ from __future__ import annotations
 
 import asyncio
 import time
+from functools import partial
 
 import numpy as np
 import pytest
 from guardian_rig import DEADLINE_S
 
 from fog_runtime.clock import SystemClock
+from fog_runtime.robot_file import default_robot
 from fog_runtime.settings import SettingsError
 from fognav_sim.pty_port import PtyPort
 from robot_agent.agent.lidar_edge import LidarEdge
+from robot_agent.bases.roomba600.emulator import RoombaEmulator
+from robot_agent.device_signature import LineCheck
 from robot_agent.lidars.rplidar_a1 import protocol as rplidar
 from robot_agent.lidars.rplidar_a1.driver import ANSWER_TIMEOUT_S, RESET_S, SAMPLES_TIMEOUT_S, STOP_S, RplidarA1Driver
 from robot_agent.lidars.rplidar_a1.emulator import RplidarEmulator
+from robot_agent.registry import make_base, signatures
 from robot_agent.serial_port import Port
 
 STEP = 0.02
@@ -160,3 +165,76 @@ async def test_edge_waits_for_its_port_and_reopens_it(tmp_path):
     finally:
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
+
+
+class Answering:
+    """A base on the lidar's port, which answers as it would on its own."""
+
+    def __init__(self):
+        self.base = RoombaEmulator()
+        self.received = b""
+
+    def pump(self, port):
+        data, now = port.read(), time.monotonic()
+        self.received += data
+        self.base.receive(data, now)
+        self.base.tick(now, 0.01)
+        port.write(self.base.outgoing(now))
+
+
+@pytest.mark.live
+@pytest.mark.parametrize("streams", [False, True])
+async def test_lidar_commands_are_not_sent_to_a_base_on_the_lidars_port(tmp_path, streams):
+    device = Answering()
+    if streams:
+        device.base.receive(make_base(default_robot()).wake(), time.monotonic())
+    with PtyPort(tmp_path / "lidar") as port:
+        check = partial(LineCheck, str(port.path), "rplidar-a1", signatures())
+        edge = LidarEdge(str(port.path), RplidarA1Driver(), SystemClock(), lambda _: None, lambda *_: None, check=check)
+        task = asyncio.create_task(edge.run())
+        try:
+            end = time.monotonic() + DEADLINE_S
+            while "a roomba600 speaks on this port, not a rplidar-a1" not in edge.problem:
+                assert time.monotonic() < end
+                await asyncio.sleep(0.005)
+                device.pump(port)
+        finally:
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+    assert 0xA5 not in device.received
+    assert device.received == (b"" if streams else bytes((128, 142, 35)))
+
+
+@pytest.mark.live
+@pytest.mark.parametrize("command", [b"", rplidar.scan()])
+async def test_a_lidar_that_scans_or_is_silent_passes_the_check(tmp_path, command):
+    device, scans = RplidarEmulator(wavy_room), []
+    device.receive(command, time.monotonic())
+    with PtyPort(tmp_path / "lidar") as port:
+        check = partial(LineCheck, str(port.path), "rplidar-a1", signatures())
+        edge = LidarEdge(
+            str(port.path),
+            RplidarA1Driver(),
+            SystemClock(),
+            lambda _: None,
+            lambda scan, _: scans.append(scan),
+            check=check,
+        )
+        task = asyncio.create_task(edge.run())
+        try:
+            end = time.monotonic() + DEADLINE_S
+            while not scans:
+                assert time.monotonic() < end
+                await asyncio.sleep(0.005)
+                device.receive(port.read(), time.monotonic())
+                port.write(device.outgoing(time.monotonic()))
+        finally:
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+
+
+@pytest.mark.live
+async def test_a_port_named_by_its_number_ends_the_agent_with_the_remedy():
+    edge = LidarEdge("/dev/ttyUSB7", RplidarA1Driver(), SystemClock(), lambda _: None, lambda *_: None)
+    with pytest.raises(SettingsError, match=r"lidar.port: /dev/ttyUSB7 .*/dev/serial/by-id"):
+        await edge.run()

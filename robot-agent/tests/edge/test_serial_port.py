@@ -10,6 +10,7 @@ import tty
 
 import pytest
 
+from robot_agent import serial_port
 from robot_agent.serial_port import Port, PortLost, open_port
 
 pytestmark = pytest.mark.live
@@ -121,3 +122,27 @@ def test_closing_twice_is_harmless(line):
     port.close()
     port.close()
     assert port.fileno() == -1
+
+
+def test_a_real_device_is_opened_exclusively_and_without_added_latency(line, monkeypatch):
+    _, path = line
+    requests = []
+
+    def ioctl(_fd, request, values=0):
+        requests.append((request, bytes(values) if isinstance(values, bytearray) else values))
+
+    monkeypatch.setattr(serial_port, "_is_pty", lambda _device: False)
+    monkeypatch.setattr(serial_port.fcntl, "ioctl", ioctl)
+    open_port(path, 115200).close()
+    assert requests[0][0] == termios.TIOCEXCL
+    assert [request for request, _ in requests[1:]] == [termios.TIOCGSERIAL, termios.TIOCSSERIAL]
+    assert int.from_bytes(requests[2][1][16:20], sys.byteorder) == 1 << 13
+
+
+def test_a_device_without_that_timer_is_opened_all_the_same(line, monkeypatch):
+    (master,), path = line
+    monkeypatch.setattr(serial_port, "_is_pty", lambda _device: False)
+    monkeypatch.setattr(serial_port.termios, "TIOCEXCL", termios.TIOCNXCL)  # a pty would stay exclusive
+    with open_port(path, 115200) as port:
+        port.write(b"x")
+        assert os.read(master, 1) == b"x"

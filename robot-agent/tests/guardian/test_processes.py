@@ -11,11 +11,14 @@ import time
 from pathlib import Path
 
 import guardian_rig as rigs
+import numpy as np
 import pytest
 from guardian_rig import STOP_S, wait_for
 
 from fog_runtime.signals import ENDING, TERMINAL_STOPS
 from robot_agent.bases.diffdrive.emulator import DiffDriveEmulator
+from robot_agent.bases.roomba600.emulator import RoombaEmulator
+from robot_agent.lidars.rplidar_a1.emulator import RplidarEmulator
 
 pytestmark = [pytest.mark.live, pytest.mark.reaction, pytest.mark.timeout(120)]
 
@@ -276,6 +279,36 @@ def test_robot_file_names_base_and_port_and_limits_the_speed(tmp_path):
             wait_for(lambda: base.speeds == pytest.approx((0.21, 0.21), abs=0.001), "the base drives at its own limit")
 
 
+class LidarOnBasePort(RplidarEmulator):
+    """An RPLidar that scans, on the base's port."""
+
+    wheel_speeds_m_s = (0.0, 0.0)
+
+    def __init__(self):
+        super().__init__(lambda angles, _now: 2.0 + np.cos(3.0 * angles))
+        self.receive(b"\xa5\x20", time.monotonic())
+
+    def tick(self, now, dt):
+        pass
+
+    def add_wheel_travel(self, left_m, right_m):
+        pass
+
+
+def test_lidar_on_the_port_of_the_base_is_named_to_the_agent_and_left_alone(tmp_path):
+    lidar = LidarOnBasePort()
+    with rigs.Rig(tmp_path, robot=lidar) as rig:
+        reason = wait_for(lambda: rig.agent.refused, "the agent is told")
+        assert "a rplidar-a1 speaks on this port, not a roomba600" in reason
+        assert rig.agent.feedback is None
+        assert lidar.scanning
+        wait_for(lambda: rig.watchdog.count("port_open") > 1, "the port is tried again")
+        # The cables are swapped back: nobody has to restart anything.
+        with rig.base.lock:
+            rig.base.robot = RoombaEmulator()
+        rig.drive()
+
+
 def test_second_watchdog_does_not_open_a_port_in_use(rig, tmp_path):
     rig.drive()
     folder = tmp_path / "second"
@@ -290,6 +323,7 @@ def test_second_watchdog_does_not_open_a_port_in_use(rig, tmp_path):
     ("setting", "value", "reason"),
     [
         ("BASE_PORT", "", "the base's serial port is not set"),
+        ("BASE_PORT", "/dev/ttyUSB0", "/dev/ttyUSB0 is no name to rely on"),
         ("ROBOT_FILE", "/none/robot.toml", "/none/robot.toml"),
         ("FOOTPRINT", "round", "FOGNAV_FOOTPRINT: "),
         ("SPEED", "fast", "positive number"),

@@ -8,17 +8,22 @@ from typing import TYPE_CHECKING, Final
 from fog_runtime import logs
 from fog_runtime.clock import ticker
 from fog_runtime.settings import SettingsError
+from robot_agent.device_signature import LISTEN_S
+from robot_agent.port_names import PortNameError
 from robot_agent.serial_port import Port, PortLost, open_port, refuse_speed
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from fog_runtime.clock import Clock
+    from robot_agent.device_signature import LineCheck
     from robot_agent.hardware import LaserScan, LidarDriver
 
 POLL_S: Final = 0.02
 """Period of reading the port: some 40 samples at a time cost a small computer far less than each alone."""
 REOPEN_S: Final = 1.0
+ANSWER_S: Final = 0.1
+"""A device that is asked what it is has answered within this time."""
 
 _log = logs.get("lidar")
 
@@ -33,12 +38,16 @@ class LidarEdge:
         clock: Clock,
         on_samples: Callable[[float], object],
         on_scan: Callable[[LaserScan, float], object],
+        *,
+        check: Callable[[], LineCheck] | None = None,
     ) -> None:
+        """Store the port's path, the driver and the callbacks; `check` makes a fresh check for each opening."""
         self._path = path
         self._driver = driver
         self._clock = clock
         self._on_samples = on_samples
         self._on_scan = on_scan
+        self._check = check
         self._last_logged = ""
         self.problem = "the lidar's port was not opened yet"
 
@@ -46,7 +55,7 @@ class LidarEdge:
         """Open the port, scan, and start over when it is lost, until cancelled.
 
         Raises:
-            SettingsError: when the clock's speed is a simulation's and the port a real one.
+            SettingsError: when the port's name is refused, or the clock's speed is a simulation's and the port real.
 
         """
         while True:
@@ -58,6 +67,8 @@ class LidarEdge:
                     await self._scan(port)
             except PortLost as error:
                 self._report(str(error))
+            except PortNameError as error:
+                raise SettingsError(f"lidar.port: {error}") from error
             await self._clock.sleep(REOPEN_S)
 
     async def _scan(self, port: Port) -> None:
@@ -65,6 +76,9 @@ class LidarEdge:
         if driver.serial.dtr is not None:
             port.set_dtr(on=driver.serial.dtr)
         port.discard_input()
+        if (problem := await self._wrong_device(port)) is not None:
+            self._report(problem)
+            return
         port.write(driver.begin(self._clock.now()))
         try:
             async for now in ticker(self._clock, POLL_S):
@@ -82,6 +96,24 @@ class LidarEdge:
                 port.write(driver.stop_command)
                 if driver.serial.dtr is not None:
                     port.set_dtr(on=not driver.serial.dtr)
+
+    async def _wrong_device(self, port: Port) -> str | None:
+        """Listen before anything is written; return the sentence for another device on this port."""
+        if self._check is None:
+            return None
+        check = self._check()
+        until = self._clock.now() + LISTEN_S
+        while not check.settled and self._clock.now() < until:
+            await self._clock.sleep(POLL_S)
+            check.feed(port.read_available())
+        if not check.silent:
+            return check.problem
+        for name, other in check.questions:
+            port.write(other.question)
+            await self._clock.sleep(ANSWER_S)
+            if (problem := check.answer(name, port.read_available())) is not None:
+                return problem
+        return None
 
     def _report(self, problem: str) -> None:
         self.problem = problem

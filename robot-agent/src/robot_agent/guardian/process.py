@@ -9,6 +9,7 @@ that has sent no command for a second is dropped as soon as another connects.
 from __future__ import annotations
 
 import os
+import select
 import selectors
 import signal
 import socket
@@ -18,15 +19,17 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import msgspec
 
+from fog_contracts.messages import SENTENCE_MAX
 from fog_runtime import logs, signals
 from fog_runtime.clock import SystemClock
 from fog_runtime.logs import Level
 from fog_runtime.robot_file import load_robot
 from fog_runtime.settings import SettingsError, load
+from robot_agent.device_signature import LISTEN_S, LineCheck
 from robot_agent.guardian.core import GuardianCore, Limits, Output
 from robot_agent.guardian.link import PACKET_LIMIT, WheelCommand, decode_command, encode
 from robot_agent.guardian.watchdog import BAD_SETTINGS, PORT_LOST
-from robot_agent.registry import make_base
+from robot_agent.registry import make_base, signatures
 from robot_agent.serial_port import Port, PortLost
 
 if TYPE_CHECKING:
@@ -38,6 +41,7 @@ TICK_S: Final = 0.02
 HEARTBEAT_S: Final = 0.05
 AGENT_LIVES_S: Final = 1.0
 """An agent sends a command every 0.05 s; one that was silent for longer than this hangs: another may take its place."""
+REFUSE_S: Final = 2.0
 PACKETS_PER_CYCLE: Final = 64
 """Limit per cycle: a flood of packets must not block the sensors."""
 
@@ -59,11 +63,14 @@ class GuardianSettings(msgspec.Struct, frozen=True, kw_only=True):
 class Guardian:
     """The loop around the core: one serial port, one agent, one watchdog."""
 
-    def __init__(self, settings: GuardianSettings, core: GuardianCore, listener: socket.socket) -> None:
+    def __init__(
+        self, settings: GuardianSettings, core: GuardianCore, listener: socket.socket, check: LineCheck
+    ) -> None:
         self._settings = settings
         self._listener = listener
         self._clock = SystemClock(settings.speed)
         self._core = core
+        self._check = check
         self._port = Port.from_fd(settings.base_fd, settings.base_port or None)
         self._selector = selectors.DefaultSelector()
         self._agent: socket.socket | None = None
@@ -85,6 +92,8 @@ class Guardian:
         try:
             # Bytes that arrived before this process started are stale.
             self._port.discard_input()
+            if (problem := self._wrong_device()) is not None:
+                return self._refuse_port(problem)
             while not self._ended and self._signal is None:
                 for key, _ in self._selector.select(self._clock.real(TICK_S)):
                     key.data()
@@ -96,6 +105,38 @@ class Guardian:
             return PORT_LOST
         self._log.info("ended", signal=self._signal and signal.Signals(self._signal).name)
         return 0
+
+    def _wrong_device(self) -> str | None:
+        """Listen until the line sounds like a known device; return the sentence for another one than the base.
+
+        Until then nothing is written but zero speeds. The watchdog has written its stop command before.
+        """
+        check, until = self._check, self._clock.now() + LISTEN_S
+        while not check.settled and self._clock.now() < until and self._signal is None:
+            select.select((self._port,), (), (), self._clock.real(TICK_S))
+            check.feed(self._port.read_available())
+            self._send_heartbeat()
+        return check.problem
+
+    def _refuse_port(self, problem: str) -> int:
+        """Tell agents for a while why there is no base; the watchdog opens the port again, perhaps after a re-plug."""
+        self._log.error("wrong_device", reason=problem)
+        until = self._clock.now() + REFUSE_S
+        while self._clock.now() < until and not self._ended and self._signal is None:
+            for key, _ in self._selector.select(self._clock.real(TICK_S)):
+                if key.fileobj is self._listener:
+                    self._refuse_agent(problem)
+                elif key.fileobj is self._port:
+                    self._port.read_available()
+                else:
+                    key.data()
+            self._send_heartbeat()
+        return PORT_LOST
+
+    def _refuse_agent(self, problem: str) -> None:
+        with suppress(BlockingIOError, ConnectionError):
+            agent, _ = self._listener.accept()
+            self._refuse(agent, problem[:SENTENCE_MAX])
 
     def end(self, signum: int, _frame: FrameType | None) -> None:
         """Finish the current cycle, stop the wheels, and end (signal handler: it may interrupt anything)."""
@@ -121,16 +162,17 @@ class Guardian:
         agent.settimeout(0)
         now = self._clock.now()
         if self._agent is not None and now - self._agent_heard_at <= AGENT_LIVES_S:
-            self._refuse(agent, now)
+            reason = "another agent is connected and drives: end one of the two"
+            self._limited_log.warning("agent_refused", "agent_refused", now, reason=reason)
+            self._refuse(agent, reason)
             return
         self._drop_agent(f"another agent connected, and this one has sent no command for {AGENT_LIVES_S:g} s")
         self._agent, self._agent_heard_at = agent, now
         self._selector.register(agent, selectors.EVENT_READ, lambda: self._read_agent(agent))
         self._log.info("agent_connected")
 
-    def _refuse(self, agent: socket.socket, now: float) -> None:
-        reason = "another agent is connected and drives: end one of the two"
-        self._limited_log.warning("agent_refused", "agent_refused", now, reason=reason)
+    def _refuse(self, agent: socket.socket, reason: str) -> None:
+        agent.settimeout(0)
         with agent, suppress(BlockingIOError, ConnectionError):
             agent.send(encode(reason))
             # A command left unread would reset the link, and the reason with it.
@@ -240,13 +282,14 @@ def main() -> int:
         settings = load(GuardianSettings, environ=os.environ)
         robot = load_robot(os.environ)
         core = GuardianCore(make_base(robot), limits_of(robot.settings.motion))
+        check = LineCheck(settings.base_port, robot.settings.base.driver, signatures())
         listener = _listen(settings.guardian_socket)
     except SettingsError as error:
         logs.configure("guardian", "info", "json")
         logs.get("guardian").error("bad_settings", reason=str(error))
         return BAD_SETTINGS
     logs.configure("guardian", settings.log_level, settings.log_format)
-    guardian = Guardian(settings, core, listener)
+    guardian = Guardian(settings, core, listener, check)
     for number in signals.ENDING:
         signal.signal(number, guardian.end)
     signals.ignore_terminal_stops()

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from fog_runtime import parts, signals
 from fog_runtime.default_parts import DEFAULT_BASE
+from robot_agent.port_names import PortNameError
 from robot_agent.serial_port import Port, PortLost, open_port, refuse_speed
 from robot_agent.stop_command import StopCommand
 
@@ -242,7 +243,12 @@ def _guard(port: Port, settings: _Settings) -> int:
 
 
 def _guard_always(settings: _Settings) -> int:
-    """Open the port and guard it, and reopen it whenever it is lost; returns BAD_SETTINGS of the guardian."""
+    """Open the port and guard it, and reopen it whenever it is lost; returns BAD_SETTINGS of the guardian.
+
+    Raises:
+        _BadSettings: when the port's name is refused, or its use at this speed.
+
+    """
     last_logged = ""
     while True:
         try:
@@ -250,6 +256,8 @@ def _guard_always(settings: _Settings) -> int:
                 last_logged = ""
                 if _guard(port, settings) == BAD_SETTINGS:
                     return BAD_SETTINGS
+        except PortNameError as error:
+            raise _BadSettings(f"base.port: {error}") from error
         except PortLost as error:
             if str(error) != last_logged:
                 last_logged = str(error)

@@ -1,0 +1,43 @@
+"""How a Roomba sounds on a serial line: stream frames, and the text that it prints when it boots or charges.
+
+A silent one is asked for its OI mode. Plain bytes, with no imports but the guardian's own.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Final
+
+from robot_agent.device_signature import Signature
+
+_TEXT: Final = re.compile(rb"bl-start|bootloader id|STR730|Flash CRC|bat: +min|Slept for")
+_FRAME_MAX: Final = 172
+_FRAMES: Final = 2
+_MODES: Final = 4
+"""Packet 35 is 0 to 3, on some robots one more."""
+
+
+def _recognizes(data: bytes) -> bool:
+    return _TEXT.search(data) is not None or any(
+        _frames_at(data, begin) for begin in range(len(data)) if data[begin] == 19
+    )
+
+
+def _frames_at(data: bytes, begin: int) -> bool:
+    """Whether whole stream frames follow one another from here, each with its checksum."""
+    for _ in range(_FRAMES):
+        if begin + 2 > len(data) or data[begin] != 19:
+            return False
+        end = begin + data[begin + 1] + 3
+        if not 4 < end - begin <= _FRAME_MAX or end > len(data) or sum(data[begin:end]) & 0xFF:
+            return False
+        begin = end
+    return True
+
+
+def _answered(data: bytes) -> bool:
+    return len(data) == 1 and data[0] <= _MODES
+
+
+# Start, Sensors 35: without Start the base would ignore the question. It ends in Passive mode, with its wheels at rest.
+SIGNATURE: Final = Signature(recognizes=_recognizes, question=bytes((128, 142, 35)), answered=_answered)

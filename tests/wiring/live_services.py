@@ -223,6 +223,9 @@ class Link:
     def send(self, command: WheelCommand) -> None:
         self.sent.append(command)
 
+    def poll(self, now: float) -> None:
+        """The lidar is silent."""
+
 
 class LiveServices:
     """Aggregator, map-service, planner and one robot's agent, assembled as in their `__main__`."""

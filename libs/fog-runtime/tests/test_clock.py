@@ -3,7 +3,7 @@ import time
 
 import pytest
 
-from fog_runtime.clock import ManualClock, SystemClock, ticker
+from fog_runtime.clock import ManualClock, SystemClock, Ticker, ticker
 
 
 async def run_ticker(clock: ManualClock, bodies: list[float], period: float = 0.1) -> list[float]:
@@ -46,6 +46,27 @@ async def test_missed_ticks_are_skipped_and_counted():
     assert times == [0.0, 0.875, 1.0]
     assert loop_ticker.late == 2
     assert loop_ticker.ticks == 3
+
+
+async def test_loops_of_one_origin_share_their_ticks_whenever_they_begin():
+    clock = ManualClock(50.13)
+    loops = [Ticker(clock, period, origin=50.0) for period in (0.1, 0.2)]
+    times: dict[float, list[float]] = {loop.period: [] for loop in loops}
+
+    async def run(loop: Ticker) -> None:
+        async for now in loop:
+            times[loop.period].append(now)
+
+    tasks = [asyncio.create_task(run(loop)) for loop in loops]
+    for _ in range(50):
+        for _ in range(5):
+            await asyncio.sleep(0)
+        clock.advance(0.01)
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
+    assert times[0.1] == pytest.approx([50.2, 50.3, 50.4, 50.5, 50.6], abs=0.011)
+    assert times[0.2] == times[0.1][::2]
 
 
 async def test_p99_of_few_ticks_is_the_largest_lateness():

@@ -77,7 +77,7 @@ async def main() -> None:
             async with asyncio.TaskGroup() as tasks:
                 tasks.create_task(guardian.run(), name="base")
                 tasks.create_task(lidar.run(), name="lidar")
-                tasks.create_task(agent.stream_loop(guardian), name="stream")
+                tasks.create_task(agent.stream_loop(guardian, lidar), name="stream")
                 tasks.create_task(agent.control_loop(), name="control")
                 tasks.create_task(agent.snapshot_loop(), name="snapshot")
                 tasks.create_task(agent.publish_loop(), name="publish")

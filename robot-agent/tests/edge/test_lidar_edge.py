@@ -121,6 +121,7 @@ async def test_laser_and_motor_are_stopped_when_the_edge_ends(tmp_path, monkeypa
             await asyncio.sleep(0.01)
             device.receive(port.read(), time.monotonic())
             port.write(device.outgoing(time.monotonic()))
+            edge.poll(time.monotonic())
         assert lines == [False]
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
@@ -150,6 +151,7 @@ async def test_edge_waits_for_its_port_and_reopens_it(tmp_path):
         while not condition():
             assert time.monotonic() < end
             await asyncio.sleep(0.01)
+            edge.poll(time.monotonic())
             if port is not None:
                 device.receive(port.read(), time.monotonic())
                 port.write(device.outgoing(time.monotonic()))

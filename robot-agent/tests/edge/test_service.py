@@ -51,6 +51,14 @@ class FakeGuardian:
         self.sent.append((time.monotonic(), command))
 
 
+class FakeLidar:
+    def __init__(self):
+        self.polled = []
+
+    def poll(self, now):
+        self.polled.append(now)
+
+
 class Rig:
     def __init__(self, tmp_path):
         self.world = LittleWorld()
@@ -162,13 +170,15 @@ async def test_hanging_decision_does_not_block_the_stream(rig, monkeypatch):
 
     monkeypatch.setattr(service_module, "decide", hang)
     monkeypatch.setattr(rig.core, "control_job", lambda _now: object())
-    guardian = FakeGuardian()
-    tasks = [asyncio.create_task(rig.service.control_loop()), asyncio.create_task(rig.service.stream_loop(guardian))]
+    guardian, lidar = FakeGuardian(), FakeLidar()
+    loops = rig.service.control_loop(), rig.service.stream_loop(guardian, lidar)
+    tasks = [asyncio.create_task(loop) for loop in loops]
     try:
         await rig.until(begun.is_set)
         before = len(guardian.sent)
         await rig.until(lambda: len(guardian.sent) >= before + 20)
         assert [command.seq for _, command in guardian.sent] == list(range(1, len(guardian.sent) + 1))
+        assert len(lidar.polled) == len(guardian.sent)
     finally:
         for task in tasks:
             task.cancel()

@@ -347,6 +347,24 @@ def test_feedback_carries_encoders_battery_and_the_reason_of_the_stop():
     assert [feedback.seq for feedback in rig.feedback] == list(range(1, len(rig.feedback) + 1))
 
 
+def feedback_of(rig: Rig, seconds: float) -> int:
+    rig.feedback.clear()
+    rig.run(seconds)
+    return len(rig.feedback)
+
+
+def test_feedback_comes_more_often_while_the_wheels_turn() -> None:
+    rig = ready_rig()
+    rig.run(0.5)
+    assert 9 <= feedback_of(rig, 1.0) <= 11
+    rig.feedback.clear()
+    rig.drive(1.0)
+    assert 16 <= len(rig.feedback) <= 23
+    rig.run(0.5)
+    rig.base.add_wheel_travel(0.01, 0.0)
+    assert feedback_of(rig, 0.07) == 1, "wheels that are moved by hand are reported as soon as when they drive"
+
+
 def test_the_stop_command_stops_the_wheels():
     rig = ready_rig()
     rig.drive(0.3)

@@ -11,7 +11,10 @@ CODE = "import importlib, sys; importlib.import_module(sys.argv[1]); print(*sys.
 @pytest.mark.parametrize(
     ("module", "unneeded"),
     [
-        ("robot_agent.guardian.__main__", {"numpy", "numba", "zenoh", "fastapi", "prometheus_client"}),
+        (
+            "robot_agent.guardian.__main__",
+            {"numpy", "numba", "zenoh", "fastapi", "prometheus_client", "asyncio", "ssl"},
+        ),
         ("robot_agent.guardian.watchdog", {"numpy", "msgspec", "asyncio", "dataclasses", "fog_contracts"}),
     ],
 )

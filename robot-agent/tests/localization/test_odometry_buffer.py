@@ -27,6 +27,21 @@ def test_pose_between_two_readings_lies_on_the_arc(v, w, at):
     assert pose == pytest.approx((v / w * math.sin(w * at), v / w * (1.0 - math.cos(w * at)), w * at), abs=1e-4)
 
 
+@given(
+    times=st.lists(st.floats(0.0, 2.0), min_size=1, max_size=30),
+    asked=st.lists(st.floats(-1.0, 4.0), min_size=1, max_size=10),
+    seed=st.integers(0, 99),
+)
+def test_single_pose_is_that_of_many(times, asked, seed):
+    rng = np.random.default_rng(seed)
+    buffer = OdometryBuffer()
+    for at in sorted(times):
+        buffer.add(at, *rng.normal(size=3))
+    poses = np.array(buffer.poses(np.array(asked)))
+    for column, at in enumerate(asked):
+        assert buffer.pose(at) == pytest.approx(poses[:, column], abs=1e-9)
+
+
 def test_twist_is_that_of_the_last_readings():
     assert driven(0.25, 0.8).twist() == pytest.approx((0.25, 0.8), abs=1e-3)
     assert driven(-0.1, 0.0).twist() == pytest.approx((-0.1, 0.0), abs=1e-6)

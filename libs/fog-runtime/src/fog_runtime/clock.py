@@ -4,11 +4,14 @@ import asyncio
 import ctypes
 import heapq
 import itertools
+import math
 import time
 from collections import deque
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Final, Literal, Protocol, get_args
+
+from fog_runtime.machine_clock import MachineClock
 
 WallClockSource = Literal["kernel", "trusted"]
 _EARLIEST: Final = 1_735_689_600.0
@@ -43,30 +46,8 @@ class Clock(Protocol):
         """Wait for `seconds` of this clock."""
 
 
-class SystemClock:
+class SystemClock(MachineClock):
     """The machine's clock, run `speed` times as fast; raises `ValueError` for a speed that is not positive."""
-
-    def __init__(self, speed: float = 1.0) -> None:
-        if not 0.0 < speed <= 100.0:
-            raise ValueError(f"the clock's speed must lie in (0, 100], not {speed}")
-        self._speed = speed
-
-    @property
-    def speed(self) -> float:
-        """How many seconds of this clock pass in one real second."""
-        return self._speed
-
-    def now(self) -> float:
-        """Monotonic seconds."""
-        return time.monotonic() * self._speed
-
-    def stamp(self) -> float:
-        """Seconds since the Unix epoch, times the speed."""
-        return time.time() * self._speed
-
-    def real(self, seconds: float) -> float:
-        """Real seconds that `seconds` of this clock take."""
-        return seconds / self._speed
 
     async def sleep(self, seconds: float) -> None:
         """Wait for `seconds` of this clock."""
@@ -161,15 +142,17 @@ class ManualClock:
 class Ticker:
     """A periodic loop without drift: `async for now in Ticker(clock, period): ...`.
 
-    Ticks lie at multiples of the period after the first. A tick that was missed because the body took too long is
-    skipped: a burst of control cycles would act several times on the same state of the world.
+    Ticks lie at multiples of the period after the first, or after `origin` (s of the clock): loops of one origin share
+    their ticks, so that the process is woken once for all of them. A tick that was missed because the body took too
+    long is skipped: a burst of control cycles would act several times on the same state of the world.
     """
 
-    def __init__(self, clock: Clock, period: float) -> None:
+    def __init__(self, clock: Clock, period: float, *, origin: float | None = None) -> None:
         if period <= 0.0:
             raise ValueError(f"a period must be positive, not {period} s")
         self.clock = clock
         self.period = period
+        self._origin = origin
         self.ticks = 0
         self.late = 0
         """Ticks that were skipped, or came more than half a period after they were due."""
@@ -184,8 +167,10 @@ class Ticker:
         return ordered[min(len(ordered) - 1, int(0.99 * len(ordered)))]
 
     async def __aiter__(self) -> AsyncIterator[float]:
-        """Yield `clock.now()` at every tick, the first at once."""
+        """Yield `clock.now()` at every tick, the first at once (at the next multiple of the period after an origin)."""
         due = self.clock.now()
+        if self._origin is not None:
+            due = self._origin + math.ceil((due - self._origin) / self.period) * self.period
         while True:
             wait = due - self.clock.now()
             if wait > 0.0:

@@ -1,6 +1,8 @@
 """Liveness and readiness: named conditions, and a small HTTP server that reports them."""
 
 import json
+import selectors
+import socket
 import threading
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -52,8 +54,17 @@ class HealthServer:
 
     def __init__(self, server: ThreadingHTTPServer) -> None:
         self._server = server
-        self._thread = threading.Thread(target=server.serve_forever, args=(0.1,), name="health", daemon=True)
+        self._end, self._ended = socket.socketpair()
+        self._thread = threading.Thread(target=self._serve, name="health", daemon=True)
         self._thread.start()
+
+    def _serve(self) -> None:
+        # `serve_forever` would look several times a second whether it shall end: work for an idle robot.
+        with selectors.DefaultSelector() as selector:
+            selector.register(self._server, selectors.EVENT_READ)
+            selector.register(self._ended, selectors.EVENT_READ)
+            while all(key.fileobj is self._server for key, _ in selector.select()):
+                self._server.handle_request()
 
     @property
     def port(self) -> int:
@@ -62,8 +73,9 @@ class HealthServer:
 
     def close(self) -> None:
         """Stop listening."""
-        self._server.shutdown()
+        self._end.close()
         self._thread.join()
+        self._ended.close()
         self._server.server_close()
 
     def __enter__(self) -> Self:

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 STREAM_S: Final = 0.05
 CONTROL_S: Final = 0.2
 PUBLISH_S: Final = 0.1
+SNAPSHOT_CHECK_S: Final = 0.1
 HOUSEKEEPING_S: Final = 1.0
 SNAPSHOT_TIMEOUT_S: Final = 3.0
 """Timeout of a snapshot request."""
@@ -71,14 +72,19 @@ class Service:
         self._health = health
         self._robot = core.robot
         self._site = site
-        self._stream = Ticker(clock, STREAM_S)
-        self._control = Ticker(clock, CONTROL_S)
+        self._started_at = clock.now()
+        self._stream = self._ticker(STREAM_S)
+        self._control = self._ticker(CONTROL_S)
         self._mode = ""
         self._searching = False
         self._encoder_faults = 0
         self._last_feedback_at = -math.inf
         self._last_scan_at = -math.inf
         self._base_reason = "the guardian is not connected yet"
+
+    def _ticker(self, period: float) -> Ticker:
+        """Return the ticks of a loop; all loops share them, so that the process sleeps in between."""
+        return Ticker(self._clock, period, origin=self._started_at)
 
     # --- State that survives a restart ------------------------------------------------------------------------------
 
@@ -99,7 +105,8 @@ class Service:
 
     async def housekeeping_loop(self, lidar: LidarEdge) -> None:
         """Once a second: store the pose if it changed, and report the health."""
-        async for now in Ticker(self._clock, HOUSEKEEPING_S):
+        async for now in self._ticker(HOUSEKEEPING_S):
+            self._core.on_loop_health(self._loop_health())
             pose = self._core.pose_to_store(now)
             if pose is not None:
                 try:
@@ -117,8 +124,6 @@ class Service:
         health.set("lidar", now - self._last_scan_at < HOUSEKEEPING_S, lidar.problem)
         base_ok = now - self._last_feedback_at < HOUSEKEEPING_S
         health.set("base", base_ok, "" if base_ok else self._base_reason)
-        LATENESS.labels("stream").set(self._stream.p99_s)
-        LATENESS.labels("control").set(self._control.p99_s)
         ENCODER_FAULTS.inc(core.encoder_faults - self._encoder_faults)
         self._encoder_faults = core.encoder_faults
         spread = core.localizer.uncertainty
@@ -146,14 +151,15 @@ class Service:
         SCANS.inc()
         self._core.on_scan(scan, now)
 
-    async def stream_loop(self, guardian: GuardianClient) -> None:
-        """Stream wheel commands at 20 Hz."""
+    async def stream_loop(self, guardian: GuardianClient, lidar: LidarEdge) -> None:
+        """Stream wheel commands at 20 Hz, each on the newest samples of the lidar."""
         suspension = SuspensionMonitor()
         async for now in self._stream:
             if seconds := suspension.suspended():
                 SUSPENSIONS.inc()
                 _log.warning("computer_was_suspended", seconds=round(seconds, 1))
                 self._core.on_suspension(seconds)
+            lidar.poll(now)
             guardian.send(self._core.stream(now, self._clock.stamp()))
 
     async def control_loop(self) -> None:
@@ -184,13 +190,13 @@ class Service:
     async def snapshot_loop(self) -> None:
         """Request a snapshot whenever the core wants one, with a growing delay after each failure."""
         failures = 0
-        while True:
-            spread = random.uniform(0.5, 1.0)  # noqa: S311  # spreads attempts in time, no secret
-            await self._clock.sleep(STREAM_S if not failures else spread * min(2.0**failures / 5, 3))
-            if not self._core.wants_snapshot(self._clock.now()) or await self._fetch_snapshot():
+        async for now in self._ticker(SNAPSHOT_CHECK_S):
+            if not self._core.wants_snapshot(now) or await self._fetch_snapshot():
                 failures = 0
             else:
                 failures += 1
+                spread = random.uniform(0.5, 1.0)  # noqa: S311  # spreads attempts in time, no secret
+                await self._clock.sleep(spread * min(2.0**failures / 5, 3))
 
     async def _fetch_snapshot(self) -> bool:
         """Request a snapshot and load it; False without a valid one."""
@@ -214,8 +220,7 @@ class Service:
 
     async def publish_loop(self) -> None:
         """Tick the core at 10 Hz, publish what it returns, and observe traces."""
-        async for _ in Ticker(self._clock, PUBLISH_S):
-            self._core.on_loop_health(self._loop_health())
+        async for _ in self._ticker(PUBLISH_S):
             self._publish(self._core.tick(self._edges.now()))
             for trace in self._core.finished_traces():
                 metrics.observe_trace(trace, ["deliver", "command", "total"])
@@ -227,11 +232,10 @@ class Service:
             self._edges.publish(publication)
 
     def _loop_health(self) -> LoopHealth:
-        return LoopHealth(
-            control_p99_s=self._control.p99_s,
-            stream_p99_s=self._stream.p99_s,
-            late=self._control.late + self._stream.late,
-        )
+        control, stream = self._control.p99_s, self._stream.p99_s
+        LATENESS.labels("control").set(control)
+        LATENESS.labels("stream").set(stream)
+        return LoopHealth(control_p99_s=control, stream_p99_s=stream, late=self._control.late + self._stream.late)
 
     def _report_mode(self, state: RobotState) -> None:
         if state.mode == self._mode:

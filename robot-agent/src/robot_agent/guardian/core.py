@@ -20,7 +20,7 @@ from fog_contracts.messages import SENTENCE_MAX
 from robot_agent.guardian.link import WHEEL_SPEED_MAX_M_S, BaseFeedback, WheelCommand
 
 if TYPE_CHECKING:
-    from robot_agent.hardware import BaseDriver, BaseReading, BaseStatus
+    from robot_agent.hardware import BaseDriver, BaseReading, BaseStatus, WheelOdometry
 
 COMMAND_FRESH_S: Final = 0.2
 """A command older than this does not move a wheel."""
@@ -29,7 +29,9 @@ OVERCURRENT_S: Final = 0.3
 REPEAT_S: Final = 0.05
 """Period of repeating an unchanged wheel command: a byte may have been lost."""
 FEEDBACK_S: Final = 0.045
-"""The agent gets every third sensor frame, and every change immediately."""
+"""The agent gets every third sensor frame while the wheels turn, and every change immediately."""
+FEEDBACK_AT_REST_S: Final = 0.09
+"""And every seventh while they do not: an idle robot shall cost little."""
 STEP_S: Final = 0.06
 """Longest time step of acceleration: after a pause the guardian must not catch up in one step."""
 
@@ -81,6 +83,7 @@ class GuardianCore:
         self._stepped_at: float | None = None
         self._feedback_at = -1.0e9
         self._feedback_key: object = None
+        self._feedback_odometry: WheelOdometry | None = None
         self._seq = 0
 
     @property
@@ -230,7 +233,9 @@ class GuardianCore:
     def _feedback(self, reading: BaseReading, now: float) -> BaseFeedback | None:
         # Any change counts but that of the battery, which changes all the time.
         key = (msgspec.structs.replace(reading.status, battery=None), self._latched, self._base.awake)
-        if key == self._feedback_key and now - self._feedback_at < FEEDBACK_S:
+        rests = reading.odometry == self._feedback_odometry and self._wheels == (0.0, 0.0)
+        period = FEEDBACK_AT_REST_S if rests else FEEDBACK_S
+        if key == self._feedback_key and now - self._feedback_at < period:
             return None
         self._feedback_key = key
         return self._report(reading, now)
@@ -242,7 +247,7 @@ class GuardianCore:
 
     def _report(self, reading: BaseReading, now: float) -> BaseFeedback:
         self._seq += 1
-        self._feedback_at = now
+        self._feedback_at, self._feedback_odometry = now, reading.odometry
         stopped = None
         if not self._base.awake:
             stopped = "the base is on its charger" if self._charging(now) else "the base is not ready to drive yet"

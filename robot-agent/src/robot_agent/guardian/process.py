@@ -21,8 +21,8 @@ import msgspec
 
 from fog_contracts.messages import SENTENCE_MAX
 from fog_runtime import logs, signals
-from fog_runtime.clock import SystemClock
 from fog_runtime.logs import Level
+from fog_runtime.machine_clock import MachineClock
 from fog_runtime.robot_file import load_robot
 from fog_runtime.settings import SettingsError, load
 from robot_agent.device_signature import LISTEN_S, LineCheck
@@ -68,7 +68,7 @@ class Guardian:
     ) -> None:
         self._settings = settings
         self._listener = listener
-        self._clock = SystemClock(settings.speed)
+        self._clock = MachineClock(settings.speed)
         self._core = core
         self._check = check
         self._port = Port.from_fd(settings.base_fd, settings.base_port or None)

@@ -45,8 +45,16 @@ class OdometryBuffer:
         """Return the pose at a time (s), interpolated; extrapolated by at most 0.15 s. None before the first."""
         if not self._history:
             return None
-        x, y, theta = self.poses(np.array([timestamp]))
-        return Pose2(float(x[0]), float(y[0]), float(theta[0]))
+        last = self._history[-1]
+        if timestamp > last[0]:
+            return self._extrapolated(min(timestamp - last[0], _EXTRAPOLATION_S))
+        # Asked for many times a second and nearly always about a moment ago: from the newest pose backwards.
+        after = last
+        for before in reversed(self._history):
+            if before[0] <= timestamp:
+                return _interpolated(before, after, timestamp)
+            after = before
+        return Pose2(*after[1:])
 
     def poses(self, times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Return x, y (m) and theta (rad) at times (n; s), as `pose` does; there must be a pose."""
@@ -58,6 +66,13 @@ class OdometryBuffer:
             heading = known[-1, 3] + 0.5 * w * late
             x, y, theta = x + v * late * np.cos(heading), y + v * late * np.sin(heading), theta + w * late
         return x, y, theta
+
+    def _extrapolated(self, late: float) -> Pose2:
+        """Return the pose `late` seconds after the newest, at the measured twist."""
+        _, x, y, theta = self._history[-1]
+        v, w = self.twist()
+        heading = theta + 0.5 * w * late
+        return Pose2(x + v * late * math.cos(heading), y + v * late * math.sin(heading), theta + w * late)
 
     def twist(self) -> tuple[float, float]:
         """Return forward speed (m/s) and turning rate (rad/s) over the last 0.15 s or more; zeros without that.
@@ -76,3 +91,12 @@ class OdometryBuffer:
         heading = 0.5 * (theta + old[3])
         forward = (x - old[1]) * math.cos(heading) + (y - old[2]) * math.sin(heading)
         return forward / span, (theta - old[3]) / span
+
+
+def _interpolated(
+    before: tuple[float, float, float, float], after: tuple[float, float, float, float], timestamp: float
+) -> Pose2:
+    span = after[0] - before[0]
+    share = (timestamp - before[0]) / span if span > 0.0 else 0.0
+    x, y, theta = (old + share * (new - old) for old, new in zip(before[1:], after[1:], strict=True))
+    return Pose2(x, y, theta)

@@ -7,6 +7,7 @@ drop and charger, and stops the wheels then; the bumper is left to the host.
 from __future__ import annotations
 
 import math
+from operator import itemgetter
 from typing import Annotated, Final
 
 import msgspec
@@ -17,6 +18,8 @@ from robot_agent.bases.roomba600.stop import STOP
 from robot_agent.hardware import BaseFactory, BaseReading, BaseStatus, BaseTiming, DriveTrain, WheelOdometry
 
 _COUNTS: Final = 1 << 16
+_status_packets = itemgetter(*(i for i in oi.GUARDIAN_STREAM if i not in {22, 23, 41, 42, 43, 44}))
+"""The packets of a frame but for those that change all the time and tell nothing about the status."""
 
 
 class Roomba600Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -45,6 +48,8 @@ class Roomba600Driver:
 
     def __init__(self, options: Roomba600Options) -> None:
         self._parser = oi.StreamParser(oi.GUARDIAN_STREAM)
+        self._status_made_of: tuple[int, ...] = ()
+        self._last_status = BaseStatus()
         self._metres_per_tick = math.pi * options.wheel_diameter_m / options.ticks_per_turn
         self.drive_train = DriveTrain(
             axle_m=options.axle_m,
@@ -65,7 +70,7 @@ class Roomba600Driver:
     def next_event(self) -> BaseReading | None:
         """Return the oldest frame not yet returned."""
         frame = self._parser.next_event()
-        return None if frame is None else BaseReading(_status(frame), self._odometry(frame))
+        return None if frame is None else BaseReading(self._status(frame), self._odometry(frame))
 
     def wake(self) -> bytes:
         """Return Start, Safe, zero speed and the request for the stream."""
@@ -77,6 +82,13 @@ class Roomba600Driver:
     def drive(self, left_m_s: float, right_m_s: float) -> bytes:
         """Return Drive Direct; speeds beyond the top speed are scaled, which keeps the curve."""
         return oi.drive_wheels(left_m_s, right_m_s)
+
+    def _status(self, frame: oi.Frame) -> BaseStatus:
+        """Return the status; that of the last frame as long as no packet has changed that it is made of."""
+        packets = _status_packets(frame.packets)
+        if packets != self._status_made_of:
+            self._status_made_of, self._last_status = packets, _status(frame)
+        return self._last_status
 
     def _odometry(self, frame: oi.Frame) -> WheelOdometry:
         left, right = frame.encoders

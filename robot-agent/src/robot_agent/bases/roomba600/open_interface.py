@@ -433,6 +433,24 @@ class _FrameCheck(IntEnum):
 _SIZES: Final = {packet_id: data_size(packet_id) for packet_id in (*PACKETS, *GROUPS)}
 
 
+class _FrameLayout:
+    """A stream frame of given single packets, compiled once: a whole frame is checked and decoded by a few calls."""
+
+    def __init__(self, ids: Sequence[int]) -> None:
+        self._ids = tuple(ids)
+        self._body = struct.Struct(">" + "".join(f"B{_format(PACKETS[packet_id])}" for packet_id in ids))
+        self._start = bytes((STREAM_HEADER, self._body.size))
+        self._size = self._body.size + 3
+
+    def decode(self, buffer: bytearray, begin: int) -> dict[int, int] | None:
+        """Return the packets of the frame that begins here; None if it is incomplete, damaged or of other packets."""
+        frame = buffer[begin : begin + self._size]
+        if len(frame) != self._size or not frame.startswith(self._start) or sum(frame) & 0xFF:
+            return None
+        fields = self._body.unpack_from(frame, 2)
+        return dict(zip(self._ids, fields[1::2], strict=True)) if fields[::2] == self._ids else None
+
+
 class StreamParser:
     """Bytes of the sensor stream -> frames. Never raises, whatever the bytes are; resynchronizes after garbage.
 
@@ -448,6 +466,7 @@ class StreamParser:
             expand(ids)
         self._ids = None if ids is None else tuple(ids)
         self._length = None if ids is None else stream_frame_size(ids) - 3
+        self._layout = _FrameLayout(ids) if ids is not None and PACKETS.keys() >= set(ids) else None
         self._buffer = bytearray()
         self._events: deque[Frame] = deque()
         self._synced = False
@@ -460,14 +479,16 @@ class StreamParser:
         self._buffer += data
         position = 0
         while position < len(self._buffer):
+            if self._layout is not None and (packets := self._layout.decode(self._buffer, position)) is not None:
+                self._accept(packets)
+                position += 3 + self._buffer[position + 1]
+                continue
             check = self._check_frame(position)
             if check is _FrameCheck.INCOMPLETE:
                 break
             if check is _FrameCheck.VALID:
                 end = position + 2 + self._buffer[position + 1]
-                self._events.append(Frame(self._decode(position + 2, end)))
-                self.frames += 1
-                self._synced = True
+                self._accept(self._decode(position + 2, end))
                 position = end + 1
                 continue
             if self._synced or check is _FrameCheck.BAD_CHECKSUM:
@@ -488,6 +509,11 @@ class StreamParser:
         self._buffer.clear()
         self._events.clear()
         self._synced = False
+
+    def _accept(self, packets: dict[int, int]) -> None:
+        self._events.append(Frame(packets))
+        self.frames += 1
+        self._synced = True
 
     def _check_frame(self, begin: int) -> _FrameCheck:  # noqa: PLR0911  # each way in which bytes are no frame ends it at once
         buffer = self._buffer

@@ -275,21 +275,41 @@ def test_missing_token_file_is_named(demo: Service, monkeypatch) -> None:
 def test_areas_are_listed_with_their_state(demo: Service) -> None:
     definition = {"id": "hall", "label": "the hall"}
     areas = [{"definition": definition, "hazard": {"state": "clear", "cause": "n1 sees nothing"}, "withheld": False}]
+    override = {"state": "blocked", "author": "ann", "rest_s": 5400.4}
+    areas = [{**areas[0], "override": None}, {**areas[0], "override": override}]
     demo.answers["GET", "/api/v1/areas"] = (200, areas)
-    assert run("area", "list") == "hall (the hall): clear, n1 sees nothing"
+    plain = "hall (the hall): clear, n1 sees nothing"
+    assert run("area", "list") == f"{plain} {plain} [blocked by ann for another 1 h 30 min]"
     assert json.loads(run("area", "list", "--json"))["areas"] == areas
 
 
-def test_area_is_blocked_by_a_zone_over_it_for_a_time(demo: Service) -> None:
-    polygon = [[0, 0], [1, 0], [1, 1]]
-    demo.answers["GET", "/api/v1/areas/hall"] = (200, {"definition": {"id": "hall", "polygon": polygon}})
-    demo.answers["PUT", "/api/v1/zones/area-hall"] = (201, {**ZONE, "id": "area-hall"})
-    override = ["area", "override", "hall", "blocked", "--ttl", "60", "--reason", "wax"]
-    assert run(*override) == "area hall is blocked for 60 s by zone area-hall"
-    shape = {"type": "polygon", "points": polygon}
-    assert demo.requests[-1][2] == {"kind": "BLOCKED", "shape": shape, "reason": "wax", "ttl_s": 60.0}
-    assert run("area", "override", "hall", "clear", "--ttl", "60", "--reason", "x", code=2)
-    assert "there is no such" in run("area", "override", "nix", "blocked", "--ttl", "6", "--reason", "x", code=1)
+def test_area_is_overridden_for_a_time_and_the_override_removed(demo: Service) -> None:
+    path = "/api/v1/areas/hall/override"
+    demo.answers["PUT", path] = (200, {"state": "blocked", "author": "ann", "rest_s": 59.9})
+    demo.answers["DELETE", path] = (204, None)
+    words = ["--state", "blocked", "--reason", "wax"]
+    assert run("area", "override", "hall", *words, "--for", "1m") == (
+        "area hall is overridden: blocked by ann for another 1 min"
+    )
+    assert demo.requests[-1][2] == {"state": "blocked", "reason": "wax", "ttl_s": 60.0}
+    assert run("area", "override", "hall", "--remove") == "area hall is no longer overridden"
+    assert json.loads(run("area", "override", "hall", "--remove", "--json"))["override"] is None
+    demo.answers["PUT", path] = (403, {"detail": "to declare an area clear needs the role admin"})
+    refused = run("area", "override", "hall", "--state", "clear", "--reason", "x", "--for", "2h", code=1)
+    assert "needs the role admin" in refused
+
+
+@pytest.mark.parametrize(
+    ("options", "problem"),
+    [
+        (["--state", "blocked", "--reason", "wax"], "needs --state, --for and --reason"),
+        (["--state", "blocked", "--reason", "wax", "--for", "60"], "--for 60: give a number and its unit"),
+        (["--state", "blocked", "--reason", "wax", "--for", "0s"], "--for 0s"),
+        (["--remove", "--reason", "wax"], "--remove goes without"),
+    ],
+)
+def test_incomplete_override_is_refused_with_the_remedy(demo: Service, options: list[str], problem: str) -> None:
+    assert problem in run("area", "override", "hall", *options, code=2)
 
 
 @pytest.mark.parametrize(

@@ -33,6 +33,11 @@ ROBOT = """
 id = "r1"
 start = { x = 1.0, y = 1.0, theta = 0.0 }
 """
+AREA_WITHOUT_NODES = """
+[[areas]]
+id = "gate"
+polygon = [[0.2, 4.5], [0.6, 4.5], [0.6, 4.9]]
+"""
 PROGRESS_S = 60.0
 
 
@@ -49,7 +54,7 @@ def sequence(chance: random.Random) -> list[tuple[str, ...]]:
 
 @dataclass
 class Operators:
-    """Change zones, an area and a robot's mission as fast as they are acknowledged, and remember what was.
+    """Change zones, areas, overrides and a robot's mission as fast as they are acknowledged, and remember what was.
 
     Each change has an idempotency key and is repeated until it is acknowledged: what must be stored is known exactly.
     """
@@ -60,6 +65,8 @@ class Operators:
     client: httpx.AsyncClient
     zones: dict[str, tuple[str, str]] = field(default_factory=dict)
     area: tuple[str, str] = ("", '"0"')
+    override: tuple[str, str] | None = None
+    """Reason and state of the override of an area without nodes."""
     goal: str | None = None
     acknowledged: Counter[str] = field(default_factory=Counter)
     repeated: int = 0
@@ -120,6 +127,19 @@ class Operators:
                 self.area = body["label"], answer.headers["etag"]
             await asyncio.sleep(0.05)
 
+    async def change_override(self) -> None:
+        path = "/api/v1/areas/gate/override"
+        for number in itertools.count():
+            async with self.turn["hazard_aggregator"]:
+                if self.override is not None and self.chance.random() < 0.4:
+                    answer = await self.change("hazard_aggregator", "DELETE", path)
+                    self.override = None
+                else:
+                    body = {"state": "blocked", "reason": f"override {number}", "ttl_s": 86_400.0}
+                    answer = await self.change("hazard_aggregator", "PUT", path, body)
+                    self.override = body["reason"], answer.json()["state"]
+            await asyncio.sleep(0.05)
+
     async def change_goal(self) -> None:
         path = "/api/v1/robots/r1/goal"
         while True:
@@ -141,15 +161,22 @@ class Operators:
             area = await self.request("hazard_aggregator", "GET", "/api/v1/areas/hall")
             if self.area[0]:
                 assert (area.json()["definition"]["label"], area.headers["etag"]) == self.area
+            gate = (await self.request("hazard_aggregator", "GET", "/api/v1/areas/gate")).json()
+            found = gate["override"]
+            assert (None if found is None else (found["reason"], found["state"])) == self.override
+            assert self.override is None or gate["hazard"]["state"] == "blocked"
             goal = await self.request("planner", "GET", "/api/v1/robots/r1/goal", headers=self.headers)
             assert (goal.json()["goal_id"] if goal.status_code == 200 else None) == self.goal
 
     async def verify_audit(self) -> None:
         """Check that each acknowledged change has exactly one entry in the audit trail."""
-        kinds = {"zone": "map_service", "area": "hazard_aggregator", "mission": "planner"}
+        kinds = {"map_service": ["zone"], "hazard_aggregator": ["area", "override"], "planner": ["mission"]}
         async with self.turn["map_service"], self.turn["hazard_aggregator"], self.turn["planner"]:
             async with Redis.from_url(self.fog.redis.url) as raw:
-                entries = {service: await raw.xlen(f"fog:test:audit:{kind}") for kind, service in kinds.items()}
+                entries = {
+                    service: sum([await raw.xlen(f"fog:test:audit:{kind}") for kind in found])
+                    for service, found in kinds.items()
+                }
             assert entries == self.acknowledged
 
 
@@ -238,13 +265,14 @@ async def test_nothing_acknowledged_is_lost_in_kills_under_load(fog, tokens):
     chance = random.Random(SEED)
     kills = sequence(chance)
     with (fog.site / "site.toml").open("a") as site:
-        site.write(ROBOT)
+        site.write(ROBOT + AREA_WITHOUT_NODES)
     for service in SERVICES:
         fog.start(service)
     async with httpx.AsyncClient(timeout=5.0) as client, asyncio.TaskGroup() as tasks:
         operators = Operators(fog, tokens["operator"], random.Random(SEED), client)
         node = Node(fog, random.Random(SEED))
-        work = (node.mqtt.run(), node.run(), operators.change_zones(), operators.change_area(), operators.change_goal())
+        changes = (operators.change_zones, operators.change_area, operators.change_override, operators.change_goal)
+        work = (node.mqtt.run(), node.run(), *(change() for change in changes))
         running = [tasks.create_task(each) for each in work]
 
         async def progress(changes: int) -> None:
@@ -263,7 +291,9 @@ async def test_nothing_acknowledged_is_lost_in_kills_under_load(fog, tokens):
             await operators.verify()
             await node.verify(operators)
         await operators.verify_audit()
-        assert node.confirmed > 0
+        async with asyncio.timeout(PROGRESS_S):
+            while not node.confirmed:  # noqa: ASYNC110  # as above
+                await asyncio.sleep(0.02)
         for task in running:
             task.cancel()
     sys.stdout.write(

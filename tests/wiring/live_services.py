@@ -178,7 +178,7 @@ class MemoryStore:
         return {}
 
     async def load(self) -> Stored:
-        return Stored([], [])
+        return Stored([], [], [], {})
 
     async def goals(self) -> dict[str, Any]:
         return {}

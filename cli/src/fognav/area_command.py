@@ -1,22 +1,21 @@
 """`fognav area`: the watched areas of a running system."""
 
-import http.client
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 import typer
 
-from fognav.operate.fog import Fog, RefusedError, find_fog
-from fognav.operate.options import FogOption, JsonOption
-from fognav.operate.systems import AGGREGATOR, MAP_SERVICE
-from fognav.output import exit_codes, print_json, print_line
+from fognav.operate.fog import find_fog
+from fognav.operate.options import FogOption, JsonOption, duration
+from fognav.operate.systems import AGGREGATOR
+from fognav.output import WrongUseError, exit_codes, print_json, print_line
 
-area_app = typer.Typer(help="List the watched areas, and block one.", no_args_is_help=True)
+area_app = typer.Typer(help="List the watched areas, and override one.", no_args_is_help=True)
 
 
 @area_app.command("list", epilog="Example: fognav area list --json")
 def area_list(*, fog: FogOption = None, json: JsonOption = False) -> None:
-    """List the watched areas with their state."""
+    """List the watched areas with their state, and who overrides it."""
     with exit_codes():
         areas = find_fog(fog).get(AGGREGATOR, "/api/v1/areas")
         if json:
@@ -28,44 +27,63 @@ def area_list(*, fog: FogOption = None, json: JsonOption = False) -> None:
             print_line("no areas")
 
 
-@area_app.command("override", epilog="Example: fognav area override z1 blocked --ttl 3600 --reason inspection")
-def area_override(
+@area_app.command("override", epilog="Example: fognav area override z1 --state blocked --for 2h --reason 'wet floor'")
+def area_override(  # noqa: PLR0913  # each option is an argument
     area: Annotated[str, typer.Argument(metavar="AREA", help="The area's id, as fognav area list shows it.")],
-    _state: Annotated[Literal["blocked"], typer.Argument(metavar="blocked", help="Robots shall avoid it.")],
     *,
-    ttl: Annotated[float, typer.Option("--ttl", metavar="S", min=1.0, help="How long.")],
-    reason: Annotated[str, typer.Option("--reason", help="Why, for other people.")],
+    state: Annotated[
+        Literal["blocked", "clear"] | None,
+        typer.Option("--state", help="blocked: robots avoid it; clear: they may pass it slowly (admins only)."),
+    ] = None,
+    length: Annotated[
+        str | None, typer.Option("--for", metavar="TIME", help="How long, such as 90s, 15m, 2h or 3d.")
+    ] = None,
+    reason: Annotated[str | None, typer.Option("--reason", help="Why, for other people.")] = None,
+    remove: Annotated[bool, typer.Option("--remove", help="End it: the area's nodes count again.")] = False,
     fog: FogOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Block an area, whatever its nodes report.
+    """Block an area, or declare it clear, whatever its nodes report.
 
-    This draws a zone over it, named after the area: fognav zone remove area-AREA ends it early. An area can't be
-    declared clear: nobody may hide from robots what a node sees.
+    It ends by itself after its time: after 30 days at most, and 15 minutes for an area that was declared clear.
     """
     with exit_codes():
-        found = find_fog(fog)
-        polygon = found.get(AGGREGATOR, f"/api/v1/areas/{area}")["definition"]["polygon"]
-        body = {"kind": "BLOCKED", "shape": {"type": "polygon", "points": polygon}, "reason": reason, "ttl_s": ttl}
-        zone = _put(found, f"/api/v1/zones/area-{area}", body)
-        if json:
-            print_json(zone)
+        path = f"/api/v1/areas/{area}/override"
+        if remove:
+            if (state, length, reason) != (None, None, None):
+                raise WrongUseError("--remove goes without --state, --for and --reason")
+            find_fog(fog).send("DELETE", AGGREGATOR, path)
+            override, line = None, f"area {area} is no longer overridden"
         else:
-            print_line(f"area {area} is blocked for {ttl:g} s by zone {zone['id']}")
-
-
-def _put(fog: Fog, path: str, zone: Mapping[str, Any]) -> Any:  # noqa: ANN401  # JSON
-    """Add a zone, or replace the one that is there."""
-    try:
-        return fog.send("PUT", MAP_SERVICE, path, zone, {"If-None-Match": "*"})
-    except RefusedError as error:
-        if error.status != http.client.PRECONDITION_FAILED:
-            raise
-    return fog.send("PUT", MAP_SERVICE, path, zone)
+            if state is None or length is None or reason is None:
+                raise WrongUseError("an override needs --state, --for and --reason; --remove ends one")
+            body = {"state": state, "ttl_s": duration(length, "--for"), "reason": reason}
+            override = find_fog(fog).send("PUT", AGGREGATOR, path, body)
+            line = f"area {area} is overridden: {_override(override)}"
+        if json:
+            print_json({"area": area, "override": override})
+        else:
+            print_line(line)
 
 
 def _line(area: Mapping[str, Any]) -> str:
-    definition, hazard = area["definition"], area["hazard"]
+    definition, hazard, override = area["definition"], area["hazard"], area["override"]
     label = f" ({definition['label']})" if definition["label"] else ""
     state = f"{hazard['state']}, {hazard['cause']}" if hazard else "nothing announced yet"
-    return f"{definition['id']}{label}: {state}"
+    return f"{definition['id']}{label}: {state}" + (f" [{_override(override)}]" if override else "")
+
+
+def _override(override: Mapping[str, Any]) -> str:
+    return f"{override['state']} by {override['author']} for another {_length(override['rest_s'])}"
+
+
+def _length(seconds: float) -> str:
+    """Return a length of time in words of two units at most."""
+    whole = round(seconds)
+    units = (("d", 86_400), ("h", 3600), ("min", 60), ("s", 1))
+    parts = []
+    for unit, size in units:
+        count, whole = divmod(whole, size)
+        if count:
+            parts.append(f"{count} {unit}")
+    return " ".join(parts[:2]) or "0 s"

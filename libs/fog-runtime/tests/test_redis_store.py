@@ -127,6 +127,19 @@ async def test_writer_whose_epoch_is_not_the_granted_one_is_refused(redis: Serve
         assert await new._records("things", Thing) == before
 
 
+async def test_standby_that_never_led_may_read_and_not_write(redis: Server):
+    async with RedisStore(redis.url, "test", service="map") as leader, RedisStore(redis.url, "test") as standby:
+        assert await leader._swap(THINGS, "a", Thing(label="x"), ABSENT, AUDIT) == "ok"
+        standby.epoch = 0
+        for attempt in (
+            standby._swap(THINGS, "b", Thing(label="y"), ABSENT, AUDIT),
+            standby._write_records("things", {"a": Thing(label="y")}),
+        ):
+            with pytest.raises(StoreRefusedError, match="stands by"):
+                await attempt
+        assert await standby._records("things", Thing) == {"a": Thing(label="x")}
+
+
 async def test_redis_without_durable_writes_is_reported(redis: Server):
     async with RedisStore(redis.url, "test") as store, Redis.from_url(redis.url) as raw:
         await raw.config_set("appendfsync", "everysec")

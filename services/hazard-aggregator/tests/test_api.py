@@ -140,3 +140,55 @@ async def test_change_of_an_area_before_the_stored_areas_are_loaded_is_refused_w
         fog.redis.start()
         await fog.ready("hazard_aggregator")
         assert (await restarted.put("/api/v1/areas/hall", json=body, headers=headers)).headers["etag"] == '"2"'
+
+
+async def test_override_counts_at_once_survives_a_kill_and_ends_with_an_entry_in_the_audit_trail(fog, client, tokens):
+    path = "/api/v1/areas/hall/override"
+    body = {"state": "blocked", "reason": "wet floor", "ttl_s": 3600}
+    assert (await client.put(path, json=body)).status_code == 401
+    put = await client.put(path, json=body, headers={**tokens["operator"], "Idempotency-Key": "k1"})
+    assert (put.status_code, put.headers["etag"], put.json()["author"]) == (200, '"1"', "anna"), put.text
+    again = await client.put(path, json=body, headers={**tokens["operator"], "Idempotency-Key": "k1"})
+    assert again.headers["etag"] == '"1"', "the same attempt"
+    fog.kill("hazard_aggregator")
+    fog.start("hazard_aggregator")
+    async with httpx.AsyncClient(base_url=await fog.ready("hazard_aggregator"), timeout=15) as restarted:
+        area = (await restarted.get("/api/v1/areas/hall")).json()
+        assert (area["hazard"]["state"], area["hazard"]["override"]["author"]) == ("blocked", "anna")
+        assert 3600 - 180 < area["override"]["rest_s"] < 3600
+        stale = {**tokens["operator"], "If-Match": '"7"'}
+        refused = await restarted.put(path, json=body, headers=stale)
+        while refused.status_code == 503:  # the lease of the one that was killed has not ended yet
+            refused = await restarted.put(path, json=body, headers=stale)
+        assert refused.status_code == 412
+        short = await restarted.put(path, json={**body, "ttl_s": 0.2}, headers=tokens["operator"])
+        assert short.headers["etag"] == '"2"'
+        async with asyncio.timeout(60), Redis.from_url(fog.redis.url) as raw:
+            while await raw.hlen("fog:test:overrides"):  # noqa: ASYNC110  # another process deletes it
+                await asyncio.sleep(0.05)
+            entries = [entry for _, entry in await raw.xrange("fog:test:audit:override")]
+        assert [(entry[b"who"], entry[b"action"], entry[b"id"]) for entry in entries] == [
+            (b"anna", b"override", b"hall"),
+            (b"anna", b"override", b"hall"),
+            (b"hazard-aggregator", b"end", b"hall"),
+        ]
+        before, after = (json.loads(entries[1][name]) for name in (b"before", b"after"))
+        assert (before["ttl_s"], after["ttl_s"]) == (3600, 0.2)
+        area = (await restarted.get("/api/v1/areas/hall")).json()
+        assert (area["override"], area["hazard"]["override"]) == (None, None)
+        assert (await restarted.delete(path, headers=tokens["operator"])).status_code == 404
+
+
+async def test_only_an_admin_declares_an_area_clear_and_for_a_quarter_of_an_hour_at_most(client, tokens):
+    path = "/api/v1/areas/hall/override"
+    body = {"state": "clear", "reason": "I stand here", "ttl_s": 900}
+    refused = await client.put(path, json=body, headers=tokens["operator"])
+    assert (refused.status_code, "needs the role admin" in refused.json()["detail"]) == (403, True)
+    long = await client.put(path, json={**body, "ttl_s": 901}, headers=tokens["admin"])
+    assert (long.status_code, long.json()["errors"][0]["field"]) == (422, "body.ttl_s")
+    unreasoned = await client.put(path, json={**body, "reason": ""}, headers=tokens["admin"])
+    assert unreasoned.status_code == 422
+    assert (await client.put(path.replace("hall", "nix"), json=body, headers=tokens["admin"])).status_code == 404
+    assert (await client.put(path, json=body, headers=tokens["admin"])).status_code == 200
+    assert (await client.delete(path, headers=tokens["operator"])).status_code == 204
+    assert (await client.get("/api/v1/areas/hall")).json()["override"] is None

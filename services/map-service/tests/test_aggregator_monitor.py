@@ -1,5 +1,6 @@
 """When an area counts as clear: only while the living aggregator confirms the very hazard that says so."""
 
+import contextlib
 from collections.abc import Sequence
 
 import pytest
@@ -11,7 +12,7 @@ from fog_contracts import channels as ch
 from fog_contracts.grid import GridGeometry
 from fog_contracts.handlers import Moment, Publication, RefusedMessageError
 from fog_contracts.hazards import digest
-from fog_contracts.messages import AggregatorHeartbeat, AreaDefinition, AreaHazard
+from fog_contracts.messages import AggregatorHeartbeat, AreaDefinition, AreaHazard, HazardOverride
 from map_service.aggregator_monitor import IN_FLIGHT_S, TRUSTED_AFTER_S
 from map_service.layers.hazards import HazardsLayer
 
@@ -138,7 +139,8 @@ def test_relief_counts_once_a_heartbeat_confirms_it_and_danger_at_once():
 @pytest.mark.parametrize("epoch", [4, 5, 6])
 def test_foreign_clear_never_clears_a_blocked_area(epoch):
     fog = running()
-    fog.hear(hazard("clear", 99, area="gate", epoch=epoch))
+    with pytest.raises(RefusedMessageError) if epoch < 5 else contextlib.nullcontext():
+        fog.hear(hazard("clear", 99, area="gate", epoch=epoch))
     for _ in range(20):
         fog.run(0.2, CLEAR, GATE)
         assert fog.state("gate") == ("blocked", 254)
@@ -147,6 +149,38 @@ def test_foreign_clear_never_clears_a_blocked_area(epoch):
     for _ in range(10):
         fog.run(0.2, *above, epoch=7)
         assert (fog.state(), fog.state("gate")) == (("clear", 0), ("blocked", 254))
+
+
+def declared_clear(seq: int, measured_penalty: int = 254) -> AreaHazard:
+    override = HazardOverride(
+        state="clear", author="ada", reason="the node is stuck", set_at=7.0, ttl_s=10.0,
+        measured="blocked", measured_penalty=measured_penalty,
+    )  # fmt: skip
+    return structs.replace(hazard("unknown", seq), override=override)
+
+
+def test_area_that_an_admin_declared_clear_is_passable_once_confirmed_and_measured_again_when_its_time_is_over():
+    fog = running()
+    blocked, relief = hazard("blocked", 4), declared_clear(5)
+    fog.hear(blocked, relief)
+    assert fog.state() == ("blocked", 254), "not confirmed yet"
+    fog.run(0.4, relief, GATE)
+    assert fog.state() == ("unknown", 200)
+    fog.run(9.0)
+    assert fog.state() == ("unknown", 200), "a restart of the aggregator strands no robot in the area"
+    fog.run(1.4)
+    assert fog.state() == ("unknown", 254), "nobody lives that would end it"
+    fog.run(2.0, relief, GATE)
+    assert fog.state() == ("unknown", 200), "its aggregator lives, and says that it still holds"
+
+
+def test_retained_word_of_an_operator_that_an_area_is_clear_does_not_count():
+    fog = Fog()
+    fog.hear(declared_clear(3))
+    assert fog.state() == ("unknown", 254)
+    fog = Fog()
+    fog.hear(declared_clear(3, measured_penalty=0))
+    assert fog.state() == ("unknown", 200)
 
 
 def test_foreign_blocked_counts_until_the_aggregator_has_gone_above_it():
@@ -158,6 +192,17 @@ def test_foreign_blocked_counts_until_the_aggregator_has_gone_above_it():
     fog.hear(*above)
     fog.run(1.0, *above, epoch=7)
     assert fog.state() == ("clear", 0)
+
+
+def test_hazards_of_a_replaced_aggregator_are_refused_but_for_dangers():
+    fog = running()
+    late = hazard("clear", 99, area="gate", epoch=4)
+    with pytest.raises(RefusedMessageError, match="epoch 4 is below 5: another hazard-aggregator has taken over"):
+        fog.hear(late)
+    fog.hear(hazard("blocked", 99, epoch=4))
+    assert fog.state() == ("blocked", 254)
+    fog.run(1.0, CLEAR, GATE)
+    assert fog.requested(), "so the one that leads says what is so"
 
 
 def test_heartbeats_of_a_replaced_aggregator_are_refused():

@@ -259,9 +259,11 @@ def test_outdated_hazards_are_ignored_and_one_of_a_new_epoch_is_applied():
     rig = make_rig()
     rig.on_definition(definition(), 0.0)
     rig.on_hazard(hazard("blocked", 5), 0.0)
-    for late in (hazard("clear", 5), hazard("clear", 4), hazard("clear", 9, epoch=0)):
+    for late in (hazard("clear", 5), hazard("clear", 4)):
         assert rig.receive(late, 0.0).deltas == []
-        assert cost_and_speed(rig, 0.75, 0.75)[0] == LETHAL
+    with pytest.raises(RefusedMessageError, match="has taken over"):
+        rig.receive(hazard("clear", 9, epoch=0), 0.0)
+    assert cost_and_speed(rig, 0.75, 0.75)[0] == LETHAL
     rig.aggregator = LivingAggregator(rig.core, epoch=2)
     rig.on_hazard(hazard("clear", 1, epoch=2), 1.0)
     assert cost_and_speed(rig, 0.75, 0.75)[0] == 0

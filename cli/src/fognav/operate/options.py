@@ -1,6 +1,7 @@
 """Options that several commands have, and the texts of points and shapes in their arguments."""
 
 import math
+import re
 from typing import Annotated, Final
 
 import typer
@@ -35,6 +36,17 @@ def numbers(text: str, count: tuple[int, ...], form: str) -> list[float]:
     if len(found) not in count or not all(math.isfinite(value) for value in found):
         raise WrongUseError(f"{text!r} is not {form}, such as {_example(form)}; metres, separated by commas")
     return found
+
+
+_UNITS: Final = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86_400.0}
+
+
+def duration(text: str, option: str) -> float:
+    """Return the seconds of a text like `90s`, `15m`, `2h` or `3d`; raises `WrongUseError` that names the option."""
+    found = re.fullmatch(r"([0-9]{1,9}(?:\.[0-9]{1,3})?)([smhd])", text.strip())
+    if found is None or float(found[1]) <= 0.0:
+        raise WrongUseError(f"{option} {text}: give a number and its unit: 90s, 15m, 2h or 3d")
+    return float(found[1]) * _UNITS[found[2]]
 
 
 def points(text: str, least: int, form: str) -> list[Point]:

@@ -175,7 +175,7 @@ NODE_VALUE        = _mqtt( "node_value",        V1 + "nodes/{node}/value",      
     publishers=(NODE,),          subscribers=(AGGREGATOR,),       durability=VOLATILE, qos=0)
 NODE_CONFIG       = _mqtt( "node_config",       V1 + "nodes/{node}/config",           m.NodeConfig,     limit=KIB,
     publishers=(AGGREGATOR,),    subscribers=(NODE,),             durability=LATEST,   qos=1)
-AREA_HAZARD       = _mqtt( "area_hazard",       V1 + "areas/{area}/hazard",           m.AreaHazard,     limit=4 * KIB,
+AREA_HAZARD       = _mqtt( "area_hazard",       V1 + "areas/{area}/hazard",           m.AreaHazard,     limit=8 * KIB,
     publishers=(AGGREGATOR,),    subscribers=(AGGREGATOR, MAP),   durability=LATEST,   qos=1, epoch="epoch")
 AREA_DEFINITION   = _mqtt( "area_definition",   V1 + "areas/{area}/definition",       m.AreaDefinition, limit=32 * KIB,
     publishers=(AGGREGATOR,),    subscribers=(MAP,),              durability=LATEST,   qos=1, epoch="epoch")

@@ -33,6 +33,11 @@ class Fence:
         """Refuse messages of the service below an epoch that came another way, as the reply to a query."""
         self._highest[service] = max(epoch, self._highest.get(service, 0))
 
+    def require_current(self, service: str, epoch: int) -> None:
+        """Raise `RefusedMessageError` for an epoch below the highest one of its service."""
+        if epoch < (highest := self._highest.get(service, 0)):
+            raise RefusedMessageError(f"its epoch {epoch} is below {highest}: another {service} has taken over")
+
     def guarded(self, handlers: Mapping[Channel, Handler]) -> dict[Channel, Handler]:
         """Return the handlers, refusing messages of lower epochs on the channels that carry one (`Channel.epoch`)."""
         return {
@@ -45,8 +50,7 @@ class Fence:
         def handle(ids: Ids, message: object, at: Moment) -> Sequence[Publication]:
             service, epoch = channel.publishers[0], getattr(message, channel.epoch)
             self.raise_to(service, epoch)
-            if epoch < (highest := self._highest[service]):
-                raise RefusedMessageError(f"its epoch {epoch} is below {highest}: another {service} has taken over")
+            self.require_current(service, epoch)
             return handler(ids, message, at)
 
         return handle

@@ -23,6 +23,7 @@ AngularSpeed = Annotated[float, Meta(ge=-10.0, le=10.0, extra={"unit": "rad/s"})
 Stamp = Annotated[float, Meta(ge=0.0, le=1e12, extra={"unit": "s"})]
 Seconds = Annotated[float, Meta(ge=0.0, le=1e12, extra={"unit": "s"})]
 """A reading of a monotonic clock, which means nothing to another host."""
+TimeToLive = Annotated[float, Meta(gt=0.0, le=1e9, extra={"unit": "s"})]
 Boot = Annotated[str, Meta(max_length=32)]
 """Id of one run of a process: random, so that no other run has it."""
 Count = Annotated[int, Meta(ge=0, le=2**53)]
@@ -119,8 +120,34 @@ SEVERITY: Final = {"clear": 0, "unknown": 1, "unknown_after_blocked": 2, "blocke
 """Severity of an area's hazard by its state; an area that was blocked before it became unknown ranks higher."""
 
 
+Author = Annotated[str, Meta(max_length=100)]
+"""The name of the token with which a change was made."""
+OverrideState = Literal["blocked", "clear"]
+OverrideReason = Annotated[str, Meta(min_length=1, max_length=200)]
+"""Why an operator overrides an area, for other people."""
+
+
+class HazardOverride(Message, frozen=True, kw_only=True):
+    """An operator's word on an area, which counts instead of its nodes' for a time: `ttl_s` from `set_at` on.
+
+    `measured` and `measured_penalty` are what the area's state and penalty would be without it.
+    """
+
+    state: OverrideState
+    author: Author
+    reason: OverrideReason
+    set_at: Stamp
+    ttl_s: TimeToLive
+    measured: AreaState
+    measured_penalty: Annotated[int, Meta(ge=0, le=254)]
+
+
 class AreaHazard(Message, frozen=True, kw_only=True):
-    """State of one area; `seq` grows by one with each change, `epoch` with each start of the aggregator."""
+    """State of one area; `seq` grows by one with each change, `epoch` with each start of the aggregator.
+
+    With an `override` the state is not that of the nodes: `blocked`, or `unknown` and passable where an operator
+    declared the area clear, which nobody measures (ADR 16).
+    """
 
     area: Id
     state: AreaState
@@ -132,6 +159,7 @@ class AreaHazard(Message, frozen=True, kw_only=True):
     cause: Sentence
     nodes: dict[Id, AreaState] = {}
     explained_by: Id | None = None
+    override: HazardOverride | None = None
     trace: Trace | None = None
 
 
@@ -272,7 +300,6 @@ class HazardArea(Message, frozen=True, kw_only=True):
 
 
 ZoneKind = Literal["BLOCKED", "PENALTY", "SPEED_LIMIT"]
-TimeToLive = Annotated[float, Meta(gt=0.0, le=1e9, extra={"unit": "s"})]
 PenaltyFactor = Annotated[float, Meta(ge=1.0, le=PENALTY_FACTOR_MAX)]
 
 

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ANY",
+    "UNFENCED",
     "Audit",
     "Outcome",
     "RecoveryError",
@@ -40,6 +41,9 @@ M = TypeVar("M", bound=Message)
 
 Outcome = Literal["ok", "exists", "missing", "stale"]
 """Result of a write: done (now or before), or refused because a record exists, is missing, or has another version."""
+
+UNFENCED: Final = -1
+"""The epoch of a writer that is no copy of a service: Redis does not ask who leads."""
 
 ANY: Final = "*"
 """Expect no particular version: overwrite what is stored."""
@@ -76,7 +80,8 @@ class RedisStore:
 
     `data_dir` is a folder that survives restarts: in it the service `service` remembers which store it uses, so that it
     notices at its start that Redis was emptied. Without it, only a running service notices. Set `epoch` to that with
-    which the service leads (`fog_runtime.lease`): Redis refuses writes unless it granted that one last.
+    which the service leads (`fog_runtime.lease`), and to 0 while it stands by: Redis refuses writes unless it granted
+    that one last.
     """
 
     def __init__(
@@ -87,7 +92,7 @@ class RedisStore:
         self._service = service
         self._identity = StoreIdentity(None if data_dir is None else data_dir / f"{service}.{site}.store")
         self._floors: dict[str, int] = {}
-        self.epoch = 0
+        self.epoch = UNFENCED
 
     async def __aenter__(self) -> Self:
         """Return the store; it connects with the first command."""
@@ -284,6 +289,8 @@ class RedisStore:
         ((outcome, writes, details),) = await self._redis.write(("EVAL", script, len(keys), *keys, request, *data))
         if outcome == b"lost":
             raise StoreLostError("Redis lost acknowledged records")
+        if outcome == b"fenced" and self.epoch == 0:
+            raise StoreRefusedError(f"this {self._service} stands by: only the one that leads may write")
         if outcome == b"fenced":
             raise StoreRefusedError(f"the epoch {self.epoch} is not that of the {self._service} that Redis lets lead")
         self._identity.acknowledge(table, int(writes))

@@ -2,8 +2,8 @@
 
 Every script begins with the guard: it writes nothing into a store that was emptied, replaced, or went back to an older
 state, nor for a process that another one has replaced: the last key holds the epoch that was granted last, and
-`request.epoch` is the writer's (0: it leads no service). Its first argument is a JSON object; it returns an outcome,
-the number of writes of the table, and details.
+`request.epoch` is the writer's (0: it stands by, -1: it is no copy of a service and may write). Its first argument is a
+JSON object; it returns an outcome, the number of writes of the table, and details.
 """
 
 from typing import Final
@@ -16,7 +16,7 @@ local request = cjson.decode(ARGV[1])
 if redis.call('GET', KEYS[1]) ~= request.generation then return {'lost', 0, ''} end
 local writes = tonumber(redis.call('HGET', KEYS[2], request.table) or '0')
 if writes < request.acknowledged then return {'lost', 0, ''} end
-if request.epoch > 0 and redis.call('GET', KEYS[#KEYS]) ~= string.format('%.0f', request.epoch) then
+if request.epoch >= 0 and redis.call('GET', KEYS[#KEYS]) ~= string.format('%.0f', request.epoch) then
   return {'fenced', 0, ''}
 end
 """

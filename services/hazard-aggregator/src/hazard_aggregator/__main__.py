@@ -5,8 +5,9 @@ from __future__ import annotations
 import asyncio
 import os
 
+from fog_contracts.handlers import Moment
 from fog_runtime import logs, process
-from fog_runtime.clock import SystemClock
+from fog_runtime.clock import SystemClock, boot_id
 from fog_runtime.health import Health
 from fog_runtime.http import load_tokens, serve
 from fog_runtime.leadership import Leadership, process_id
@@ -19,6 +20,7 @@ from hazard_aggregator.api import make_api
 from hazard_aggregator.core import Aggregator
 from hazard_aggregator.debounce import make_rule
 from hazard_aggregator.fusion import AreaFusion
+from hazard_aggregator.overrides import StoredOverrides
 from hazard_aggregator.registry import find_rule
 from hazard_aggregator.service import Service
 from hazard_aggregator.settings import Settings
@@ -57,8 +59,12 @@ async def main() -> None:
                 "hazard-aggregator", keeper, zenoh, health, connected=lambda: zenoh.connected or mqtt.connected
             )
             core = Aggregator(fusion, complete=loaded_from_store)
-            service = Service(core, store, mqtt, zenoh, clock, health, leadership)
+            boot = boot_id()
+            service = Service(core, store, mqtt, zenoh, clock, health, leadership, boot=boot)
             if loaded_from_store:
+                core.load_overrides(
+                    StoredOverrides(stored.overrides, stored.rests, boot), Moment(clock.now(), clock.stamp())
+                )
                 service.records.mark_loaded()
             service.subscribe()
             leadership.subscribe()

@@ -40,6 +40,7 @@ from fog_runtime.http import (
 from fog_runtime.idempotency import IdempotencyError
 from hazard_aggregator.area_size import AreaError, check_size
 from hazard_aggregator.area_writer import ConflictError
+from hazard_aggregator.override_api import OverrideView, add_overrides, override_view
 from hazard_aggregator.service import Service
 from hazard_aggregator.store import StoreError
 
@@ -57,11 +58,15 @@ class AreaBody(Message, frozen=True, kw_only=True):
 
 
 class AreaView(Message, frozen=True, kw_only=True):
-    """An area with its announced hazard; `withheld`: a newer hazard, a relief, is not announced until it is stored."""
+    """An area with its announced hazard; `withheld`: a newer hazard, a relief, is not announced until it is stored.
+
+    `override` is an operator's word, which counts instead of the nodes'.
+    """
 
     definition: AreaDefinition
     hazard: AreaHazard | None
     withheld: bool
+    override: OverrideView | None
 
 
 class NodeView(Message, frozen=True, kw_only=True):
@@ -90,7 +95,7 @@ def make_api(
     While `standby` returns a reason, nothing can be written.
     """
     app = make_app("Fognav hazard-aggregator", health, tokens, standby=standby)
-    _add_areas(Routes(app, "areas"), service, geometry)
+    _add_areas(Routes(app, "areas"), service, geometry, clock)
     _add_nodes(Routes(app, "nodes"), service, clock)
     recovery = Routes(app, "store")
     add_store_errors(recovery)
@@ -98,7 +103,7 @@ def make_api(
     return app
 
 
-def _add_areas(routes: Routes, service: Service, geometry: GridGeometry) -> None:
+def _add_areas(routes: Routes, service: Service, geometry: GridGeometry, clock: Clock) -> None:
     add_store_errors(routes)
     routes.raises(
         ConflictError,
@@ -107,9 +112,14 @@ def _add_areas(routes: Routes, service: Service, geometry: GridGeometry) -> None
     )
 
     def area_views() -> dict[str, AreaView]:
-        announced, withheld = service.core.announced(), service.core.withheld()
+        announced, withheld, now = service.core.announced(), service.core.withheld(), clock.now()
         return {
-            d.id: AreaView(definition=d, hazard=announced.get(d.id), withheld=d.id in withheld)
+            d.id: AreaView(
+                definition=d,
+                hazard=announced.get(d.id),
+                withheld=d.id in withheld,
+                override=override_view(service, d.id, now),
+            )
             for d in service.core.definitions()
             if not d.removed
         }
@@ -148,6 +158,8 @@ def _add_areas(routes: Routes, service: Service, geometry: GridGeometry) -> None
             attempt=attempt_of(idempotency_key, caller, f"PUT /api/v1/areas/{area_id}", body),
         )
         return Answer(definition, etag(definition.version))
+
+    add_overrides(routes, service, clock)
 
 
 def _add_nodes(routes: Routes, service: Service, clock: Clock) -> None:

@@ -6,7 +6,7 @@ from typing import Final
 
 from fog_contracts import channels as ch
 from fog_contracts.codec import ContractError, encode
-from fog_contracts.messages import SENTENCE_MAX, AreaDefinition, AreaHazard, Trace
+from fog_contracts.messages import SENTENCE_MAX, AreaDefinition, AreaHazard, HazardOverride, Trace
 
 _LARGEST: Final = 2**53
 _LATEST: Final = 9_999_999_999.999999
@@ -37,6 +37,15 @@ def check_size(definition: AreaDefinition) -> None:
         cause=_WIDEST * SENTENCE_MAX,
         nodes=dict.fromkeys(definition.nodes, "unknown"),
         explained_by="x" * 32,
+        override=HazardOverride(
+            state="blocked",
+            author=_WIDEST * 100,
+            reason=_WIDEST * 200,
+            set_at=_LATEST,
+            ttl_s=1e9,
+            measured="unknown",
+            measured_penalty=254,
+        ),
         trace=Trace(area=definition.id, epoch=_LARGEST, seq=_LARGEST, first_reading=_LATEST, confirmed=_LATEST),
     )
     for channel, message in ((ch.AREA_DEFINITION, definition), (ch.AREA_HAZARD, hazard)):

@@ -15,6 +15,7 @@ from fog_contracts.hazards import digest
 from fog_contracts.messages import AggregatorHeartbeat
 from hazard_aggregator.foreign_messages import ForeignMessages
 from hazard_aggregator.outbox import Outbox
+from hazard_aggregator.overrides import Overrides
 from hazard_aggregator.own_messages import OwnMessages
 from hazard_aggregator.publications import definition_publication, deletions, hazard_publications, node_publication
 
@@ -24,8 +25,10 @@ if TYPE_CHECKING:
     from fog_contracts.channels import Channel
     from fog_contracts.handlers import Handler, Ids, Moment, QueryHandler
     from fog_contracts.messages import AreaDefinition, AreaHazard, NodeReading, RobotPose
+    from hazard_aggregator.area_override import AreaOverride
     from hazard_aggregator.foreign_messages import ForeignMessage
     from hazard_aggregator.fusion import AreaFusion, NodeReport
+    from hazard_aggregator.overrides import StoredOverrides
     from hazard_aggregator.reading_order import Rejection
 
 
@@ -41,6 +44,7 @@ class Aggregator:
     def __init__(self, fusion: AreaFusion, *, complete: bool = True) -> None:
         self.epoch = fusion.epoch
         self.nodes = fusion.nodes
+        self.overrides = Overrides(fusion)
         self._fusion = fusion
         self._outbox = Outbox()
         self._own = OwnMessages()
@@ -114,8 +118,8 @@ class Aggregator:
         return {}
 
     def tick(self, at: Moment) -> list[Publication]:
-        """Detect silent and flapping nodes, and publish the heartbeat when it is due; call ten times a second."""
-        publications = self._announce(self._fusion.tick(at.now, at.stamp))
+        """End overrides, detect silent and flapping nodes, publish the heartbeat if it is due; call it at 10 Hz."""
+        publications = self._announce([*self.overrides.tick(at), *self._fusion.tick(at.now, at.stamp)])
         if at.now - self._heartbeat_at > ch.AGGREGATOR_HEARTBEAT.period_s - _HALF_TICK_S:
             self._heartbeat_at = at.now
             publications.append(Publication(ch.AGGREGATOR_HEARTBEAT, self._heartbeat(at)))
@@ -141,6 +145,18 @@ class Aggregator:
             self._outbox.forget(definition.id)
             return [self._definition_publication(definition), *deletions(definition.id)]
         return [self._definition_publication(definition), *self._announce(changed)]
+
+    def put_override(self, override: AreaOverride, at: Moment) -> list[Publication]:
+        """Put an operator's override, which is stored, into force."""
+        return self._announce(self.overrides.put(override, at))
+
+    def remove_override(self, area: str, at: Moment) -> list[Publication]:
+        """End an override, which is not stored any more: the area's nodes count again."""
+        return self._announce(self.overrides.remove(area, at))
+
+    def load_overrides(self, stored: StoredOverrides, at: Moment) -> list[Publication]:
+        """Put the stored overrides into force, and end all others."""
+        return self._announce(self.overrides.replace_all(stored, at))
 
     def restore(
         self, definitions: Iterable[AreaDefinition], hazards: Iterable[AreaHazard], at: Moment
@@ -198,7 +214,7 @@ class Aggregator:
                 return deletions(hazard.area)
             self._unlisted.add(hazard.area)
             return []
-        changed = self._announce(self._fusion.restore([hazard], at.stamp))
+        changed = self._announce([*self.overrides.follow(hazard, at), *self._fusion.restore([hazard], at.stamp)])
         if hazard.epoch >= self.epoch:
             self._foreign.add("hazard", hazard.epoch, hazard.area)
             return changed

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
     from fog_contracts.messages import AreaDefinition, AreaHazard, AreaState, NodeReading, RobotPose
     from fog_contracts.site import NodeSite
+    from hazard_aggregator.area_override import AreaOverride
     from hazard_aggregator.debounce import Registry, Rule
     from hazard_aggregator.reading_order import Rejection
 
@@ -73,6 +74,7 @@ class AreaFusion:
         self._registry = registry
         self._default_rule = default_rule
         self._areas: dict[str, WatchedArea] = {}
+        self._overrides: dict[str, AreaOverride] = {}
         self._tombstones: dict[str, AreaDefinition] = {}
         self._poses: dict[str, tuple[float, RobotPose]] = {}
         self._seqs: dict[str, int] = {}
@@ -202,11 +204,23 @@ class AreaFusion:
         area = self._areas.get(definition.id)
         return self._evaluate(area, stamp) if area else []
 
+    def set_override(self, area_id: str, override: AreaOverride | None, stamp: float) -> list[AreaHazard]:
+        """Let an operator's word count for an area, whether it is known already or not; or, with None, no more."""
+        if override is None:
+            self._overrides.pop(area_id, None)
+        else:
+            self._overrides[area_id] = override
+        area = self._areas.get(area_id)
+        return self._evaluate(area, stamp) if area else []
+
     def restore(self, hazards: Iterable[AreaHazard], stamp: float) -> list[AreaHazard]:
         """Apply hazards that were unreadable at the start; areas that readings have confirmed since keep theirs."""
-        areas = [(self._areas.get(hazard.area), hazard) for hazard in hazards]
-        dangerous = [area for area, hazard in areas if area is not None and area.restore_late(hazard)]
-        return [changed for area in dangerous for changed in self._evaluate(area, stamp)]
+        changed: list[AreaHazard] = []
+        for hazard in hazards:
+            if (area := self._areas.get(hazard.area)) is not None:
+                area.restore_late(hazard)
+                changed += self._evaluate(area, stamp)
+        return changed
 
     def set_epoch(self, epoch: int) -> None:
         """Give all hazards, those to come too, another epoch."""
@@ -282,7 +296,7 @@ class AreaFusion:
     def _evaluate(self, area: WatchedArea, stamp: float) -> list[AreaHazard]:
         """Return the area's hazard when it changed."""
         seq = self._seqs.get(area.definition.id, 0) + 1
-        hazard = area.evaluate(self.epoch, seq, stamp)
+        hazard = area.evaluate(self.epoch, seq, stamp, self._overrides.get(area.definition.id))
         if hazard is None:
             return []
         self._seqs[area.definition.id] = seq

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 from fog_contracts import channels as ch
 from fog_runtime.redis_connection import StoreRefusedError
-from hazard_aggregator.store import Audit, RecoveryError, StoreError, usable_areas
+from hazard_aggregator.overrides import StoredOverrides
+from hazard_aggregator.store import Audit, RecoveryError, Stored, StoreError, usable_areas
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -25,9 +26,9 @@ if TYPE_CHECKING:
 
 
 class Records:
-    """The stored areas and hazards. Who changes an area holds `lock`, and writes inside `uncertain_write`.
+    """The stored areas, hazards and overrides. Who changes one holds `lock`, and writes inside `uncertain_write`.
 
-    `loaded` is set once the records were loaded, before which nothing may be written.
+    `loaded` is set once the records were loaded, before which nothing may be written; `boot` is `clock.boot_id`.
     """
 
     def __init__(  # noqa: PLR0913  # the process's parts
@@ -39,6 +40,7 @@ class Records:
         edges: Edges,
         clock: Clock,
         health: Health,
+        boot: str,
     ) -> None:
         self.lock = asyncio.Lock()
         self.loaded = asyncio.Event()
@@ -49,6 +51,7 @@ class Records:
         self._edges = edges
         self._clock = clock
         self._health = health
+        self._boot = boot
         self._reload_due = False
 
     def mark_loaded(self) -> None:
@@ -74,11 +77,13 @@ class Records:
             raise
 
     async def load(self) -> Sequence[Publication]:
-        """Put the stored areas and hazards into force; return everything, to be published. Raises `StoreError`."""
+        """Put the stored records into force; return everything, to be published. Raises `StoreError`."""
         async with self.lock:
             stored = await self._store.load()
             usable = usable_areas(stored.definitions, self._core.check)
-            publications = self._core.restore(usable, stored.hazards, self._edges.now())
+            overrides = StoredOverrides(stored.overrides, stored.rests, self._boot)
+            changed = self._core.load_overrides(overrides, self._edges.now())
+            publications = [*changed, *self._core.restore(usable, stored.hazards, self._edges.now())]
         await self.subscribe_numbers()
         return publications
 
@@ -98,6 +103,8 @@ class Records:
         for definition in usable_areas(await self._store.areas(), self._core.check):
             if definition != known.get(definition.id):
                 self._publisher.announce(self._core.put_area(definition, self._edges.now()))
+        overrides = StoredOverrides(*await self._store.overrides(), self._boot)
+        self._publisher.announce(self._core.load_overrides(overrides, self._edges.now()))
         self._reload_due = False
 
     async def subscribe_numbers(self) -> None:
@@ -117,10 +124,19 @@ class Records:
                 await self._store.accept_loss(audit)
                 self._reload_due = True
             elif self.loaded.is_set():
-                stored = [definition for definition in self._core.definitions() if definition.version > 0]
-                await self._store.restore(stored, self._core.announced().values(), audit)
+                await self._store.restore(self._in_memory(), audit)
             else:
                 raise RecoveryError(
                     "this service was started after the loss and has no stored areas: restore a backup of Redis, or"
                     " accept"
                 )
+
+    def _in_memory(self) -> Stored:
+        """Return what of the records in force is stored."""
+        overrides = self._core.overrides
+        return Stored(
+            [definition for definition in self._core.definitions() if definition.version > 0],
+            list(self._core.announced().values()),
+            overrides.all(),
+            overrides.rests(self._clock.now()),
+        )

@@ -11,6 +11,7 @@ from fog_runtime import logs
 from fog_runtime.clock import ticker
 from fog_runtime.edges import Edges
 from hazard_aggregator.area_writer import AreaWriter
+from hazard_aggregator.override_writer import OverrideWriter
 from hazard_aggregator.publisher import Publisher
 from hazard_aggregator.records import Records
 from hazard_aggregator.store import StoreError, StoreLostError
@@ -57,8 +58,10 @@ class Service:
         clock: Clock,
         health: Health,
         gate: Gate | None = None,
+        *,
+        boot: str = "",
     ) -> None:
-        """Prepare; `gate` decides whether this process leads or stands by."""
+        """Prepare; `gate` decides whether this process leads or stands by, `boot` is `clock.boot_id`."""
         self.core = core
         self._store = store
         self._mqtt = mqtt
@@ -67,8 +70,9 @@ class Service:
         self._health = health
         self._edges = Edges(clock, mqtt=mqtt, zenoh=zenoh, gate=gate)
         self._publisher = Publisher(core, self._edges)
-        self.records = Records(core, store, self._publisher, mqtt, self._edges, clock, health)
+        self.records = Records(core, store, self._publisher, mqtt, self._edges, clock, health, boot)
         self.areas = AreaWriter(core, store, self.records, self._publisher, self._edges, clock)
+        self.overrides = OverrideWriter(core, store, self.records, self._publisher, self._edges, clock, boot)
         self._leading = asyncio.Event()
         self._limited = logs.RateLimited(_log)
 
@@ -145,6 +149,7 @@ class Service:
             self.records.mark_loaded()
         if self._leading.is_set():
             await self.records.reload()
+            await self.overrides.keep()
         await self._store.check()
         self._health.set("store", ok=True)
 
@@ -175,3 +180,5 @@ class Service:
     def stand_by(self) -> None:
         """Follow the nodes, and the hazards of the aggregator that leads; announce and store nothing."""
         self._leading.clear()
+        self._store.epoch = 0
+        self.core.overrides.follow_others()

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from fog_contracts.messages import AreaDefinition, AreaHazard
+from msgspec import structs
+
+from fog_contracts.messages import AreaDefinition, AreaHazard, Message
 from fog_runtime import logs
 from fog_runtime.redis_store import Audit, Outcome, RecoveryError, RedisStore, StoreError, StoreLostError, Table
+from hazard_aggregator.area_override import AreaOverride, Rest
 from hazard_aggregator.area_size import AreaError, check_size
 
 if TYPE_CHECKING:
@@ -28,15 +31,24 @@ __all__ = [
 
 _AREAS: Final = Table("areas", "area")
 _HAZARDS: Final = "hazards"
+_OVERRIDES: Final = Table("overrides", "override")
+_RESTS: Final = "override_rests"
+_ALL: Final = "all"
 
 _log = logs.get("store")
 
 
+class _AllRests(Message, frozen=True, kw_only=True):
+    overrides: dict[str, Rest]
+
+
 class Stored(NamedTuple):
-    """What an aggregator loads when it starts, and when it begins to lead."""
+    """What an aggregator loads when it starts, and when it begins to lead; `rests` are those of the overrides."""
 
     definitions: list[AreaDefinition]
     hazards: list[AreaHazard]
+    overrides: list[AreaOverride]
+    rests: dict[str, Rest]
 
 
 class Store(RedisStore):
@@ -45,7 +57,7 @@ class Store(RedisStore):
     async def load(self) -> Stored:
         """Return all readable records."""
         hazards = await self._readable_records(_HAZARDS, AreaHazard)
-        return Stored(await self.areas(), list(hazards.values()))
+        return Stored(await self.areas(), list(hazards.values()), *await self.overrides())
 
     async def areas(self) -> list[AreaDefinition]:
         """Return the stored areas; an unreadable one is left out, so the site's definition of it stays in force."""
@@ -64,14 +76,54 @@ class Store(RedisStore):
         """
         return await self._swap(_AREAS, definition.id, definition, str(expected), audit, before=before)
 
+    async def overrides(self) -> tuple[list[AreaOverride], dict[str, Rest]]:
+        """Return the stored overrides, and the rests of their times by area; unreadable ones are left out."""
+        found = await self._readable_records(_OVERRIDES.name, AreaOverride)
+        await self._load_floor(_OVERRIDES.name)
+        rests = (await self._readable_records(_RESTS, _AllRests)).get(_ALL)
+        return list(found.values()), {} if rests is None else rests.overrides
+
+    async def put_override(self, override: AreaOverride, audit: Audit) -> tuple[Outcome, AreaOverride]:
+        """Write an override durably instead of the one of its version (0: there is none); return its new version."""
+        if override.version > 0:
+            new = structs.replace(override, version=override.version + 1)
+            return await self._swap(_OVERRIDES, new.area, new, str(override.version), audit), new
+        outcome, new = await self._create_override(override, audit)
+        if outcome == "stale":
+            # This process did not know of the newest deletion, and does now.
+            outcome, new = await self._create_override(override, audit)
+        return outcome, new
+
+    async def _create_override(self, override: AreaOverride, audit: Audit) -> tuple[Outcome, AreaOverride]:
+        new = structs.replace(override, version=self._floor(_OVERRIDES.name) + 1)
+        return await self._swap(_OVERRIDES, new.area, new, "0", audit), new
+
+    async def delete_override(self, override: AreaOverride, audit: Audit) -> Outcome:
+        """Delete an override durably if the stored version is this one's; `ok` if there is none."""
+        outcome = await self._swap(_OVERRIDES, override.area, None, str(override.version), audit)
+        return "ok" if outcome == "missing" else outcome
+
+    async def save_rests(self, rests: dict[str, Rest]) -> None:
+        """Replace the stored rests of all overrides."""
+        await self._write_records(_RESTS, {_ALL: _AllRests(overrides=rests)})
+
+    async def earlier_override(self, attempt: Attempt | None) -> AreaOverride | None:
+        """Return the override that an earlier attempt with the same idempotency key stored."""
+        return await self.recall(attempt, AreaOverride)
+
     async def earlier_result(self, attempt: Attempt | None) -> AreaDefinition | None:
         """Return the area that an earlier attempt with the same idempotency key stored."""
         return await self.recall(attempt, AreaDefinition)
 
-    async def restore(self, definitions: Iterable[AreaDefinition], hazards: Iterable[AreaHazard], audit: Audit) -> None:
-        """Replace the stored areas and hazards by these, on an administrator's decision after Redis lost them."""
-        areas = {definition.id: definition for definition in definitions}
-        await self._adopt({_AREAS.name: areas, _HAZARDS: {hazard.area: hazard for hazard in hazards}}, audit)
+    async def restore(self, known: Stored, audit: Audit) -> None:
+        """Replace the stored records by these, on an administrator's decision after Redis lost them."""
+        tables: dict[str, dict[str, Message]] = {
+            _AREAS.name: {definition.id: definition for definition in known.definitions},
+            _HAZARDS: {hazard.area: hazard for hazard in known.hazards},
+            _OVERRIDES.name: {override.area: override for override in known.overrides},
+            _RESTS: {_ALL: _AllRests(overrides=known.rests)},
+        }
+        await self._adopt(tables, audit)
 
 
 async def load_at_start(store: Store) -> tuple[Stored, bool]:
@@ -80,7 +132,7 @@ async def load_at_start(store: Store) -> tuple[Stored, bool]:
         return await store.load(), True
     except StoreError as error:
         _log.warning("started_without_store", reason=str(error))
-        return Stored([], []), False
+        return Stored([], [], [], {}), False
 
 
 def usable_areas(

@@ -62,7 +62,7 @@ from map_service.service import ConflictError, Service
 from map_service.store import StoreError
 from map_service.zone_validation import ZoneError
 
-AuditKind = Literal["area", "mission", "store", "zone"]
+AuditKind = Literal["area", "mission", "override", "store", "zone"]
 
 _PNG: Final = "image/png"
 _MAX_PICTURES: Final = 4

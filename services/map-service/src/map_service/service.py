@@ -186,6 +186,7 @@ class Service:
     def stand_by(self) -> None:
         """Follow the inputs, and the stored zones, which another process changes now."""
         self._leading = False
+        self._store.epoch = 0
 
     # --- Zones: stored first, then put on the map -------------------------------------------------------------------
 

@@ -71,6 +71,7 @@ class MissionKeeper:
     def stand_by(self) -> None:
         """Forget the missions: another planner changes them until this one leads again."""
         self._leading, self._reload = False, True
+        self._store.epoch = 0
         self._loaded.clear()
         self.goals.clear()
         self._reached.clear()

@@ -12,7 +12,7 @@ from fog_runtime.http.store_routes import (
     attempt_of,
     must_be_new,
 )
-from fog_runtime.http.tokens import Admin, Operator, Tokens, Viewer, load_tokens
+from fog_runtime.http.tokens import Admin, Caller, Operator, Tokens, Viewer, load_tokens
 from fog_runtime.token_file import TokensError, token_hash
 
 __all__ = [
@@ -20,6 +20,7 @@ __all__ = [
     "Admin",
     "Answer",
     "Body",
+    "Caller",
     "IdempotencyKey",
     "IfMatch",
     "IfNoneMatch",

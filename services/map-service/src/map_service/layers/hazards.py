@@ -2,18 +2,21 @@
 
 Penalty 254 is lethal and gets inflated, a lower one is a graded cost. An unknown area limits the speed too. A clear
 area whose hazard no living aggregator confirms is unknown, with the penalty of its own policy, as is one whose hazard
-was not received yet; what was blocked stays blocked.
+was not received yet; what was blocked stays blocked. An area that an operator declared clear stays passable for as long
+as that was meant to last, then it is what its nodes measured.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from msgspec import structs
 
 from fog_contracts import channels as ch
-from fog_contracts.costs import DEGRADED_SPEED
+from fog_contracts.costs import DEGRADED_SPEED, LETHAL
+from fog_contracts.fencing import Fence
 from fog_contracts.geometry import GeometryError, normalized_polygon
 from fog_contracts.handlers import Publication, RefusedMessageError
 from fog_contracts.hazards import is_relief
@@ -33,6 +36,9 @@ if TYPE_CHECKING:
     from map_service.layers.base import Grid
 
 
+_AGGREGATOR: Final = ch.AREA_HAZARD.publishers[0]
+
+
 @dataclass
 class _Area:
     definition: AreaDefinition
@@ -42,6 +48,10 @@ class _Area:
     accepted: AreaHazard | None = None
     """The last hazard that was confirmed or is no relief."""
     confirmed: bool = False
+    declared_clear_at: float = 0.0
+    """When the operator did so whose word was accepted last (`set_at`)."""
+    declared_until: float = -math.inf
+    """How long that word may count while no aggregator lives that would end it (s, monotonic)."""
 
 
 class HazardsLayer(CostLayer):
@@ -53,6 +63,7 @@ class HazardsLayer(CostLayer):
         self._areas: dict[str, _Area] = {}
         self._received: dict[str, AreaHazard] = {}
         self._removed: dict[str, HazardArea] = {}
+        self._fence = Fence()
         self.aggregator = AggregatorMonitor()
 
     # --- Inputs -----------------------------------------------------------------------------------------------------
@@ -107,8 +118,8 @@ class HazardsLayer(CostLayer):
     def _on_hazard(self, ids: Ids, hazard: AreaHazard, at: Moment) -> list[Publication]:
         """Receive an area's hazard.
 
-        Duplicate and outdated ones of the same epoch are ignored; one of an older epoch counts only if it raises the
-        cost (a clock that went back must not hide a danger), or if it is from the aggregator that the map believes.
+        Duplicate and outdated ones of the same epoch are ignored. Of an aggregator that was replaced by the one that
+        the map believes only dangers count; the others raise `RefusedMessageError`.
         """
         if hazard.area != ids["area"]:
             raise RefusedMessageError(f"it is about another area, {hazard.area}")
@@ -116,15 +127,15 @@ class HazardsLayer(CostLayer):
         if old is not None:
             if hazard.epoch == old.epoch and hazard.seq <= old.seq:
                 return []
-            believed = hazard.epoch == self.aggregator.epoch
-            if hazard.epoch < old.epoch and not believed and hazard.penalty <= old.penalty:
-                return []
+            if hazard.penalty <= old.penalty:
+                self._fence.require_current(_AGGREGATOR, hazard.epoch)
         self._received[hazard.area] = hazard
         self.aggregator.on_hazard(hazard)
         return self._refresh(hazard.area, at)
 
     def _on_heartbeat(self, _ids: Ids, heartbeat: AggregatorHeartbeat, at: Moment) -> list[Publication]:
         self.aggregator.on_heartbeat(heartbeat, self._received, self._areas.keys(), at.now)
+        self._fence.raise_to(_AGGREGATOR, self.aggregator.epoch or 0)
         removed: list[Publication] = []
         if (listed := self.aggregator.areas(at.now)) is not None:
             removed = [p for area in list(self._areas) if area not in listed for p in self._remove(area)]
@@ -196,12 +207,14 @@ class HazardsLayer(CostLayer):
         """Set the hazard on the map: the accepted one, or unknown when nobody upholds that the area is clear."""
         received = self._received.get(area.definition.id)
         confirmed = received is not None and self.aggregator.confirms(received, at.now)
-        if received is not None and (confirmed or not is_relief(received, area.shown)):
+        if received is not None and (confirmed or not _may_relieve(received, area.shown)):
             area.accepted = received
+            _note_declaration(area, received, at.now)
         accepted = area.accepted
         upheld = accepted is not None and self.aggregator.upholds(area.definition.id, at.now)
         area.confirmed = confirmed or upheld
-        if accepted is not None and (accepted.state != "clear" or area.confirmed):
+        declared_clear = accepted is not None and _declares_clear(accepted) and at.now >= area.declared_until
+        if accepted is not None and (area.confirmed or not (accepted.state == "clear" or declared_clear)):
             area.shown = accepted
             return
         unknown = _unknown(area.definition, received, at.stamp)
@@ -210,13 +223,32 @@ class HazardsLayer(CostLayer):
         area.shown = unknown
 
 
+def _declares_clear(hazard: AreaHazard) -> bool:
+    return hazard.override is not None and hazard.override.state == "clear"
+
+
+def _may_relieve(hazard: AreaHazard, shown: AreaHazard) -> bool:
+    """Whether a hazard allows robots more than the one on the map, or than the area's nodes do."""
+    return is_relief(hazard, shown) or _declares_clear(hazard)
+
+
+def _note_declaration(area: _Area, hazard: AreaHazard, now: float) -> None:
+    """Remember how long an operator's word may count that the area is clear, from when it was first accepted."""
+    override = hazard.override
+    if override is not None and override.state == "clear" and override.set_at != area.declared_clear_at:
+        area.declared_clear_at, area.declared_until = override.set_at, now + override.ttl_s
+
+
 def _unknown(definition: AreaDefinition, received: AreaHazard | None, stamp: float) -> AreaHazard:
     """Return the hazard of an area that nobody confirms to be clear, since `stamp`."""
+    penalty = definition.unknown.penalty
+    if received is not None and received.override is not None:
+        penalty = max(penalty, received.override.measured_penalty)
     return AreaHazard(
         area=definition.id,
         state="unknown",
-        severity=SEVERITY["unknown"],
-        penalty=definition.unknown.penalty,
+        severity=SEVERITY["unknown_after_blocked" if penalty >= LETHAL else "unknown"],
+        penalty=penalty,
         since=stamp if received else 0.0,
         seq=received.seq if received else 0,
         epoch=received.epoch if received else 0,

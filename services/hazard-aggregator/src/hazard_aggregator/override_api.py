@@ -1,0 +1,123 @@
+"""REST: operators' overrides of areas, `/api/v1/areas/{area_id}/override` (ADR 16)."""
+
+from fog_contracts.messages import Author, Count, Message, OverrideReason, OverrideState, Seconds, Stamp, TimeToLive
+from fog_runtime.clock import Clock
+from fog_runtime.http import (
+    Answer,
+    Body,
+    Caller,
+    IdempotencyKey,
+    IfMatch,
+    Operator,
+    ProblemError,
+    Routes,
+    attempt_of,
+    etag,
+    expected_version,
+)
+from fog_runtime.idempotency import IdempotencyError
+from hazard_aggregator.area_override import LONGEST_S, AreaOverride
+from hazard_aggregator.area_writer import ConflictError
+from hazard_aggregator.service import Service
+from hazard_aggregator.store import StoreError
+
+
+class OverrideBody(Message, frozen=True, kw_only=True):
+    """What an operator says of an area instead of its nodes, why, and for how long (`ttl_s`).
+
+    `blocked` for 30 days at most; `clear`, which needs an admin's token, for 15 minutes at most.
+    """
+
+    state: OverrideState
+    reason: OverrideReason
+    ttl_s: TimeToLive
+
+
+class OverrideView(Message, frozen=True, kw_only=True):
+    """An override in force; `rest_s` is the time until it ends."""
+
+    state: OverrideState
+    author: Author
+    reason: OverrideReason
+    set_at: Stamp
+    ttl_s: TimeToLive
+    rest_s: Seconds
+    version: Count
+
+
+def override_view(service: Service, area: str, now: float) -> OverrideView | None:
+    """Return the override of an area that is in force."""
+    override = service.core.overrides.get(area)
+    return None if override is None else _view(override, service.core.overrides.rest_s(area, now))
+
+
+def add_overrides(routes: Routes, service: Service, clock: Clock) -> None:
+    """Add the routes that set and remove overrides; `routes` knows the errors of areas and of the store."""
+
+    @routes.put(
+        "/api/v1/areas/{area_id}/override",
+        raises=[ConflictError, IdempotencyError, StoreError],
+        problems={404: "No area has this id"},
+    )
+    async def put_override(
+        area_id: str,
+        body: Body[OverrideBody],
+        caller: Operator,
+        if_match: IfMatch = None,
+        idempotency_key: IdempotencyKey = None,
+    ) -> Answer[OverrideView]:
+        """Override an area for a time; replies once it is durably stored.
+
+        Robots avoid a `blocked` area whatever its nodes measure. They may pass a `clear` one, at half speed.
+        """
+        _require_area(service, area_id)
+        _require_allowed(body, caller)
+        override = await service.overrides.put(
+            area_id,
+            body.state,
+            body.reason,
+            body.ttl_s,
+            caller.name,
+            expected=expected_version(if_match),
+            attempt=attempt_of(idempotency_key, caller, f"PUT /api/v1/areas/{area_id}/override", body),
+        )
+        rest_s = max(0.0, override.deadline - clock.now())
+        return Answer(_view(override, rest_s), etag(override.version))
+
+    @routes.delete(
+        "/api/v1/areas/{area_id}/override",
+        raises=[ConflictError, StoreError],
+        problems={404: "The area has no override"},
+    )
+    async def delete_override(area_id: str, caller: Operator) -> None:
+        """End an area's override: its nodes count again."""
+        if not await service.overrides.remove(area_id, caller.name):
+            raise ProblemError(404, f"area {area_id} has no override")
+
+
+def _require_area(service: Service, area: str) -> None:
+    if not any(known.id == area and not known.removed for known in service.core.definitions()):
+        raise ProblemError(404, f"there is no area {area}")
+
+
+def _require_allowed(body: OverrideBody, caller: Caller) -> None:
+    if body.state == "clear" and caller.role != "admin":
+        raise ProblemError(
+            403, f"to declare an area clear needs the role admin; {caller.name} has the role {caller.role}"
+        )
+    if body.ttl_s > (longest := LONGEST_S[body.state]):
+        raise ProblemError(
+            422, f"an area can be overridden as {body.state} for {longest:g} s at most", field="body.ttl_s"
+        )
+
+
+def _view(override: AreaOverride, rest_s: float) -> OverrideView:
+    return OverrideView(
+        state=override.state,
+        author=override.author,
+        reason=override.reason,
+        set_at=override.set_at,
+        ttl_s=override.ttl_s,
+        rest_s=rest_s,
+        version=override.version,
+    )

@@ -230,6 +230,7 @@ async def test_a_lidar_that_scans_or_is_silent_passes_the_check(tmp_path, comman
                 await asyncio.sleep(0.005)
                 device.receive(port.read(), time.monotonic())
                 port.write(device.outgoing(time.monotonic()))
+                edge.poll(time.monotonic())
         finally:
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)

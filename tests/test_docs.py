@@ -70,11 +70,12 @@ def test_the_steps_of_a_hazard_name_files_that_define_what_they_name() -> None:
     missing = []
     for step, files, names, _ in steps:
         sources = [(ROOT / "docs" / link).read_text("utf-8") for link in LINK.findall(files)]
-        for name in re.findall(r"`([\w.]+)`", names):
-            owner, _, member = name.rpartition(".")
+        for name in re.findall(r"`([\w.:]+)`", names):
+            owner, _, member = name.replace("::", ".").rpartition(".")
+            # A definition in Python, or in C++ a type before the name and arguments behind it.
+            defined = rf"^ *((async )?(def|class) {member}\b|(?!return )\w+ {member}\()"
             found = any(
-                re.search(rf"^ *(async )?(def|class) {member}\b", source, re.MULTILINE)
-                and (not owner or f"class {owner}" in source)
+                re.search(defined, source, re.MULTILINE) and (not owner or f"class {owner}" in source)
                 for source in sources
             )
             if not found:

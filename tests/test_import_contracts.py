@@ -47,6 +47,7 @@ EDGES = {
     "robot_agent.agent.settings", "robot_agent.agent.store", "robot_agent.guardian.__main__",
     "robot_agent.guardian.process", "robot_agent.guardian.watchdog", "robot_agent.port_names", "robot_agent.registry",
     "robot_agent.serial_port",
+    "fognav_sim.firmware", "fognav_sim.firmware_node", "fognav_sim.nodes",
     "fognav_sim.__main__", "fognav_sim.devices", "fognav_sim.live", "fognav_sim.planner_client", "fognav_sim.pty_port",
     "fognav_sim.robot_unit", "fognav_sim.settings",
 }  # fmt: skip

@@ -120,7 +120,7 @@ def run_tests(context: typer.Context, *, yes: Yes = False) -> None:
     from fognav import testing  # noqa: PLC0415  # keeps the other commands fast
 
     _prepare(yes=yes)
-    testing.get_browser(yes=yes, print_line=print_line)
+    testing.get_optional_tools(yes=yes, print_line=print_line)
     done = subprocess.run(testing.pytest_command(context.args), check=False, cwd=checkout.root())
     raise typer.Exit(done.returncode)
 

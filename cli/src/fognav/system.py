@@ -16,7 +16,7 @@ _INSTALL_TIMEOUT_S: Final = 600.0
 
 @dataclass(frozen=True)
 class Tool:
-    """A program: its possible names, the Debian package that contains it, and its purpose."""
+    """A program: its possible names, the Debian packages that contain it, and its purpose."""
 
     name: str
     executables: tuple[str, ...]
@@ -30,7 +30,14 @@ REDIS: Final = Tool("redis-server", ("redis-server",), "redis-server", "store of
 CHROMIUM: Final = Tool(
     "chromium", ("chromium", "chromium-browser", "google-chrome"), "chromium", "tests of the page", required=False
 )
-TOOLS: Final = (MOSQUITTO, REDIS, CHROMIUM)
+COMPILER: Final = Tool(
+    "g++", ("g++", "clang++"), "g++", "sensor nodes that run their firmware on this computer", required=False
+)
+BOARD_COMPILER: Final = Tool(
+    "xtensa-lx106-elf-g++", ("xtensa-lx106-elf-g++",), "gcc-xtensa-lx106 picolibc-xtensa-lx106-elf",
+    "compiling the firmware's core for the ESP8266", required=False,
+)  # fmt: skip
+TOOLS: Final = (MOSQUITTO, REDIS, CHROMIUM, COMPILER, BOARD_COMPILER)
 
 
 class MissingToolsError(RuntimeError):
@@ -100,7 +107,9 @@ class AptProvider:
         install = [*prefix, "apt-get", "install", "-y", "-q", "--no-install-recommends"]
         code, output = self._run([*prefix, "apt-get", "update", "-q"], environment)
         if code == 0:
-            code, output = self._run([*install, *(tool.package for tool in tools)], environment)
+            code, output = self._run(
+                [*install, *(name for tool in tools for name in tool.package.split())], environment
+            )
         if code != 0:
             last = "\n".join(output.strip().splitlines()[-8:])
             raise MissingToolsError(f"{self.command(tools)} failed with code {code}:\n{last}")

@@ -1,4 +1,4 @@
-"""How `fognav test` runs pytest: on all cores, with progress, and with a browser if one can be installed."""
+"""How `fognav test` runs pytest: on all cores, with progress, and with the optional programs that can be installed."""
 
 import os
 import sys
@@ -39,11 +39,14 @@ def pytest_command(arguments: Sequence[str], *, terminal: bool | None = None) ->
     return [*command, *arguments]
 
 
-def get_browser(*, yes: bool, print_line: Callable[[str], None]) -> None:
-    """Install a missing browser for the tests of the page, given consent; without a browser they are skipped."""
-    if system.find(system.CHROMIUM) is not None or not system.has_consent(yes):
+def get_optional_tools(*, yes: bool, print_line: Callable[[str], None]) -> None:
+    """Install, given consent, missing programs that some tests need; without them those tests are skipped."""
+    if not system.has_consent(yes):
         return
-    try:
-        system.ensure([system.CHROMIUM], yes=yes, print_line=print_line)
-    except system.MissingToolsError as error:
-        print_line(f"the tests of the page are skipped: {error}")
+    for tool in system.TOOLS:
+        if tool.required or system.find(tool) is not None:
+            continue
+        try:
+            system.ensure([tool], yes=yes, print_line=print_line)
+        except system.MissingToolsError as error:
+            print_line(f"skipping tests that need {tool.name} ({tool.purpose}): {error}")

@@ -278,6 +278,14 @@ def test_range_within_rounding_of_the_limit_takes_the_nodes_reported_state():
     assert rig.hazard.state == "unknown"
 
 
+def test_node_that_stays_blocked_a_little_beyond_the_limit_is_believed_but_not_farther():
+    rig = Rig(site("n1"))
+    rig.read(LIMIT + 0.045, 3.0, state="blocked", times=5)
+    assert rig.hazard.state == "blocked"
+    rig.read(LIMIT + 0.07, 3.0, state="blocked", times=5)
+    assert rig.hazard.state == "unknown"
+
+
 def test_no_echo_is_clear_only_where_calibration_found_nothing_in_range():
     free = Rig(site("n1", no_echo_is_clear=True))
     free.read(None, None, state="clear", times=5)

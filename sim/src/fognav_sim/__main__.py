@@ -20,7 +20,7 @@ from fognav_sim import devices
 from fognav_sim.floor import Floor
 from fognav_sim.hardware import Hardware
 from fognav_sim.live import LiveWorld, VirtualNode, run_nodes
-from fognav_sim.node import SonarNode
+from fognav_sim.nodes import make_nodes
 from fognav_sim.sensors import LidarPlace
 from fognav_sim.settings import Settings
 from fognav_sim.world import World
@@ -69,7 +69,7 @@ async def main() -> None:
                 async with asyncio.TaskGroup() as tasks:
                     tasks.create_task(live_world.run(), name="world")
                     tasks.create_task(live_world.publish_truth(edge, robot.id), name="truth")
-                    sonars = [SonarNode(node, boot, clock.now()) for node in loaded.site.nodes]
+                    sonars = make_nodes(loaded.site.nodes, boot, clock.now(), settings.nodes)
                     nodes = [VirtualNode(each, live_world, settings.mqtt_url, clock, site) for each in sonars]
                     tasks.create_task(run_nodes(nodes, clock), name="nodes")
                     while True:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from fog_runtime.clock import Clock
     from fog_runtime.zenoh_edge import ZenohEdge
     from fognav_sim.hardware import Hardware
-    from fognav_sim.node import SonarNode
+    from fognav_sim.nodes import SensorNode
 
 LOG_S: Final = 0.01
 CATCH_UP_S: Final = 0.25
@@ -174,7 +174,7 @@ class LiveWorld:
 class VirtualNode:
     """A simulated sensor node with its own MQTT connection, as a real one has."""
 
-    def __init__(self, sonars: SonarNode, live_world: LiveWorld, url: str, clock: Clock, site: str) -> None:
+    def __init__(self, sonars: SensorNode, live_world: LiveWorld, url: str, clock: Clock, site: str) -> None:
         self._sonars = sonars
         self._world = live_world
         self._clock = clock

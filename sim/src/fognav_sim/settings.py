@@ -1,6 +1,7 @@
 """Settings of the simulator."""
 
 from pathlib import Path
+from typing import Literal
 
 from fog_runtime.settings import CommonSettings
 
@@ -14,5 +15,8 @@ class Settings(CommonSettings, frozen=True, kw_only=True):
     run_dir: Path
     robot: str = ""
     """Id of the robot in `site.toml`; empty: the first."""
+    nodes: Literal["auto", "firmware", "model"] = "auto"
+    """What the sensor nodes run: the firmware's core, compiled for this computer, or a model of it in Python.
+    `auto`: the firmware where its sources and a C++ compiler are."""
     seed: int = 1
     truth_log: Path | None = None

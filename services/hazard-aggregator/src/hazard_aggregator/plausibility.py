@@ -26,6 +26,8 @@ MIN_RANGE: Final = 0.02
 """Below this range (m) an HC-SR04 measures its own ringing (datasheet: 2 cm to 4 m)."""
 LIMIT_TOLERANCE: Final = 0.01
 """A range this close (m) to the limit may be classified either way: node and aggregator round differently."""
+NODE_HYSTERESIS: Final = 0.05
+"""A node that is blocked stays so until its echo is this far (m) beyond the limit (the firmware's `kHysteresisMm`)."""
 
 
 class Classification(NamedTuple):
@@ -111,7 +113,7 @@ def classify_reading(site: NodeSite, reading: NodeReading, poses: Iterable[tuple
         return Classification("unknown", f"it reports {len(reading.range_m)} sonars, the site has {len(site.sonars)}")
     classified, fused = _fuse(site, reading, 0.0)
     if fused != reading.state:
-        for shift in (LIMIT_TOLERANCE, -LIMIT_TOLERANCE):
+        for shift in (LIMIT_TOLERANCE, -LIMIT_TOLERANCE, NODE_HYSTERESIS + LIMIT_TOLERANCE):
             other, other_fused = _fuse(site, reading, shift)
             if other_fused == reading.state:
                 classified, fused = other, other_fused

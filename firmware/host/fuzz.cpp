@@ -1,0 +1,71 @@
+// Feeds arbitrary bytes to the node: as a configuration, and as a program of edges, steps and commands. A fuzzer of LLVM
+// calls the first function; without one, `main` reads a file of inputs, each preceded by its length (32 bits, little-endian).
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "fognav_contract.h"
+#include "json_reader.hpp"
+#include "node.hpp"
+
+extern "C" int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size);
+
+int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
+    // Copies on the heap: a read beyond their ends is a fault that a sanitizer sees.
+    char* text = static_cast<char*>(malloc(size));
+    if (size > 0) memcpy(text, data, size);
+    fognav::NodeSettings settings;
+    settings.config.sonars = size == 0 ? 1 : 1 + data[0] % fognav::kMaxSonars;
+    settings.boot = static_cast<uint32_t>(size);
+    settings.firmware = "fuzz \"\\";
+    fognav::Node node(settings);
+    node.configure(text, size);
+    fognav::JsonReader(text, size).skip_value();
+    uint32_t now_us = 0;
+    for (size_t i = 0; i + 2 < size; i += 3) {
+        now_us += static_cast<uint32_t>(data[i + 1]) << (data[i + 2] % 16);
+        switch (data[i] % 8) {
+            case 0:
+                node.calibrate();
+                break;
+            case 1:
+                node.configure(text + i, size - i);
+                break;
+            case 2:
+            case 3:
+                node.on_edge(data[i + 2] % settings.config.sonars, data[i] % 2 != 0, now_us);
+                break;
+            case 4:
+                node.set_temperature(static_cast<int16_t>(data[i + 1] * 4 - 400));
+                break;
+            default:
+                if (node.step(now_us) != fognav::Node::Event::publish) break;
+                if (node.message_length() == 0 || node.message_length() >= FOGNAV_NODE_READING_LIMIT) abort();
+                if (node.message_length() != strlen(node.message())) abort();
+        }
+    }
+    free(text);
+    return 0;
+}
+
+#ifndef FOGNAV_LIBFUZZER
+int main(int count, char** arguments) {
+    FILE* file = count > 1 ? fopen(arguments[1], "rb") : nullptr;
+    if (file == nullptr) {
+        fprintf(stderr, "usage: fuzz FILE, inputs each preceded by its length\n");
+        return 2;
+    }
+    uint8_t length[4];
+    long inputs = 0;
+    for (; fread(length, 1, sizeof length, file) == sizeof length; ++inputs) {
+        const size_t size = length[0] | length[1] << 8 | length[2] << 16 | static_cast<size_t>(length[3]) << 24;
+        uint8_t* data = static_cast<uint8_t*>(malloc(size + 1));
+        if (fread(data, 1, size, file) != size) return 2;
+        LLVMFuzzerTestOneInput(data, size);
+        free(data);
+    }
+    fclose(file);
+    printf("%ld inputs\n", inputs);
+    return 0;
+}
+#endif

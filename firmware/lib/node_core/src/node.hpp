@@ -1,0 +1,91 @@
+// A sensor node without its board: measurement cycle, spike filter, classification, calibration and publishing. The edge
+// (src/ for a board, host/ for a computer) calls `step` in its loop, triggers the sonar that it names, passes the echo
+// lines' edges to `on_edge`, and publishes the message when there is one.
+#pragma once
+
+#include "calibration.hpp"
+#include "cycle.hpp"
+#include "messages.hpp"
+#include "publishing.hpp"
+#include "spike_filter.hpp"
+
+namespace fognav {
+
+// A reading of eight sonars with the longest name of a firmware has 380 characters.
+constexpr size_t kMessageSize = 512;
+
+struct NodeSettings {
+    NodeConfig config;
+    uint32_t boot = 0;  // random, new at each boot; 0 also switches the jitter of the pause off
+    PublishMode publish = PublishMode::on_change;
+    NoEchoSignature no_echo[kMaxSonars] = {};
+    const char* firmware = "";
+};
+
+class Node {
+public:
+    enum class Event : uint8_t {
+        none,
+        trigger,  // raise the trigger of sonar `sonar()` for kTriggerUs, at once
+        publish   // publish `message()`
+    };
+
+    explicit Node(const NodeSettings& settings);
+
+    // Take the next step at this time: micros(), 32 bits that wrap; call it at least once in 30 minutes.
+    Event step(uint32_t now_us);
+
+    // For the interrupt of a sonar's echo line.
+    void on_edge(int sonar, bool high, uint32_t now_us) { captures_[sonar].on_edge(high, now_us); }
+
+    int sonar() const { return cycle_.current(); }
+
+    // Written by the step that returned `publish`, valid until the next step.
+    const char* message() const { return message_; }
+    size_t message_length() const { return length_; }
+
+    // What the last cycle measured; the state is that of all sonars.
+    const Reading& reading() const { return reading_; }
+
+    // Apply a configuration (JSON); return nullptr, or what is wrong with it.
+    const char* configure(const char* text, size_t size);
+    const NodeConfig& config() const { return config_; }
+
+    // Tenths of a degree Celsius. Without a sensor of the temperature the node assumes 20 degrees, and is 0.2 % wrong per
+    // degree.
+    void set_temperature(int16_t temperature_dc) { temperature_dc_ = temperature_dc; }
+    void set_rssi(int16_t rssi) { reading_.rssi = rssi; }
+
+    // The connection has come back: readings go out as after a change.
+    void on_connected() { publish_.restart(); }
+
+    // Learn the limits anew. While it is under way the node's state is unknown: its sonars' way is to be kept free. When
+    // all sonars are done, their limits are in `config`, for the edge to store; a sonar that fails keeps its limit.
+    void calibrate();
+    bool calibrating() const { return calibrating_; }
+    CalibrationResult calibration(int sonar) const { return calibrations_[sonar].result(); }
+
+private:
+    void take(const Sample& sample);
+    Event finish();
+    void end_calibration();
+
+    NodeConfig config_;
+    NoEchoSignature no_echo_[kMaxSonars];
+    MeasurementCycle cycle_;
+    PublishPolicy publish_;
+    EchoCapture captures_[kMaxSonars];
+    SpikeFilter filters_[kMaxSonars];
+    State states_[kMaxSonars] = {};
+    Calibration calibrations_[kMaxSonars];
+    bool calibrating_ = false;
+    int16_t temperature_dc_ = 200;
+    bool started_ = false;
+    uint32_t seen_us_ = 0;
+    uint64_t uptime_us_ = 0;
+    Reading reading_;
+    char message_[kMessageSize];
+    size_t length_ = 0;
+};
+
+}  // namespace fognav

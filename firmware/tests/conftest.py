@@ -1,0 +1,77 @@
+"""The firmware's core, compiled once for all tests of the firmware."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from fog_contracts.site import NodeSite, Sonar
+from fognav_sim.firmware import Core, FirmwareError, build_library, find_compiler, find_firmware
+from fognav_sim.firmware_node import FirmwareNode
+
+SITE = NodeSite(id="n1", area="z1", x=0.0, y=0.0, theta=0.0, sonars=[Sonar(range_limit=2.0), Sonar(range_limit=2.5)])
+
+
+class Ranges:
+    """A stand-in for the world: the sonars measure the given ranges (m)."""
+
+    def __init__(self, *metres):
+        self.metres = metres
+
+    def sonar(self, _node, index):
+        return self.metres[index]
+
+
+@pytest.fixture(scope="session")
+def compiler():
+    try:
+        return find_compiler()
+    except FirmwareError as error:
+        pytest.skip(str(error))
+
+
+@pytest.fixture(scope="session")
+def library(compiler, tmp_path_factory):
+    return build_library(tmp_path_factory.mktemp("firmware"))
+
+
+@pytest.fixture(scope="session")
+def core(library):
+    return Core(library)
+
+
+@pytest.fixture(scope="session")
+def make_node(core):
+    """Make a node with two sonars that begins at 100 s."""
+
+    def make(**options):
+        return FirmwareNode(core, SITE, 7, 100.0, **options)
+
+    return make
+
+
+@pytest.fixture
+def run():
+    """Run a node for so many seconds in front of ranges; return its readings."""
+    moments = {}
+
+    def run(node, metres, seconds):
+        start = moments.get(id(node), 100.0)
+        moments[id(node)] = start + seconds
+        steps = range(1, round(seconds * 100) + 1)
+        return [reading for step in steps for reading in node.poll(Ranges(*metres), start + step * 0.01)]
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def firmware():
+    return find_firmware()
+
+
+@pytest.fixture(scope="session")
+def recordings():
+    folder = Path(os.environ.get("FOGNAV_DATA") or find_firmware().parents[1] / "shared" / "data")
+    if not folder.is_dir():
+        pytest.skip(f"no data: {folder} does not exist; FOGNAV_DATA names another folder")
+    return folder

@@ -1,0 +1,127 @@
+"""The core compiles for the board, and no input makes it fault."""
+
+import json
+import os
+import random
+import shutil
+import struct
+import subprocess
+
+import pytest
+
+INPUTS = int(os.environ.get("FOGNAV_FUZZ_INPUTS", "5000"))
+WARNINGS = ("-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Werror")
+BOARD = (
+    "-std=c++17",
+    "-Os",
+    "-mlongcalls",
+    "-ffreestanding",
+    "-fno-exceptions",
+    "-fno-rtti",
+    "-fno-threadsafe-statics",
+)
+BOARD_C_LIBRARY = "/usr/lib/xtensa-lx106-elf/include"
+
+
+def sources(firmware):
+    return sorted(str(file) for file in (firmware / "lib" / "node_core" / "src").glob("*.cpp"))
+
+
+def includes(firmware):
+    return [f"-I{firmware / 'include'}", f"-I{firmware / 'lib' / 'node_core' / 'src'}"]
+
+
+def run(*command):
+    done = subprocess.run(command, check=False, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def test_core_compiles_for_the_esp8266_without_a_standard_library(firmware, tmp_path):
+    compiler = shutil.which("xtensa-lx106-elf-g++")
+    if compiler is None:
+        pytest.skip("no xtensa-lx106-elf-g++: apt-get install gcc-xtensa-lx106 picolibc-xtensa-lx106-elf")
+    objects = []
+    for source in sources(firmware):
+        objects.append(str(tmp_path / f"{len(objects)}.o"))
+        run(
+            compiler,
+            *BOARD,
+            *WARNINGS,
+            "-isystem",
+            BOARD_C_LIBRARY,
+            *includes(firmware),
+            "-c",
+            source,
+            "-o",
+            objects[-1],
+        )
+    undefined = run("xtensa-lx106-elf-nm", "--undefined-only", *objects)
+    defined = run("xtensa-lx106-elf-nm", "--defined-only", *objects)
+    names = {line.split()[-1] for line in defined.splitlines() if len(line.split()) == 3}
+    foreign = {line.split()[-1] for line in undefined.splitlines() if line.strip().startswith("U ")} - names
+    # Only what the board's C library and the compiler's own have: no heap, no C++ runtime.
+    assert {name for name in foreign if not name.startswith("__")} <= {"memcmp", "memcpy", "memset", "strlen"}
+    sizes = run("xtensa-lx106-elf-size", "--totals", *objects).splitlines()[-1].split()
+    assert int(sizes[0]) < 16 * 1024
+    assert int(sizes[1]) + int(sizes[2]) == 0, "the core has no variables of its own"
+
+
+def test_no_input_makes_the_node_fault(firmware, compiler, tmp_path):
+    program, inputs = tmp_path / "fuzz", tmp_path / "inputs"
+    sanitizers = (
+        "-g",
+        "-O1",
+        "-fsanitize=address,undefined",
+        "-fno-sanitize-recover=all",
+        "-fno-exceptions",
+        "-fno-rtti",
+    )
+    source = str(firmware / "host" / "fuzz.cpp")
+    run(
+        compiler,
+        "-std=c++17",
+        *sanitizers,
+        *WARNINGS,
+        *includes(firmware),
+        *sources(firmware),
+        source,
+        "-o",
+        str(program),
+    )
+    chance = random.Random(int(os.environ.get("FOGNAV_SEED", "1")))
+    with inputs.open("wb") as file:
+        for _ in range(INPUTS):
+            data = fuzzed(chance)
+            file.write(struct.pack("<I", len(data)) + data)
+    assert run(str(program), str(inputs)) == f"{INPUTS} inputs\n"
+
+
+def fuzzed(chance):
+    """A configuration with a few bytes changed, bytes at random, or a program of many steps and edges."""
+    kind = chance.randrange(3)
+    if kind == 0:
+        nested = {"a": [1, {"b": None}], "": -1.5e-3}
+        config = {
+            "version": 1,
+            "range_limit_m": [1.5, 2],
+            "no_echo_is_clear": [True, False],
+            "pause_ms": 50,
+            "x": nested,
+        }
+        data = bytearray(json.dumps(config).encode())
+        for _ in range(chance.randrange(6)):
+            data[chance.randrange(len(data))] = chance.randrange(256)
+        return bytes(data[: chance.randrange(len(data) + 1)] if chance.random() < 0.3 else data)
+    if kind == 1:
+        return chance.randbytes(chance.randrange(600))
+    # Steps (5) with small times, edges (2, 3) of the sonars, now and then a calibration (0).
+    program = (
+        (
+            chance.choice((5, 5, 5, 5, 2, 3)) if chance.random() < 0.995 else 0,
+            chance.randrange(256),
+            chance.choice((2, 4, 6)),
+        )
+        for _ in range(3000)
+    )
+    return bytes(byte for step in program for byte in step)

@@ -1,0 +1,186 @@
+"""The firmware's node measures, classifies and publishes as the contract says, and as the model in Python does."""
+
+import itertools
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fog_contracts.channels import NODE_READING
+from fog_contracts.codec import decode, encode
+from fog_contracts.messages import NodeConfig, NodeReading
+from fog_contracts.site import NodeSite, Sonar
+from fognav_sim.firmware_node import FirmwareNode
+from fognav_sim.node import SonarNode, classify, default_config
+
+SITE = NodeSite(id="n1", area="z1", x=0.0, y=0.0, theta=0.0, sonars=[Sonar(range_limit=2.0), Sonar(range_limit=2.5)])
+RANGE = st.none() | st.floats(0.05, 4.0)
+
+
+@pytest.mark.parametrize("metres", [(2.0, 2.0), (3.0, 3.0), (2.2, None), (None, None)])
+def test_node_measures_eight_to_ten_times_a_second_with_and_without_echoes(make_node, run, metres):
+    assert 7.9 <= len(run(make_node(), metres, 20.0)) / 20.0 <= 10.0
+
+
+def test_readings_have_consecutive_numbers_and_true_uptimes_and_fit_the_channel(make_node, run):
+    published = run(make_node(), (2.2, 2.7), 5.0)
+    assert [reading.seq for reading in published] == list(range(len(published)))
+    uptimes = [reading.uptime_ms for reading in published]
+    assert uptimes == sorted(uptimes)
+    assert uptimes[-1] == pytest.approx(5000, abs=150)
+    assert {reading.boot for reading in published} == {7}
+    assert all(decode(NODE_READING, encode(NODE_READING, reading), NodeReading) == reading for reading in published)
+
+
+def test_uptime_goes_on_when_the_clock_of_32_bits_wraps(make_node, run):
+    node = make_node(every_reading=False)
+    run(node, (3.0, 3.0), 1.0)
+    node._now_us += 2**32 - 3_000_000  # the board's clock is about to wrap, and nobody was asked to measure until now
+    node._start -= (2**32 - 3_000_000) / 1e6
+    uptimes = [reading.uptime_ms for reading in run(node, (3.0, 3.0), 6.0)]
+    assert uptimes[-1] - uptimes[0] == pytest.approx(6000, abs=1100)
+    assert uptimes == sorted(uptimes)
+
+
+@settings(deadline=None, max_examples=60)
+@given(metres=st.tuples(RANGE, RANGE), silent=st.tuples(st.booleans(), st.booleans()))
+def test_steady_ranges_are_classified_as_by_the_model(core, metres, silent):
+    sonars = [Sonar(range_limit=2.0, no_echo_is_clear=silent[0]), Sonar(range_limit=2.5, no_echo_is_clear=silent[1])]
+    site = NodeSite(id="n1", area="z1", x=0.0, y=0.0, theta=0.0, sonars=sonars)
+    world = type("World", (), {"sonar": lambda _self, _node, index: metres[index]})()
+    node, model = FirmwareNode(core, site, 7, 0.0), SonarNode(site, 7, 0.0)
+    last = [reading for step in range(150) for reading in node.poll(world, step * 0.01)][-1]
+    expected = [reading for step in range(150) for reading in model.poll(world, step * 0.01)][-1]
+    assert last.status == expected.status
+    for ours, theirs in zip(last.range_m, expected.range_m, strict=True):
+        assert (ours is None) == (theirs is None)
+        # A clock of a microsecond and the speed of sound at 20 degrees, which the model rounds: 3 mm in 4 m.
+        assert ours is None or ours == pytest.approx(theirs, abs=0.008)
+    assert last.state == classify(last.range_m, default_config(site))
+
+
+@pytest.mark.parametrize("spike", [0.4, None, 0.01])
+def test_single_spike_never_changes_what_is_reported(make_node, run, spike):
+    """Every fifth measurement of one sonar is a spike."""
+    measured = itertools.count()
+
+    class World:
+        def sonar(self, _node, index):
+            return spike if index == 0 and next(measured) % 5 == 4 else 3.0
+
+    node = make_node()
+    published = [reading for step in range(1, 1000) for reading in node.poll(World(), 100.0 + step * 0.01)]
+    assert len(published) > 80
+    assert {(reading.state, *reading.range_m, *reading.status) for reading in published} == {
+        ("clear", 3.004, 3.004, "ok", "ok")
+    }
+
+
+def test_real_change_is_reported_with_its_second_measurement(make_node, run):
+    node = make_node()
+    run(node, (3.0, 3.0), 3.0)
+    states = [reading.state for reading in run(node, (1.0, 3.0), 1.0)]
+    assert states.index("blocked") == 1
+    assert set(states[1:]) == {"blocked"}
+
+
+def test_obstacle_at_the_limit_does_not_flap(make_node, run):
+    node = make_node()
+    run(node, (1.98, 3.0), 1.0)
+    states = {reading.state for metres in (2.02, 1.99, 2.03, 2.0) * 5 for reading in run(node, (metres, 3.0), 0.3)}
+    assert states == {"blocked"}
+    assert run(node, (2.06, 3.0), 0.6)[-1].state == "clear"
+
+
+def test_silence_is_clear_only_where_it_was_calibrated(make_node, run):
+    assert run(make_node(), (None, 3.0), 2.0)[-1].state == "unknown"
+    node = make_node()
+    config = NodeConfig(version=1, range_limit_m=[2.0, 2.5], no_echo_is_clear=[True, True])
+    assert node.configure(config)
+    assert run(node, (None, None), 2.0)[-1].state == "clear"
+
+
+def test_sonar_without_an_answer_is_stuck_and_unknown(core):
+    node = FirmwareNode(core, SITE, 7, 0.0)
+    # Nothing moves the echo lines.
+    node._trigger = lambda _world: None
+    published = [reading for step in range(300) for reading in node.poll(None, step * 0.01)]
+    assert published[-1].status == ["stuck", "stuck"]
+    assert {reading.state for reading in published} == {"unknown"}
+
+
+def test_leak_of_the_trigger_and_bounces_are_no_echoes(core):
+    node = FirmwareNode(core, SITE, 7, 0.0)
+
+    def trigger(_world):
+        sonar, now = core.sonar(node._node), node._now_us
+        flight = round(2 * 3.0 / 343.42 * 1e6)
+        leak = [(now + 10, sonar, 1), (now + 60, sonar, 0)]
+        bounce = [(now + 300, sonar, 1), (now + 320, sonar, 0)]
+        node._edges = [*leak, *bounce, (now + 450, sonar, 1), (now + 450 + flight, sonar, 0)]
+
+    node._trigger = trigger
+    published = [reading for step in range(300) for reading in node.poll(None, step * 0.01)]
+    assert {tuple(reading.range_m) for reading in published} == {(3.0, 3.0)}
+
+
+@pytest.mark.parametrize(("tenths", "metres"), [(-200, 2.787), (0, 2.894), (200, 3.0), (400, 3.106)])
+def test_range_follows_the_temperature(core, run, make_node, tenths, metres):
+    node = make_node()
+    core.temperature(node._node, tenths)
+    measured = run(node, (3.0, 3.0), 2.0)[-1].range_m[0]
+    assert measured == pytest.approx(metres, abs=0.006)
+
+
+def test_saving_air_publishes_ten_readings_after_a_change_and_then_one_a_second(make_node, run):
+    node = make_node(every_reading=False)
+    run(node, (3.0, 3.0), 5.0)
+    quiet = run(node, (3.0, 3.0), 20.0)
+    assert 18 <= len(quiet) <= 21
+    changed = run(node, (1.0, 3.0), 10.0)
+    blocked = [reading.uptime_ms for reading in changed if reading.state == "blocked"]
+    gaps = [later - earlier for earlier, later in itertools.pairwise(blocked)]
+    assert all(gap < 150 for gap in gaps[:9])
+    assert all(900 < gap < 1200 for gap in gaps[10:])
+
+
+@pytest.mark.parametrize("again", ["connected", "configure"])
+def test_readings_go_out_as_after_a_change_when_connection_or_configuration_is_new(core, make_node, run, again):
+    node = make_node(every_reading=False)
+    run(node, (3.0, 3.0), 5.0)
+    if again == "connected":
+        core.connected(node._node)
+    else:
+        assert node.configure(NodeConfig(version=2, range_limit_m=[2.0, 2.5], no_echo_is_clear=[False, False]))
+    assert len(run(node, (3.0, 3.0), 1.3)) >= 10
+
+
+@pytest.mark.parametrize(
+    ("free", "learned"),
+    [
+        ((3.0, 3.5), [("calibrated", 2.8, 0), ("calibrated", 3.3, 0)]),
+        ((None, 3.5), [("calibrated", 4.0, 1), ("calibrated", 3.3, 0)]),
+        ((0.45, 3.5), [("its free distance", 2.0, 0), ("calibrated", 3.3, 0)]),
+    ],
+)
+def test_calibration_learns_the_free_distance(core, make_node, run, free, learned):
+    node = make_node()
+    run(node, (3.0, 3.0), 1.0)
+    node.calibrate()
+    assert {reading.state for reading in run(node, free, 2.0)} == {"unknown"}
+    run(node, free, 10.0)
+    assert not core.calibrating(node._node)
+    for sonar, (words, limit, silent) in enumerate(learned):
+        assert core.describe_calibration(core.calibration(node._node, sonar)).decode().startswith(words)
+        assert core.limit_mm(node._node, sonar) / 1000 == pytest.approx(limit, abs=0.02)
+        assert core.no_echo_is_clear(node._node, sonar) == silent
+
+
+def test_calibration_refuses_a_sonar_that_is_disturbed(core, make_node, run):
+    node = make_node()
+    node.calibrate()
+    for step in range(60):
+        run(node, (3.0 if step % 2 else 1.5, 3.0), 0.2)
+    assert not core.calibrating(node._node)
+    assert b"unsteady" in core.describe_calibration(core.calibration(node._node, 0))
+    assert core.limit_mm(node._node, 0) == 2000

@@ -1,0 +1,92 @@
+"""A sensor node that runs the firmware's own code: the simulated world moves its echo lines. Pure but for the library.
+
+The core is stepped once in a millisecond, as the loop of a board would at least; edges of the echo lines have their
+exact times.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from typing import TYPE_CHECKING, Final
+
+import msgspec
+
+from fog_contracts.messages import NodeReading
+from fognav_sim.firmware import Sonar
+from fognav_sim.node import default_config
+from fognav_sim.sensors import SOUND_M_S
+
+if TYPE_CHECKING:
+    from fog_contracts.messages import NodeConfig
+    from fog_contracts.site import NodeSite
+    from fognav_sim.firmware import Core
+    from fognav_sim.world import World
+
+FIRMWARE: Final = b"host-1"
+STEP_US: Final = 1000
+BURST_US: Final = 450
+"""From trigger to the rise of the echo line: eight periods of 40 kHz and the module's own delay (HC-SR04)."""
+NO_ECHO_US: Final = 38_000
+_RSSI_DBM: Final = -55
+_TRIGGER: Final = 1
+_PUBLISH: Final = 2
+_US: Final = 1_000_000
+
+
+class FirmwareNode:
+    """One sensor node of the site; the same interface as `SonarNode`, the model in Python."""
+
+    def __init__(self, core: Core, node: NodeSite, boot: int, start: float, *, every_reading: bool = True) -> None:
+        self.node = node
+        self.config = default_config(node)
+        limits = zip(self.config.range_limit_m, self.config.no_echo_is_clear, strict=True)
+        sonars = [Sonar(round(limit * 1000), int(silent)) for limit, silent in limits]
+        self._core = core
+        self._node = core.new(
+            (Sonar * len(sonars))(*sonars), len(sonars), boot, self.config.pause_ms, int(every_reading), FIRMWARE
+        )
+        core.rssi(self._node, _RSSI_DBM)
+        self._start = start
+        self._now_us = 0
+        self._edges: list[tuple[int, int, int]] = []
+
+    def __del__(self) -> None:
+        self._core.free(self._node)
+
+    def configure(self, config: NodeConfig) -> bool:
+        """Apply a configuration; return False if it is for another number of sonars, and ignore it."""
+        text = msgspec.json.encode(config)
+        if self._core.configure(self._node, text, len(text)) is not None:
+            return False
+        self.config = config
+        return True
+
+    def calibrate(self) -> None:
+        """Learn the limits anew; the node's state is unknown meanwhile."""
+        self._core.calibrate(self._node)
+
+    def poll(self, world: World, now: float) -> list[NodeReading]:
+        """Run the firmware up to `now` (s); return the readings that it published, oldest first."""
+        until = round((now - self._start) * _US)
+        if until - self._now_us > _US:
+            # The simulation paused: a node does not catch up on readings that it missed.
+            self._now_us = until
+        readings: list[NodeReading] = []
+        while self._now_us <= until:
+            while self._edges and self._edges[0][0] <= self._now_us:
+                at, sonar, high = self._edges.pop(0)
+                self._core.edge(self._node, sonar, high, ctypes.c_uint32(at))
+            event = self._core.step(self._node, ctypes.c_uint32(self._now_us))
+            if event == _TRIGGER:
+                self._trigger(world)
+            elif event == _PUBLISH:
+                readings.append(msgspec.json.decode(self._core.message(self._node), type=NodeReading))
+            self._now_us += STEP_US
+        return readings
+
+    def _trigger(self, world: World) -> None:
+        sonar = self._core.sonar(self._node)
+        measured = world.sonar(self.node, sonar)
+        flight_us = NO_ECHO_US if measured is None else round(2 * measured / SOUND_M_S * _US)
+        rise = self._now_us + BURST_US
+        self._edges = [(rise, sonar, 1), (rise + flight_us, sonar, 0)]

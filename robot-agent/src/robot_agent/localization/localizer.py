@@ -172,6 +172,12 @@ class Localizer:
         """Pose in `odom` at a time (s), interpolated; extrapolated by at most 0.15 s. None before the first."""
         return self._odometry.pose(timestamp)
 
+    def odom_poses(
+        self, times: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return x, y (m) and theta (rad) in `odom` at times (n; s), as `odom_at` does; there must be a pose."""
+        return self._odometry.poses(times)
+
     def pose(self, timestamp: float) -> Pose2 | None:
         """Pose in `map` at a time (s) not older than 3 s; None while it is unknown."""
         odom = self._odometry.pose(timestamp)

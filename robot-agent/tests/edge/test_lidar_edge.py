@@ -215,7 +215,9 @@ async def test_lidar_commands_are_not_sent_to_a_base_on_the_lidars_port(tmp_path
         device.base.receive(make_base(default_robot()).wake(), time.monotonic())
     with PtyPort(tmp_path / "lidar") as port:
         check = partial(LineCheck, str(port.path), "rplidar-a1", signatures())
-        edge = LidarEdge(str(port.path), RplidarA1Driver(), SystemClock(), lambda _: None, lambda *_: None, check=check)
+        edge = LidarEdge(
+            str(port.path), RplidarA1Driver(), SystemClock(), lambda *_: None, lambda *_: None, check=check
+        )
         task = asyncio.create_task(edge.run())
         try:
             end = time.monotonic() + DEADLINE_S
@@ -241,7 +243,7 @@ async def test_a_lidar_that_scans_or_is_silent_passes_the_check(tmp_path, comman
             str(port.path),
             RplidarA1Driver(),
             SystemClock(),
-            lambda _: None,
+            lambda *_: None,
             lambda scan, _: scans.append(scan),
             check=check,
         )
@@ -261,6 +263,6 @@ async def test_a_lidar_that_scans_or_is_silent_passes_the_check(tmp_path, comman
 
 @pytest.mark.live
 async def test_a_port_named_by_its_number_ends_the_agent_with_the_remedy():
-    edge = LidarEdge("/dev/ttyUSB7", RplidarA1Driver(), SystemClock(), lambda _: None, lambda *_: None)
+    edge = LidarEdge("/dev/ttyUSB7", RplidarA1Driver(), SystemClock(), lambda *_: None, lambda *_: None)
     with pytest.raises(SettingsError, match=r"lidar.port: /dev/ttyUSB7 .*/dev/serial/by-id"):
         await edge.run()

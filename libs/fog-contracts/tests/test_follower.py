@@ -1,4 +1,4 @@
-"""Following the map over a network that loses, duplicates, delays, reorders and damages, from a writer that restarts.
+"""Following the map over a network that loses, duplicates, delays, reorders and damages, from writers that take over.
 
 `FOGNAV_HISTORIES` sets how many random histories are tried.
 """
@@ -16,15 +16,15 @@ from msgspec.structs import replace
 from fog_contracts.follower import GRACE_S, MapFollower
 from fog_contracts.grid import GridGeometry, Window
 from fog_contracts.messages import Cause, Trace
-from fog_contracts.replica import MapError, MasterMap, TileHashes
+from fog_contracts.replica import MapError, MasterMap, TileHashes, Version, plan_hash
 
 HISTORIES = int(os.environ.get("FOGNAV_HISTORIES", "200"))
 WIDTH, HEIGHT = 70, 12  # two tiles
 HEARTBEAT_S = 0.1
 
 
-def master(epoch=10, seed=0):
-    geometry = GridGeometry(WIDTH, HEIGHT, 0.05, -1.0, 2.0)
+def master(epoch=10, seed=0, origin_x=-1.0):
+    geometry = GridGeometry(WIDTH, HEIGHT, 0.05, origin_x, 2.0)
     static = np.random.default_rng(seed).choice(np.array([0, 254, 255], dtype=np.uint8), geometry.shape)
     return MasterMap("lab", geometry, static, static, epoch)
 
@@ -42,11 +42,17 @@ def write(writer, seed, layers=("cost",), name="z"):
 
 
 def cells(writer):
-    return {layer: grid.copy() for layer, grid in writer.layers.items()}
+    return {layer: grid.copy() for layer, grid in [*writer.layers.items(), ("static", writer.static)]}
 
 
 def replica_cells(follower):
     return {"cost": follower.replica.cost, "speed": follower.replica.speed}
+
+
+def take_over(writer, epochs, seq):
+    """Let another writer with the same map go on: it has counted the same changes from another number on."""
+    writer._version = Version(writer.version.epoch, seq, writer.version.hash)
+    writer.set_epoch(writer.version.epoch + epochs)
 
 
 class Network:
@@ -56,17 +62,26 @@ class Network:
         self.now = 50.0
         self.writer = master(epoch=1000)
         self.follower = MapFollower()
-        self.history = {self.writer.version: cells(self.writer)}
+        self.history = {}
+        self.remember()
         self.deltas, self.heartbeats, self.snapshots = [], [], []
 
     def write(self, seed, layers):
         self.deltas += write(self.writer, seed, layers)
-        self.history[self.writer.version] = cells(self.writer)
+        self.remember()
 
-    def restart(self, epochs, seed):
+    def remember(self):
+        self.history[self.writer.version] = self.writer.geometry, cells(self.writer)
+
+    def restart(self, epochs, seed, origin_x=-1.0):
         """Start another writer, which replaces the former one: its epoch is higher."""
-        self.writer = master(max(version.epoch for version in self.history) + epochs, seed)
-        self.history[self.writer.version] = cells(self.writer)
+        self.writer = master(max(version.epoch for version in self.history) + epochs, seed, origin_x)
+        self.remember()
+
+    def take_over(self, epochs, seq):
+        """Let a writer with the same map replace the former one."""
+        take_over(self.writer, epochs, seq)
+        self.remember()
 
     def send_heartbeat(self):
         self.heartbeats.append((self.now, self.writer.heartbeat(self.now)))
@@ -90,8 +105,8 @@ class Network:
         match step:
             case ("write", seed, layers):
                 self.write(seed, layers)
-            case ("restart", epochs, seed):
-                self.restart(epochs, seed)
+            case ("restart" | "take over" as kind, *change):
+                (self.restart if kind == "restart" else self.take_over)(*change)
             case ("send heartbeat",):
                 self.send_heartbeat()
             case ("deliver heartbeat", n):
@@ -135,12 +150,13 @@ class Network:
             assert not follower.up_to_date
             return
         assert follower.version in self.history
-        assert all(
-            np.array_equal(replica_cells(follower)[layer], grid)
-            for layer, grid in self.history[follower.version].items()
-        )
+        geometry, layers = self.history[follower.version]
+        found = {**replica_cells(follower), "static": follower.replica.static}
+        assert follower.replica.geometry == geometry
+        assert all(np.array_equal(found[layer], grid) for layer, grid in layers.items())
         if follower.up_to_date:
-            assert TileHashes(replica_cells(follower)).value == follower.version.hash
+            plan = plan_hash(geometry, follower.replica.static)
+            assert TileHashes(replica_cells(follower), plan).value == follower.version.hash
             assert follower.gap(now) == 0.0
         if follower.version == self.writer.version:
             assert not follower.wants_snapshot(now), "nothing is missing"
@@ -171,6 +187,8 @@ STEPS = st.lists(
             st.sampled_from([("cost",), ("speed",), ("cost", "speed"), ("cost", "cost", "cost")]),
         ),
         st.tuples(st.just("restart"), st.sampled_from([1, 1, 3]), st.integers(0, 2**32)),
+        st.tuples(st.just("restart"), st.just(1), st.sampled_from([0, 7]), st.just(-2.0)),
+        st.tuples(st.just("take over"), st.sampled_from([1, 2]), st.sampled_from([0, 1, 2, 5])),
         st.tuples(st.just("send heartbeat")),
         st.tuples(st.just("deliver heartbeat"), POSITIONS),
         st.tuples(st.just("deliver"), POSITIONS),
@@ -221,6 +239,28 @@ def test_follower_that_receives_every_delta_never_wants_another_snapshot(writes)
         assert follower.version == network.writer.version
         if with_heartbeat or deltas:
             assert follower.age(network.now) == 0.0
+
+
+@settings(max_examples=max(20, HISTORIES // 10), deadline=None)
+@given(steps=st.lists(st.one_of(st.integers(0, 2**32), st.tuples(st.integers(1, 3), st.integers(0, 9))), max_size=20))
+def test_follower_goes_on_without_a_snapshot_at_takeovers_that_lose_no_change(steps):
+    network = Network()
+    follower = network.follower
+    follower.on_snapshot(network.writer.snapshot(), network.now)
+    for step in steps:
+        network.wait(HEARTBEAT_S)
+        if isinstance(step, tuple):
+            network.take_over(*step)
+        else:
+            network.write(step, ("cost", "speed"))
+            deltas, network.deltas = network.deltas, []
+            for delta in deltas:
+                follower.on_delta(delta, network.now)
+        follower.on_heartbeat(network.writer.heartbeat(network.now), network.now)
+        network.check()
+        assert (follower.up_to_date, follower.version) == (True, network.writer.version)
+        assert not follower.wants_snapshot(network.now)
+        assert follower.age(network.now) == 0.0
 
 
 def loaded_follower(writer, now=0.0, **options):
@@ -365,6 +405,21 @@ def test_writer_with_a_higher_epoch_is_followed_at_once():
     follower.on_snapshot(restarted.snapshot(), 1.1)
     follower.on_heartbeat(restarted.heartbeat(0.0), 1.2)
     assert follower.age(1.2) == 0.0
+
+
+def test_writer_that_takes_over_with_another_floor_plan_or_place_has_another_map():
+    writer = master(epoch=10)
+    for other in (master(epoch=11, origin_x=-1.05), master(epoch=11, seed=3)):
+        same_cells = MasterMap("lab", other.geometry, other.static, writer.layers["cost"], 11)
+        follower = loaded_follower(writer)
+        follower.on_heartbeat(same_cells.heartbeat(0.0), 1.0)
+        assert follower.wants_snapshot(1.0)
+
+
+def test_copy_is_renamed_only_to_a_version_with_its_hash():
+    follower = loaded_follower(master(epoch=10))
+    with pytest.raises(ValueError, match="under another name"):
+        follower.replica.rename(Version(11, 0, 1))
 
 
 def test_late_heartbeat_of_a_replaced_writer_is_ignored():

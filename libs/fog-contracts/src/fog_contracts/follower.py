@@ -22,6 +22,9 @@ class MapFollower:
     The newest version is the highest that a heartbeat, a delta or a snapshot announced: higher epoch first, then higher
     seq. It never goes back: a writer with a lower epoch was replaced (`fog_contracts.fencing`).
 
+    A map-service that takes over has another epoch, and usually the same map: as its hash proves that, the copy goes on
+    under its new name, without a snapshot.
+
     Deltas that can't be applied yet are held, the latest `max_held` of them, and applied as soon as the missing ones
     or a snapshot arrive.
     """
@@ -53,6 +56,7 @@ class MapFollower:
         announced = Version(heartbeat.epoch, heartbeat.seq, heartbeat.hash)
         if self._newest is None or _order(announced) >= _order(self._newest):
             self._newest = announced
+            self._continue_with(announced)
         self._update_freshness(now, confirmed=announced == self._newest)
 
     def on_snapshot(self, snapshot: MapSnapshot | DecodedMap, now: float) -> Applied:
@@ -112,6 +116,15 @@ class MapFollower:
         return self._replica.version
 
     # --- Internals --------------------------------------------------------------------------------------------------
+
+    def _continue_with(self, newest: Version) -> None:
+        """Follow another writer's history with the copy as it is, if that one's newest version is the same map."""
+        version = self._replica.version
+        if version is None or self._replica.needs_snapshot or newest.epoch <= version.epoch:
+            return
+        if newest.hash == version.hash:
+            self._replica.rename(newest)
+            self._held = {key: delta for key, delta in self._held.items() if key[:2] > _order(newest)}
 
     def _hold(self, delta: MapDelta, newest: Version) -> None:
         version = self._replica.version

@@ -1,11 +1,13 @@
 """Versioned copies of the master costmap: one writer, many replicas, and a hash that proves them equal.
 
 Every version is named by `epoch, seq, hash`. The epoch changes when the writer starts, the seq grows by one with each
-change, and the hash is over both layers. It combines the hashes of 64 x 64 tiles by XOR, so that a change needs only
-the hashes of its tiles; each tile's hash is keyed by layer and tile number, so that equal tiles don't cancel out.
+change, and the hash is over geometry, floor plan and both layers: versions with the same hash are the same map. It
+combines the hashes of 64 x 64 tiles by XOR, so that a change needs only the hashes of its tiles; each tile's hash is
+keyed by layer and tile number, so that equal tiles don't cancel out.
 """
 
 import hashlib
+import struct
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -62,15 +64,23 @@ def _unpack(packing: Packing, data: bytes, shape: tuple[int, int], subject: str)
     return np.frombuffer(data, dtype=np.uint8).reshape(shape)
 
 
-class TileHashes:
-    """The hash of a map, updated by recomputing changed tiles only."""
+def plan_hash(geometry: GridGeometry, static: Grid) -> int:
+    """Return a 63-bit hash of what never changes of a map: its geometry and its floor plan."""
+    g = geometry
+    place = struct.pack("<2Q3d", g.width, g.height, g.resolution, g.origin_x, g.origin_y)
+    digest = hashlib.blake2b(np.ascontiguousarray(static).data, digest_size=8, key=place)
+    return int.from_bytes(digest.digest(), "little") >> 1
 
-    def __init__(self, layers: Mapping[Layer, Grid]) -> None:
+
+class TileHashes:
+    """The hash of a map, updated by recomputing changed tiles only; `plan` is its `plan_hash`."""
+
+    def __init__(self, layers: Mapping[Layer, Grid], plan: int = 0) -> None:
         height, width = layers[LAYERS[0]].shape
         self._columns = -(-width // TILE)
         self._rows = -(-height // TILE)
         self._tiles = {layer: np.zeros((self._rows, self._columns), dtype=np.uint64) for layer in LAYERS}
-        self.value = 0
+        self.value = plan
         for layer in LAYERS:
             self.update(layer, layers[layer], Window(0, 0, width, height))
 
@@ -109,7 +119,7 @@ class MasterMap:
         self.geometry = geometry
         self.static = static
         self.layers: dict[Layer, Grid] = {"cost": cost.copy(), "speed": np.zeros(geometry.shape, dtype=np.uint8)}
-        self._hashes = TileHashes(self.layers)
+        self._hashes = TileHashes(self.layers, plan_hash(geometry, static))
         self._version = Version(epoch, 0, self._hashes.value)
         self._snapshot: Later[MapSnapshot] | None = None
         self._static_packed: bytes | None = None
@@ -170,7 +180,7 @@ class MasterMap:
         ]
 
     def set_epoch(self, epoch: int) -> None:
-        """Continue as another history, with the same cells: readers fetch a snapshot of it."""
+        """Continue as another history, with the same cells: readers that have them go on with it."""
         self._version = Version(epoch, self._version.seq, self._version.hash)
         self._snapshot = None
 
@@ -283,7 +293,7 @@ def decode_map(snapshot: MapSnapshot) -> DecodedMap:
         "speed": _unpack("zlib", snapshot.speed, geometry.shape, "the speed layer").copy(),
     }
     static = _unpack("zlib", snapshot.static, geometry.shape, "the static layer")
-    hashes = TileHashes(layers)
+    hashes = TileHashes(layers, plan_hash(geometry, static))
     if hashes.value != snapshot.hash:
         raise MapError("the snapshot's cells don't have its hash: it was damaged in transit")
     version = Version(snapshot.epoch, snapshot.seq, snapshot.hash)
@@ -340,6 +350,13 @@ class Replica:
         if len(self._parts) < delta.parts:
             return "waiting"
         return self._complete(delta)
+
+    def rename(self, version: Version) -> None:
+        """Take the copy for another history's version, with which it has the hash in common: it is the same map."""
+        if self.version is None or self.needs_snapshot or self.version.hash != version.hash:
+            raise ValueError(f"{version} is not the version of this copy, {self.version}, under another name")
+        self.version = version
+        self._parts = {}
 
     def invalidate(self) -> None:
         """Accept no more deltas until a snapshot arrives: the copy is not of the writer's history."""

@@ -32,7 +32,8 @@ MESSAGES = "libs/fog-contracts/src/fog_contracts/messages.py"
 CHANNELS = "libs/fog-contracts/src/fog_contracts/channels.py"
 SHAPES = "libs/fog-contracts/src/fog_contracts/shapes.py"
 DRAWING_COMMANDS = {
-    f"cli/src/fognav/{name}.py" for name in ("area_command", "zone_command", "bench/costmap", "bench/fleet")
+    f"cli/src/fognav/{name}.py"
+    for name in ("area_command", "zone_command", "bench/costmap", "bench/fleet", "bench/rest_clients")
 }
 AGGREGATOR = "services/hazard-aggregator/src/hazard_aggregator/core.py"
 MAP_API = "services/map-service/src/map_service/api.py"
@@ -122,7 +123,7 @@ class Extension(Message, frozen=True, kw_only=True):
 
 
 '''),
-    Edit(MAP_API, r'^    @routes\.get\("/api/v1/audit"', before='''\
+    Edit(MAP_API, r'^    @routes\.delete\("/api/v1/zones/', before='''\
     @routes.post(
         "/api/v1/zones/{zone_id}/extension", raises=[ZoneError, ConflictError, StoreError], problems=_NO_SUCH_ZONE
     )
@@ -130,7 +131,7 @@ class Extension(Message, frozen=True, kw_only=True):
         """Let a zone hold for so many more minutes."""
         old = _find_zone(service, zone_id)
         longer = msgspec.structs.replace(old, expires_at=clock.stamp() + 60.0 * body.minutes)
-        zone = await service.replace(longer, old.version, caller.name)
+        zone = await service.zones.replace(longer, old.version, caller.name)
         return Answer(zone, etag(zone.version))
 
 '''),

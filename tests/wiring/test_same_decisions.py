@@ -260,7 +260,7 @@ def feed(live: Any, entries: list[log.Entry]) -> None:
             case log.BaseReceived():
                 live.agent.on_feedback(entry.feedback, entry.now)
             case log.LidarSamplesReceived():
-                live.agent_core.on_lidar_samples(entry.samples(), entry.now)
+                live.agent_core.on_lidar_samples(entry.now)
             case log.ScanReceived():
                 live.agent.on_scan(entry.scan(), entry.now)
 
@@ -292,9 +292,9 @@ async def drive_live(recorded: Run) -> tuple[Run, Any]:
                 await live.run(live.planner.send(robot, pose, "tester", place=None, any_heading=True))
         if step == ZONES:
             for zone in (ZONE_SLOW, ZONE_WET):
-                await live.run(live.map.create(zone, "tester"))
+                await live.run(live.map.zones.create(zone, "tester"))
         if step == ZONE_AROUND_ROBOT:
-            await live.run(live.map.create(recorded.last_zone, "tester"))
+            await live.run(live.map.zones.create(recorded.last_zone, "tester"))
         if step == QUERIES:
             run.replies.append(await live.run(live.query(ch.PLANNER_PLAN, PLAN, PlanReply)))
             run.replies.append(await live.run(live.query(ch.PLANNER_EGRESS, EGRESS, PlanReply)))

@@ -7,7 +7,7 @@ calls no service.
 from collections.abc import Callable, Mapping
 from importlib.metadata import distribution
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Final
 
 from fog_contracts.generate.header import firmware_header
 from fog_contracts.generate.markdown import OpenApi, channels_markdown
@@ -16,7 +16,7 @@ from fog_contracts.generate.robot_toml import robot_settings_markdown
 from fog_contracts.generate.zenoh_acl import zenoh_acl
 from fog_runtime.clock import SystemClock
 from fog_runtime.health import Health
-from fog_runtime.http import Tokens
+from fog_runtime.http import Tokens, unused
 from fog_runtime.robot_file import default_robot
 from fog_runtime.site import load_site
 from fognav import checkout
@@ -37,19 +37,12 @@ def rest_routes() -> dict[str, OpenApi]:
 
     loaded = load_site(checkout.site_folder(None))
     clock, health, tokens = SystemClock(), Health(), Tokens()
-    unused: Any = _UnusedService()
+    service = unused()
     return {
-        "hazard-aggregator": make_aggregator(unused, loaded.map.geometry, clock, health, tokens).openapi(),
-        "map-service": make_map(unused, loaded.site, clock, health, tokens).openapi(),
-        "planner": make_planner(unused, loaded.site, health, tokens).openapi(),
+        "hazard-aggregator": make_aggregator(service, loaded.map.geometry, clock, health, tokens).openapi(),
+        "map-service": make_map(service, loaded.site, clock, health, tokens).openapi(),
+        "planner": make_planner(service, loaded.site, health, tokens).openapi(),
     }
-
-
-class _UnusedService:
-    """A placeholder for a service: an app may read its attributes on creation, but never calls it."""
-
-    def __getattr__(self, name: str) -> Self:
-        return self
 
 
 def markdown() -> str:

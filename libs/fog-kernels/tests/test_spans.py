@@ -52,21 +52,28 @@ def test_spans_are_combined_with_a_window_like_masks(shape: ShapeMask, value: in
     below = np.ascontiguousarray(whole[window.rows, window.columns])
     spans, layer = mask_spans(shape), np.full(below.shape, value, np.uint8)
     cost = below.copy()
-    raise_costs(spans, x, y, value, cost)
+    raise_costs([(spans, value)], x, y, cost)
     assert np.array_equal(cost, combine_costs(below, layer, mask))
     if value > 0:
         speed = np.minimum(below, 254)
         expected = combine_speed_limits(speed, np.where(mask, layer, 0).astype(np.uint8))
-        lower_speeds(spans, x, y, value, speed)
+        lower_speeds([(spans, value)], x, y, speed)
         assert np.array_equal(speed, expected)
+
+
+def test_lethal_span_beside_a_window_changes_nothing_in_it() -> None:
+    left: Spans = mask_spans(ShapeMask(Window(0, 0, 1, 1), np.ones((1, 1), np.bool_)))
+    cost = np.zeros((1, 4), np.uint8)
+    raise_costs([(left, 254)], 2, 0, cost)
+    assert not cost.any()
 
 
 def test_invalid_values_and_arrays_are_refused_by_name() -> None:
     spans: Spans = mask_spans(ShapeMask(Window(0, 0, 1, 1), np.ones((1, 1), np.bool_)))
     grid = np.zeros((2, 2), np.uint8)
     with pytest.raises(ValueError, match="cost must be 0 to 254"):
-        raise_costs(spans, 0, 0, 255, grid)
-    with pytest.raises(ValueError, match="at least 1 cm/s"):
-        lower_speeds(spans, 0, 0, 0, grid)
+        raise_costs([(spans, 255)], 0, 0, grid)
+    with pytest.raises(ValueError, match="must be 1 to 254 cm/s"):
+        lower_speeds([(spans, 0)], 0, 0, grid)
     with pytest.raises(TypeError, match="speed must be uint8"):
-        lower_speeds(spans, 0, 0, 1, grid.astype(np.int32))
+        lower_speeds([(spans, 1)], 0, 0, grid.astype(np.int32))

@@ -13,6 +13,7 @@ from fog_runtime.health import Health
 from fog_runtime.http import (
     Answer,
     Body,
+    Front,
     IfMatch,
     Operator,
     ProblemError,
@@ -22,7 +23,6 @@ from fog_runtime.http import (
     expected_version,
     load_tokens,
     make_app,
-    serve,
     token_hash,
 )
 
@@ -96,7 +96,7 @@ async def client(tokens, tmp_path):
 
 @contextlib.asynccontextmanager
 async def running(app, folder):
-    task = asyncio.create_task(serve(app, port_file=folder / "port"))
+    task = asyncio.create_task(Front.fork(lambda: app).serve(app, folder / "port"))
     try:
         async with asyncio.timeout(60):
             while not (folder / "port").exists():
@@ -250,7 +250,7 @@ async def test_oversized_bodies_are_refused_with_and_without_content_length(clie
 async def test_port_in_use_raises(client):
     port = client.base_url.port
     with pytest.raises(OSError, match="in use"):
-        await serve(make_app("x", Health(), load_tokens(None)), port=port)
+        Front.fork(lambda: make_app("x", Health(), load_tokens(None)), port=port)
 
 
 @pytest.mark.parametrize(

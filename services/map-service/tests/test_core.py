@@ -445,9 +445,9 @@ def test_loaded_zones_replace_all_zones_and_an_invalid_one_changes_nothing():
     bad = zone("bad", shape=RectangleShape(corner=(0.0, 0.0), opposite=(0.0, 1.0)))
     with pytest.raises(ShapeError, match=r"bad\.shape\.opposite"):
         core.load_zones([zone("new"), bad], moment(1.0))
-    assert [z.id for z in core.zones()] == ["kept", "old"]
+    assert [z.id for z in core.zones.zones()] == ["kept", "old"]
     core.load_zones([zone("new"), zone("kept")], moment(1.0))
-    assert [z.id for z in core.zones()] == ["kept", "new"]
+    assert [z.id for z in core.zones.zones()] == ["kept", "new"]
 
 
 # --- Zones ----------------------------------------------------------------------------------------------------------

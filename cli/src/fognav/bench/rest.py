@@ -57,17 +57,24 @@ async def measure(  # all that a run consists of, by name
         with _listener(stack.zenoh_endpoint) as listener:
             await asyncio.sleep(idle_s)
             idle = _gaps(listener)
-            begun = psutil.Process(pid).cpu_times()
+            service, *fronts = psutil.Process(pid), *psutil.Process(pid).children()
+            begun = service.cpu_times()
             await load.run(clients, seconds)
             loaded = _gaps(listener)
-            ended = psutil.Process(pid)
+            ended = service.cpu_times()
         return {
             **_figures("idle_heartbeat_gap", idle),
             **_figures("heartbeat_gap", loaded),
             "requests": dict(sorted(load.answers.items())),
-            "cpu_s": round(sum(ended.cpu_times()[:2]) - sum(begun[:2]), 1),
-            "rss_mb": round(ended.memory_info().rss / 1e6, 1),
+            "cpu_s": round(sum(ended[:2]) - sum(begun[:2]), 1),
+            "rss_mb": round(service.memory_info().rss / 1e6, 1),
+            "front_rss_mb": round(sum(_own_bytes(front) for front in fronts) / 1e6, 1),
         }
+
+
+def _own_bytes(process: psutil.Process) -> int:
+    """Return the memory that a process does not share with the one that it was forked from."""
+    return int(process.memory_full_info().uss)
 
 
 def _figures(name: str, gaps: list[float]) -> dict[str, float]:

@@ -14,6 +14,8 @@ from fog_contracts.costs import LETHAL
 from fog_kernels import _arrays
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from fog_contracts.raster import Spans
@@ -28,7 +30,8 @@ def _raise_costs(rows: Any, starts: Any, stops: Any, x: int, y: int, value: int,
     height, width = cost.shape
     for i in range(np.searchsorted(rows, y), np.searchsorted(rows, y + height)):
         row = cost[rows[i] - y]
-        first, last = max(starts[i] - x, 0), min(stops[i] - x, width)
+        # A negative end of a slice would count from the window's other side.
+        first, last = max(starts[i] - x, 0), max(min(stops[i] - x, width), 0)
         if value == LETHAL:
             row[first:last] = LETHAL
         else:
@@ -51,25 +54,23 @@ def _lower_speeds(rows: Any, starts: Any, stops: Any, x: int, y: int, value: int
                 row[column] = value
 
 
-def raise_costs(spans: Spans, x: int, y: int, value: int, cost: NDArray[np.uint8]) -> None:
-    """Combine one cost (0 to 254) with `cost` (uint8, a map's window from column x, row y on) in the cells of a shape.
+def raise_costs(shapes: Sequence[tuple[Spans, int]], x: int, y: int, cost: NDArray[np.uint8]) -> None:
+    """Combine each shape's cost (0 to 254) with `cost` (uint8, a map's window from column x, row y on) in its cells.
 
     As `combine_costs`: the higher cost wins, and only 254 replaces unknown. Raises TypeError or ValueError for a wrong
     array or value.
     """
-    _check(value, cost, "cost")
-    _raise_costs(spans.rows, spans.starts, spans.stops, x, y, value, cost)
+    _arrays.exact(cost, np.uint8, 2, "cost")
+    for spans, value in shapes:
+        if not 0 <= value <= LETHAL:
+            raise ValueError(f"cost must be 0 to {LETHAL}, not {value}")
+        _raise_costs(spans.rows, spans.starts, spans.stops, x, y, value, cost)
 
 
-def lower_speeds(spans: Spans, x: int, y: int, value: int, speed: NDArray[np.uint8]) -> None:
-    """Combine one speed limit (1 to 254 cm/s) with `speed` (as `cost` of `raise_costs`): the lower limit wins."""
-    _check(value, speed, "speed")
-    if value == 0:
-        raise ValueError("a speed limit must be at least 1 cm/s: 0 means no limit")
-    _lower_speeds(spans.rows, spans.starts, spans.stops, x, y, value, speed)
-
-
-def _check(value: int, array: NDArray[np.uint8], name: str) -> None:
-    _arrays.exact(array, np.uint8, 2, name)
-    if not 0 <= value <= LETHAL:
-        raise ValueError(f"{name} must be 0 to {LETHAL}, not {value}")
+def lower_speeds(shapes: Sequence[tuple[Spans, int]], x: int, y: int, speed: NDArray[np.uint8]) -> None:
+    """Combine speed limits (1 to 254 cm/s) with `speed` (as `cost` of `raise_costs`): the lower limit wins."""
+    _arrays.exact(speed, np.uint8, 2, "speed")
+    for spans, value in shapes:
+        if not 1 <= value <= LETHAL:
+            raise ValueError(f"a speed limit must be 1 to {LETHAL} cm/s, not {value}: 0 means no limit")
+        _lower_speeds(spans.rows, spans.starts, spans.stops, x, y, value, speed)

@@ -21,11 +21,11 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 PROFILES: dict[str, tuple[str, ...]] = {
-    "robot": ("amcl", "astar", "distance", "dwa", "inflation", "likelihood", "raycast", "sweep"),
+    "robot": ("amcl", "astar", "distance", "dwa", "inflation", "likelihood", "raycast"),
     "planner": ("astar", "components", "distance", "inflation"),
     "map": ("distance", "inflation", "spans"),
     "sim": ("distance", "raycast"),
-    "all": ("amcl", "astar", "components", "distance", "dwa", "inflation", "likelihood", "raycast", "spans", "sweep"),
+    "all": ("amcl", "astar", "components", "distance", "dwa", "inflation", "likelihood", "raycast", "spans"),
 }
 
 

@@ -9,7 +9,7 @@ from fog_contracts.handlers import Moment
 from fog_runtime import logs, process
 from fog_runtime.clock import SystemClock, boot_id
 from fog_runtime.health import Health
-from fog_runtime.http import load_tokens, serve
+from fog_runtime.http import Front, load_tokens, unused
 from fog_runtime.leadership import Leadership, process_id
 from fog_runtime.lease_store import LeaseStore
 from fog_runtime.mqtt_edge import MqttEdge
@@ -38,6 +38,12 @@ async def main() -> None:
     site = settings.site or loaded.site.id
     clock = SystemClock(settings.speed)
     health = Health("store", "mqtt")
+    tokens = load_tokens(settings.tokens_file)
+    front = Front.fork(
+        lambda: make_api(unused(), loaded.map.geometry, clock, health, tokens),
+        settings.http_host,
+        settings.http_port,
+    )
     async with (
         Store(settings.redis_url, site, service="hazard-aggregator", data_dir=settings.data_dir) as store,
         LeaseStore(settings.redis_url, site, "hazard-aggregator") as keeper,
@@ -69,7 +75,6 @@ async def main() -> None:
             service.subscribe()
             leadership.subscribe()
             zenoh.declare_liveliness("hazard-aggregator", site)
-            tokens = load_tokens(settings.tokens_file)
             app = make_api(service, loaded.map.geometry, clock, health, tokens, leadership.standby_reason)
             async with asyncio.TaskGroup() as tasks:
                 tasks.create_task(leadership.run(service), name="lease")
@@ -77,7 +82,7 @@ async def main() -> None:
                 tasks.create_task(service.tick_loop(), name="tick")
                 tasks.create_task(service.write_loop(), name="write")
                 tasks.create_task(service.store_loop(), name="store")
-                tasks.create_task(serve(app, settings.http_host, settings.http_port, settings.port_file), name="http")
+                tasks.create_task(front.serve(app, settings.port_file), name="http")
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from fog_contracts import channels as ch
 from fog_runtime import logs, process
 from fog_runtime.clock import SystemClock, WallClock, boot_id
 from fog_runtime.health import Health
-from fog_runtime.http import load_tokens, serve
+from fog_runtime.http import Front, load_tokens, unused
 from fog_runtime.leadership import Leadership, process_id
 from fog_runtime.lease_store import LeaseStore
 from fog_runtime.mqtt_edge import MqttEdge
@@ -35,6 +35,10 @@ async def main() -> None:
     site = settings.site or loaded.site.id
     clock = SystemClock(settings.speed)
     health = Health("store", "zones", "mqtt", "map")
+    tokens = load_tokens(settings.tokens_file)
+    front = Front.fork(
+        lambda: make_api(unused(), loaded.site, clock, health, tokens), settings.http_host, settings.http_port
+    )
     async with (
         Store(settings.redis_url, site, service="map-service", data_dir=settings.data_dir) as store,
         LeaseStore(settings.redis_url, site, "map-service") as keeper,
@@ -63,15 +67,14 @@ async def main() -> None:
             service.subscribe()
             leadership.subscribe()
             zenoh.declare_liveliness("map-service", site)
-            tokens = load_tokens(settings.tokens_file)
             app = make_api(service, loaded.site, clock, health, tokens, leadership.standby_reason)
             async with asyncio.TaskGroup() as tasks:
                 tasks.create_task(mqtt.run(), name="mqtt")
                 tasks.create_task(leadership.run(service), name="lease")
                 tasks.create_task(service.store_loop(), name="store")
                 tasks.create_task(service.tick_loop(), name="tick")
-                tasks.create_task(service.commit_loop(), name="commit")
-                tasks.create_task(serve(app, settings.http_host, settings.http_port, settings.port_file), name="http")
+                tasks.create_task(service.publisher.commit_loop(), name="commit")
+                tasks.create_task(front.serve(app, settings.port_file), name="http")
 
 
 if __name__ == "__main__":

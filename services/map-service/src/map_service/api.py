@@ -37,6 +37,7 @@ from fog_runtime.http import (
     RETRY_AFTER,
     Answer,
     Body,
+    Encoded,
     IdempotencyKey,
     IfMatch,
     IfNoneMatch,
@@ -58,11 +59,14 @@ from fog_runtime.idempotency import Attempt, IdempotencyError
 from fog_runtime.work import BusyError, Worker
 from map_service.costmap import LayeredCostmap
 from map_service.layers.base import Grid
-from map_service.service import ConflictError, Service
+from map_service.service import Service
 from map_service.store import StoreError
 from map_service.zone_validation import ZoneError
+from map_service.zone_writer import ConflictError
 
 AuditKind = Literal["area", "mission", "override", "store", "zone"]
+
+Image.preinit()  # the first picture would load PIL's formats, while the map is served
 
 _PNG: Final = "image/png"
 _MAX_PICTURES: Final = 4
@@ -111,25 +115,35 @@ def make_api(  # the process's parts
 ) -> FastAPI:
     """Return the app over a running service; while `standby` returns a reason, nothing can be written."""
     app = make_app("Fognav map-service", health, tokens, standby=standby)
-    _add_zones(Routes(app, "zones"), service, clock)
+    zones = Routes(app, "zones")
+    _add_errors(zones)
+    _add_zone_reads(zones, service)
+    _add_zone_writes(zones, service, clock)
+    _add_audit(zones, service)
     _add_views(Routes(app, "map"), service, site)
     recovery = Routes(app, "store")
     add_store_errors(recovery)
-    add_recovery(recovery, service)
+    add_recovery(recovery, service.zones)
     return app
 
 
-def _add_zones(routes: Routes, service: Service, clock: Clock) -> None:
-    _add_errors(routes)
+def _add_zone_reads(routes: Routes, service: Service) -> None:
+    listing = _ZoneListing(service)
 
     @routes.get("/api/v1/zones", problems=_ZONES_NOT_LOADED)
-    async def list_zones() -> ZoneList:
+    async def list_zones() -> Encoded[ZoneList]:
         """List all zones with the map version that contains them."""
         _require_zones(service)
-        version = service.core.costmap.version
-        zones = service.core.zones()
-        return ZoneList(zones=zones, active=service.core.active_zones(), epoch=version.epoch, seq=version.seq)
+        return listing.current()
 
+    @routes.get("/api/v1/zones/{zone_id}", problems=_NO_SUCH_ZONE)
+    async def get_zone(zone_id: str) -> Answer[Zone]:
+        """Return one zone with its ETag."""
+        zone = _find_zone(service, zone_id)
+        return Answer(zone, etag(zone.version))
+
+
+def _add_zone_writes(routes: Routes, service: Service, clock: Clock) -> None:
     @routes.post("/api/v1/zones", status=201, raises=[*_REFUSALS, ConflictError], problems=_ZONES_NOT_LOADED)
     async def create_zone(
         body: Body[ZoneBody], caller: Operator, idempotency_key: IdempotencyKey = None
@@ -137,15 +151,9 @@ def _add_zones(routes: Routes, service: Service, clock: Clock) -> None:
         """Add a zone; replies once it is durably stored and on the map."""
         _require_zones(service)
         attempt = attempt_of(idempotency_key, caller, "POST /api/v1/zones", body)
-        zone_id = body.id or f"z-{secrets.token_hex(4)}"
-        zone = await service.create(_zone_from_body(body, zone_id, caller.name, clock.stamp()), caller.name, attempt)
+        zone = _zone_from_body(body, body.id or f"z-{secrets.token_hex(4)}", caller.name, clock.stamp())
+        zone = await service.zones.create(zone, caller.name, attempt)
         return Answer(zone, {**etag(zone.version), "Location": f"/api/v1/zones/{zone.id}"})
-
-    @routes.get("/api/v1/zones/{zone_id}", problems=_NO_SUCH_ZONE)
-    async def get_zone(zone_id: str) -> Answer[Zone]:
-        """Return one zone with its ETag."""
-        zone = _find_zone(service, zone_id)
-        return Answer(zone, etag(zone.version))
 
     @routes.put(
         "/api/v1/zones/{zone_id}", status=(200, 201), raises=[*_REFUSALS, ConflictError], problems=_NO_SUCH_ZONE
@@ -166,22 +174,24 @@ def _add_zones(routes: Routes, service: Service, clock: Clock) -> None:
         attempt = attempt_of(idempotency_key, caller, f"PUT /api/v1/zones/{zone_id}", body)
         new = must_be_new(if_none_match)
         # Before the condition, which the first attempt may have made false.
-        if (earlier := await service.earlier_result(attempt)) is not None:
+        if (earlier := await service.zones.earlier_result(attempt)) is not None:
             return Answer(earlier, etag(earlier.version), status=201 if new else None)
         zone = _zone_from_body(body, zone_id, caller.name, clock.stamp())
         if new:
             return await _put_new(service, zone, caller.name, attempt)
-        await service.reload_after_uncertain_write()
+        await service.zones.reload_after_uncertain_write()
         old = _find_matching(service, zone_id, if_match)
-        zone = await service.replace(zone, old.version, caller.name, attempt)
+        zone = await service.zones.replace(zone, old.version, caller.name, attempt)
         return Answer(zone, etag(zone.version))
 
     @routes.delete("/api/v1/zones/{zone_id}", raises=[ConflictError, StoreError], problems=_NO_SUCH_ZONE)
     async def delete_zone(zone_id: str, caller: Operator, if_match: IfMatch = None) -> None:
         """Delete a zone; with If-Match, only if it is unchanged."""
-        await service.reload_after_uncertain_write()
-        await service.delete(_find_matching(service, zone_id, if_match), caller.name)
+        await service.zones.reload_after_uncertain_write()
+        await service.zones.delete(_find_matching(service, zone_id, if_match), caller.name)
 
+
+def _add_audit(routes: Routes, service: Service) -> None:
     @routes.get("/api/v1/audit", raises=[CursorError, StoreError])
     async def audit(
         _caller: Viewer, kind: AuditKind | None = None, cursor: str | None = None, limit: int = 100
@@ -239,6 +249,25 @@ def _add_busy_error(routes: Routes) -> None:
         {503: "Too many requests wait for a calculation; `Retry-After` says when to try again"},
         lambda error: ProblemError(503, f"{error}: try again", headers=RETRY_AFTER),
     )
+
+
+class _ZoneListing:
+    """The list of all zones, encoded when they change and not for each who asks: thousands of them take some ms."""
+
+    def __init__(self, service: Service) -> None:
+        self._core = service.core
+        self._zones: tuple[list[Zone] | None, msgspec.Raw] = None, msgspec.Raw()
+        self._active: tuple[list[str] | None, msgspec.Raw] = None, msgspec.Raw()
+
+    def current(self) -> Encoded[ZoneList]:
+        """Return the list as it is now."""
+        version, zones, active = self._core.costmap.version, self._core.zones.zones(), self._core.zones.active()
+        if self._zones[0] is not zones:
+            self._zones = zones, msgspec.Raw(msgspec.json.encode(zones))
+        if self._active[0] is not active:
+            self._active = active, msgspec.Raw(msgspec.json.encode(active))
+        parts = {"zones": self._zones[1], "active": self._active[1], "epoch": version.epoch, "seq": version.seq}
+        return Encoded(msgspec.json.encode(parts))
 
 
 class _Pictures:
@@ -311,7 +340,7 @@ async def _put_new(service: Service, zone: Zone, who: str, attempt: Attempt | No
         detail = f"{zone.id!r} is no valid id: use a to z, 0 to 9 and -, at most 32"
         raise ProblemError(422, detail, field="path") from error
     try:
-        zone = await service.create(zone, who, attempt)
+        zone = await service.zones.create(zone, who, attempt)
     except ConflictError as error:
         raise ProblemError(412, f"zone {zone.id} exists already: PUT it with If-Match") from error
     return Answer(zone, etag(zone.version), status=201)
@@ -319,10 +348,10 @@ async def _put_new(service: Service, zone: Zone, who: str, attempt: Attempt | No
 
 def _find_zone(service: Service, zone_id: str) -> Zone:
     _require_zones(service)
-    for zone in service.core.zones():
-        if zone.id == zone_id:
-            return zone
-    raise ProblemError(404, f"there is no zone {zone_id}")
+    entry = service.core.zones.get(zone_id)
+    if entry is None:
+        raise ProblemError(404, f"there is no zone {zone_id}")
+    return entry.zone
 
 
 def _find_matching(service: Service, zone_id: str, if_match: str | None) -> Zone:

@@ -33,12 +33,13 @@ if TYPE_CHECKING:
     from fog_contracts.raster import Spans
     from map_service.aggregator_monitor import AggregatorMonitor
     from map_service.layers.base import CostLayer
+    from map_service.zone_catalog import ZoneCatalog
     from map_service.zone_times import Progress
 
 L = TypeVar("L", bound="CostLayer")
 
 NOTHING_STORED: Final = StoredState()
-COMMIT_CELLS: Final = 512 * 1024
+COMMIT_CELLS: Final = 128 * 1024
 """About how many cells one commit recomputes, so that the next heartbeat, hazard or request need not wait for long."""
 MANY_ZONES: Final = 200
 MANY_ZONES_PERIOD_S: Final = 0.5
@@ -101,22 +102,15 @@ class MapCore:
             return f"waiting for the hazards of {', '.join(self._hazards.areas_without_hazard()) or 'no area'}"
         return ""
 
-    def zones(self) -> list[Zone]:
-        """Return all zones by id; the same list, which nobody may change, as long as they are the same."""
-        return self._zones.zones()
-
-    def active_zones(self) -> list[str]:
-        """Return the ids of the zones that are in force now; the same list as long as they are the same."""
-        return self._zones.active()
-
-    def zones_besides(self, zone_id: str) -> tuple[int, int]:
-        """Return how many zones there are besides the one with this id, and how many cells they cover in sum."""
-        return self._zones.size(zone_id)
+    @property
+    def zones(self) -> ZoneCatalog:
+        """All zones."""
+        return self._zones.catalog
 
     def zone_set(self) -> ZoneSet:
         """Return all zones with the map version that contains them."""
         version = self.costmap.version
-        return ZoneSet(epoch=version.epoch, seq=version.seq, zones=self.zones())
+        return ZoneSet(epoch=version.epoch, seq=version.seq, zones=self.zones.zones())
 
     @property
     def aggregator(self) -> AggregatorMonitor:
@@ -216,8 +210,7 @@ class MapCore:
 
     def _changed_zones(self, now: float) -> list[Publication]:
         """Return the publication of the zones when they changed and are on the map; many of them not too often."""
-        zones = self._zones.zones()
-        too_soon = len(zones) > MANY_ZONES and now < self._zones_published_at + MANY_ZONES_PERIOD_S
+        too_soon = len(self.zones) > MANY_ZONES and now < self._zones_published_at + MANY_ZONES_PERIOD_S
         if self.costmap.pending or too_soon or not self._zones.pop_changed():
             return []
         self._zones_published_at = now

@@ -10,10 +10,11 @@ from msgspec import structs
 from fog_contracts import channels as ch
 from fog_contracts.messages import ZoneSet
 from fog_contracts.shapes import ShapeError, normalized_shape, shape_spans
+from map_service.zone_catalog import encoded_size
 from map_service.zone_times import is_time_zone
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable
 
     from fog_contracts.grid import GridGeometry
     from fog_contracts.messages import Zone
@@ -98,21 +99,26 @@ def named_spans(zone: Zone, geometry: GridGeometry) -> Spans:
         raise ShapeError(f"{zone.id}.shape.{error.field}", error.problem) from error
 
 
-def list_size(zones: Sequence[Zone]) -> int:
-    """Return the largest size (bytes) of the message that tells robots of these zones."""
-    largest = 2**53
-    return len(msgspec.msgpack.encode(ZoneSet(epoch=largest, seq=largest, zones=list(zones))))
+def list_size(size: int) -> int:
+    """Return the largest size (bytes) of the message that tells robots of zones that have `size` bytes in sum."""
+    return _EMPTY_LIST + size
 
 
-def check_list_size(zone: Zone, zones: Sequence[Zone]) -> None:
+def check_list_size(zone: Zone, others: int, known: int) -> None:
     """Raise `ZoneError` when this zone, new or changed, would make the list of all zones too large for robots.
 
-    A list that is too large already may shrink.
+    `others` are the bytes of all others (`encoded_size`), `known` those of all as they are: a list that is too large
+    already may shrink.
     """
-    size = list_size([zone, *(known for known in zones if known.id != zone.id)])
-    if size > max(ch.ZONES.limit, list_size(zones)):
+    size = list_size(others + encoded_size(zone))
+    if size > max(ch.ZONES.limit, list_size(known)):
         raise ZoneError(
             "shape",
             f"the list of all zones would have {size} bytes, and robots accept {ch.ZONES.limit}: give the shape fewer"
             " corners, or delete zones that nobody needs",
         )
+
+
+_LARGEST: Final = 2**53
+_EMPTY_LIST: Final = len(msgspec.msgpack.encode(ZoneSet(epoch=_LARGEST, seq=_LARGEST, zones=[]))) + 4
+"""Size of a list without zones, and of the longer number of zones in it."""

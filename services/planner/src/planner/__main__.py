@@ -8,7 +8,7 @@ import os
 from fog_runtime import logs, process
 from fog_runtime.clock import SystemClock
 from fog_runtime.health import Health
-from fog_runtime.http import load_tokens, serve
+from fog_runtime.http import Front, load_tokens, unused
 from fog_runtime.leadership import Leadership
 from fog_runtime.lease_store import LeaseStore
 from fog_runtime.memory import release_startup_memory
@@ -35,6 +35,8 @@ async def main() -> None:
     site = settings.site or loaded.site.id
     clock = SystemClock(settings.speed)
     health = Health("store", "goals", "map", "zenoh")
+    tokens = load_tokens(settings.tokens_file)
+    front = Front.fork(lambda: make_api(unused(), loaded.site, health, tokens), settings.http_host, settings.http_port)
     config = PlannerConfig(inflation=settings.inflation, release_length=settings.release_m)
     async with (
         Store(settings.redis_url, site, service="planner", data_dir=settings.data_dir) as store,
@@ -49,7 +51,7 @@ async def main() -> None:
         service.subscribe()
         leadership.subscribe()
         zenoh.declare_liveliness("planner", site)
-        app = make_api(service, loaded.site, health, load_tokens(settings.tokens_file), leadership.standby_reason)
+        app = make_api(service, loaded.site, health, tokens, leadership.standby_reason)
         try:
             async with asyncio.TaskGroup() as tasks:
                 tasks.create_task(leadership.run(service), name="lease")
@@ -57,7 +59,7 @@ async def main() -> None:
                 tasks.create_task(service.snapshot_loop(), name="snapshot")
                 tasks.create_task(service.tick_loop(), name="tick")
                 tasks.create_task(service.plan_loop(), name="plan")
-                tasks.create_task(serve(app, settings.http_host, settings.http_port, settings.port_file), name="http")
+                tasks.create_task(front.serve(app, settings.port_file), name="http")
         finally:
             service.close()
 

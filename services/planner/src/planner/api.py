@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from fastapi import FastAPI, Request
+from fastapi import FastAPI
 
 from fog_contracts.messages import (
     Id,
@@ -22,6 +22,7 @@ from fog_contracts.site import Site
 from fog_runtime.health import Health
 from fog_runtime.http import (
     Body,
+    ClientHost,
     IdempotencyKey,
     Operator,
     ProblemError,
@@ -238,6 +239,6 @@ def _add_plan(routes: Routes, service: Service) -> None:
     )
 
     @routes.post("/api/v1/plan", raises=[BusyError])
-    async def preview(request: Request, body: Body[PlanRequest]) -> PlanReply:
+    async def preview(client: ClientHost, body: Body[PlanRequest]) -> PlanReply:
         """Plan a path without side effects; the reply may be a refusal."""
-        return await service.preview(body, request.client.host if request.client else "")
+        return await service.preview(body, client)

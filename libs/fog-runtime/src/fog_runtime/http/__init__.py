@@ -1,9 +1,9 @@
 """The REST interface of all services: problem documents (RFC 9457), tokens with roles, health, metrics, limits."""
 
 from fog_runtime.http.app import make_app
+from fog_runtime.http.front import Front, FrontError, unused
 from fog_runtime.http.problems import RETRY_AFTER, ProblemError
-from fog_runtime.http.routes import Answer, Body, IfMatch, Routes, etag, expected_version
-from fog_runtime.http.server import serve
+from fog_runtime.http.routes import Answer, Body, ClientHost, Encoded, IfMatch, Routes, etag, expected_version
 from fog_runtime.http.store_routes import (
     IdempotencyKey,
     IfNoneMatch,
@@ -21,6 +21,10 @@ __all__ = [
     "Answer",
     "Body",
     "Caller",
+    "ClientHost",
+    "Encoded",
+    "Front",
+    "FrontError",
     "IdempotencyKey",
     "IfMatch",
     "IfNoneMatch",
@@ -38,6 +42,6 @@ __all__ = [
     "load_tokens",
     "make_app",
     "must_be_new",
-    "serve",
     "token_hash",
+    "unused",
 ]

@@ -19,6 +19,8 @@ BODY_LIMIT: Final = 1024 * 1024
 _DRAIN_FACTOR: Final = 16
 """A body is read and discarded up to this many times the limit."""
 
+BODY_S: Final = 10.0
+"""How long a body may take to arrive: a client that sends slowly must not hold a place for long."""
 MAX_OPEN_REQUESTS: Final = 128
 """Most requests that are served at the same time."""
 _ALWAYS_SERVED: Final = frozenset({"/healthz", "/readyz", "/metrics"})
@@ -40,24 +42,17 @@ class _BodyLimit:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        body = bytearray()
-        size = 0
-        more = True
-        # The excess of a body is read for a while and discarded: a client whose connection is closed while it sends
-        # sees a reset connection instead of the response.
-        while more and size <= _DRAIN_FACTOR * self._limit:
-            message = await receive()
-            if message["type"] != "http.request":
-                return  # the client disconnected
-            part = message.get("body", b"")
-            size += len(part)
-            more = message.get("more_body", False)
-            if size <= self._limit:
-                body += part
-        if size > self._limit:
-            headers = {"Connection": "close"} if more else None
-            response = problem(413, f"the body has more than {self._limit} bytes", headers=headers)
-            await response(scope, receive, send)
+        try:
+            async with asyncio.timeout(BODY_S):
+                body, refusal = await self._read(receive)
+        except TimeoutError:
+            slow = problem(408, f"the body did not arrive within {BODY_S:.0f} s", headers={"Connection": "close"})
+            await slow(scope, receive, send)
+            return
+        if refusal is not None:
+            await refusal(scope, receive, send)
+            return
+        if body is None:
             return
         replayed = False
 
@@ -66,23 +61,42 @@ class _BodyLimit:
             if replayed:
                 return await receive()
             replayed = True
-            return {"type": "http.request", "body": bytes(body), "more_body": False}
+            return {"type": "http.request", "body": body, "more_body": False}
 
         await self._app(scope, replay, send)
 
+    async def _read(self, receive: Receive) -> tuple[bytes | None, Response | None]:
+        """Return the body, or None when the client disconnected, or the answer to one that is too large."""
+        body = bytearray()
+        size = 0
+        more = True
+        # The excess of a body is read for a while and discarded: a client whose connection is closed while it sends
+        # sees a reset connection instead of the response.
+        while more and size <= _DRAIN_FACTOR * self._limit:
+            message = await receive()
+            if message["type"] != "http.request":
+                return None, None
+            part = message.get("body", b"")
+            size += len(part)
+            more = message.get("more_body", False)
+            if size <= self._limit:
+                body += part
+        if size > self._limit:
+            headers = {"Connection": "close"} if more else None
+            return None, problem(413, f"the body has more than {self._limit} bytes", headers=headers)
+        return bytes(body), None
 
-class _Turns:
-    """Begins one request per turn of the event loop, so that a burst of them holds up nothing else for long.
 
-    Of requests that are open, at most `limit` are served: further ones are answered with 503 and `Retry-After`. Health
-    and metrics are always served.
+class _OpenLimit:
+    """Serves at most `limit` requests at the same time: further ones are answered with 503 and `Retry-After`.
+
+    Health and metrics are always served.
     """
 
     def __init__(self, app: App, limit: int) -> None:
         self._app = app
         self._limit = limit
         self._open = 0
-        self._turn = asyncio.Lock()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http" or scope["path"] in _ALWAYS_SERVED:
@@ -94,8 +108,6 @@ class _Turns:
             return
         self._open += 1
         try:
-            async with self._turn:
-                await asyncio.sleep(0)
             await self._app(scope, receive, send)
         finally:
             self._open -= 1
@@ -153,10 +165,12 @@ def make_app(
     app.state.tokens = tokens
     app.state.schemas = {}
     app.state.standby = standby
+    app.state.endpoints = {}
+    app.state.core = None
     add_problem_handlers(app)
     _add_health(Routes(app, "health"), health)
     app.add_middleware(_BodyLimit, limit=body_limit)
-    app.add_middleware(_Turns, limit=MAX_OPEN_REQUESTS)
+    app.add_middleware(_OpenLimit, limit=MAX_OPEN_REQUESTS)
     generate = app.openapi
 
     def openapi() -> dict[str, Any]:

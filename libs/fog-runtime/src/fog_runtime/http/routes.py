@@ -16,13 +16,27 @@ import inspect
 import re
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Final, Generic, TypeVar, get_args, get_origin, get_type_hints
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    Final,
+    Generic,
+    NamedTuple,
+    TypeVar,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import msgspec
 from fastapi import Depends, FastAPI, Header, Request, Response
 
 from fog_runtime.http.problems import PROBLEM, Problem, ProblemError
 from fog_runtime.http.tokens import Caller
+
+if TYPE_CHECKING:
+    from fog_runtime.http.link import CoreLink
 
 T = TypeVar("T")
 E = TypeVar("E", bound=Exception)
@@ -45,6 +59,14 @@ IfMatch = Annotated[
 ]
 
 
+def _client_host(request: Request) -> str:
+    return request.client.host if request.client else ""
+
+
+ClientHost = Annotated[str, Depends(_client_host)]
+"""A parameter that receives the client's address, empty if it is not known."""
+
+
 @dataclass(frozen=True, slots=True)
 class Answer(Generic[T]):
     """An answer with headers, and with another of the route's statuses than the usual one."""
@@ -52,6 +74,13 @@ class Answer(Generic[T]):
     value: T
     headers: Mapping[str, str] = field(default_factory=dict)
     status: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Encoded(Generic[T]):
+    """An answer that was encoded before, as JSON."""
+
+    data: bytes
 
 
 def etag(version: int) -> dict[str, str]:
@@ -71,10 +100,12 @@ class Routes:
     """Adds routes to an app, all under one tag.
 
     A route is an async function. `Body[T]` declares the type of its body, `Viewer` or `Operator` the role of its
-    callers, and the return type its response: a msgspec type, an `Answer` of one, None for 204, or a ready `Response`.
+    callers, and the return type its response: a msgspec type, an `Answer` or `Encoded` of one, None for 204, or a ready
+    `Response`.
     The first `status` is the usual one; those of a route that may create something are (200, 201), for example.
     `raises` lists exceptions that become problem documents as registered by `Routes.raises`; `problems` describes
-    further ones.
+    further ones. In a service, FastAPI runs in another process than the handlers (`fog_runtime.http.front`), and their
+    arguments, which must be of types that msgspec knows, are passed on by name.
     """
 
     def __init__(self, app: FastAPI, tag: str) -> None:
@@ -132,9 +163,12 @@ class Routes:
             if signature.needs_token and method != "GET":
                 standby = self._app.state.standby
                 described = {503: "This process stands by: another one leads"} | described
+            route = f"{method} {path}"
+            run = _handling(handler, statuses[0], standby)
+            self._app.state.endpoints[route] = Endpoint(method, path, signature.arguments, run)
             self._app.add_api_route(
                 path,
-                _endpoint(handler, signature, statuses[0], standby),
+                _endpoint(handler, run, signature, route, self._app),
                 methods=[method],
                 tags=[self._tag],
                 status_code=statuses[0],
@@ -184,9 +218,11 @@ class _Signature:
         self.body: tuple[str, Any] | None = None
         first: list[inspect.Parameter] = []
         others: list[inspect.Parameter] = []
+        fields: list[tuple[str, Any]] = []
         for name, parameter in inspect.signature(handler).parameters.items():
             kind = hints[name]
             arguments = get_args(kind) if get_origin(kind) is Annotated else (kind,)
+            fields.append((name, arguments[0]))
             if any(isinstance(mark, _BodyMarker) for mark in arguments[1:]):
                 self.body = (name, arguments[0])
                 kind = Annotated[arguments[0], Depends(_reader(arguments[0]))]
@@ -198,17 +234,39 @@ class _Signature:
         body = self.body[0] if self.body is not None else None
         self.has_parameters = any(parameter.name != body for parameter in others)
         self.parameters = [*first, *others]
+        self.arguments = msgspec.defstruct("Arguments", fields)
         answer = hints["return"]
-        self.answer = get_args(answer)[0] if get_origin(answer) is Answer else answer
+        self.answer = get_args(answer)[0] if get_origin(answer) in (Answer, Encoded) else answer
 
 
-def _endpoint(
-    handler: Callable[..., Awaitable[object]], signature: _Signature, status: int, standby: Callable[[], str]
+class Endpoint(NamedTuple):
+    """A route as the process with the handlers runs it: with decoded arguments, by name."""
+
+    method: str
+    path: str
+    arguments: type[msgspec.Struct]
+    run: Callable[..., Awaitable[Response]]
+
+
+async def answer_call(app: FastAPI, route: str, arguments: bytes) -> Response:
+    """Call a route's handler with arguments from another process; exceptions become problem documents."""
+    endpoint: Endpoint = app.state.endpoints[route]
+    try:
+        decoded = msgspec.msgpack.decode(arguments, type=endpoint.arguments)
+        return await endpoint.run(**msgspec.structs.asdict(decoded))
+    except Exception as error:  # noqa: BLE001  # registered for `Exception`, too, which logs it
+        handle = next(app.exception_handlers[kind] for kind in type(error).__mro__ if kind in app.exception_handlers)
+        scope = {"type": "http", "method": endpoint.method, "path": endpoint.path, "headers": [], "app": app}
+        response: Response = await handle(Request(scope), error)  # type: ignore[misc]  # Starlette's loose type
+        return response
+
+
+def _handling(
+    handler: Callable[..., Awaitable[object]], status: int, standby: Callable[[], str]
 ) -> Callable[..., Awaitable[Response]]:
-    """Return the function that FastAPI calls: it decodes the body, calls the handler and encodes its answer."""
+    """Return a function that calls the handler, unless this process stands by, and encodes its answer."""
 
-    @functools.wraps(handler)
-    async def endpoint(**arguments: Any) -> Response:
+    async def run(**arguments: Any) -> Response:
         if reason := standby():
             raise ProblemError(503, f"{reason}; send the request there", headers={"Retry-After": "1"})
         answer = await handler(**arguments)
@@ -216,9 +274,30 @@ def _endpoint(
             return answer
         if answer is None:
             return Response(status_code=status)
+        if isinstance(answer, Encoded):
+            return Response(answer.data, status, media_type="application/json")
         full: Answer[object] = answer if isinstance(answer, Answer) else Answer(answer)
         data = msgspec.json.encode(full.value)
         return Response(data, full.status or status, dict(full.headers), media_type="application/json")
+
+    return run
+
+
+def _endpoint(
+    handler: Callable[..., object],
+    run: Callable[..., Awaitable[Response]],
+    signature: "_Signature",
+    route: str,
+    app: FastAPI,
+) -> Callable[..., Awaitable[Response]]:
+    """Return the function that FastAPI calls with the arguments that it has checked and decoded."""
+
+    @functools.wraps(handler)
+    async def endpoint(**arguments: Any) -> Response:
+        core: CoreLink | None = app.state.core
+        if core is None:
+            return await run(**arguments)
+        return await core.call(route, msgspec.msgpack.encode(arguments))
 
     setattr(endpoint, "__signature__", inspect.Signature(signature.parameters))  # noqa: B010  # what FastAPI reads
     return endpoint

@@ -52,10 +52,11 @@ class Ld19Driver:
         """Parse bytes received from the port."""
         self._parser.receive_data(data)
         scans: list[LaserScan] = []
+        samples = False
         while (packets := self._parser.next_event()) is not None:
-            self._samples_at, self.problem = now, ""
+            samples, self._samples_at, self.problem = True, now, ""
             scans.extend(self._assembler.feed(packets, now))
-        return LidarEvents(self._assembler.take_samples(), tuple(scans))
+        return LidarEvents(samples, tuple(scans))
 
     def tick(self, now: float) -> bytes:
         """Advance time; a silent lidar is a problem, but no command can restart it."""

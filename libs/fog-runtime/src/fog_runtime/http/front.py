@@ -1,0 +1,155 @@
+"""The process that receives requests, so that no request delays the core (docs/adr/0023).
+
+It is forked from the core's process before that has threads and connections, and reads, checks and limits requests:
+sizes, tokens, JSON, types. What is well-formed it passes on over a link; the core's process runs the route's handler on
+its event loop, and returns the response.
+"""
+
+import asyncio
+import contextlib
+import gc
+import os
+import signal
+import socket
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Final, NoReturn, Self
+
+import uvicorn
+from fastapi import FastAPI
+
+from fog_runtime import logs, signals
+from fog_runtime.files import write_port_file
+from fog_runtime.http.link import CoreLink, FrontLink
+from fog_runtime.http.routes import answer_call
+
+NICENESS: Final = 5
+"""The front gets a third of the processor time of a core that wants some, too."""
+END_S: Final = 3.0
+"""How long the front may take to end: open requests get 2 s."""
+
+_log = logs.get("http")
+
+
+class _Unused:
+    """Has every attribute, each of them the same again."""
+
+    def __getattr__(self, name: str) -> Self:
+        return self
+
+
+def unused() -> Any:  # noqa: ANN401  # it stands for anything
+    """Return a placeholder for what an app is made over but never uses: in a front, no handler is called."""
+    return _Unused()
+
+
+class FrontError(Exception):
+    """The process that receives requests has ended by itself."""
+
+
+class Front:
+    """The front as the core's process sees it."""
+
+    def __init__(self, pid: int, link: socket.socket, host: str, port: int) -> None:
+        """Use `Front.fork`."""
+        self._pid = pid
+        self._link = link
+        self._host = host
+        self._port = port
+
+    @classmethod
+    def fork(cls, make_app: Callable[[], FastAPI], host: str = "127.0.0.1", port: int = 0) -> Self:
+        """Fork the front, which accepts connections once `serve` runs; raises `OSError` when the port is taken.
+
+        `make_app` is called there: the handlers of its routes are never called, and need nothing behind them. Fork
+        before this process has threads and connections. The front ends with this process.
+        """
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        with socket.create_server((host, port), family=family, backlog=128) as listener:
+            ours, theirs = socket.socketpair()
+            with theirs:
+                pid = os.fork()
+                if pid == 0:
+                    _become_front(make_app, listener, theirs)
+            return cls(pid, ours, host, int(listener.getsockname()[1]))
+
+    async def serve(self, app: FastAPI, port_file: Path | None = None) -> None:
+        """Answer what the front passes on with the routes of `app`, until cancelled.
+
+        The port is logged as `listening` and written to `port_file`. Open requests get 2 s to end. Raises `FrontError`
+        when the front ends by itself.
+        """
+        link = await FrontLink.over(self._link)
+        answering = asyncio.ensure_future(link.answer_calls(lambda route, data: answer_call(app, route, data)))
+        try:
+            await link.start()
+            _log.info("listening", url=f"http://{self._host}:{self._port}", port=self._port)
+            write_port_file(port_file, self._port)
+            await asyncio.shield(answering)
+            raise FrontError("the process that receives requests has ended; its own log says why")
+        finally:
+            await link.stop()
+            await asyncio.wait({answering}, timeout=END_S)
+            link.close()
+            answering.cancel()
+            os.kill(self._pid, signal.SIGKILL)  # it has ended, or hangs
+            await asyncio.to_thread(os.waitpid, self._pid, 0)
+
+
+class _Server(uvicorn.Server):
+    @contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Leave signals alone: the front ends with the core's process."""
+        yield
+
+
+def _become_front(make_app: Callable[[], FastAPI], listener: socket.socket, link: socket.socket) -> NoReturn:
+    """Run the front in a forked child, and end the process."""
+    status = 1
+    try:
+        signal.set_wakeup_fd(-1)  # the parent's loop listens at its other end
+        for number in signals.ending():
+            signal.signal(number, signal.SIG_IGN)
+        _leave_files({listener.fileno(), link.fileno()})
+        gc.freeze()  # shared with the parent until one of them writes
+        os.nice(NICENESS)
+        asyncio.run(_receive(make_app(), listener, link))
+        status = 0
+    except Exception as error:  # noqa: BLE001  # the last place that can log why the front ends
+        _log.error("front_crashed", error=error)
+    finally:
+        os._exit(status)
+
+
+def _leave_files(kept: Collection[int]) -> None:
+    """Let go of the parent's open files and sockets; their numbers stay in use, as objects here may close them."""
+    null = os.open(os.devnull, os.O_RDWR)
+    for path in list(Path("/proc/self/fd").iterdir()):
+        number = int(path.name)
+        if number > 2 and number not in kept and number != null:
+            with contextlib.suppress(OSError):
+                os.fstat(number)  # that of the listing itself is closed again
+                os.dup2(null, number)
+
+
+async def _receive(app: FastAPI, listener: socket.socket, end: socket.socket) -> None:
+    """Serve, once started, until the core's process stops this or ends."""
+    link = await CoreLink.over(end)
+    if not await link.started():
+        return
+    app.state.core = link
+    server = _Server(
+        uvicorn.Config(
+            app, log_config=None, access_log=False, lifespan="off", timeout_graceful_shutdown=2, server_header=False
+        )
+    )
+
+    def stop() -> None:
+        server.should_exit = True
+
+    linked = asyncio.ensure_future(link.run(stop))
+    serving = asyncio.ensure_future(server.serve(sockets=[listener]))
+    done, _ = await asyncio.wait({linked, serving}, return_when=asyncio.FIRST_COMPLETED)
+    for task in done:
+        task.result()

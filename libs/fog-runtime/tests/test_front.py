@@ -1,0 +1,198 @@
+"""The process that receives requests: what reaches the core, and how both end."""
+
+import asyncio
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import httpx
+import msgspec
+import pytest
+
+from fog_contracts.messages import Zone
+from fog_runtime.health import Health
+from fog_runtime.http import (
+    Body,
+    ClientHost,
+    Encoded,
+    Front,
+    FrontError,
+    ProblemError,
+    Routes,
+    Tokens,
+    app,
+    make_app,
+    unused,
+)
+
+pytestmark = pytest.mark.live
+DEADLINE_S = 60.0
+ALONE = """
+import asyncio, pathlib, sys
+from fog_runtime.health import Health
+from fog_runtime.http import Front, Tokens, make_app
+async def main():
+    make = lambda: make_app("Test", Health(), Tokens())
+    await Front.fork(make).serve(make(), pathlib.Path(sys.argv[1]))
+asyncio.run(main())
+"""
+
+
+class Service:
+    """The core's side of a small app, on the test's event loop."""
+
+    def __init__(self, folder) -> None:
+        self.calls: list[str] = []
+        self.called = asyncio.Event()
+        self.release = asyncio.Event()
+        self.pids: set[int] = set()
+        self.front = Front.fork(lambda: self.make(unused()))
+        self.app = self.make(self)
+        self.port_file = folder / "port"
+        self.task = asyncio.create_task(self.front.serve(self.app, self.port_file))
+
+    @staticmethod
+    def make(service):
+        made = make_app("Test", Health(), Tokens(), body_limit=10_000)
+        routes = Routes(made, "test")
+
+        @routes.put("/zones/{zone}")
+        async def zones(zone: str, body: Body[Zone]) -> Zone:
+            service.calls.append(zone)
+            service.pids.add(os.getpid())
+            return body
+
+        @routes.get("/slow")
+        async def slow() -> str:
+            service.called.set()
+            await service.release.wait()
+            return "done"
+
+        @routes.get("/bug")
+        async def bug() -> str:
+            raise RuntimeError("inner detail")
+
+        @routes.get("/gone", problems={410: "It is gone"})
+        async def gone() -> str:
+            raise ProblemError(410, "it is gone", headers={"X-Since": "monday"}, since=7)
+
+        @routes.get("/encoded")
+        async def encoded() -> Encoded[list[int]]:
+            return Encoded(b"[1,2]")
+
+        @routes.get("/client")
+        async def client(host: ClientHost) -> str:
+            return host
+
+        return made
+
+    async def url(self) -> str:
+        async with asyncio.timeout(DEADLINE_S):
+            while not self.port_file.exists():  # noqa: ASYNC110  # another program's file
+                await asyncio.sleep(0.01)
+        return f"http://127.0.0.1:{self.port_file.read_text().strip()}"
+
+    async def close(self) -> None:
+        self.task.cancel()
+        await asyncio.gather(self.task, return_exceptions=True)
+
+
+@contextlib.asynccontextmanager
+async def serving(folder):
+    service = Service(folder)
+    try:
+        async with httpx.AsyncClient(base_url=await service.url(), timeout=DEADLINE_S) as client:
+            yield service, client
+    finally:
+        await service.close()
+
+
+ZONE = {"id": "z1", "kind": "BLOCKED", "shape": {"type": "circle", "centre": [1, 2], "radius": 1}}
+
+
+async def test_handlers_run_in_the_cores_process_with_the_decoded_arguments(tmp_path):
+    async with serving(tmp_path) as (service, client):
+        answer = await client.put("/zones/z1", json=ZONE)
+        assert msgspec.json.decode(answer.content, type=Zone) == msgspec.convert(ZONE, Zone)
+        assert (service.calls, service.pids) == (["z1"], {os.getpid()})
+        assert (await client.get("/encoded")).json() == [1, 2]
+        assert (await client.get("/client")).json() == "127.0.0.1"
+
+
+async def test_invalid_requests_do_not_reach_the_core(tmp_path):
+    async with serving(tmp_path) as (service, client):
+        assert (await client.put("/zones/z1", content=b"[" * 9_000)).status_code == 422
+        assert (await client.put("/zones/z1", json={**ZONE, "kind": "SOFT"})).status_code == 422
+        assert (await client.put("/zones/z1", content=b"x" * 10_001)).status_code == 413
+        assert (await client.get("/nowhere")).status_code == 404
+        assert service.calls == []
+
+
+async def test_errors_of_handlers_become_problems_with_their_headers_and_members(tmp_path):
+    async with serving(tmp_path) as (_, client):
+        gone = await client.get("/gone")
+        assert (gone.status_code, gone.headers["x-since"], gone.json()["since"]) == (410, "monday", 7)
+        assert gone.headers["content-type"] == "application/problem+json"
+        bug = await client.get("/bug")
+        assert (bug.status_code, bug.json()["detail"]) == (500, "the service failed: see its log for the reason")
+
+
+async def test_body_that_does_not_arrive_is_refused_after_a_while(tmp_path, monkeypatch):
+    monkeypatch.setattr(app, "BODY_S", 0.2)
+    async with serving(tmp_path) as (service, client):
+        reader, writer = await asyncio.open_connection("127.0.0.1", client.base_url.port)
+        writer.write(b"PUT /zones/z1 HTTP/1.1\r\nHost: fog\r\nContent-Length: 100\r\n\r\n{")
+        assert b" 408 " in await asyncio.wait_for(reader.readline(), DEADLINE_S)
+        writer.close()
+        assert service.calls == []
+
+
+async def test_open_request_is_answered_at_the_end(tmp_path):
+    async with serving(tmp_path) as (service, client):
+        request = asyncio.create_task(client.get("/slow"))
+        await asyncio.wait_for(service.called.wait(), DEADLINE_S)
+        ending = asyncio.create_task(service.close())
+        await asyncio.sleep(0)
+        service.release.set()
+        assert (await request).json() == "done"
+        await ending
+
+
+async def test_request_that_never_ends_does_not_hold_up_the_end(tmp_path):
+    async with serving(tmp_path) as (service, client):
+        request = asyncio.create_task(client.get("/slow"))
+        await asyncio.wait_for(service.called.wait(), DEADLINE_S)
+        async with asyncio.timeout(DEADLINE_S):
+            await service.close()
+            (outcome,) = await asyncio.gather(request, return_exceptions=True)
+        assert isinstance(outcome, httpx.HTTPError) or outcome.status_code == 500
+
+
+async def test_end_of_the_front_ends_the_service_with_an_error(tmp_path):
+    async with serving(tmp_path) as (service, client):
+        await client.get("/encoded")
+        os.kill(service.front._pid, signal.SIGKILL)
+        with pytest.raises(FrontError, match="has ended"):
+            await service.task
+
+
+def test_front_ends_with_a_killed_core(tmp_path):
+    with subprocess.Popen([sys.executable, "-c", ALONE, str(tmp_path / "port")]) as core:
+        deadline = time.monotonic() + DEADLINE_S
+        while not (tmp_path / "port").exists():
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        port = int((tmp_path / "port").read_text())
+        socket.create_connection(("127.0.0.1", port)).close()
+        core.kill()
+        while time.monotonic() < deadline:
+            try:
+                socket.create_connection(("127.0.0.1", port)).close()
+            except ConnectionRefusedError:
+                break
+            time.sleep(0.01)
+        assert time.monotonic() < deadline, "its front listens still"

@@ -1,0 +1,209 @@
+"""All zones with their cells, found by id, by order and by place. Pure.
+
+The change of one zone costs no time by their number. With thousands of zones, whatever walks through all of them takes
+milliseconds, at each request.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Generic, TypeVar
+
+import msgspec
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable
+
+    from numpy.typing import NDArray
+
+    from fog_contracts.grid import Window
+    from fog_contracts.messages import Zone
+    from fog_contracts.raster import Spans
+    from map_service.zone_times import ZoneTimes
+
+T = TypeVar("T")
+
+_CAPACITY: Final = 64
+
+
+def encoded_size(zone: Zone) -> int:
+    """Return the size (bytes) of a zone in the message that lists all zones."""
+    return len(msgspec.msgpack.encode(zone))
+
+
+@dataclass(eq=False)
+class ZoneEntry:
+    """A zone, its cells, how many they are, its size in the list of zones (bytes), and whether it is in force."""
+
+    zone: Zone
+    spans: Spans
+    cells: int
+    size: int
+    times: ZoneTimes
+    active: bool
+
+    @classmethod
+    def of(cls, zone: Zone, spans: Spans, times: ZoneTimes, *, active: bool) -> ZoneEntry:
+        """Return the entry of a zone with these cells and times."""
+        return cls(zone, spans, spans.cells, encoded_size(zone), times, active)
+
+    @property
+    def timed(self) -> bool:
+        """Whether time decides if the zone is in force."""
+        zone = self.zone
+        return not (zone.starts_at is None and zone.expires_at is None and zone.ttl_s is None and zone.schedule is None)
+
+
+class ZoneCatalog:
+    """The entries of all zones, and the sums over them."""
+
+    def __init__(self) -> None:
+        self._entries: dict[str, ZoneEntry] = {}
+        self._timed: dict[str, ZoneEntry] = {}
+        self._zones: _Ordered[Zone] = _Ordered()
+        self._active: _Ordered[str] = _Ordered()
+        self._places = _Places()
+        self.cells = 0
+        """How many cells all zones cover in sum."""
+        self.size = 0
+        """Size (bytes) of all zones in the message that lists them."""
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def __getitem__(self, zone_id: str) -> ZoneEntry:
+        return self._entries[zone_id]
+
+    def get(self, zone_id: str) -> ZoneEntry | None:
+        """Return the entry of a zone, None if there is none."""
+        return self._entries.get(zone_id)
+
+    def ids(self) -> list[str]:
+        """Return the ids of all zones."""
+        return list(self._entries)
+
+    def zones(self) -> list[Zone]:
+        """Return all zones by id; the same list, which nobody may change, until the next change."""
+        return self._zones.values()
+
+    def active(self) -> list[str]:
+        """Return the ids of the zones in force, ordered; the same list, as above."""
+        return self._active.values()
+
+    def timed(self) -> Collection[ZoneEntry]:
+        """Return the entries of the zones that begin or end by themselves."""
+        return self._timed.values()
+
+    def active_in(self, window: Window) -> list[ZoneEntry]:
+        """Return the entries of the zones in force whose windows overlap this one."""
+        return [self._entries[name] for name in self._places.overlapping(window)]
+
+    def put(self, entry: ZoneEntry) -> None:
+        """Add an entry, or replace that of the same zone."""
+        name = entry.zone.id
+        self.remove(name)
+        self._entries[name] = entry
+        self._zones.put(name, entry.zone)
+        self.cells += entry.cells
+        self.size += entry.size
+        if entry.timed:
+            self._timed[name] = entry
+        if entry.active:
+            self._activate(entry)
+
+    def remove(self, zone_id: str) -> ZoneEntry | None:
+        """Remove a zone; return its entry, None if there was none."""
+        entry = self._entries.pop(zone_id, None)
+        if entry is None:
+            return None
+        self._zones.remove(zone_id)
+        self._timed.pop(zone_id, None)
+        self.cells -= entry.cells
+        self.size -= entry.size
+        if entry.active:
+            self._deactivate(entry)
+        return entry
+
+    def set_active(self, entry: ZoneEntry, active: bool) -> None:  # noqa: FBT001  # what the entry is to be
+        """Put a zone into force, or end it."""
+        if active and not entry.active:
+            self._activate(entry)
+        elif entry.active and not active:
+            self._deactivate(entry)
+        entry.active = active
+
+    def _activate(self, entry: ZoneEntry) -> None:
+        self._active.put(entry.zone.id, entry.zone.id)
+        self._places.put(entry.zone.id, entry.spans.window)
+
+    def _deactivate(self, entry: ZoneEntry) -> None:
+        self._active.remove(entry.zone.id)
+        self._places.remove(entry.zone.id)
+
+
+class _Ordered(Generic[T]):
+    """Values in the order of their names. A list that was handed out is never changed, but copied before a change."""
+
+    def __init__(self) -> None:
+        self._names: list[str] = []
+        self._values: list[T] = []
+        self._handed_out = False
+
+    def values(self) -> list[T]:
+        self._handed_out = True
+        return self._values
+
+    def put(self, name: str, value: T) -> None:
+        """Add a new name."""
+        index = bisect_left(self._names, name)
+        self._names.insert(index, name)
+        self._own().insert(index, value)
+
+    def remove(self, name: str) -> None:
+        """Remove a name that is there."""
+        index = bisect_left(self._names, name)
+        del self._names[index]
+        del self._own()[index]
+
+    def _own(self) -> list[T]:
+        if self._handed_out:
+            self._values, self._handed_out = self._values.copy(), False
+        return self._values
+
+
+class _Places:
+    """The windows of the zones in force, as an array: which of them overlap another is one operation on it."""
+
+    def __init__(self) -> None:
+        self._names: list[str] = []
+        self._rows: dict[str, int] = {}
+        self._windows: NDArray[np.int64] = np.zeros((_CAPACITY, 4), np.int64)
+
+    def put(self, name: str, window: Window) -> None:
+        """Add a new name; the window of a shape beside the map is empty."""
+        if window.empty:
+            return
+        row = len(self._names)
+        if row == len(self._windows):
+            self._windows = np.concatenate([self._windows, np.zeros_like(self._windows)])
+        self._names.append(name)
+        self._rows[name] = row
+        self._windows[row] = window
+
+    def remove(self, name: str) -> None:
+        """Remove a name, if it is there; the last one takes its row."""
+        row = self._rows.pop(name, None)
+        if row is None:
+            return
+        last = self._names.pop()
+        if last != name:
+            self._names[row], self._rows[last] = last, row
+            self._windows[row] = self._windows[len(self._names)]
+
+    def overlapping(self, window: Window) -> Iterable[str]:
+        x, y, width, height = self._windows[: len(self._names)].T
+        overlapping = (x < window.x + window.width) & (window.x < x + width)
+        overlapping &= (y < window.y + window.height) & (window.y < y + height)
+        return [self._names[row] for row in np.flatnonzero(overlapping).tolist()]

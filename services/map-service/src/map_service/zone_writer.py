@@ -1,0 +1,221 @@
+"""Writes of zones: validated, stored first, then put on the map; and the zones loaded from the store."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from msgspec import structs
+from prometheus_client import Counter
+
+from fog_contracts import channels as ch
+from fog_contracts.shapes import ShapeError
+from fog_runtime import logs
+from fog_runtime.work import Worker
+from map_service.store import Audit, RecoveryError, StoreError
+from map_service.zone_times import StoredState
+from map_service.zone_validation import check_list_size, check_room, list_size, prepare_zone, zones_spans
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from typing import Literal
+
+    from fog_contracts.handlers import Moment
+    from fog_contracts.messages import Zone
+    from fog_runtime.health import Health
+    from fog_runtime.idempotency import Attempt
+    from map_service.core import MapCore
+    from map_service.publisher import Publisher
+    from map_service.store import Outcome, Store
+    from map_service.times_keeper import TimesKeeper
+    from map_service.zone_validation import PreparedZone
+
+ZONE_WRITES = Counter("fognav_zone_writes_total", "Writes of zones to the store, by outcome", ["outcome"])
+MAX_PREPARING = 64
+"""Most zones that are validated or wait for it; further requests are answered with 503."""
+
+_log = logs.get("map")
+
+
+class ConflictError(Exception):
+    """A zone has another version than the writer expected, or exists already."""
+
+    def __init__(self, outcome: Outcome, zone_id: str) -> None:
+        super().__init__(f"zone {zone_id}: {outcome}")
+        self.outcome = outcome
+        self.zone = zone_id
+
+
+class ZoneWriter:
+    """Changes zones one after another: none is on the map before it is stored."""
+
+    def __init__(  # the parts that it works with
+        self,
+        core: MapCore,
+        store: Store,
+        times: TimesKeeper,
+        publisher: Publisher,
+        health: Health,
+        now: Callable[[], Moment],
+    ) -> None:
+        """Prepare; `now` says whether the time of day is known, too."""
+        self._core = core
+        self._store = store
+        self._times = times
+        self._publisher = publisher
+        self._health = health
+        self._now = now
+        self._lock = asyncio.Lock()
+        self._worker = Worker("zones", limit=MAX_PREPARING)
+        self.must_reload = False
+        """Whether stored zones may differ from those on the map: after a write whose outcome is unknown."""
+
+    # --- Changes ----------------------------------------------------------------------------------------------------
+
+    async def create(self, zone: Zone, who: str, attempt: Attempt | None = None) -> Zone:
+        """Store a new zone and put it on the map; raises `ZoneError`, `ConflictError` (exists), `StoreError`.
+
+        An `attempt` that succeeded before returns its zone again; raises `IdempotencyError` for another request's.
+        """
+        async with self._lock:
+            if (earlier := await self._earlier_result(attempt)) is not None:
+                return earlier
+            if self._core.zones.get(zone.id) is not None:
+                # The store would treat an identical zone as a repeated attempt.
+                raise ConflictError("exists", zone.id)
+            prepared = await self._prepare(zone)
+            audit = Audit(self._now().stamp, who, "create", attempt)
+            with self._uncertain_write():
+                outcome, zone = await self._store.create(prepared.zone, audit)
+            self._require_ok(outcome, zone.id)
+            self._publisher.publish(self._core.put_zone(zone, self._now(), prepared.spans))
+        await self._publisher.all_on_map()
+        return zone
+
+    async def replace(self, zone: Zone, expected: int, who: str, attempt: Attempt | None = None) -> Zone:
+        """Store a new version of a zone; raises `ZoneError`, `ConflictError` (stale, missing), `StoreError`.
+
+        `attempt` as in `create`.
+        """
+        async with self._lock:
+            if (earlier := await self._earlier_result(attempt)) is not None:
+                return earlier
+            known = self._core.zones.get(zone.id)
+            if known is None or known.zone.version != expected:
+                # The store would treat an identical zone as a repeated attempt.
+                raise ConflictError("stale", zone.id)
+            prepared = await self._prepare(structs.replace(zone, version=expected + 1))
+            audit = Audit(self._now().stamp, who, "replace", attempt)
+            with self._uncertain_write():
+                outcome = await self._store.replace(prepared.zone, expected=expected, audit=audit)
+            self._require_ok(outcome, zone.id)
+            self._publisher.publish(self._core.put_zone(prepared.zone, self._now(), prepared.spans))
+        await self._publisher.all_on_map()
+        return prepared.zone
+
+    async def delete(self, zone: Zone, who: str) -> None:
+        """Delete this version of a zone; raises `ConflictError` (stale) and `StoreError`."""
+        async with self._lock:
+            with self._uncertain_write():
+                outcome = await self._store.delete(zone, Audit(self._now().stamp, who, "delete"))
+            self._require_ok(outcome, zone.id)
+            self._publisher.publish(self._core.remove_zone(zone.id, self._now()))
+        await self._publisher.all_on_map()
+
+    async def earlier_result(self, attempt: Attempt | None) -> Zone | None:
+        """Return the zone that an earlier attempt stored, once it is on the map; None for a first attempt.
+
+        Raises `IdempotencyError` for another request's attempt, and `StoreError`.
+        """
+        async with self._lock:
+            return await self._earlier_result(attempt)
+
+    async def recover_store(self, action: Literal["restore", "accept"], who: str) -> None:
+        """Restore the zones from memory, or accept those in Redis, after Redis lost records.
+
+        Raises `RecoveryError` and `StoreError`.
+        """
+        await self._store.require_loss()
+        async with self._lock:
+            audit = Audit(self._now().stamp, who, action)
+            if action == "accept":
+                await self._store.accept_loss(audit)
+            elif self._core.zones_loaded:
+                await self._store.restore(self._core.zones.zones(), audit)
+            else:
+                raise RecoveryError(
+                    "this service was started after the loss and has no zones: restore a backup of Redis, or accept"
+                )
+        await self.load()
+
+    # --- Loading ----------------------------------------------------------------------------------------------------
+
+    async def load(self) -> None:
+        """Replace the map's zones by the stored ones, where they differ; raises `StoreError`."""
+        async with self._lock:
+            await self._load()
+
+    async def reload_after_uncertain_write(self) -> None:
+        """Load the zones if a failed write may have been stored, so that what is missing here is missing there, too.
+
+        Raises `StoreError`.
+        """
+        if self._core.zones_loaded and self.must_reload:
+            await self.load()
+
+    async def _load(self) -> None:
+        core, zones = self._core, await self._store.zones()
+        known = {zone.id: zone for zone in core.zones.zones()}
+        if not core.zones_loaded or {zone.id: zone for zone in zones} != known:
+            changed = [zone for zone in zones if zone.id not in known or known[zone.id].shape != zone.shape]
+            try:
+                spans = await self._worker.run(zones_spans, changed, core.costmap.geometry)
+                stored = StoredState(spans=spans, progress=await self._times.load(), boot=self._times.boot)
+                self._publisher.publish(core.load_zones(zones, self._now(), stored))
+            except ShapeError as error:
+                raise StoreError(f"a stored zone is invalid: {error}; repair or delete it") from error
+        self.must_reload = False
+        detail = f"{len(zones)} loaded"
+        if (excess := list_size(core.zones.size) - ch.ZONES.limit) > 0:
+            detail += f"; their list is {excess} bytes too large for robots, which drive by the map alone: delete some"
+            _log.error("zone_list_too_large", zones=len(zones), excess_bytes=excess, remedy="delete zones")
+        self._health.set("zones", ok=True, detail=detail)
+        self._health.set("store", ok=True)
+
+    # --- Inside -----------------------------------------------------------------------------------------------------
+
+    async def _earlier_result(self, attempt: Attempt | None) -> Zone | None:
+        """Return the zone that an earlier attempt stored, once it is on the map."""
+        earlier = await self._store.earlier_result(attempt)
+        if earlier is not None and self.must_reload:
+            await self._load()
+        return earlier
+
+    async def _prepare(self, zone: Zone) -> PreparedZone:
+        """Validate and rasterize a zone on the worker thread; raises `ZoneError`, and `BusyError` if too many wait."""
+        at, zones, geometry = self._now(), self._core.zones, self._core.costmap.geometry
+        stamp = at.stamp if at.synchronized else 0.0
+        prepared = await self._worker.run(prepare_zone, zone, geometry, stamp)
+        old = zones.get(zone.id)
+        count, cells, size = (0, 0, 0) if old is None else (1, old.cells, old.size)
+        check_room(prepared, len(zones) - count, zones.cells - cells, geometry)
+        check_list_size(prepared.zone, zones.size - size, zones.size)
+        return prepared
+
+    @contextmanager
+    def _uncertain_write(self) -> Iterator[None]:
+        """Reload the zones after a failure: they may have been written although the reply was lost."""
+        try:
+            yield
+        except StoreError as error:
+            self.must_reload = True
+            self._health.set("store", ok=False, detail=str(error))
+            ZONE_WRITES.labels("failed").inc()
+            raise
+
+    def _require_ok(self, outcome: Outcome, zone_id: str) -> None:
+        ZONE_WRITES.labels(outcome).inc()
+        if outcome != "ok":
+            self.must_reload = True
+            raise ConflictError(outcome, zone_id)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import socket
 import subprocess
 import sys
+import termios
 import threading
 import time
 from contextlib import ExitStack
@@ -32,6 +34,14 @@ def wait_for(condition, expected: str, deadline_s: float = DEADLINE_S):
             return value
         time.sleep(0.005)
     raise AssertionError(f"not within {deadline_s} s: {expected}")
+
+
+BAUDS = {getattr(termios, name): int(name[1:]) for name in dir(termios) if re.fullmatch(r"B\d+", name)}
+
+
+def baud_of(fd: int) -> int:
+    """Rate of a terminal; a new pty has none, like a line that no host has opened."""
+    return BAUDS[termios.tcgetattr(fd)[4]]
 
 
 class Base:
@@ -89,12 +99,16 @@ class Base:
             now = time.monotonic()
             with self.lock:
                 if self._port is not None:
-                    if data := self._port.read():
+                    # At another rate than the host's a device gets garbage, here nothing, and so does the host.
+                    heard = baud_of(self._port.fileno()) == self.robot.baud
+                    if (data := self._port.read()) and heard:
                         self.robot.receive(data, now)
                     left, right = self.robot.wheel_speeds_m_s
                     self.robot.add_wheel_travel(left * (now - before), right * (now - before))
                     self.robot.tick(now, now - before)
-                    self._port.write(self.robot.outgoing(now))
+                    sent = self.robot.outgoing(now)
+                    if heard:
+                        self._port.write(sent)
             before = now
             if self.robot.wheel_speeds_m_s != (0.0, 0.0):
                 self.stopped_at = None

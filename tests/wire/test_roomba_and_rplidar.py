@@ -280,7 +280,7 @@ def test_whole_scans_are_received_over_a_pty():
     scans = []
     deadline = time.monotonic() + 60.0
     with PtyPort() as line, open_port(str(line.path), 115200) as port:
-        port.set_dtr(on=False)
+        port.set_line("dtr", on=False)
         port.write(rplidar.stop() + rplidar.get_health() + rplidar.scan())
         while len(scans) < 3:
             assert time.monotonic() < deadline

@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Generic, NamedTuple, Protocol, TypeVar
+from typing import TYPE_CHECKING, Annotated, Generic, Literal, NamedTuple, Protocol, TypeVar
 
 import msgspec
 from msgspec import Meta
@@ -97,6 +97,26 @@ class DriveTrain:
         return Twist((left_m_s + right_m_s) / 2, (right_m_s - left_m_s) / self.axle_m)
 
 
+class WakeLine(NamedTuple):
+    """A control line of the serial adapter that wakes the base while it is asserted: its name, and for how long (s)."""
+
+    name: Literal["rts", "dtr"]
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Awakening:
+    """What may help a base that does not answer.
+
+    bauds: rates of its serial line, the configured one first. line: the control line that wakes it, None without one.
+    remedy: what a person can do, for the message after all was tried.
+    """
+
+    bauds: tuple[int, ...]
+    line: WakeLine | None = None
+    remedy: str = "check its cable and power"
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BaseTiming:
     """Timeouts of the guardian for this base, s.
@@ -162,6 +182,10 @@ class BaseDriver(Protocol):
         """Timeouts of the guardian for this base."""
 
     @property
+    def awakening(self) -> Awakening:
+        """What may help when this base does not answer."""
+
+    @property
     def corrupted(self) -> int:
         """Number of damaged frames since the driver was made."""
 
@@ -176,6 +200,12 @@ class BaseDriver(Protocol):
 
         They work in any state of the base, also when its receiver is in the middle of a command.
         """
+
+    def respond(self) -> bytes:
+        """Return the next bytes of waking, once what was received calls for them; empty otherwise."""
+
+    def use_baud(self, baud: int) -> None:
+        """Speak at another of the `awakening`'s rates from the next `wake` on."""
 
     def drive(self, left_m_s: float, right_m_s: float) -> bytes:
         """Return the command that turns the wheels at these speeds until the next one; zeros stop them at once."""

@@ -14,12 +14,13 @@ import struct
 import sys
 import termios
 from contextlib import suppress
-from typing import Final, Self
+from typing import Final, Literal, Self
 
 from robot_agent.port_names import check_port_name
 
 _READ_BYTES: Final = 65536
 _WRITE_WAIT_S: Final = 0.1
+_LINES: Final = {"dtr": termios.TIOCM_DTR, "rts": termios.TIOCM_RTS}
 
 
 _LOW_LATENCY: Final = 1 << 13
@@ -116,8 +117,8 @@ class Port:
             except OSError as error:
                 raise PortLost(self.path, _reason(error)) from error
 
-    def set_dtr(self, *, on: bool) -> bool:
-        """Set or clear the DTR line. False where there is none, as on a pty.
+    def set_line(self, name: Literal["dtr", "rts"], *, on: bool) -> bool:
+        """Set or clear the DTR or the RTS line. False where there is none, as on a pty.
 
         Raises:
             PortLost: when the device is lost.
@@ -125,12 +126,27 @@ class Port:
         """
         request = termios.TIOCMBIS if on else termios.TIOCMBIC
         try:
-            fcntl.ioctl(self._fd, request, struct.pack("i", termios.TIOCM_DTR))
+            fcntl.ioctl(self._fd, request, struct.pack("i", _LINES[name]))
         except OSError as error:
             if error.errno in {errno.ENOTTY, errno.EINVAL}:
                 return False
             raise PortLost(self.path, _reason(error)) from error
         return True
+
+    def set_baud(self, baud: int) -> None:
+        """Change the rate for all who use this terminal, once everything is sent that was written.
+
+        Raises:
+            PortLost: when the device is lost or does not support the rate.
+
+        """
+        speed = _speed(self.path, baud)
+        try:
+            attributes = termios.tcgetattr(self._fd)
+            attributes[4] = attributes[5] = speed
+            termios.tcsetattr(self._fd, termios.TCSADRAIN, attributes)
+        except termios.error as error:
+            raise PortLost(self.path, str(error.args[-1])) from error
 
     def discard_input(self) -> None:
         """Discard bytes that have arrived and were not read. Raises PortLost when the device is lost."""
@@ -174,9 +190,7 @@ def open_port(path: str, baud: int) -> Port:
 
 
 def _set_up(fd: int, path: str, baud: int) -> None:
-    speed = getattr(termios, f"B{baud}", None)
-    if speed is None:
-        raise PortLost(path, f"this system has no rate of {baud} baud")
+    speed = _speed(path, baud)
     try:
         # Advisory, and shared with processes that inherit the descriptor.
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -197,6 +211,13 @@ def _set_up(fd: int, path: str, baud: int) -> None:
         termios.tcsetattr(fd, termios.TCSAFLUSH, [0, 0, mode, 0, speed, speed, control])
     except termios.error as error:
         raise PortLost(path, f"not a serial device ({error.args[-1]})") from error
+
+
+def _speed(path: str, baud: int) -> int:
+    speed: int | None = getattr(termios, f"B{baud}", None)
+    if speed is None:
+        raise PortLost(path, f"this system has no rate of {baud} baud")
+    return speed
 
 
 def _set_low_latency(fd: int) -> None:

@@ -102,15 +102,28 @@ def test_lidar_in_error_is_reset_and_restarted():
     line.run(0.5)
     assert line.sent.endswith(rplidar.reset())
     assert "error 7" in line.driver.problem
+    assert "supply or cable" in line.driver.problem
     line.device.health = 0
     line.run(RESET_S + 1.0)
     assert line.scans
 
 
+@pytest.mark.parametrize("text", [b"", b"RP LIDAR System.\r\n" * 30, bytes(range(256)) * 4, rplidar.get_info() * 9])
+def test_text_of_any_length_after_a_reset_is_skipped(text):
+    line = Line()
+    line.device.boot_text = text
+    line.device.health = 2
+    line.run(0.5)
+    line.device.health = 0
+    line.run(RESET_S + 1.5)
+    assert line.scans
+    assert line.driver.problem == ""
+
+
 @pytest.mark.live
 async def test_laser_and_motor_are_stopped_when_the_edge_ends(tmp_path, monkeypatch):
     lines = []  # of DTR, which a pty does not have
-    monkeypatch.setattr(Port, "set_dtr", lambda _port, *, on: lines.append(on))
+    monkeypatch.setattr(Port, "set_line", lambda _port, name, *, on: lines.append((name, on)))
     device, scans = RplidarEmulator(wavy_room), []
     with PtyPort(tmp_path / "lidar") as port:
         edge = LidarEdge(str(port.path), RplidarA1Driver(), SystemClock(), lambda _: None, lambda s, _: scans.append(s))
@@ -122,11 +135,11 @@ async def test_laser_and_motor_are_stopped_when_the_edge_ends(tmp_path, monkeypa
             device.receive(port.read(), time.monotonic())
             port.write(device.outgoing(time.monotonic()))
             edge.poll(time.monotonic())
-        assert lines == [False]
+        assert lines == [("dtr", False)]
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
         assert port.read() == rplidar.stop()
-    assert lines == [False, True]
+    assert lines == [("dtr", False), ("dtr", True)]
 
 
 @pytest.mark.live

@@ -57,10 +57,22 @@ def test_the_line_is_115200_8n1_and_raw(line):
     assert (ispeed, ospeed) == (termios.B115200, termios.B115200)
 
 
-def test_set_dtr_returns_false_on_a_pty(line):
+def test_control_lines_of_a_pty_do_not_exist(line):
     _, path = line
     with open_port(path, 115200) as port:
-        assert port.set_dtr(on=False) is False
+        assert port.set_line("dtr", on=False) is False
+        assert port.set_line("rts", on=True) is False
+
+
+def test_the_rate_changes_for_all_who_share_the_terminal(line):
+    (master,), path = line
+    with open_port(path, 115200) as port:
+        Port.from_fd(port.fileno()).set_baud(19200)
+        assert termios.tcgetattr(port.fileno())[4:6] == [termios.B19200, termios.B19200]
+        port.write(b"x")
+        assert os.read(master, 1) == b"x"
+        with pytest.raises(PortLost, match="no rate of 12345 baud"):
+            port.set_baud(12345)
 
 
 def test_lost_device_raises_port_lost_with_a_remedy(line):

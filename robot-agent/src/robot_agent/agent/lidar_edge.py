@@ -80,7 +80,7 @@ class LidarEdge:
         """Let `poll` use an open port until it is lost; raises `PortLost`."""
         driver = self._driver
         if driver.serial.dtr is not None:
-            port.set_dtr(on=driver.serial.dtr)
+            port.set_line("dtr", on=driver.serial.dtr)
         port.discard_input()
         if (problem := await self._wrong_device(port)) is not None:
             self._report(problem)
@@ -96,7 +96,7 @@ class LidarEdge:
             with suppress(PortLost):
                 port.write(driver.stop_command)
                 if driver.serial.dtr is not None:
-                    port.set_dtr(on=not driver.serial.dtr)
+                    port.set_line("dtr", on=not driver.serial.dtr)
 
     async def _wrong_device(self, port: Port) -> str | None:
         """Listen before anything is written; return the sentence for another device on this port."""

@@ -18,6 +18,7 @@ import msgspec
 
 from fog_contracts.messages import SENTENCE_MAX
 from robot_agent.guardian.link import WHEEL_SPEED_MAX_M_S, BaseFeedback, WheelCommand
+from robot_agent.guardian.revival import Attempt, Revival
 
 if TYPE_CHECKING:
     from robot_agent.hardware import BaseDriver, BaseReading, BaseStatus, WheelOdometry
@@ -47,10 +48,11 @@ class Limits:
 
 @dataclass(frozen=True)
 class Output:
-    """Result of an input: bytes for the base and feedback for the agent."""
+    """Result of an input: bytes for the base, feedback for the agent, and what to try on a silent base."""
 
     data: bytes = b""
     feedback: tuple[BaseFeedback, ...] = ()
+    attempt: Attempt | None = None
 
 
 @dataclass
@@ -74,6 +76,7 @@ class GuardianCore:
     def __post_init__(self) -> None:
         self._wheel_limit = min(self.limits.wheel, self.driver.drive_train.wheel_speed_max_m_s)
         self._base = _Base()
+        self._revival = Revival(self.driver.awakening)
         self._command: WheelCommand | None = None
         self._command_at = -1.0e9
         self._latched: str | None = None
@@ -92,6 +95,11 @@ class GuardianCore:
         return self._latched
 
     @property
+    def unanswered(self) -> str | None:
+        """Why there is no base at all, once all that may help was tried; None while there is hope."""
+        return self._revival.problem
+
+    @property
     def corrupted(self) -> int:
         """Number of damaged sensor frames."""
         return self.driver.corrupted
@@ -103,10 +111,13 @@ class GuardianCore:
         stop = b""
         while (reading := self.driver.next_event()) is not None:
             self._base.reading, self._base.reading_at = reading, now
+            self._revival.on_answer()
             stop += self._check(reading.status, now)
             feedback = self._feedback(reading, now)
             if feedback is not None:
                 feedbacks.append(feedback)
+        if not self._base.awake:
+            stop += self.driver.respond()
         return Output(stop, tuple(feedbacks))
 
     def on_command(self, command: WheelCommand, now: float) -> Output:
@@ -130,7 +141,7 @@ class GuardianCore:
             due = base.woken_at is None or now - base.woken_at > timing.wake_timeout
             # A base that does not drive on its charger is left alone there: waking it would only disturb the charging.
             if due and not self._charging(now):
-                return Output(self._wake(now), self._reminder(now))
+                return Output(self._wake(now), self._reminder(now), self._attempt(now))
             # The wake command may have been lost, and the base may still roll at an old speed.
             repeat = now - self._sent_at >= REPEAT_S
             return Output(self._send((0.0, 0.0), now) if repeat else b"", self._reminder(now))
@@ -143,6 +154,16 @@ class GuardianCore:
     def stop_command(self) -> bytes:
         """Return the bytes that stop the wheels at an orderly end of the guardian; the base stays awake."""
         return self.driver.drive(0.0, 0.0)
+
+    def _attempt(self, now: float) -> Attempt | None:
+        """Return what to try on a base from which nothing has come since it was woken last."""
+        if now - self._base.reading_at <= self.driver.timing.wake_timeout:
+            return None
+        attempt = self._revival.attempt(now)
+        if attempt is not None and attempt.baud is not None:
+            self.driver.use_baud(attempt.baud)
+            self._base.woken_at = None
+        return attempt
 
     def _charging(self, now: float) -> bool:
         base = self._base
@@ -213,7 +234,8 @@ class GuardianCore:
 
     def _target(self, now: float) -> tuple[float, float]:
         command = self._command
-        if self._latched is not None or command is None or now - self._command_at > COMMAND_FRESH_S:
+        stale = command is None or now - self._command_at > COMMAND_FRESH_S
+        if command is None or stale or self._latched is not None or self._charging(now):
             return 0.0, 0.0
         left, right = command.left, command.right
         mean = abs(left + right) / 2
@@ -251,6 +273,8 @@ class GuardianCore:
         stopped = None
         if not self._base.awake:
             stopped = "the base is on its charger" if self._charging(now) else "the base is not ready to drive yet"
+        elif self._charging(now):
+            stopped = "the base is on its charger, where it does not drive: take it off first"
         elif self._command is None or now - self._command_at > COMMAND_FRESH_S:
             stopped = "no fresh command from the agent"
         return BaseFeedback(

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from types import FrameType
 
     from fog_contracts.robot import MotionSettings
+    from robot_agent.guardian.revival import Attempt
 
 TICK_S: Final = 0.02
 HEARTBEAT_S: Final = 0.05
@@ -77,6 +78,7 @@ class Guardian:
         self._agent_heard_at = -1.0
         self._heartbeat_at = -1.0
         self._latched: str | None = None
+        self._pulse: tuple[Literal["rts", "dtr"], float] | None = None
         self._corrupted = 0
         self._log = logs.get("guardian")
         self._limited_log = logs.RateLimited(self._log)
@@ -98,6 +100,8 @@ class Guardian:
                 for key, _ in self._selector.select(self._clock.real(TICK_S)):
                     key.data()
                 self._apply(self._core.tick(self._clock.now()))
+                self._end_pulse()
+                self._tell_unanswered()
                 self._send_heartbeat()
             self._port.write(self._core.stop_command())
         except PortLost as error:
@@ -161,6 +165,9 @@ class Guardian:
             return  # it disconnected already
         agent.settimeout(0)
         now = self._clock.now()
+        if self._core.unanswered is not None:
+            self._refuse(agent, self._core.unanswered[:SENTENCE_MAX])
+            return
         if self._agent is not None and now - self._agent_heard_at <= AGENT_LIVES_S:
             reason = "another agent is connected and drives: end one of the two"
             self._limited_log.warning("agent_refused", "agent_refused", now, reason=reason)
@@ -215,6 +222,8 @@ class Guardian:
         self._apply(self._core.on_agent_lost(self._clock.now()))
 
     def _apply(self, output: Output) -> None:
+        if output.attempt is not None:
+            self._revive(output.attempt)
         if output.data:
             self._port.write(output.data)
         if self._core.latched != self._latched:
@@ -231,6 +240,28 @@ class Guardian:
             except ConnectionError as error:
                 self._drop_agent(str(error))
                 break
+
+    def _revive(self, attempt: Attempt) -> None:
+        """Pulse the base's wake-up line or change the line's rate, and tell the agent when there is no hope."""
+        self._log.warning("base_silent", line=attempt.line and attempt.line.name, baud=attempt.baud)
+        if attempt.baud is not None:
+            self._port.set_baud(attempt.baud)
+        if attempt.line is not None:
+            self._port.set_line(attempt.line.name, on=True)
+            self._pulse = (attempt.line.name, self._clock.now() + attempt.line.seconds)
+
+    def _end_pulse(self) -> None:
+        if self._pulse is not None and self._clock.now() >= self._pulse[1]:
+            self._port.set_line(self._pulse[0], on=False)
+            self._pulse = None
+
+    def _tell_unanswered(self) -> None:
+        """End the link to an agent that would wait in vain, with the reason."""
+        if self._core.unanswered is not None and self._agent is not None:
+            agent = self._agent
+            with suppress(BlockingIOError, ConnectionError):
+                agent.send(encode(self._core.unanswered[:SENTENCE_MAX]))
+            self._drop_agent(self._core.unanswered)
 
     def _send_heartbeat(self) -> None:
         now = self._clock.now()

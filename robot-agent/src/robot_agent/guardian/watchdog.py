@@ -177,8 +177,8 @@ class _Settings(NamedTuple):
     speed: float
 
 
-def _base() -> tuple[str, str]:
-    """Return driver and port of the base, from the variables or from the robot file.
+def _base() -> tuple[str, str, int | None]:
+    """Return driver and port of the base, and its rate if the options name one: from variables or the robot file.
 
     Raises:
         _BadSettings: when the file can't be read.
@@ -193,7 +193,13 @@ def _base() -> tuple[str, str]:
             raise _BadSettings(f"FOGNAV_ROBOT_FILE: {file}: {error}. Check it with `fognav robot check`") from error
     base = table if isinstance(table, dict) else {}
     driver = os.environ.get("FOGNAV_BASE") or base.get("driver") or DEFAULT_BASE
-    return str(driver), str(os.environ.get("FOGNAV_BASE_PORT") or base.get("port") or "")
+    port = os.environ.get("FOGNAV_BASE_PORT") or base.get("port") or ""
+    options = base.get("options")
+    baud = options.get("baud") if isinstance(options, dict) and driver == base.get("driver", driver) else None
+    if given := os.environ.get("FOGNAV_BASE_OPTIONS"):
+        with suppress(ValueError, AttributeError):  # the guardian names the mistake
+            baud = json.loads(given).get("baud", baud)
+    return str(driver), str(port), baud if isinstance(baud, int) else None
 
 
 def _settings() -> _Settings:
@@ -203,7 +209,7 @@ def _settings() -> _Settings:
         _BadSettings: when a variable is missing or invalid.
 
     """
-    driver, path = _base()
+    driver, path, baud = _base()
     if not path:
         raise _BadSettings(
             "the base's serial port is not set: set `port` in [base] of the robot file, or FOGNAV_BASE_PORT, to its "
@@ -219,7 +225,7 @@ def _settings() -> _Settings:
         base = parts.load(STOPS, driver, StopCommand)
     except parts.PartError as error:
         raise _BadSettings(f"base.driver: {error}") from error
-    return _Settings(path, base, speed)
+    return _Settings(path, base if baud is None else base._replace(baud=baud), speed)
 
 
 def _guard(port: Port, settings: _Settings) -> int:

@@ -124,7 +124,7 @@ def _values(kind: inspect.Type) -> str:  # noqa: PLR0911  # one answer per kind 
     if isinstance(kind, inspect.StrType):
         return ""
     if isinstance(kind, inspect.LiteralType):
-        return " or ".join(f'"{value}"' for value in kind.values)
+        return " or ".join(_toml(value) for value in kind.values)
     if isinstance(kind, inspect.TupleType):
         return f"[{len(kind.item_types)} numbers, {_values(kind.item_types[0])}]"
     if isinstance(kind, inspect.ListType):

@@ -11,7 +11,7 @@ from msgspec import Meta
 from robot_agent.bases.diffdrive import protocol
 from robot_agent.bases.diffdrive.protocol import Flag
 from robot_agent.bases.diffdrive.stop import STOP
-from robot_agent.hardware import BaseFactory, BaseReading, BaseStatus, BaseTiming, DriveTrain, WheelOdometry
+from robot_agent.hardware import Awakening, BaseFactory, BaseReading, BaseStatus, BaseTiming, DriveTrain, WheelOdometry
 
 
 class DiffDriveOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -39,6 +39,7 @@ class DiffDriveDriver:
     """One board's protocol; see `robot_agent.hardware.BaseDriver`."""
 
     timing = BaseTiming(frame_timeout=0.3, wake_timeout=1.0, ignored_after_wake=0.1)
+    awakening = Awakening(bauds=(protocol.BAUD,))
 
     def __init__(self, options: DiffDriveOptions) -> None:
         self._options = options
@@ -73,6 +74,13 @@ class DiffDriveDriver:
     def wake(self) -> bytes:
         """Return a line feed that ends a truncated line, zero speeds, and the command that switches the motors on."""
         return b"\n" + protocol.velocity(0, 0) + protocol.enable()
+
+    def respond(self) -> bytes:
+        """Return nothing: `wake` is all that it takes."""
+        return b""
+
+    def use_baud(self, baud: int) -> None:
+        """Keep the only rate that there is."""
 
     def drive(self, left_m_s: float, right_m_s: float) -> bytes:
         """Return the command for these wheel speeds; beyond the top speed both are scaled, which keeps the curve."""

@@ -8,18 +8,39 @@ from __future__ import annotations
 
 import math
 from operator import itemgetter
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import msgspec
 from msgspec import Meta
 
 from robot_agent.bases.roomba600 import open_interface as oi
+from robot_agent.bases.roomba600.mode_monitor import ModeMonitor
 from robot_agent.bases.roomba600.stop import STOP
-from robot_agent.hardware import BaseFactory, BaseReading, BaseStatus, BaseTiming, DriveTrain, WheelOdometry
+from robot_agent.hardware import (
+    Awakening,
+    BaseFactory,
+    BaseReading,
+    BaseStatus,
+    BaseTiming,
+    DriveTrain,
+    WakeLine,
+    WheelOdometry,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
 
 _COUNTS: Final = 1 << 16
-_status_packets = itemgetter(*(i for i in oi.GUARDIAN_STREAM if i not in {22, 23, 41, 42, 43, 44}))
-"""The packets of a frame but for those that change all the time and tell nothing about the status."""
+BRC_PULSE_S: Final = 1.2
+"""The robot wakes by one low pulse of a second; three shorter ones would change its baud rate."""
+_STREAMS: Final = {115200: oi.GUARDIAN_STREAM, 19200: oi.SLOW_STREAM}
+_REMEDY: Final = (
+    "it may be asleep, and its BRC pin is not wired (`brc` in [base.options]): press its CLEAN button, then check "
+    "cable and battery"
+)
+_REMEDY_BRC: Final = "it was pulsed awake without success: check the cable, its BRC wire, and the battery"
+_CHANGING: Final = frozenset((22, 23, 35, 41, 42, 43, 44))
+"""Packets that change all the time and tell nothing about the status, and the mode, which the monitor follows."""
 
 
 class Roomba600Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -39,6 +60,14 @@ class Roomba600Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
         float,
         Meta(ge=0.15, le=0.35, description="distance between the driven wheels; measure it by some turns on the spot"),
     ] = 0.235
+    baud: Annotated[
+        Literal[115200, 19200],
+        Meta(description="rate of the serial line; the guardian tries the other one when the robot is silent"),
+    ] = 115200
+    brc: Annotated[
+        Literal["none", "rts", "dtr"],
+        Meta(description="control line of the adapter that is wired to the BRC pin, which wakes a sleeping robot"),
+    ] = "none"
 
 
 class Roomba600Driver:
@@ -47,9 +76,21 @@ class Roomba600Driver:
     timing = BaseTiming(frame_timeout=0.3, wake_timeout=1.0, ignored_after_wake=0.1)
 
     def __init__(self, options: Roomba600Options) -> None:
-        self._parser = oi.StreamParser(oi.GUARDIAN_STREAM)
-        self._status_made_of: tuple[int, ...] = ()
+        self._stream = _STREAMS[options.baud]
+        self._parser = oi.StreamParser(self._stream)
+        self._corrupted_before = 0
+        self._mode = ModeMonitor()
+        self._safe_sent = False
+        self._on_charger = False
+        self._received_at = 0.0
+        other = 19200 if options.baud == 115200 else 115200
+        line = None if options.brc == "none" else WakeLine(options.brc, BRC_PULSE_S)
+        self.awakening = Awakening(
+            bauds=(options.baud, other), line=line, remedy=_REMEDY if line is None else _REMEDY_BRC
+        )
+        self._status_made_of: tuple[object, ...] = ()
         self._last_status = BaseStatus()
+        self._status_packets = _status_packets(self._stream)
         self._metres_per_tick = math.pi * options.wheel_diameter_m / options.ticks_per_turn
         self.drive_train = DriveTrain(
             axle_m=options.axle_m,
@@ -60,24 +101,43 @@ class Roomba600Driver:
     @property
     def corrupted(self) -> int:
         """Number of damaged stream frames."""
-        return self._parser.corrupted
+        return self._corrupted_before + self._parser.corrupted
 
     def receive_data(self, data: bytes, now: float) -> None:
         """Parse received bytes."""
-        del now
+        self._received_at = now
         self._parser.receive_data(data)
 
     def next_event(self) -> BaseReading | None:
         """Return the oldest frame not yet returned."""
         frame = self._parser.next_event()
-        return None if frame is None else BaseReading(self._status(frame), self._odometry(frame))
+        if frame is None:
+            return None
+        self._mode.on_report(frame[35], self._received_at)
+        self._on_charger = frame.on_charger
+        return BaseReading(self._status(frame), self._odometry(frame))
 
     def wake(self) -> bytes:
-        """Return Start, Safe, zero speed and the request for the stream."""
-        # Start puts the OI into Passive mode, which stops the wheels by itself. The zeros after Safe are for a base
-        # whose receiver was in the middle of a command: it takes Start, Safe and the beginning of the first zero speed
-        # as the missing bytes, and the second zero speed ends whatever speed they make.
-        return oi.start() + oi.safe() + 2 * oi.drive_direct(0, 0) + oi.stream(oi.GUARDIAN_STREAM)
+        """Return Start and the request for the stream; Safe follows when the robot reports its Passive mode."""
+        # Start puts the OI into Passive mode, which stops the wheels by itself. A base whose receiver was in the middle
+        # of a wheel command takes up to four bytes as the missing ones.
+        self._mode.restart()
+        self._safe_sent = False
+        return 5 * oi.start() + oi.stream(self._stream)
+
+    def respond(self) -> bytes:
+        """Return Safe and zero speed, once the offset of the mode is known; a charging robot stays in Passive mode."""
+        if self._mode.offset is None or self._safe_sent or self._on_charger:
+            return b""
+        self._safe_sent = True
+        return oi.safe() + 2 * oi.drive_direct(0, 0)
+
+    def use_baud(self, baud: int) -> None:
+        """Ask for the stream that fits into this rate."""
+        self._stream = _STREAMS[baud]
+        self._corrupted_before += self._parser.corrupted
+        self._parser = oi.StreamParser(self._stream)
+        self._status_packets = _status_packets(self._stream)
 
     def drive(self, left_m_s: float, right_m_s: float) -> bytes:
         """Return Drive Direct; speeds beyond the top speed are scaled, which keeps the curve."""
@@ -85,9 +145,9 @@ class Roomba600Driver:
 
     def _status(self, frame: oi.Frame) -> BaseStatus:
         """Return the status; that of the last frame as long as no packet has changed that it is made of."""
-        packets = _status_packets(frame.packets)
-        if packets != self._status_made_of:
-            self._status_made_of, self._last_status = packets, _status(frame)
+        made_of = (self._mode.mode, self._status_packets(frame.packets))
+        if made_of != self._status_made_of:
+            self._status_made_of, self._last_status = made_of, _status(frame, self._mode.mode)
         return self._last_status
 
     def _odometry(self, frame: oi.Frame) -> WheelOdometry:
@@ -95,8 +155,12 @@ class Roomba600Driver:
         return WheelOdometry(left_m=left * self._metres_per_tick, right_m=right * self._metres_per_tick)
 
 
-def _status(frame: oi.Frame) -> BaseStatus:
-    charge = frame.charge_fraction
+def _status_packets(stream: Sequence[int]) -> Callable[[Mapping[int, int]], object]:
+    return itemgetter(*(packet for packet in stream if packet not in _CHANGING))
+
+
+def _status(frame: oi.Frame, mode: oi.Mode | int | None) -> BaseStatus:
+    charge = frame.charge_fraction if 26 in frame else math.nan
     return BaseStatus(
         bumper_left=frame.bump_left,
         bumper_right=frame.bump_right,
@@ -105,14 +169,16 @@ def _status(frame: oi.Frame) -> BaseStatus:
         overcurrent=frame.wheel_overcurrent,
         battery=min(1.0, max(0.0, charge)) if math.isfinite(charge) else None,
         charging=frame.on_charger,
-        mode_problem=_mode_problem(frame),
+        mode_problem=_mode_problem(frame, mode),
     )
 
 
-def _mode_problem(frame: oi.Frame) -> str | None:
-    if frame.mode == oi.Mode.SAFE:
+def _mode_problem(frame: oi.Frame, mode: oi.Mode | int | None) -> str | None:
+    if mode == oi.Mode.SAFE:
         return None
-    name = frame.mode.name.capitalize() if isinstance(frame.mode, oi.Mode) else f"number {frame.mode}"
+    if mode is None:
+        return "its Open Interface is being started"
+    name = mode.name.capitalize() if isinstance(mode, oi.Mode) else f"number {mode}"
     reason = ", because a charger is connected" if frame.on_charger else ""
     return f"its Open Interface is in mode {name} instead of Safe{reason}"
 

@@ -10,7 +10,7 @@ from msgspec import Meta
 from robot_agent.hardware import LaserScan, LidarEvents, LidarFactory, LidarTraits, SerialSettings
 from robot_agent.lidars.rplidar_a1 import protocol as rplidar
 
-STOP_S: Final = 0.05
+STOP_S: Final = 0.1
 """Time between a stop and the next request; the device needs 1 ms, and its last bytes must arrive."""
 ANSWER_TIMEOUT_S: Final = 1.0
 SAMPLES_TIMEOUT_S: Final = 1.0
@@ -91,7 +91,10 @@ class RplidarA1Driver:
 
     def _on_health(self, health: rplidar.Health, now: float) -> bytes:
         if health.status == rplidar.HealthStatus.ERROR:
-            self.problem = f"the lidar reports error {health.error_code}; it is reset"
+            self.problem = (
+                f"the lidar reports error {health.error_code}; it is reset. The cause is nearly always its supply or "
+                "cable (5 V at the plug, under load), or mounting screws that are longer than 4 mm"
+            )
             return self._enter("resetting", now, rplidar.reset())
         return self._enter("scanning", now, rplidar.scan())
 

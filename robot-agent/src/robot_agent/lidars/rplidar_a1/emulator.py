@@ -38,8 +38,8 @@ class RplidarEmulator:
     """The lidar's end of the serial line; implements `fognav_sim.emulators.LidarEmulator`.
 
     The port calls `receive` and `outgoing`; `now` is any monotonic clock, seconds. `health` and `error_code` answer a
-    health request. Two faults can be set at any time: `stalled` sends nothing more, `frozen` repeats the bytes of the
-    last whole revolution, as a stuck serial bridge does.
+    health request; `boot_text` follows a reset. Two faults can be set at any time: `stalled` sends nothing more,
+    `frozen` repeats the bytes of the last whole revolution, as a stuck serial bridge does.
     """
 
     def __init__(
@@ -65,6 +65,7 @@ class RplidarEmulator:
         self._serial_number = serial_number[:16].ljust(16, b"\0")
         self.health = 0
         self.error_code = 0
+        self.boot_text = BOOT_TEXT
         self.stalled = False
         self.frozen = False
         self._incoming = bytearray()
@@ -125,7 +126,7 @@ class RplidarEmulator:
             self._scanning = False
         elif command == 0x40:
             self._scanning = False
-            self._outgoing += BOOT_TEXT
+            self._outgoing += self.boot_text
         elif command in {0x20, 0x21}:
             self._answer(5, 0x81, repeats=True)
             self._begin(now, express=False)

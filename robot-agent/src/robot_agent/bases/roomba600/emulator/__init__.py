@@ -5,11 +5,12 @@ Source: iRobot Create 2 Open Interface specification based on the Roomba 600 (20
 a byte that is no opcode is ignored; speeds and radii out of range are clamped; Spot, Clean, Max and Seek Dock end in
 Passive mode with the wheels at rest (the simulation may drive it to the dock, see `seeking_dock`);
 Power puts the robot to sleep in Passive mode with its stream off; the encoders survive everything but Reset.
-Not emulated: the five minutes after which Passive mode sleeps, songs, LEDs, brushes, schedules, other baud rates (their
-commands are accepted and have no effect).
+What owners report of single robots is in `quirks`. Not emulated: the five minutes after which Passive mode sleeps (set
+`asleep`), songs, LEDs, brushes, schedules, the command for another baud rate (they are accepted and have no effect).
 """
 
 from robot_agent.bases.roomba600.emulator.body import Battery
+from robot_agent.bases.roomba600.emulator.quirks import Quirks
 from robot_agent.bases.roomba600.emulator.robot import BOOT_TEXT, FULL, OFF, PASSIVE, SAFE, RoombaEmulator
 
-__all__ = ["BOOT_TEXT", "FULL", "OFF", "PASSIVE", "SAFE", "Battery", "RoombaEmulator"]
+__all__ = ["BOOT_TEXT", "FULL", "OFF", "PASSIVE", "SAFE", "Battery", "Quirks", "RoombaEmulator"]

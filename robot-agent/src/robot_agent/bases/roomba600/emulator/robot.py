@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from robot_agent.bases.roomba600.emulator.body import AXLE_MM, Battery, Wheels, World
+from robot_agent.bases.roomba600.emulator.quirks import LineNoise, Quirks
 from robot_agent.bases.roomba600.emulator.sensors import Sensors, Stream
 
 if TYPE_CHECKING:
@@ -12,7 +13,6 @@ if TYPE_CHECKING:
 
 OFF, PASSIVE, SAFE, FULL = range(4)
 
-BAUD: Final = 115200
 BOOT_TEXT: Final = b"bl-start\r\nSTR730\r\nbootloader id: #x47186549 82ECCFFF\r\nbootloader info rev: #xF000\r\n"
 """Text that a robot of the 600 series prints when it resets."""
 
@@ -56,8 +56,19 @@ class RoombaEmulator:
     clock (s). Like the real robot, it keeps its last speeds for ever while the host is silent.
     """
 
-    def __init__(self, *, left_encoder: int = 0, right_encoder: int = 0, battery: Battery | None = None) -> None:
+    def __init__(
+        self,
+        *,
+        left_encoder: int = 0,
+        right_encoder: int = 0,
+        battery: Battery | None = None,
+        quirks: Quirks | None = None,
+    ) -> None:
         """Wake up in mode Off, with the encoders at these readings."""
+        self.quirks = quirks or Quirks()
+        self.asleep = False
+        """It neither hears nor sends anything until it is woken."""
+        self._noise = LineNoise(self.quirks)
         self.world = World()
         self.battery = battery or Battery()
         self.mode = OFF
@@ -71,7 +82,13 @@ class RoombaEmulator:
     @property
     def baud(self) -> int:
         """Speed of the serial line."""
-        return BAUD
+        return self.quirks.baud
+
+    def pulse_wake_line(self, seconds: float) -> None:
+        """Pull the BRC pin low for so long: a second wakes the robot."""
+        if self.asleep and seconds >= 1.0:
+            self.asleep = False
+            self._leave(OFF)
 
     @property
     def axle_m(self) -> float:
@@ -87,6 +104,8 @@ class RoombaEmulator:
     @property
     def wheel_speeds_m_s(self) -> tuple[float, float]:
         """(left, right) speeds at which the motors are driven now, m/s."""
+        if self.quirks.stays_safe_on_dock and self.world.powered and self.mode == SAFE:
+            return 0.0, 0.0
         return self._wheels.left_mm_s / 1000.0, self._wheels.right_mm_s / 1000.0
 
     @property
@@ -109,6 +128,8 @@ class RoombaEmulator:
 
     def receive(self, data: bytes, now: float) -> None:
         """Receive bytes from the host; whole commands take effect immediately."""
+        if self.asleep:
+            return
         for opcode, arguments in self._commands.parse(data):
             self._act(opcode, arguments, now)
 
@@ -120,7 +141,13 @@ class RoombaEmulator:
         return sent
 
     def _send_stream(self, now: float) -> None:
-        self._outgoing += self._stream.due(now, self._sensors.packet)
+        if not self.asleep:
+            self._outgoing += self._stream.due(now, self._packet_in_stream, self._noise.frame)
+
+    def _packet_in_stream(self, packet_id: int) -> bytes:
+        if packet_id == 35:
+            return bytes((self._noise.mode(self.mode),))
+        return self._sensors.packet(packet_id)
 
     # --- commands ---
 
@@ -180,7 +207,8 @@ class RoombaEmulator:
         # Backwards the specification ignores a cliff, unless the robot turns within its own radius.
         left, right = self._wheels.left_mm_s, self._wheels.right_mm_s
         forward_or_turning = left > 0 or right > 0 or left == right == 0
-        if self.world.wheel_drop or self.world.powered or (self.world.cliff and forward_or_turning):
+        powered = self.world.powered and not self.quirks.stays_safe_on_dock
+        if self.world.wheel_drop or powered or (self.world.cliff and forward_or_turning):
             self._leave(PASSIVE, keep_stream=True)
 
 

@@ -53,8 +53,8 @@ class Stream:
         """Forget the packets."""
         self.ids = ()
 
-    def due(self, now: float, packet: Packet) -> bytes:
-        """Return the frames up to `now`, each with its checksum."""
+    def due(self, now: float, packet: Packet, line: Callable[[bytes, float], bytes]) -> bytes:
+        """Return the frames up to `now`, each with its checksum, as `line` passes them on."""
         if not self._running:
             return b""
         if now - self._next_frame > _CATCH_UP_FRAMES * STREAM_PERIOD_S:
@@ -65,7 +65,7 @@ class Stream:
             body = b"".join(bytes((packet_id,)) + packet(packet_id) for packet_id in self.ids)
             if len(body) <= 0xFF:
                 frame = bytes((19, len(body))) + body
-                frames += frame + bytes((-sum(frame) & 0xFF,))
+                frames += line(frame + bytes((-sum(frame) & 0xFF,)), now)
         return frames
 
 

@@ -28,6 +28,7 @@ from fog_runtime.settings import SettingsError, load
 from robot_agent.device_signature import LISTEN_S, LineCheck
 from robot_agent.guardian.core import GuardianCore, Limits, Output
 from robot_agent.guardian.link import PACKET_LIMIT, WheelCommand, decode_command, encode
+from robot_agent.guardian.protection import lock_memory
 from robot_agent.guardian.watchdog import BAD_SETTINGS, PORT_LOST
 from robot_agent.registry import make_base, signatures
 from robot_agent.serial_port import Port, PortLost
@@ -325,5 +326,7 @@ def main() -> int:
         signal.signal(number, guardian.end)
     signals.ignore_terminal_stops()
     priority = set_realtime_priority(settings.realtime_priority)
-    logs.get("guardian").info("started", base=robot.settings.base.driver, port=settings.base_port, priority=priority)
+    logs.get("guardian").info(
+        "started", base=robot.settings.base.driver, port=settings.base_port, priority=priority, memory=lock_memory()
+    )
     return guardian.run()

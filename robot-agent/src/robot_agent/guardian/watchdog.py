@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from fog_runtime import parts, signals
 from fog_runtime.default_parts import DEFAULT_BASE
+from robot_agent.guardian.protection import lock_memory
 from robot_agent.port_names import PortNameError
 from robot_agent.serial_port import Port, PortLost, open_port, refuse_speed
 from robot_agent.stop_command import StopCommand
@@ -52,11 +53,13 @@ class _Terminated(Exception):  # noqa: N818  # an end, not an error
     """A signal that ends the process arrived."""
 
 
-class _BadSettings(Exception):  # noqa: N818  # an end, too
+class BadSettings(Exception):  # noqa: N818  # an end, too
     """The settings are invalid: the process ends, and a restart would fail again."""
 
 
-def _log(event: str, **fields: object) -> None:
+def log_event(event: str, **fields: object) -> None:
+    """Write one line of JSON to standard error."""
+    """Write one line of JSON to standard error."""
     line = {"ts": time.time(), "process": "watchdog", "event": event, **fields}
     # A log without a reader must not end the process that stops the wheels.
     with suppress(OSError):
@@ -76,7 +79,7 @@ def stop_wheels(port: Port, command: bytes) -> bool:
     try:
         port.write(command)
     except PortLost as error:
-        _log("stop_failed", reason=str(error))
+        log_event("stop_failed", reason=str(error))
         return False
     return True
 
@@ -148,7 +151,7 @@ def guard_once(port: Port, base: StopCommand, silence_s: float) -> int:
         reason = _monitor(guardian, heartbeat_read, port, base.hold, silence_s)
         stopped = stop_wheels(port, base.stop)
         code = _end(guardian)
-        _log("guardian_lost", reason=reason, exit_code=code, wheels_stopped=stopped)
+        log_event("guardian_lost", reason=reason, exit_code=code, wheels_stopped=stopped)
         return code
     finally:
         # On a signal, end a guardian that still runs: it stops the wheels first.
@@ -169,7 +172,7 @@ def _end(guardian: subprocess.Popen[bytes]) -> int:
         return guardian.wait()
 
 
-class _Settings(NamedTuple):
+class Settings(NamedTuple):
     """Settings from the environment: the base's port, its stop command, and the ratio of simulated to wall time."""
 
     path: str
@@ -181,7 +184,7 @@ def _base() -> tuple[str, str, int | None]:
     """Return driver and port of the base, and its rate if the options name one: from variables or the robot file.
 
     Raises:
-        _BadSettings: when the file can't be read.
+        BadSettings: when the file can't be read.
 
     """
     table: object = None
@@ -190,7 +193,7 @@ def _base() -> tuple[str, str, int | None]:
             with Path(file).open("rb") as opened:
                 table = tomllib.load(opened).get("base")
         except (OSError, ValueError) as error:
-            raise _BadSettings(f"FOGNAV_ROBOT_FILE: {file}: {error}. Check it with `fognav robot check`") from error
+            raise BadSettings(f"FOGNAV_ROBOT_FILE: {file}: {error}. Check it with `fognav robot check`") from error
     base = table if isinstance(table, dict) else {}
     driver = os.environ.get("FOGNAV_BASE") or base.get("driver") or DEFAULT_BASE
     port = os.environ.get("FOGNAV_BASE_PORT") or base.get("port") or ""
@@ -202,16 +205,16 @@ def _base() -> tuple[str, str, int | None]:
     return str(driver), str(port), baud if isinstance(baud, int) else None
 
 
-def _settings() -> _Settings:
+def read_settings() -> Settings:
     """Read the environment.
 
     Raises:
-        _BadSettings: when a variable is missing or invalid.
+        BadSettings: when a variable is missing or invalid.
 
     """
     driver, path, baud = _base()
     if not path:
-        raise _BadSettings(
+        raise BadSettings(
             "the base's serial port is not set: set `port` in [base] of the robot file, or FOGNAV_BASE_PORT, to its "
             "name in /dev/serial/by-id or /dev/serial/by-path"
         )
@@ -220,39 +223,39 @@ def _settings() -> _Settings:
     except ValueError:
         speed = -1.0
     if not 0 < speed < 1000:
-        raise _BadSettings("FOGNAV_SPEED must be a positive number such as 1 (simulated over wall time)")
+        raise BadSettings("FOGNAV_SPEED must be a positive number such as 1 (simulated over wall time)")
     try:
         base = parts.load(STOPS, driver, StopCommand)
     except parts.PartError as error:
-        raise _BadSettings(f"base.driver: {error}") from error
-    return _Settings(path, base if baud is None else base._replace(baud=baud), speed)
+        raise BadSettings(f"base.driver: {error}") from error
+    return Settings(path, base if baud is None else base._replace(baud=baud), speed)
 
 
-def _guard(port: Port, settings: _Settings) -> int:
+def _guard(port: Port, settings: Settings) -> int:
     """Run the guardian on an open port, again after each end; returns PORT_LOST, or BAD_SETTINGS of the guardian.
 
     Raises:
         PortLost: when the port is lost before a guardian's first heartbeat.
-        _BadSettings: when this port must not be guarded at this speed.
+        BadSettings: when this port must not be guarded at this speed.
 
     """
     base, speed = settings.base, settings.speed
     # Before anything else: a blocked log must not keep the wheels turning.
     stop_wheels(port, base.stop)
     if (refusal := refuse_speed(speed, port.device)) is not None:
-        raise _BadSettings(refusal)
-    _log("port_open", path=settings.path)
+        raise BadSettings(refusal)
+    log_event("port_open", path=settings.path)
     silence_s = max(SILENCE_S / speed, SILENCE_MIN_S)
     while (code := guard_once(port, base, silence_s)) not in {PORT_LOST, BAD_SETTINGS}:
         hold(port, base.hold, RESTART_S / speed)
     return code
 
 
-def _guard_always(settings: _Settings) -> int:
+def _guard_always(settings: Settings) -> int:
     """Open the port and guard it, and reopen it whenever it is lost; returns BAD_SETTINGS of the guardian.
 
     Raises:
-        _BadSettings: when the port's name is refused, or its use at this speed.
+        BadSettings: when the port's name is refused, or its use at this speed.
 
     """
     last_logged = ""
@@ -263,11 +266,11 @@ def _guard_always(settings: _Settings) -> int:
                 if _guard(port, settings) == BAD_SETTINGS:
                     return BAD_SETTINGS
         except PortNameError as error:
-            raise _BadSettings(f"base.port: {error}") from error
+            raise BadSettings(f"base.port: {error}") from error
         except PortLost as error:
             if str(error) != last_logged:
                 last_logged = str(error)
-                _log("port_lost", reason=last_logged)
+                log_event("port_lost", reason=last_logged)
         time.sleep(REOPEN_S / settings.speed)
 
 
@@ -283,15 +286,16 @@ def main() -> int:
     try:
         _own_session()
         signals.ignore_terminal_stops()
-        settings = _settings()
+        settings = read_settings()
+        log_event("started", memory=lock_memory())
         for number in signals.ending():
             signal.signal(number, _terminate)
         return _guard_always(settings)
-    except _BadSettings as error:
-        _log("bad_settings", reason=str(error))
+    except BadSettings as error:
+        log_event("bad_settings", reason=str(error))
         return BAD_SETTINGS
     except _Terminated as end:
-        _log("ended", signal=str(end))
+        log_event("ended", signal=str(end))
         return 0
 
 

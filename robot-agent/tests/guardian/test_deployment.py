@@ -1,0 +1,196 @@
+"""The files of `deploy/robot`: systemd accepts the units, and what they start and run afterwards stops the wheels."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import guardian_rig as rigs
+import pytest
+from guardian_rig import wait_for
+
+from fog_runtime.robot_file import ROBOT_FILE, load_robot
+from fog_runtime.settings import load
+from robot_agent.agent.settings import Settings
+
+DEPLOY = Path(__file__).parents[3] / "deploy/robot"
+UNITS = ["fognav-watchdog.service", "fognav-agent.service"]
+PYTHON = "/opt/fognav/venv/bin/python"
+
+NO_EXECUTABLE_MEMORY = """
+import ctypes, os, sys
+assert ctypes.CDLL(None).prctl(65, 1, 0, 0, 0) == 0, "PR_SET_MDWE"
+os.execv(sys.executable, [sys.executable, "-c", sys.argv[1]])
+"""
+LOADS_ALL = """
+import mmap
+import robot_agent.guardian.process, robot_agent.guardian.stop_base
+from fog_runtime.robot_file import default_robot
+from robot_agent.registry import make_base, signatures
+make_base(default_robot()), signatures()
+try:
+    mmap.mmap(-1, 4096, prot=mmap.PROT_WRITE | mmap.PROT_EXEC)
+except PermissionError:
+    print("loaded")
+"""
+
+
+@pytest.fixture
+def installed(tmp_path):
+    """The files as the installer writes them, below a folder."""
+    robot_file, key = tmp_path / "robot.toml", tmp_path / "key"
+    robot_file.write_text('[base]\ndriver = "roomba600"\n[lidar]\ndriver = "rplidar-a1"\nport = "/dev/pts/7"\n')
+    key.write_text("ab" * 32)
+    root = tmp_path / "root"
+    install(root, "--robot-file", str(robot_file), "--key", str(key))
+    return root
+
+
+def install(root, *more):
+    command = [DEPLOY / "install", "--robot", "r1", "--site", "lab", "--fog", "fog.local", "--root", str(root), *more]
+    return subprocess.run(command, check=True, capture_output=True, text=True)
+
+
+def entries(unit, name):
+    return re.findall(rf"^{name}=(.*)$", unit.read_text(), re.MULTILINE)
+
+
+def environment(root):
+    lines = (root / "etc/fognav/robot.env").read_text().splitlines()
+    return dict(line.split("=", 1) for line in lines if line and not line.startswith("#"))
+
+
+def test_installed_files_have_no_placeholder_left_and_are_not_writable_by_others(installed):
+    files = [path for path in installed.rglob("*") if path.is_file()]
+    assert len(files) == 10
+    for path in files:
+        assert not re.search(r"@[A-Z]+@", path.read_text()), path
+        assert not path.stat().st_mode & 0o022
+    assert (installed / "etc/fognav/operator.key").stat().st_mode & 0o007 == 0
+    assert "NTP=fog.local" in (installed / "etc/systemd/timesyncd.conf.d/fognav.conf").read_text()
+
+
+def test_a_second_installation_keeps_what_was_changed_on_the_robot(installed):
+    env, toml = installed / "etc/fognav/robot.env", installed / "etc/fognav/robot.toml"
+    env.write_text(env.read_text().replace("r1", "r9"))
+    before = toml.read_text()
+    install(installed)
+    assert environment(installed)["FOGNAV_ROBOT"] == "r9"
+    assert toml.read_text() == before
+
+
+@pytest.mark.parametrize(
+    "arguments", [[], ["--robot"], ["--robot", "r 1", "--site", "s", "--fog", "f"], ["--what", "x"]]
+)
+def test_the_installer_refuses_wrong_arguments(arguments):
+    done = subprocess.run([DEPLOY / "install", *arguments], check=False, capture_output=True, text=True)
+    assert done.returncode != 0
+    assert "usage" in done.stderr or "fognav:" in done.stderr
+
+
+def test_the_variables_are_settings_that_the_processes_accept(installed):
+    environ = environment(installed)
+    settings = load(Settings, environ={**environ, "FOGNAV_SITE_DIR": "/none"})
+    assert (settings.robot, settings.site, settings.zenoh_endpoints) == ("r1", "lab", ["tcp/fog.local:7447"])
+    environ[ROBOT_FILE] = str(installed) + environ[ROBOT_FILE]
+    assert load_robot(environ).settings.lidar.port == "/dev/pts/7"
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="needs systemd-analyze")
+def test_systemd_accepts_the_units(installed, tmp_path):
+    folder = tmp_path / "units"
+    folder.mkdir()
+    for name in UNITS:
+        unit = (installed / "etc/systemd/system" / name).read_text()
+        (folder / name).write_text(unit.replace(PYTHON, sys.executable))
+    done = subprocess.run(
+        ["systemd-analyze", "verify", "--man=no", "--recursive-errors=no", *(str(folder / name) for name in UNITS)],
+        check=False,
+        capture_output=True,
+        text=True,
+    )
+    assert (done.returncode, [line for line in done.stderr.splitlines() if "fognav" in line]) == (0, [])
+
+
+@pytest.mark.skipif(shutil.which("udevadm") is None, reason="needs udevadm")
+def test_udev_accepts_the_rules(installed):
+    rules = installed / "etc/udev/rules.d/60-fognav.rules"
+    done = subprocess.run(["udevadm", "verify", str(rules)], check=False, capture_output=True, text=True)
+    if "Unknown command" in done.stderr or "unrecognized" in done.stderr:
+        pytest.skip("this udevadm has no verify")
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_the_watchdog_is_protected_and_the_agent_may_compile():
+    watchdog, agent = (DEPLOY / "systemd" / name for name in UNITS)
+    assert entries(watchdog, "Restart") == entries(agent, "Restart") == ["always"]
+    assert entries(watchdog, "RestartPreventExitStatus") == ["78"]
+    assert int(entries(watchdog, "OOMScoreAdjust")[0]) < int(entries(agent, "OOMScoreAdjust")[0]) < 0
+    assert entries(watchdog, "LimitMEMLOCK") == ["infinity"]
+    assert entries(watchdog, "MemoryDenyWriteExecute") == ["yes"]
+    assert entries(agent, "MemoryDenyWriteExecute") == []
+    # The guardian's own real-time priority (10) lies below the watchdog's, within the limit.
+    assert 10 < int(entries(watchdog, "CPUSchedulingPriority")[0]) <= int(entries(watchdog, "LimitRTPRIO")[0])
+    for unit in (watchdog, agent):
+        assert {"char-ttyUSB rw", "char-ttyACM rw"} <= set(entries(unit, "DeviceAllow"))
+        assert entries(unit, "DevicePolicy") == ["closed"]
+    assert "After" not in watchdog.read_text(), "the watchdog waits for nothing"
+
+
+def test_watchdog_and_guardian_load_without_executable_memory():
+    done = subprocess.run(
+        [sys.executable, "-c", NO_EXECUTABLE_MEMORY, LOADS_ALL], check=False, capture_output=True, text=True, timeout=60
+    )
+    if "PR_SET_MDWE" in done.stderr:
+        pytest.skip("this kernel has no PR_SET_MDWE")
+    assert done.stdout == "loaded\n", done.stderr
+
+
+@pytest.mark.live
+def test_the_units_commands_guard_a_base_and_stop_it_after_the_watchdog_is_killed(installed, tmp_path):
+    unit = installed / "etc/systemd/system/fognav-watchdog.service"
+    (start,), (afterwards,) = entries(unit, "ExecStart"), entries(unit, "ExecStopPost")
+    with rigs.Base(tmp_path / "base") as base:
+        environ = {**os.environ, **environment(installed), "FOGNAV_BASE_PORT": str(base.link)}
+        environ[ROBOT_FILE] = str(installed) + environ[ROBOT_FILE]
+        environ["FOGNAV_GUARDIAN_SOCKET"] = str(tmp_path / "guardian.sock")
+        with (tmp_path / "log").open("wb") as log:
+            watchdog = subprocess.Popen(start.replace(PYTHON, sys.executable).split(), env=environ, stderr=log)
+            try:
+                with rigs.Agent(tmp_path / "guardian.sock") as agent:
+                    agent.wheels = (0.3, 0.3)
+                    wait_for(lambda: base.speeds == (0.3, 0.3), "the base drives")
+                    children = Path(f"/proc/{watchdog.pid}/task/{watchdog.pid}/children").read_text().split()
+                    # The worst case: both die at once, and the base rolls on.
+                    watchdog.send_signal(signal.SIGSTOP)
+                    os.kill(int(children[0]), signal.SIGKILL)
+                    watchdog.kill()
+                    watchdog.wait()
+                assert base.speeds == (0.3, 0.3)
+                done = subprocess.run(
+                    afterwards.replace(PYTHON, sys.executable).split(),
+                    env=environ,
+                    check=False,
+                    capture_output=True,
+                    text=True,
+                )
+                assert done.returncode == 0, done.stderr
+                wait_for(lambda: base.speeds == (0.0, 0.0), "the base stops")
+            finally:
+                watchdog.kill()
+                watchdog.wait()
+        assert '"memory": "' in (tmp_path / "log").read_text()
+        missing = subprocess.run(
+            afterwards.replace(PYTHON, sys.executable).split(),
+            env={**environ, "FOGNAV_BASE_PORT": str(tmp_path / "nowhere")},
+            check=False,
+            capture_output=True,
+            text=True,
+        )
+        assert missing.returncode == 1
+        assert "stop_failed" in missing.stderr

@@ -27,9 +27,12 @@ from numba import float64, int64, njit, types, void
 
 from fog_contracts.costs import COST_WEIGHT, INSCRIBED, NEUTRAL_WEIGHT, PENALTY_MAX
 from fog_kernels import _arrays
+from fog_kernels.guides import UNREACHABLE, GoalField
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+    from fog_kernels.guides import Detour
 
 STRAIGHT = 408
 DIAGONAL = 577
@@ -44,9 +47,6 @@ _QUEUE_FULL = 4
 type_cells = _arrays.I32_FLAT
 type_scratch = _arrays.I32_OUT
 
-
-_UNREACHABLE = 65535
-"""In a goal field: no path leads from the block to the goal."""
 
 _U16_FLAT = types.Array(types.uint16, 1, "C", readonly=True)
 
@@ -63,6 +63,9 @@ def _search_signature(costs: Any) -> Any:
         int64,  # field_width
         int64,  # field_bits
         int64,  # field_unit
+        _U16_FLAT,  # detour
+        int64,  # detour_unit
+        int64,  # detour_offset
         write,  # g
         type_scratch,  # queue_cell
         type_scratch,  # queue_next
@@ -85,6 +88,9 @@ def _search(
     field_width: int,
     field_bits: int,
     field_unit: int,
+    detour: Any,
+    detour_unit: int,
+    detour_offset: int,
     g: Any,
     queue_cell: Any,
     queue_next: Any,
@@ -94,7 +100,7 @@ def _search(
     max_expansions: int,
     result: Any,
 ) -> None:
-    """Search from start to goal; an empty field (see `GoalField`) means the octile heuristic.
+    """Search from start to goal; an empty field (see `GoalField`) means the octile heuristic, and no detour.
 
     `g` holds its largest value everywhere before and after. A negative g is the complement of an expanded cell's
     cost. `result` receives status, cost, path length, expansions; the path itself ends in queue_cell, goal first.
@@ -106,6 +112,7 @@ def _search(
     mask = heads.size - 1
     capacity = queue_cell.size
     use_field = field.size > 0
+    use_detour = detour.size > 0
     goal_x = goal % width
     goal_y = goal // width
     cheapest = 2 * np.int64(weight[0])
@@ -125,9 +132,12 @@ def _search(
         return
     if use_field:
         block = np.int64(field[(start // width >> field_bits) * field_width + (start % width >> field_bits)])
-        if block == _UNREACHABLE:
+        if block == UNREACHABLE:
             return
-        bucket = (block * field_unit) >> shift
+        remaining = block * field_unit
+        if use_detour and detour[start] != UNREACHABLE:
+            remaining = max(remaining, np.int64(detour[start]) * detour_unit + detour_offset)
+        bucket = remaining >> shift
     else:
         dx = abs(start % width - goal_x)
         dy = abs(start // width - goal_y)
@@ -178,7 +188,12 @@ def _search(
         if best != highest:
             if use_field:
                 block = np.int64(field[np.uint64((y >> field_bits) * field_width + (x >> field_bits))])
-                f = here + block * field_unit
+                remaining = block * field_unit
+                if use_detour:
+                    bound = np.int64(detour[np.uint64(cell)])
+                    if bound != UNREACHABLE:
+                        remaining = max(remaining, bound * detour_unit + detour_offset)
+                f = here + remaining
             else:
                 dx = abs(x - goal_x)
                 dy = abs(y - goal_y)
@@ -228,9 +243,13 @@ def _search(
             ny = y + rows[k]
             if use_field:
                 block = np.int64(field[np.uint64((ny >> field_bits) * field_width + (nx >> field_bits))])
-                if block == _UNREACHABLE:
+                if block == UNREACHABLE:
                     continue
                 remaining = block * field_unit
+                if use_detour:
+                    bound = np.int64(detour[np.uint64(neighbour)])
+                    if bound != UNREACHABLE:
+                        remaining = max(remaining, bound * detour_unit + detour_offset)
             else:
                 dx = abs(nx - goal_x)
                 dy = abs(ny - goal_y)
@@ -437,7 +456,7 @@ def _compact(field: Any, unset: int, unit: int, out: Any) -> None:
     """Write the field in multiples of `unit`, rounded down."""
     for cell in range(field.size):
         cost = np.int64(field[cell])
-        out[cell] = _UNREACHABLE if cost == unset else cost // unit
+        out[cell] = UNREACHABLE if cost == unset else cost // unit
 
 
 def _descend_signature(costs: Any) -> Any:
@@ -679,38 +698,6 @@ class PlanResult:
     timed_out: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class GoalField:
-    """A lower bound of the cost to one goal, for every block of 2^bits x 2^bits cells.
-
-    `costs` is uint16 (rows, columns): the lowest cost in a block in multiples of `unit`, rounded down; 65535 where no
-    path leads to the goal. It guides `Planner.plan` on costmaps of `width` x `height` cells none of which is lower than
-    in the costmap that it was computed on. 2000 x 1200 cells take 4.8 MB, and a quarter of that with each further bit.
-    """
-
-    goal: tuple[int, int]
-    width: int
-    height: int
-    bits: int
-    costs: NDArray[np.uint16]
-    unit: int
-
-    @property
-    def size(self) -> int:
-        """The memory (bytes) of the costs."""
-        return self.costs.nbytes
-
-    def coarser(self) -> GoalField:
-        """Return the field with blocks of twice the side: searches stay exact and expand more cells."""
-        rows, columns = self.costs.shape
-        padded = np.full((rows + rows % 2, columns + columns % 2), _UNREACHABLE, np.uint16)
-        padded[:rows, :columns] = self.costs
-        costs = np.minimum(
-            np.minimum(padded[::2, ::2], padded[1::2, ::2]), np.minimum(padded[::2, 1::2], padded[1::2, 1::2])
-        )
-        return GoalField(self.goal, self.width, self.height, self.bits + 1, costs, self.unit)
-
-
 class Planner:
     """Exact A* on costmaps of one size; owns the memory of its searches, so that planning allocates little.
 
@@ -726,12 +713,13 @@ class Planner:
         self.height = height
         self.neutral = neutral
         self.factor = factor
-        self._weight = _weights_of(neutral, factor)
-        highest_edge_cost = 2 * DIAGONAL * int(self._weight.max())
+        self.weight = _weights_of(neutral, factor)
+        """The weight of every cost (0..255); 0 marks impassable cells."""
+        highest_edge_cost = 2 * DIAGONAL * int(self.weight.max())
         # With a consistent heuristic the total estimate rises by at most twice the highest edge cost per step.
         self._shift = max(0, (2 * highest_edge_cost // (BUCKETS - 2)).bit_length())
-        self._field_shift = (2 * STRAIGHT * int(self._weight[0])).bit_length() - 1
-        open_buckets = (highest_edge_cost >> self._field_shift) + 3
+        self.bucket_shift = (2 * STRAIGHT * int(self.weight[0])).bit_length() - 1
+        open_buckets = (highest_edge_cost >> self.bucket_shift) + 3
         self._field_buckets = 1 << open_buckets.bit_length()
         self._costs: type[np.int32 | np.int64] = np.int32
         self._capacity = width * height
@@ -767,22 +755,27 @@ class Planner:
         goal: tuple[int, int],
         max_expansions: int = 0,
         field: GoalField | None = None,
+        detour: Detour | None = None,
     ) -> PlanResult:
         """Return a cheapest path from start to goal, both (column, row), on a uint8 (h, w) costmap.
 
         The goal's field, if given, guides the search, which stays exact as long as no cell of the costmap is lower than
-        in the costmap of the field. `max_expansions` above 0 limits the work. A start or goal that isn't traversable
+        in the costmap of the field; so does the detour, which counts with a field only, for a goal outside its part of
+        the floor. `max_expansions` above 0 limits the work. A start or goal that isn't traversable
         gives `found=False`. Raises ValueError for cells outside, for a costmap of another shape, and for a field of
         another goal or shape.
         """
         costmap = self._grid(costmap)
         first = self._index(start, "start")
         last = self._index(goal, "goal")
+        around, around_unit, offset = _NO_FIELD, 0, None
         if field is None:
             guide, columns, bits, unit = _NO_FIELD, 0, 0, 0
         elif field.goal == (int(goal[0]), int(goal[1])) and (field.width, field.height) == (self.width, self.height):
             guide, columns = field.costs.ravel(), field.costs.shape[1]
             bits, unit = field.bits, field.unit
+            if detour is not None and (offset := detour.offset(field)) is not None:
+                around, around_unit = detour.costs.ravel(), detour.unit
         else:
             size = f"{field.width} x {field.height}"
             raise ValueError(f"the field is of goal {field.goal} on {size} cells: pass that of this goal and map")
@@ -790,13 +783,16 @@ class Planner:
             _search(
                 costmap.ravel(),
                 self.width,
-                self._weight,
+                self.weight,
                 first,
                 last,
                 guide,
                 columns,
                 bits,
                 unit,
+                around,
+                around_unit,
+                offset or 0,
                 self._g,
                 self._queue_cell,
                 self._queue_next,
@@ -842,7 +838,7 @@ class Planner:
         self._fill(costmap, self._index(goal, "goal"), _NO_EXITS)
         unset = np.iinfo(self._costs).max
         highest = int(self._g.max(where=self._g != unset, initial=0))
-        unit = highest // (_UNREACHABLE - 1) + 1
+        unit = highest // (UNREACHABLE - 1) + 1
         costs = np.empty((self.height, self.width), np.uint16)
         _compact(self._g, unset, unit, costs.ravel())
         self._g.fill(unset)
@@ -860,7 +856,7 @@ class Planner:
         status, cell = self._fill(costmap, self._index(start, "start"), exits.ravel())
         cells = None
         if status == _FOUND:
-            count = int(_descend(costmap.ravel(), self.width, self._weight, cell, self._g, self._queue_cell))
+            count = int(_descend(costmap.ravel(), self.width, self.weight, cell, self._g, self._queue_cell))
             flat = self._queue_cell[:count][::-1]
             cells = np.stack((flat % self.width, flat // self.width), axis=1).astype(np.int32)
         self._g.fill(np.iinfo(self._costs).max)
@@ -872,14 +868,14 @@ class Planner:
             status, cell = _fill_field(
                 costmap.ravel(),
                 self.width,
-                self._weight,
+                self.weight,
                 target,
                 exits,
                 self._g,
                 self._queue_cell,
                 self._queue_next,
                 np.empty(self._field_buckets, np.int32),
-                self._field_shift,
+                self.bucket_shift,
             )
             if status == _OVERFLOW:
                 self._widen()

@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 
 PROFILES: dict[str, tuple[str, ...]] = {
     "robot": ("amcl", "astar", "distance", "dwa", "inflation", "likelihood", "raycast"),
-    "planner": ("astar", "components", "distance", "inflation"),
+    "planner": ("astar", "components", "detour", "distance", "inflation"),
     "map": ("distance", "inflation", "spans"),
     "sim": ("distance", "raycast"),
-    "all": ("amcl", "astar", "components", "distance", "dwa", "inflation", "likelihood", "raycast", "spans"),
+    "all": ("amcl", "astar", "components", "detour", "distance", "dwa", "inflation", "likelihood", "raycast", "spans"),
 }
 
 

@@ -41,6 +41,10 @@ class PlannerConfig:
     max_expansions: int = 50_000_000
     quick_expansions: int = 40_000
     """After so many expanded cells (1 ms) a search first asks whether the goal can be reached at all."""
+    detour_expansions: int = 30_000
+    """After a search of so many expanded cells, a bound of the way round is computed for those that are left ..."""
+    detour_searches: int = 3
+    """... if at least so many are."""
     goal_fields_bytes: int = 40_000_000
     """The memory of all distance fields together."""
     refused_retry_s: float = 1.0

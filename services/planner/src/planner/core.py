@@ -98,6 +98,8 @@ class PlannerCore:
         if planning_map is None:
             return ()
         self._fields.set_lower_bound(planning_map.lower_bound)
+        if any(change.any_decreased for change in changes):
+            self.replanner.detours.clear()
         for change in changes:
             for _, mission in self.missions.active():
                 self._apply_change(mission, change, planning_map)
@@ -160,6 +162,7 @@ class PlannerCore:
         assert planning_map is not None
         self.fence.raise_to(ch.MAP, planning_map.version.epoch)
         self._fields.set_lower_bound(planning_map.lower_bound)
+        self.replanner.detours.clear()
         for _, mission in self.missions.active():
             refused = mission.plan is not None and mission.plan.route is None
             mission.request_replan("epoch" if loaded.restarted else "refused" if refused else "map", loaded.traces)
@@ -201,9 +204,11 @@ class PlannerCore:
             return
         self._served = self.missions.located(at.now, self.config)
         covers = partial(cover, self._regions.sources)
-        for robot, mission, reason in self.missions.to_replan(at.now, self.config):
+        due = self.missions.to_replan(at.now, self.config)
+        for number, (robot, mission, reason) in enumerate(due):
             if mission.target is not None and mission.pose is not None:
-                self.replanner.replan(mission, reason, planning_map, covers, at.now)
+                waiting = [other for _, other, _ in due[number + 1 :]]
+                self.replanner.replan(mission, reason, planning_map, covers, at.now, waiting)
                 yield robot
 
     def publish(self, at: Moment) -> Sequence[Publication]:

@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fog_contracts.costs import INSCRIBED
-from fog_kernels.astar import GoalField, Planner
+from fog_kernels.astar import Planner
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
+    from fog_kernels.guides import GoalField
     from planner.planning_map import Cell, Grid
 
 
@@ -74,6 +75,16 @@ class GoalFields:
         self._running: dict[Cell, FieldJob] = {}
         self._scratch = FieldScratch()
 
+    @property
+    def bound(self) -> Grid:
+        """The costmap below which no cost falls: the fields are computed on it."""
+        return self._lower_bound
+
+    @property
+    def reference(self) -> GoalField | None:
+        """A field of single cells; one is kept as long as it fits. None without one."""
+        return next((field for field in self._fields.values() if field.bits == 0), None)
+
     def set_lower_bound(self, lower_bound: Grid) -> None:
         """Set the lower bound; a new one discards all fields, because they would mislead the search."""
         if lower_bound is not self._lower_bound:
@@ -96,7 +107,10 @@ class GoalFields:
                 del self._fields[goal]
         bits = self._bits(len(current))
         scratch, bound = self._scratch, self._lower_bound
-        jobs = [FieldJob(goal, bound, bits, scratch, last=goal == missing[-1]) for goal in missing]
+        fine = missing[0] if self.reference is None and 2 * bound.size <= self._capacity else None
+        jobs = [
+            FieldJob(goal, bound, 0 if goal == fine else bits, scratch, last=goal == missing[-1]) for goal in missing
+        ]
         self._running.update({job.goal: job for job in jobs})
         return jobs
 
@@ -109,11 +123,16 @@ class GoalFields:
         self._fields[job.goal] = job.field
         self._fields.move_to_end(job.goal)
         while self.size > self._capacity:
-            largest = max(self._fields.values(), key=lambda field: field.size)  # the first: the least recently used
+            largest = max(self._coarsenable(), key=lambda field: field.size)  # the first: the least recently used
             if max(largest.costs.shape) == 1:
-                self._fields.popitem(last=False)
+                del self._fields[largest.goal]
             else:
                 self._fields[largest.goal] = largest.coarser()
+
+    def _coarsenable(self) -> list[GoalField]:
+        """Return the fields that make room for others: all but the reference, if there are any."""
+        reference = self.reference
+        return [field for field in self._fields.values() if field is not reference] or list(self._fields.values())
 
     def guide(self, goal: Cell) -> GoalField | None:
         """Return the goal's field; None without one."""

@@ -25,7 +25,8 @@ from planner.route import Floats, Route
 if TYPE_CHECKING:
     from fog_contracts.grid import GridGeometry
     from fog_contracts.messages import PointXY, Refusal
-    from fog_kernels.astar import GoalField, PlanResult
+    from fog_kernels.astar import PlanResult
+    from fog_kernels.guides import Detour, GoalField
     from planner.config import PlannerConfig
     from planner.planning_map import Cell, Grid, PlanningMap
 
@@ -54,6 +55,7 @@ class SearchResult:
     refusal: Refusal | None
     question: Question | None = None
     searched: bool = True
+    expansions: int = 0
 
 
 def refused(refusal: Refusal, question: Question | None = None, *, searched: bool = False) -> SearchResult:
@@ -74,12 +76,18 @@ class PathSearch:
         self.planner = Planner(geometry.width, geometry.height)
 
     def find(
-        self, planning_map: PlanningMap, covers: Covers, start: PointXY, goal: PointXY, field: GoalField | None = None
+        self,
+        planning_map: PlanningMap,
+        covers: Covers,
+        start: PointXY,
+        goal: PointXY,
+        field: GoalField | None = None,
+        detour: Detour | None = None,
     ) -> SearchResult:
         """Return the cheapest path between two points (m, frame `map`), or why there is none.
 
-        `field` is that of the goal's cell, if there is one. Refusals name no hazard and no zone: the `question` can be
-        answered later.
+        `field` is that of the goal's cell, if there is one, `detour` a bound that holds for start and goal. Refusals
+        name no hazard and no zone: the `question` can be answered later.
         """
         geometry = self.geometry
         first, last = geometry.cell(*start), geometry.cell(*goal)
@@ -93,13 +101,13 @@ class PathSearch:
         if planning_map.cost[last[1], last[0]] >= INSCRIBED:
             nearest = nearest_reachable(planning_map, free, last)
             return refused(goal_occupied(goal, nearest), Question("goal", start, goal, free, last))
-        found = self._search(planning_map, free, last, field)
+        found = self._search(planning_map, free, last, field, detour)
         if found is None or found.timed_out:
             return self._without_path(planning_map, Question("path", start, goal, free, last), found)
         corners = self.planner.shortcut(planning_map.cost, found.cells)
         points = self._points(planning_map.cost, corners, start, goal, escaping=free != first)
         route = Route(points, self._config.point_spacing, escape_lines=int(free != first))
-        return SearchResult(route, route.cost(planning_map.cost, geometry), None)
+        return SearchResult(route, route.cost(planning_map.cost, geometry), None, expansions=found.expansions)
 
     def _without_path(self, planning_map: PlanningMap, question: Question, found: PlanResult | None) -> SearchResult:
         if found is not None:
@@ -107,7 +115,9 @@ class PathSearch:
             return refused(refuse(207, reason), searched=True)
         return refused(no_path(nearest_reachable(planning_map, question.start_cell, question.goal_cell)), question)
 
-    def _search(self, planning_map: PlanningMap, start: Cell, goal: Cell, field: GoalField | None) -> PlanResult | None:
+    def _search(
+        self, planning_map: PlanningMap, start: Cell, goal: Cell, field: GoalField | None, detour: Detour | None
+    ) -> PlanResult | None:
         """Search a path between two traversable cells; None if they are not connected.
 
         Most searches are short, so a few cells are expanded first; then it is worth to ask whether there is a path.
@@ -116,12 +126,12 @@ class PathSearch:
             return None
         most = self._config.max_expansions
         if not planning_map.has_components and self._config.quick_expansions < most:
-            found = self.planner.plan(planning_map.cost, start, goal, self._config.quick_expansions, field)
+            found = self.planner.plan(planning_map.cost, start, goal, self._config.quick_expansions, field, detour)
             if not found.timed_out:
                 return found if found.found else None
             if not planning_map.reachable(start, goal):
                 return None
-        found = self.planner.plan(planning_map.cost, start, goal, most, field)
+        found = self.planner.plan(planning_map.cost, start, goal, most, field, detour)
         return found if found.found or found.timed_out else None
 
     def _points(self, cost: Grid, corners: Floats, start: PointXY, goal: PointXY, *, escaping: bool) -> Floats:

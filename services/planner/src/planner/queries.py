@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from fog_contracts.messages import EgressRequest, PlanRequest, Refusal
-    from fog_kernels.astar import GoalField
+    from fog_kernels.guides import GoalField
     from planner.config import PlannerConfig
     from planner.mission import Plan
     from planner.path_search import Covers, Question, SearchResult

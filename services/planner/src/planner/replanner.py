@@ -4,13 +4,18 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Literal
 
+from planner.detours import Detours
 from planner.mission import Plan
 from planner.path_search import PathSearch
 from planner.replan_policy import is_kept, is_other_way, must_wait
 
 if TYPE_CHECKING:
-    from fog_contracts.messages import PlanCode, Pose, RobotPose
+    from collections.abc import Sequence
+
+    from fog_contracts.grid import GridGeometry
+    from fog_contracts.messages import PlanCode
     from planner.config import PlannerConfig
+    from planner.detours import Trip
     from planner.goal_fields import GoalFields
     from planner.mission import Mission, ReplanReason
     from planner.path_search import Covers, SearchResult
@@ -27,6 +32,7 @@ class Replanner:
         self._config = config
         self._fields = fields
         self._search: PathSearch | None = None
+        self.detours = Detours(fields)
         self._next_id = 1
         self.plans: dict[ReplanReason, int] = {}
         """Number of replans, by reason."""
@@ -40,15 +46,24 @@ class Replanner:
         self.avoided[reason] = self.avoided.get(reason, 0) + 1
 
     def replan(
-        self, mission: Mission, reason: ReplanReason, planning_map: PlanningMap, covers: Covers, now: float
+        self,
+        mission: Mission,
+        reason: ReplanReason,
+        planning_map: PlanningMap,
+        covers: Covers,
+        now: float,
+        waiting: Sequence[Mission] = (),
     ) -> None:
-        """Search a path for a mission with a target and a pose, and keep or replace its plan."""
+        """Search a path for a mission with a target and a pose, and keep or replace its plan.
+
+        `waiting`: the missions that are searched next on this map. What they have in common is computed once.
+        """
         pose, target = mission.pose, mission.target
         assert pose is not None
         assert target is not None
         traces = mission.begin_replan(reason, now)
         mission.release_now()
-        found = self._find(planning_map, covers, pose, target)
+        found = self._find(mission, planning_map, covers, waiting)
         self.plans[reason] = self.plans.get(reason, 0) + 1
         if found.refusal is not None:
             self.refusals[found.refusal.code] = self.refusals.get(found.refusal.code, 0) + 1
@@ -70,9 +85,32 @@ class Replanner:
         )
         self._next_id += 1
 
-    def _find(self, planning_map: PlanningMap, covers: Covers, pose: RobotPose, target: Pose) -> SearchResult:
+    def _find(
+        self, mission: Mission, planning_map: PlanningMap, covers: Covers, waiting: Sequence[Mission]
+    ) -> SearchResult:
+        pose, target = mission.pose, mission.target
+        assert pose is not None
+        assert target is not None
         geometry = planning_map.geometry
         if self._search is None or self._search.geometry != geometry:
             self._search = PathSearch(self._config, geometry)
-        field = self._fields.guide(geometry.cell(target.x, target.y))
-        return self._search.find(planning_map, covers, (pose.x, pose.y), (target.x, target.y), field)
+        goal = geometry.cell(target.x, target.y)
+        trip = _trip(mission, geometry)
+        detour = None if trip is None else self.detours.guide(*trip)
+        found = self._search.find(
+            planning_map, covers, (pose.x, pose.y), (target.x, target.y), self._fields.guide(goal), detour
+        )
+        if detour is None and found.expansions >= self._config.detour_expansions:
+            trips = [trip for other in waiting if (trip := _trip(other, geometry)) is not None]
+            if len(trips) >= self._config.detour_searches:
+                self.detours.compute(planning_map, self._search.planner, trips)
+        return found
+
+
+def _trip(mission: Mission, geometry: GridGeometry) -> Trip | None:
+    """Return the cells of a mission's robot and goal; None when one is unknown or off the map."""
+    pose, target = mission.pose, mission.target
+    if pose is None or target is None:
+        return None
+    start, goal = geometry.cell(pose.x, pose.y), geometry.cell(target.x, target.y)
+    return (start, goal) if geometry.contains_cell(*start) and geometry.contains_cell(*goal) else None

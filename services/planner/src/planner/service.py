@@ -51,6 +51,9 @@ AVOIDED = Counter(
     " robot, or left the goal out of reach",
     ["reason"],
 )
+DETOURS = Counter(
+    "fognav_plan_shared_bounds_total", "Bounds of the way round a closure, computed once for several robots' searches"
+)
 ROBOTS = Gauge("fognav_planner_robots", "Robots with a mission")
 FIELD_BYTES = Gauge("fognav_planner_goal_fields_bytes", "Memory of the distance fields of all goals")
 
@@ -292,6 +295,8 @@ class Service:
         ROBOTS.set(len(self.goals))
         FIELD_BYTES.set(self._core.fields_bytes)
         replanner = self._core.replanner
+        DETOURS.inc(replanner.detours.computed - self._exported_counts.get((id(DETOURS), None), 0))
+        self._exported_counts[id(DETOURS), None] = replanner.detours.computed
         for counter, values in ((PLANS, replanner.plans), (REFUSALS, replanner.refusals), (AVOIDED, replanner.avoided)):
             for label, count in dict(values).items():
                 key = (id(counter), label)

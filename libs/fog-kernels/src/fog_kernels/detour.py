@@ -1,0 +1,340 @@
+"""The way round a closed part of the floor: a lower bound that all searches behind the closure share.
+
+A goal field knows nothing of a hazard that came later. The cells whose cheapest path leads through the hazard are its
+*shadow*: a search guided by the field floods the whole of it before it turns round. For any set of cells A without the
+goal, a path from a cell of A enters the rest of the map through one of the few border cells b of A, so
+
+    cost(x, goal) >= min over b of (cost within A from x to b + level(b)) + min over b of (field(b) - level(b))
+
+for any levels, if the field is a lower bound. The first term, the `Detour`, is one Dijkstra search over A and does not
+depend on the goal; the second is one number for each goal. So a closure costs one search of the shadow for all robots
+in it, instead of one for each robot. The bound is tight for a goal whose field differs from the levels by about the
+same at every border cell that matters.
+
+Nothing here has to be exact for a search to stay optimal: any set A gives a valid bound.
+"""
+
+# Kernels take arrays and scalars, typed by their compiled signatures.
+# ruff: noqa: ANN401, C901, PLR0912, PLR0913, PLR0915
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numba import int64, njit, types, void
+
+from fog_kernels import _arrays
+from fog_kernels.astar import DIAGONAL, STRAIGHT
+from fog_kernels.guides import UNREACHABLE, Detour
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from numpy.typing import NDArray
+
+    from fog_kernels.astar import Planner
+    from fog_kernels.guides import GoalField
+
+_QUEUED = 1
+_SHADOW = 2
+_LIT = 3
+_INSIDE = 4
+_BORDER = 5
+
+_BUCKETS = 65536
+"""One for every value of a goal field."""
+_UNSET = 2147483647
+
+_U16_FLAT = types.Array(types.uint16, 1, "C", readonly=True)
+_U16_OUT = types.Array(types.uint16, 1, "C")
+_U8_OUT = types.Array(types.uint8, 1, "C")
+_I64_FLAT = types.Array(types.int64, 1, "C", readonly=True)
+
+
+@njit(inline="always")
+def _steps(width: int) -> tuple[Any, Any, Any, Any]:
+    """Return columns, rows, flat offsets and lengths of the steps to the 8 neighbours of a cell."""
+    columns = np.array((1, -1, 0, 0, 1, -1, 1, -1), np.int64)
+    rows = np.array((0, 0, 1, -1, 1, 1, -1, -1), np.int64)
+    return columns, rows, rows * width + columns, np.where(columns * rows == 0, STRAIGHT, DIAGONAL)
+
+
+@njit(
+    int64(
+        _arrays.U8_FLAT, int64, _arrays.I32_FLAT, _U16_FLAT, int64, _arrays.I32_FLAT, _U8_OUT,
+        _arrays.I32_OUT, _arrays.I32_OUT,
+    ),
+    cache=True, nogil=True, error_model="numpy",
+)  # fmt: skip
+def _mark_shadow(
+    costmap: Any, width: int, weight: Any, field: Any, unit: int, raised: Any, mark: Any, chain: Any, heads: Any
+) -> int:
+    """Mark the cells whose cheapest path leads through raised cells, in the order of the field; return their number.
+
+    A cell is lit, not in the shadow, when a step to a cell outside the shadow leads on at the cost that the field
+    gives, but for its rounding. Each cell is queued once, so the queue is a chain through the cells themselves.
+    """
+    height = costmap.size // width
+    columns, rows, steps, lengths = _steps(width)
+    heads[:] = -1
+    for i in range(raised.size):
+        cell: Any = np.int64(raised[i])
+        reached = np.int64(field[np.uint64(cell)])
+        if reached != UNREACHABLE:
+            mark[np.uint64(cell)] = _QUEUED
+            chain[np.uint64(cell)] = heads[np.uint64(reached)]
+            heads[np.uint64(reached)] = cell
+    count = 0
+    for level in range(_BUCKETS - 1):
+        while heads[np.uint64(level)] >= 0:
+            cell = np.int64(heads[np.uint64(level)])
+            heads[np.uint64(level)] = chain[np.uint64(cell)]
+            y: Any = np.int64(np.uint32(cell) // np.uint32(width))
+            x = cell - y * width
+            own = np.int64(weight[costmap[np.uint64(cell)]])
+            lit = False
+            if own > 0:
+                lit = level == 0
+                for k in range(8):
+                    if not (0 <= x + columns[k] < width and 0 <= y + rows[k] < height):
+                        continue
+                    other = cell + steps[k]
+                    if np.int64(field[np.uint64(other)]) >= level or mark[np.uint64(other)] == _SHADOW:
+                        continue
+                    there = np.int64(weight[costmap[np.uint64(other)]])
+                    if there == 0:
+                        continue
+                    if columns[k] != 0 and rows[k] != 0:
+                        aside, along = np.uint64(cell + columns[k]), np.uint64(cell + steps[k] - columns[k])
+                        if weight[costmap[aside]] == 0 or weight[costmap[along]] == 0:
+                            continue
+                    if np.int64(field[np.uint64(other)]) * unit + lengths[k] * (own + there) < (level + 1) * unit:
+                        lit = True
+                        break
+            if lit:
+                mark[np.uint64(cell)] = _LIT
+                continue
+            mark[np.uint64(cell)] = _SHADOW
+            count += 1
+            for k in range(8):
+                if not (0 <= x + columns[k] < width and 0 <= y + rows[k] < height):
+                    continue
+                other = cell + steps[k]
+                if mark[np.uint64(other)] != 0:
+                    continue
+                reached = np.int64(field[np.uint64(other)])
+                if level < reached < UNREACHABLE:
+                    mark[np.uint64(other)] = _QUEUED
+                    chain[np.uint64(other)] = heads[np.uint64(reached)]
+                    heads[np.uint64(reached)] = other
+    return count
+
+
+@njit(
+    void(
+        _arrays.U8_FLAT, int64, _arrays.I32_FLAT, _arrays.I32_FLAT, _U8_OUT, _arrays.I32_OUT, _arrays.I32_OUT,
+        _arrays.I64_OUT,
+    ),
+    cache=True, nogil=True, error_model="numpy",
+)  # fmt: skip
+def _enclose(
+    costmap: Any, width: int, weight: Any, starts: Any, mark: Any, inside: Any, border: Any, result: Any
+) -> None:
+    """List the cells of the shadow that are connected with a start, and the cells where one can leave them.
+
+    `result` receives the numbers of both.
+    """
+    height = costmap.size // width
+    columns, rows, steps, _ = _steps(width)
+    count = 0
+    leaving = 0
+    for i in range(starts.size):
+        cell: Any = np.int64(starts[i])
+        if mark[np.uint64(cell)] == _SHADOW and weight[costmap[np.uint64(cell)]] > 0:
+            mark[np.uint64(cell)] = _INSIDE
+            inside[count] = cell
+            count += 1
+    done = 0
+    while done < count:
+        cell = np.int64(inside[np.uint64(done)])
+        done += 1
+        y: Any = np.int64(np.uint32(cell) // np.uint32(width))
+        x = cell - y * width
+        for k in range(8):
+            if not (0 <= x + columns[k] < width and 0 <= y + rows[k] < height):
+                continue
+            other = cell + steps[k]
+            if mark[np.uint64(other)] >= _INSIDE:
+                continue
+            there = np.int64(weight[costmap[np.uint64(other)]])
+            if there == 0:
+                continue
+            if columns[k] != 0 and rows[k] != 0:
+                aside, along = np.uint64(cell + columns[k]), np.uint64(cell + steps[k] - columns[k])
+                if weight[costmap[aside]] == 0 or weight[costmap[along]] == 0:
+                    continue
+            if mark[np.uint64(other)] == _SHADOW:
+                mark[np.uint64(other)] = _INSIDE
+                inside[np.uint64(count)] = other
+                count += 1
+            else:
+                mark[np.uint64(other)] = _BORDER
+                border[np.uint64(leaving)] = other
+                leaving += 1
+    result[0] = count
+    result[1] = leaving
+
+
+@njit(
+    int64(
+        _arrays.U8_FLAT, int64, _arrays.I32_FLAT, _arrays.I32_FLAT, _I64_FLAT, _U8_OUT, _arrays.I32_OUT,
+        _arrays.I32_OUT, _arrays.I32_OUT, _arrays.I32_OUT, int64,
+    ),
+    cache=True, nogil=True, error_model="numpy",
+)  # fmt: skip
+def _fill(
+    costmap: Any, width: int, weight: Any, border: Any, levels: Any, mark: Any, label: Any,
+    queue_cell: Any, queue_next: Any, heads: Any, shift: int,
+) -> int:  # fmt: skip
+    """Write the lowest cost from every cell inside to a border cell, plus that cell's level.
+
+    Return the highest, or -1 when the costs or the queue exceed their limits.
+    """
+    height = costmap.size // width
+    columns, rows, steps, lengths = _steps(width)
+    heads[:] = -1
+    free: Any = np.int64(-1)
+    used: Any = np.int64(0)
+    highest: Any = np.int64(0)
+    bucket: Any = np.int64(-1)  # the border's cells come first
+    i: Any = np.int64(0)
+    while True:
+        if i < border.size:
+            cell: Any = np.int64(border[np.uint64(i)])
+            here = np.int64(levels[np.uint64(i)])
+            i += 1
+        else:
+            bucket = max(bucket, 0)
+            while bucket < heads.size and heads[np.uint64(bucket)] < 0:
+                bucket += 1
+            if bucket == heads.size:
+                return int(highest)
+            entry: Any = np.int64(heads[np.uint64(bucket)])
+            heads[np.uint64(bucket)] = queue_next[np.uint64(entry)]
+            queue_next[np.uint64(entry)] = free
+            free = entry
+            cell = np.int64(queue_cell[np.uint64(entry)])
+            here = np.int64(label[np.uint64(cell)])
+            if here >> shift != bucket:
+                continue  # a stale entry: the cell was expanded from a lower bucket
+            highest = max(highest, here)
+        y: Any = np.int64(np.uint32(cell) // np.uint32(width))
+        x = cell - y * width
+        own = np.int64(weight[costmap[np.uint64(cell)]])
+        for k in range(8):
+            if not (0 <= x + columns[k] < width and 0 <= y + rows[k] < height):
+                continue
+            other = cell + steps[k]
+            if mark[np.uint64(other)] != _INSIDE:
+                continue
+            there = np.int64(weight[costmap[np.uint64(other)]])
+            if there == 0:
+                continue
+            if columns[k] != 0 and rows[k] != 0:
+                aside, along = np.uint64(cell + columns[k]), np.uint64(cell + steps[k] - columns[k])
+                if weight[costmap[aside]] == 0 or weight[costmap[along]] == 0:
+                    continue
+            reached = here + lengths[k] * (own + there)
+            if reached >= np.int64(label[np.uint64(other)]):
+                continue
+            slot = reached >> shift
+            if slot >= heads.size:
+                return -1
+            label[np.uint64(other)] = reached
+            if free >= 0:
+                entry = free
+                free = np.int64(queue_next[np.uint64(entry)])
+            elif used < queue_cell.size:
+                entry = used
+                used += 1
+            else:
+                return -1
+            queue_cell[np.uint64(entry)] = other
+            queue_next[np.uint64(entry)] = heads[np.uint64(slot)]
+            heads[np.uint64(slot)] = entry
+
+
+@njit(void(_arrays.I32_FLAT, _arrays.I32_FLAT, int64, _U16_OUT), cache=True, nogil=True)
+def _compact(inside: Any, label: Any, unit: int, costs: Any) -> None:
+    """Write the labels of the cells inside in multiples of `unit`, rounded down."""
+    for i in range(inside.size):
+        cell = np.uint64(inside[i])
+        if label[cell] != _UNSET:
+            costs[cell] = label[cell] // unit
+
+
+class Shadow:
+    """The part of the floor that the starts share and whose cheapest paths to a goal lead through raised cells."""
+
+    def __init__(
+        self,
+        costmap: NDArray[np.uint8],
+        bound: NDArray[np.uint8],
+        field: GoalField,
+        starts: Iterable[tuple[int, int]],
+        planner: Planner,
+    ) -> None:
+        """Find it on a uint8 (h, w) costmap; `field` is one of single cells over the costmap `bound`.
+
+        Takes some 50 ns for each of its cells. Raises ValueError for a coarser field.
+        """
+        if field.bits != 0:
+            raise ValueError(f"the field has blocks of {1 << field.bits} cells: pass one of single cells")
+        self._costmap = _arrays.grid(costmap, "costmap")
+        self._planner = planner
+        self._mark = np.zeros(costmap.size, np.uint8)
+        raised = np.flatnonzero((costmap > bound).ravel()).astype(np.int32)
+        memory = np.empty(costmap.size, np.int32)
+        heads = np.empty(_BUCKETS, np.int32)
+        flat, width, weight = costmap.ravel(), planner.width, planner.weight
+        count = int(
+            _mark_shadow(flat, width, weight, field.costs.ravel(), field.unit, raised, self._mark, memory, heads)
+        )
+        first = np.array([row * width + column for column, row in starts], np.int32)
+        inside, border = np.empty(count, np.int32), np.empty(costmap.size, np.int32)
+        result = np.empty(2, np.int64)
+        _enclose(flat, width, weight, first, self._mark, inside, border, result)
+        number, leaving = result.tolist()
+        self._inside = inside[:number]
+        self.border = border[:leaving].copy()
+        """The flat indexes of the cells through which every path leaves it."""
+
+    def contains(self, cell: tuple[int, int]) -> bool:
+        """Whether a cell (column, row) is part of it."""
+        return bool(self._mark[cell[1] * self._planner.width + cell[0]] == _INSIDE)
+
+    def detour(self, levels: NDArray[np.int64]) -> Detour | None:
+        """Return the bound that begins with a level at each border cell.
+
+        None when nothing leads out of the shadow, or when costs exceed 32 bits. Takes some 50 ns for each cell.
+        """
+        if len(self.border) == 0:
+            return None
+        size, planner = self._costmap.size, self._planner
+        levels = levels - levels.min()
+        label, memory = np.empty(size, np.int32), np.empty((2, size), np.int32)
+        label[self._inside] = _UNSET
+        heads = np.empty(_BUCKETS, np.int32)
+        highest = int(
+            _fill(
+                self._costmap.ravel(), planner.width, planner.weight, self.border, levels, self._mark, label,
+                memory[0], memory[1], heads, planner.bucket_shift,
+            )
+        )  # fmt: skip
+        if highest < 0:
+            return None
+        unit = highest // (UNREACHABLE - 1) + 1
+        costs = np.full(self._costmap.shape, UNREACHABLE, np.uint16)
+        _compact(self._inside, label, unit, costs.ravel())
+        return Detour(costs, unit, self.border, levels)

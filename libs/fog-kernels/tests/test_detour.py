@@ -1,0 +1,99 @@
+"""Bounds of the way round: never above the true cost, so that guided searches stay optimal, and worth their time."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from compiler import examples
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from shortest_paths import cell_of, costmaps, dijkstra
+
+from fog_kernels.astar import STRAIGHT, Planner
+from fog_kernels.detour import Shadow
+from fog_kernels.guides import border_costs
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+def raise_somewhere(costmap: NDArray[np.uint8], data: st.DataObject) -> NDArray[np.uint8]:
+    """Return the costmap with a rectangle of higher costs."""
+    raised = costmap.copy()
+    height, width = costmap.shape
+    x, y = cell_of(data, costmap)
+    patch = raised[y : y + data.draw(st.integers(1, height)), x : x + data.draw(st.integers(1, width))]
+    np.maximum(patch, data.draw(st.sampled_from([30, 200, 253, 254, 255])), out=patch)
+    return raised
+
+
+@settings(max_examples=examples(200), deadline=None)
+@given(costmaps(), st.data())
+def test_searches_guided_by_field_and_detour_equal_full_searches(bound: NDArray[np.uint8], data: st.DataObject) -> None:
+    planner = Planner(bound.shape[1], bound.shape[0])
+    reference = planner.goal_field(bound, cell_of(data, bound))
+    closed = raise_somewhere(raise_somewhere(bound, data), data)
+    starts = [cell_of(data, bound) for _ in range(data.draw(st.integers(1, 4)))]
+    shadow = Shadow(closed, bound, reference, starts, planner)
+    levels = np.maximum(border_costs(reference, shadow.border), 0)
+    detour = shadow.detour(levels + data.draw(st.integers(0, 10**6)) * np.arange(len(levels)))
+    if detour is None:
+        assert len(shadow.border) == 0
+        return
+    for costmap in (closed, raise_somewhere(closed, data)):
+        for start in starts:
+            goal = cell_of(data, bound)
+            if not detour.covers(start) or shadow.contains(goal):
+                continue
+            field = planner.goal_field(bound, goal)
+            for _ in range(data.draw(st.integers(0, 2))):
+                field = field.coarser()
+            expected = dijkstra(costmap, start).get(goal)
+            found = planner.plan(costmap, start, goal, field=field, detour=detour)
+            assert found.cost == (math.inf if expected is None else expected / (2 * STRAIGHT))
+            offset = detour.offset(field)
+            if expected is not None and offset is not None:
+                assert int(detour.costs[start[1], start[0]]) * detour.unit + offset <= expected
+
+
+def test_closed_corridor_is_its_own_shadow_and_is_left_by_its_ends_only() -> None:
+    bound = np.full((9, 40), 254, np.uint8)
+    bound[1:8, 1:39] = 0
+    bound[3, 3:37] = bound[5, 3:37] = 254
+    bound[4, 3:37] = 0  # a corridor in the middle
+    closed = bound.copy()
+    closed[4, 30] = 254
+    planner = Planner(40, 9)
+    shadow = Shadow(closed, bound, planner.goal_field(bound, (38, 4)), [(10, 4)], planner)
+    assert shadow.contains((10, 4))
+    assert shadow.contains((29, 4))
+    assert not shadow.contains((30, 4))
+    assert not shadow.contains((20, 1))
+    columns, rows = shadow.border % 40, shadow.border // 40
+    assert set(columns.tolist()) <= {1, 2, 3}
+    assert set(rows.tolist()) <= {2, 3, 4, 5, 6}
+
+
+def test_detour_saves_the_flood_of_a_closed_room() -> None:
+    bound = np.zeros((60, 60), np.uint8)
+    closed = bound.copy()
+    closed[5:55, 40] = closed[5, 10:40] = closed[54, 10:40] = 254  # a pocket that opens to the left
+    planner = Planner(60, 60)
+    fields = [planner.goal_field(bound, goal) for goal in ((55, 30), (55, 33))]
+    shadow = Shadow(closed, bound, fields[0], [(30, 30), (20, 35)], planner)
+    detour = shadow.detour(border_costs(fields[0], shadow.border))
+    assert detour is not None
+    flooded = planner.plan(closed, (20, 35), (55, 33), field=fields[1])
+    guided = planner.plan(closed, (20, 35), (55, 33), field=fields[1], detour=detour)
+    assert guided.cost == flooded.cost
+    assert guided.expansions < 0.5 * flooded.expansions
+
+
+def test_shadow_of_a_coarse_field_is_refused() -> None:
+    bound = np.zeros((8, 8), np.uint8)
+    planner = Planner(8, 8)
+    with pytest.raises(ValueError, match="blocks of 2 cells"):
+        Shadow(bound, bound, planner.goal_field(bound, (1, 1)).coarser(), [(6, 6)], planner)

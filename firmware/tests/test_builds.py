@@ -20,15 +20,22 @@ BOARD = (
     "-fno-rtti",
     "-fno-threadsafe-statics",
 )
+SETTINGS = {
+    "site": "lab",
+    "node": "n1",
+    "wifi_name": "caf\u00e9",
+    "broker": "fog.local",
+    "sonars": [{"trigger": 14, "echo": 5, "range_limit_m": 1.5}, {"trigger": 12, "echo": 4, "range_limit_m": 2}],
+}
 BOARD_C_LIBRARY = "/usr/lib/xtensa-lx106-elf/include"
 
 
-def sources(firmware):
-    return sorted(str(file) for file in (firmware / "lib" / "node_core" / "src").glob("*.cpp"))
+def sources(firmware, *libraries):
+    return sorted(str(file) for library in libraries for file in (firmware / "lib" / library / "src").glob("*.cpp"))
 
 
 def includes(firmware):
-    return [f"-I{firmware / 'include'}", f"-I{firmware / 'lib' / 'node_core' / 'src'}"]
+    return [f"-I{firmware / folder}" for folder in ("include", "lib/node_core/src", "lib/node_edge/src")]
 
 
 def run(*command):
@@ -42,7 +49,7 @@ def test_core_compiles_for_the_esp8266_without_a_standard_library(firmware, tmp_
     if compiler is None:
         pytest.skip("no xtensa-lx106-elf-g++: apt-get install gcc-xtensa-lx106 picolibc-xtensa-lx106-elf")
     objects = []
-    for source in sources(firmware):
+    for source in sources(firmware, "node_core"):
         objects.append(str(tmp_path / f"{len(objects)}.o"))
         run(
             compiler,
@@ -67,6 +74,22 @@ def test_core_compiles_for_the_esp8266_without_a_standard_library(firmware, tmp_
     assert int(sizes[1]) + int(sizes[2]) == 0, "the core has no variables of its own"
 
 
+@pytest.mark.parametrize("board", ["ESP8266", "ESP32"])
+def test_the_boards_part_compiles_against_stand_ins_for_arduino_and_the_mqtt_library(firmware, compiler, board):
+    options = (
+        f"-D{board}",
+        '-DFOGNAV_FIRMWARE="test"',
+        "-std=gnu++17",
+        "-fsyntax-only",
+        "-Wall",
+        "-Wextra",
+        "-Wshadow",
+        "-Werror",
+    )
+    stand_ins = f"-I{firmware / 'host' / 'board'}"
+    run(compiler, *options, stand_ins, *includes(firmware), str(firmware / "src" / "main.cpp"))
+
+
 def test_no_input_makes_the_node_fault(firmware, compiler, tmp_path):
     program, inputs = tmp_path / "fuzz", tmp_path / "inputs"
     sanitizers = (
@@ -77,15 +100,14 @@ def test_no_input_makes_the_node_fault(firmware, compiler, tmp_path):
         "-fno-exceptions",
         "-fno-rtti",
     )
-    source = str(firmware / "host" / "fuzz.cpp")
+    files = [*sources(firmware, "node_core", "node_edge"), str(firmware / "host" / "fuzz" / "fuzz.cpp")]
     run(
         compiler,
         "-std=c++17",
         *sanitizers,
         *WARNINGS,
         *includes(firmware),
-        *sources(firmware),
-        source,
+        *files,
         "-o",
         str(program),
     )
@@ -99,7 +121,7 @@ def test_no_input_makes_the_node_fault(firmware, compiler, tmp_path):
 
 def fuzzed(chance):
     """A configuration with a few bytes changed, bytes at random, or a program of many steps and edges."""
-    kind = chance.randrange(3)
+    kind = chance.randrange(4)
     if kind == 0:
         nested = {"a": [1, {"b": None}], "": -1.5e-3}
         config = {
@@ -114,6 +136,10 @@ def fuzzed(chance):
             data[chance.randrange(len(data))] = chance.randrange(256)
         return bytes(data[: chance.randrange(len(data) + 1)] if chance.random() < 0.3 else data)
     if kind == 1:
+        data = bytearray(json.dumps(SETTINGS).encode())
+        data[chance.randrange(len(data))] = chance.randrange(256)
+        return bytes(data)
+    if kind == 2:
         return chance.randbytes(chance.randrange(600))
     # Steps (5) with small times, edges (2, 3) of the sonars, now and then a calibration (0).
     program = (

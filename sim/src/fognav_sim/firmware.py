@@ -14,7 +14,7 @@ import subprocess
 from pathlib import Path
 from typing import Final
 
-SOURCES: Final = ("lib/node_core/src", "host", "include")
+SOURCES: Final = ("lib/node_core/src", "lib/node_edge/src", "host", "include")
 FLAGS: Final = ("-std=c++17", "-O2", "-Wall", "-Wextra", "-Werror", "-fno-exceptions", "-fno-rtti", "-fPIC", "-shared")
 _BUILD_TIMEOUT_S: Final = 120.0
 
@@ -66,7 +66,7 @@ def build_library(cache: Path, flags: tuple[str, ...] = FLAGS) -> Path:
     # Under a name of its own first: another process may build the same at the same time.
     unfinished = library.with_suffix(f".{os.getpid()}")
     sources = [str(file) for file in files if file.suffix == ".cpp"]
-    includes = [f"-I{firmware / folder}" for folder in (SOURCES[0], SOURCES[2])]
+    includes = [f"-I{firmware / folder}" for folder in SOURCES]
     command = [find_compiler(), *flags, *includes, *sources, "-o", str(unfinished)]
     done = subprocess.run(  # noqa: S603  # the compiler that this machine or its user names, on our own sources
         command, check=False, capture_output=True, text=True, timeout=_BUILD_TIMEOUT_S

@@ -33,9 +33,9 @@ public:
     // Begin a measurement, before the trigger's pulse. Times are micros(): 32 bits that wrap.
     void arm(uint32_t now_us);
 
-    // The line has changed. Does nothing unless a measurement is under way. In the header, so that the compiler puts it
-    // where the interrupt's handler is: on the ESP8266 that must be the internal RAM.
-    void on_edge(bool high, uint32_t now_us) {
+    // The line has changed. Does nothing unless a measurement is under way. Always a part of its caller: an interrupt's
+    // handler must be in the internal RAM of an ESP8266 with all that it calls.
+    __attribute__((always_inline)) void on_edge(bool high, uint32_t now_us) {
         if (phase_ == Phase::idle || phase_ == Phase::done || now_us - armed_us_ < kLeakUs) return;
         if (high) {
             if (phase_ == Phase::armed) {

@@ -132,6 +132,62 @@ bool JsonReader::number_milli(int64_t& value) {
     return true;
 }
 
+// Resolve the escape behind a backslash at `from`, and move behind it. Characters beyond 16 bits are not resolved.
+bool JsonReader::escape(const char*& from, const char* to, uint32_t& character) const {
+    static const char codes[] = "\"\\/bfnrt";
+    static const char meanings[] = "\"\\/\b\f\n\r\t";
+    const char code = *from++;
+    for (int i = 0; codes[i] != 0; ++i) {
+        if (codes[i] != code) continue;
+        character = static_cast<unsigned char>(meanings[i]);
+        return true;
+    }
+    if (code != 'u' || to - from < 4) return false;
+    character = 0;
+    for (int i = 0; i < 4; ++i, ++from) {
+        const char c = *from;
+        const int digit = c >= '0' && c <= '9' ? c - '0' : c >= 'a' && c <= 'f' ? c - 'a' + 10 : c >= 'A' && c <= 'F' ? c - 'A' + 10 : -1;
+        if (digit < 0) return false;
+        character = character << 4 | static_cast<uint32_t>(digit);
+    }
+    return character != 0 && (character < 0xD800 || character > 0xDFFF);
+}
+
+bool JsonReader::text(char* buffer, size_t size) {
+    const char* from = nullptr;
+    size_t length = 0;
+    if (failed_) return false;
+    blanks();
+    if (!string(from, length)) return fail();
+    size_t written = 0;
+    // UTF-8 by its definition: what was not escaped is copied byte by byte.
+    const auto put = [&](uint32_t byte) {
+        if (written + 1 < size) buffer[written] = static_cast<char>(byte);
+        ++written;
+    };
+    for (const char* to = from + length; from < to;) {
+        if (*from != '\\') {
+            put(static_cast<unsigned char>(*from++));
+            continue;
+        }
+        uint32_t character = 0;
+        if (!escape(++from, to, character)) return fail();
+        if (character < 0x80) {
+            put(character);
+        } else if (character < 0x800) {
+            put(0xC0 | character >> 6);
+            put(0x80 | (character & 0x3F));
+        } else {
+            put(0xE0 | character >> 12);
+            put(0x80 | (character >> 6 & 0x3F));
+            put(0x80 | (character & 0x3F));
+        }
+    }
+    if (written >= size) return fail();
+    buffer[written] = 0;
+    return true;
+}
+
 bool JsonReader::scalar() {
     const char* start = nullptr;
     size_t length = 0;

@@ -23,6 +23,9 @@ public:
     // A number times 1000, rounded half away from zero: metres to millimetres.
     bool number_milli(int64_t& value);
     bool boolean(bool& value);
+
+    // A string with its escapes resolved, as UTF-8 with a terminating zero. False if the buffer is too small for it.
+    bool text(char* buffer, size_t size);
     bool skip_value();
 
     // True if nothing but blanks follows and all went well.
@@ -38,6 +41,7 @@ private:
     bool take(char character);
     bool digit() const { return at_ < end_ && *at_ >= '0' && *at_ <= '9'; }
     bool scalar();
+    bool escape(const char*& from, const char* to, uint32_t& character) const;
     void blanks();
     bool fail() {
         failed_ = true;

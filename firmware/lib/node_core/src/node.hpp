@@ -36,7 +36,7 @@ public:
     Event step(uint32_t now_us);
 
     // For the interrupt of a sonar's echo line.
-    void on_edge(int sonar, bool high, uint32_t now_us) { captures_[sonar].on_edge(high, now_us); }
+    __attribute__((always_inline)) void on_edge(int sonar, bool high, uint32_t now_us) { captures_[sonar].on_edge(high, now_us); }
 
     int sonar() const { return cycle_.current(); }
 

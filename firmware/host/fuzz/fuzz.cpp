@@ -1,12 +1,14 @@
-// Feeds arbitrary bytes to the node: as a configuration, and as a program of edges, steps and commands. A fuzzer of LLVM
+// Feeds arbitrary bytes to the node: as settings, as a configuration, and as a program of edges, steps and commands. A fuzzer of LLVM
 // calls the first function; without one, `main` reads a file of inputs, each preceded by its length (32 bits, little-endian).
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
+#include "discovery.hpp"
 #include "fognav_contract.h"
 #include "json_reader.hpp"
 #include "node.hpp"
+#include "settings.hpp"
 
 extern "C" int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size);
 
@@ -21,6 +23,12 @@ int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
     fognav::Node node(settings);
     node.configure(text, size);
     fognav::JsonReader(text, size).skip_value();
+    fognav::Settings found;
+    static char description[FOGNAV_HOME_ASSISTANT_LIMIT];
+    if (fognav::read_settings(text, size, found) == nullptr &&
+        fognav::write_discovery(found, settings.firmware, description, sizeof description) == 0) {
+        abort();
+    }
     uint32_t now_us = 0;
     for (size_t i = 0; i + 2 < size; i += 3) {
         now_us += static_cast<uint32_t>(data[i + 1]) << (data[i + 2] % 16);

@@ -45,7 +45,7 @@ def measure_scan(pose_at, begin, end, *, solid=SOLID, noise=0.0, seed=0, repeats
 
 def standing(pose, *, scans=8, localizer=None, solid=SOLID, start=0.0, prepare=None):
     localizer = localizer or Localizer(seed=3)
-    localizer.load_map(STATIC, GEOMETRY)
+    localizer.load_map(localizer.fields_of(STATIC, GEOMETRY))
     for i in range(scans):
         begin = start + 0.18 * i
         for j in range(5):
@@ -84,13 +84,13 @@ def test_scan_taken_in_motion_is_deskewed(v, w):
         )
 
     localizer = Localizer()
-    localizer.load_map(STATIC, GEOMETRY)
+    localizer.load_map(localizer.fields_of(STATIC, GEOMETRY))
     origin = pose_at(0.0)
     for i in range(9):
         localizer.on_odometry(0.025 * i, *(pose_at(0.025 * i).relative_to(origin)))
     localizer.on_scan(measure_scan(pose_at, 0.0, 0.18), 0.18)
     still = Localizer()
-    still.load_map(STATIC, GEOMETRY)
+    still.load_map(still.fields_of(STATIC, GEOMETRY))
     still.on_odometry(0.0, 0.0, 0.0, 0.0)
     still.on_scan(measure_scan(pose_at, 0.0, 0.18), 0.18)
     end = pose_at(0.18)
@@ -127,7 +127,7 @@ def test_global_localization_finds_the_robot_anywhere(place):
 def test_global_localization_fails_when_places_look_alike():
     static, geometry = grid_of([(1, 1, 4, 4), (6, 1, 9, 4)], 10, 5)
     localizer = Localizer()
-    localizer.load_map(static, geometry)
+    localizer.load_map(localizer.fields_of(static, geometry))
     localizer.on_odometry(0.0, 0.0, 0.0, 0.0)
     solid = (static == 254).astype(np.uint8)
     angles = np.arange(360) * 2 * math.pi / 360
@@ -183,7 +183,7 @@ def test_between_scans_the_pose_follows_the_odometry():
 def test_number_of_particles_stays_within_its_bounds_and_the_seed_repeats_everything():
     def drive(seed):
         localizer = Localizer(LocalizationConfig(), seed)
-        localizer.load_map(STATIC, GEOMETRY)
+        localizer.load_map(localizer.fields_of(STATIC, GEOMETRY))
         counts, found = [], []
         localizer.on_odometry(0.0, 0.0, 0.0, 0.0)
         localizer.initial_pose(2.0, 2.0, 0.0, 0.1, 0.05)

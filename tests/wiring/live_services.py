@@ -25,6 +25,7 @@ from map_service.service import Service as MapService
 from planner.core import PlannerCore
 from planner.service import Service as PlannerService
 from robot_agent.agent.core import AgentCore
+from robot_agent.agent.map_loader import MapLoader
 from robot_agent.agent.service import Service as AgentService
 
 if TYPE_CHECKING:
@@ -260,12 +261,16 @@ class LiveServices:
         self.planner_core = PlannerCore(1)
         self.planner = PlannerService(self.planner_core, MemoryStore(), edges["planner"], clock, Health())
         self.agent_core = AgentCore(config, seed)
-        self.agent = AgentService(self.agent_core, edges["robot-agent"], MemoryStore(), clock, Health(), site=self.site)
+        store = MemoryStore()
+        self.agent = AgentService(self.agent_core, edges["robot-agent"], store, clock, Health())
+        self.agent_map = MapLoader(
+            self.agent_core, edges["robot-agent"], store, clock, site=self.site, phase=self.agent.phase
+        )
 
     async def start(self) -> None:
         """Subscribe, load the stores and connect, at time 0; periodic loops do not run yet."""
         body = next(robot for robot in self._loaded.site.robots if robot.id == self._robot)
-        self.agent.restore(body)
+        await self.agent_map.restore(body)
         for service in (self.aggregator, self.map, self.planner, self.agent):
             service.subscribe()
         self.aggregator.records.mark_loaded()
@@ -284,9 +289,9 @@ class LiveServices:
     async def begin_loops(self) -> None:
         """Start all periodic loops; each ticks at once."""
         loops = {
-            "agent map": self.agent.snapshot_loop(),
+            "agent map": self.agent_map.snapshot_loop(),
             "agent control": self.agent.control_loop(),
-            "agent stream": self.agent.stream_loop(self.link),
+            "agent stream": self.agent.stream_loop(self.link, self.link),
             "aggregator tick": self.aggregator.tick_loop(),
             "map tick": self.map.tick_loop(),
             "planner tick": self.planner.tick_loop(),

@@ -313,7 +313,12 @@ def lockstep() -> Run:
 @pytest.fixture(scope="module")
 def live(lockstep: Run) -> tuple[Run, Any]:
     with pytest.MonkeyPatch.context() as patch:
-        for module in ("planner.threads", "robot_agent.agent.service", "fog_runtime.work"):
+        for module in (
+            "planner.threads",
+            "robot_agent.agent.map_loader",
+            "robot_agent.agent.service",
+            "fog_runtime.work",
+        ):
             patch.setattr(f"{module}.ThreadPoolExecutor", live_services.InlineExecutor)
         patch.setattr("planner.mission_keeper.secrets.token_hex", lambda _: GOAL_ID)
         return asyncio.run(drive_live(lockstep))

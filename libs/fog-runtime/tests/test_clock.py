@@ -3,7 +3,7 @@ import time
 
 import pytest
 
-from fog_runtime.clock import ManualClock, SystemClock, Ticker, ticker
+from fog_runtime.clock import ManualClock, Phase, SystemClock, Ticker, ticker
 
 
 async def run_ticker(clock: ManualClock, bodies: list[float], period: float = 0.1) -> list[float]:
@@ -48,9 +48,11 @@ async def test_missed_ticks_are_skipped_and_counted():
     assert loop_ticker.ticks == 3
 
 
-async def test_loops_of_one_origin_share_their_ticks_whenever_they_begin():
-    clock = ManualClock(50.13)
-    loops = [Ticker(clock, period, origin=50.0) for period in (0.1, 0.2)]
+async def test_loops_of_one_phase_share_their_ticks_whenever_they_begin():
+    clock, phase = ManualClock(50.0), Phase()
+    assert phase.next_tick(50.0, 0.1) == 50.0
+    clock.advance(0.13)
+    loops = [Ticker(clock, period, phase) for period in (0.1, 0.2)]
     times: dict[float, list[float]] = {loop.period: [] for loop in loops}
 
     async def run(loop: Ticker) -> None:

@@ -7,6 +7,7 @@ It drives through the guardian, which stops the wheels when the agent is gone. T
 from __future__ import annotations
 
 import asyncio
+import gc
 import os
 import secrets
 from functools import partial
@@ -14,6 +15,7 @@ from functools import partial
 from fog_runtime import logs, process, signals
 from fog_runtime.clock import SystemClock
 from fog_runtime.health import Health, serve_health
+from fog_runtime.memory import release_startup_memory
 from fog_runtime.robot_file import describe_robot, load_robot
 from fog_runtime.settings import describe, load
 from fog_runtime.zenoh_edge import ZenohEdge
@@ -21,6 +23,7 @@ from robot_agent import registry
 from robot_agent.agent.guardian_client import GuardianClient
 from robot_agent.agent.input_writer import open_core
 from robot_agent.agent.lidar_edge import LidarEdge
+from robot_agent.agent.map_loader import MapLoader
 from robot_agent.agent.service import Service
 from robot_agent.agent.settings import Settings, read_footprint, read_operator_key, read_port, read_site
 from robot_agent.agent.store import Store
@@ -61,7 +64,9 @@ async def main() -> None:
             open_core(config, settings.seed, settings.input_log) as core,
             serve_health(health, settings.http_host, settings.http_port, settings.port_file),
         ):
-            agent = Service(core, zenoh, Store(settings.data_dir), clock, health, site=site)
+            store = Store(settings.data_dir)
+            agent = Service(core, zenoh, store, clock, health)
+            map_loader = MapLoader(core, zenoh, store, clock, site=site, phase=agent.phase)
             guardian = GuardianClient(settings.guardian_socket, clock, agent.on_feedback, agent.on_base_lost)
             lidar = LidarEdge(
                 port,
@@ -71,15 +76,17 @@ async def main() -> None:
                 agent.on_scan,
                 check=partial(LineCheck, port, robot.settings.lidar.driver, registry.signatures()),
             )
-            agent.restore(body)
             agent.subscribe()
             zenoh.declare_liveliness("robot-agent", settings.robot)
+            # What the start has made stays: no later collection of garbage looks at it, and delays a wheel command.
+            release_startup_memory()
+            gc.freeze()
             async with asyncio.TaskGroup() as tasks:
                 tasks.create_task(guardian.run(), name="base")
                 tasks.create_task(lidar.run(), name="lidar")
                 tasks.create_task(agent.stream_loop(guardian, lidar), name="stream")
                 tasks.create_task(agent.control_loop(), name="control")
-                tasks.create_task(agent.snapshot_loop(), name="snapshot")
+                tasks.create_task(map_loader.run(body), name="map")
                 tasks.create_task(agent.publish_loop(), name="publish")
                 tasks.create_task(agent.housekeeping_loop(lidar), name="housekeeping")
 

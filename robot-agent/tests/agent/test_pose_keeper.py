@@ -1,17 +1,17 @@
 from __future__ import annotations
 
 import math
-from types import SimpleNamespace
 
 import msgspec
-import numpy as np
 import pytest
 
-from fog_contracts.grid import GridGeometry
 from robot_agent.agent.pose_keeper import SEARCH_AGAIN_S, PoseKeeper
 from robot_agent.localization.localizer import SavedPose
 
 POSE = SavedPose(site="lab", x=1.0, y=2.0, theta=3.1, sigma_xy=0.1, sigma_theta=0.1)
+
+
+FIELDS = object()
 
 
 class FakeLocalizer:
@@ -34,8 +34,8 @@ class FakeLocalizer:
     def restore(self, saved):
         self.restored.append(saved)
 
-    def load_map(self, static, geometry):
-        self.map = static, geometry
+    def load_map(self, fields):
+        self.fields = fields
 
     def save(self, site, _now):
         return self.trusted and msgspec.structs.replace(self.trusted, site=site)
@@ -49,10 +49,6 @@ def localizer():
 @pytest.fixture
 def keeper(localizer):
     return PoseKeeper(localizer)
-
-
-def replica(site):
-    return SimpleNamespace(site=site, static=np.zeros((2, 2), np.uint8), geometry=GridGeometry(2, 2, 0.1, 0.0, 0.0))
 
 
 def test_search_begins_without_a_pose_and_not_again_before_the_interval(keeper, localizer):
@@ -85,8 +81,8 @@ def test_no_search_begins_while_the_robot_is_enabled_or_moves(keeper, mode, at_r
 def test_a_stored_pose_waits_for_the_map_of_its_site(keeper, localizer, site, restored):
     keeper.restore(POSE, "")
     assert localizer.restored == []
-    keeper.load_map(replica(site))
-    keeper.load_map(replica("lab"))
+    keeper.load_map(site, FIELDS)
+    keeper.load_map("lab", FIELDS)
     assert localizer.restored == restored
 
 

@@ -18,6 +18,7 @@ from fog_runtime.clock import SystemClock
 from fog_runtime.health import Health
 from robot_agent.agent import service as service_module
 from robot_agent.agent.core import AgentCore
+from robot_agent.agent.map_loader import MapLoader
 from robot_agent.agent.service import Service
 from robot_agent.agent.store import Store
 
@@ -65,7 +66,9 @@ class Rig:
         self.master = self.world.master
         self.fog = Fog()
         self.core = AgentCore(AGENT, seed=1)
-        self.service = Service(self.core, self.fog, Store(tmp_path), SystemClock(), Health(), site=self.master.site)
+        store, clock = Store(tmp_path), SystemClock()
+        self.service = Service(self.core, self.fog, store, clock, Health())
+        self.map_loader = MapLoader(self.core, self.fog, store, clock, site=self.master.site)
         self.service.subscribe()
         self.changes = 0
 
@@ -94,7 +97,7 @@ def rig(tmp_path):
 
 @pytest.fixture
 async def mapping(rig):
-    task = asyncio.create_task(rig.service.snapshot_loop())
+    task = asyncio.create_task(rig.map_loader.snapshot_loop())
     yield rig
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)

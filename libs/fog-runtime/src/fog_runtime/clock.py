@@ -139,20 +139,33 @@ class ManualClock:
                 woken.set_result(None)
 
 
+class Phase:
+    """The common beginning of several loops' ticks: the first tick of the loop that begins first."""
+
+    def __init__(self) -> None:
+        self._origin: float | None = None
+
+    def next_tick(self, now: float, period: float) -> float:
+        """Return the first multiple of the period after the common beginning that is not before `now` (s)."""
+        if self._origin is None:
+            self._origin = now
+        return self._origin + math.ceil((now - self._origin) / period) * period
+
+
 class Ticker:
     """A periodic loop without drift: `async for now in Ticker(clock, period): ...`.
 
-    Ticks lie at multiples of the period after the first, or after `origin` (s of the clock): loops of one origin share
-    their ticks, so that the process is woken once for all of them. A tick that was missed because the body took too
-    long is skipped: a burst of control cycles would act several times on the same state of the world.
+    Ticks lie at multiples of the period after the first. Loops of one `phase` share their ticks, so that the process is
+    woken once for all of them. A tick that was missed because the body took too long is skipped: a burst of control
+    cycles would act several times on the same state of the world.
     """
 
-    def __init__(self, clock: Clock, period: float, *, origin: float | None = None) -> None:
+    def __init__(self, clock: Clock, period: float, phase: Phase | None = None) -> None:
         if period <= 0.0:
             raise ValueError(f"a period must be positive, not {period} s")
         self.clock = clock
         self.period = period
-        self._origin = origin
+        self._phase = phase or Phase()
         self.ticks = 0
         self.late = 0
         """Ticks that were skipped, or came more than half a period after they were due."""
@@ -167,10 +180,8 @@ class Ticker:
         return ordered[min(len(ordered) - 1, int(0.99 * len(ordered)))]
 
     async def __aiter__(self) -> AsyncIterator[float]:
-        """Yield `clock.now()` at every tick, the first at once (at the next multiple of the period after an origin)."""
-        due = self.clock.now()
-        if self._origin is not None:
-            due = self._origin + math.ceil((due - self._origin) / self.period) * self.period
+        """Yield `clock.now()` at every tick, the first at once, or when the phase's next one is due."""
+        due = self._phase.next_tick(self.clock.now(), self.period)
         while True:
             wait = due - self.clock.now()
             if wait > 0.0:

@@ -6,7 +6,8 @@ Values and times go in, values come out. `now` is the robot's own monotonic cloc
 - calls `stream` 20 times a second and sends the wheel command to the guardian;
 - runs `decide(control_job(now))` 5 times a second, on any thread, and passes the decision to `accept`;
 - calls `tick` 10 times a second and publishes what it returns;
-- requests a snapshot of the map while `wants_snapshot`, and stores what `pose_to_store` returns.
+- requests a snapshot of the map while `wants_snapshot`, passes what `prepare_map` makes of it to
+  `load`, and stores what `pose_to_store` returns.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from robot_agent.agent.obstacle_reporter import ObstacleReporter
 from robot_agent.agent.operator_commands import OperatorCommands, initial_pose_refusal
 from robot_agent.agent.path_driving import PathDriving
 from robot_agent.agent.pose_keeper import PoseKeeper
+from robot_agent.agent.prepared_map import PreparedMap, prepare_map
 from robot_agent.agent.publishing import PublishingPolicy
 from robot_agent.agent.reports import hindrances, robot_pose, robot_state
 from robot_agent.agent.safety_supervisor import SafetySupervisor, safety_inputs
@@ -64,7 +66,7 @@ __all__ = ["AgentCore", "Decision", "Job", "SavedPose", "decide"]
 
 
 class AgentCore:
-    """One robot. All methods belong on one thread; `decide` may run on another."""
+    """One robot. All methods belong on one thread; `decide` and `prepare_map` may run on others."""
 
     def __init__(self, config: AgentConfig, seed: int = 0) -> None:
         self._config = config
@@ -137,11 +139,16 @@ class AgentCore:
         """Return whether the replica of the map needs a snapshot from the map-service."""
         return self._map.wants_snapshot(now)
 
-    def load(self, snapshot: MapSnapshot, now: float) -> None:
-        """Load a snapshot, from the map-service or from disk; raises `MapError` when it is invalid."""
-        self._map.on_snapshot(snapshot, now)
-        self._fence.raise_to(ch.MAP, snapshot.epoch)
-        self._pose_keeper.load_map(self.replica)
+    def prepare_map(self, snapshot: MapSnapshot) -> PreparedMap:
+        """Do what takes long when a snapshot is loaded, on any thread; raises `MapError` when it is invalid."""
+        return prepare_map(snapshot, self._localizer)
+
+    def load(self, map_: MapSnapshot | PreparedMap, now: float) -> None:
+        """Load a snapshot, from the map-service or from disk, prepared or not; raises `MapError` when it is invalid."""
+        prepared = map_ if isinstance(map_, PreparedMap) else self.prepare_map(map_)
+        self._map.on_snapshot(prepared.decoded, now)
+        self._fence.raise_to(ch.MAP, prepared.snapshot.epoch)
+        self._pose_keeper.load_map(prepared.snapshot.site, prepared.fields)
         self._driving.check_path(self.replica, now)
 
     # --- base and lidar ---

@@ -23,6 +23,7 @@ from fog_contracts.commands import sign
 from fog_contracts.handlers import completed
 from fog_contracts.messages import LoopHealth, MapSnapshot, Mode, RobotCommand
 from robot_agent.agent.core import AgentCore
+from robot_agent.agent.prepared_map import PreparedMap
 from robot_agent.config import AgentConfig
 from robot_agent.guardian.link import BaseFeedback, WheelCommand
 from robot_agent.hardware import LaserScan
@@ -289,10 +290,11 @@ class LoggedAgent(AgentCore):
             return sign(command, LOG_KEY)
         return msgspec.structs.replace(command, signature=b"")
 
-    def load(self, snapshot: MapSnapshot, now: float) -> None:
+    def load(self, map_: MapSnapshot | PreparedMap, now: float) -> None:
         """Log the snapshot and load it."""
+        snapshot = map_.snapshot if isinstance(map_, PreparedMap) else map_
         self._write(SnapshotLoaded(snapshot=snapshot, now=now))
-        super().load(snapshot, now)
+        super().load(map_, now)
 
     def restore(self, saved: SavedPose) -> None:
         """Log the pose and start at it."""

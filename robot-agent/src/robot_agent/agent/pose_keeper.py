@@ -9,9 +9,9 @@ from robot_agent.localization.localizer import SavedPose
 
 if TYPE_CHECKING:
     from fog_contracts.messages import Mode
-    from fog_contracts.replica import Replica
     from fog_contracts.site import RobotSite
     from robot_agent.localization.localizer import Localizer
+    from robot_agent.localization.map_fields import MapFields
 
 SEARCH_AGAIN_S: Final = 15.0
 """Least time between the beginnings of two global searches."""
@@ -40,12 +40,11 @@ class PoseKeeper:
         else:
             self._pending = saved
 
-    def load_map(self, replica: Replica) -> None:
-        """Load the static map of a snapshot into the localizer."""
-        assert replica.geometry is not None
-        self._localizer.load_map(replica.static, replica.geometry)
+    def load_map(self, site: str, fields: MapFields) -> None:
+        """Load the static map of a site into the localizer."""
+        self._localizer.load_map(fields)
         pending, self._pending = self._pending, None
-        if pending is not None and pending.site == replica.site:
+        if pending is not None and pending.site == site:
             self._localizer.restore(pending)
 
     def search(self, mode: Mode, now: float, *, at_rest: bool) -> bool:

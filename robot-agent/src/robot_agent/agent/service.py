@@ -4,29 +4,24 @@ from __future__ import annotations
 
 import asyncio
 import math
-import random
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Final
 
 from prometheus_client import Counter, Gauge
 
-from fog_contracts import channels as ch
-from fog_contracts.codec import ContractError
-from fog_contracts.messages import CommandReply, LoopHealth, MapSnapshot, RobotCommand, RobotState
-from fog_contracts.replica import MapError
+from fog_contracts.messages import CommandReply, LoopHealth, RobotCommand, RobotState
 from fog_runtime import logs, metrics
-from fog_runtime.clock import Ticker
+from fog_runtime.clock import Phase, Ticker
 from fog_runtime.edges import Edges
 from fog_runtime.suspension import SuspensionMonitor
 from robot_agent.agent.core import decide
-from robot_agent.agent.pose_keeper import start_pose
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from fog_contracts import channels as ch
     from fog_contracts.handlers import Publication
     from fog_contracts.messages import Message
-    from fog_contracts.site import RobotSite
     from fog_runtime.clock import Clock
     from fog_runtime.health import Health
     from fog_runtime.zenoh_edge import ZenohEdge
@@ -40,10 +35,7 @@ if TYPE_CHECKING:
 STREAM_S: Final = 0.05
 CONTROL_S: Final = 0.2
 PUBLISH_S: Final = 0.1
-SNAPSHOT_CHECK_S: Final = 0.1
 HOUSEKEEPING_S: Final = 1.0
-SNAPSHOT_TIMEOUT_S: Final = 3.0
-"""Timeout of a snapshot request."""
 
 SCANS = Counter("fognav_lidar_scans_total", "Whole scans of the lidar")
 LATENESS = Gauge("fognav_loop_lateness_p99_seconds", "99th percentile of a loop's lateness", ["loop"])
@@ -61,18 +53,15 @@ _log = logs.get("agent")
 class Service:
     """The running agent; its loops are tasks of the process. The core is used on the loop's thread only."""
 
-    def __init__(
-        self, core: AgentCore, zenoh: ZenohEdge, store: Store, clock: Clock, health: Health, *, site: str
-    ) -> None:
+    def __init__(self, core: AgentCore, zenoh: ZenohEdge, store: Store, clock: Clock, health: Health) -> None:
         self._core = core
-        self._zenoh = zenoh
         self._edges = Edges(clock, zenoh=zenoh)
         self._store = store
         self._clock = clock
         self._health = health
         self._robot = core.robot
-        self._site = site
-        self._started_at = clock.now()
+        self.phase = Phase()
+        """The common phase of all loops: the process sleeps between their ticks."""
         self._stream = self._ticker(STREAM_S)
         self._control = self._ticker(CONTROL_S)
         self._mode = ""
@@ -83,37 +72,29 @@ class Service:
         self._base_reason = "the guardian is not connected yet"
 
     def _ticker(self, period: float) -> Ticker:
-        """Return the ticks of a loop; all loops share them, so that the process sleeps in between."""
-        return Ticker(self._clock, period, origin=self._started_at)
+        return Ticker(self._clock, period, self.phase)
 
-    # --- State that survives a restart ------------------------------------------------------------------------------
-
-    def restore(self, body: RobotSite | None) -> None:
-        """Load the stored map and pose; without a stored pose, start at the site's start pose."""
-        snapshot = self._store.snapshot(self._site)
-        if snapshot is not None:
-            try:
-                self._core.load(snapshot, self._clock.now())
-            except MapError as error:
-                _log.warning("stored_map_refused", reason=str(error))
-        saved = self._store.pose(self._site)
-        if saved is None and body is not None:
-            saved = start_pose(self._site, body)
-        if saved is not None:
-            self._core.restore(saved)
-        _log.info("state_restored", map=snapshot is not None, x=saved and saved.x, y=saved and saved.y)
+    # --- Housekeeping -----------------------------------------------------------------------------------------------
 
     async def housekeeping_loop(self, lidar: LidarEdge) -> None:
-        """Once a second: store the pose if it changed, and report the health."""
-        async for now in self._ticker(HOUSEKEEPING_S):
-            self._core.on_loop_health(self._loop_health())
-            pose = self._core.pose_to_store(now)
-            if pose is not None:
-                try:
-                    await asyncio.to_thread(self._store.put_pose, pose)
-                except OSError as error:
-                    _log.error("pose_not_stored", reason=str(error))
-            self._report_health(self._clock.now(), lidar)
+        """Once a second: store the pose if it changed, and report the health; more often until the robot is ready."""
+        due = -math.inf
+        async for now in self._ticker(PUBLISH_S):
+            if now >= due:
+                due = now + HOUSEKEEPING_S - PUBLISH_S / 2
+                self._core.on_loop_health(self._loop_health())
+                await self._store_pose(now)
+                self._report_health(self._clock.now(), lidar)
+            elif not self._health.ready:
+                self._report_health(now, lidar)
+
+    async def _store_pose(self, now: float) -> None:
+        pose = self._core.pose_to_store(now)
+        if pose is not None:
+            try:
+                await asyncio.to_thread(self._store.put_pose, pose)
+            except OSError as error:
+                _log.error("pose_not_stored", reason=str(error))
 
     def _report_health(self, now: float, lidar: LidarEdge) -> None:
         core, health = self._core, self._health
@@ -186,35 +167,6 @@ class Service:
             _log.info(
                 "command", kind=request.kind, operator=request.operator, accepted=reply.accepted, reason=reply.reason
             )
-
-    async def snapshot_loop(self) -> None:
-        """Request a snapshot whenever the core wants one, with a growing delay after each failure."""
-        failures = 0
-        async for now in self._ticker(SNAPSHOT_CHECK_S):
-            if not self._core.wants_snapshot(now) or await self._fetch_snapshot():
-                failures = 0
-            else:
-                failures += 1
-                spread = random.uniform(0.5, 1.0)  # noqa: S311  # spreads attempts in time, no secret
-                await self._clock.sleep(spread * min(2.0**failures / 5, 3))
-
-    async def _fetch_snapshot(self) -> bool:
-        """Request a snapshot and load it; False without a valid one."""
-        try:
-            snapshot = await self._zenoh.query(ch.MAP_SNAPSHOT, None, MapSnapshot, SNAPSHOT_TIMEOUT_S)
-            if snapshot is None:
-                return False
-            self._core.load(snapshot, self._clock.now())
-        except (ContractError, MapError) as error:
-            _log.warning("snapshot_refused", reason=str(error))
-            return False
-        version = self._core.replica.version
-        _log.info("map_loaded", epoch=snapshot.epoch, snapshot=snapshot.seq, seq=version and version.seq)
-        try:
-            await asyncio.to_thread(self._store.put_snapshot, snapshot)
-        except OSError as error:
-            _log.error("map_not_stored", reason=str(error))
-        return True
 
     # --- Publications -----------------------------------------------------------------------------------------------
 

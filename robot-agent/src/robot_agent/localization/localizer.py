@@ -72,10 +72,20 @@ class Localizer:
 
     # --- inputs ---
 
-    def load_map(self, static: NDArray[np.uint8], geometry: GridGeometry) -> None:
-        """Load the static map (h, w; 0 free, 254 occupied, 255 unknown); the pose is kept."""
-        if self._fields is None or not self._fields.matches(static, geometry):
-            self._fields = map_fields(static, geometry, self._config)
+    def fields_of(self, static: NDArray[np.uint8], geometry: GridGeometry) -> MapFields:
+        """Return the fields of a static map (h, w; 0 free, 254 occupied, 255 unknown); the present ones if they fit.
+
+        It takes some 0.4 s for 2000 x 1200 cells and changes nothing: it may run on any thread.
+        """
+        known = self._fields
+        if known is not None and known.matches(static, geometry):
+            return known
+        return map_fields(static, geometry, self._config)
+
+    def load_map(self, fields: MapFields) -> None:
+        """Load a static map by its fields; the pose is kept."""
+        if fields is not self._fields:
+            self._fields = fields
             self._relocalization.cancel()
 
     def on_odometry(self, timestamp: float, x: float, y: float, theta: float) -> None:

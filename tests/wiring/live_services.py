@@ -172,8 +172,8 @@ class MemoryStore:
     async def durability_warning(self) -> str:
         return ""
 
-    async def zones(self) -> list[Any]:
-        return []
+    async def zones(self) -> tuple[list[Any], dict[str, str]]:
+        return [], {}
 
     async def zone_times(self) -> dict[str, Any]:
         return {}

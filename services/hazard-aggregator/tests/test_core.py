@@ -143,6 +143,31 @@ def test_stored_areas_and_hazards_take_effect_when_they_are_loaded_late():
     assert {p.ids["area"] for p in rig.published if p.channel is ch.AREA_DEFINITION} == {"hall", "gate"}
 
 
+def test_since_is_taken_over_from_hazards_that_are_loaded_late():
+    rig = Rig(complete=False)
+    rig.read(0.8)
+    assert rig.core.announced()["hall"].since > 1e6
+    rig.core.restore([], [stored("blocked", 254)], rig.at)
+    assert (rig.core.announced()["hall"].state, rig.core.announced()["hall"].since) == ("blocked", 1.0)
+    rig.read(3.0)
+    rig.core.mark_stored(rig.core.to_store())
+    rig.read(0.8)
+    assert rig.core.announced()["hall"].since > 1e6, "blocked anew"
+    silent = Rig(complete=False)
+    silent.core.restore([], [stored("unknown", 200)], silent.at)
+    assert silent.core.announced()["hall"].since == 1.0
+
+
+def test_since_of_an_area_that_changed_meanwhile_is_kept_when_hazards_are_loaded_late():
+    rig = Rig(complete=False)
+    rig.read(3.0)
+    rig.core.mark_stored(rig.core.to_store())
+    rig.read(0.8)
+    since = rig.core.announced()["hall"].since
+    rig.core.restore([], [stored("blocked", 254)], rig.at)
+    assert rig.core.announced()["hall"].since == since
+
+
 def test_removed_area_is_published_as_removed_and_leaves_nothing_to_store():
     rig = Rig()
     removed = AreaDefinition(id="hall", polygon=SQUARE, removed=True, version=1)

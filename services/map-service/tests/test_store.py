@@ -3,6 +3,7 @@
 import asyncio
 from pathlib import Path
 
+import msgspec
 import pytest
 from redis.asyncio import Redis
 
@@ -30,15 +31,15 @@ async def test_version_is_written_once_and_a_stale_one_is_refused(redis: Server)
         assert (await store.create(zone(radius=0.7), AUDIT))[0] == "exists"
         assert await store.replace(zone(2, 0.7), expected=1, audit=AUDIT) == "ok"
         assert await store.replace(zone(2, 0.9), expected=1, audit=AUDIT) == "stale"
-        assert await store.zones() == [zone(2, 0.7)]
+        assert await store.zones() == ([zone(2, 0.7)], {})
         assert await store.delete(zone(1), AUDIT) == "stale"
         assert await store.delete(zone(2), AUDIT) == "ok"
-        assert await store.zones() == []
+        assert await store.zones() == ([], {})
 
 
 async def test_zone_that_is_created_again_has_a_version_that_no_zone_had_before(redis: Server):
     async with Store(redis.url, "test") as store, Store(redis.url, "test") as other:
-        assert await other.zones() == []
+        assert await other.zones() == ([], {})
         await store.create(zone(), AUDIT)
         for version in range(2, 4):
             await store.replace(zone(version), expected=version - 1, audit=AUDIT)
@@ -47,7 +48,7 @@ async def test_zone_that_is_created_again_has_a_version_that_no_zone_had_before(
         assert await other.create(zone(), AUDIT) == ("ok", zone(4))
         assert await store.delete(zone(4), AUDIT) == "ok"
     async with Store(redis.url, "test") as restarted:
-        assert await restarted.zones() == []
+        assert await restarted.zones() == ([], {})
         assert await restarted.create(zone(), AUDIT) == ("ok", zone(5))
 
 
@@ -69,7 +70,7 @@ async def test_acknowledged_zones_survive_kills_of_redis(redis: Server):
             assert await store.replace(zone(version), expected=version - 1, audit=AUDIT) == "ok"
             await asyncio.to_thread(redis.kill)
             await asyncio.to_thread(redis.start)
-            assert await store.zones() == [zone(version)]
+            assert await store.zones() == ([zone(version)], {})
 
 
 async def test_write_to_a_dead_redis_is_a_store_error(redis: Server):
@@ -80,8 +81,15 @@ async def test_write_to_a_dead_redis_is_a_store_error(redis: Server):
             await store.create(zone(), AUDIT)
 
 
-async def test_unreadable_zone_is_a_store_error(redis: Server):
+@pytest.mark.parametrize("record", [b'{"id": "z2"}', b"nonsense", b"[7]"])
+async def test_unreadable_zone_is_left_out_by_name_and_can_be_deleted(redis: Server, record: bytes):
     async with Store(redis.url, "test") as store, Redis.from_url(redis.url) as raw:
-        await raw.hset("fog:test:zones", "z1", b'{"id": "z1"}')
-        with pytest.raises(StoreError, match="fog:test:zones"):
-            await store.zones()
+        await store.create(zone(), AUDIT)
+        await raw.hset("fog:test:zones", "z2", record)
+        zones, unreadable = await store.zones()
+        assert (zones, list(unreadable)) == ([zone()], ["z2"])
+        await store.delete_unusable("z2", AUDIT)
+        assert await store.zones() == ([zone()], {})
+        (entry, _) = (await store.audit()).entries
+        assert (entry.id, msgspec.json.decode(entry.after)) == ("z2", None)
+        msgspec.json.decode(entry.before)

@@ -151,16 +151,6 @@ class RedisStore:
 
     # --- For the services' stores -----------------------------------------------------------------------------------
 
-    async def _records(self, table: str, kind: type[M]) -> dict[str, M]:
-        """Return all records of a table; raises `StoreError` for an unreadable one, which must not be lost silently."""
-        records, failures = await self._decoded(table, kind)
-        for name, reason in failures.items():
-            raise StoreError(
-                f"{self._key(table)} contains an invalid {kind.__name__} ({name}): {reason}; repair or delete that"
-                " field"
-            )
-        return records
-
     async def _readable_records(self, table: str, kind: type[M]) -> dict[str, M]:
         """Return the readable records of a table; an unreadable one is logged and left out."""
         records, failures = await self._decoded(table, kind)

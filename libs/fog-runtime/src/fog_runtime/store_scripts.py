@@ -36,9 +36,16 @@ if attempted then
 end
 
 local function version_of(record)
-  local version = cjson.decode(record)
-  for part in string.gmatch(request.version, '[^.]+') do version = version[part] end
-  return version
+  local readable, version = pcall(function()
+    local found = cjson.decode(record)
+    for part in string.gmatch(request.version, '[^.]+') do found = found[part] end
+    return found
+  end)
+  return readable and version or nil
+end
+
+local function as_json(record)
+  return pcall(cjson.decode, record) and record or cjson.encode(record)
 end
 
 local floor = tonumber(redis.call('HGET', KEYS[5], request.table) or '0')
@@ -66,7 +73,7 @@ else
     redis.call('HSET', KEYS[3], id, data)
   end
   redis.call('XADD', KEYS[4], 'MAXLEN', '~', {AUDIT_ENTRIES}, '*', 'at', request.at, 'who', request.who,
-    'action', request.action, 'id', id, 'before', current or ARGV[3], 'after', data)
+    'action', request.action, 'id', id, 'before', current and as_json(current) or ARGV[3], 'after', data)
   writes = redis.call('HINCRBY', KEYS[2], request.table, 1)
   if attempted then redis.call('SET', KEYS[6], ARGV[4], 'EX', request.attempt_s) end
 end

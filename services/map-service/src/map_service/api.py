@@ -101,6 +101,13 @@ class ZoneList(Message, frozen=True, kw_only=True):
     seq: int
 
 
+class UnusableZone(Message, frozen=True, kw_only=True):
+    """A stored zone that is left out of the map, and why."""
+
+    id: str
+    reason: str
+
+
 class MapInfo(Message, frozen=True, kw_only=True):
     """The map's geometry and version; its images have the geometry's size, and their first row is the map's top."""
 
@@ -135,6 +142,12 @@ def _add_zone_reads(routes: Routes, service: Service) -> None:
         """List all zones with the map version that contains them."""
         _require_zones(service)
         return listing.current()
+
+    @routes.get("/api/v1/unusable-zones", problems=_ZONES_NOT_LOADED)
+    async def list_unusable_zones() -> list[UnusableZone]:
+        """List the stored zones that are left out of the map because their records are invalid: DELETE them."""
+        _require_zones(service)
+        return [UnusableZone(id=name, reason=reason) for name, reason in service.zones.unusable.reasons.items()]
 
     @routes.get("/api/v1/zones/{zone_id}", problems=_NO_SUCH_ZONE)
     async def get_zone(zone_id: str) -> Answer[Zone]:
@@ -188,6 +201,9 @@ def _add_zone_writes(routes: Routes, service: Service, clock: Clock) -> None:
     async def delete_zone(zone_id: str, caller: Operator, if_match: IfMatch = None) -> None:
         """Delete a zone; with If-Match, only if it is unchanged."""
         await service.zones.reload_after_uncertain_write()
+        if zone_id in service.zones.unusable.reasons:
+            await service.zones.delete_unusable(zone_id, caller.name)
+            return
         await service.zones.delete(_find_matching(service, zone_id, if_match), caller.name)
 
 

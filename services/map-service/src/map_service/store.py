@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 from msgspec import structs
 
 from fog_contracts.messages import Message, Zone
-from fog_runtime.redis_store import Audit, Outcome, RecoveryError, RedisStore, StoreError, StoreLostError, Table
+from fog_runtime.redis_store import ANY, Audit, Outcome, RecoveryError, RedisStore, StoreError, StoreLostError, Table
 from map_service.zone_times import Progress
 
 if TYPE_CHECKING:
@@ -31,11 +31,11 @@ class _AllTimes(Message, frozen=True, kw_only=True):
 class Store(RedisStore):
     """The map-service's keys."""
 
-    async def zones(self) -> list[Zone]:
-        """Return all stored zones; an unreadable one raises `StoreError`: a no-go zone must never be left out."""
-        zones = list((await self._records(_ZONES.name, Zone)).values())
+    async def zones(self) -> tuple[list[Zone], dict[str, str]]:
+        """Return all stored zones, and, by id, why others are unreadable."""
+        zones, unreadable = await self._decoded(_ZONES.name, Zone)
         await self._load_floor(_ZONES.name)
-        return zones
+        return list(zones.values()), unreadable
 
     async def create(self, zone: Zone, audit: Audit) -> tuple[Outcome, Zone]:
         """Write a new zone durably; return it with its version, which no zone of this id had before."""
@@ -56,6 +56,10 @@ class Store(RedisStore):
         outcome = await self._swap(_ZONES, zone.id, None, str(zone.version), audit)
         # The zone is deleted already: by an attempt whose reply was lost, or by somebody else.
         return "ok" if outcome == "missing" else outcome
+
+    async def delete_unusable(self, zone_id: str, audit: Audit) -> None:
+        """Delete a zone, whatever its record contains."""
+        await self._swap(_ZONES, zone_id, None, ANY, audit)
 
     async def zone_times(self) -> dict[str, Progress]:
         """Return the stored times of zones by id."""

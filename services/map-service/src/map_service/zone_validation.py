@@ -86,9 +86,16 @@ def check_room(prepared: PreparedZone, count: int, cells: int, geometry: GridGeo
         raise ZoneError("shape", f"{problem}: make it smaller, or delete zones that are not needed")
 
 
-def zones_spans(zones: Iterable[Zone], geometry: GridGeometry) -> dict[str, Spans]:
-    """Return the cells of each zone by its id; raises `ShapeError`, which names the zone."""
-    return {zone.id: named_spans(zone, geometry) for zone in zones}
+def zones_spans(zones: Iterable[Zone], geometry: GridGeometry) -> tuple[dict[str, Spans], dict[str, str]]:
+    """Return the cells of each zone by its id, and, by id, why the shapes of others are invalid."""
+    spans: dict[str, Spans] = {}
+    invalid: dict[str, str] = {}
+    for zone in zones:
+        try:
+            spans[zone.id] = named_spans(zone, geometry)
+        except ShapeError as error:
+            invalid[zone.id] = str(error)
+    return spans, invalid
 
 
 def named_spans(zone: Zone, geometry: GridGeometry) -> Spans:

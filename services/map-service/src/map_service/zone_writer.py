@@ -10,10 +10,10 @@ from msgspec import structs
 from prometheus_client import Counter
 
 from fog_contracts import channels as ch
-from fog_contracts.shapes import ShapeError
 from fog_runtime import logs
 from fog_runtime.work import Worker
 from map_service.store import Audit, RecoveryError, StoreError
+from map_service.unusable_zones import UnusableZones
 from map_service.zone_times import StoredState
 from map_service.zone_validation import check_list_size, check_room, list_size, prepare_zone, zones_spans
 
@@ -68,6 +68,7 @@ class ZoneWriter:
         self._now = now
         self._lock = asyncio.Lock()
         self._worker = Worker("zones", limit=MAX_PREPARING)
+        self.unusable = UnusableZones()
         self.must_reload = False
         """Whether stored zones may differ from those on the map: after a write whose outcome is unknown."""
 
@@ -123,6 +124,13 @@ class ZoneWriter:
             self._publisher.publish(self._core.remove_zone(zone.id, self._now()))
         await self._publisher.all_on_map()
 
+    async def delete_unusable(self, zone_id: str, who: str) -> None:
+        """Delete a zone that is left out because its record is invalid; raises `StoreError`."""
+        async with self._lock:
+            with self._uncertain_write():
+                await self._store.delete_unusable(zone_id, Audit(self._now().stamp, who, "delete"))
+            await self._load()
+
     async def earlier_result(self, attempt: Attempt | None) -> Zone | None:
         """Return the zone that an earlier attempt stored, once it is on the map; None for a first attempt.
 
@@ -165,18 +173,18 @@ class ZoneWriter:
             await self.load()
 
     async def _load(self) -> None:
-        core, zones = self._core, await self._store.zones()
+        core = self._core
+        zones, unreadable = await self._store.zones()
         known = {zone.id: zone for zone in core.zones.zones()}
+        changed = [zone for zone in zones if zone.id not in known or known[zone.id].shape != zone.shape]
+        spans, invalid = await self._worker.run(zones_spans, changed, core.costmap.geometry)
+        self.unusable.replace({**unreadable, **invalid})
+        zones = [zone for zone in zones if zone.id not in invalid]
         if not core.zones_loaded or {zone.id: zone for zone in zones} != known:
-            changed = [zone for zone in zones if zone.id not in known or known[zone.id].shape != zone.shape]
-            try:
-                spans = await self._worker.run(zones_spans, changed, core.costmap.geometry)
-                stored = StoredState(spans=spans, progress=await self._times.load(), boot=self._times.boot)
-                self._publisher.publish(core.load_zones(zones, self._now(), stored))
-            except ShapeError as error:
-                raise StoreError(f"a stored zone is invalid: {error}; repair or delete it") from error
+            stored = StoredState(spans=spans, progress=await self._times.load(), boot=self._times.boot)
+            self._publisher.publish(core.load_zones(zones, self._now(), stored))
         self.must_reload = False
-        detail = f"{len(zones)} loaded"
+        detail = f"{len(zones)} loaded{self.unusable.detail()}"
         if (excess := list_size(core.zones.size) - ch.ZONES.limit) > 0:
             detail += f"; their list is {excess} bytes too large for robots, which drive by the map alone: delete some"
             _log.error("zone_list_too_large", zones=len(zones), excess_bytes=excess, remedy="delete zones")

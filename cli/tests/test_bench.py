@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from fog_kernels.components import Components
 from fognav.__main__ import app
-from fognav.bench import costmap, fleet, office, rest
+from fognav.bench import costmap, fleet, localization, office, rest
 
 
 def test_office_is_connected_and_the_same_for_the_same_seed() -> None:
@@ -74,3 +74,19 @@ async def test_clients_of_every_kind_are_answered_while_the_heartbeat_is_timed(t
         assert figures[f"idle_{key}"] > 0
         assert figures[key] > 0
     assert figures["rss_mb"] > 50
+
+
+def test_localization_figures_are_there_and_the_search_and_match_ran() -> None:
+    figures = localization.measure(office.make_office(60.0, 40.0), 300, 60, 2, 1)
+    assert figures["cells"] == 800 * 1200
+    for key in (
+        "cycle_ms",
+        "reference_cycle_ms",
+        "ratio",
+        "move_ms",
+        "score_ms",
+        "clusters_ms",
+        "match_ms",
+        "search_ms",
+    ):
+        assert figures[key] > 0

@@ -136,3 +136,30 @@ def rest_command(
         return
     for name, value in (asked | figures).items():
         console.print(f"{name:26} {value}", markup=False)
+
+
+@bench_app.command("localization", epilog="Example: fognav bench localization --json")
+def localization_command(
+    *,
+    particles: Annotated[int, typer.Option("--particles", metavar="N", min=10, max=50_000, help="Particles.")] = 2000,
+    beams: Annotated[int, typer.Option("--beams", metavar="N", min=10, max=1000, help="Beams of an update.")] = 60,
+    repeats: Annotated[int, typer.Option("--repeats", metavar="N", min=1, help="Repetitions of each figure.")] = 200,
+    seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of floor and particles.")] = 1,
+    json: Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")] = False,
+) -> None:
+    """Measure the localization.
+
+    One cycle of the particle filter (move, weight, cluster, resample) beside the same with plainly written scores, the
+    match of a scan, and the search of a whole office of 100 x 60 m at 5 cm. Times are in ms.
+    """
+    from fognav.bench import localization, machine  # noqa: PLC0415  # keeps the other commands fast
+    from fognav.bench.office import make_office  # noqa: PLC0415  # same
+
+    kernels.warm_cache(lambda text: console.print(text, markup=False))
+    figures = localization.measure(make_office(seed=seed), particles, beams, repeats, seed)
+    if json:
+        asked = {"particles": particles, "beams": beams, "repeats": repeats, "seed": seed}
+        print_json({"bench": "localization", **asked, **figures, **machine.describe()})
+        return
+    for name, value in figures.items():
+        console.print(f"{name:22} {value}", markup=False)

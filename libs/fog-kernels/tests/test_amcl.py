@@ -203,6 +203,44 @@ def test_estimate_is_the_circular_mean_of_the_cluster_with_the_highest_weight() 
     assert np.array_equal(other.covariance, other.covariance.T)
 
 
+@settings(max_examples=examples(40), deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(2, 60), st.sampled_from([0.3, 1.0, 3.0]))
+def test_clusters_are_the_connected_groups_of_bins_with_circular_means(seed: int, n: int, spread: float) -> None:
+    rng = np.random.default_rng(seed)
+    x, y = (rng.normal(0.0, spread, n).astype(np.float32) for _ in range(2))
+    theta = rng.normal(3.0, 0.3 * spread, n).astype(np.float32)
+    weights = rng.uniform(0.1, 1.0, n)
+    bins = np.floor(np.column_stack((x / 0.5, y / 0.5)).astype(np.float64)).astype(int)
+    headings = np.floor(np.mod(theta.astype(np.float64) / (2 * math.pi), 1.0) * 36).astype(int)
+    groups = list(range(n))
+    for i in range(n):
+        for j in range(i):
+            turn = (headings[i] - headings[j]) % 36
+            if np.abs(bins[i] - bins[j]).max() <= 1 and turn in {0, 1, 35} and groups[i] != groups[j]:
+                groups = [groups[i] if group == groups[j] else group for group in groups]
+    expected = []
+    for group in set(groups):
+        own = np.array(groups) == group
+        mean = np.exp(1j * theta[own].astype(np.float64)) @ weights[own]
+        expected.append((weights[own].sum() / weights.sum(), np.average(x[own], weights=weights[own]), np.angle(mean)))
+    found = clusters(x, y, theta, weights)
+    assert len(found) == len(expected)
+    for cluster, (share, mean_x, mean_theta) in zip(found, sorted(expected, reverse=True), strict=True):
+        assert cluster.share == pytest.approx(share, rel=1e-6)
+        assert cluster.estimate.x == pytest.approx(mean_x, abs=1e-5)
+        assert abs(math.remainder(cluster.estimate.theta - mean_theta, 2 * math.pi)) < 5e-3
+
+
+def test_scores_do_not_depend_on_how_many_poses_are_scored_together() -> None:
+    rng = np.random.default_rng(1)
+    poses = [rng.uniform(low, high, 5000) for low, high in ((0.0, 12.0), (0.0, 8.0), (-3.0, 3.0))]
+    ranges = scan(3.0, 2.0, 0.3)
+    together = score_poses(*poses, FIELD, RESOLUTION, 0.0, 0.0, BEAMS, ranges)
+    for part in (slice(0, 1), slice(2040, 2060), slice(4990, 5000)):
+        alone = score_poses(*(values[part] for values in poses), FIELD, RESOLUTION, 0.0, 0.0, BEAMS, ranges)
+        assert np.array_equal(together[part], alone)
+
+
 def track(seed: int, steps: int) -> tuple[list[NDArray[np.float32]], tuple[float, float, float], list[float]]:
     """Drive a loop with drifting odometry from an uncertain start; return particles, true pose and errors."""
     state = rng_state(seed)

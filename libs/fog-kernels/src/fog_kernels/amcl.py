@@ -138,6 +138,7 @@ def _move(x: Any, y: Any, theta: Any, rot1: float, trans: float, rot2: float, al
 
 
 _BEAM_ARGUMENTS = (_arrays.F32_GRID, float32, float32, float32, _arrays.F32_FLAT, _arrays.F32_FLAT)
+_BLOCK = 2048  # poses scored together: what is kept of them stays in the processor's nearest caches
 
 
 @njit(
@@ -157,20 +158,44 @@ def _score(
     end_y: Any,
     out: Any,
 ) -> None:
+    """Beam by beam: first the cells where it ends for all poses of a block, which vectorizes, then their values.
+
+    Each pose's sum adds the beams in their order, so it does not depend on the machine's vectors or on the block.
+    """
     height, width = field.shape
-    beams = end_x.size
-    for i in range(xs.size):
-        cos = np.float32(math.cos(thetas[i]))
-        sin = np.float32(math.sin(thetas[i]))
-        base_x = (np.float32(xs[i]) - origin_x) * inverse
-        base_y = (np.float32(ys[i]) - origin_y) * inverse
-        match = np.float32(0.0)
-        for k in range(beams):
-            column = base_x + cos * end_x[k] - sin * end_y[k]
-            row = base_y + sin * end_x[k] + cos * end_y[k]
-            if column >= 0 and row >= 0 and column < width and row < height:
-                match += field[np.uint32(row), np.uint32(column)]
-        out[i] = match / beams
+    cells = field.ravel()
+    columns, rows, stride = np.float32(width), np.float32(height), np.int32(width)
+    zero = np.float32(0.0)
+    size = min(xs.size, _BLOCK)
+    cos, sin, base_x, base_y = (
+        np.empty(size, np.float32),
+        np.empty(size, np.float32),
+        np.empty(size, np.float32),
+        np.empty(size, np.float32),
+    )
+    match = np.empty(size, np.float32)
+    ends = np.empty(size, np.int32)
+    for first in range(0, xs.size, _BLOCK):
+        count = min(_BLOCK, xs.size - first)
+        for i in range(count):
+            cos[i] = math.cos(thetas[first + i])
+            sin[i] = math.sin(thetas[first + i])
+            base_x[i] = (np.float32(xs[first + i]) - origin_x) * inverse
+            base_y[i] = (np.float32(ys[first + i]) - origin_y) * inverse
+            match[i] = zero
+        for k in range(end_x.size):
+            ahead, left = end_x[k], end_y[k]
+            for i in range(count):
+                column = base_x[i] + cos[i] * ahead - sin[i] * left
+                row = base_y[i] + sin[i] * ahead + cos[i] * left
+                inside = (column >= zero) & (row >= zero) & (column < columns) & (row < rows)
+                end = np.int32(np.int32(row) * stride + np.int32(column))
+                ends[i] = end if inside else np.int32(-1)
+            for i in range(count):
+                if ends[i] >= 0:
+                    match[i] += cells[np.uint32(ends[i])]
+        for i in range(count):
+            out[first + i] = match[i] / end_x.size
 
 
 @njit(
@@ -320,7 +345,8 @@ def _clusters(x: Any, y: Any, theta: Any, weights: Any, bin_xy: float, n_theta: 
     numbers = np.empty(size, np.int64)
     bin_of = np.empty(n, np.int64)
     bin_keys = np.empty(n, np.int64)
-    sums = np.zeros((n, 5))
+    sums = np.zeros((n, 4))
+    bin_theta = _TWO_PI / n_theta
     bins = 0
     for i in range(n):
         key = _bin_key(x[i], y[i], theta[i], bin_xy, n_theta)
@@ -337,16 +363,16 @@ def _clusters(x: Any, y: Any, theta: Any, weights: Any, bin_xy: float, n_theta: 
         sums[number, 0] += weights[i]
         sums[number, 1] += weights[i] * x[i]
         sums[number, 2] += weights[i] * y[i]
-        sums[number, 3] += weights[i] * math.cos(theta[i])
-        sums[number, 4] += weights[i] * math.sin(theta[i])
+        sums[number, 3] += weights[i] * _wrap(theta[i] - ((key & 0xFFF) + 0.5) * bin_theta)
 
     parent = np.arange(bins)
     for number in range(bins):
         key = bin_keys[number]
         heading = key & 0xFFF
-        for dx in range(-1, 2):
-            for dy in range(-1, 2):
-                for dt in range(-1, 2):
+        # Half of the neighbours: each of the others finds this bin among its own.
+        for dx in range(2):
+            for dy in range(-dx, 2):
+                for dt in range(-1 if dx > 0 or dy > 0 else 1, 2):
                     other = (
                         (((key >> 36) + dx) << 36)
                         | ((((key >> 12) & 0xFFFFFF) + dy) << 12)
@@ -383,8 +409,12 @@ def _clusters(x: Any, y: Any, theta: Any, weights: Any, bin_xy: float, n_theta: 
         group = index[number]
         for k in range(3):
             table[group, k] += sums[number, k]
-        heading_sums[group, 0] += sums[number, 3]
-        heading_sums[group, 1] += sums[number, 4]
+        # The mean within a bin needs no sines; that of the bins is circular.
+        share = sums[number, 0]
+        if share > 0.0:
+            heading_mean = ((bin_keys[number] & 0xFFF) + 0.5) * bin_theta + sums[number, 3] / share
+            heading_sums[group, 0] += share * math.cos(heading_mean)
+            heading_sums[group, 1] += share * math.sin(heading_mean)
     for group in range(count):
         share = table[group, 0]
         if share > 0.0:

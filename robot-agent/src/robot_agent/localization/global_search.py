@@ -35,8 +35,7 @@ class GlobalSearch:
 
     def __init__(self, fields: MapFields, points: NDArray[np.float64], odom: Pose2, range_max: float) -> None:
         """Begin; points (n, 2; m, frame `base`) were measured at `odom`; `range_max`: the lidar's rated range (m)."""
-        places = fields.free_places
-        spaced = places[np.unique(np.floor(places / _SPACING_M).astype(np.int64), axis=0, return_index=True)[1]]
+        spaced = _spaced(fields.free_places)
         headings = np.arange(_HEADINGS) * (2.0 * math.pi / _HEADINGS)
         self._candidates = np.column_stack((np.repeat(spaced, len(headings), axis=0), np.tile(headings, len(spaced))))
         self._scores = np.zeros(len(self._candidates))
@@ -57,7 +56,7 @@ class GlobalSearch:
 
     def _refined(self, fields: MapFields) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the best candidates (n, 3), each moved to the best pose around it, and their scores."""
-        kept = np.argsort(-self._scores, kind="stable")[:_REFINED]
+        kept = np.argpartition(-self._scores, min(_REFINED, len(self._scores) - 1))[:_REFINED]
         poses, scores = self._candidates[kept], self._scores[kept]
         step = np.array([0.15, 0.15, math.radians(5.0)])
         shifts = np.array([(i, j, k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)], dtype=np.float64)
@@ -79,6 +78,15 @@ class GlobalSearch:
                 value = quality(score / fields.best_likelihood, fit)
                 places.append(Hypothesis(pose, math.log(max(value, 1e-3))))
         return Hypotheses(places, self.odom)
+
+
+def _spaced(places: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the first of the places (n, 2) in each square of the search's spacing."""
+    squares = np.floor((places - places.min(axis=0)) / _SPACING_M).astype(np.int64)
+    numbers = squares[:, 0] * (squares[:, 1].max() + 1) + squares[:, 1]
+    first = np.full(numbers.max() + 1, -1)
+    first[numbers[::-1]] = np.arange(len(places))[::-1]
+    return places[first[first >= 0]]
 
 
 def _places(poses: NDArray[np.float64], scores: NDArray[np.float64]) -> list[tuple[float, Pose2]]:

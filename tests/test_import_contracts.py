@@ -31,7 +31,7 @@ EDGES = {
     "fognav.demo.scene", "fognav.demo.usage", "fognav.demo.view", "fognav.demo_command", "fognav.doctor",
     "fognav.generated", "fognav.kernels", "fognav.operate", "fognav.output", "fognav.page.app",
     "fognav.pytest_progress", "fognav.recording", "fognav.robot_command", "fognav.robot_file_command",
-    "fognav.site_command", "fognav.stack",
+    "fognav.localization", "fognav.localize_command", "fognav.map_command", "fognav.site_command", "fognav.stack",
     "fognav.status_command", "fognav.system", "fognav.testing", "fognav.token_command", "fognav.zone_command",
     "fog_kernels.warm",
     "hazard_aggregator.__main__", "hazard_aggregator.api", "hazard_aggregator.registry", "hazard_aggregator.service",

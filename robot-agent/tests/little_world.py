@@ -23,7 +23,15 @@ from fog_kernels.raycast import cast
 from robot_agent.agent.core import AgentCore, decide
 from robot_agent.config import agent_config
 from robot_agent.guardian.link import BaseFeedback
-from robot_agent.hardware import BaseStatus, DriveTrain, LaserScan, LidarTraits, RepeatCounter, WheelOdometry
+from robot_agent.hardware import (
+    BaseStatus,
+    DriveTrain,
+    LaserScan,
+    LidarSamples,
+    LidarTraits,
+    RepeatCounter,
+    WheelOdometry,
+)
 
 KEY = b"k" * 32
 TICK_M = math.pi * 0.072 / 508.8
@@ -279,7 +287,13 @@ class LittleWorld:
             ranges += self.lidar_noise * self.rng.standard_normal(len(ranges))
             ranges[~np.isfinite(ranges) | (self.rng.random(len(ranges)) < 0.02)] = math.nan
             self.beams.extend(zip(angles, ranges, strict=True))
-            self.agent.on_lidar_samples(self.now)
+            samples = LidarSamples(
+                angles_rad=np.array([math.remainder(a, 2 * math.pi) for a in angles], np.float32),
+                ranges_m=ranges.astype(np.float32),
+                started_at=self.now - DT,
+                ended_at=self.now,
+            )
+            self.agent.on_lidar_samples(samples, self.now)
         if len(self.beams) == BEAMS:
             data = self.frozen_scan if self.frozen_scan is not None else np.array(self.beams)
             scan = LaserScan(

@@ -13,7 +13,7 @@ from fog_contracts.robot import BaseSettings, LidarSettings, RobotSettings
 from fog_runtime.robot_file import RobotFile
 from fognav_sim.sensors import LidarPlace
 from robot_agent.config import LocalizationConfig
-from robot_agent.hardware import LaserScan
+from robot_agent.hardware import LaserScan, LidarSamples
 from robot_agent.lidar_mounting import MountedLidar, Mounting
 from robot_agent.lidars.rplidar_a1.emulator import RplidarEmulator
 from robot_agent.localization.deskew import deskew
@@ -87,3 +87,15 @@ def test_walls_stand_where_they_are_however_the_lidar_is_mounted(settings):
     assert points[:, 0] == pytest.approx(3.0, abs=0.03)
     assert driver.stop_command
     assert driver.problem == ""
+
+
+def test_samples_of_the_stop_field_are_mounted_as_the_scans_are_and_masked_ones_have_no_return():
+    angles = np.array([-3.0, -0.5, 0.5, 3.0], np.float32)
+    samples = LidarSamples(angles, np.full(4, 1.0, np.float32), 5.0, 5.1)
+    mounted = Mounting(mirrored=True, latency_s=0.05, masks=((0.4, 0.6),)).apply_to_samples(samples)
+    assert mounted.angles_rad == pytest.approx([3.0, 0.5, -0.5, -3.0])
+    assert np.isnan(mounted.ranges_m).tolist() == [False, True, False, False]
+    assert (mounted.started_at, mounted.ended_at) == pytest.approx((4.95, 5.05))
+    assert mounted.angles_rad.dtype == mounted.ranges_m.dtype == np.float32
+    behind = LidarSamples(np.array([math.pi], np.float32), np.ones(1, np.float32), 0.0, 0.0)
+    assert abs(Mounting(mirrored=True).apply_to_samples(behind).angles_rad[0]) == pytest.approx(math.pi)

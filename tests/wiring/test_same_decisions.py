@@ -260,7 +260,7 @@ def feed(live: Any, entries: list[log.Entry]) -> None:
             case log.BaseReceived():
                 live.agent.on_feedback(entry.feedback, entry.now)
             case log.LidarSamplesReceived():
-                live.agent_core.on_lidar_samples(entry.now)
+                live.agent_core.on_lidar_samples(entry.samples(), entry.now)
             case log.ScanReceived():
                 live.agent.on_scan(entry.scan(), entry.now)
 

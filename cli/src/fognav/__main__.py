@@ -16,6 +16,8 @@ from fognav import __version__, checkout, doctor, kernels, system
 from fognav.area_command import area_app
 from fognav.bench_command import bench_app
 from fognav.channels_command import channels_command
+from fognav.localize_command import localize_command
+from fognav.map_command import map_app
 from fognav.operate.options import NUMBERS, JsonOption
 from fognav.output import (
     NOT_TRUE,
@@ -50,7 +52,11 @@ app.add_typer(zone_app, name="zone")
 app.add_typer(area_app, name="area")
 app.add_typer(robot_app, name="robot")
 app.add_typer(token_app, name="token")
+app.add_typer(map_app, name="map")
 app.add_typer(bench_app, name="bench")
+app.command("localize", epilog="Example: fognav localize --map floor.yaml --log drive.log.gz --scans even --json")(
+    localize_command
+)
 app.command("status", epilog="Example: fognav status --json")(status_command)
 app.command("goal", context_settings=NUMBERS, epilog="Example: fognav goal b")(robot_goal)
 robot_app.command("new", epilog="Example: fognav robot new --base roomba600 --lidar rplidar-a1 --out robot.toml")(

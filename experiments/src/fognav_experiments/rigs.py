@@ -143,8 +143,8 @@ class RobotRig:
             return
         received = self._lidar_driver.receive(self._from_lidar, now)
         self._from_lidar = b""
-        if received.samples:
-            self.agent.on_lidar_samples(now)
+        if received.samples is not None:
+            self.agent.on_lidar_samples(received.samples, now)
         for scan in received.scans:
             self.agent.on_scan(scan, now)
         self._to_lidar += received.data + self._lidar_driver.tick(now)

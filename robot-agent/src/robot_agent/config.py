@@ -59,6 +59,20 @@ class SafetyConfig:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class StopFieldConfig:
+    """Limits of the stop field; lengths in m, times in s, speeds in m/s."""
+
+    margin: float = 0.02
+    """How far from a lidar point the body comes to rest: twice the error of a near range."""
+    reaction: float = 0.25
+    """How long a command may act: 0.05 s to the next one, and 0.2 s until the guardian ends it when none comes."""
+    slowest: float = 0.01
+    """A slower wheel is a standing one."""
+    memory: float = 0.5
+    """How long a lidar point counts: two turns and a half, because thin and dark things are not seen in each."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LocalizationConfig:
     """Particle filter (Thrun, Burgard, Fox 2005; KLD sampling by Fox 2003) and the likelihood field's model."""
 
@@ -122,6 +136,7 @@ class AgentConfig:
     """How long (s) a reported obstacle counts while no lidar looks there again: longer than a detour takes."""
     obstacle_limit: int = 400
     safety: SafetyConfig = field(default_factory=SafetyConfig)
+    stop_field: StopFieldConfig = field(default_factory=StopFieldConfig)
     localization: LocalizationConfig = field(default_factory=LocalizationConfig)
 
 

@@ -85,12 +85,14 @@ class DriveTrain:
     """A differential drive: two driven wheels on one axle.
 
     `axle_m`: distance between the wheels. `wheel_speed_max_m_s`: top speed of a wheel. `travel_wrap_m`: the travel at
-    which the encoders' counters wrap (infinite: never).
+    which the encoders' counters wrap (infinite: never). `deceleration_m_s2`: how fast a wheel that is commanded to zero
+    comes to rest, at least, with the heaviest load on the smoothest floor.
     """
 
     axle_m: float
     wheel_speed_max_m_s: float
     travel_wrap_m: float = math.inf
+    deceleration_m_s2: float = 1.0
 
     def twist(self, left_m_s: float, right_m_s: float) -> Twist:
         """Return the body's motion at these wheel speeds."""
@@ -148,6 +150,20 @@ class LaserScan:
     started_at: float
     ended_at: float
     repeats: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LidarSamples:
+    """The newest n samples of a lidar, before their scan is whole, in order of arrival.
+
+    angles_rad, ranges_m: float32[n] as in `LaserScan`. started_at, ended_at: arrival of the first and last sample (s of
+    the caller's clock); those between arrive evenly.
+    """
+
+    angles_rad: NDArray[np.float32]
+    ranges_m: NDArray[np.float32]
+    started_at: float
+    ended_at: float
 
 
 class RepeatCounter:
@@ -237,9 +253,9 @@ class LidarTraits:
 
 
 class LidarEvents(NamedTuple):
-    """Result of received bytes: whether there were any samples, the whole scans, and bytes to send."""
+    """Result of received bytes: the samples in them (None without any), the whole scans, and bytes to send."""
 
-    samples: bool = False
+    samples: LidarSamples | None = None
     scans: tuple[LaserScan, ...] = ()
     data: bytes = b""
 

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
+
+from robot_agent.hardware import LidarSamples
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from robot_agent.hardware import LaserScan, LidarDriver, LidarEvents, LidarTraits, SerialSettings
+
+
+Real = TypeVar("Real", np.float32, np.float64)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,7 +54,16 @@ class Mounting:
             ended_at=scan.ended_at - self.latency_s,
         )
 
-    def masked(self, angles_rad: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def apply_to_samples(self, samples: LidarSamples) -> LidarSamples:
+        """Return the samples with true angles and times, those of masked directions without a return.
+
+        They stay in their places, because the times of the others follow from their order.
+        """
+        angles = _wrapped(-samples.angles_rad) if self.mirrored else samples.angles_rad
+        ranges = np.where(self.masked(angles), np.float32(np.nan), samples.ranges_m)
+        return LidarSamples(angles, ranges, samples.started_at - self.latency_s, samples.ended_at - self.latency_s)
+
+    def masked(self, angles_rad: NDArray[np.floating]) -> NDArray[np.bool_]:
         """Return which of these angles (float64[n], frame of the lidar the right way up) lie in a masked sector."""
         masked = np.zeros(angles_rad.shape, np.bool_)
         for begin, end in self.masks:
@@ -91,13 +105,14 @@ class MountedLidar:
     def receive(self, data: bytes, now: float) -> LidarEvents:
         """Parse bytes received at `now`."""
         events = self._driver.receive(data, now)
-        return events._replace(scans=tuple(map(self._mounting.apply, events.scans)))
+        samples = None if events.samples is None else self._mounting.apply_to_samples(events.samples)
+        return events._replace(samples=samples, scans=tuple(map(self._mounting.apply, events.scans)))
 
     def tick(self, now: float) -> bytes:
         """Advance time; return the bytes to send."""
         return self._driver.tick(now)
 
 
-def _wrapped(angles_rad: NDArray[np.float64]) -> NDArray[np.float64]:
+def _wrapped(angles_rad: NDArray[Real]) -> NDArray[Real]:
     """Return the angles in (-pi, pi]."""
-    return np.where(angles_rad <= -math.pi, angles_rad + math.tau, angles_rad)
+    return np.where(angles_rad <= -np.pi, angles_rad + angles_rad.dtype.type(math.tau), angles_rad)

@@ -20,6 +20,10 @@ def outputs(stop="none", cap=0.3):
     return SafetyOutputs(mode="NORMAL", reasons=(), cap=cap, stop=stop, changed=False, refusal=None)
 
 
+def free(wheels, _now):
+    return wheels
+
+
 def decision(made_at=0.0, left=0.2, right=0.3):
     return Decision(plan_id=1, planner_epoch=1, made_at=made_at, left=left, right=right)
 
@@ -29,7 +33,7 @@ def driving():
     control = WheelControl(CONFIG)
     for step in range(5):
         control.decision = decision(step * DT)
-        control.command(outputs(), step * DT)
+        control.command(outputs(), free, step * DT)
     assert control.speeds == pytest.approx((0.2, 0.3))
     return control
 
@@ -37,7 +41,7 @@ def driving():
 def test_commands_are_numbered_and_approach_the_decision_within_the_acceleration(driving):
     control = WheelControl(CONFIG)
     control.decision = decision()
-    first, second = control.command(outputs(), 0.0), control.command(outputs(), DT)
+    first, second = control.command(outputs(), free, 0.0), control.command(outputs(), free, DT)
     assert (first.seq, first.left, first.right) == (1, 0.0, 0.0)
     assert second.seq == 2
     assert second.right == pytest.approx(CONFIG.motion.limits.acc_v * DT)
@@ -51,32 +55,47 @@ def test_commands_are_numbered_and_approach_the_decision_within_the_acceleration
 def test_hold_and_stale_decision_ramp_the_wheels_to_rest(driving, stale, stop):
     driving.decision = decision(0.0 - CONFIG.decision_max_age if stale else 0.25)
     before, now = driving.speeds, 5 * DT
-    driving.command(outputs(stop), now)
+    driving.command(outputs(stop), free, now)
     assert 0.0 < driving.speeds[1] < before[1]
     assert driving.speeds[0] / driving.speeds[1] == pytest.approx(before[0] / before[1])
     assert not driving.following
     while not driving.at_rest:
         now += DT
-        driving.command(outputs(stop), now)
+        driving.command(outputs(stop), free, now)
     assert now <= 5 * DT + CONFIG.safety.ramp
 
 
 def test_protective_stop_sets_zero_speed_immediately(driving):
     driving.decision = decision(0.25)
-    driving.command(outputs("immediate", cap=0.0), 0.25)
+    driving.command(outputs("immediate", cap=0.0), free, 0.25)
     assert driving.at_rest
     assert not driving.following
 
 
 def test_speed_step_after_a_long_pause_is_limited():
     control = WheelControl(CONFIG)
-    control.command(outputs(), 0.0)
+    control.command(outputs(), free, 0.0)
     control.decision = decision(100.0, left=0.5, right=0.5)
-    command = control.command(outputs(cap=0.5), 100.0)
+    command = control.command(outputs(cap=0.5), free, 100.0)
     assert command.left <= CONFIG.motion.limits.acc_v * 0.2 + 1e-9
 
 
 def test_reset_is_passed_on_once():
     control = WheelControl(CONFIG)
     control.pass_reset()
-    assert [control.command(outputs(), step * DT).reset for step in range(3)] == [True, False, False]
+    assert [control.command(outputs(), free, step * DT).reset for step in range(3)] == [True, False, False]
+
+
+def test_guard_has_the_last_word_on_decisions_and_ramps(driving):
+    driving.decision = decision(0.25)
+    asked = []
+
+    def half(wheels, now):
+        asked.append((wheels, now))
+        return wheels[0] / 2, wheels[1] / 2
+
+    command = driving.command(outputs(), half, 0.25)
+    assert (command.left, command.right) == driving.speeds == pytest.approx((0.1, 0.15))
+    ramped = driving.command(outputs("ramp"), half, 0.30)
+    assert asked[1][0][1] < 0.15
+    assert ramped.right == asked[1][0][1] / 2

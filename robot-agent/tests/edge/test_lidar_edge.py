@@ -36,6 +36,7 @@ class Line:
         self.driver = RplidarA1Driver()
         self.now = 50.0
         self.scans = []
+        self.samples = []
         self.sent = b""
         self.cut = False
         self.write(self.driver.begin(self.now))
@@ -51,6 +52,7 @@ class Line:
             data = self.device.outgoing(self.now)
             received = self.driver.receive(b"" if self.cut else data, self.now)
             self.scans += received.scans
+            self.samples += [received.samples] if received.samples is not None else []
             self.write(received.data + self.driver.tick(self.now))
 
 
@@ -70,6 +72,25 @@ def test_lidar_that_scans_already_is_stopped_first_and_its_old_nodes_are_discard
     assert line.scans
     assert line.driver.incomplete == 0
     assert all(scan.started_at > 50.0 + STOP_S for scan in line.scans)
+
+
+def test_samples_come_before_their_scan_is_whole_and_are_those_of_the_scans():
+    line = Line()
+    line.run(0.25)
+    assert not line.scans
+    assert line.samples
+    line.run(1.75)
+    # 2000 a second from the scan's begin on, within 40 ms of it, evenly in time.
+    counts = [len(samples.ranges_m) for samples in line.samples]
+    assert 3500 < sum(counts) < 3900
+    assert max(counts) <= 41
+    assert all(0.0 <= s.ended_at - s.started_at <= STEP for s in line.samples)
+    angles = np.concatenate([samples.angles_rad for samples in line.samples])
+    ranges = np.concatenate([samples.ranges_m for samples in line.samples])
+    assert ranges == pytest.approx(wavy_room(angles, 0.0), abs=0.01)
+    scan = line.scans[0]
+    first = int(np.flatnonzero(np.isclose(angles, scan.angles_rad[0], atol=1e-6))[0])
+    assert angles[first : first + len(scan.angles_rad)] == pytest.approx(scan.angles_rad, abs=1e-6)
 
 
 def test_silence_restarts_the_scan():
@@ -126,7 +147,9 @@ async def test_laser_and_motor_are_stopped_when_the_edge_ends(tmp_path, monkeypa
     monkeypatch.setattr(Port, "set_line", lambda _port, name, *, on: lines.append((name, on)))
     device, scans = RplidarEmulator(wavy_room), []
     with PtyPort(tmp_path / "lidar") as port:
-        edge = LidarEdge(str(port.path), RplidarA1Driver(), SystemClock(), lambda _: None, lambda s, _: scans.append(s))
+        edge = LidarEdge(
+            str(port.path), RplidarA1Driver(), SystemClock(), lambda *_: None, lambda s, _: scans.append(s)
+        )
         task = asyncio.create_task(edge.run())
         end = time.monotonic() + DEADLINE_S
         while not scans:
@@ -146,7 +169,7 @@ async def test_laser_and_motor_are_stopped_when_the_edge_ends(tmp_path, monkeypa
 async def test_simulated_speed_is_refused_on_a_real_port(tmp_path, monkeypatch):
     monkeypatch.setattr(Port, "device", "/dev/ttyUSB1")
     with PtyPort(tmp_path / "lidar") as port:
-        edge = LidarEdge(str(port.path), RplidarA1Driver(), SystemClock(5.0), lambda _: None, lambda *_: None)
+        edge = LidarEdge(str(port.path), RplidarA1Driver(), SystemClock(5.0), lambda *_: None, lambda *_: None)
         with pytest.raises(SettingsError, match="FOGNAV_SPEED is 5, but /dev/ttyUSB1 is no simulated device"):
             await edge.run()
         assert port.read() == b""
@@ -156,7 +179,7 @@ async def test_simulated_speed_is_refused_on_a_real_port(tmp_path, monkeypatch):
 async def test_edge_waits_for_its_port_and_reopens_it(tmp_path):
     link = tmp_path / "lidar"
     scans = []
-    edge = LidarEdge(str(link), RplidarA1Driver(), SystemClock(), lambda _: None, lambda scan, _: scans.append(scan))
+    edge = LidarEdge(str(link), RplidarA1Driver(), SystemClock(), lambda *_: None, lambda scan, _: scans.append(scan))
     task = asyncio.create_task(edge.run())
 
     async def until(condition, port=None, device=None):
@@ -205,7 +228,9 @@ async def test_lidar_commands_are_not_sent_to_a_base_on_the_lidars_port(tmp_path
         device.base.receive(make_base(default_robot()).wake(), time.monotonic())
     with PtyPort(tmp_path / "lidar") as port:
         check = partial(LineCheck, str(port.path), "rplidar-a1", signatures())
-        edge = LidarEdge(str(port.path), RplidarA1Driver(), SystemClock(), lambda _: None, lambda *_: None, check=check)
+        edge = LidarEdge(
+            str(port.path), RplidarA1Driver(), SystemClock(), lambda *_: None, lambda *_: None, check=check
+        )
         task = asyncio.create_task(edge.run())
         try:
             end = time.monotonic() + DEADLINE_S
@@ -231,7 +256,7 @@ async def test_a_lidar_that_scans_or_is_silent_passes_the_check(tmp_path, comman
             str(port.path),
             RplidarA1Driver(),
             SystemClock(),
-            lambda _: None,
+            lambda *_: None,
             lambda scan, _: scans.append(scan),
             check=check,
         )
@@ -251,6 +276,6 @@ async def test_a_lidar_that_scans_or_is_silent_passes_the_check(tmp_path, comman
 
 @pytest.mark.live
 async def test_a_port_named_by_its_number_ends_the_agent_with_the_remedy():
-    edge = LidarEdge("/dev/ttyUSB7", RplidarA1Driver(), SystemClock(), lambda _: None, lambda *_: None)
+    edge = LidarEdge("/dev/ttyUSB7", RplidarA1Driver(), SystemClock(), lambda *_: None, lambda *_: None)
     with pytest.raises(SettingsError, match=r"lidar.port: /dev/ttyUSB7 .*/dev/serial/by-id"):
         await edge.run()

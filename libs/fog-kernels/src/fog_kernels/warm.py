@@ -21,11 +21,23 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 PROFILES: dict[str, tuple[str, ...]] = {
-    "robot": ("amcl", "astar", "distance", "dwa", "inflation", "likelihood", "raycast"),
+    "robot": ("amcl", "astar", "distance", "dwa", "inflation", "likelihood", "raycast", "sweep"),
     "planner": ("astar", "components", "detour", "distance", "inflation"),
     "map": ("distance", "inflation", "spans"),
     "sim": ("distance", "raycast"),
-    "all": ("amcl", "astar", "components", "detour", "distance", "dwa", "inflation", "likelihood", "raycast", "spans"),
+    "all": (
+        "amcl",
+        "astar",
+        "components",
+        "detour",
+        "distance",
+        "dwa",
+        "inflation",
+        "likelihood",
+        "raycast",
+        "spans",
+        "sweep",
+    ),
 }
 
 

@@ -20,6 +20,7 @@ from fog_contracts.fencing import Fence
 from fog_contracts.follower import MapFollower
 from fog_contracts.messages import LoopHealth
 from robot_agent.agent.blocked_places import BlockedPlaces
+from robot_agent.agent.motion_guard import MotionGuard
 from robot_agent.agent.obstacle_reporter import ObstacleReporter
 from robot_agent.agent.operator_commands import OperatorCommands, initial_pose_refusal
 from robot_agent.agent.path_driving import PathDriving
@@ -55,7 +56,7 @@ if TYPE_CHECKING:
     from fog_contracts.replica import Replica
     from robot_agent.config import AgentConfig
     from robot_agent.guardian.link import BaseFeedback, WheelCommand
-    from robot_agent.hardware import LaserScan
+    from robot_agent.hardware import LaserScan, LidarSamples
     from robot_agent.localization.absolute import AbsoluteObservation
     from robot_agent.safety.gate import Request, SafetyOutputs
 
@@ -79,6 +80,7 @@ class AgentCore:
         self._map = MapFollower()
         self._places = BlockedPlaces()
         self._driving = PathDriving(config)
+        self._guard = MotionGuard(config, self._localizer)
         self._safety = SafetySupervisor(config.safety)
         self._reporter = ObstacleReporter(config.obstacle_ttl, config.obstacle_limit)
         self._commands = OperatorCommands(config, self)
@@ -178,9 +180,10 @@ class AgentCore:
         del now
         self._base.on_lost(reason)
 
-    def on_lidar_samples(self, now: float) -> None:
-        """Record that lidar samples arrived."""
+    def on_lidar_samples(self, samples: LidarSamples, now: float) -> None:
+        """Handle the lidar's newest samples, which arrived at `now`."""
         self._lidar.on_samples(now)
+        self._guard.on_samples(samples)
 
     def on_scan(self, scan: LaserScan, now: float) -> None:
         """Handle a whole scan that arrived at `now`; repeated identical scans don't correct the pose."""
@@ -196,7 +199,7 @@ class AgentCore:
 
     def stream(self, now: float, stamp: float) -> WheelCommand:
         """Evaluate safety and return the wheel speeds to send now; call it 20 times a second."""
-        return self._driving.command(self._evaluate_safety(now), now, stamp)
+        return self._driving.command(self._evaluate_safety(now), self._guard.limit, now, stamp)
 
     def control_job(self, now: float) -> Job | None:
         """Return the inputs of the next decision; None while there is no goal or the robot must not drive."""
@@ -269,7 +272,9 @@ class AgentCore:
             mission,
             self.replica.version,
             self._base.feedback,
-            hindrances=hindrances(mission, self._driving.wheels.decision, stuck_after, at.now) if may_drive else [],
+            hindrances=hindrances(mission, self._driving.wheels.decision, self._guard.reason, stuck_after, at.now)
+            if may_drive
+            else [],
             traces=self._driving.traces.recent,
             loop=self._loop_health,
             epochs=self._fence.epochs,

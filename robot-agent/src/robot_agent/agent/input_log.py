@@ -26,7 +26,7 @@ from robot_agent.agent.core import AgentCore
 from robot_agent.agent.prepared_map import PreparedMap
 from robot_agent.config import AgentConfig
 from robot_agent.guardian.link import BaseFeedback, WheelCommand
-from robot_agent.hardware import LaserScan
+from robot_agent.hardware import LaserScan, LidarSamples
 from robot_agent.localization.absolute import AbsoluteObservation
 from robot_agent.localization.localizer import SavedPose
 from robot_agent.localization.pose import Pose2
@@ -129,9 +129,33 @@ class PoseObserved(Input, frozen=True, kw_only=True):
 
 
 class LidarSamplesReceived(Input, frozen=True, kw_only=True):
-    """Lidar samples arrived."""
+    """Lidar samples arrived: their arrays as bytes, float32, little-endian, so that they come back exactly."""
 
+    angles_rad: bytes
+    ranges_m: bytes
+    started_at: float
+    ended_at: float
     now: float
+
+    @classmethod
+    def of(cls, samples: LidarSamples, now: float) -> LidarSamplesReceived:
+        """Return the entry of samples that arrived at `now`."""
+        return cls(
+            angles_rad=np.asarray(samples.angles_rad, "<f4").tobytes(),
+            ranges_m=np.asarray(samples.ranges_m, "<f4").tobytes(),
+            started_at=float(samples.started_at),
+            ended_at=float(samples.ended_at),
+            now=now,
+        )
+
+    def samples(self) -> LidarSamples:
+        """Return the samples."""
+        return LidarSamples(
+            angles_rad=np.frombuffer(self.angles_rad, "<f4"),
+            ranges_m=np.frombuffer(self.ranges_m, "<f4"),
+            started_at=self.started_at,
+            ended_at=self.ended_at,
+        )
 
 
 class ScanReceived(Input, frozen=True, kw_only=True):
@@ -323,10 +347,10 @@ class LoggedAgent(AgentCore):
         self._write(PoseObserved(pose=pose, covariance=covariance, observed_at=observation.stamp))
         return super().on_absolute_observation(observation)
 
-    def on_lidar_samples(self, now: float) -> None:
-        """Log that lidar samples arrived, and record it."""
-        self._write(LidarSamplesReceived(now=now))
-        super().on_lidar_samples(now)
+    def on_lidar_samples(self, samples: LidarSamples, now: float) -> None:
+        """Log the samples and handle them."""
+        self._write(LidarSamplesReceived.of(samples, now))
+        super().on_lidar_samples(samples, now)
 
     def on_scan(self, scan: LaserScan, now: float) -> None:
         """Log the scan and handle it."""

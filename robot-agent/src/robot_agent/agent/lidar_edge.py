@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from fog_runtime.clock import Clock
     from robot_agent.device_signature import LineCheck
-    from robot_agent.hardware import LaserScan, LidarDriver
+    from robot_agent.hardware import LaserScan, LidarDriver, LidarSamples
 
 _LISTEN_PERIOD_S: Final = 0.02
 REOPEN_S: Final = 1.0
@@ -39,7 +39,7 @@ class LidarEdge:
         path: str,
         driver: LidarDriver,
         clock: Clock,
-        on_samples: Callable[[float], object],
+        on_samples: Callable[[LidarSamples, float], object],
         on_scan: Callable[[LaserScan, float], object],
         *,
         check: Callable[[], LineCheck] | None = None,
@@ -123,8 +123,8 @@ class LidarEdge:
             return
         try:
             events = driver.receive(port.read_available(), now)
-            if events.samples:
-                self._on_samples(now)
+            if events.samples is not None:
+                self._on_samples(events.samples, now)
             for scan in events.scans:
                 # After the caller's own work: localization by a scan must not delay the wheel command.
                 lost.get_loop().call_soon(self._on_scan, scan, now)

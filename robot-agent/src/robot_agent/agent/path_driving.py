@@ -13,6 +13,8 @@ from robot_agent.agent.wheel_control import WheelControl
 from robot_agent.motion.local_planner import make_job, twist
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from fog_contracts.handlers import Moment
     from fog_contracts.messages import RobotGoal, RobotPath, RobotRelease
     from fog_contracts.replica import Replica
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
     from robot_agent.localization.pose import Pose2
     from robot_agent.motion.local_planner import Decision, Job
     from robot_agent.safety.gate import SafetyOutputs
+    from robot_agent.safety.stop_field import Wheels
 
 
 class PathDriving:
@@ -122,9 +125,11 @@ class PathDriving:
         if safety.stop == "immediate" or (safety.changed and safety.stop != "none"):
             self.wheels.decision = None
 
-    def command(self, safety: SafetyOutputs, now: float, stamp: float) -> WheelCommand:
-        """Return the wheel speeds to send now; the first ones on a new path close its traces."""
-        command = self.wheels.command(safety, now)
+    def command(
+        self, safety: SafetyOutputs, guard: Callable[[Wheels, float], Wheels], now: float, stamp: float
+    ) -> WheelCommand:
+        """Return the wheel speeds to send now, within `guard`; the first ones on a new path close its traces."""
+        command = self.wheels.command(safety, guard, now)
         if self.wheels.following:
             self.traces.close(stamp)
         return command

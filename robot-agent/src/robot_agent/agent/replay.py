@@ -186,7 +186,7 @@ class _Run:
             case log.BaseLost():
                 self._agent.on_base_lost(entry.now, entry.reason)
             case log.LidarSamplesReceived():
-                self._agent.on_lidar_samples(entry.now)
+                self._agent.on_lidar_samples(entry.samples(), entry.now)
             case log.ScanReceived():
                 self._agent.on_scan(entry.scan(), entry.now)
 

@@ -84,9 +84,11 @@ def robot_state(  # noqa: PLR0913  # a message gathers from all parts of the age
     )
 
 
-def hindrances(mission: Mission, decision: Decision | None, stuck_after: float, now: float) -> list[str]:
-    """Return why a robot that may drive makes no progress to its goal."""
-    found: list[str] = []
+def hindrances(
+    mission: Mission, decision: Decision | None, limited: str | None, stuck_after: float, now: float
+) -> list[str]:
+    """Return why a robot that may drive makes little progress to its goal; `limited`: why it is stopped."""
+    found = [] if limited is None else [limited]
     if decision is not None and decision.blocked:
         found.append(decision.blocked)
     if mission.follower is None:

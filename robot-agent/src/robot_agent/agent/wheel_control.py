@@ -8,9 +8,12 @@ from robot_agent.guardian.link import WheelCommand
 from robot_agent.safety.gate import limit_wheels, ramp_down
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from robot_agent.config import AgentConfig
     from robot_agent.motion.local_planner import Decision
     from robot_agent.safety.gate import SafetyOutputs
+    from robot_agent.safety.stop_field import Wheels
 
 _STEP_MAX_S: Final = 0.2
 """After a longer pause the wheel speeds change by no more than within this time."""
@@ -40,8 +43,8 @@ class WheelControl:
         """Pass an operator's reset on to the guardian with the next command."""
         self._reset_pending = True
 
-    def command(self, outputs: SafetyOutputs, now: float) -> WheelCommand:
-        """Return the wheel speeds to send at `now` (s, monotonic)."""
+    def command(self, outputs: SafetyOutputs, guard: Callable[[Wheels, float], Wheels], now: float) -> WheelCommand:
+        """Return the wheel speeds to send at `now` (s, monotonic); `guard` has the last word on them."""
         dt = 0.0 if self._streamed_at is None else min(max(now - self._streamed_at, 0.0), _STEP_MAX_S)
         self._streamed_at = now
         limits, safety = self._config.motion.limits, self._config.safety
@@ -61,6 +64,7 @@ class WheelControl:
                 wheel_speed=limits.wheel_max,
                 config=safety,
             )
+        self.speeds = guard(self.speeds, now)
         self.following = decision is not None and outputs.stop == "none"
         self._seq += 1
         reset, self._reset_pending = self._reset_pending, False

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from robot_agent.hardware import LaserScan, RepeatCounter
+from robot_agent.hardware import LaserScan, LidarSamples, RepeatCounter
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -42,6 +42,7 @@ class ScanBuilder:
         self._pieces: list[Samples] = []
         self._times: list[NDArray[np.float64]] = []
         self._count = 0
+        self._newest: list[tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]] = []
         self._started = False
         self._last_arrival: float | None = None
         self._repeats = RepeatCounter()
@@ -54,6 +55,7 @@ class ScanBuilder:
         """
         count = len(samples.ranges_m)
         times = self._arrival_times(count, now)
+        self._newest.append((samples.clockwise_rad, samples.ranges_m, times))
         scans: list[LaserScan] = []
         begin = 0
         for boundary in boundaries:
@@ -64,9 +66,23 @@ class ScanBuilder:
         self._append(samples, times, begin, count)
         return scans
 
+    def take_samples(self) -> LidarSamples | None:
+        """Return all samples since the last call, be their scan whole or not; None without any."""
+        if not sum(len(times) for _, _, times in self._newest):
+            return None
+        clockwise, ranges, times = (np.concatenate(fields) for fields in zip(*self._newest, strict=True))
+        self._newest = []
+        return LidarSamples(
+            angles_rad=_counter_clockwise(clockwise).astype(np.float32),
+            ranges_m=ranges.astype(np.float32),
+            started_at=float(times[0]),
+            ended_at=float(times[-1]),
+        )
+
     def reset(self) -> None:
         """Discard the incomplete scan, after a gap or a restart."""
         self._clear()
+        self._newest = []
         self._started = False
         self._last_arrival = None
 
@@ -104,7 +120,7 @@ class ScanBuilder:
             return []
         return [
             LaserScan(
-                angles_rad=np.where(clockwise < np.pi, 0.0, 2.0 * np.pi) - clockwise,
+                angles_rad=_counter_clockwise(clockwise),
                 ranges_m=ranges,
                 quality=quality,
                 started_at=float(times[0]),
@@ -112,3 +128,8 @@ class ScanBuilder:
                 repeats=self._repeats.count(clockwise, ranges, quality),
             )
         ]
+
+
+def _counter_clockwise(clockwise: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return clockwise angles (rad; in [0, 2 pi)) as counter-clockwise ones in (-pi, pi]."""
+    return np.where(clockwise < np.pi, 0.0, 2.0 * np.pi) - clockwise

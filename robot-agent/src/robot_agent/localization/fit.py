@@ -117,9 +117,14 @@ class FitMonitor:
             self.status = "weak"
         self.detail = detail
 
-    def add(self, fit: Fit, spread: Uncertainty) -> None:
-        """Add the fit of the newest scan, with the pose's standard deviations."""
+    def add(self, fit: Fit, spread: Uncertainty, *, verified: bool = True) -> None:
+        """Add the fit of the newest scan, with the pose's standard deviations.
+
+        A pose that was found again is at most weak until it is `verified` that no other place looks like it.
+        """
         grade, reason = grade_fit(fit, spread)
+        if grade == "good" and not verified:
+            grade, reason = "weak", "the pose was lost and found again: other places may look like this one"
         if grade == "good" and not self._proven and fit.contradict > _CONTRADICTION_LIMIT_UNPROVEN:
             grade, reason = "weak", _contradiction(fit)
         self._contradicted = self._contradicted + 1 if fit.contradict > _CONTRADICTION_LIMIT else 0
@@ -128,7 +133,7 @@ class FitMonitor:
         self._recent.append(grade)
         before = self.status
         self.status, self.detail = self._next_status(reason)
-        if before == "none" and not self._trial_scans and self._is_steadily_weak(fit):
+        if before in {"none", "lost"} and not self._trial_scans and self._is_steadily_weak(fit):
             self.status = "weak"
         self._count_trial()
 

@@ -9,6 +9,7 @@ Pure: times are arguments, randomness comes from the seed. The parts are modules
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Final
 
 import msgspec
@@ -17,6 +18,7 @@ import numpy as np
 from robot_agent.config import LocalizationConfig
 from robot_agent.localization.deskew import DeskewedScan, deskew
 from robot_agent.localization.fit import FitMonitor, evaluate_fit
+from robot_agent.localization.hypotheses import apart
 from robot_agent.localization.map_fields import MapFields, map_fields
 from robot_agent.localization.odometry_buffer import OdometryBuffer
 from robot_agent.localization.particle_filter import ParticleFilter
@@ -40,6 +42,8 @@ _FOUND_SIGMAS: Final = (0.2, 0.1)
 """Standard deviations (m, rad) of a place that a search found, which the next scan narrows."""
 _LOCAL_SIGMAS: Final = (1.0, 0.5)
 """Standard deviations (m, rad) within which a lost robot is looked for first."""
+_VERIFIED_AFTER_M: Final = 5.0
+"""A pose that was found again is verified by a search of the whole map, or by fitting for so long a drive."""
 _LOCAL_SCANS: Final = 5
 """After this many scans that do not fit there either, the whole map is searched."""
 
@@ -67,6 +71,8 @@ class Localizer:
         self._relocalization = Relocalization(self._config)
         self._local_scans = 0
         """Scans since a lost robot was looked for near its last pose; 0 while it is not lost."""
+        self._found_at: Pose2 | None = None
+        """Odometry at which a lost pose was found again, until that is verified."""
         self.scan: DeskewedScan | None = None
         """The newest scan, without its skew."""
 
@@ -151,6 +157,13 @@ class Localizer:
         self._monitor.begin_search()
         return True
 
+    def continue_search(self, now: float) -> None:
+        """Do one more share of a search in progress, between scans."""
+        if self._fields is None or self.scan is None or not self.searching:
+            return
+        self._relocalization.advance(self._fields)
+        self._settle(self.scan, self._fields, now)
+
     # --- outputs ---
 
     @property
@@ -181,6 +194,12 @@ class Localizer:
     def odom_at(self, timestamp: float) -> Pose2 | None:
         """Pose in `odom` at a time (s), interpolated; extrapolated by at most 0.15 s. None before the first."""
         return self._odometry.pose(timestamp)
+
+    def odom_poses(
+        self, times: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return x, y (m) and theta (rad) in `odom` at times (n; s), as `odom_at` does; there must be a pose."""
+        return self._odometry.poses(times)
 
     def pose(self, timestamp: float) -> Pose2 | None:
         """Pose in `map` at a time (s) not older than 3 s; None while it is unknown."""
@@ -228,6 +247,7 @@ class Localizer:
     def _start(self, pose: Pose2, sigma_xy: float, sigma_theta: float) -> None:
         self._relocalization.cancel()
         self._local_scans = 0
+        self._found_at = None
         odom = self._odometry.latest() or Pose2(0.0, 0.0, 0.0)
         self._filter.start(pose, odom, sigma_xy, sigma_theta)
 
@@ -235,22 +255,38 @@ class Localizer:
         """Evaluate how the scan fits at the corrected pose; look for the robot when the pose is lost."""
         pose = self._filter.pose(scan.odom)
         assert pose is not None
+        if self._filter.jumped:
+            self._found_at = scan.odom
         fit = evaluate_fit(fields, pose, scan.beams(_FIT_BEAMS), self._config.range_max)
-        self._monitor.add(fit, self._filter.uncertainty)
-        if self._monitor.status != "lost":
-            self._local_scans = 0
-            if self._monitor.trial_failed:
-                self.global_localization()
-            elif self._monitor.status in {"good", "weak"}:
-                self._relocalization.cancel()
+        self._monitor.add(fit, self._filter.uncertainty, verified=self._found_at is None)
+        if self._monitor.status == "lost":
+            self._look_nearby(scan, now)
             return
+        self._local_scans = 0
+        if self._monitor.trial_failed:
+            self.global_localization()
+        elif self._found_at is not None:
+            self._verify(scan, fields, self._found_at, now)
+        elif self._monitor.status in {"good", "weak"}:
+            self._relocalization.cancel()
+
+    def _look_nearby(self, scan: DeskewedScan, now: float) -> None:
+        """Look for a lost robot near its last pose, since most slipped or were pushed; then on the whole map."""
         self._local_scans += 1
         if self._local_scans == 1:
-            # Most poses are lost nearby, by a slip or a push.
             self._filter.widen(scan.odom, *_LOCAL_SIGMAS)
             self._monitor.restart()
+            self._found_at = scan.odom
         elif self._local_scans > _LOCAL_SCANS and not self._relocalization.active and self._may_search(now):
             self.global_localization()
+
+    def _verify(self, scan: DeskewedScan, fields: MapFields, found_at: Pose2, now: float) -> None:
+        """Search the whole map for places that look like the one where a lost pose was found again."""
+        driven = scan.odom.relative_to(found_at)
+        if math.hypot(driven.x, driven.y) > _VERIFIED_AFTER_M:
+            self._found_at = None
+        elif not self._relocalization.active and self._relocalization.may_begin(now):
+            self._relocalization.begin(scan, fields)
 
     def _may_search(self, now: float) -> bool:
         """Whether the pose is lost and the last search is long enough ago."""
@@ -261,10 +297,17 @@ class Localizer:
         outcome = self._relocalization.outcome(now)
         if outcome is None:
             return
+        verifying = self._found_at is not None and self._monitor.status == "weak"
         if outcome.pose is None:
-            self._monitor.lose(outcome.detail)
+            if not verifying:
+                self._monitor.lose(outcome.detail)
+            return
+        self._found_at = None
+        pose = self._filter.pose(outcome.odom)
+        if verifying and pose is not None and not apart(pose, outcome.pose):
             return
         self._monitor.restart()
+        self._local_scans = 1
         self._filter.start(outcome.pose, outcome.odom, *_FOUND_SIGMAS)
         self._filter.add(scan, fields, recover=False)
         self._evaluate(scan, fields, now)

@@ -42,6 +42,7 @@ _SKIP_SHARE_MAX: Final = 0.6
 _OTHER_CLUSTER: Final = 1.5
 """The estimate moves to another cluster of particles when that weighs this many times as much as its own."""
 _SAME_CLUSTER_M: Final = 0.75
+_JUMP_M: Final = 1.0
 _STRAIGHT_RAD: Final = 1e-6
 _GATE: Final = 11.345
 """Squared Mahalanobis distance (0.99 quantile, 3 degrees of freedom) beyond which two poses contradict each other."""
@@ -67,6 +68,8 @@ class ParticleFilter:
         self._spread: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
         """Smallest and largest standard deviations (m, m, rad) around the estimate that no scan has narrowed yet."""
         self._slow = self._fast = 0.0
+        self.jumped = False
+        """Whether the last update moved the estimate to another place."""
         self.covariance: NDArray[np.float64] = np.zeros((3, 3))
         """Over (x, y, theta) in `map` (m, rad), as of the last update."""
 
@@ -137,6 +140,7 @@ class ParticleFilter:
 
         `recover`: whether random particles may be added over the map when scans fit less and less.
         """
+        self.jumped = False
         if self._spread is not None:
             self._narrow(scan, fields, *self._spread)
         else:
@@ -188,7 +192,9 @@ class ParticleFilter:
         self._estimate = self.pose(scan.odom)
         self._anchor = scan.odom
         random_share = self._update_weights(scan, fields)
+        predicted = self._estimate
         self._conclude(scan, fields)
+        self.jumped = _distance(predicted, self._estimate) > _JUMP_M
         # Unknown objects lower the average too: random particles are added only while the pose is not good.
         self._resample(fields, random_share if recover else 0.0)
 
@@ -244,8 +250,8 @@ class ParticleFilter:
         heaviest, before = groups[0], self._estimate
         assert before is not None
         for group in groups:
-            offset = math.hypot(group.estimate.x - before.x, group.estimate.y - before.y)
-            if offset < _SAME_CLUSTER_M and heaviest.share < _OTHER_CLUSTER * group.share:
+            place = Pose2(group.estimate.x, group.estimate.y, group.estimate.theta)
+            if _distance(place, before) < _SAME_CLUSTER_M and heaviest.share < _OTHER_CLUSTER * group.share:
                 return group.estimate
         return heaviest.estimate
 
@@ -267,3 +273,9 @@ class ParticleFilter:
             free_xy=fields.free_places if random_share else None,
             jitter=fields.geometry.resolution,
         )
+
+
+def _distance(one: Pose2 | None, other: Pose2 | None) -> float:
+    assert one is not None
+    assert other is not None
+    return math.hypot(one.x - other.x, one.y - other.y)

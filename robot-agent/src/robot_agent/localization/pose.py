@@ -42,3 +42,9 @@ class Pose2(NamedTuple):
         return np.column_stack(
             (self.x + cos * points[:, 0] - sin * points[:, 1], self.y + sin * points[:, 0] + cos * points[:, 1])
         )
+
+    def inverse_transform(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Undo `transform`: return points (n, 2; m) of the frame that this pose is in as seen from it."""
+        dx, dy = points[:, 0] - self.x, points[:, 1] - self.y
+        cos, sin = math.cos(self.theta), math.sin(self.theta)
+        return np.column_stack((cos * dx + sin * dy, -sin * dx + cos * dy))

@@ -52,11 +52,10 @@ class Ld19Driver:
         """Parse bytes received from the port."""
         self._parser.receive_data(data)
         scans: list[LaserScan] = []
-        samples = False
         while (packets := self._parser.next_event()) is not None:
-            samples, self._samples_at, self.problem = True, now, ""
+            self._samples_at, self.problem = now, ""
             scans.extend(self._assembler.feed(packets, now))
-        return LidarEvents(samples, tuple(scans))
+        return LidarEvents(self._assembler.take_samples(), tuple(scans))
 
     def tick(self, now: float) -> bytes:
         """Advance time; a silent lidar is a problem, but no command can restart it."""

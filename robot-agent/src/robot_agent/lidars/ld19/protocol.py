@@ -18,7 +18,7 @@ from robot_agent.lidars.scan_builder import Samples, ScanBuilder
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from robot_agent.hardware import LaserScan
+    from robot_agent.hardware import LaserScan, LidarSamples
 
 BAUD: Final = 230_400
 PACKET_BYTES: Final = 47
@@ -160,6 +160,10 @@ class ScanAssembler:
         ranges = np.where(returned, packets.distance_mm / 1000.0, np.nan)
         samples = Samples(packets.angle * (np.pi / 18_000.0), ranges, packets.intensity)
         return self._builder.feed(samples, (int(index) for index in np.flatnonzero(passes_zero)), now)
+
+    def take_samples(self) -> LidarSamples | None:
+        """Return all samples since the last call, be their scan whole or not; None without any."""
+        return self._builder.take_samples()
 
     def reset(self) -> None:
         """Discard the incomplete scan, after the port was reopened."""

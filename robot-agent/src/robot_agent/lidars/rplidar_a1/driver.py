@@ -61,7 +61,7 @@ class RplidarA1Driver:
     def receive(self, data: bytes, now: float) -> LidarEvents:
         """Parse bytes received from the port."""
         self._parser.receive_data(data)
-        nodes, answer = False, b""
+        answer = b""
         scans: list[LaserScan] = []
         while (event := self._parser.next_event()) is not None:
             if isinstance(event, rplidar.Descriptor):
@@ -70,9 +70,9 @@ class RplidarA1Driver:
             elif isinstance(event, rplidar.Health) and self._phase == "checking":
                 answer = self._on_health(event, now)
             elif isinstance(event, rplidar.Nodes) and self._phase == "scanning":
-                nodes, self._since, self.problem = True, now, ""
+                self._since, self.problem = now, ""
                 scans.extend(self._assembler.feed(event, now))
-        return LidarEvents(nodes, tuple(scans), answer)
+        return LidarEvents(self._assembler.take_samples(), tuple(scans), answer)
 
     def tick(self, now: float) -> bytes:
         """Advance time (20 Hz or more); return the bytes to send."""

@@ -20,7 +20,7 @@ from robot_agent.lidars.scan_builder import Samples, ScanBuilder
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from robot_agent.hardware import LaserScan
+    from robot_agent.hardware import LaserScan, LidarSamples
 
 BAUD: Final = 115200
 RANGE_MIN_M: Final = 0.15
@@ -477,6 +477,10 @@ class ScanAssembler:
         ranges = nodes.distance_q2.astype(np.float64) * 0.00025
         ranges[nodes.distance_q2 == 0] = np.nan
         return self._builder.feed(Samples(clockwise, ranges, nodes.quality), boundaries, now)
+
+    def take_samples(self) -> LidarSamples | None:
+        """Return all samples since the last call, be their scan whole or not; None without any."""
+        return self._builder.take_samples()
 
     def reset(self) -> None:
         """Discard the incomplete scan, after the device was restarted."""

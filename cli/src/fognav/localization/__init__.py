@@ -1,0 +1,1 @@
+"""Localization on recorded logs: reading logs, building maps from them, and evaluating the particle filter."""

@@ -1,0 +1,198 @@
+"""`fognav localize` and `fognav map from-log`, on logs that a simulated robot records in a small floor."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import math
+
+import numpy as np
+import pytest
+from PIL import Image
+from typer.testing import CliRunner
+
+from fog_contracts.grid import GridGeometry, StaticMap
+from fog_kernels.raycast import cast
+from fog_runtime.maps import load_map, save_map
+from fognav.__main__ import app
+from fognav.localization.logs import read_log
+from robot_agent.localization.pose import Pose2
+
+BEAMS = np.arange(180) * math.pi / 180.0 - math.pi / 2.0
+CORNERS = [(2.0, 2.0), (11.8, 2.0), (11.8, 9.6), (7.4, 9.6), (7.4, 6.2), (3.0, 6.2), (3.0, 9.0)]
+
+
+def floor() -> StaticMap:
+    geometry = GridGeometry(300, 240, 0.05, 0.0, 0.0)
+    cells = np.full(geometry.shape, 254, np.uint8)
+    for left, bottom, right, top in [
+        (1, 1, 13, 3), (11, 1, 13, 11), (3, 3, 4, 4.4), (6.5, 8.6, 11, 10.6), (6.5, 5.4, 8.3, 8.6),
+        (1.6, 5.2, 6.5, 7.2), (2, 7.2, 4.2, 10.4),
+    ]:  # fmt: skip
+        cells[round(bottom * 20) : round(top * 20), round(left * 20) : round(right * 20)] = 0
+    return StaticMap(geometry, cells)
+
+
+FLOOR = floor()
+
+
+def drive() -> list[Pose2]:
+    """Poses each 0.25 m or 0.4 rad along the corners."""
+    poses = [Pose2(*CORNERS[0], 0.0)]
+    for corner in CORNERS[1:]:
+        while math.dist(poses[-1][:2], corner) > 0.2:
+            x, y, theta = poses[-1]
+            turn = math.remainder(math.atan2(corner[1] - y, corner[0] - x) - theta, math.tau)
+            if abs(turn) > 0.05:
+                poses.append(Pose2(x, y, theta + max(-0.4, min(0.4, turn))))
+            else:
+                poses.append(poses[-1].compose(Pose2(0.25, 0.0, turn)))
+    return poses
+
+
+def scans(rng: np.random.Generator) -> list[tuple[Pose2, Pose2, np.ndarray]]:
+    """(odometry, reference, ranges) along the drive; 81.9 is the code for no return."""
+    solid, g = (FLOOR.cells == 254).astype(np.uint8), FLOOR.geometry
+    odom, before, found = Pose2(5.0, -3.0, 1.0), None, []
+    for pose in drive():
+        if before is not None:
+            step = pose.relative_to(before)
+            odom = odom.compose(Pose2(step.x * 1.02, step.y, step.theta * 1.02 + 0.004 * rng.standard_normal()))
+        before = pose
+        ranges = cast(solid, g.resolution, 0.0, 0.0, pose.x, pose.y, BEAMS + pose.theta, 12.0)
+        ranges = np.where(rng.random(180) < 0.02, 81.9, ranges + 0.01 * rng.standard_normal(180))
+        found.append((odom, pose, ranges))
+    return found
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("logs")
+    recorded = scans(np.random.default_rng(1))
+    lines = [json.dumps({"meta": "synthetic", "beams": 180, "fov_deg": 180})]
+    flaser = []
+    for number, (odom, reference, ranges) in enumerate(recorded):
+        values = [round(float(value), 3) for value in ranges]
+        lines.append(json.dumps({"t": 1000.0 + number, "odom": list(odom), "ref": list(reference), "ranges": values}))
+        place = " ".join(f"{value:.5f}" for value in reference)
+        flaser.append(f"FLASER 180 {' '.join(map(str, values))} {place} {place} 1018930000 host 1018930000")
+    (folder / "drive.jsonl.gz").write_bytes(gzip.compress("\n".join(lines).encode()))
+    (folder / "drive.log").write_text("# CARMEN\nODOM 0 0 0 0 0 0 1 host 1\n" + "\n".join(flaser) + "\n")
+    save_map(folder / "floor", FLOOR)
+    return folder
+
+
+def run(*words: object) -> tuple[int, dict]:
+    done = CliRunner().invoke(app, [str(word) for word in (*words, "--json")])
+    assert done.stdout, done.output
+    return done.exit_code, json.loads(done.stdout)
+
+
+@pytest.mark.parametrize(("log", "odometry"), [("drive.jsonl.gz", "measured"), ("drive.log", "reference with noise")])
+def test_tracking_follows_the_reference(folder, log, odometry):
+    png = folder / "tracking.png"
+    code, found = run(
+        "localize", "--map", folder / "floor.yaml", "--log", folder / log, "--scans", "even", "--png", png
+    )
+    assert code == 0
+    assert found["odometry"] == odometry
+    assert found["position_error_median_m"] < 0.04
+    assert found["position_error_p95_m"] < 0.15
+    assert found["heading_error_median_deg"] < 0.5
+    assert found["lost_share"] == found["falsely_good_share"] == 0.0
+    assert found["update_ms"] > 0.0
+    with Image.open(png) as picture:
+        assert picture.size == (1500, 1200)
+        assert len(picture.convert("RGB").getcolors(1 << 16)) > 3
+
+
+def test_search_of_the_whole_map_finds_the_robot_and_stays_right(folder):
+    code, found = run("localize", "--map", folder / "floor.yaml", "--log", folder / "drive.jsonl.gz", "--global")
+    assert code == 0
+    assert found["converged_right"]
+    assert found["converged_after_scans"] <= 10
+    assert found["falsely_good_share"] == 0.0
+    assert found["position_error_p95_m"] < 0.15
+
+
+def test_kidnapped_robot_is_found_again(folder):
+    _, found = run("localize", "--map", folder / "floor.yaml", "--log", folder / "drive.jsonl.gz", "--kidnap")
+    assert found["recovered_after_scans"] is not None
+    assert found["recovered_after_scans"] <= 15
+
+
+def test_log_of_another_building_is_never_good(folder, tmp_path):
+    cells = FLOOR.cells.copy()
+    cells[:, :] = 254
+    cells[20:220, 20:280] = 0
+    save_map(tmp_path / "hall", StaticMap(FLOOR.geometry, cells))
+    code, found = run("localize", "--map", tmp_path / "hall.yaml", "--log", folder / "drive.jsonl.gz", "--global")
+    assert (code, found["good_share"], found["converged_right"]) == (1, 0.0, False)
+
+
+@pytest.mark.parametrize("log", ["drive.jsonl.gz", "drive.log"])
+def test_map_of_a_log_shows_the_walls_where_they_are(folder, tmp_path, log):
+    _, found = run("map", "from-log", folder / log, "--out", tmp_path / "built", "--scans", "odd")
+    built = load_map(tmp_path / "built.yaml")
+    assert (found["width"], found["height"]) == (built.geometry.width, built.geometry.height)
+    assert found["free"] + found["occupied"] + found["unknown"] == built.cells.size
+    true = FLOOR.geometry.sample(FLOOR.cells, built.geometry.centres(np.argwhere(built.cells == 0)[:, ::-1]), 254)
+    assert (true == 0).mean() > 0.97
+    near = FLOOR.geometry.sample(_grown_walls(), built.geometry.centres(np.argwhere(built.cells == 254)[:, ::-1]), 0)
+    assert near.mean() > 0.99
+    assert found["occupied"] > 500
+
+
+def _grown_walls() -> np.ndarray:
+    """Return 1 within a cell of a wall's face."""
+    solid = np.pad((FLOOR.cells == 254), 1, mode="edge")
+    height, width = FLOOR.cells.shape
+    return np.max([solid[i : i + height, j : j + width] for i in range(3) for j in range(3)], axis=0).astype(np.uint8)
+
+
+def test_constant_stamps_increase_and_codes_are_no_ranges(folder):
+    log = read_log(folder / "drive.log")
+    assert not log.odometry_measured
+    assert np.all(np.diff([scan.stamp for scan in log.scans]) > 0.0)
+    assert 0.0 < np.mean([np.isnan(scan.ranges).mean() for scan in log.scans]) < 0.1
+    assert len(log.select("odd")) + len(log.select("even")) == len(log.scans)
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("", "no scan"),
+        ("FLASER 180 1 2 3\n", "line 1"),
+        ('{"ranges": [1, "x"], "t": 0, "odom": [0, 0, 0]}\n', "line 1"),
+        ('{"meta": "m"}\n{"t": 0, "ranges": [1], "odom": [0, 0, NaN]}\n', "line 2"),
+    ],
+)
+def test_log_that_can_not_be_used_is_refused_with_its_line(folder, tmp_path, text, problem):
+    (tmp_path / "bad.log").write_text(text)
+    done = CliRunner().invoke(
+        app, ["localize", "--map", str(folder / "floor.yaml"), "--log", str(tmp_path / "bad.log")]
+    )
+    assert done.exit_code == 2
+    assert problem in done.stderr
+
+
+@pytest.mark.data
+def test_recorded_floor_with_real_odometry_meets_its_targets(data_dir, tmp_path):
+    log = data_dir / "lidar_logs" / "intel_odom_ref_scan.jsonl.gz"
+    if not log.is_file():
+        pytest.skip(f"{log} does not exist")
+    run("map", "from-log", log, "--out", tmp_path / "intel", "--scans", "odd")
+    code, found = run("localize", "--map", tmp_path / "intel.yaml", "--log", log, "--scans", "even")
+    assert code == 0
+    assert found["odometry"] == "measured"
+    assert found["position_error_median_m"] <= 0.04
+    assert found["position_error_p95_m"] <= 0.15
+    assert found["heading_error_median_deg"] <= 0.5
+    assert found["lost_share"] == found["falsely_good_share"] == 0.0
+    for first in (10, 260):
+        _, found = run(
+            "localize", "--map", tmp_path / "intel.yaml", "--log", log, "--scans", "even", "--global",
+            "--first", first, "--count", 10,
+        )  # fmt: skip
+        assert found["converged_right"]
+        assert found["falsely_good_share"] == 0.0

@@ -1,0 +1,69 @@
+"""The points that the stop field gets: newest samples, moved by the odometry since each was taken."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from robot_agent.agent.near_points import NearPoints
+from robot_agent.config import LocalizationConfig
+from robot_agent.hardware import LidarSamples
+from robot_agent.localization.localizer import Localizer
+
+
+def samples(*polar, at):
+    angles, ranges = zip(*polar, strict=True)
+    return LidarSamples(np.array(angles, np.float32), np.array(ranges, np.float32), at, at)
+
+
+def driven(speed, until, turning=0.0):
+    localizer = Localizer()
+    for t in np.arange(0.0, until, 0.05):
+        localizer.on_odometry(t, speed * t, 0.0, turning * t)
+    return localizer
+
+
+def test_sample_counts_before_its_scan_is_whole_and_moves_with_the_robot():
+    near, localizer = NearPoints(LocalizationConfig(), 1.0, 0.5), driven(0.3, 2.0)
+    near.add(samples((0.0, 0.8), (math.pi / 2, 0.5), at=1.5))
+    seen = near.seen_from(localizer, 1.9)
+    assert seen == pytest.approx(np.array([(0.8 - 0.4 * 0.3, 0.0), (-0.12, 0.5)]), abs=1e-5)
+
+
+def test_turn_of_the_robot_moves_the_points_around_it():
+    near, localizer = NearPoints(LocalizationConfig(), 1.0, 0.5), driven(0.0, 2.0, turning=1.0)
+    near.add(samples((0.0, 0.5), at=1.5))
+    assert near.seen_from(localizer, 1.9)[0] == pytest.approx((0.5 * math.cos(0.4), -0.5 * math.sin(0.4)), abs=1e-5)
+
+
+def test_points_are_forgotten_after_the_memory_and_beyond_the_reach_never_kept():
+    near, localizer = NearPoints(LocalizationConfig(), 1.0, 0.5), driven(0.0, 3.0)
+    near.add(samples((0.0, 0.5), (1.0, 1.2), (2.0, math.nan), at=1.0))
+    assert len(near.seen_from(localizer, 1.0)) == 1
+    assert len(near.seen_from(localizer, 1.49)) == 1
+    assert len(near.seen_from(localizer, 1.51)) == 0
+    near.add(samples((1.0, 1.2), at=1.6))
+    assert len(near.seen_from(localizer, 1.6)) == 0
+
+
+def test_lidar_off_the_centre_and_turned_is_placed_by_its_configuration():
+    config = LocalizationConfig(lidar_x=0.1, lidar_y=-0.05, lidar_yaw=math.pi / 2)
+    near, localizer = NearPoints(config, 1.0, 0.5), driven(0.0, 1.0)
+    near.add(samples((0.0, 0.4), at=0.5))
+    assert near.seen_from(localizer, 0.5)[0] == pytest.approx((0.1, 0.35), abs=1e-6)
+
+
+def test_times_between_first_and_last_sample_are_even():
+    near, localizer = NearPoints(LocalizationConfig(), 1.0, 0.5), driven(0.3, 2.0)
+    near.add(LidarSamples(np.zeros(3, np.float32), np.full(3, 0.8, np.float32), 1.2, 1.4))
+    assert near.seen_from(localizer, 1.4)[:, 0] == pytest.approx([0.74, 0.77, 0.8], abs=1e-5)
+
+
+def test_nothing_is_seen_without_odometry_or_samples():
+    near = NearPoints(LocalizationConfig(), 1.0, 0.5)
+    assert near.seen_from(driven(0.0, 1.0), 0.5).shape == (0, 2)
+    near.add(samples((0.0, 0.4), at=0.5))
+    assert near.seen_from(Localizer(), 0.5).shape == (0, 2)
+    assert len(near.seen_from(driven(0.0, 1.0), 0.5)) == 1

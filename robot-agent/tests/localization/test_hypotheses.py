@@ -1,0 +1,102 @@
+"""Places that look alike are kept, moved with the odometry, and decided between by later scans."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from little_world import grid_of
+
+from robot_agent.config import LocalizationConfig
+from robot_agent.localization.deskew import DeskewedScan
+from robot_agent.localization.hypotheses import Hypotheses, Hypothesis
+from robot_agent.localization.map_fields import map_fields
+from robot_agent.localization.pose import Pose2
+from robot_agent.localization.relocalization import Relocalization
+
+CONFIG = LocalizationConfig()
+# Two equal rooms; only one of them has a niche behind its corner, which is seen from its upper half.
+ROOMS = [(1, 1, 4, 5), (6, 1, 9, 5), (9, 4.2, 9.9, 5)]
+FIELDS = map_fields(*grid_of(ROOMS, 11.0, 6.0), CONFIG)
+ORIGIN = Pose2(0.0, 0.0, 0.0)
+TRUE, TWIN = Pose2(7.2, 1.6, 1.2), Pose2(2.2, 1.6, 1.2)
+
+
+def scan_at(pose: Pose2, odom: Pose2) -> DeskewedScan:
+    angles = np.linspace(-math.pi, math.pi, 180, endpoint=False)
+    ranges = FIELDS.ranges(pose.x, pose.y, angles + pose.theta, 12.0)
+    hit = np.isfinite(ranges)
+    return DeskewedScan(
+        np.column_stack((ranges[hit] * np.cos(angles[hit]), ranges[hit] * np.sin(angles[hit]))), odom, 0.0
+    )
+
+
+def twins() -> Hypotheses:
+    return Hypotheses([Hypothesis(TWIN, -0.1), Hypothesis(TRUE, -0.15)], ORIGIN)
+
+
+def test_places_that_explain_a_scan_alike_leave_it_undecided_and_a_single_one_decides():
+    assert twins().decided is None
+    assert Hypotheses([Hypothesis(TRUE, -0.1), Hypothesis(TWIN, -0.9)], ORIGIN).decided == TRUE
+    assert Hypotheses([Hypothesis(TRUE, -0.1)], ORIGIN).decided == TRUE
+    assert Hypotheses([], ORIGIN).decided is None
+
+
+def test_scans_from_one_spot_are_no_news():
+    hypotheses = twins()
+    before = hypotheses.places
+    hypotheses.add(scan_at(TRUE, Pose2(0.05, 0.0, 0.05)), FIELDS, 12.0)
+    assert hypotheses.places == before
+
+
+def test_scans_along_a_drive_decide_for_the_place_that_explains_them():
+    hypotheses, step = twins(), Pose2(0.3, 0.0, 0.05)
+    true, odom = TRUE, ORIGIN
+    for _ in range(8):
+        true, odom = true.compose(step), odom.compose(step)
+        hypotheses.add(scan_at(true, odom), FIELDS, 12.0)
+        if hypotheses.decided is not None:
+            break
+    found = hypotheses.decided
+    assert found is not None
+    assert math.hypot(found.x - true.x, found.y - true.y) < 0.1
+
+
+def test_twin_rooms_are_kept_as_hypotheses_by_a_search_until_the_drive_decides():
+    one, step = Relocalization(CONFIG), Pose2(0.3, 0.0, 0.05)
+    true, odom = TRUE, ORIGIN
+    assert one.begin(scan_at(true, odom), FIELDS)
+    while one.searching:
+        one.advance(FIELDS)
+    first = one.outcome(0.0)
+    assert first.pose is None
+    assert "places of the map look like this one" in first.detail
+    places = one.places
+    for twin in (TRUE, TWIN):
+        assert any(math.hypot(place.pose.x - twin.x, place.pose.y - twin.y) < 0.2 for place in places)
+    for _ in range(8):
+        true, odom = true.compose(step), odom.compose(step)
+        one.on_scan(scan_at(true, odom), FIELDS)
+        outcome = one.outcome(1.0)
+        if outcome.pose is not None:
+            break
+    assert (outcome.pose.x, outcome.pose.y) == pytest.approx((true.x, true.y), abs=0.1)
+    assert not one.active
+
+
+def test_search_without_any_place_may_begin_again_after_ten_seconds_only():
+    one = Relocalization(CONFIG)
+    rng = np.random.default_rng(1)
+    angles, ranges = rng.uniform(-math.pi, math.pi, 100), rng.uniform(5.0, 9.0, 100)
+    assert one.begin(
+        DeskewedScan(np.column_stack((ranges * np.cos(angles), ranges * np.sin(angles))), ORIGIN, 0.0), FIELDS
+    )
+    while one.searching:
+        one.advance(FIELDS)
+    outcome = one.outcome(5.0)
+    assert outcome.pose is None
+    assert "fits no place" in outcome.detail
+    assert not one.active
+    assert not one.may_begin(14.9)
+    assert one.may_begin(15.0)

@@ -6,6 +6,8 @@ here. `./fognav check` runs it.
 
 # --- Fields of messages, reports and API answers: other programs and people read them. ---
 _.age_s  # api: age of an area's last reading
+_.charge_ah  # messages: of a robot's battery
+_.capacity_ah
 _.after_input  # the agent's replay: where a recording and its replay differ
 _.control_p99_s  # messages: how regular the agent's loops are
 _.stream_p99_s

@@ -135,6 +135,8 @@ class AgentConfig:
     obstacle_ttl: float = 600.0
     """How long (s) a reported obstacle counts while no lidar looks there again: longer than a detour takes."""
     obstacle_limit: int = 400
+    battery_low: float = 0.2
+    """Charge (of 1) below which the robot announces a low battery."""
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     stop_field: StopFieldConfig = field(default_factory=StopFieldConfig)
     localization: LocalizationConfig = field(default_factory=LocalizationConfig)
@@ -207,4 +209,10 @@ def _with_settings(config: AgentConfig, settings: RobotSettings) -> AgentConfig:
         lidar_y=lidar.y_m,
         lidar_yaw=lidar.yaw_rad,
     )
-    return replace(config, motion=replace(config.motion, limits=limits), safety=safety, localization=localization)
+    return replace(
+        config,
+        motion=replace(config.motion, limits=limits),
+        safety=safety,
+        localization=localization,
+        battery_low=settings.power.low_fraction,
+    )

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Generic, Literal, NamedTuple, Proto
 import msgspec
 from msgspec import Meta
 
-from fog_contracts.messages import Finite, Sentence
+from fog_contracts.messages import Finite, Power, Sentence, Strength
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -55,7 +55,9 @@ class BaseStatus(msgspec.Struct, frozen=True, kw_only=True):
     """State that a base reports. A missing sensor is False, a missing number None.
 
     `overcurrent`: a wheel motor draws too much current. `battery`: charged fraction. `charging`: a charger is
-    connected. `mode_problem`: why the base does not obey wheel commands (None: it is in its driving mode).
+    connected. `power`: what it measures of battery and charger. `proximity`: strengths of its light sensors from the
+    left to the right, in its own unit. `mode_problem`: why the base does not obey wheel commands (None: it is in its
+    driving mode).
     """
 
     bumper_left: bool = False
@@ -65,6 +67,8 @@ class BaseStatus(msgspec.Struct, frozen=True, kw_only=True):
     overcurrent: bool = False
     battery: Annotated[float, Meta(ge=0.0, le=1.0)] | None = None
     charging: bool = False
+    power: Power | None = None
+    proximity: tuple[Strength, ...] = ()
     mode_problem: Sentence | None = None
 
     @property

@@ -7,7 +7,14 @@ from dataclasses import replace
 import pytest
 
 from fog_contracts.messages import Pose
-from fog_contracts.robot import BaseSettings, LidarSettings, MotionSettings, OdometrySettings, RobotSettings
+from fog_contracts.robot import (
+    BaseSettings,
+    LidarSettings,
+    MotionSettings,
+    OdometrySettings,
+    PowerSettings,
+    RobotSettings,
+)
 from fog_contracts.site import RobotSite
 from fog_runtime.robot_file import default_robot
 from robot_agent.config import agent_config
@@ -59,8 +66,10 @@ def test_every_setting_of_the_robot_file_reaches_the_configuration():
             acceleration_m_s2=0.5,
             turn_acceleration_rad_s2=0.9,
         ),
+        power=PowerSettings(low_fraction=0.3),
     )
     config = agent_config("r1", KEY, BASE, LIDAR, BODY, boot="b1", settings=settings)
+    assert config.battery_low == 0.3
     limits, where = config.motion.limits, config.localization
     assert (limits.v_max, limits.w_max, limits.acc_v, limits.acc_w) == (0.2, 1.5, 0.5, 0.9)
     assert (limits.axle, limits.wheel_max) == (0.3, 0.4)

@@ -520,10 +520,32 @@ class LoopHealth(Message, frozen=True, kw_only=True):
     late: Count = 0
 
 
+Charging = Literal["no", "reconditioning", "bulk", "trickle", "waiting", "fault"]
+"""What a charger does; `waiting`: it is connected and gives no current."""
+
+
+class Power(Message, frozen=True, kw_only=True):
+    """A robot's battery and charger as its base measures them; None for what it does not measure.
+
+    `current_a` is positive into the battery.
+    """
+
+    voltage_v: Annotated[Finite, Meta(extra={"unit": "V"})] | None = None
+    current_a: Annotated[Finite, Meta(extra={"unit": "A"})] | None = None
+    charge_ah: Annotated[Finite, Meta(extra={"unit": "Ah"})] | None = None
+    capacity_ah: Annotated[Finite, Meta(extra={"unit": "Ah"})] | None = None
+    temperature_c: Annotated[Finite, Meta(extra={"unit": "°C"})] | None = None
+    charging: Charging | None = None
+
+
+Strength = Annotated[int, Meta(ge=0, le=4095)]
+
+
 class RobotState(Message, frozen=True, kw_only=True):
     """A robot's mode with its reasons, the map version and plan that it follows, and the epochs that it received.
 
     `boot` is the id of this run of its agent, `clock` the agent's own monotonic clock: a command names both.
+    `proximity` has the strength of each of the base's light sensors, from the left to the right; empty without any.
     """
 
     mode: Mode
@@ -543,6 +565,8 @@ class RobotState(Message, frozen=True, kw_only=True):
     epochs: Epochs = {}
     boot: Boot = ""
     clock: Seconds = 0.0
+    power: Power | None = None
+    proximity: Annotated[list[Strength], Meta(max_length=16)] = []
 
 
 VIEW_SECTORS: Final = 180

@@ -112,6 +112,15 @@ class MotionSettings(_Table, frozen=True, kw_only=True):
             )
 
 
+class PowerSettings(_Table, frozen=True, kw_only=True):
+    """When the robot announces that its battery is low."""
+
+    low_fraction: Annotated[
+        Annotated[float, Meta(ge=0.0, le=0.9)],
+        Meta(description="charge, of 1, below which its state says so; 0: never"),
+    ] = 0.2
+
+
 class RobotSettings(_Table, frozen=True, kw_only=True):
     """All of a `robot.toml`."""
 
@@ -120,3 +129,4 @@ class RobotSettings(_Table, frozen=True, kw_only=True):
     body: BodySettings = BodySettings()
     odometry: OdometrySettings = OdometrySettings()
     motion: MotionSettings = MotionSettings()
+    power: PowerSettings = PowerSettings()

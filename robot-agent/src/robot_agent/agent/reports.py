@@ -81,6 +81,8 @@ def robot_state(  # noqa: PLR0913  # a message gathers from all parts of the age
         epochs=epochs,
         boot=boot,
         clock=at.now,
+        power=feedback.status.power if feedback else None,
+        proximity=list(feedback.status.proximity) if feedback else [],
     )
 
 

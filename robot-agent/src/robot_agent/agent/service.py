@@ -15,6 +15,7 @@ from fog_runtime.clock import Phase, Ticker
 from fog_runtime.edges import Edges
 from fog_runtime.suspension import SuspensionMonitor
 from robot_agent.agent.core import decide
+from robot_agent.agent.power_metrics import observe_power
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -181,6 +182,7 @@ class Service:
         for publication in publications:
             if isinstance(state := publication.message, RobotState):
                 self._report_mode(state)
+                observe_power(state)
             self._edges.publish(publication)
 
     def _loop_health(self) -> LoopHealth:

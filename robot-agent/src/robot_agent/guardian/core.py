@@ -253,8 +253,12 @@ class GuardianCore:
         return self.driver.drive(*wheels)
 
     def _feedback(self, reading: BaseReading, now: float) -> BaseFeedback | None:
-        # Any change counts but that of the battery, which changes all the time.
-        key = (msgspec.structs.replace(reading.status, battery=None), self._latched, self._base.awake)
+        # Any change counts but that of measurements, which change all the time.
+        key = (
+            msgspec.structs.replace(reading.status, battery=None, power=None, proximity=()),
+            self._latched,
+            self._base.awake,
+        )
         rests = reading.odometry == self._feedback_odometry and self._wheels == (0.0, 0.0)
         period = FEEDBACK_AT_REST_S if rests else FEEDBACK_S
         if key == self._feedback_key and now - self._feedback_at < period:

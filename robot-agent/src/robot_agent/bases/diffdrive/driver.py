@@ -8,6 +8,7 @@ from typing import Annotated, Final
 import msgspec
 from msgspec import Meta
 
+from fog_contracts.messages import Power
 from robot_agent.bases.diffdrive import protocol
 from robot_agent.bases.diffdrive.protocol import Flag
 from robot_agent.bases.diffdrive.stop import STOP
@@ -96,6 +97,7 @@ class DiffDriveDriver:
             overcurrent=Flag.OVERCURRENT in flags,
             battery=self._charge(status.battery_mv),
             charging=Flag.CHARGER in flags,
+            power=Power(voltage_v=status.battery_mv / 1000.0) if status.battery_mv else None,
             mode_problem=_mode_problem(flags),
         )
 

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import math
 from operator import itemgetter
-from typing import TYPE_CHECKING, Annotated, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Final, Literal, NamedTuple
 
 import msgspec
 from msgspec import Meta
 
+from fog_contracts.messages import Power
 from robot_agent.bases.roomba600 import open_interface as oi
 from robot_agent.bases.roomba600.mode_monitor import ModeMonitor
 from robot_agent.bases.roomba600.stop import STOP
@@ -30,6 +31,8 @@ from robot_agent.hardware import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
+    from fog_contracts.messages import Charging
+
 _COUNTS: Final = 1 << 16
 BRC_PULSE_S: Final = 1.2
 """The robot wakes by one low pulse of a second; three shorter ones would change its baud rate."""
@@ -39,8 +42,13 @@ _REMEDY: Final = (
     "cable and battery"
 )
 _REMEDY_BRC: Final = "it was pulsed awake without success: check the cable, its BRC wire, and the battery"
-_CHANGING: Final = frozenset((22, 23, 35, 41, 42, 43, 44))
-"""Packets that change all the time and tell nothing about the status, and the mode, which the monitor follows."""
+_CHANGING: Final = frozenset((*range(21, 27), 35, 41, 42, 43, 44, *oi.LIGHT_BUMPER))
+"""Packets that change all the time, and the mode, which the monitor follows."""
+MEASURE_S: Final = 0.5
+"""Period of looking at battery and light bumper: they hurry nobody."""
+_CHARGING: Final[dict[int, Charging]] = {
+    0: "no", 1: "reconditioning", 2: "bulk", 3: "trickle", 4: "waiting", 5: "fault",
+}  # fmt: skip
 
 
 class Roomba600Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -88,6 +96,8 @@ class Roomba600Driver:
         self.awakening = Awakening(
             bauds=(options.baud, other), line=line, remedy=_REMEDY if line is None else _REMEDY_BRC
         )
+        self._measured = _Measured()
+        self._measured_at = -math.inf
         self._status_made_of: tuple[object, ...] = ()
         self._last_status = BaseStatus()
         self._status_packets = _status_packets(self._stream)
@@ -145,9 +155,12 @@ class Roomba600Driver:
 
     def _status(self, frame: oi.Frame) -> BaseStatus:
         """Return the status; that of the last frame as long as no packet has changed that it is made of."""
-        made_of = (self._mode.mode, self._status_packets(frame.packets))
+        if self._received_at - self._measured_at >= MEASURE_S:
+            self._measured, self._measured_at = _measure(frame), self._received_at
+        made_of = (self._mode.mode, self._measured, self._status_packets(frame.packets))
         if made_of != self._status_made_of:
-            self._status_made_of, self._last_status = made_of, _status(frame, self._mode.mode)
+            self._status_made_of = made_of
+            self._last_status = _status(frame, self._mode.mode, self._measured)
         return self._last_status
 
     def _odometry(self, frame: oi.Frame) -> WheelOdometry:
@@ -159,16 +172,41 @@ def _status_packets(stream: Sequence[int]) -> Callable[[Mapping[int, int]], obje
     return itemgetter(*(packet for packet in stream if packet not in _CHANGING))
 
 
-def _status(frame: oi.Frame, mode: oi.Mode | int | None) -> BaseStatus:
-    charge = frame.charge_fraction if 26 in frame else math.nan
+class _Measured(NamedTuple):
+    """What changes slowly: the charged fraction, the battery, and the light bumper's strengths."""
+
+    battery: float | None = None
+    power: Power | None = None
+    proximity: tuple[int, ...] = ()
+
+
+def _measure(frame: oi.Frame) -> _Measured:
+    if 26 not in frame:
+        return _Measured()
+    charge = frame.charge_fraction
+    power = Power(
+        voltage_v=frame.voltage_v,
+        current_a=frame.current_a,
+        charge_ah=frame[25] / 1000.0,
+        capacity_ah=frame[26] / 1000.0,
+        temperature_c=float(frame[24]),
+        charging=_CHARGING.get(frame[21]),
+    )
+    proximity = tuple(min(frame[packet], 4095) for packet in oi.LIGHT_BUMPER)
+    return _Measured(min(1.0, max(0.0, charge)) if math.isfinite(charge) else None, power, proximity)
+
+
+def _status(frame: oi.Frame, mode: oi.Mode | int | None, measured: _Measured) -> BaseStatus:
     return BaseStatus(
         bumper_left=frame.bump_left,
         bumper_right=frame.bump_right,
         cliff=frame.cliff,
         wheel_drop=frame.wheel_dropped,
         overcurrent=frame.wheel_overcurrent,
-        battery=min(1.0, max(0.0, charge)) if math.isfinite(charge) else None,
+        battery=measured.battery,
         charging=frame.on_charger,
+        power=measured.power,
+        proximity=measured.proximity,
         mode_problem=_mode_problem(frame, mode),
     )
 

@@ -131,9 +131,10 @@ GROUPS: Final[Mapping[int, tuple[int, int]]] = {
 }
 """Group id -> first and last packet in it, both included."""
 
-GUARDIAN_STREAM: Final = (7, 9, 10, 11, 12, 13, 14, 21, 22, 23, 25, 26, 34, 35, 41, 42, 43, 44)
+LIGHT_BUMPER: Final = (46, 47, 48, 49, 50, 51)
+GUARDIAN_STREAM: Final = (7, 9, 10, 11, 12, 13, 14, *range(21, 27), 34, 35, 41, 42, 43, 44, *LIGHT_BUMPER)
 """Packets that the guardian streams: all safety sensors, the battery, the wheel speeds that the robot was last
-commanded, and the encoders. 47 bytes a frame, of 172 possible."""
+commanded, the encoders and the light bumper. 70 bytes a frame, of 172 possible."""
 
 SLOW_STREAM: Final = (7, 9, 10, 11, 12, 14, 34, 35, 43, 44)
 """What fits into 15 ms at 19200 baud, 28 bytes: the safety sensors and the encoders, without the battery."""

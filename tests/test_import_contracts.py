@@ -23,7 +23,8 @@ SOURCES = sorted({path.parent for path in ROOT.glob("*/src/*/__init__.py")} | {
 })  # fmt: skip
 
 EDGES = {
-    "fog_runtime", "fog_supervisor", "fognav_experiments.lockstep", "fognav_experiments.rigs",
+    "fog_runtime", "fog_supervisor", "fognav_experiments.gaps", "fognav_experiments.lockstep",
+    "fognav_experiments.rigs",
     "fognav.__main__", "fognav.bench", "fognav.bench_command",
     "fognav.area_command", "fognav.channels_command", "fognav.checkout", "fognav.checks",
     "fognav.demo.attempt", "fognav.demo.background", "fognav.demo.operator", "fognav.demo.options",

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from fog_kernels.components import Components
 from fognav.__main__ import app
-from fognav.bench import costmap, fleet, localization, office, rest
+from fognav.bench import costmap, dwa, fleet, localization, office, rest
 
 
 def test_office_is_connected_and_the_same_for_the_same_seed() -> None:
@@ -90,3 +90,10 @@ def test_localization_figures_are_there_and_the_search_and_match_ran() -> None:
         "search_ms",
     ):
         assert figures[key] > 0
+
+
+def test_dwa_figures_are_of_both_bodies_and_of_a_whole_decision() -> None:
+    figures = dwa.measure(2)
+    assert figures["arcs"] == 875
+    assert figures["decision_ms"] > figures["cycle_ms"] > 0
+    assert {"field_ms", "field_long_ms", "cycle_long_ms", "peer_ratio"} <= figures.keys()

@@ -12,8 +12,10 @@ from hypothesis import strategies as st
 from fog_contracts.grid import GridGeometry
 from fog_kernels.dwa import DwaLimits
 from robot_agent.config import MotionConfig
+from robot_agent.footprint import Footprint
 from robot_agent.localization.pose import Pose2
-from robot_agent.motion.local_planner import decide, detour, make_job, twist, wheels
+from robot_agent.motion.detour import detour
+from robot_agent.motion.local_planner import decide, make_job, twist, wheels
 from robot_agent.motion.path_follower import PathFollower, first_blocked
 
 GRID = GridGeometry(200, 120, 0.05, 0.0, 0.0)
@@ -35,6 +37,7 @@ def job(follower, pose, *, cost=None, speed=None, lidar_points=(), cap=0.3, spee
         speed_limits=np.zeros(GRID.shape, np.uint8) if speed is None else speed,
         geometry=GRID,
         lidar_points=np.array(lidar_points, dtype=np.float64).reshape(-1, 2),
+        footprint=Footprint.circle(0.17),
         config=CONFIG,
     )
 

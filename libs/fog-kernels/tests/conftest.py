@@ -11,5 +11,5 @@ sys.path.insert(0, str(Path(__file__).parent))
 from compiler import COMPILED, guard_kernels
 
 if not COMPILED:
-    for name in ("amcl", "astar", "distance", "dwa", "inflation", "raycast"):
+    for name in ("amcl", "astar", "clearance", "distance", "dwa", "inflation", "raycast"):
         guard_kernels(importlib.import_module(f"fog_kernels.{name}"))

@@ -13,34 +13,70 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fog_contracts.costs import INSCRIBED, PENALTY_MAX, UNKNOWN
+from fog_contracts.costs import INSCRIBED, LETHAL, PENALTY_MAX, UNKNOWN
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from numpy.typing import NDArray
 
+    from fog_kernels.body import Body
+    from fog_kernels.clearance import Clearance
     from fog_kernels.dwa import DwaLimits, DwaSettings
+
+SWEEP_STEP = 0.025
+"""m between two places on the way of a body that isn't round."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """The inputs of a decision: speeds, pose, costmap with resolution and origin, path (n, 2), goal (x, y), heading."""
+    """The inputs of a decision: speeds, pose, distances around the robot, path (n, 2), goal (x, y), heading."""
 
     v: float
     w: float
     pose: tuple[float, float, float]
-    costmap: NDArray[np.uint8]
-    resolution: float
-    origin: tuple[float, float]
+    around: Clearance
+    body: Body
     path: NDArray[np.float64]
     goal: tuple[float, float]
     goal_theta: float | None
 
+    def cell(self, x: float, y: float) -> tuple[float, float]:
+        """Return column and row of a point, with fractions."""
+        around = self.around
+        return (x - around.origin_x) / around.resolution, (y - around.origin_y) / around.resolution
+
     def cost_at(self, x: float, y: float) -> int:
         """Return the cost at a point; outside the window it is unknown."""
-        column = math.floor((x - self.origin[0]) / self.resolution)
-        row = math.floor((y - self.origin[1]) / self.resolution)
-        height, width = self.costmap.shape
-        return int(self.costmap[row, column]) if 0 <= column < width and 0 <= row < height else UNKNOWN
+        column, row = map(math.floor, self.cell(x, y))
+        height, width = self.around.cost.shape
+        return int(self.around.cost[row, column]) if 0 <= column < width and 0 <= row < height else UNKNOWN
+
+    def distance_at(self, x: float, y: float) -> float:
+        """Return the distance, interpolated between the centres of the four nearest cells."""
+        size = self.around.distance.shape[0]
+        column, row = (min(max(value - 0.5, 0.0), size - 1.001) for value in self.cell(x, y))
+        i, j = int(column), int(row)
+        corner = self.around.distance[j : j + 2, i : i + 2].astype(np.float64)
+        shares = np.outer((1.0 - row + j, row - j), (1.0 - column + i, column - i))
+        return float((shares * corner).sum())
+
+    def clearance(self, x: float, y: float, theta: float, limits: DwaLimits, settings: DwaSettings) -> float:
+        """Return how far the body keeps from everything at least, after what may happen between two lookups."""
+        body, cell, padding = self.body, self.around.resolution, settings.padding
+        near = body.inscribed + padding
+        bend = limits.wheel_max**2 / (2.0 * limits.axle) * settings.dt**2
+        slack = ((limits.v_max * settings.dt) ** 2 / near + bend) / 8.0 + cell**2 / (4.0 * near)
+        away = self.distance_at(x, y)
+        keeps = [away - body.inscribed - slack]
+        if away < body.circumscribed + padding + slack and len(body.discs):
+            small = float(body.discs[:, 2].min()) + padding
+            slack = SWEEP_STEP**2 / (8.0 * small) + cell**2 / (4.0 * small)
+            turned = complex(math.cos(theta), math.sin(theta))
+            for disc_x, disc_y, radius in body.discs:
+                place = complex(x, y) + turned * complex(disc_x, disc_y)
+                keeps.append(self.distance_at(place.real, place.imag) - radius - slack)
+        return min(keeps)
 
 
 @dataclass(frozen=True)
@@ -107,21 +143,68 @@ def position(scene: Scene, v: float, w: float, time: float) -> NDArray[np.float6
     return np.array((x + chord * math.cos(theta + 0.5 * w * time), y + chord * math.sin(theta + 0.5 * w * time)))
 
 
-def highest_cost(scene: Scene, v: float, w: float, times: NDArray[np.float64], *, escaping: bool) -> int | None:
-    """Return the highest cost on an arc, INSCRIBED if it never leaves the inscribed cells, None if it is blocked."""
-    costs = [scene.cost_at(*position(scene, v, w, float(time))) for time in times]
-    outside = next((i for i, cost in enumerate(costs) if cost != INSCRIBED), len(costs)) if escaping else 0
-    if any(cost >= INSCRIBED for cost in costs[outside:]):
-        return None
-    return max(costs[outside:], default=INSCRIBED)
+def places(
+    scene: Scene, v: float, w: float, times: NDArray[np.float64], settings: DwaSettings
+) -> Iterator[tuple[bool, float, float, float]]:
+    """Yield the poses of an arc, and whether each lies at one of the times or between two of them.
+
+    A disc is looked up at the times only; between them, on the chord, a body that isn't round is looked up as well.
+    """
+    body, theta = scene.body, scene.pose[2]
+    parts = 1
+    if len(body.discs):
+        parts = max(1, math.ceil((v + abs(w) * body.circumscribed) * settings.dt / SWEEP_STEP))
+    begin, earlier = np.array(scene.pose[:2]), 0.0
+    for time in times:
+        end = position(scene, v, w, float(time))
+        for part in range(1, parts + 1):
+            share = part / parts
+            at = earlier + share * settings.dt
+            yield part == parts, *(begin + share * (end - begin)), theta + w * at
+        begin, earlier = end, float(time)
+
+
+def highest_cost(
+    scene: Scene, v: float, w: float, times: NDArray[np.float64], limits: DwaLimits, settings: DwaSettings
+) -> int | None:
+    """Return the highest cost on an arc; None if the body comes too near to something."""
+    highest = 0
+    for at_step, x, y, theta in places(scene, v, w, times, settings):
+        if at_step:
+            cost = scene.cost_at(x, y)
+            if cost >= INSCRIBED:
+                return None
+            highest = max(highest, cost)
+        if scene.clearance(x, y, theta, limits, settings) < settings.padding:
+            return None
+    return highest
+
+
+def escape_cost(
+    scene: Scene, v: float, w: float, times: NDArray[np.float64], limits: DwaLimits, settings: DwaSettings
+) -> int | None:
+    """Return the highest cost on an escaping arc, INSCRIBED if it never regains the padding, None if it is blocked."""
+    level = min(scene.clearance(*scene.pose, limits, settings), settings.padding)
+    highest, inside = 0, True
+    for _, x, y, theta in places(scene, v, w, times, settings):
+        cost, clear = scene.cost_at(x, y), scene.clearance(x, y, theta, limits, settings)
+        if cost >= LETHAL or clear < level - 1e-6:
+            return None
+        level = max(level, min(clear, settings.padding))
+        if cost < INSCRIBED and clear >= settings.padding:
+            highest, inside = max(highest, cost), False
+        elif not inside:
+            return None
+    return INSCRIBED if inside else highest
 
 
 def decide(scene: Scene, limits: DwaLimits, settings: DwaSettings) -> list[Arc] | None:  # noqa: C901, PLR0912  # a single function, like the description of the method
     """Return all admissible arcs in any order; None when the goal and its heading are reached."""
     x, y, theta = scene.pose
     here = scene.cost_at(x, y)
-    escaping = here == INSCRIBED and settings.escape_v > 0.0
-    if here >= INSCRIBED and not escaping:
+    too_near = here == INSCRIBED or scene.clearance(*scene.pose, limits, settings) < settings.padding
+    escaping = too_near and settings.escape_v > 0.0
+    if here >= LETHAL or (too_near and not escaping):
         return []
     route = Route(scene, limits, settings)
     to_goal = math.hypot(scene.goal[0] - x, scene.goal[1] - y)
@@ -155,7 +238,10 @@ def decide(scene: Scene, limits: DwaLimits, settings: DwaSettings) -> list[Arc] 
         for v in speeds:
             if v + 0.5 * limits.axle * abs(w) > limits.wheel_max + 1e-9:
                 continue
-            cost = highest_cost(scene, float(v), w, times, escaping=escaping)
+            if v > speeds[0] and v * abs(w) > limits.acc_lateral:
+                continue
+            on_arc = escape_cost if escaping else highest_cost
+            cost = on_arc(scene, float(v), w, times, limits, settings)
             if cost is None or (cost == INSCRIBED and v > 0.0 and not turning):
                 continue
             if turning:

@@ -11,6 +11,8 @@ import pytest
 from compiler import compiled_only
 
 from fog_contracts.costs import DEFAULT_INFLATION
+from fog_kernels.body import cover
+from fog_kernels.clearance import clearance
 from fog_kernels.dwa import DwaLimits, DwaResult, DwaSettings, dwa
 from fog_kernels.inflation import inflate, inflation_table
 
@@ -20,6 +22,7 @@ if TYPE_CHECKING:
 RESOLUTION = 0.05
 PERIOD = 0.2
 ROOMBA = DwaLimits(axle=0.235, wheel_max=0.5)
+BODY = cover([(0.17 * math.cos(a), 0.17 * math.sin(a)) for a in np.arange(32) * math.tau / 32])
 Point = tuple[float, float]
 
 
@@ -60,10 +63,11 @@ def decide(  # noqa: PLR0913  # the kernel's inputs
     column = max(int(x / RESOLUTION) - 20, 0)
     row = max(int(y / RESOLUTION) - 20, 0)
     window = np.ascontiguousarray(costmap[row : row + 40, column : column + 40])
-    return dwa(
-        *speeds, x, y, theta, window, RESOLUTION, column * RESOLUTION, row * RESOLUTION, path, *goal, goal_theta,
-        limits=limits or ROOMBA, settings=settings or DwaSettings(),
-    )  # fmt: skip
+    limits, settings = limits or ROOMBA, settings or DwaSettings()
+    around = clearance(
+        window, RESOLUTION, column * RESOLUTION, row * RESOLUTION, [], x, y, BODY, DEFAULT_INFLATION, limits, settings
+    )
+    return dwa(*speeds, x, y, theta, around, path, *goal, goal_theta, BODY, limits, settings)
 
 
 def drive(  # noqa: PLR0913  # the kernel's inputs, and how long

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,6 +14,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from fog_contracts.costs import DEFAULT_INFLATION
+from fog_kernels.body import cover
+from fog_kernels.clearance import Clearance, clearance
 from fog_kernels.dwa import DwaLimits, DwaResult, DwaSettings, dwa
 from fog_kernels.inflation import inflate, inflation_table
 
@@ -60,8 +62,33 @@ def route(rng: np.random.Generator, kind: str) -> NDArray[np.float64]:
     return np.zeros((0, 2))
 
 
+ROUND = cover([(0.17 * math.cos(a), 0.17 * math.sin(a)) for a in np.arange(64) * math.tau / 64])
+LONG = cover([(0.25, -0.15), (0.25, 0.15), (-0.12, 0.15), (-0.12, -0.15)])
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A scene whose distances are not computed yet: they depend on limits and settings."""
+
+    scene: Scene
+    costmap: NDArray[np.uint8]
+    points: NDArray[np.float64]
+
+    def scene_for(self, bounds: DwaLimits, chosen: DwaSettings) -> Scene:
+        x, y, _ = self.scene.pose
+        return replace(
+            self.scene,
+            around=clearance(
+                self.costmap, RESOLUTION, *ORIGIN, self.points, x, y, self.scene.body, DEFAULT_INFLATION, bounds, chosen
+            ),
+        )
+
+
+NOTHING = Clearance(np.zeros((2, 2), np.uint8), np.ones((2, 2), np.float32), RESOLUTION, *ORIGIN)
+
+
 @st.composite
-def scenes(draw: st.DrawFn, routes: list[str]) -> Scene:
+def scenes(draw: st.DrawFn, routes: list[str]) -> Draft:
     """Random decisions; numbers come from a seeded generator, so that none lies on a cell's border."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     path = route(rng, draw(st.sampled_from(routes)))
@@ -78,17 +105,19 @@ def scenes(draw: st.DrawFn, routes: list[str]) -> Scene:
         nearest = min(int(np.hypot(*(path - here).T).argmin()), len(path) - 2)
         along = path[nearest + 1] - path[nearest]
         theta = math.atan2(along[1], along[0]) + rng.normal(0.0, 0.4)
-    return Scene(
+    seen = here + rng.uniform(-1.0, 1.0, (draw(st.sampled_from([0, 1, 6])), 2))
+    scene = Scene(
         v=rng.uniform(-0.05, 0.5),
         w=rng.uniform(-3.5, 3.5),
         pose=(ORIGIN[0] + here[0], ORIGIN[1] + here[1], theta),
-        costmap=costmap(rng, draw(st.sampled_from(["clutter", "clutter", "noise", "patches"]))),
-        resolution=RESOLUTION,
-        origin=ORIGIN,
+        around=NOTHING,
+        body=draw(st.sampled_from([ROUND, LONG])),
         path=path + ORIGIN,
         goal=(float(ORIGIN[0] + goal[0]), float(ORIGIN[1] + goal[1])),
         goal_theta=draw(st.sampled_from([None, rng.uniform(-4.0, 4.0)])),
     )
+    kind = draw(st.sampled_from(["clutter", "clutter", "noise", "patches"]))
+    return Draft(scene, costmap(rng, kind), seen + ORIGIN)
 
 
 ROOMBA = DwaLimits(axle=0.235, wheel_max=0.5)
@@ -100,6 +129,7 @@ limits = st.builds(
     acc_v=st.sampled_from([0.1, 2.5]),
     acc_w=st.sampled_from([1.0, 3.2]),
     wheel_max=st.sampled_from([0.22, 0.5]),
+    acc_lateral=st.sampled_from([0.1, 0.4]),
 )
 parameters = st.builds(
     DwaSettings,
@@ -120,14 +150,15 @@ parameters = st.builds(
 
 def choose(scene: Scene, bounds: DwaLimits, chosen: DwaSettings) -> DwaResult:
     return dwa(
-        scene.v, scene.w, *scene.pose, scene.costmap, scene.resolution, *scene.origin, scene.path, *scene.goal,
-        scene.goal_theta, bounds, chosen,
+        scene.v, scene.w, *scene.pose, scene.around, scene.path, *scene.goal, scene.goal_theta, scene.body, bounds,
+        chosen,
     )  # fmt: skip
 
 
 @settings(max_examples=examples(300), deadline=None)
 @given(scenes(["corners", "hairpin", "line", "none"]), limits, parameters)
-def test_kernel_chooses_the_same_arc_as_the_reference(scene: Scene, bounds: DwaLimits, weights: DwaSettings) -> None:
+def test_kernel_chooses_the_same_arc_as_the_reference(draft: Draft, bounds: DwaLimits, weights: DwaSettings) -> None:
+    scene = draft.scene_for(bounds, weights)
     result = choose(scene, bounds, weights)
     arcs = decide(scene, bounds, weights)
     if arcs is None:
@@ -145,16 +176,17 @@ def test_kernel_chooses_the_same_arc_as_the_reference(scene: Scene, bounds: DwaL
 
 @settings(max_examples=examples(60), deadline=None)
 @given(scenes(["curve"]))
-def test_merging_points_of_a_curve_changes_scores_only_slightly(scene: Scene) -> None:
+def test_merging_points_of_a_curve_changes_scores_only_slightly(draft: Draft) -> None:
     """Points within a centimetre of a straight line are merged: a score moves by centimetres of path.
 
     On free floor, near the path, and never turning in place: elsewhere centimetres decide, and rightly so, at a
     threshold, beside a wall, or as near to one part of the curve as to another. A curve of chords is a few per cent
     shorter, and so is what is left of the route.
     """
-    assume(np.hypot(*(scene.path - scene.pose[:2]).T).min() < 0.2)
-    scene = replace(scene, costmap=np.zeros_like(scene.costmap))
+    assume(np.hypot(*(draft.scene.path - draft.scene.pose[:2]).T).min() < 0.2)
     weights = DwaSettings(n_v=5, n_w=7, turn_in_place=4.0)
+    free = replace(draft, costmap=np.zeros_like(draft.costmap), points=np.zeros((0, 2)))
+    scene = free.scene_for(ROOMBA, weights)
     result = choose(scene, ROOMBA, weights)
     arcs = decide(scene, ROOMBA, weights)
     if arcs and result != (0.0, 0.0, 0.0, 1):
@@ -168,13 +200,15 @@ def test_generated_scenes_cover_all_kinds_of_decisions() -> None:
 
     @settings(max_examples=examples(150), deadline=None, database=None, derandomize=True)
     @given(scenes(["corners", "hairpin", "line", "none"]))
-    def collect(scene: Scene) -> None:
-        result = choose(scene, ROOMBA, DwaSettings(n_v=5, n_w=7))
+    def collect(draft: Draft) -> None:
+        weights = DwaSettings(n_v=5, n_w=7)
+        scene = draft.scene_for(ROOMBA, weights)
+        result = choose(scene, ROOMBA, weights)
         if result.n_admissible == 0:
             kinds.add("nothing is free")
         elif result == (0.0, 0.0, 0.0, 1):
             kinds.add("reached")
-        elif scene.cost_at(*scene.pose[:2]) == 253:
+        elif scene.clearance(*scene.pose, ROOMBA, weights) < weights.padding:
             kinds.add("escaping")
         else:
             kinds.add("driving" if result.v > 0.0 else "turning")

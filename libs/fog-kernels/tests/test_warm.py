@@ -18,7 +18,8 @@ import numpy as np
 from fog_contracts.costs import DEFAULT_INFLATION
 from fog_kernels import warm
 warm.warm()
-from fog_kernels import amcl, astar, components, distance, dwa, inflation, likelihood, raycast
+from fog_kernels import amcl, astar, body, clearance, components, distance, dwa, dwa_settings, inflation, likelihood
+from fog_kernels import raycast
 raw = np.zeros((60, 60), np.uint8)
 raw[0] = 254
 shut = raw.copy()
@@ -39,7 +40,9 @@ for source in (raw, shut):
     found.nearest(found.of(20, 20), (0, 0)), found.labels(0, 0, 5, 5)
     astar.line_cost(cost, 20, 20, 30, 30)
     limits = dwa.DwaLimits(axle=0.235, wheel_max=0.5)
-    dwa.dwa(0, 0, 1, 1, np.float32(0), cost, 0.05, 0, 0, [(1, 1), (2, 1)], 2, 1, None, limits)
+    shape, how = body.cover([(0.2, -0.1), (0.2, 0.1), (-0.2, 0.1), (-0.2, -0.1)]), dwa_settings.DEFAULT_SETTINGS
+    around = clearance.clearance(cost, 0.05, 0, 0, [(1, 2)], 1, 1, shape, DEFAULT_INFLATION, limits, how)
+    dwa.dwa(0, 0, 1, 1, np.float32(0), around, [(1, 1), (2, 1)], 2, 1, None, shape, limits)
     ranges = raycast.cast(source, 0.05, 0, 0, 1, 1, [0, -1.5], 5)
     state = amcl.rng_state(1)
     x, y, theta = (np.ones(5, np.float32) for _ in range(3))

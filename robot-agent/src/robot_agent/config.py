@@ -115,6 +115,12 @@ class MotionConfig:
     window: float = 2.0
     inflation: Inflation = LOCAL_INFLATION
     stuck_after: float = 10.0
+    slow_within: float = 0.12
+    """Free space (m) beside the body from which on the robot passes at full speed."""
+    speed_narrow: float = 0.10
+    """Speed (m/s) where there is hardly any."""
+    lookahead_narrow: float = 0.35
+    """Share of the lookahead that remains there."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,7 +1,8 @@
-"""Local motion by the Dynamic Window Approach (Fox, Burgard and Thrun 1997) for a round robot with two driven wheels.
+"""Local motion by the Dynamic Window Approach (Fox, Burgard and Thrun 1997) for a robot with two driven wheels.
 
-Every pair of speeds that the motors can reach within a control period is rolled out as an arc over the local costmap;
-among the collision-free arcs the one with the lowest cost is chosen. The cost adds up the distance from the path, the
+Every pair of speeds that the motors can reach within a control period is rolled out as an arc through the distances
+around the robot (`fog_kernels.clearance`); among the arcs on which the body keeps its padding from everything, the one
+with the lowest cost is chosen. The cost adds up the distance from the path, the
 distance to go, the heading error relative to the path ahead, and the highest costmap value on the arc. Large heading
 errors are corrected by turning in place, so that a path that starts behind the robot isn't reached by a wide arc.
 
@@ -15,7 +16,6 @@ The tests contain a plain reference implementation, with which a property test c
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -23,11 +23,17 @@ from numba import float64, int64, njit, types
 
 from fog_contracts.costs import INSCRIBED, LETHAL, PENALTY_MAX
 from fog_kernels import _arrays
+from fog_kernels.clearance import NEAR, sampling_slack
+from fog_kernels.dwa_settings import DEFAULT_SETTINGS, MAX_STEPS, DwaLimits, DwaResult, DwaSettings
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
-_MAX_STEPS = 200
+    from fog_kernels.body import Body
+    from fog_kernels.clearance import Clearance
+
+__all__ = ["DwaLimits", "DwaParameters", "DwaResult", "DwaSettings", "dwa"]
+
 _MAX_SEGMENTS = 64
 _MERGED_LENGTH = 0.25
 """Points of the path are merged into segments of at most this length (m)."""
@@ -36,96 +42,28 @@ _MERGED_OFFSET = 0.01
 _TURN_IN_PLACE_WEIGHT = 10.0
 """Weight per m/s of forward speed while turning in place; high enough that braking always wins."""
 _ESCAPE_LENGTH = 0.3
-"""Distance (m) within which an escaping robot must leave the inscribed cells."""
-
-
-@dataclass(frozen=True, slots=True)
-class DwaLimits:
-    """Limits of the base: the distance of the wheels (m), the limit of each wheel (m/s), m/s, rad/s, m/s^2, rad/s^2.
-
-    The defaults are the speeds and accelerations of the thesis that Fognav builds on.
-    """
-
-    axle: float
-    wheel_max: float
-    v_max: float = 0.3
-    w_max: float = 2.75
-    acc_v: float = 2.5
-    acc_w: float = 3.2
-
-    def __post_init__(self) -> None:
-        for name in ("w_max", "acc_v", "acc_w", "wheel_max", "axle"):
-            _arrays.positive(getattr(self, name), name)
-        if not 0.0 <= self.v_max < math.inf:
-            raise ValueError(f"v_max must not be negative, not {self.v_max}")
-
-
-@dataclass(frozen=True, slots=True)
-class DwaSettings:
-    """How arcs are sampled, rolled out and scored; lengths in metres, times in seconds.
-
-    `period` is the time until the next decision. Weights: `w_path` per metre of distance from the path, `w_goal` per
-    metre to go, `w_heading` per radian between the heading at the arc's end and the path ahead of it, `w_cost` for the
-    highest cost on the arc (0..1), `w_turn` per rad/s of change in angular speed. `lookahead` is the distance ahead on
-    the path of the point at which the heading aims; heading errors above `turn_in_place` are corrected by turning in
-    place. Towards the goal the speed follows sqrt(2 * approach * distance). A robot whose centre is already on an
-    inscribed cell (253), because of a map change or the rounding to cells, may turn, and drive at up to `escape_v` on
-    arcs that leave these cells within 0.3 m and contain no 254 or 255; with an `escape_v` of 0 it may not move.
-    """
-
-    n_v: int = 25
-    n_w: int = 35
-    sim_time: float = 1.5
-    dt: float = 0.1
-    period: float = 0.2
-    w_path: float = 2.0
-    w_goal: float = 1.0
-    w_heading: float = 0.25
-    w_cost: float = 0.1
-    w_turn: float = 0.01
-    lookahead: float = 0.3
-    turn_in_place: float = 1.0
-    approach: float = 0.15
-    goal_tolerance: float = 0.10
-    heading_tolerance: float = 0.17
-    escape_v: float = 0.1
-
-    def __post_init__(self) -> None:
-        for name in ("sim_time", "dt", "period", "lookahead", "turn_in_place", "approach", "goal_tolerance"):
-            _arrays.positive(getattr(self, name), name)
-        if self.n_v < 2 or self.n_w < 3:
-            raise ValueError(f"n_v must be at least 2 and n_w at least 3, not {self.n_v} and {self.n_w}")
-        if self.sim_time / self.dt > _MAX_STEPS:
-            raise ValueError(f"sim_time / dt must not exceed {_MAX_STEPS} steps")
-
-
-class DwaResult(NamedTuple):
-    """The chosen speeds (m/s, rad/s), the score of their arc (higher is better) and the number of admissible arcs.
-
-    With no admissible arc, or at the goal, both speeds are 0; `n_admissible` 0 means that every arc was blocked.
-    """
-
-    v: float
-    w: float
-    score: float
-    n_admissible: int
-
-
-DEFAULT_SETTINGS = DwaSettings()
+"""Distance (m) within which an escaping robot must regain its padding."""
+_SWEEP_STEP = 0.025
+"""The discs of a body that isn't round are looked up at least every so many metres of their way."""
+_ROUNDING = 1e-6
+"""Clearance (m) may shrink by this much on an escaping arc: the field is of single precision."""
 
 
 class DwaParameters(NamedTuple):
-    """`DwaLimits` and `DwaSettings` as a named tuple, which numba kernels can read by name.
+    """Limits, settings and the body's radii as a named tuple, which numba kernels can read by name.
 
-    m/s: v_max, wheel_max, escape_v. rad/s: w_max. m/s^2: acc_v, approach. rad/s^2: acc_w. m: axle, lookahead,
-    goal_tolerance. rad: turn_in_place, heading_tolerance. s: sim_time, dt, period. Weights: w_path and w_goal per m,
-    w_heading per rad, w_cost for the highest cost (0..1), w_turn per rad/s. Numbers of samples: n_v, n_w.
+    m/s: v_max, wheel_max, escape_v. rad/s: w_max. m/s^2: acc_v, acc_lateral, approach. rad/s^2: acc_w. m: axle,
+    lookahead, goal_tolerance, padding, the body's inscribed and circumscribed radius, and how much nearer than where
+    they are looked up the body and its discs may come (`slack`, `disc_slack`). rad: turn_in_place, heading_tolerance.
+    s: sim_time, dt, period. Weights: w_path and w_goal per m, w_heading per rad, w_cost for the highest cost (0..1),
+    w_turn per rad/s. Numbers of samples: n_v, n_w.
     """
 
     v_max: float
     w_max: float
     acc_v: float
     acc_w: float
+    acc_lateral: float
     wheel_max: float
     axle: float
     sim_time: float
@@ -142,6 +80,11 @@ class DwaParameters(NamedTuple):
     goal_tolerance: float
     heading_tolerance: float
     escape_v: float
+    padding: float
+    inscribed: float
+    circumscribed: float
+    slack: float
+    disc_slack: float
     n_v: int
     n_w: int
 
@@ -172,7 +115,7 @@ class _Window(NamedTuple):
     w_high: float
 
 
-_PARAMETERS: Any = types.NamedTuple((*(float64,) * 20, int64, int64), DwaParameters)  # type: ignore[no-untyped-call]  # numba has no types
+_PARAMETERS: Any = types.NamedTuple((*(float64,) * 26, int64, int64), DwaParameters)  # type: ignore[no-untyped-call]  # numba has no types
 _RESULT: Any = types.NamedTuple((float64, float64, float64, int64), DwaResult)  # type: ignore[no-untyped-call]  # numba has no types
 
 # Inlined before compilation: passing an array to a compiled function costs reference counting at each call, which more
@@ -342,37 +285,139 @@ def _roll_out(w: float, theta: float, dt: float, cells_per_m: float, unit_x: Any
 
 
 @_helper
+def _distance_at(distance: Any, column: float, row: float) -> float:
+    """Return the distance (m) to the nearest thing at a position in cells, between cells' centres interpolated."""
+    size = distance.shape[0]
+    c = min(max(column - 0.5, 0.0), size - 1.001)
+    r = min(max(row - 0.5, 0.0), size - 1.001)
+    i = int(c)
+    j = int(r)
+    c -= i
+    r -= j
+    below = (1.0 - c) * distance[j, i] + c * distance[j, i + 1]
+    above = (1.0 - c) * distance[j + 1, i] + c * distance[j + 1, i + 1]
+    between: float = (1.0 - r) * below + r * above
+    return between
+
+
+@_helper
+def _clearance_at(
+    distance: Any, discs: Any, column: float, row: float, theta: float, cells_per_m: float, p: DwaParameters
+) -> float:
+    """Return how far (m) the body keeps from everything at least; negative where it may touch something.
+
+    It is exact enough to be compared with the padding; a body that is far away may be farther still.
+    """
+    away = _distance_at(distance, column, row)
+    least = away - p.inscribed - p.slack
+    if discs.shape[0] > 0 and away < p.circumscribed + p.padding + p.slack:
+        cos = math.cos(theta) * cells_per_m
+        sin = math.sin(theta) * cells_per_m
+        for k in range(discs.shape[0]):
+            x, y = discs[k, 0], discs[k, 1]
+            off = _distance_at(distance, column + x * cos - y * sin, row + x * sin + y * cos)
+            least = min(least, off - discs[k, 2] - p.disc_slack)
+    return least
+
+
+@_helper
 def _highest_cost(
-    costmap: Any,
+    cost: Any,
+    distance: Any,
+    discs: Any,
     column: float,
     row: float,
+    theta: float,
     v: float,
+    w: float,
     unit_x: Any,
     unit_y: Any,
     steps: int,
-    escaping: bool,  # noqa: FBT001  # numba supports no keyword-only arguments
+    cells_per_m: float,
+    p: DwaParameters,
 ) -> int:
-    """Return the highest cost (0..252) on an arc from (column, row), LETHAL when the arc is blocked.
+    """Return the highest cost (0..252) on an arc from (column, row), LETHAL when the body comes too near to something.
 
-    An `escaping` arc may begin on inscribed cells, but not return to them; INSCRIBED means that it never leaves them.
     Keep the early returns: with a single one at the end, numba's code is half as fast.
     """
-    height, width = costmap.shape
+    size = cost.shape[0]
     highest = 0
-    inscribed = escaping
+    parts = 1
+    if discs.shape[0] > 0:
+        parts = max(1, math.ceil((v + abs(w) * p.circumscribed) * p.dt / _SWEEP_STEP))
+    before = NEAR
     for t in range(1, steps + 1):
         c = math.floor(column + v * unit_x[t])
         r = math.floor(row + v * unit_y[t])
-        if c < 0 or c >= width or r < 0 or r >= height:
+        if c < 0 or c >= size or r < 0 or r >= size:
             return LETHAL
-        cost = int(costmap[r, c])
-        if cost >= INSCRIBED:
-            if inscribed and cost == INSCRIBED:
-                continue
+        here = int(cost[r, c])
+        if here > NEAR:
             return LETHAL
-        inscribed = False
-        highest = max(highest, cost)
-    return INSCRIBED if inscribed else highest
+        if here == NEAR or (parts > 1 and before == NEAR):
+            for part in range(1, parts + 1):
+                share = part / parts
+                at_x = column + v * (unit_x[t - 1] + share * (unit_x[t] - unit_x[t - 1]))
+                at_y = row + v * (unit_y[t - 1] + share * (unit_y[t] - unit_y[t - 1]))
+                turned = theta + w * (t - 1 + share) * p.dt
+                if _clearance_at(distance, discs, at_x, at_y, turned, cells_per_m, p) < p.padding:
+                    return LETHAL
+        before = here
+        highest = max(highest, here)
+    return highest
+
+
+@_helper
+def _escape_cost(
+    cost: Any,
+    distance: Any,
+    discs: Any,
+    column: float,
+    row: float,
+    theta: float,
+    v: float,
+    w: float,
+    unit_x: Any,
+    unit_y: Any,
+    steps: int,
+    cells_per_m: float,
+    p: DwaParameters,
+) -> int:
+    """Return the highest cost on an arc from a place that is too near to something, LETHAL when it is inadmissible.
+
+    The clearance must never shrink until the padding is regained, and then never fall below it again; INSCRIBED means
+    that it isn't regained. Cells that the map calls inscribed count as too near; none may be entered again.
+    """
+    size = cost.shape[0]
+    highest = 0
+    inside = True
+    parts = 1
+    if discs.shape[0] > 0:
+        parts = max(1, math.ceil((v + abs(w) * p.circumscribed) * p.dt / _SWEEP_STEP))
+    level = min(_clearance_at(distance, discs, column, row, theta, cells_per_m, p), p.padding)
+    for t in range(1, steps + 1):
+        for part in range(1, parts + 1):
+            share = part / parts
+            at_x = column + v * (unit_x[t - 1] + share * (unit_x[t] - unit_x[t - 1]))
+            at_y = row + v * (unit_y[t - 1] + share * (unit_y[t] - unit_y[t - 1]))
+            c = math.floor(at_x)
+            r = math.floor(at_y)
+            if c < 0 or c >= size or r < 0 or r >= size:
+                return LETHAL
+            here = int(cost[r, c])
+            if here >= LETHAL:
+                return LETHAL
+            turned = theta + w * (t - 1 + share) * p.dt
+            clear = _clearance_at(distance, discs, at_x, at_y, turned, cells_per_m, p)
+            if clear < level - _ROUNDING:
+                return LETHAL
+            level = max(level, min(clear, p.padding))
+            if here <= NEAR and clear >= p.padding:
+                inside = False
+                highest = max(highest, here)
+            elif not inside:
+                return LETHAL
+    return INSCRIBED if inside else highest
 
 
 @_helper
@@ -412,9 +457,11 @@ def _route_cost(
         float64,
         float64,
         _arrays.U8_GRID,
+        _arrays.F32_GRID,
         float64,
         float64,
         float64,
+        _arrays.F64_GRID,
         _arrays.F64_GRID,
         float64,
         float64,
@@ -430,10 +477,12 @@ def _choose(
     x: float,
     y: float,
     theta: float,
-    costmap: Any,
+    cost: Any,
+    distance: Any,
     resolution: float,
     origin_x: float,
     origin_y: float,
+    discs: Any,
     path: Any,
     goal_x: float,
     goal_y: float,
@@ -441,15 +490,18 @@ def _choose(
     p: DwaParameters,
 ) -> DwaResult:
     """Return the best arc; arguments as for `dwa`, goal_theta may be nan."""
-    height, width = costmap.shape
+    size = cost.shape[0]
     cells_per_m = 1.0 / resolution
     column = (x - origin_x) * cells_per_m
     row = (y - origin_y) * cells_per_m
-    if not (0.0 <= column < width and 0.0 <= row < height):
+    if not (0.0 <= column < size and 0.0 <= row < size):
         return DwaResult(0.0, 0.0, -math.inf, 0)
-    cost_here = costmap[math.floor(row), math.floor(column)]
-    escaping = cost_here == INSCRIBED and p.escape_v > 0.0
-    if cost_here >= INSCRIBED and not escaping:
+    cost_here = cost[math.floor(row), math.floor(column)]
+    too_near = cost_here == INSCRIBED
+    if cost_here == NEAR:
+        too_near = _clearance_at(distance, discs, column, row, theta, cells_per_m, p) < p.padding
+    escaping = too_near and p.escape_v > 0.0
+    if cost_here >= LETHAL or (too_near and not escaping):
         return DwaResult(0.0, 0.0, -math.inf, 0)
 
     route = _route_ahead(path, goal_x, goal_y, x, y, p)
@@ -477,7 +529,7 @@ def _choose(
     horizon = max(p.sim_time, p.period + window.v_high / p.acc_v)
     if escaping:
         horizon = max(horizon, _ESCAPE_LENGTH / p.escape_v)
-    steps = min(math.ceil(horizon / p.dt - 1e-9), _MAX_STEPS)
+    steps = min(math.ceil(horizon / p.dt - 1e-9), MAX_STEPS)
     end = min(max(round(p.sim_time / p.dt), 1), steps)
     middle = max(end // 2, 1)
     unit_x = np.empty(steps + 1)
@@ -496,9 +548,16 @@ def _choose(
         _roll_out(w, theta, p.dt, cells_per_m, unit_x, unit_y)
         for i in range(p.n_v if v_step > 0.0 else 1):
             v = window.v_low + i * v_step
-            if v + 0.5 * p.axle * abs(w) > p.wheel_max + 1e-9:
-                break  # faster ones exceed the wheel limit too
-            highest = _highest_cost(costmap, column, row, v, unit_x, unit_y, steps, escaping)
+            if v + 0.5 * p.axle * abs(w) > p.wheel_max + 1e-9 or (i > 0 and v * abs(w) > p.acc_lateral):
+                break  # faster ones exceed these limits too
+            if escaping:
+                highest = _escape_cost(
+                    cost, distance, discs, column, row, theta, v, w, unit_x, unit_y, steps, cells_per_m, p
+                )
+            else:
+                highest = _highest_cost(
+                    cost, distance, discs, column, row, theta, v, w, unit_x, unit_y, steps, cells_per_m, p
+                )
             if highest == LETHAL:
                 continue
             if turning:
@@ -528,13 +587,15 @@ def _choose(
     return DwaResult(best_v, best_w, -least, admissible)
 
 
-def _parameters(limits: DwaLimits, settings: DwaSettings) -> DwaParameters:
-    """Return limits and settings as the kernel reads them."""
+def _parameters(body: Body, cell: float, limits: DwaLimits, settings: DwaSettings) -> DwaParameters:
+    """Return body, limits and settings as the kernel reads them; `cell`: m per cell of the field."""
+    near = body.smallest_disc + settings.padding
     return DwaParameters(
         v_max=float(limits.v_max),
         w_max=float(limits.w_max),
         acc_v=float(limits.acc_v),
         acc_w=float(limits.acc_w),
+        acc_lateral=float(limits.acc_lateral),
         wheel_max=float(limits.wheel_max),
         axle=float(limits.axle),
         sim_time=float(settings.sim_time),
@@ -551,6 +612,11 @@ def _parameters(limits: DwaLimits, settings: DwaSettings) -> DwaParameters:
         goal_tolerance=float(settings.goal_tolerance),
         heading_tolerance=float(settings.heading_tolerance),
         escape_v=float(settings.escape_v),
+        padding=float(settings.padding),
+        inscribed=float(body.inscribed),
+        circumscribed=float(body.circumscribed),
+        slack=sampling_slack(body, cell, limits, settings),
+        disc_slack=_SWEEP_STEP**2 / (8.0 * near) + cell**2 / (4.0 * near),
         n_v=settings.n_v,
         n_w=settings.n_w,
     )
@@ -562,42 +628,43 @@ def dwa(
     x: float,
     y: float,
     theta: float,
-    costmap: NDArray[np.uint8],
-    resolution: float,
-    origin_x: float,
-    origin_y: float,
+    around: Clearance,
     path: ArrayLike,
     goal_x: float,
     goal_y: float,
     goal_theta: float | None,
+    body: Body,
     limits: DwaLimits,
     settings: DwaSettings = DEFAULT_SETTINGS,
 ) -> DwaResult:
     """Choose the speeds for the next control period.
 
-    `v`, `w`: current speeds (m/s, rad/s). `x`, `y`, `theta`: pose of the robot's centre in `map`. `costmap`: inflated
-    local window, uint8 (h, w), row 0 at the bottom, its lower-left corner at (origin_x, origin_y) in `map`; arcs over
-    cells of 253 or more, or beyond the window, are inadmissible. `path`: (n, 2) points in `map`, the rest of the path
-    (earlier points do no harm unless the path passes here twice; none means straight to the goal). `goal_x`, `goal_y`:
-    where to stop; the path is extended to it in a straight line. `goal_theta`: final heading, or None.
+    `v`, `w`: current speeds (m/s, rad/s). `x`, `y`, `theta`: pose of the point between the wheels in `map`. `around`:
+    the distances around the robot, made for the same body, limits and settings; arcs on which the body comes nearer
+    than the padding to anything, whose centre enters cells of 253 or more, or which lead beyond the window, are
+    inadmissible. `path`: (n, 2) points in `map`, the rest of the path (earlier points do no harm unless the path passes
+    here twice; none means straight to the goal). `goal_x`, `goal_y`: where to stop; the path is extended to it in a
+    straight line. `goal_theta`: final heading, or None.
 
     Returns the best admissible pair. Within `goal_tolerance` of the goal it brakes and turns to `goal_theta`.
-    Raises TypeError or ValueError for wrong types or shapes, and ValueError for numbers that aren't finite.
+    Raises ValueError for numbers that aren't finite.
     """
-    costmap = _arrays.grid(costmap, "costmap")
     points = np.ascontiguousarray(path, dtype=np.float64).reshape(-1, 2)
-    state = (float(v), float(w), float(x), float(y), float(theta), float(origin_x), float(origin_y))
+    state = (float(v), float(w), float(x), float(y), float(theta))
     aims = (float(goal_x), float(goal_y), 0.0 if goal_theta is None else float(goal_theta))
     if not all(map(math.isfinite, state + aims)) or not np.isfinite(points).all():
-        raise ValueError("speeds, pose, origin, path and goal must be finite: stop the robot while its pose is unknown")
+        raise ValueError("speeds, pose, path and goal must be finite: stop the robot while its pose is unknown")
     chosen: DwaResult = _choose(
-        *state[:5],
-        costmap,
-        _arrays.positive(resolution, "resolution"),
-        *state[5:],
+        *state,
+        around.cost,
+        around.distance,
+        around.resolution,
+        around.origin_x,
+        around.origin_y,
+        body.discs,
         points,
         *aims[:2],
         math.nan if goal_theta is None else aims[2],
-        _parameters(limits, settings),
+        _parameters(body, around.resolution, limits, settings),
     )
     return chosen

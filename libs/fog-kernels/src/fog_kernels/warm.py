@@ -21,13 +21,14 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 PROFILES: dict[str, tuple[str, ...]] = {
-    "robot": ("amcl", "astar", "distance", "dwa", "inflation", "likelihood", "raycast", "sweep"),
+    "robot": ("amcl", "astar", "clearance", "distance", "dwa", "inflation", "likelihood", "raycast", "sweep"),
     "planner": ("astar", "components", "detour", "distance", "inflation"),
     "map": ("distance", "inflation", "spans"),
     "sim": ("distance", "raycast"),
     "all": (
         "amcl",
         "astar",
+        "clearance",
         "components",
         "detour",
         "distance",

@@ -11,6 +11,7 @@ from robot_agent.agent.path_monitor import PathMonitor
 from robot_agent.agent.path_traces import PathTraces
 from robot_agent.agent.wheel_control import WheelControl
 from robot_agent.motion.local_planner import make_job, twist
+from robot_agent.motion.recent_scans import RecentScans
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -35,10 +36,12 @@ class PathDriving:
 
     def __init__(self, config: AgentConfig) -> None:
         self._config = config.motion
+        self._footprint = config.footprint
         self.mission = Mission()
         self.wheels = WheelControl(config)
         self.traces = PathTraces()
         self._monitor = PathMonitor()
+        self._scans = RecentScans()
 
     # --- goal and path ---
 
@@ -94,7 +97,11 @@ class PathDriving:
         if safety.stop != "none":
             follower.restart_progress_timer(now)
             return None
-        points = localizer.points_in_map()
+        scan, scan_pose = localizer.scan, localizer.scan_pose()
+        points = np.zeros((0, 2))
+        if scan is not None and scan_pose is not None:
+            self._scans.add(scan, now)
+            points = self._scans.points(scan_pose, now)
         return make_job(
             follower,
             plan_id=path.plan_id,
@@ -107,7 +114,8 @@ class PathDriving:
             cost=replica.cost,
             speed_limits=replica.speed,
             geometry=replica.geometry,
-            lidar_points=np.zeros((0, 2)) if points is None else points,
+            lidar_points=points,
+            footprint=self._footprint,
             config=self._config,
         )
 

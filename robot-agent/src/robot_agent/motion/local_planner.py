@@ -1,4 +1,4 @@
-"""From a path to wheel speeds: the costs around the robot, a detour around what blocks it, the dynamic window's choice.
+"""From a path to wheel speeds: the distances around the robot, a way round what blocks it, the dynamic window's choice.
 
 `make_job` gathers what a decision needs; `decide` is the slow part, pure, and may run on a thread.
 Frames: everything in `map`. Method: Dynamic Window Approach (Fox, Burgard and Thrun 1997) in `fog_kernels.dwa`.
@@ -8,15 +8,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from fog_contracts.costs import INSCRIBED, LETHAL, NO_SPEED_LIMIT, UNKNOWN
-from fog_kernels.astar import Planner
+from fog_contracts.costs import NO_SPEED_LIMIT
+from fog_kernels.body import Body, cover
+from fog_kernels.clearance import Clearance, clearance
 from fog_kernels.dwa import dwa
-from fog_kernels.inflation import InflationTable, inflate, inflation_table
 from robot_agent.localization.pose import Pose2, wrap
+from robot_agent.motion.band import distances, give_way
+from robot_agent.motion.detour import detour, local_costs
 from robot_agent.motion.path_follower import PathFollower
 
 if TYPE_CHECKING:
@@ -24,11 +27,14 @@ if TYPE_CHECKING:
 
     from fog_contracts.grid import GridGeometry
     from robot_agent.config import MotionConfig
+    from robot_agent.footprint import Footprint
 
 _AHEAD_M: Final = 2.5
 """Length of the path in a decision: more than an arc can reach, so that a detour can be found."""
-_REJOIN_M: Final = 0.2
-"""A detour rejoins the path this far behind its last blocked point."""
+_LOOK_M: Final = 1.0
+"""Gaps this near are measured exactly; beyond, the cells of the map tell whether they are worth coming nearer."""
+_NEAR_AHEAD_M: Final = 0.5
+"""The narrowest place within this length of path decides how slowly the robot drives."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,6 +60,7 @@ class Job:
     cost: NDArray[np.uint8]
     window: GridGeometry
     lidar_points: NDArray[np.float64]
+    footprint: Footprint
     config: MotionConfig
 
 
@@ -85,49 +92,52 @@ def twist(left: float, right: float, axle: float) -> tuple[float, float]:
     return 0.5 * (left + right), (right - left) / axle
 
 
-def local_costs(
-    cost: NDArray[np.uint8], window: GridGeometry, lidar_points: NDArray[np.float64], table: InflationTable
-) -> NDArray[np.uint8]:
-    """Make the cells of the lidar points lethal, inflate them, and combine them with the map by the higher cost.
-
-    The master costmap is inflated already: only the lidar points are inflated here. Unknown cells stay unknown.
-    """
-    marks = np.zeros(cost.shape, np.uint8)
-    cells, inside = window.cells(lidar_points)
-    marks[cells[inside, 1], cells[inside, 0]] = LETHAL
-    return np.maximum(cost, inflate(marks, table))
-
-
 def decide(job: Job) -> Decision:
-    """Choose the speeds for the next period; pure, some milliseconds of work, releases the GIL inside its kernels."""
-    config = job.config
-    resolution = job.window.resolution
-    table = inflation_table(resolution, config.inflation)
-    costs = local_costs(job.cost, job.window, job.lidar_points, table)
-    path = detour(job.path, costs, job.window, job.pose)
+    """Choose the speeds for the next period; pure, a millisecond of work, releases the GIL inside its kernels."""
+    config, body = job.config, body_of(job.footprint)
+    window = job.window
+    limits = replace(config.limits, v_max=max(0.0, min(job.cap, config.limits.v_max)))
+    around = clearance(
+        job.cost,
+        window.resolution,
+        window.origin_x,
+        window.origin_y,
+        job.lidar_points,
+        job.pose.x,
+        job.pose.y,
+        body,
+        replace(config.inflation, inscribed_radius=body.inscribed),
+        limits,
+        config.arcs,
+        at_least=_LOOK_M,
+    )
+    costs = local_costs(
+        job.cost, window, job.lidar_points, config.inflation, around, body.inscribed + config.arcs.padding
+    )
+    path = give_way(detour(job.path, costs, window, job.pose), around, body.inscribed + config.slow_within)
+    room = room_beside(around, path, body.inscribed, config.slow_within)
     end = job.path[-1]
     goal_theta = job.goal_theta if job.ends_here else None
     chosen = dwa(
         job.v,
         job.w,
         *job.pose,
-        costs,
-        resolution,
-        job.window.origin_x,
-        job.window.origin_y,
+        around,
         path,
         float(end[0]),
         float(end[1]),
         goal_theta,
-        replace(config.limits, v_max=max(0.0, min(job.cap, config.limits.v_max))),
-        config.arcs,
+        body,
+        replace(limits, v_max=min(limits.v_max, config.speed_narrow + (limits.v_max - config.speed_narrow) * room)),
+        # In a narrow curve an arc that aims far ahead cuts the corner.
+        replace(config.arcs, lookahead=config.arcs.lookahead * max(room, config.lookahead_narrow)),
     )
     at_position = math.hypot(end[0] - job.pose.x, end[1] - job.pose.y) <= config.arcs.goal_tolerance
     at_heading = goal_theta is None or abs(wrap(goal_theta - job.pose.theta)) <= config.arcs.heading_tolerance
     blocked = None
     if chosen.n_admissible == 0 and not at_position:
         blocked = "an obstacle is so near that no arc is free"
-    left, right = wheels(chosen.v, chosen.w, config.limits.axle)
+    left, right = wheels(chosen.v, chosen.w, limits.axle)
     return Decision(
         plan_id=job.plan_id,
         planner_epoch=job.planner_epoch,
@@ -141,31 +151,20 @@ def decide(job: Job) -> Decision:
     )
 
 
-def detour(
-    path: NDArray[np.float64], costs: NDArray[np.uint8], window: GridGeometry, pose: Pose2
-) -> NDArray[np.float64]:
-    """Return the path (n, 2; m) with a detour around what blocks it, if one exists inside the local window.
+@lru_cache(maxsize=8)
+def body_of(footprint: Footprint) -> Body:
+    """Return the discs of a footprint."""
+    return cover(footprint.polygon)
 
-    `costs`: uint8 (h, w) over `window`. The dynamic window alone is greedy and stops in front of an obstacle on its
-    path. The robot itself searches only these few metres; everything beyond is planned by the fog.
+
+def room_beside(around: Clearance, path: NDArray[np.float64], inscribed: float, enough: float) -> float:
+    """Return how wide the narrowest place of the path (n, 2; m) just ahead is.
+
+    0 when the body only just fits, 1 when there are `enough` m or more beside it.
     """
-    route = PathFollower(path, math.inf)
-    points, ahead = route.ahead(0.5 * window.resolution)
-    cells = window.sample(costs, points, UNKNOWN)
-    bad = np.flatnonzero((cells >= INSCRIBED) & (cells != UNKNOWN))
-    start = window.cell(pose.x, pose.y)
-    if not len(bad) or not window.contains_cell(*start) or costs[start[1], start[0]] >= INSCRIBED:
-        return path
-    clear = np.flatnonzero((ahead > ahead[bad[-1]] + _REJOIN_M) & (cells < INSCRIBED))
-    if not len(clear):
-        return path
-    rejoin = points[clear[0]]
-    search = Planner(window.width, window.height)
-    found = search.plan(costs, start, window.cell(float(rejoin[0]), float(rejoin[1])))
-    if not found.found:
-        return path
-    detour_cells = search.shortcut(costs, found.cells) if len(found.cells) > 1 else found.cells.astype(np.float64)
-    return np.vstack((window.centres(detour_cells), path[route.along > ahead[clear[0]]]))
+    points, along = PathFollower(path, math.inf).ahead(2.0 * around.resolution)
+    free = float(distances(around, points[along <= _NEAR_AHEAD_M]).min()) - inscribed
+    return min(max(free / enough, 0.0), 1.0)
 
 
 def make_job(  # noqa: PLR0913  # a job holds all that a decision rests on
@@ -182,6 +181,7 @@ def make_job(  # noqa: PLR0913  # a job holds all that a decision rests on
     speed_limits: NDArray[np.uint8],
     geometry: GridGeometry,
     lidar_points: NDArray[np.float64],
+    footprint: Footprint,
     config: MotionConfig,
 ) -> Job | None:
     """Gather the inputs of a decision; None when the robot is off the map. `lidar_points`: (m, 2) m.
@@ -210,6 +210,7 @@ def make_job(  # noqa: PLR0913  # a job holds all that a decision rests on
         cost=np.ascontiguousarray(cost[window.rows, window.columns]),
         window=part,
         lidar_points=lidar_points[near],
+        footprint=footprint,
         config=config,
     )
 

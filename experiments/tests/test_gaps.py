@@ -1,0 +1,30 @@
+"""Narrow places that only the lidar sees: the robot never touches anything, and passes what it fits through.
+
+FOGNAV_GAP_SEEDS sets the number of drives at each place; `python -m fognav_experiments.gaps --seeds 200` prints all.
+"""
+
+import os
+
+import pytest
+
+from fognav_experiments.gaps import series
+
+SEEDS = int(os.environ.get("FOGNAV_GAP_SEEDS", "2"))
+
+
+@pytest.mark.parametrize(
+    ("kind", "gap"), [("doorway", 0.44), ("door ajar", 0.48), ("chair legs", 0.44), ("corner", 0.52)]
+)
+def test_robot_passes_a_gap_8_cm_wider_than_itself_without_contact(kind, gap):
+    row = series(kind, gap, SEEDS)
+    assert row.passable
+    assert row.contacts == 0
+    assert row.passed >= 0.95 * row.drives
+
+
+@pytest.mark.parametrize(("kind", "gap"), [("doorway", 0.20), ("doorway", 0.32), ("door ajar", 0.36)])
+def test_robot_does_not_touch_what_it_does_not_fit_through(kind, gap):
+    row = series(kind, gap, SEEDS, seconds=15.0)
+    assert not row.passable
+    assert (row.contacts, row.passed) == (0, 0)
+    assert row.clearance_min_m > 0.0

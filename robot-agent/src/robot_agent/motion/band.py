@@ -1,0 +1,66 @@
+"""The path as an elastic band: near obstacles it gives way to the middle of what is free. Frame: `map`.
+
+Method: elastic bands (Quinlan and Khatib 1993, Elastic bands: connecting path planning and control), reduced to the
+force that pushes points out of narrow places; the planner's path gives the rest of the shape.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from robot_agent.motion.path_follower import PathFollower
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from fog_kernels.clearance import Clearance
+
+_SPACING_M: Final = 0.05
+_STEPS: Final = 6
+_STEP_M: Final = 0.02
+"""Points are pushed in so many steps of at most this length: by 12 cm in all."""
+_REACH_M: Final = 0.05
+"""Half the distance over which the slope of the distances is measured: noise of the lidar is no slope."""
+
+
+def give_way(path: NDArray[np.float64], around: Clearance, keep: float) -> NDArray[np.float64]:
+    """Return the path (n, 2; m), its points near things pushed away until they are `keep` m off or in the middle.
+
+    Begin and end stay where they are, and so does everything beyond the window of `around`.
+    """
+    points, along = PathFollower(path, math.inf).ahead(_SPACING_M)
+    size = len(around.distance) * around.resolution
+    corner = np.array((around.origin_x, around.origin_y))
+    inside = np.all((points > corner + _REACH_M) & (points < corner + size - _REACH_M), axis=1)
+    inside &= (along > 0.0) & (along < along[-1])
+    if not (distances(around, points[inside]) < keep).any():
+        return path
+    # What the window's border cuts off must not become a step in the path.
+    moved, free = points[inside], np.minimum(along[-1] - along[inside], along[inside]) / (2.0 * _SPACING_M)
+    for _ in range(_STEPS):
+        slope = np.column_stack(
+            [
+                distances(around, moved + offset) - distances(around, moved - offset)
+                for offset in ((_REACH_M, 0.0), (0.0, _REACH_M))
+            ]
+        ) / (2.0 * _REACH_M)
+        lacking = np.clip(keep - distances(around, moved), 0.0, _STEP_M)
+        moved = moved + slope * (lacking * np.clip(free, 0.0, 1.0))[:, None]
+    points[inside] = moved
+    return points
+
+
+def distances(around: Clearance, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the distances (m) at points (n, 2; m) from the nearest thing, interpolated between cells."""
+    last = len(around.distance) - 1
+    cells = ((points - (around.origin_x, around.origin_y)) / around.resolution - 0.5).clip(0.0, last)
+    low = np.minimum(cells.astype(np.int64), last - 1)
+    (c, r), (i, j) = (cells - low).T, low.T
+    field = around.distance
+    below = (1.0 - c) * field[j, i] + c * field[j, i + 1]
+    above = (1.0 - c) * field[j + 1, i] + c * field[j + 1, i + 1]
+    result: NDArray[np.float64] = (1.0 - r) * below + r * above
+    return result

@@ -86,6 +86,7 @@ class LittleWorld:
         self.beams = []
         self.scan_started = self.now
         self.lidar_on = self.heartbeats_on = self.base_on = True
+        self.link_delay = self.link_delay_growth = 0.0  # of heartbeats: s, and s per s
         self.bumper = False
         self.fault = None
         self.path = None
@@ -228,7 +229,8 @@ class LittleWorld:
             )
         self._scan()
         if self.heartbeats_on and self.steps % 10 == 0:
-            self.send(ch.MAP_HEARTBEAT, self.master.heartbeat(self.stamp))
+            self.link_delay += 10 * DT * self.link_delay_growth
+            self.send(ch.MAP_HEARTBEAT, self.master.heartbeat(self.stamp - self.link_delay))
         if self.path is not None and self.path_on and self.steps % 50 == 0:
             self._publish_as_planner()
         if self.decide_on and self.steps % 20 == 0 and (job := self.agent.control_job(self.now)) is not None:

@@ -161,6 +161,38 @@ def test_refusal_holds_the_robot_with_the_planners_reason(driving):
     assert sentence in " ".join(driving.state().reasons)
 
 
+def test_heartbeats_that_come_ever_later_at_their_usual_rate_slow_then_hold_the_robot(driving):
+    driving.link_delay_growth = 0.5
+    driving.run(1.5)
+    assert driving.state().mode == "NORMAL"
+    driving.run(1.5)
+    assert driving.link_delay == pytest.approx(1.5, abs=0.1)
+    assert driving.state().mode == "DEGRADED"
+    driving.run(4.0)
+    assert driving.link_delay == pytest.approx(3.5, abs=0.1)
+    assert driving.state().mode == "HOLD"
+    driving.run(13.0)
+    driving.link_delay_growth = 0.0
+    driving.run(20.0)
+    assert driving.link_delay == pytest.approx(10.0, abs=0.1)
+    assert driving.state().mode == "HOLD"
+    assert driving.wheels == (0.0, 0.0)
+    driving.link_delay = 0.0
+    assert driving.run(5.0, lambda w: w.state().mode == "NORMAL")
+
+
+def test_path_that_comes_before_its_goal_is_followed_once_that_comes(driving):
+    points, goal = driving.path.points, driving.goal
+    driving.path_on = False
+    driving.drive_to(points, goal_id="g2", plan_id=2)
+    # As drive_to, in the other order.
+    path = msgspec.structs.replace(driving.path, goal_id="g3", plan_id=3)
+    driving.send(ch.ROBOT_PATH, path)
+    assert driving.state().plan_id == 2
+    driving.send(ch.ROBOT_GOAL, msgspec.structs.replace(goal, goal_id="g3"))
+    assert driving.state().plan_id == 3
+
+
 def test_missing_heartbeats_slow_then_hold_the_robot_until_they_return(driving):
     driving.heartbeats_on = False
     driving.run(1.3)

@@ -160,7 +160,7 @@ def replay_deltas(messages: list[RecordedMessage], site: LoadedSite) -> list[Map
                 raise ReplayError(f"{delta} does not continue {follower.version}")
             if applied is not None:
                 version = applied.version
-                versions.append(MapHeartbeat(epoch=version.epoch, seq=version.seq, hash=version.hash, stamp=at))
+                versions.append(MapHeartbeat(epoch=version.epoch, seq=version.seq, hash=version.hash, sent=(0, at)))
     return versions
 
 

@@ -60,6 +60,7 @@ class SteppedClock:
     """A clock that stands still while tasks run, and wakes sleeping tasks one by one, in the order of their names."""
 
     speed = 1.0
+    id = 0
 
     def __init__(self, order: Sequence[str]) -> None:
         self.time = 0.0

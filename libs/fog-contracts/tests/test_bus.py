@@ -10,7 +10,7 @@ AT = Moment(1.0, 1_700_000_001.0)
 
 
 def heartbeat(seq=1):
-    return MapHeartbeat(epoch=1, seq=seq, hash=0, stamp=1.0)
+    return MapHeartbeat(epoch=1, seq=seq, hash=0, sent=(0, 1.0))
 
 
 def pose(x=0.0):

@@ -35,7 +35,7 @@ def test_message_of_a_lower_epoch_is_refused_on_all_channels_of_its_sender():
     handlers = fence.guarded(
         {channel: lambda _, message, __: handled.append(message) or () for channel in (ch.MAP_HEARTBEAT, ch.ZONES)}
     )
-    heartbeat = MapHeartbeat(epoch=5, seq=1, hash=0, stamp=0.0)
+    heartbeat = MapHeartbeat(epoch=5, seq=1, hash=0, sent=(0, 0.0))
     handlers[ch.MAP_HEARTBEAT]({}, heartbeat, AT)
     with pytest.raises(RefusedMessageError, match="its epoch 4 is below 5: another map-service has taken over"):
         handlers[ch.ZONES]({}, ZoneSet(epoch=4, seq=9, zones=[]), AT)
@@ -47,7 +47,7 @@ def test_message_of_a_lower_epoch_is_refused_on_all_channels_of_its_sender():
 def test_epochs_of_different_services_are_independent():
     fence = Fence()
     handlers = fence.guarded({ch.MAP_HEARTBEAT: lambda *_: (), ch.ROBOT_GOAL: lambda *_: ()})
-    handlers[ch.MAP_HEARTBEAT]({}, MapHeartbeat(epoch=9, seq=1, hash=0, stamp=0.0), AT)
+    handlers[ch.MAP_HEARTBEAT]({}, MapHeartbeat(epoch=9, seq=1, hash=0, sent=(0, 0.0)), AT)
     handlers[ch.ROBOT_GOAL]({}, goal(2), AT)
     fence.raise_to("planner", 3)
     with pytest.raises(RefusedMessageError):

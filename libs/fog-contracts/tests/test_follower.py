@@ -283,7 +283,7 @@ def test_heartbeat_confirms_a_snapshot():
     follower = loaded_follower(writer)
     assert follower.up_to_date
     assert follower.age(5.0) == math.inf
-    follower.on_heartbeat(writer.heartbeat(0.0), 5.0)
+    follower.on_heartbeat(writer.heartbeat(5.0), 5.0)
     assert follower.age(5.5) == 0.5
     assert (follower.replica.site, follower.replica.geometry) == ("lab", writer.geometry)
     assert np.array_equal(follower.replica.static, writer.static)
@@ -292,9 +292,9 @@ def test_heartbeat_confirms_a_snapshot():
 def test_delta_does_not_confirm_the_map_while_a_newer_version_is_announced():
     writer = master()
     follower = loaded_follower(writer)
-    follower.on_heartbeat(writer.heartbeat(0.0), 1.0)
+    follower.on_heartbeat(writer.heartbeat(1.0), 1.0)
     (first,), (second,) = write(writer, 1), write(writer, 2)
-    follower.on_heartbeat(writer.heartbeat(0.0), 2.0)
+    follower.on_heartbeat(writer.heartbeat(2.0), 2.0)
     assert follower.on_delta(first, 2.1)
     assert not follower.up_to_date
     assert follower.age(2.1) == pytest.approx(1.1)
@@ -308,7 +308,7 @@ def test_snapshot_is_wanted_when_an_announced_delta_is_missing_after_the_grace()
     follower = loaded_follower(writer, grace_s=0.5)
     write(writer, 1)
     for now in (1.0, 1.2, 1.4):
-        follower.on_heartbeat(writer.heartbeat(0.0), now)
+        follower.on_heartbeat(writer.heartbeat(now), now)
         assert not follower.wants_snapshot(now)
     assert follower.wants_snapshot(1.6)
     assert follower.gap(1.6) == pytest.approx(0.6)
@@ -375,7 +375,7 @@ def test_older_or_damaged_snapshot_is_refused_and_changes_nothing():
     older = writer.snapshot()
     write(writer, 1)
     follower = loaded_follower(writer)
-    follower.on_heartbeat(writer.heartbeat(0.0), 1.0)
+    follower.on_heartbeat(writer.heartbeat(1.0), 1.0)
     with pytest.raises(MapError, match="older"):
         follower.on_snapshot(older, 1.0)
     with pytest.raises(MapError, match="damaged"):
@@ -400,10 +400,10 @@ def test_older_snapshot_is_refused_after_a_rejected_delta():
 def test_writer_with_a_higher_epoch_is_followed_at_once():
     follower = loaded_follower(master(epoch=10))
     restarted = master(epoch=11, seed=5)
-    follower.on_heartbeat(restarted.heartbeat(0.0), 1.0)
+    follower.on_heartbeat(restarted.heartbeat(1.0), 1.0)
     assert follower.wants_snapshot(1.0)
     follower.on_snapshot(restarted.snapshot(), 1.1)
-    follower.on_heartbeat(restarted.heartbeat(0.0), 1.2)
+    follower.on_heartbeat(restarted.heartbeat(1.2), 1.2)
     assert follower.age(1.2) == 0.0
 
 
@@ -412,7 +412,7 @@ def test_writer_that_takes_over_with_another_floor_plan_or_place_has_another_map
     for other in (master(epoch=11, origin_x=-1.05), master(epoch=11, seed=3)):
         same_cells = MasterMap("lab", other.geometry, other.static, writer.layers["cost"], 11)
         follower = loaded_follower(writer)
-        follower.on_heartbeat(same_cells.heartbeat(0.0), 1.0)
+        follower.on_heartbeat(same_cells.heartbeat(1.0), 1.0)
         assert follower.wants_snapshot(1.0)
 
 
@@ -426,9 +426,9 @@ def test_late_heartbeat_of_a_replaced_writer_is_ignored():
     old, new = master(epoch=10), master(epoch=11)
     follower = loaded_follower(new)
     for now in (1.0, 1.1, 1.2):
-        follower.on_heartbeat(old.heartbeat(0.0), now)
+        follower.on_heartbeat(old.heartbeat(now), now)
         assert not follower.wants_snapshot(now)
-    follower.on_heartbeat(new.heartbeat(0.0), 1.3)
+    follower.on_heartbeat(new.heartbeat(1.3), 1.3)
     assert not follower.wants_snapshot(9.9)
 
 
@@ -440,7 +440,7 @@ def test_writer_that_was_replaced_is_not_followed_however_long_it_goes_on():
     for now in itertools.takewhile(lambda now: now < 5.0, itertools.count(0.1, 0.1)):
         for delta in write(replaced, 7):
             follower.on_delta(delta, now)
-        follower.on_heartbeat(replaced.heartbeat(0.0), now)
+        follower.on_heartbeat(replaced.heartbeat(now), now)
         with pytest.raises(MapError):
             follower.on_snapshot(replaced.snapshot(), now)
         assert not follower.wants_snapshot(now)
@@ -452,7 +452,7 @@ def test_heartbeats_overtaken_by_deltas_do_not_mean_a_restart():
     writer = master()
     follower = loaded_follower(writer)
     for step in range(20):
-        late = writer.heartbeat(0.0)
+        late = writer.heartbeat(step * HEARTBEAT_S)
         for delta in write(writer, step):
             follower.on_delta(delta, step * HEARTBEAT_S)
         follower.on_heartbeat(late, step * HEARTBEAT_S)
@@ -466,3 +466,20 @@ def test_different_hash_for_the_same_version_wants_a_snapshot():
     follower.on_heartbeat(replace(writer.heartbeat(0.0), hash=1), 1.0)
     assert follower.wants_snapshot(1.0)
     assert not follower.up_to_date
+
+
+def test_late_heartbeats_and_the_deltas_beside_them_confirm_the_copy_as_of_when_they_were_sent():
+    writer = master()
+    follower = loaded_follower(writer)
+    follower.on_heartbeat(writer.heartbeat(1000.0), 1.0)
+    assert (follower.age(1.0), follower.delay_s) == (0.0, 0.0)
+    for i in range(100):  # at the usual rate, sent 10 s before they arrive
+        follower.on_heartbeat(writer.heartbeat(1001.0 + 0.1 * i), 12.0 + 0.1 * i)
+    assert follower.delay_s == pytest.approx(10.0, abs=0.02)
+    assert follower.age(21.9) == pytest.approx(10.0, abs=0.02)
+    (delta,) = write(writer, 2)
+    follower.on_delta(delta, 22.0)
+    assert follower.version == writer.version
+    assert follower.age(22.0) == pytest.approx(10.0, abs=0.02)
+    follower.on_heartbeat(writer.heartbeat(1022.0), 23.0)
+    assert follower.age(23.0) == pytest.approx(0.0, abs=0.02)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fog_contracts.liveness import HeartbeatWatch
+from fog_contracts.liveness import CLOCK_DRIFT, MAX_CLOCKS, Delays, HeartbeatWatch
 
 MAX_AGE, TRUSTED_AFTER, PERIOD = 1.5, 0.5, 0.2
 ORIGIN = 7000.0
@@ -93,3 +93,36 @@ def test_sender_never_lives_longer_than_the_limit_after_its_last_heartbeat(steps
         assert watched.age(arrived) >= arrived - sent - 5e-4 * arrived - 1e-6
     if later > MAX_AGE + 5e-4 * (arrived + later):
         assert not watched.alive(max(arrived, sent + later))
+
+
+TRIPS = st.lists(st.tuples(st.floats(0.01, 2.0), st.floats(0.0, 20.0)), min_size=1, max_size=60)
+
+
+@given(TRIPS, st.floats(-1e-4, 1e-4))
+@settings(max_examples=300, deadline=None)
+def test_delay_is_the_time_on_the_way_beyond_that_of_the_fastest_message_whatever_the_clocks_drift(trips, drift):
+    delays, sent, fastest = Delays(), 0.0, math.inf
+    for gap, way in trips:
+        sent += gap
+        fastest = min(fastest, way)
+        found = delays.update((1, ORIGIN + sent * (1.0 + drift)), sent + way)
+        slack = (CLOCK_DRIFT + 1e-4) * (sent + 20.0) + 1e-6
+        assert found >= -1e-9
+        assert way - fastest - slack <= found <= way - fastest + slack
+
+
+def test_clock_of_another_host_begins_anew_and_a_known_one_goes_on():
+    delays = Delays()
+    assert delays.update((1, 100.0), 0.0) == 0.0
+    assert delays.update((2, 5e6), 1.0) == 0.0
+    assert delays.update((1, 101.0), 11.0) == pytest.approx(10.0, abs=0.01)
+    assert delays.update((2, 5e6 + 1.0), 12.0) == pytest.approx(10.0, abs=0.01)
+    assert delays.update(None, 12.0) == 0.0
+
+
+def test_only_the_latest_clocks_are_remembered():
+    delays = Delays()
+    for clock in range(MAX_CLOCKS + 1):
+        delays.update((clock, 0.0), 0.0)
+    assert delays.update((MAX_CLOCKS, 1.0), 11.0) == pytest.approx(10.0, abs=0.01)
+    assert delays.update((0, 1.0), 11.0) == 0.0

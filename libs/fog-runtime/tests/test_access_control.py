@@ -216,7 +216,7 @@ def pose(x):
 
 
 def heartbeat(seq):
-    return m.MapHeartbeat(epoch=1, seq=seq, hash=0, stamp=1.0)
+    return m.MapHeartbeat(epoch=1, seq=seq, hash=0, sent=(0, 1.0))
 
 
 GOAL = m.RobotGoal(goal_id="g", pose=None)

@@ -100,7 +100,7 @@ class Process:
             await asyncio.sleep(0.1)
 
     def heartbeat(self) -> MapHeartbeat:
-        return MapHeartbeat(epoch=self.epoch, seq=1, hash=1, stamp=self.world.now)
+        return MapHeartbeat(epoch=self.epoch, seq=1, hash=1, sent=(0, self.world.now))
 
     def zones(self) -> ZoneSet:
         return ZoneSet(epoch=self.epoch, seq=1, zones=[])
@@ -276,7 +276,7 @@ def test_message_with_another_epoch_than_the_one_that_leads_is_never_sent(world)
     process = world.processes[name]
     sent = len(world.sent)
     for epoch in (0, process.epoch - 1, process.epoch + 1):
-        process.edges.publish(Publication(ch.MAP_HEARTBEAT, MapHeartbeat(epoch=epoch, seq=1, hash=1, stamp=0.0)))
+        process.edges.publish(Publication(ch.MAP_HEARTBEAT, MapHeartbeat(epoch=epoch, seq=1, hash=1, sent=(0, 0.0))))
     assert len(world.sent) == sent
 
 

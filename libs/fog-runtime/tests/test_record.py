@@ -174,7 +174,7 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True):
 
 def test_entries_that_belong_to_no_channel_are_read_separately_from_messages(tmp_path):
     path = tmp_path / "both.mcap"
-    heartbeat = m.MapHeartbeat(epoch=1, seq=2, hash=3, stamp=4.0)
+    heartbeat = m.MapHeartbeat(epoch=1, seq=2, hash=3, sent=(0, 4.0))
     with Recorder(path, site="lab") as recorder:
         recorder.write_entry("own/entry", Entry(number=1, data=b"\x00\xff"), 10)
         recorder.write(ch.MAP_HEARTBEAT, {}, heartbeat, 11)

@@ -85,6 +85,28 @@ def test_a_release_keeps_a_refusal_alive(mission):
     assert (mission.follower, mission.path.map_seq, mission.planner_age(9.5)) == (None, 3, 0.5)
 
 
+def test_planner_age_counts_from_when_path_and_releases_were_sent_by_their_delay(mission):
+    mission.on_release(release(sent=(9, 100.0)), 3.0)
+    assert mission.planner_age(3.0) == 0.0
+    mission.on_release(release(sent=(9, 101.0)), 6.0)
+    assert mission.planner_age(6.0) == pytest.approx(2.0, abs=0.01)
+    mission.on_path(changed(PATH, plan_id=6, sent=(9, 102.0)), 8.0)
+    assert mission.planner_age(8.0) == pytest.approx(3.0, abs=0.01)
+    # The clock of another host, of which nothing is known yet.
+    mission.on_release(release(plan_id=6, sent=(4, 55.0)), 9.0)
+    assert mission.planner_age(9.0) == 0.0
+
+
+def test_newest_path_that_comes_before_its_goal_is_kept_for_it(mission):
+    early = [changed(PATH, goal_id="g2", plan_id=plan_id) for plan_id in (8, 9, 7)]
+    assert [mission.on_path(path, 3.0) for path in early] == [False] * 3
+    assert mission.path is PATH
+    assert mission.take_early_path() is None
+    assert mission.on_goal(changed(GOAL, goal_id="g2"), 4.0)
+    assert mission.take_early_path() == early[1]
+    assert mission.take_early_path() is None
+
+
 METRES = st.floats(-20, 20)
 
 

@@ -405,7 +405,7 @@ def test_nothing_is_published_before_the_zones_are_loaded():
     assert (channel_names(first), core.missing()) == (["hazard", "hazard", "zones", "map_heartbeat"], "")
     assert [z.id for z in first[2].message.zones] == ["stored"]
     assert first[-1].message == MapHeartbeat(
-        epoch=3, seq=core.costmap.version.seq, hash=core.costmap.version.hash, stamp=100.2
+        epoch=3, seq=core.costmap.version.seq, hash=core.costmap.version.hash, sent=(0, 100.2)
     )
     assert channel_names(core.tick(moment(100.3))) == ["map_heartbeat"]
 

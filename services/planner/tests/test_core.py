@@ -484,7 +484,7 @@ def test_ages_count_from_the_arrival_of_a_message_not_from_its_handling() -> Non
     drive.core.set_goal("r1", goal(*RIGHT))
     arrived = drive.moment
     drive.now += 1.5
-    drive.core.handlers()[ch.MAP_HEARTBEAT]({}, drive.map.master.heartbeat(0.0), arrived)
+    drive.core.handlers()[ch.MAP_HEARTBEAT]({}, drive.map.master.heartbeat(arrived.now), arrived)
     drive.core.handlers()[ch.ROBOT_POSE]({"robot": "r1"}, pose(*LEFT), arrived)
     drive.publish(drive.core.tick(drive.moment))
     assert drive.paths == []

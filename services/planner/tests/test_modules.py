@@ -270,7 +270,7 @@ def test_release_is_published_at_its_period_at_once_on_request_and_never_before_
     assert release(100.4) is None
     found = release(100.5)
     assert found == RobotRelease(
-        plan_id=1, planner_epoch=7, released_length=pytest.approx(10.0), map_epoch=1, map_seq=2
+        plan_id=1, planner_epoch=7, released_length=pytest.approx(10.0), map_epoch=1, map_seq=2, sent=(0, 100.5)
     )
     assert release(100.9) is None
     mission.release_now()

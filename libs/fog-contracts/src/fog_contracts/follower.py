@@ -8,6 +8,7 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
+from fog_contracts.liveness import Delays
 from fog_contracts.messages import MapDelta, MapHeartbeat, MapSnapshot
 from fog_contracts.replica import Applied, DecodedMap, MapError, Replica, Version
 
@@ -38,6 +39,9 @@ class MapFollower:
         self._newest: Version | None = None
         self._behind_since: float | None = None
         self._confirmed_at = -math.inf
+        self._delays = Delays()
+        self.delay_s = 0.0
+        """How much longer (s) the latest heartbeat took than the fastest one: so long ago it was true what it says."""
 
     # --- Messages in ------------------------------------------------------------------------------------------------
 
@@ -52,7 +56,8 @@ class MapFollower:
         return applied
 
     def on_heartbeat(self, heartbeat: MapHeartbeat, now: float) -> None:
-        """Record which version the writer has."""
+        """Record which version the writer has, or had when it sent this."""
+        self.delay_s = self._delays.update(heartbeat.sent, now)
         announced = Version(heartbeat.epoch, heartbeat.seq, heartbeat.hash)
         if self._newest is None or _order(announced) >= _order(self._newest):
             self._newest = announced
@@ -98,7 +103,7 @@ class MapFollower:
         return self.gap(now) > self._grace_s
 
     def age(self, now: float) -> float:
-        """Return the seconds since a message last confirmed the copy as the newest version; inf before the first."""
+        """Return the seconds since a message was sent that confirmed the copy as the newest version; inf before one."""
         return max(0.0, now - self._confirmed_at)
 
     def gap(self, now: float) -> float:
@@ -164,7 +169,8 @@ class MapFollower:
         if self.up_to_date:
             self._behind_since = None
             if confirmed:
-                self._confirmed_at = max(self._confirmed_at, now)
+                # A delta came the same way as the heartbeats.
+                self._confirmed_at = max(self._confirmed_at, now - self.delay_s)
         elif self._behind_since is None:
             self._behind_since = now
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 from fog_contracts.channels import Channel
-from fog_contracts.messages import Message
+from fog_contracts.messages import Message, Sent
 
 M = TypeVar("M", bound=Message)
 
@@ -24,12 +24,19 @@ class Moment:
     """When an input is handled: `now` in seconds of the receiver's monotonic clock, `stamp` in seconds since the epoch.
 
     Ages and timeouts are computed from `now` alone; `stamp` is for traces and people. `synchronized` says whether the
-    clock that `stamp` is of can be believed.
+    clock that `stamp` is of can be believed, and `clock` identifies the one that `now` is of
+    (`fog_runtime.clock.Clock.id`).
     """
 
     now: float
     stamp: float
     synchronized: bool = True
+    clock: int = 0
+
+    @property
+    def sent(self) -> Sent:
+        """What a message that is sent now tells its receivers, so that they notice how late it comes."""
+        return self.clock, self.now
 
 
 @dataclass(frozen=True, slots=True)

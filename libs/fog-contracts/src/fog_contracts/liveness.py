@@ -9,10 +9,15 @@ and whatever one takes longer is its delay, which counts as age. No wall clock i
 from __future__ import annotations
 
 import math
-from typing import Final
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from fog_contracts.messages import Sent
 
 CLOCK_DRIFT: Final = 5e-4
 """How much faster one host's monotonic clock may run than the other's: crystals 1e-4, corrected by NTP up to 5e-4."""
+MAX_CLOCKS: Final = 8
+"""Senders' clocks that are remembered; one that was forgotten begins anew."""
 LATE_S: Final = 0.25
 """A sender that is not trusted yet must start anew when a heartbeat was this much (s) faster than those before."""
 
@@ -33,6 +38,29 @@ class DelayEstimator:
         self.faster_by = max(0.0, known - offset)
         self._offset, self._offset_at = min(known, offset), now
         return offset - self._offset
+
+
+class Delays:
+    """How much longer (s) messages of a service take than its fastest ones, whichever of its processes sends them.
+
+    Each clock of a sender (`messages.Sent`) is compared by itself: processes of one host share one, so that a restart
+    or a change of the leader there does not make late messages look timely.
+    """
+
+    def __init__(self) -> None:
+        self._clocks: dict[int, DelayEstimator] = {}
+
+    def update(self, sent: Sent | None, now: float) -> float:
+        """Return the delay of a message that arrives `now`; 0 for one that does not say when it was sent."""
+        if sent is None:
+            return 0.0
+        clock, uptime = sent
+        # Taken out and put back: the one that was silent for longest is the first.
+        estimator = self._clocks.pop(clock, None) or DelayEstimator()
+        self._clocks[clock] = estimator
+        if len(self._clocks) > MAX_CLOCKS:
+            del self._clocks[next(iter(self._clocks))]
+        return estimator.update(uptime, now)
 
 
 class HeartbeatWatch:

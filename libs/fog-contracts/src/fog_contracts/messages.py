@@ -27,6 +27,9 @@ TimeToLive = Annotated[float, Meta(gt=0.0, le=1e9, extra={"unit": "s"})]
 Boot = Annotated[str, Meta(max_length=32)]
 """Id of one run of a process: random, so that no other run has it."""
 Count = Annotated[int, Meta(ge=0, le=2**53)]
+Sent = tuple[Count, Seconds]
+"""When a message was sent: the id of a monotonic clock of its sender, and that clock's reading. How late messages come
+is computed from it (`fog_contracts.liveness.Delays`)."""
 Hash = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Cells = Annotated[int, Meta(ge=0, le=65_535, extra={"unit": "cells"})]
 SENTENCE_MAX: Final = 500
@@ -267,7 +270,7 @@ class MapHeartbeat(Message, frozen=True, kw_only=True):
     epoch: Count
     seq: Count
     hash: Hash
-    stamp: Stamp
+    sent: Sent
 
 
 class MapSnapshot(Message, frozen=True, kw_only=True):
@@ -457,6 +460,7 @@ class RobotRelease(Message, frozen=True, kw_only=True):
     released_length: Annotated[float, Meta(ge=0.0, le=1e6, extra={"unit": "m"})]
     map_epoch: Count
     map_seq: Count
+    sent: Sent | None = None
 
 
 class RobotPath(Message, frozen=True, kw_only=True):
@@ -478,6 +482,7 @@ class RobotPath(Message, frozen=True, kw_only=True):
     refusal: Refusal | None = None
     traces: list[Trace] = []
     stamp: Stamp = 0.0
+    sent: Sent | None = None
 
     def after(self, release: RobotRelease) -> "RobotPath":
         """Return the path with a release of its plan; that of another plan changes nothing."""

@@ -131,9 +131,10 @@ class MasterMap:
         """The current version."""
         return self._version
 
-    def heartbeat(self, stamp: float) -> MapHeartbeat:
-        """Return the message that announces the current version."""
-        return MapHeartbeat(epoch=self._version.epoch, seq=self._version.seq, hash=self._version.hash, stamp=stamp)
+    def heartbeat(self, uptime: float, clock: int = 0) -> MapHeartbeat:
+        """Return the message that announces the current version, sent at `uptime` of the monotonic clock `clock`."""
+        version = self._version
+        return MapHeartbeat(epoch=version.epoch, seq=version.seq, hash=version.hash, sent=(clock, uptime))
 
     def write(
         self,

@@ -5,7 +5,9 @@ import ctypes
 import heapq
 import itertools
 import math
+import random
 import time
+import zlib
 from collections import deque
 from collections.abc import AsyncIterator
 from pathlib import Path
@@ -16,6 +18,9 @@ from fog_runtime.machine_clock import MachineClock
 WallClockSource = Literal["kernel", "trusted"]
 _EARLIEST: Final = 1_735_689_600.0
 """2025-01-01: earlier than this software."""
+_COUNTS_SUSPENSION: Final = hasattr(time, "CLOCK_BOOTTIME")
+_SUSPENSION_S: Final = 0.75
+"""A shorter suspension is not noticed, and counts as delay."""
 _SYNCHRONIZED_S: Final = 1.0
 _TIME_ERROR: Final = 5
 """What adjtimex(2) returns for a clock that nothing keeps synchronized."""
@@ -29,6 +34,10 @@ class Clock(Protocol):
     @property
     def speed(self) -> float:
         """How many seconds of this clock pass in one real second."""
+
+    @property
+    def id(self) -> int:
+        """Identifies what `now` counts from, among all hosts (32 bits): another one after a boot, or a suspension."""
 
     def now(self) -> float:
         """Monotonic seconds, for ages, periods and timeouts; the origin is arbitrary."""
@@ -48,6 +57,20 @@ class Clock(Protocol):
 
 class SystemClock(MachineClock):
     """The machine's clock, run `speed` times as fast; raises `ValueError` for a speed that is not positive."""
+
+    def __init__(self, speed: float = 1.0) -> None:
+        super().__init__(speed)
+        self._boot = boot_id() or str(random.SystemRandom().getrandbits(64))
+        self._suspended = 0
+
+    @property
+    def id(self) -> int:
+        """The same for all processes of a host, as long as that runs without a break."""
+        # The monotonic clock stands still while the host is suspended, the other one does not.
+        suspended = time.clock_gettime(time.CLOCK_BOOTTIME) - time.monotonic() if _COUNTS_SUSPENSION else 0.0
+        if abs(suspended - self._suspended) > _SUSPENSION_S:
+            self._suspended = round(suspended)
+        return zlib.crc32(f"{self._boot} {self._suspended} {self.speed}".encode())
 
     async def sleep(self, seconds: float) -> None:
         """Wait for `seconds` of this clock."""
@@ -106,6 +129,11 @@ class ManualClock:
     def speed(self) -> float:
         """1: a manual clock has no relation to real time."""
         return 1.0
+
+    @property
+    def id(self) -> int:
+        """0."""
+        return 0
 
     def now(self) -> float:
         """Return the seconds to which it was advanced."""

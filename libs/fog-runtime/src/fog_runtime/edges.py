@@ -64,7 +64,7 @@ class Edges:
 
     def now(self) -> Moment:
         """Return the current moment by the process's clock."""
-        return Moment(self._clock.now(), self._clock.stamp())
+        return Moment(self._clock.now(), self._clock.stamp(), clock=self._clock.id)
 
     def subscribe(
         self,

@@ -122,7 +122,7 @@ class AgentCore:
         return ()
 
     def _on_goal(self, _ids: Ids, goal: RobotGoal, at: Moment) -> Sequence[Publication]:
-        self._driving.on_goal(goal, at.now)
+        self._driving.on_goal(goal, self._localizer.pose(at.now), self.replica, at)
         return ()
 
     def _on_path(self, _ids: Ids, path: RobotPath, at: Moment) -> Sequence[Publication]:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from fog_contracts.geometry import PATH_SPACING_M, sampled
+from fog_contracts.liveness import Delays
 from robot_agent.motion.path_follower import PathFollower
 
 if TYPE_CHECKING:
@@ -32,6 +33,8 @@ class Mission:
         self._cancelled: str | None = None
         self._goal_at = _NEVER
         self._path_at = _NEVER
+        self._delays = Delays()
+        self._early_path: RobotPath | None = None
 
     @property
     def active(self) -> bool:
@@ -59,7 +62,10 @@ class Mission:
         return None if self.path is None else (self.path.planner_epoch, self.path.plan_id)
 
     def planner_age(self, now: float) -> float:
-        """Return the age (s) of the planner's last word on goal, path or refusal; infinite without one."""
+        """Return the age (s) of the planner's last word on goal, path or refusal; infinite without one.
+
+        It counts from when that was sent, as far as the delays of paths and releases tell.
+        """
         return now - max(self._path_at, self._goal_at)
 
     def on_goal(self, goal: RobotGoal, now: float) -> bool:
@@ -77,14 +83,17 @@ class Mission:
     def on_path(self, path: RobotPath, now: float) -> bool:
         """Handle a path, the same one again or a refusal; return whether a new path is followed from now on.
 
-        A path for another goal, or older than the current one, is ignored.
+        A path older than the current one is ignored; the newest one for another goal, which may be about to arrive, is
+        kept for `take_early_path`.
         """
+        delay = self._delays.update(path.sent, now)
         if self.goal is None or path.goal_id != self.goal.goal_id:
+            self._keep_early(path)
             return False
         new, current = (path.planner_epoch, path.plan_id), self.path_id
         if current is not None and new < current:
             return False
-        self.path, self._path_at = path, now
+        self.path, self._path_at = path, now - delay
         if path.refusal is not None or not path.points:
             self.follower = None
             return False
@@ -95,11 +104,20 @@ class Mission:
         self.follower = PathFollower(sampled(corners, PATH_SPACING_M), path.released_length)
         return True
 
+    def take_early_path(self) -> RobotPath | None:
+        """Return the path that came before its goal, once that is there; None if there is none."""
+        path = self._early_path
+        if path is None or self.goal is None or path.goal_id != self.goal.goal_id:
+            return None
+        self._early_path = None
+        return path
+
     def on_release(self, release: RobotRelease, now: float) -> None:
         """Extend the path; the release of one that the robot does not have keeps nothing alive."""
+        delay = self._delays.update(release.sent, now)
         if self.path is None or self.path_id != (release.planner_epoch, release.plan_id):
             return
-        self.path, self._path_at = self.path.after(release), now
+        self.path, self._path_at = self.path.after(release), max(self._path_at, now - delay)
         if self.follower is not None:
             self.follower.release(release.released_length)
 
@@ -115,6 +133,11 @@ class Mission:
         self._cancelled = self.goal_id
         self.drop_path()
         return self._cancelled
+
+    def _keep_early(self, path: RobotPath) -> None:
+        known = self._early_path
+        if known is None or (path.planner_epoch, path.plan_id) >= (known.planner_epoch, known.plan_id):
+            self._early_path = path
 
     def drop_path(self) -> None:
         """Follow no path until the planner sends one again."""

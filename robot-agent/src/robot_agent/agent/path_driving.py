@@ -45,10 +45,12 @@ class PathDriving:
 
     # --- goal and path ---
 
-    def on_goal(self, goal: RobotGoal, now: float) -> None:
-        """Set the goal; the path to another goal is no longer followed."""
-        if self.mission.on_goal(goal, now):
+    def on_goal(self, goal: RobotGoal, pose: Pose2 | None, replica: Replica, at: Moment) -> None:
+        """Set the goal; the path to another goal is no longer followed, and one that came before its goal is now."""
+        if self.mission.on_goal(goal, at.now):
             self._stop_following()
+        if (early := self.mission.take_early_path()) is not None:
+            self.on_path(early, pose, replica, at)
 
     def on_path(self, path: RobotPath, pose: Pose2 | None, replica: Replica, at: Moment) -> None:
         """Follow a new path from where the robot is, extend the current one that is repeated, or record a refusal."""

@@ -149,7 +149,7 @@ class MapCore:
                 return requests
             self._serving = True
             publications = self._everything()
-        return [*requests, *publications, Publication(ch.MAP_HEARTBEAT, self.costmap.heartbeat(at.stamp))]
+        return [*requests, *publications, Publication(ch.MAP_HEARTBEAT, self.costmap.heartbeat(at.now, at.clock))]
 
     # --- Leading and standing by: one of several map-services leads, the others follow all inputs -------------------
 

@@ -75,9 +75,9 @@ class LayeredCostmap:
         """Continue with another epoch; cells and seq stay."""
         self._master.set_epoch(epoch)
 
-    def heartbeat(self, stamp: float) -> MapHeartbeat:
-        """Return the message that carries the version."""
-        return self._master.heartbeat(stamp)
+    def heartbeat(self, uptime: float, clock: int) -> MapHeartbeat:
+        """Return the message that carries the version, sent at `uptime` of the monotonic clock `clock`."""
+        return self._master.heartbeat(uptime, clock)
 
     def snapshot(self) -> MapSnapshot:
         """Return the whole map."""

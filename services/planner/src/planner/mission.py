@@ -194,6 +194,7 @@ class Mission:
             refusal=plan.refusal,
             traces=plan.traces,
             stamp=at.stamp,
+            sent=at.sent,
         )
 
     def due_release(self, at: Moment, config: PlannerConfig, epoch: int, version: Version) -> RobotRelease | None:
@@ -208,6 +209,7 @@ class Mission:
             released_length=plan.released_length(config),
             map_epoch=version.epoch,
             map_seq=version.seq,
+            sent=at.sent,
         )
 
 

@@ -32,6 +32,27 @@ def test_test_folders_in_the_readme_exist() -> None:
     assert [folder for folder in folders if not (ROOT / folder).exists()] == []
 
 
+DOCUMENTED = {
+    "fognav_build_info", "fognav_map_epoch", "fognav_map_heartbeat_gap_seconds", "fognav_worker_queue",
+    "fognav_planner_queries_waiting", "fognav_readings_rejected_total", "fognav_answered_queries_total",
+    "fognav_map_commit_seconds", "fognav_plans_total", "fognav_plans_avoided_total", "fognav_obstacles_refused_total",
+    "fognav_bytes_total",
+}  # fmt: skip
+"""Metrics by which an operator recognizes what is slow, lost or refused."""
+
+
+def test_operations_names_metrics_that_exist_and_those_that_matter() -> None:
+    sources = [
+        path for part in ("libs", "services", "robot-agent", "sim") for path in (ROOT / part).rglob("src/**/*.py")
+    ]
+    defined = {name for path in sources for name in re.findall(r'"(fognav_[a-z_]+)",', path.read_text("utf-8"))} - {
+        "fognav_build"
+    } | {"fognav_build_info"}  # an Info, which adds the ending
+    named = set(re.findall(r"`(fognav_[a-z_]+)`", (ROOT / "docs" / "operations.md").read_text("utf-8")))
+    assert named <= defined, f"no process exports {sorted(named - defined)}"
+    assert named >= DOCUMENTED, f"docs/operations.md lacks {sorted(DOCUMENTED - named)}"
+
+
 @pytest.mark.parametrize("record", sorted((ROOT / "docs" / "adr").glob("0*.md")), ids=lambda path: path.stem)
 def test_decision_records_have_a_number_and_a_dated_status(record: Path) -> None:
     title, empty, status, *_ = record.read_text("utf-8").splitlines()

@@ -496,7 +496,7 @@ def test_view_reaches_to_the_walls_and_to_obstacles_before_them(world):
         view = world.obstacles().view
         dx, dy = x - view.x, y - view.y
         assert math.hypot(view.x - world.x, view.y - world.y) < 0.1
-        return view.reach_cm[int(math.atan2(dy, dx) % math.tau / math.tau * 180)] / 100 - math.hypot(dx, dy)
+        return 0.05 * view.reach[int(math.atan2(dy, dx) % math.tau / math.tau * 180)] - math.hypot(dx, dy)
 
     assert reach(4.0, 1.0) == pytest.approx(0.0, abs=0.15)
     window = world.geometry.window_around(3.0, 1.3, 3.3, 1.6)

@@ -7,9 +7,17 @@ import pytest
 
 from fog_contracts import channels as ch
 from fog_contracts.codec import encode
-from fog_contracts.messages import RobotPath, RobotRelease
+from fog_contracts.messages import VIEW_SECTORS, RobotObstacles, RobotPath, RobotRelease, View
 
 LARGEST = 2**53
+
+
+def test_a_report_of_obstacles_is_a_quarter_of_a_kilobyte_with_a_whole_view_and_20_bytes_more_per_point() -> None:
+    view = View(x=12.34, y=56.78, reach=bytes(range(VIEW_SECTORS)))
+    without = RobotObstacles(points=[], stamp=1.8e9, ttl=10.0, view=view)
+    points = msgspec.structs.replace(without, points=[(0.05 + i / 10, 3.05) for i in range(10)])
+    assert len(encode(ch.ROBOT_OBSTACLES, without)) <= 256
+    assert len(encode(ch.ROBOT_OBSTACLES, points)) <= 256 + 10 * 20
 
 
 def test_a_release_is_below_120_bytes_with_the_largest_numbers() -> None:

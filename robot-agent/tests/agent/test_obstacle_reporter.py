@@ -9,7 +9,16 @@ import pytest
 from fog_contracts import channels as ch
 from fog_contracts.grid import GridGeometry
 from fog_contracts.handlers import Moment
-from fog_contracts.messages import AreaHazard, CircleShape, CorridorShape, HazardArea, RectangleShape, Zone, ZoneSet
+from fog_contracts.messages import (
+    REACH_UNIT_M,
+    AreaHazard,
+    CircleShape,
+    CorridorShape,
+    HazardArea,
+    RectangleShape,
+    Zone,
+    ZoneSet,
+)
 from robot_agent.agent.blocked_places import BlockedPlaces
 from robot_agent.agent.obstacle_reporter import ObstacleReporter, view
 from robot_agent.localization.localizer import Pose2
@@ -92,12 +101,13 @@ def test_obstacles_of_others_are_left_out_and_own_ones_repeated_until_forgotten(
 
 
 def test_view_gives_the_nearest_return_of_each_sector_and_zero_without_one():
-    points = np.array([(7.0, 5.01), (6.0, 5.01), (5.01, 8.0)])
+    points = np.array([(7.0, 5.01), (6.04, 5.01), (5.01, 8.0)])
     seen = view(HERE, points, GEOMETRY)
     assert (seen.x, seen.y) == (5.0, 5.0)
-    assert seen.reach_cm[0] == 100
-    assert seen.reach_cm[44] == 300
-    assert sum(reach > 0 for reach in seen.reach_cm) == 2
+    assert [seen.reach[0] * REACH_UNIT_M, seen.reach[44] * REACH_UNIT_M] == pytest.approx([1.0, 3.0])
+    assert sum(reach > 0 for reach in seen.reach) == 2
+    (far,) = np.flatnonzero(list(view(HERE, np.array([(25.0, 5.01)]), GEOMETRY).reach))
+    assert (far, view(HERE, np.array([(25.0, 5.01)]), GEOMETRY).reach[far]) == (0, 255)
     assert view(Pose2(-1.0, 5.0, 0.0), points, GEOMETRY) is None
     assert view(None, points, GEOMETRY) is None
 

@@ -15,6 +15,7 @@ from fog_contracts.grid import GridGeometry, Window
 from fog_contracts.handlers import Moment, Publication, RefusedMessageError
 from fog_contracts.hazards import digest
 from fog_contracts.messages import (
+    REACH_UNIT_M,
     VIEW_SECTORS,
     AggregatorHeartbeat,
     AreaDefinition,
@@ -205,12 +206,12 @@ def obstacles(*points: tuple[float, float], ttl: float = 5.0, view: View | None 
 
 def view_from(x: float, y: float, reach: float, towards: float = 0.0, width: float = math.tau) -> View:
     """Return a view from (x, y) that reaches `reach` (m) in the `width` (rad) around `towards` (rad) only."""
-    reach_cm = [0] * VIEW_SECTORS
+    units = [0] * VIEW_SECTORS
     for sector in range(VIEW_SECTORS):
         middle = (sector + 0.5) * math.tau / VIEW_SECTORS
         if abs(math.remainder(middle - towards, math.tau)) <= width / 2:
-            reach_cm[sector] = round(100 * reach)
-    return View(x=x, y=y, reach_cm=reach_cm)
+            units[sector] = min(255, int(reach / REACH_UNIT_M + 1e-9))
+    return View(x=x, y=y, reach=bytes(units))
 
 
 # --- Hazards --------------------------------------------------------------------------------------------------------

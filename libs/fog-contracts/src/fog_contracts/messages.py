@@ -578,15 +578,20 @@ VIEW_SECTORS: Final = 180
 """Sectors of a robot's view, each 2 degrees wide, counted counter-clockwise from the map's x axis."""
 
 
-class View(Message, frozen=True, kw_only=True):
-    """What a robot's lidar sees from (x, y) (m, frame `map`): per sector the nearest range in cm, 0 without any echo.
+REACH_UNIT_M: Final = 0.05
+"""Unit of a view's ranges, which end at 255 of them: 12.75 m."""
 
-    Up to that range the floor is free at the lidar's height; a sector without an echo carries no information.
+
+class View(Message, frozen=True, kw_only=True):
+    """What a robot's lidar sees from (x, y) (m, frame `map`).
+
+    `reach` has a byte for each sector: the nearest range in units of 5 cm, rounded down, 0 without any echo. Up to that
+    range the floor is free at the lidar's height; a sector without an echo carries no information.
     """
 
     x: Metres
     y: Metres
-    reach_cm: Annotated[list[Annotated[int, Meta(ge=0, le=65_535)]], Meta(min_length=180, max_length=180)]
+    reach: Annotated[bytes, Meta(min_length=180, max_length=180)]
 
 
 class RobotObstacles(Message, frozen=True, kw_only=True):

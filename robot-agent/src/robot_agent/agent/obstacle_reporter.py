@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from fog_contracts.costs import FREE, INSCRIBED, UNKNOWN
-from fog_contracts.messages import VIEW_SECTORS, RobotObstacles, View
+from fog_contracts.messages import REACH_UNIT_M, VIEW_SECTORS, RobotObstacles, View
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -107,5 +107,5 @@ def view(pose: Pose2 | None, points: NDArray[np.float64], geometry: GridGeometry
     sectors = np.floor(np.arctan2(dy, dx) % math.tau * (VIEW_SECTORS / math.tau)).astype(np.int64) % VIEW_SECTORS
     reach = np.full(VIEW_SECTORS, np.inf)
     np.minimum.at(reach, sectors, np.hypot(dx, dy))
-    reach_cm = np.where(np.isfinite(reach), np.clip(np.floor(100.0 * reach), 0, 65_535), 0).astype(np.int64)
-    return View(x=pose.x, y=pose.y, reach_cm=reach_cm.tolist())
+    units = np.where(np.isfinite(reach), np.clip(np.floor(reach / REACH_UNIT_M), 0, 255), 0).astype(np.uint8)
+    return View(x=pose.x, y=pose.y, reach=units.tobytes())

@@ -107,6 +107,11 @@ class MapCore:
         """All zones."""
         return self._zones.catalog
 
+    @property
+    def refused_cells(self) -> int:
+        """How many cells layers did not take, because they hold as many as they may."""
+        return sum(layer.refused for layer in self._layers)
+
     def zone_set(self) -> ZoneSet:
         """Return all zones with the map version that contains them."""
         version = self.costmap.version

@@ -6,7 +6,7 @@ import asyncio
 import dataclasses
 from typing import TYPE_CHECKING
 
-from prometheus_client import Gauge
+from prometheus_client import Counter, Gauge
 
 from fog_contracts import channels as ch
 from fog_runtime import logs
@@ -41,6 +41,9 @@ AGGREGATOR_DELAY = Gauge(
     "How much longer the aggregator's latest heartbeat took than its fastest one",
 )
 AREAS_UNCONFIRMED = Gauge("fognav_areas_unconfirmed", "Areas whose hazard no living aggregator confirms")
+OBSTACLES_REFUSED = Counter(
+    "fognav_obstacles_refused_total", "Obstacle cells that are not on the map because it holds as many as it may"
+)
 CLOCK_UNKNOWN = (
     "nothing keeps the time of day synchronized: zones with a start, an end or a schedule are in force until it is"
     " known (FOGNAV_WALL_CLOCK=trusted if the machine's clock is right)"
@@ -82,6 +85,7 @@ class Service:
         self._leading = False
         self._serving_queries = False
         self._aggregator_alive = False
+        self._refused_cells = 0
 
     def _now(self) -> Moment:
         return dataclasses.replace(self._edges.now(), synchronized=self._synchronized())
@@ -101,6 +105,7 @@ class Service:
                 self._edges.serve(self.core.query_handlers())
             self.publisher.publish(publications)
             self._observe_aggregator(at.now)
+            self._observe_layers()
             self._health.set("clock", ok=True, detail="" if at.synchronized else CLOCK_UNKNOWN)
             self._health.set("map", ok=self.core.serving, detail=self.core.missing())
             self._health.set("mqtt", ok=connected, detail="" if connected else "not connected to the broker")
@@ -159,6 +164,10 @@ class Service:
                 if not self.core.zones_loaded:
                     self._health.set("zones", ok=False, detail=f"not loaded yet, so the map is not served: {error}")
             await asyncio.sleep(STORE_PERIOD_S)
+
+    def _observe_layers(self) -> None:
+        before, self._refused_cells = self._refused_cells, self.core.refused_cells
+        OBSTACLES_REFUSED.inc(self._refused_cells - before)
 
     def _observe_aggregator(self, now: float) -> None:
         aggregator = self.core.aggregator

@@ -59,6 +59,9 @@ class CostLayer(ABC):
         `write_cost` and `write_speed_limit` guarantee that.
         """
 
+    refused: int = 0
+    """How many cells it did not take, because it holds as many as it may."""
+
     def mark_updated(self, window: Window, cause: Cause, trace: Trace | None = None) -> None:
         """Record that the layer's costs inside a window have changed."""
         self._updated.append(UpdatedBounds(window, cause, trace))

@@ -18,7 +18,7 @@ import numpy as np
 from fog_contracts import channels as ch
 from fog_contracts.costs import LETHAL
 from fog_contracts.grid import Window
-from fog_contracts.messages import VIEW_SECTORS, Cause
+from fog_contracts.messages import REACH_UNIT_M, VIEW_SECTORS, Cause
 from fog_contracts.raster import ShapeMask
 from map_service.layers.base import CostLayer, LayerFactory, NoOptions, write_cost
 
@@ -65,7 +65,6 @@ class ObstaclesLayer(CostLayer):
         self._reach = reach
         # How many discs cover a cell: where discs overlap, a cell is free only once the last one is removed.
         self._disc_count = np.zeros(geometry.shape, dtype=np.int16)
-        self.refused = 0
 
     def handlers(self) -> Mapping[Channel, Handler]:
         """Return the handlers of robots' obstacles and poses."""
@@ -112,7 +111,7 @@ class ObstaclesLayer(CostLayer):
         sectors_per_radian = VIEW_SECTORS / (2.0 * np.pi)
         first = np.floor((bearing - half_angle) * sectors_per_radian).astype(np.int64)
         last = np.floor((bearing + half_angle) * sectors_per_radian).astype(np.int64)
-        reach = np.array(view.reach_cm) / 100.0
+        reach = REACH_UNIT_M * np.frombuffer(view.reach, np.uint8)
         cleared: list[tuple[int, int]] = []
         for (column, row), cell_distance, begin, end in zip(cells.tolist(), distance, first, last, strict=True):
             ranges = reach[np.arange(begin, end + 1) % VIEW_SECTORS]

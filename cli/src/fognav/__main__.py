@@ -34,6 +34,7 @@ from fognav.output import (
 from fognav.robot_command import robot_app, robot_goal
 from fognav.robot_file_command import robot_check, robot_new
 from fognav.status_command import status_command
+from fognav.store_command import store_app
 from fognav.token_command import token_app
 from fognav.zone_command import zone_app
 from fognav_sim import emulators
@@ -53,6 +54,7 @@ app.add_typer(area_app, name="area")
 app.add_typer(robot_app, name="robot")
 app.add_typer(token_app, name="token")
 app.add_typer(map_app, name="map")
+app.add_typer(store_app, name="store")
 app.add_typer(bench_app, name="bench")
 app.command("localize", epilog="Example: fognav localize --map floor.yaml --log drive.log.gz --scans even --json")(
     localize_command

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import secrets
 import time
-from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, Self, TypeVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, NamedTuple, Self, TypeVar, cast
 
 import msgspec
 
@@ -34,6 +34,7 @@ __all__ = [
     "RedisStore",
     "StoreError",
     "StoreLostError",
+    "StoreStatus",
     "Table",
 ]
 
@@ -64,6 +65,18 @@ class RecoveryError(Exception):
     """There is nothing to recover: Redis lost nothing, or the service has nothing in memory."""
 
 
+class StoreStatus(Message, frozen=True, kw_only=True):
+    """Whether Redis lost acknowledged records, and how; and the numbers of records by table.
+
+    `in_memory` is empty when the service was started after the loss, and has not loaded any.
+    """
+
+    lost: bool
+    detail: str
+    in_redis: dict[str, int]
+    in_memory: dict[str, int]
+
+
 class Table(NamedTuple):
     """A Redis hash of JSON records by id: `name` ends its key, `subject` is the kind of its records in the audit trail.
 
@@ -83,6 +96,9 @@ class RedisStore:
     which the service leads (`fog_runtime.lease`), and to 0 while it stands by: Redis refuses writes unless it granted
     that one last.
     """
+
+    tables: ClassVar[Sequence[str]] = ()
+    """The names of the service's tables, for people."""
 
     def __init__(
         self, url: str, site: str, *, service: str = "service", data_dir: Path | None = None, timeout_s: float = 1.0
@@ -136,6 +152,16 @@ class RedisStore:
     async def audit(self, *, kinds: Sequence[str] = KINDS, cursor: str | None = None, limit: int = 100) -> AuditPage:
         """Return a page of the audit trail that all services of the site share; raises `CursorError` too."""
         return await read_page(self._redis, self._key("audit:"), kinds=kinds, cursor=cursor, limit=limit)
+
+    async def status(self, in_memory: Mapping[str, int]) -> StoreStatus:
+        """Return what Redis has of the service's tables, beside what the service has in memory."""
+        lost, detail = False, ""
+        try:
+            await self.check()
+        except StoreLostError as error:
+            lost, detail = True, error.what
+        in_redis = {name: int(await self._redis.read("HLEN", self._key(name))) for name in self.tables}
+        return StoreStatus(lost=lost, detail=detail, in_redis=in_redis, in_memory=dict(in_memory))
 
     async def require_loss(self) -> None:
         """Raise `RecoveryError` unless Redis lost acknowledged records."""

@@ -21,9 +21,9 @@ LOST: Final = Gauge(
     "fognav_store_lost", "Whether Redis lost acknowledged records (1), so that writes are refused until it is decided"
 )
 _REMEDY: Final = (
-    "writes are refused until an administrator decides: POST /api/v1/store/recovery with"
-    ' {"action": "restore"} (write back what this service has in memory) or {"action": "accept"} (go on with what Redis'
-    " has); see docs/operations.md"
+    "writes are refused until an administrator decides: `fognav store restore` (write back what this service has in"
+    " memory) or `fognav store accept` (go on with what Redis has), or POST /api/v1/store/recovery with"
+    ' {"action": "restore"} or {"action": "accept"}; see docs/operations.md'
 )
 
 
@@ -32,6 +32,7 @@ class StoreLostError(StoreRefusedError):
 
     def __init__(self, what: str) -> None:
         super().__init__(f"{what}: {_REMEDY}")
+        self.what = what
         LOST.set(1)
 
 

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from fog_runtime.edges import Edges
     from fog_runtime.health import Health
     from fog_runtime.mqtt_edge import MqttEdge
+    from fog_runtime.redis_store import StoreStatus
     from hazard_aggregator.core import Aggregator
     from hazard_aggregator.publisher import Publisher
     from hazard_aggregator.store import Store
@@ -111,6 +112,16 @@ class Records:
         """Subscribe to the thesis's topics of all areas."""
         for number in self._core.thesis_numbers():
             await self._mqtt.add_number(ch.THESIS_AREA, number)
+
+    async def store_status(self) -> StoreStatus:
+        """Return what Redis and this process have; raises `StoreError`."""
+        known = self._in_memory()
+        counts = {
+            "areas": len(known.definitions),
+            "hazards": len(known.hazards),
+            "overrides": len(known.overrides),
+        }
+        return await self._store.status(counts if self.loaded.is_set() else {})
 
     async def recover_store(self, action: Literal["restore", "accept"], who: str) -> None:
         """Restore the records from memory, or accept those in Redis, after Redis lost records.

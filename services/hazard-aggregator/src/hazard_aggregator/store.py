@@ -54,6 +54,8 @@ class Stored(NamedTuple):
 class Store(RedisStore):
     """The aggregator's keys."""
 
+    tables = (_AREAS.name, _HAZARDS, _OVERRIDES.name)
+
     async def load(self) -> Stored:
         """Return all readable records."""
         hazards = await self._readable_records(_HAZARDS, AreaHazard)

@@ -31,6 +31,8 @@ class _AllTimes(Message, frozen=True, kw_only=True):
 class Store(RedisStore):
     """The map-service's keys."""
 
+    tables = (_ZONES.name,)
+
     async def zones(self) -> tuple[list[Zone], dict[str, str]]:
         """Return all stored zones, and, by id, why others are unreadable."""
         zones, unreadable = await self._decoded(_ZONES.name, Zone)

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from fog_contracts.messages import Zone
     from fog_runtime.health import Health
     from fog_runtime.idempotency import Attempt
+    from fog_runtime.redis_store import StoreStatus
     from map_service.core import MapCore
     from map_service.publisher import Publisher
     from map_service.store import Outcome, Store
@@ -138,6 +139,10 @@ class ZoneWriter:
         """
         async with self._lock:
             return await self._earlier_result(attempt)
+
+    async def store_status(self) -> StoreStatus:
+        """Return what Redis and this process have; raises `StoreError`."""
+        return await self._store.status({"zones": len(self._core.zones)} if self._core.zones_loaded else {})
 
     async def recover_store(self, action: Literal["restore", "accept"], who: str) -> None:
         """Restore the zones from memory, or accept those in Redis, after Redis lost records.

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from fog_runtime.clock import Clock
     from fog_runtime.health import Health
     from fog_runtime.idempotency import Attempt
+    from fog_runtime.redis_store import StoreStatus
     from planner.core import PlannerCore
     from planner.store import Store
 
@@ -120,6 +121,10 @@ class MissionKeeper:
             self._cancel(robot)
         _log.info("goal_cancelled", robot=robot, goal=stored.goal.goal_id, who=who)
         return True
+
+    async def store_status(self) -> StoreStatus:
+        """Return what Redis and this process have; raises `StoreError`."""
+        return await self._store.status({"goals": len(self.goals)} if self._loaded.is_set() else {})
 
     async def recover_store(self, action: Literal["restore", "accept"], who: str) -> None:
         """Restore the missions from memory, or accept those in Redis, after Redis lost records.

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from fog_runtime.edges import Gate
     from fog_runtime.health import Health
     from fog_runtime.idempotency import Attempt
+    from fog_runtime.redis_store import StoreStatus
     from fog_runtime.zenoh_edge import ZenohEdge
     from planner.core import Job, PlannerCore
     from planner.store import Store, StoredGoal
@@ -122,6 +123,10 @@ class Service:
     async def cancel(self, robot: str, who: str) -> bool:
         """End a robot's mission; False when it has none. Raises `StoreError`."""
         return await self._missions.cancel(robot, who)
+
+    async def store_status(self) -> StoreStatus:
+        """Return what Redis and this process have; raises `StoreError`."""
+        return await self._missions.store_status()
 
     async def recover_store(self, action: Literal["restore", "accept"], who: str) -> None:
         """Restore the missions from memory, or accept those in Redis, after Redis lost records.

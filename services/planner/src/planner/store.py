@@ -27,6 +27,8 @@ class StoredGoal(Message, frozen=True, kw_only=True):
 class Store(RedisStore):
     """The planner's keys."""
 
+    tables = (_GOALS.name,)
+
     async def goals(self) -> dict[str, StoredGoal]:
         """Return all stored missions by robot; an unreadable one is left out and logged.
 

@@ -7,10 +7,10 @@ from fastapi import Header
 from fog_contracts.messages import Message
 from fog_runtime.http.problems import RETRY_AFTER, ProblemError
 from fog_runtime.http.routes import Body, Routes
-from fog_runtime.http.tokens import Admin, Caller
+from fog_runtime.http.tokens import Admin, Caller, Viewer
 from fog_runtime.idempotency import Attempt, IdempotencyError
 from fog_runtime.redis_connection import StoreError, StoreRefusedError
-from fog_runtime.redis_store import RecoveryError
+from fog_runtime.redis_store import RecoveryError, StoreStatus
 
 IdempotencyKey = Annotated[
     str | None,
@@ -36,6 +36,9 @@ class Recovery(Message, frozen=True, kw_only=True):
 
 class Recoverable(Protocol):
     """A service that can recover its store."""
+
+    async def store_status(self) -> StoreStatus:
+        """Return what Redis and the service have; raises `StoreError`."""
 
     async def recover_store(self, action: Literal["restore", "accept"], who: str) -> None:
         """Carry out an administrator's decision; raises `RecoveryError` and `StoreError`."""
@@ -66,6 +69,11 @@ def add_store_errors(routes: Routes) -> None:
 def add_recovery(routes: Routes, service: Recoverable) -> None:
     """Add the route by which an administrator decides what happens after Redis lost records."""
     routes.raises(RecoveryError, {409: "There is nothing to recover"}, lambda error: ProblemError(409, str(error)))
+
+    @routes.get("/api/v1/store", raises=[StoreError])
+    async def store_status(_caller: Viewer) -> StoreStatus:
+        """Whether Redis lost acknowledged records; how many it has, and how many this service has in memory."""
+        return await service.store_status()
 
     @routes.post("/api/v1/store/recovery", raises=[StoreError, RecoveryError])
     async def recover_store(body: Body[Recovery], caller: Admin) -> None:

@@ -1,0 +1,102 @@
+"""`fognav store`: what the fog's store (Redis) lost, and an administrator's decision about it."""
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Final, Literal
+
+import typer
+
+from fognav.operate.fog import Fog, find_fog
+from fognav.operate.options import FogOption, JsonOption
+from fognav.operate.systems import AGGREGATOR, MAP_SERVICE, PLANNER
+from fognav.output import NOT_TRUE, FailedError, WrongUseError, exit_codes, print_json, print_line
+
+store_app = typer.Typer(help="Show what Redis lost, and recover from it.", no_args_is_help=True)
+
+_SERVICES: Final = (AGGREGATOR, MAP_SERVICE, PLANNER)
+ServiceOption = Annotated[
+    str | None, typer.Option("--service", metavar="NAME", help="Only this service; default: all that report a loss.")
+]
+YesOption = Annotated[bool, typer.Option("--yes", help="Do it; without this, only say what would be done.")]
+
+
+@store_app.command("status", epilog="Example: fognav store status")
+def store_status(*, fog: FogOption = None, json: JsonOption = False) -> None:
+    """Show what each service has in memory and in Redis, and whether Redis lost records.
+
+    The exit code is 1 if it did, or if a service could not be asked.
+    """
+    with exit_codes():
+        found = _statuses(find_fog(fog), None)
+        if json:
+            print_json({"services": found})
+        else:
+            for service, status in found.items():
+                print_line(_line(service, status))
+    if any(status["lost"] is not False for status in found.values()):
+        raise typer.Exit(NOT_TRUE)
+
+
+@store_app.command("restore", epilog="Example: fognav store restore --yes")
+def store_restore(*, service: ServiceOption = None, yes: YesOption = False, fog: FogOption = None) -> None:
+    """Write back to Redis what the running services have in memory, where Redis lost records.
+
+    A service that was started after the loss has nothing in memory: restore a backup of Redis, or accept.
+    """
+    with exit_codes():
+        _recover(find_fog(fog), "restore", service, yes=yes)
+
+
+@store_app.command("accept", epilog="Example: fognav store accept --service planner --yes")
+def store_accept(*, service: ServiceOption = None, yes: YesOption = False, fog: FogOption = None) -> None:
+    """Go on with what Redis has now, where it lost records: what it lacks is lost for good."""
+    with exit_codes():
+        _recover(find_fog(fog), "accept", service, yes=yes)
+
+
+def _recover(fog: Fog, action: Literal["restore", "accept"], service: str | None, *, yes: bool) -> None:
+    """Send the decision to each service that reports a loss; raises `FailedError` if one could not carry it out."""
+    found = _statuses(fog, service)
+    failures = [f"{name}: {status['detail']}" for name, status in found.items() if status["lost"] is None]
+    lost = {name: status for name, status in found.items() if status["lost"]}
+    if not lost and not failures:
+        raise FailedError("Redis has lost nothing: there is nothing to recover")
+    for name, status in lost.items():
+        print_line(_line(name, status))
+    if not yes:
+        effect = "writes what is in memory to Redis" if action == "restore" else "gives up what Redis lacks"
+        raise WrongUseError(f"nothing was changed. `fognav store {action} --yes` {effect}, for the services above")
+    for name in lost:
+        try:
+            fog.send("POST", name, "/api/v1/store/recovery", {"action": action})
+        except FailedError as error:
+            failures.append(str(error))
+        else:
+            print_line(f"{name}: {'restored' if action == 'restore' else 'accepted'}")
+    if failures:
+        raise FailedError("; ".join(failures))
+
+
+def _statuses(fog: Fog, service: str | None) -> dict[str, dict[str, Any]]:
+    """Return the status of each service's store; of one that can't be asked, `lost` is None and `detail` says why."""
+    if service not in (None, *_SERVICES):
+        raise WrongUseError(f"--service {service}: name {', '.join(_SERVICES)}")
+    found: dict[str, dict[str, Any]] = {}
+    for name in _SERVICES if service is None else (service,):
+        try:
+            found[name] = fog.get(name, "/api/v1/store")
+        except FailedError as error:
+            found[name] = {"lost": None, "detail": str(error), "in_memory": {}, "in_redis": {}}
+    return found
+
+
+def _line(service: str, status: Mapping[str, Any]) -> str:
+    if status["lost"] is None:
+        return f"{service}: not known: {status['detail']}"
+    if not status["lost"]:
+        return f"{service}: complete: {_counts(status['in_redis'])}"
+    memory = _counts(status["in_memory"]) if status["in_memory"] else "nothing, since it was started after the loss"
+    return f"{service}: LOST: {status['detail']}. In Redis: {_counts(status['in_redis'])}; in memory: {memory}"
+
+
+def _counts(tables: Mapping[str, int]) -> str:
+    return ", ".join(f"{count} {name}" for name, count in tables.items())

@@ -25,7 +25,6 @@ from robot_agent.agent.obstacle_reporter import ObstacleReporter
 from robot_agent.agent.operator_commands import OperatorCommands, initial_pose_refusal
 from robot_agent.agent.path_driving import PathDriving
 from robot_agent.agent.pose_keeper import PoseKeeper
-from robot_agent.agent.power import power_warnings
 from robot_agent.agent.prepared_map import PreparedMap, prepare_map
 from robot_agent.agent.publishing import PublishingPolicy
 from robot_agent.agent.reports import hindrances, robot_pose, robot_state
@@ -267,16 +266,14 @@ class AgentCore:
     def state(self, at: Moment) -> RobotState:
         """Return mode, reasons, goal, path and map version as a message."""
         mission, stuck_after = self._driving.mission, self._config.motion.stuck_after
-        may_drive = mission.active and self.safety.stop == "none"
-        decision, guard = self._driving.wheels.decision, self._guard.reason
-        held_up = hindrances(mission, decision, guard, stuck_after, at.now) if may_drive else []
-        status = self._base.feedback.status if self._base.feedback is not None else None
+        driven = mission if mission.active and self.safety.stop == "none" else None
         return robot_state(
             self._safety.state,
             mission,
             self.replica.version,
             self._base.feedback,
-            hindrances=[*held_up, *power_warnings(status, self._config.battery_low)],
+            hindrances=hindrances(driven, self._driving.wheels.decision, self._guard.reason, stuck_after, at.now),
+            battery_low=self._config.battery_low,
             traces=self._driving.traces.recent,
             loop=self._loop_health,
             epochs=self._fence.epochs,

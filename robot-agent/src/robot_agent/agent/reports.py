@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from fog_contracts.messages import LoopHealth, RobotPose, RobotState
+from robot_agent.agent.power import power_warnings
 
 if TYPE_CHECKING:
     from fog_contracts.handlers import Moment
@@ -52,6 +53,7 @@ def robot_state(  # noqa: PLR0913  # a message gathers from all parts of the age
     feedback: BaseFeedback | None,
     *,
     hindrances: list[str],
+    battery_low: float,
     traces: list[Trace],
     loop: LoopHealth,
     epochs: dict[str, int],
@@ -60,12 +62,14 @@ def robot_state(  # noqa: PLR0913  # a message gathers from all parts of the age
 ) -> RobotState:
     """Return mode, reasons, goal, path, map version and the `epochs` received of each service.
 
-    `hindrances` are reasons besides the safety gate's; `boot` is the id of this run of the agent.
+    `hindrances` are reasons besides the safety gate's, and so is a charge below `battery_low` (of 1); `boot` is the id
+    of this run of the agent.
     """
     path = mission.path
+    warnings = power_warnings(feedback.status if feedback else None, battery_low)
     return RobotState(
         mode=safety.mode,
-        reasons=[reason[:_REASON_LIMIT] for reason in (*safety.reasons, *hindrances)],
+        reasons=[reason[:_REASON_LIMIT] for reason in (*safety.reasons, *hindrances, *warnings)],
         enabled=safety.enabled,
         battery=feedback.status.battery if feedback else None,
         goal_id=mission.goal_id,
@@ -87,9 +91,14 @@ def robot_state(  # noqa: PLR0913  # a message gathers from all parts of the age
 
 
 def hindrances(
-    mission: Mission, decision: Decision | None, limited: str | None, stuck_after: float, now: float
+    mission: Mission | None, decision: Decision | None, limited: str | None, stuck_after: float, now: float
 ) -> list[str]:
-    """Return why a robot that may drive makes little progress to its goal; `limited`: why it is stopped."""
+    """Return why a robot makes little progress to its goal; `limited`: why it is stopped.
+
+    mission: None while the robot must not drive or has no goal: then there is nothing to report.
+    """
+    if mission is None:
+        return []
     found = [] if limited is None else [limited]
     if decision is not None and decision.blocked:
         found.append(decision.blocked)

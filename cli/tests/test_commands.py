@@ -35,6 +35,7 @@ def _warm_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
         ["status"],
         ["bench", "fleet"],
         ["bench", "robot"],
+        ["bench", "reactions"],
         ["bench", "rest"],
         ["goal"],
         ["area", "list"],

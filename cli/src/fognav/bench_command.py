@@ -11,7 +11,7 @@ import typer
 from rich.progress import Progress
 
 from fognav import kernels
-from fognav.output import console, exit_codes, print_json
+from fognav.output import check_writable, console, exit_codes, print_json
 
 bench_app = typer.Typer(help="Measure parts of the system on this machine.", no_args_is_help=True)
 
@@ -185,3 +185,33 @@ def dwa_command(
         return
     for name, value in figures.items():
         console.print(f"{name:22} {value}", markup=False)
+
+
+@bench_app.command("reactions", epilog="Example: fognav bench reactions --trials 200 --write docs/reaction-times.md")
+def reactions_command(
+    *,
+    trials: Annotated[int, typer.Option("--trials", metavar="N", min=1, help="Trials of each fault.")] = 3,
+    write: Annotated[
+        Path | None, typer.Option("--write", metavar="FILE", help="Write the table to a Markdown file.")
+    ] = None,
+    json: Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")] = False,
+) -> None:
+    """Measure how soon the wheels stop.
+
+    Agent, guardian and watchdog of a driving robot are killed or stopped, one by one and in pairs; the time ends when
+    the emulated base's wheels stand. A trial takes some ten seconds.
+    """
+    from fognav.bench import machine, reactions  # noqa: PLC0415  # keeps the other commands fast
+
+    kernels.warm_cache(lambda text: console.print(text, markup=False))
+    with exit_codes():
+        check_writable(write)
+        rows = reactions.measure(trials, lambda text: console.print(text, markup=False))
+    described = machine.describe()
+    if write is not None:
+        write.write_text(reactions.markdown(rows, machine.sentence()), "utf-8")
+    if json:
+        print_json({"bench": "reactions", "trials": trials, "rows": rows, **described})
+        return
+    for values in rows:
+        console.print("  ".join(f"{name} {value}" for name, value in values.items()), markup=False)

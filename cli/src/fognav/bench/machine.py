@@ -21,6 +21,12 @@ def describe() -> dict[str, object]:
     }
 
 
+def sentence() -> str:
+    """Return the machine in a few words, with its load."""
+    load = os.getloadavg()[0]
+    return f"{_processor()}, {os.cpu_count()} cores, {platform.platform(terse=True)}, load {load:.0f} at the end"
+
+
 def _processor() -> str:
     """Return the processor's name; an empty text where the system does not tell it."""
     try:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import time
 from contextlib import AsyncExitStack
+from itertools import cycle
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Final, Self
@@ -34,7 +35,7 @@ NAME: Final = "r1"
 FLOOR_M: Final = (100.0, 57.0)
 """2000 x 1140 cells of 5 cm."""
 GUARDIAN: Final = "robot-guardian"
-_GOAL: Final = "far"
+_PLACES: Final = ("far", "near")
 _SITE: Final = "bench"
 _WAIT_S: Final = 90.0
 _POLL_S: Final = 0.01
@@ -45,11 +46,13 @@ _DRIVING_M_S: Final = 0.2
 def write_site(folder: Path, floor: StaticMap) -> Path:
     """Write a site with a robot in the south-west of an office, and a place in its north-east; return its folder."""
     right = floor.geometry.bounds[2]
+    far, near = _PLACES
     rows = corridor_rows(floor.geometry.bounds[3])
     save_map(folder / "map", floor)
     (folder / "site.toml").write_text(
         f'id = "{_SITE}"\nname = "Benchmark floor"\nmap = "map.yaml"\n'
-        f"[places.{_GOAL}]\nx = {right - 4.0:.1f}\ny = {rows[-1]:.1f}\n"
+        f"[places.{far}]\nx = {right - 4.0:.1f}\ny = {rows[-1]:.1f}\n"
+        f"[places.{near}]\nx = 4.0\ny = {rows[0]:.1f}\n"
         f'[[robots]]\nid = "{NAME}"\nstart = {{ x = 4.0, y = {rows[0]:.1f}, theta = 0.0 }}\n',
         "utf-8",
     )
@@ -68,6 +71,8 @@ class RobotSystem:
         self._policy = OperatorPolicy(self._clock.now())
         self.state: RobotState | None = None
         self.speed = 0.0
+        """The robot's speed (m/s) by its own last pose."""
+        self._goals = cycle(_PLACES)
 
     async def __aenter__(self) -> Self:
         try:
@@ -84,7 +89,9 @@ class RobotSystem:
         contexts = self._contexts
         folder = Path(contexts.enter_context(TemporaryDirectory(prefix="fognav-bench-")))
         site = await asyncio.to_thread(write_site, folder, make_office(*FLOOR_M))
-        self.stack = await contexts.enter_async_context(Stack(StackConfig(site_dir=site, robot=NAME), self._on_event))
+        self.truth_log = folder / "truth.jsonl"
+        config = StackConfig(site_dir=site, robot=NAME, extra={"TRUTH_LOG": str(self.truth_log)})
+        self.stack = await contexts.enter_async_context(Stack(config, self._on_event))
         await self.stack.start()
         edge = await contexts.enter_async_context(
             ZenohEdge.open(
@@ -145,12 +152,24 @@ class RobotSystem:
         await self._until(lambda: self.state is not None and self.state.mode == "NORMAL", "the robot is in NORMAL mode")
 
     async def start_drive(self) -> None:
-        """Send the robot to the far end of the floor, some two minutes away or more, and wait until it drives."""
+        """Send the robot to the other end of the floor, some two minutes away or more, and wait until it drives."""
+        await self._send_goal()
+        await self._until(lambda: self.speed > _DRIVING_M_S, "the robot drives")
+
+    async def wait_driving(self) -> None:
+        """Wait until the robot drives (again), and send it to the other end of the floor if it has no goal."""
+        await self.wait_enabled()
+        state = self.state
+        if state is None or state.goal_id is None or state.goal_reached:
+            await self._send_goal()
+        await self._until(lambda: self.speed > _DRIVING_M_S, "the robot drives")
+
+    async def _send_goal(self) -> None:
+        place = next(self._goals)
         port = self.stack.port(PLANNER)
-        answer = await asyncio.to_thread(put_goal, f"http://{net.LOOPBACK}:{port}", NAME, _GOAL, self.stack.token)
+        answer = await asyncio.to_thread(put_goal, f"http://{net.LOOPBACK}:{port}", NAME, place, self.stack.token)
         if answer.status >= 300:
             raise RuntimeError(f"the planner refused the goal: HTTP {answer.status}, {answer.reason}")
-        await self._until(lambda: self.speed > _DRIVING_M_S, "the robot drives")
 
     async def _until(self, condition: Callable[[], bool], expected: str) -> None:
         deadline = time.monotonic() + _WAIT_S

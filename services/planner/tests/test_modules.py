@@ -11,10 +11,10 @@ from msgspec import structs
 from ring_map import LEFT, LOWER, RIGHT, UPPER, Box, RingMap, goal, pose
 
 from fog_contracts import channels as ch
-from fog_contracts.costs import DEFAULT_INFLATION
+from fog_contracts.costs import DEFAULT_INFLATION, INSCRIBED
 from fog_contracts.grid import GridGeometry
 from fog_contracts.handlers import Moment
-from fog_contracts.messages import PointXY, RectangleShape, Refusal, RobotRelease, Trace, Zone, ZoneSet
+from fog_contracts.messages import MapDelta, PointXY, RectangleShape, Refusal, RobotRelease, Trace, Zone, ZoneSet
 from fog_contracts.replica import MapError, Version
 from fog_contracts.shapes import rasterize_shape
 from fog_kernels.astar import Planner
@@ -38,7 +38,7 @@ NOW = Moment(100.0, 5000.0)
 
 
 def make_tracker(ring_map: RingMap) -> MapTracker:
-    tracker = MapTracker(DEFAULT_INFLATION, grace_s=0.5, max_age_s=1.0)
+    tracker = MapTracker(DEFAULT_INFLATION, grace_s=0.5, max_age_s=1.0, standing_s=60.0)
     tracker.load(ring_map.master.snapshot(), 0.0)
     return tracker
 
@@ -109,7 +109,7 @@ def test_lower_bound_is_replaced_only_when_costs_fall_below_it() -> None:
 
 def test_snapshot_of_a_new_epoch_is_a_restart_and_a_damaged_one_changes_nothing() -> None:
     ring_map = RingMap()
-    tracker = MapTracker(DEFAULT_INFLATION, grace_s=0.5, max_age_s=1.0)
+    tracker = MapTracker(DEFAULT_INFLATION, grace_s=0.5, max_age_s=1.0, standing_s=60.0)
     assert tracker.current is None
     assert tracker.load(ring_map.master.snapshot(), 0.0).restarted
     assert not tracker.load(ring_map.master.snapshot(), 0.0).restarted
@@ -321,7 +321,7 @@ def run(fields: GoalFields, job: FieldJob) -> None:
 
 def test_field_is_computed_once_per_goal_and_discarded_with_its_lower_bound() -> None:
     fields = GoalFields(10_000)
-    fields.set_lower_bound(BOUND)
+    fields.set_bounds(BOUND, BOUND)
     (job,) = fields.jobs([(3, 3), (3, 3)])
     assert fields.jobs([(3, 3)]) == []
     assert fields.guide((3, 3)) is None
@@ -330,20 +330,88 @@ def test_field_is_computed_once_per_goal_and_discarded_with_its_lower_bound() ->
     assert guide is not None
     assert Planner(20, 12).plan(BOUND, (10, 3), (3, 3), field=guide).found
     assert fields.jobs([(3, 3)]) == []
-    fields.set_lower_bound(BOUND)
+    fields.set_bounds(BOUND, BOUND)
     assert fields.guide((3, 3)) is guide
-    fields.set_lower_bound(BOUND.copy())
+    floor = BOUND.copy()
+    fields.set_bounds(floor, floor)
     assert fields.guide((3, 3)) is None
     (again,) = fields.jobs([(3, 3)])
-    assert again.lower_bound is not BOUND
+    assert again.bound is not BOUND
+
+
+def test_fields_guide_on_until_the_risen_costs_have_theirs_and_a_coarse_one_guides_after_a_fall() -> None:
+    fields = GoalFields(10_000)
+    fields.set_bounds(BOUND, BOUND)
+    (job,) = fields.jobs([(3, 3)])
+    run(fields, job)
+    before = fields.guide((3, 3))
+    risen = BOUND.copy()
+    risen[2:9, 10] = 254
+    fields.set_bounds(BOUND, risen)
+    assert fields.guide((3, 3)) is before
+    (job,) = fields.jobs([(3, 3)])
+    run(fields, job)
+    after = fields.guide((3, 3))
+    assert after is not None
+    assert before is not None
+    assert after.costs[5, 15] > before.costs[5, 15]
+    assert fields.jobs([(3, 3)]) == []
+    fields.set_bounds(BOUND, BOUND.copy())
+    coarse = fields.guide((3, 3))
+    assert coarse is not None
+    assert coarse.bits == 3
+    planner = Planner(20, 12)
+    assert planner.plan(BOUND, (15, 5), (3, 3), field=coarse).cost == planner.plan(BOUND, (15, 5), (3, 3)).cost
+    assert [again.goal for again in fields.jobs([(3, 3)])] == [(3, 3)]
+
+
+def test_standing_costs_rise_after_a_minute_fall_at_once_and_never_rise_above_a_fall_again() -> None:
+    ring_map = RingMap()
+    tracker = make_tracker(ring_map)
+    tracker.settle(0.0)
+    assert current(tracker).standing is current(tracker).lower_bound
+
+    def change(deltas: list[MapDelta], now: float) -> bool:
+        """Apply deltas; return whether the standing costs hold the zone a minute later."""
+        for delta in deltas:
+            tracker.on_delta(delta, now)
+        assert np.all((current(tracker).standing <= current(tracker).cost) | (current(tracker).cost >= INSCRIBED))
+        tracker.settle(now + 50.0)
+        tracker.settle(now + 110.0)
+        column, row = ring_map.geometry.cell(10.0, 11.0)
+        return bool(current(tracker).standing[row, column] == 254)
+
+    assert change(ring_map.put("zone", UPPER), 100.0)
+    assert not change(ring_map.clear("zone"), 300.0)
+    assert not change(ring_map.put("zone", UPPER), 500.0)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 2), st.booleans(), st.integers(0, 90)), max_size=20))
+def test_standing_costs_never_exceed_the_map_whatever_comes_and_goes(steps: list[tuple[int, bool, int]]) -> None:
+    ring_map = RingMap()
+    tracker = make_tracker(ring_map)
+    now = 0.0
+    for number, put, seconds in steps:
+        name, box = f"z{number}", (4.0 + 4 * number, 9.0, 9.0 + 4 * number, 11.5)
+        deltas = ring_map.put(name, box) if put else ring_map.clear(name) if name in ring_map.areas else []
+        now += seconds
+        for delta in deltas:
+            tracker.on_delta(delta, now)
+        tracker.settle(now)
+        planning_map = current(tracker)
+        free = planning_map.cost < INSCRIBED
+        assert np.all(planning_map.standing[free] <= planning_map.cost[free])
+        assert np.all(planning_map.lower_bound[free] <= planning_map.standing[free])
 
 
 def test_field_over_an_outdated_lower_bound_is_not_computed_and_dropped() -> None:
     fields = GoalFields(10_000)
-    fields.set_lower_bound(BOUND)
+    fields.set_bounds(BOUND, BOUND)
     (job, late) = fields.jobs([(3, 3), (4, 4)])
     job.run()
-    fields.set_lower_bound(BOUND.copy())
+    floor = BOUND.copy()
+    fields.set_bounds(floor, floor)
     fields.add(job)
     run(fields, late)
     assert late.field is None
@@ -354,7 +422,7 @@ def test_every_goal_has_a_field_within_the_bound_of_memory_and_a_goal_in_a_wall_
     fields = GoalFields(2 * BOUND.size + 200)  # one field at full resolution and a bit
     walled = BOUND.copy()
     walled[5, 5] = 254
-    fields.set_lower_bound(walled)
+    fields.set_bounds(walled, walled)
     assert fields.jobs([(5, 5)]) == []
     (first,) = fields.jobs([(1, 1)])
     run(fields, first)
@@ -369,7 +437,7 @@ def test_every_goal_has_a_field_within_the_bound_of_memory_and_a_goal_in_a_wall_
 
 def test_fields_of_goals_that_ended_make_room_for_new_ones() -> None:
     fields = GoalFields(2 * BOUND.size)
-    fields.set_lower_bound(BOUND)
+    fields.set_bounds(BOUND, BOUND)
     for goal_cell in ((1, 1), (2, 2)):
         (job,) = fields.jobs([goal_cell])
         run(fields, job)
@@ -516,7 +584,7 @@ def test_egress_is_found_however_large_the_blocked_area_is() -> None:
     raw[window.rows, window.columns][mask] = 254
     cost = inflate(raw, inflation_table(0.05, DEFAULT_INFLATION))
     static = np.zeros(geometry.shape, np.uint8)
-    planning_map = PlanningMap(geometry, Version(1, 1, 1), cost, static, static)
+    planning_map = PlanningMap(geometry, Version(1, 1, 1), cost, static, static, static)
     regions = Regions(DEFAULT_INFLATION).on(planning_map, [zone], 0.0)
     out = find_egress(planning_map, regions, (18.0, 20.0), CONFIG, Planner(800, 800))
     assert out.route is not None

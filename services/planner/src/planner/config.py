@@ -45,6 +45,8 @@ class PlannerConfig:
     """After a search of so many expanded cells, a bound of the way round is computed for those that are left ..."""
     detour_searches: int = 3
     """... if at least so many are."""
+    standing_s: float = 60.0
+    """What has stayed on the map for so long, zones above all, is in the distance fields, too."""
     goal_fields_bytes: int = 40_000_000
     """The memory of all distance fields together."""
     refused_retry_s: float = 1.0

@@ -66,7 +66,10 @@ class PlannerCore:
         """Whether the missions are all that are stored, so that a robot's other goal is none any more."""
         self.config = config or PlannerConfig()
         self._map = MapTracker(
-            self.config.inflation, grace_s=self.config.delta_grace_s, max_age_s=self.config.max_map_age_s
+            self.config.inflation,
+            grace_s=self.config.delta_grace_s,
+            max_age_s=self.config.max_map_age_s,
+            standing_s=self.config.standing_s,
         )
         self._regions = BlockedRegions()
         self._fields = GoalFields(self.config.goal_fields_bytes)
@@ -97,7 +100,7 @@ class PlannerCore:
         planning_map = self._map.current
         if planning_map is None:
             return ()
-        self._fields.set_lower_bound(planning_map.lower_bound)
+        self._fields.set_bounds(planning_map.lower_bound, planning_map.standing)
         if any(change.any_decreased for change in changes):
             self.replanner.detours.clear()
         for change in changes:
@@ -161,7 +164,7 @@ class PlannerCore:
         planning_map = self._map.current
         assert planning_map is not None
         self.fence.raise_to(ch.MAP, planning_map.version.epoch)
-        self._fields.set_lower_bound(planning_map.lower_bound)
+        self._fields.set_bounds(planning_map.lower_bound, planning_map.standing)
         self.replanner.detours.clear()
         for _, mission in self.missions.active():
             refused = mission.plan is not None and mission.plan.route is None
@@ -233,9 +236,11 @@ class PlannerCore:
 
     def jobs(self, at: Moment) -> list[Job]:
         """Return new background work, each piece once: run it on any thread, one for each `thread`, then `add` it."""
+        self._map.settle(at.now)
         planning_map = self._map.current
         if planning_map is None:
             return []
+        self._fields.set_bounds(planning_map.lower_bound, planning_map.standing)
         jobs: list[Job] = [*self._fields.jobs(self.missions.goal_cells(planning_map.geometry))]
         if self._explaining is None and (explain := self._explain_job(at, planning_map)) is not None:
             self._explaining = explain

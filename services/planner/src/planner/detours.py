@@ -55,10 +55,13 @@ class Detours:
         """Return the bound for a search; None without one."""
         return next((known for known in self._known if known.covers(start) and not known.covers(goal)), None)
 
-    def compute(self, planning_map: PlanningMap, planner: Planner, trips: Sequence[Trip]) -> None:
+    def compute(
+        self, planning_map: PlanningMap, planner: Planner, cells: NDArray[np.int32], trips: Sequence[Trip]
+    ) -> None:
         """Compute the bound for the searches that are due, unless there have been enough for this version of the map.
 
-        `planner` gives the weights. Takes some 60 ns for each cell of the closed part.
+        `planner` gives the weights; `cells` is the path of the search before them, whose way out the others should
+        share. Takes some 60 ns for each cell of the closed part.
         """
         if self._version != planning_map.version:
             self._version, self._attempts = planning_map.version, 0
@@ -66,33 +69,34 @@ class Detours:
         if self._attempts >= _ATTEMPTS or reference is None:
             return
         self._attempts += 1
-        starts = [start for start, _ in trips]
+        starts = [(int(cells[0, 0]), int(cells[0, 1])), *(start for start, _ in trips)]
         shadow = Shadow(planning_map.cost, self._fields.bound, reference, starts, planner)
         behind = [(start, goal) for start, goal in trips if shadow.contains(start) and not shadow.contains(goal)]
         fields = [field for _, goal in behind if (field := self._fields.guide(goal)) is not None]
-        if not fields:
+        way_out = shadow.exit_of(cells)
+        if not fields or way_out is None:
             return
-        detour = shadow.detour(_levels(fields, shadow.border)) if len(shadow.border) else None
+        detour = shadow.detour(_levels(fields, shadow.border, way_out))
         if detour is not None:
             self._known = [detour, *self._known][:_KEPT]
             self.computed += 1
 
 
-def _levels(fields: Sequence[GoalField], border: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Return the border costs of the goal from which those of the others differ most evenly.
+def _levels(fields: Sequence[GoalField], border: NDArray[np.int32], way_out: int) -> NDArray[np.int64]:
+    """Return the border costs of the goal that serves the others best.
 
-    A bound is tight where the difference is the lowest one; its distance from the median tells how much is lost.
+    A bound is tight for a goal whose costs differ from them at the way out by no more than elsewhere; the excess is
+    what is lost.
     """
     costs: NDArray[np.int64] = np.stack([border_costs(field, border) for field in fields])
     reached = np.all(costs >= 0, axis=0)
-    if not reached.any():
+    if not reached[way_out]:
         return np.zeros(len(border), np.int64)
-    known = costs[:, reached]
     candidates = range(0, len(fields), -(-len(fields) // _CANDIDATES))
     losses = []
     for candidate in candidates:
-        differences = known - known[candidate]
-        losses.append(float(np.sum(np.median(differences, axis=1) - differences.min(axis=1))))
+        differences = costs - costs[candidate]
+        losses.append(float(np.sum(differences[:, way_out] - differences[:, reached].min(axis=1))))
     chosen: NDArray[np.int64] = costs[candidates[int(np.argmin(losses))]]
-    chosen[~reached] = known.max()
+    chosen[~reached] = chosen.max()
     return chosen

@@ -55,7 +55,8 @@ class SearchResult:
     refusal: Refusal | None
     question: Question | None = None
     searched: bool = True
-    expansions: int = 0
+    found: PlanResult | None = None
+    """The path by cells that the route straightens."""
 
 
 def refused(refusal: Refusal, question: Question | None = None, *, searched: bool = False) -> SearchResult:
@@ -107,7 +108,7 @@ class PathSearch:
         corners = self.planner.shortcut(planning_map.cost, found.cells)
         points = self._points(planning_map.cost, corners, start, goal, escaping=free != first)
         route = Route(points, self._config.point_spacing, escape_lines=int(free != first))
-        return SearchResult(route, route.cost(planning_map.cost, geometry), None, expansions=found.expansions)
+        return SearchResult(route, route.cost(planning_map.cost, geometry), None, found=found)
 
     def _without_path(self, planning_map: PlanningMap, question: Question, found: PlanResult | None) -> SearchResult:
         if found is not None:

@@ -16,6 +16,7 @@ from fog_contracts.replica import decode_map
 from fog_kernels.components import Components
 from fog_kernels.distance import squared_distance_capped
 from fog_kernels.inflation import inflate, inflation_table
+from planner.standing_map import StandingMap
 
 if TYPE_CHECKING:
     from fog_contracts.costs import Inflation
@@ -40,6 +41,8 @@ class PlanningMap:
     static: Grid
     lower_bound: Grid
     """The inflated static map: the costs without any hazard, zone or obstacle."""
+    standing: Grid
+    """Costs that have stayed for a while; never above `cost` where that is traversable, never below `lower_bound`."""
 
     @cached_property
     def components(self) -> Components:
@@ -111,12 +114,13 @@ class Loaded:
 class MapTracker:
     """Follows the map-service's map, and reports which costs changed."""
 
-    def __init__(self, inflation: Inflation, *, grace_s: float, max_age_s: float) -> None:
+    def __init__(self, inflation: Inflation, *, grace_s: float, max_age_s: float, standing_s: float) -> None:
         self._inflation = inflation
         self._max_age_s = max_age_s
         self._follower = MapFollower(grace_s=grace_s)
         self._previous: Grid = np.zeros((0, 0), dtype=np.uint8)
         self._lower_bound: Grid = self._previous
+        self._standing = StandingMap(standing_s)
         self._current: PlanningMap | None = None
         self._copy: PlanningMap | None = None
 
@@ -129,9 +133,11 @@ class MapTracker:
         replica, current = self._follower.replica, self._current
         if replica.geometry is None or replica.version is None:
             return None
-        if current is None or current.version != replica.version or current.lower_bound is not self._lower_bound:
+        standing = self._standing.costs
+        bounds_are_new = current is None or current.lower_bound is not self._lower_bound
+        if current is None or bounds_are_new or current.version != replica.version or current.standing is not standing:
             self._current = PlanningMap(
-                replica.geometry, replica.version, replica.cost, replica.static, self._lower_bound
+                replica.geometry, replica.version, replica.cost, replica.static, self._lower_bound, standing
             )
         return self._current
 
@@ -165,11 +171,20 @@ class MapTracker:
         if applied.version != prepared.decoded.version:
             # Deltas that arrived meanwhile were applied, too.
             lower_bound = np.minimum(lower_bound, cost)
-        if not np.array_equal(lower_bound, self._lower_bound):
+        same_floor = np.array_equal(lower_bound, self._lower_bound)
+        if not same_floor:
             self._lower_bound = lower_bound
+        self._standing.load(cost, same_floor=same_floor, now=now)
+        if np.array_equal(self._standing.costs, self._lower_bound):
+            self._standing.costs = self._lower_bound  # one array, so that fields are computed over one bound only
         self._previous = cost.copy()
         self._current = None
         return Loaded(before is None or before.epoch != applied.version.epoch, applied.traces)
+
+    def settle(self, now: float) -> None:
+        """Let the standing costs follow what has stayed on the map; call it often."""
+        if self.current is not None:
+            self._standing.settle(self._follower.replica.cost, now)
 
     def on_heartbeat(self, heartbeat: MapHeartbeat, now: float) -> None:
         """Compare with the map-service's version; if deltas are missing, a snapshot is needed."""
@@ -188,6 +203,7 @@ class MapTracker:
             previous = self._previous[window.rows, window.columns]
             cost = self._follower.replica.cost[window.rows, window.columns]
             self._adjust_lower_bound(window, cost)
+            self._standing.update(window, cost)
             changed, decreased = cost != previous, cost < previous
             if changed.any():
                 changes.append(CostChange(window, changed, decreased, applied.traces))

@@ -100,10 +100,11 @@ class Replanner:
         found = self._search.find(
             planning_map, covers, (pose.x, pose.y), (target.x, target.y), self._fields.guide(goal), detour
         )
-        if detour is None and found.expansions >= self._config.detour_expansions:
+        first = found.found
+        if detour is None and first is not None and first.expansions >= self._config.detour_expansions:
             trips = [trip for other in waiting if (trip := _trip(other, geometry)) is not None]
             if len(trips) >= self._config.detour_searches:
-                self.detours.compute(planning_map, self._search.planner, trips)
+                self.detours.compute(planning_map, self._search.planner, first.cells, trips)
         return found
 
 

@@ -52,6 +52,9 @@ def box_distance(x: float, y: float, angle: float, column: int, row: int) -> flo
 @example(seed=504, height=1, width=1, x=0.0, y=0.0, angle=2.0, density=0.02).via(
     "a ray that leaves the cell on whose border it starts"
 )
+@example(seed=0, height=2, width=2, x=2.0, y=1.0, angle=0.0, density=0.02).via(
+    "a ray that leaves the grid on whose border it starts"
+)
 @given(
     st.integers(0, 2**32 - 1),
     st.integers(1, 14),

@@ -47,7 +47,9 @@ def _cast(occupied: Any, x: float, y: float, angles: Any, reach: float, out: Any
             leave = min(leave, far)
         elif y < 0.0 or y >= height:
             continue
-        if enter > leave:
+        # A ray that only touches the grid enters no cell, but for the one in which it starts.
+        starts_inside = 0.0 <= x < width and 0.0 <= y < height
+        if enter > leave or (enter == leave and not starts_inside):
             continue
         column = min(max(math.floor(x + enter * dx), 0), width - 1)
         row = min(max(math.floor(y + enter * dy), 0), height - 1)

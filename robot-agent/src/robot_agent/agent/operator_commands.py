@@ -13,7 +13,8 @@ if TYPE_CHECKING:
     from fog_contracts.messages import Pose, RobotCommand
     from fog_contracts.replica import Replica
     from robot_agent.config import AgentConfig
-    from robot_agent.safety.gate import Request, SafetyOutputs
+    from robot_agent.safety.conditions import Request
+    from robot_agent.safety.gate import SafetyOutputs
 
 _REASON_LIMIT: Final = 500
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from robot_agent.safety.gate import SafetyInputs, SafetyState, step
+from robot_agent.safety.conditions import SafetyInputs
+from robot_agent.safety.gate import SafetyState, step
 
 if TYPE_CHECKING:
     from fog_contracts.follower import MapFollower
@@ -13,7 +14,8 @@ if TYPE_CHECKING:
     from robot_agent.agent.sensors import BaseSource, LidarSource
     from robot_agent.config import SafetyConfig
     from robot_agent.localization.localizer import Localizer
-    from robot_agent.safety.gate import Request, SafetyOutputs
+    from robot_agent.safety.conditions import Request
+    from robot_agent.safety.gate import SafetyOutputs
 
 
 class SafetySupervisor:

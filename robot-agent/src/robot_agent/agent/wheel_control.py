@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from robot_agent.guardian.link import WheelCommand
-from robot_agent.safety.gate import limit_wheels, ramp_down
+from robot_agent.safety.wheel_limits import limit_wheels, ramp_down
 
 if TYPE_CHECKING:
     from collections.abc import Callable

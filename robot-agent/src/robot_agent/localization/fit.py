@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from robot_agent.localization.map_fields import MapFields
     from robot_agent.localization.pose import Pose2
     from robot_agent.localization.uncertainty import Uncertainty
-    from robot_agent.safety.gate import Localization
+    from robot_agent.safety.conditions import Localization
 
 _NEAR_M: Final = 0.25
 """A beam that ends this near to a wall of the map agrees with it."""

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from robot_agent.localization.absolute import AbsoluteObservation
     from robot_agent.localization.hypotheses import Hypothesis
     from robot_agent.localization.uncertainty import Uncertainty
-    from robot_agent.safety.gate import Localization
+    from robot_agent.safety.conditions import Localization
 
 _FIT_BEAMS: Final = 120
 _TRIAL_SCANS: Final = 8

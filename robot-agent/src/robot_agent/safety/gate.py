@@ -1,36 +1,22 @@
 """The safety gate: which mode the robot is in and what its wheels may do, decided on the robot alone.
 
-`step` is a pure state machine, called 20 times a second and with each operator's request. Every input is a source's
-age, value or fault; the most restrictive finding wins. Escalation is immediate. A level is left only when no
-finding has demanded it during the last 2 s. Messages from the fog can only ever add findings, so they can slow or stop
-the robot but not speed it up.
+`step` is a pure state machine, called 20 times a second and with each operator's request. Its findings come from the
+table in `robot_agent.safety.conditions`; the most restrictive one wins. Escalation is immediate. A level is left only
+when no finding has demanded it during the last 2 s. Messages from the fog can only ever add findings, so they can slow
+or stop the robot but not speed it up.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from enum import IntEnum
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple
+from typing import TYPE_CHECKING, Final, Literal
 
 from robot_agent.config import SafetyConfig
+from robot_agent.safety.conditions import Finding, Level, SafetyInputs, collect_findings
 
 if TYPE_CHECKING:
     from fog_contracts.messages import Mode
-
-Localization = Literal["good", "weak", "lost", "none"]
-Request = Literal["enable", "disable", "reset"]
-
-
-class Level(IntEnum):
-    """How restrictive a finding is."""
-
-    NORMAL = 0
-    DEGRADED = 1
-    HOLD = 2
-    PROTECTIVE_STOP = 3
-    FAULT = 4
-
 
 MODE_OF: Final[dict[Level, Mode]] = {
     Level.NORMAL: "NORMAL",
@@ -43,49 +29,6 @@ STOPPED_MODES: Final[frozenset[Mode]] = frozenset({"INIT", "HOLD", "PROTECTIVE_S
 """Modes in which no wheel turns (in HOLD after a ramp). EGRESS and DOCK drive slowly; nothing enters them yet."""
 IMMEDIATE_STOP_MODES: Final[frozenset[Mode]] = frozenset({"INIT", "PROTECTIVE_STOP", "FAULT"})
 _NEVER: Final = -math.inf
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SafetyInputs:
-    """Inputs of one step; ages in s by the robot's own monotonic clock, infinite for what was never received.
-
-    map_age: since the map copy was last confirmed to be the newest version. map_gap: for how long deltas have been
-    missing, 0 when none are. plan_age: since the planner's last message about the goal. released_remaining: m of
-    released path ahead. path_problem: why the path must not be driven. inside_blocked: the blocked area or zone that
-    the robot is in. caution: a reason to drive slowly here. guardian_lost: why there is no link to the guardian.
-    base_stopped: why the guardian keeps the wheels at zero.
-    """
-
-    map_loaded: bool = False
-    map_age: float = math.inf
-    map_gap: float = 0.0
-    localization: Localization = "none"
-    localization_detail: str = ""
-    lidar_age: float = math.inf
-    scan_age: float = math.inf
-    identical_scans: int = 1
-    base_age: float = math.inf
-    guardian_lost: str | None = None
-    base_fault: str | None = None
-    base_stopped: str | None = None
-    bumper: bool = False
-    cliff: bool = False
-    wheel_drop: bool = False
-    mission: bool = False
-    plan_age: float = 0.0
-    released_remaining: float = 0.0
-    path_problem: str | None = None
-    inside_blocked: str | None = None
-    caution: str | None = None
-    request: Request | None = None
-
-
-class Finding(NamedTuple):
-    """One reason to restrict the robot: the level, the reason, and whether an operator must enable it again."""
-
-    level: Level
-    reason: str
-    operator: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,93 +65,6 @@ class SafetyOutputs:
     refusal: str | None
 
 
-def collect_findings(inputs: SafetyInputs, config: SafetyConfig) -> list[Finding]:
-    """Return every finding that restricts the robot, in no particular order."""
-    found: list[Finding] = []
-    found.extend(_check_base(inputs, config))
-    found.extend(_check_lidar(inputs, config))
-    found.extend(_check_pose(inputs))
-    found.extend(_check_map(inputs, config))
-    found.extend(_check_plan(inputs, config))
-    return found
-
-
-def _check_base(inputs: SafetyInputs, config: SafetyConfig) -> list[Finding]:
-    found: list[Finding] = []
-    if inputs.base_fault is not None:
-        found.append(Finding(Level.FAULT, f"base: {inputs.base_fault}"))
-    if inputs.bumper:
-        found.append(Finding(Level.FAULT, "the bumper is pressed"))
-    if inputs.cliff:
-        found.append(Finding(Level.FAULT, "a cliff sensor sees no floor"))
-    if inputs.wheel_drop:
-        found.append(Finding(Level.FAULT, "a wheel has dropped"))
-    if inputs.guardian_lost is not None:
-        found.append(Finding(Level.PROTECTIVE_STOP, f"the guardian is not connected: {inputs.guardian_lost}"))
-    elif not inputs.base_age <= config.base_lost:
-        found.append(Finding(Level.PROTECTIVE_STOP, f"no message from the guardian for {_seconds(inputs.base_age)}"))
-    elif inputs.base_stopped is not None:
-        found.append(Finding(Level.PROTECTIVE_STOP, f"the guardian holds the wheels: {inputs.base_stopped}"))
-    return found
-
-
-def _check_lidar(inputs: SafetyInputs, config: SafetyConfig) -> list[Finding]:
-    found: list[Finding] = []
-    if not inputs.lidar_age <= config.lidar_lost:
-        found.append(Finding(Level.PROTECTIVE_STOP, f"the lidar has been silent for {_seconds(inputs.lidar_age)}"))
-    if not inputs.scan_age <= config.scan_lost:
-        found.append(Finding(Level.PROTECTIVE_STOP, f"no complete scan of the lidar for {_seconds(inputs.scan_age)}"))
-    if inputs.identical_scans >= config.identical_scans:
-        found.append(
-            Finding(Level.PROTECTIVE_STOP, f"the lidar repeats itself: {inputs.identical_scans} identical scans")
-        )
-    return found
-
-
-def _check_pose(inputs: SafetyInputs) -> list[Finding]:
-    detail = f": {inputs.localization_detail}" if inputs.localization_detail else ""
-    found: list[Finding] = []
-    if inputs.localization == "none":
-        found.append(Finding(Level.PROTECTIVE_STOP, f"the pose is not known yet{detail}", operator=True))
-    elif inputs.localization == "lost":
-        found.append(Finding(Level.PROTECTIVE_STOP, f"the pose is lost{detail}", operator=True))
-    elif inputs.localization == "weak":
-        found.append(Finding(Level.DEGRADED, f"the pose is uncertain{detail}"))
-    if inputs.inside_blocked is not None:
-        found.append(Finding(Level.PROTECTIVE_STOP, f"the robot is in {inputs.inside_blocked}", operator=True))
-    return found
-
-
-def _check_map(inputs: SafetyInputs, config: SafetyConfig) -> list[Finding]:
-    found: list[Finding] = []
-    if not inputs.map_loaded:
-        found.append(Finding(Level.HOLD, "no map was received yet"))
-    elif not inputs.map_age <= config.map_lost:
-        found.append(Finding(Level.HOLD, f"the map is {_seconds(inputs.map_age)} old"))
-    elif not inputs.map_age <= config.map_late:
-        found.append(Finding(Level.DEGRADED, f"the map is {_seconds(inputs.map_age)} old"))
-    if not inputs.map_gap <= config.gap_lost:
-        found.append(Finding(Level.HOLD, f"changes of the map have been missing for {_seconds(inputs.map_gap)}"))
-    return found
-
-
-def _check_plan(inputs: SafetyInputs, config: SafetyConfig) -> list[Finding]:
-    found: list[Finding] = []
-    if inputs.caution is not None:
-        found.append(Finding(Level.DEGRADED, inputs.caution))
-    if not inputs.mission:
-        return found
-    if inputs.path_problem is not None:
-        found.append(Finding(Level.HOLD, inputs.path_problem))
-    if not inputs.plan_age <= config.plan_late:
-        silent = f"the planner has been silent for {_seconds(inputs.plan_age)}"
-        if inputs.released_remaining > config.released_end:
-            found.append(Finding(Level.DEGRADED, silent))
-        else:
-            found.append(Finding(Level.HOLD, f"{silent} and no released path is left"))
-    return found
-
-
 def step(
     state: SafetyState, inputs: SafetyInputs, now: float, config: SafetyConfig | None = None
 ) -> tuple[SafetyState, SafetyOutputs]:
@@ -220,7 +76,7 @@ def step(
     config = config or SafetyConfig()
     findings = collect_findings(inputs, config)
     map_held_at = state.map_held_at
-    if any(finding.level == Level.HOLD for finding in _check_map(inputs, config)):
+    if any(finding.about_map for finding in findings):
         map_held_at = now
     elif inputs.mission and now - inputs.plan_age <= map_held_at:
         findings.append(Finding(Level.HOLD, "waiting for a plan on the fresh map"))
@@ -279,7 +135,7 @@ def _enable(state: SafetyState, inputs: SafetyInputs, findings: list[Finding]) -
     present = [finding.reason for finding in findings if finding.level >= limit]
     if present:
         return state, f"the cause is still there: {'; '.join(present)}"
-    return replace(state, enabled=True, latched=()), None
+    return replace(state, enabled=True, latched=(), stopped_since=math.inf), None
 
 
 def _advance(
@@ -375,56 +231,3 @@ def _outputs(state: SafetyState, before: Mode, refusal: str | None, config: Safe
         changed=state.mode != before,
         refusal=refusal,
     )
-
-
-def limit_wheels(  # noqa: PLR0913  # the gate knows nothing of the motion's settings
-    requested: tuple[float, float],
-    last: tuple[float, float],
-    outputs: SafetyOutputs,
-    dt: float,
-    *,
-    acceleration: float,
-    wheel_speed: float,
-    config: SafetyConfig | None = None,
-) -> tuple[float, float]:
-    """Return the wheel speeds (left, right; m/s) that may be streamed now, `dt` s after `last` was.
-
-    Stopped modes bring the wheels to rest, at once or along a straight ramp that ends within `config.ramp` s whatever
-    the speed; the ratio of the wheels is kept, so the robot brakes along its arc. Driving modes cap the robot's speed,
-    then each wheel's speed and rate of change; never does a wheel speed up while the other limits apply.
-    """
-    config = config or SafetyConfig()
-    if outputs.stop == "immediate":
-        return 0.0, 0.0
-    if outputs.stop == "ramp":
-        return ramp_down(last, dt, wheel_speed / config.ramp)
-    left, right = requested
-    if not (math.isfinite(left) and math.isfinite(right)):
-        return ramp_down(last, dt, wheel_speed / config.ramp)
-    scale = 1.0
-    centre = 0.5 * abs(left + right)
-    if centre > outputs.cap:
-        scale = outputs.cap / centre
-    fastest = max(abs(left), abs(right)) * scale
-    if fastest > wheel_speed:
-        scale *= wheel_speed / fastest
-    target = left * scale, right * scale
-    change = acceleration * max(dt, 0.0)
-    largest = max(abs(target[0] - last[0]), abs(target[1] - last[1]))
-    if largest <= change:
-        return target
-    share = change / largest
-    return last[0] + (target[0] - last[0]) * share, last[1] + (target[1] - last[1]) * share
-
-
-def ramp_down(last: tuple[float, float], dt: float, deceleration: float) -> tuple[float, float]:
-    """Return wheel speeds (m/s) on the way from `last` to rest, the faster wheel slowing by `deceleration` (m/s2)."""
-    fastest = max(abs(last[0]), abs(last[1]))
-    slowed = fastest - deceleration * max(dt, 0.0)
-    if slowed <= 1e-9:
-        return 0.0, 0.0
-    return last[0] * slowed / fastest, last[1] * slowed / fastest
-
-
-def _seconds(age: float) -> str:
-    return "as long as the agent runs" if math.isinf(age) else f"{age:.1f} s"

@@ -10,16 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from robot_agent.config import SafetyConfig
-from robot_agent.safety.gate import (
-    Level,
-    SafetyInputs,
-    SafetyOutputs,
-    SafetyState,
-    collect_findings,
-    limit_wheels,
-    ramp_down,
-    step,
-)
+from robot_agent.safety.conditions import Level, SafetyInputs, collect_findings
+from robot_agent.safety.gate import SafetyOutputs, SafetyState, step
+from robot_agent.safety.wheel_limits import limit_wheels, ramp_down
 
 CONFIG = SafetyConfig()
 DT = 0.05

@@ -1,0 +1,207 @@
+"""The conditions that restrict the robot, in one table: when each holds, its level, and what it tells people.
+
+Pure: values in, values out. The gate (`robot_agent.safety.gate`) turns the findings of one step into a mode.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from robot_agent.config import SafetyConfig
+
+Localization = Literal["good", "weak", "lost", "none"]
+Request = Literal["enable", "disable", "reset"]
+
+
+class Level(IntEnum):
+    """How restrictive a finding is."""
+
+    NORMAL = 0
+    DEGRADED = 1
+    HOLD = 2
+    PROTECTIVE_STOP = 3
+    FAULT = 4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SafetyInputs:
+    """Inputs of one step; ages in s by the robot's own monotonic clock, infinite for what was never received.
+
+    map_age: since the map copy was last confirmed to be the newest version. map_gap: for how long deltas have been
+    missing, 0 when none are. plan_age: since the planner's last message about the goal. released_remaining: m of
+    released path ahead. path_problem: why the path must not be driven. inside_blocked: the blocked area or zone that
+    the robot is in. caution: a reason to drive slowly here. guardian_lost: why there is no link to the guardian.
+    base_stopped: why the guardian keeps the wheels at zero.
+    """
+
+    map_loaded: bool = False
+    map_age: float = math.inf
+    map_gap: float = 0.0
+    localization: Localization = "none"
+    localization_detail: str = ""
+    lidar_age: float = math.inf
+    scan_age: float = math.inf
+    identical_scans: int = 1
+    base_age: float = math.inf
+    guardian_lost: str | None = None
+    base_fault: str | None = None
+    base_stopped: str | None = None
+    bumper: bool = False
+    cliff: bool = False
+    wheel_drop: bool = False
+    mission: bool = False
+    plan_age: float = 0.0
+    released_remaining: float = 0.0
+    path_problem: str | None = None
+    inside_blocked: str | None = None
+    caution: str | None = None
+    request: Request | None = None
+
+
+class Finding(NamedTuple):
+    """One reason to restrict the robot: the level, the reason, and whether an operator must enable it again.
+
+    `about_map`: the plan that the robot has may rest on another map, and must be followed by a newer one.
+    """
+
+    level: Level
+    reason: str
+    operator: bool = False
+    about_map: bool = False
+
+
+class Condition(NamedTuple):
+    """One row of the table; `holds` gets inputs and limits, `sentence` gets the inputs. The rest as in `Finding`.
+
+    An age that is no number fails every comparison with its limit, so it counts as too old.
+    """
+
+    level: Level
+    holds: Callable[[SafetyInputs, SafetyConfig], bool]
+    sentence: Callable[[SafetyInputs], str]
+    operator: bool = False
+    about_map: bool = False
+
+
+def _seconds(age: float) -> str:
+    return "as long as the agent runs" if math.isinf(age) else f"{age:.1f} s"
+
+
+def _detail(inputs: SafetyInputs) -> str:
+    return f": {inputs.localization_detail}" if inputs.localization_detail else ""
+
+
+def _planner_silent(inputs: SafetyInputs, config: SafetyConfig) -> bool:
+    return inputs.mission and not inputs.plan_age <= config.plan_late
+
+
+def _guardian_heard(inputs: SafetyInputs, config: SafetyConfig) -> bool:
+    return inputs.guardian_lost is None and inputs.base_age <= config.base_lost
+
+
+CONDITIONS: Final[tuple[Condition, ...]] = (
+    # --- base and guardian ---
+    Condition(Level.FAULT, lambda i, _: i.base_fault is not None, lambda i: f"base: {i.base_fault}"),
+    Condition(Level.FAULT, lambda i, _: i.bumper, lambda _: "the bumper is pressed"),
+    Condition(Level.FAULT, lambda i, _: i.cliff, lambda _: "a cliff sensor sees no floor"),
+    Condition(Level.FAULT, lambda i, _: i.wheel_drop, lambda _: "a wheel has dropped"),
+    Condition(
+        Level.PROTECTIVE_STOP,
+        lambda i, _: i.guardian_lost is not None,
+        lambda i: f"the guardian is not connected: {i.guardian_lost}",
+    ),
+    Condition(
+        Level.PROTECTIVE_STOP,
+        lambda i, c: i.guardian_lost is None and not _guardian_heard(i, c),
+        lambda i: f"no message from the guardian for {_seconds(i.base_age)}",
+    ),
+    Condition(
+        Level.PROTECTIVE_STOP,
+        lambda i, c: _guardian_heard(i, c) and i.base_stopped is not None,
+        lambda i: f"the guardian holds the wheels: {i.base_stopped}",
+    ),
+    # --- lidar ---
+    Condition(
+        Level.PROTECTIVE_STOP,
+        lambda i, c: not i.lidar_age <= c.lidar_lost,
+        lambda i: f"the lidar has been silent for {_seconds(i.lidar_age)}",
+    ),
+    Condition(
+        Level.PROTECTIVE_STOP,
+        lambda i, c: not i.scan_age <= c.scan_lost,
+        lambda i: f"no complete scan of the lidar for {_seconds(i.scan_age)}",
+    ),
+    Condition(
+        Level.PROTECTIVE_STOP,
+        lambda i, c: i.identical_scans >= c.identical_scans,
+        lambda i: f"the lidar repeats itself: {i.identical_scans - 1} scans in a row equal earlier ones",
+    ),
+    # --- pose ---
+    Condition(
+        Level.PROTECTIVE_STOP,
+        lambda i, _: i.localization == "none",
+        lambda i: f"the pose is not known yet{_detail(i)}",
+        operator=True,
+    ),
+    Condition(
+        Level.PROTECTIVE_STOP,
+        lambda i, _: i.localization == "lost",
+        lambda i: f"the pose is lost{_detail(i)}",
+        operator=True,
+    ),
+    Condition(Level.DEGRADED, lambda i, _: i.localization == "weak", lambda i: f"the pose is uncertain{_detail(i)}"),
+    Condition(
+        Level.PROTECTIVE_STOP,
+        lambda i, _: i.inside_blocked is not None,
+        lambda i: f"the robot is in {i.inside_blocked}",
+        operator=True,
+    ),
+    # --- map ---
+    Condition(Level.HOLD, lambda i, _: not i.map_loaded, lambda _: "no map was received yet", about_map=True),
+    Condition(
+        Level.HOLD,
+        lambda i, c: i.map_loaded and not i.map_age <= c.map_lost,
+        lambda i: f"the map is {_seconds(i.map_age)} old",
+        about_map=True,
+    ),
+    Condition(
+        Level.DEGRADED,
+        lambda i, c: i.map_loaded and c.map_late < i.map_age <= c.map_lost,
+        lambda i: f"the map is {_seconds(i.map_age)} old",
+    ),
+    Condition(
+        Level.HOLD,
+        lambda i, c: not i.map_gap <= c.gap_lost,
+        lambda i: f"changes of the map have been missing for {_seconds(i.map_gap)}",
+        about_map=True,
+    ),
+    # --- plan ---
+    Condition(Level.DEGRADED, lambda i, _: i.caution is not None, lambda i: str(i.caution)),
+    Condition(Level.HOLD, lambda i, _: i.mission and i.path_problem is not None, lambda i: str(i.path_problem)),
+    Condition(
+        Level.DEGRADED,
+        lambda i, c: _planner_silent(i, c) and i.released_remaining > c.released_end,
+        lambda i: f"the planner has been silent for {_seconds(i.plan_age)}",
+    ),
+    Condition(
+        Level.HOLD,
+        lambda i, c: _planner_silent(i, c) and not i.released_remaining > c.released_end,
+        lambda i: f"the planner has been silent for {_seconds(i.plan_age)} and no released path is left",
+    ),
+)
+"""Every condition that restricts the robot; the most restrictive one that holds wins."""
+
+
+def collect_findings(inputs: SafetyInputs, config: SafetyConfig) -> list[Finding]:
+    """Return every finding that restricts the robot, in the table's order."""
+    return [
+        Finding(condition.level, condition.sentence(inputs), condition.operator, condition.about_map)
+        for condition in CONDITIONS
+        if condition.holds(inputs, config)
+    ]

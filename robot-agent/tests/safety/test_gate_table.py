@@ -1,0 +1,381 @@
+"""Every condition in every mode: which mode follows, when it is left, and who must act. All limits are literal here."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import pytest
+
+from robot_agent.config import SafetyConfig
+from robot_agent.safety.conditions import CONDITIONS, Finding, Level, SafetyInputs, collect_findings
+from robot_agent.safety.gate import SafetyState, step
+
+DT = 0.05
+HEALTHY = {
+    "map_loaded": True, "map_age": 0.1, "localization": "good", "lidar_age": 0.02, "scan_age": 0.1, "base_age": 0.02,
+    "mission": True, "plan_age": 0.1, "released_remaining": 5.0,
+}  # fmt: skip
+
+
+class Row(NamedTuple):
+    """A condition: inputs at which it holds, inputs at which it just does not, and what follows."""
+
+    name: str
+    holds: dict
+    not_yet: dict
+    mode: str
+    left: str
+    """By whom a robot in this mode is released: by an operator, or alone."""
+    words: str
+
+
+ROWS = [
+    Row("base fault", {"base_fault": "OI mode"}, {}, "FAULT", "operator", "base: OI mode"),
+    Row("bumper", {"bumper": True}, {}, "FAULT", "operator", "the bumper is pressed"),
+    Row("cliff", {"cliff": True}, {}, "FAULT", "operator", "a cliff sensor sees no floor"),
+    Row("wheel drop", {"wheel_drop": True}, {}, "FAULT", "operator", "a wheel has dropped"),
+    Row(
+        "guardian lost",
+        {"guardian_lost": "closed"},
+        {},
+        "PROTECTIVE_STOP",
+        "alone",
+        "the guardian is not connected: closed",
+    ),
+    Row(
+        "guardian silent",
+        {"base_age": 0.301},
+        {"base_age": 0.3},
+        "PROTECTIVE_STOP",
+        "alone",
+        "no message from the guardian for 0.3 s",
+    ),
+    Row(
+        "guardian never heard",
+        {"base_age": math.inf},
+        {},
+        "PROTECTIVE_STOP",
+        "alone",
+        "no message from the guardian for as long as the agent runs",
+    ),
+    Row(
+        "wheels held",
+        {"base_stopped": "no fresh command"},
+        {},
+        "PROTECTIVE_STOP",
+        "alone",
+        "the guardian holds the wheels: no fresh command",
+    ),
+    Row(
+        "lidar silent",
+        {"lidar_age": 0.301},
+        {"lidar_age": 0.3},
+        "PROTECTIVE_STOP",
+        "alone",
+        "the lidar has been silent for 0.3 s",
+    ),
+    Row(
+        "scan lost",
+        {"scan_age": 0.451},
+        {"scan_age": 0.45},
+        "PROTECTIVE_STOP",
+        "alone",
+        "no complete scan of the lidar for 0.5 s",
+    ),
+    Row(
+        "scans repeat",
+        {"identical_scans": 3},
+        {"identical_scans": 2},
+        "PROTECTIVE_STOP",
+        "alone",
+        "the lidar repeats itself",
+    ),
+    Row("pose unknown", {"localization": "none"}, {}, "PROTECTIVE_STOP", "operator", "the pose is not known yet"),
+    Row(
+        "pose lost",
+        {"localization": "lost", "localization_detail": "no fit"},
+        {},
+        "PROTECTIVE_STOP",
+        "operator",
+        "the pose is lost: no fit",
+    ),
+    Row("pose weak", {"localization": "weak"}, {}, "DEGRADED", "alone", "the pose is uncertain"),
+    Row("in a zone", {"inside_blocked": "the zone x"}, {}, "PROTECTIVE_STOP", "operator", "the robot is in the zone x"),
+    Row("map lost", {"map_age": 3.01}, {"map_age": 0.99}, "HOLD", "alone", "the map is 3.0 s old"),
+    Row("map late", {"map_age": 1.01}, {"map_age": 1.0}, "DEGRADED", "alone", "the map is 1.0 s old"),
+    Row("map still late", {"map_age": 3.0}, {}, "DEGRADED", "alone", "the map is 3.0 s old"),
+    Row(
+        "map gap",
+        {"map_gap": 1.01},
+        {"map_gap": 1.0},
+        "HOLD",
+        "alone",
+        "changes of the map have been missing for 1.0 s",
+    ),
+    Row("caution", {"caution": "area z4 is unknown"}, {}, "DEGRADED", "alone", "area z4 is unknown"),
+    Row(
+        "path problem",
+        {"path_problem": "goal blocked"},
+        {"path_problem": "goal blocked", "mission": False},
+        "HOLD",
+        "alone",
+        "goal blocked",
+    ),
+    Row(
+        "planner late",
+        {"plan_age": 1.51},
+        {"plan_age": 1.5},
+        "DEGRADED",
+        "alone",
+        "the planner has been silent for 1.5 s",
+    ),
+    Row(
+        "planner late before the end",
+        {"plan_age": 2.0, "released_remaining": 0.151},
+        {},
+        "DEGRADED",
+        "alone",
+        "the planner has been silent for 2.0 s",
+    ),
+    Row(
+        "planner lost",
+        {"plan_age": 1.51, "released_remaining": 0.15},
+        {"plan_age": 1.51, "released_remaining": 0.15, "mission": False},
+        "HOLD",
+        "alone",
+        "and no released path is left",
+    ),
+]
+RANK = {"NORMAL": 0, "DEGRADED": 1, "HOLD": 2, "PROTECTIVE_STOP": 3, "FAULT": 4}
+CAP = {"INIT": 0.0, "NORMAL": 0.30, "DEGRADED": 0.15, "HOLD": 0.0, "PROTECTIVE_STOP": 0.0, "FAULT": 0.0}
+STOP = {"INIT": "immediate", "NORMAL": "none", "DEGRADED": "none", "HOLD": "ramp", "PROTECTIVE_STOP": "immediate",
+        "FAULT": "immediate"}  # fmt: skip
+TO = {
+    "INIT": None, "NORMAL": {}, "DEGRADED": {"localization": "weak"}, "HOLD": {"path_problem": "x"},
+    "PROTECTIVE_STOP": {"lidar_age": 9.0}, "FAULT": {"bumper": True},
+}  # fmt: skip
+
+
+def inputs(**changes):
+    return SafetyInputs(**{**HEALTHY, **changes})
+
+
+class Gate:
+    def __init__(self, mode="NORMAL"):
+        self.state, self.now, self.out = SafetyState(), 100.0, None
+        if mode == "INIT":
+            self.run()
+            return
+        self.run(request="enable")
+        self.run(2.2)
+        assert self.out.mode == "NORMAL"
+        if TO[mode]:
+            self.run(**TO[mode])
+        assert self.out.mode == mode
+
+    def run(self, seconds=DT, **changes):
+        for _ in range(max(1, round(seconds / DT))):
+            self.now += DT
+            self.state, self.out = step(self.state, inputs(**changes), self.now)
+            changes.pop("request", None)
+        return self.out
+
+
+def test_every_row_of_the_table_is_listed_here():
+    covered = set()
+    for row in ROWS:
+        covered |= {i for i, c in enumerate(CONDITIONS) if c.holds(inputs(**row.holds), SafetyConfig())}
+    covered |= {i for i, c in enumerate(CONDITIONS) if c.holds(inputs(map_loaded=False), SafetyConfig())}
+    assert covered == set(range(len(CONDITIONS)))
+
+
+@pytest.mark.parametrize("row", ROWS, ids=[row.name for row in ROWS])
+@pytest.mark.parametrize("before", ["INIT", "NORMAL", "DEGRADED", "HOLD", "PROTECTIVE_STOP", "FAULT"])
+def test_mode_after_a_condition_begins_and_after_it_ends(before, row):
+    holds, mode, operator, words = row.holds, row.mode, row.left == "operator", row.words
+    gate = Gate(before)
+    out = gate.run(**holds)
+    stays = before in {"INIT", "FAULT"} or RANK[before] > RANK[mode]
+    after = before if stays else mode
+    assert out.mode == after
+    assert out.changed == (after != before)
+    assert (out.cap, out.stop) == (CAP[after], STOP[after])
+    assert any(words in reason for reason in out.reasons)
+    # The condition ends: the mode relaxes after 2 s, unless an operator must act.
+    assert gate.run(1.9).mode == after
+    relaxed = gate.run(0.3).mode
+    if before == "INIT":
+        assert relaxed == "INIT"
+    elif after == "FAULT" or before == "FAULT":
+        assert relaxed == "FAULT"
+    elif operator:
+        assert relaxed == "PROTECTIVE_STOP"
+        assert any(reason.endswith("(an operator must enable again)") for reason in gate.out.reasons)
+        assert gate.run(request="enable").refusal is None
+        assert gate.run(2.2).mode == "NORMAL"
+    else:
+        assert relaxed == "NORMAL"
+
+
+@pytest.mark.parametrize("row", ROWS, ids=[row.name for row in ROWS])
+def test_condition_holds_beyond_its_limit_and_not_at_it(row):
+    gate = Gate()
+    assert gate.run(**row.not_yet).mode == "NORMAL"
+    assert gate.run(**row.holds).mode == row.mode
+
+
+@pytest.mark.parametrize("row", ROWS, ids=[row.name for row in ROWS])
+def test_enable_is_refused_by_conditions_that_stop_at_once_and_by_no_other(row):
+    gate = Gate("INIT")
+    out = gate.run(request="enable", **row.holds)
+    if RANK[row.mode] >= 3:
+        assert out.mode == "INIT"
+        assert out.refusal.startswith("the cause is still there: ")
+        assert row.words in out.refusal
+    else:
+        assert out.refusal is None
+        assert out.mode == row.mode
+
+
+def test_missing_map_holds_and_refuses_an_enable():
+    gate = Gate()
+    out = gate.run(map_loaded=False)
+    assert (out.mode, out.reasons) == ("HOLD", ("no map was received yet",))
+    gate = Gate("INIT")
+    assert gate.run(request="enable", map_loaded=False).refusal == "the cause is still there: no map was received yet"
+
+
+def test_findings_come_with_level_and_operator_in_order_of_the_table():
+    found = collect_findings(inputs(bumper=True, localization="lost", map_gap=2.0), SafetyConfig())
+    assert found == [
+        Finding(Level.FAULT, "the bumper is pressed"),
+        Finding(Level.PROTECTIVE_STOP, "the pose is lost", operator=True),
+        Finding(Level.HOLD, "changes of the map have been missing for 2.0 s", about_map=True),
+    ]
+    out = Gate().run(caution="slow here", map_gap=2.0, lidar_age=1.0)
+    assert [reason[:9] for reason in out.reasons] == ["the lidar", "changes o", "slow here"]
+
+
+@pytest.mark.parametrize("field", ["lidar_age", "scan_age", "base_age", "map_age", "map_gap", "plan_age"])
+def test_age_that_is_no_number_counts_as_too_old(field):
+    assert RANK[Gate().run(**{field: math.nan}).mode] >= (1 if field == "plan_age" else 2)
+
+
+# --- requests in every mode ---
+
+
+@pytest.mark.parametrize("before", ["INIT", "NORMAL", "DEGRADED", "HOLD", "PROTECTIVE_STOP", "FAULT"])
+def test_disable_leads_to_init_from_every_mode_but_fault(before):
+    out = Gate(before).run(request="disable")
+    assert out.refusal is None
+    assert out.mode == ("FAULT" if before == "FAULT" else "INIT")
+    assert out.cap == 0.0
+
+
+@pytest.mark.parametrize("before", ["INIT", "NORMAL", "DEGRADED", "HOLD", "PROTECTIVE_STOP"])
+def test_reset_without_a_fault_is_refused_and_changes_nothing(before):
+    gate = Gate(before)
+    out = gate.run(request="reset", **(TO[before] or {}))
+    assert out.mode == before
+    assert out.refusal == f"there is no fault to reset: the mode is {before}"
+
+
+def test_reset_of_a_fault_needs_its_cause_gone_and_leads_to_init():
+    gate = Gate("FAULT")
+    assert gate.run(request="enable").refusal == "a fault is latched, reset it first: the bumper is pressed"
+    refused = gate.run(request="reset", bumper=True, cliff=True)
+    assert refused.refusal == "the cause is still there: the bumper is pressed; a cliff sensor sees no floor"
+    assert gate.run(1.0).reasons == ("the bumper is pressed",)
+    assert gate.run(cliff=True).reasons == ("the bumper is pressed", "a cliff sensor sees no floor")
+    accepted = gate.run(request="reset", base_fault="the bumper is pressed (left)")
+    assert (accepted.mode, accepted.refusal) == ("INIT", None)
+    assert gate.run(5.0).reasons == ("waiting for an operator to enable",)
+
+
+def test_enabled_again_after_a_reset_the_old_fault_counts_no_more():
+    gate = Gate("FAULT")
+    gate.run(request="reset")
+    out = gate.run(request="enable")
+    assert (out.refusal, out.mode) == (None, "PROTECTIVE_STOP")  # healthy for 2 s first
+    assert gate.run(2.0).mode == "NORMAL"
+
+
+# --- durations ---
+
+
+def test_hold_of_sixty_seconds_needs_an_operator_and_a_shorter_one_does_not():
+    gate = Gate()
+    gate.run(57.8, path_problem="x")
+    assert gate.run(2.1).mode == "NORMAL"
+    gate.run(59.9, path_problem="x")
+    assert not any("operator" in reason for reason in gate.out.reasons)
+    gate.run(0.2, path_problem="x")
+    held = "stopped for more than 60 s, an operator must enable again (x)"
+    assert gate.out.reasons == ("x", f"{held} (an operator must enable again)")
+    assert gate.run(30.0).mode == "HOLD"
+    assert gate.run(request="enable", path_problem="x").refusal == "the cause is still there: x"
+    assert gate.run(request="enable").refusal is None
+    assert gate.run(2.1).mode == "NORMAL"
+
+
+def test_sixty_seconds_begin_anew_after_driving():
+    gate = Gate()
+    for _ in range(3):
+        gate.run(40.0, path_problem="x")
+        assert gate.run(2.1).mode == "NORMAL"
+        gate.run(1.0)
+    assert gate.state.latched == ()
+
+
+def test_third_protective_stop_in_sixty_seconds_is_a_fault_and_the_time_slides():
+    gate = Gate()
+    for pause in (29.5, 31.0, 29.0):
+        assert gate.run(lidar_age=9.0).mode == "PROTECTIVE_STOP"
+        assert gate.run(pause).mode == "NORMAL"
+    assert gate.run(lidar_age=9.0).mode == "PROTECTIVE_STOP"
+    assert gate.run(2.2).mode == "NORMAL"
+    out = gate.run(lidar_age=9.0)
+    assert out.mode == "FAULT"
+    assert out.reasons[0].startswith("3 protective stops within 60 s, the last because: the lidar has been silent")
+
+
+def test_longer_protective_stop_counts_once():
+    gate = Gate()
+    assert gate.run(40.0, lidar_age=9.0).mode == "PROTECTIVE_STOP"
+    assert gate.run(2.2).mode == "NORMAL"
+    assert len(gate.state.stops) == 1
+
+
+def test_hold_for_the_map_waits_for_a_plan_that_is_newer_than_the_map():
+    gate = Gate()
+    gate.run(1.0, map_gap=2.0)
+    assert gate.run(DT, plan_age=0.06).reasons[0] == "waiting for a plan on the fresh map"
+    assert gate.run(5.0, plan_age=1.4 + 5.0).mode == "HOLD"
+    assert gate.run(2.1, plan_age=0.0).mode == "NORMAL"
+    gate.run(1.0, map_gap=2.0)
+    assert gate.run(2.1, mission=False, plan_age=100.0).mode == "NORMAL"
+
+
+def test_reason_of_the_last_escalation_is_told_until_the_mode_relaxes():
+    gate = Gate()
+    gate.run(lidar_age=0.5)
+    assert gate.run(1.0).reasons == ("over, waiting until healthy for 2 s: the lidar has been silent for 0.5 s",)
+    gate.run(0.5, localization="weak")
+    assert gate.out.reasons == ("the pose is uncertain",)
+    assert gate.run(0.6).mode == "DEGRADED"
+
+
+def test_second_condition_for_an_operator_is_not_added_to_a_stop_that_waits_for_one():
+    gate = Gate()
+    gate.run(inside_blocked="the zone x")
+    gate.run(inside_blocked="the zone x", localization="lost")
+    assert [finding.reason for finding in gate.state.latched] == ["the robot is in the zone x"]
+
+
+def test_disable_forgets_latches_and_stops():
+    gate = Gate()
+    gate.run(inside_blocked="the zone x")
+    gate.run(request="disable")
+    assert (gate.state.latched, gate.state.stops, gate.state.enabled) == ((), (), False)
+    assert gate.run(request="enable").refusal is None

@@ -73,6 +73,25 @@ class StopFieldConfig:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class VisibilityConfig:
+    """When missing returns of the lidar in the direction of travel slow or stop the robot; m, rad, m/s, shares."""
+
+    half_width: float = 0.70
+    """Directions this near to the heading are those of travel: a body of 0.17 m needs 40 degrees 0.26 m ahead."""
+    range_share: float = 0.75
+    range_max: float = 6.0
+    """A return is expected of walls within this range, and within `range_share` of the lidar's rated range."""
+    speed: float = 0.10
+    missing_slow: float = 0.5
+    missing_refused: float = 0.9
+    blind_slow: float = 0.1
+    blind_refused: float = 0.5
+    """Shares of the sectors of travel without an expected return, and without any sample."""
+    lift: float = 0.7
+    """A limit ends below this part of the share at which it began."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LocalizationConfig:
     """Particle filter (Thrun, Burgard, Fox 2005; KLD sampling by Fox 2003) and the likelihood field's model."""
 
@@ -145,6 +164,7 @@ class AgentConfig:
     """Charge (of 1) below which the robot announces a low battery."""
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     stop_field: StopFieldConfig = field(default_factory=StopFieldConfig)
+    visibility: VisibilityConfig = field(default_factory=VisibilityConfig)
     localization: LocalizationConfig = field(default_factory=LocalizationConfig)
 
 

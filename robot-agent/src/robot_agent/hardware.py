@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections import deque
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Generic, Literal, NamedTuple, Protocol, TypeVar
+from typing import TYPE_CHECKING, Annotated, Final, Generic, Literal, NamedTuple, Protocol, TypeVar
 
 import msgspec
 from msgspec import Meta
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from robot_agent.stop_command import StopCommand
+
+_REMEMBERED_SCANS: Final = 64
 
 Options = TypeVar("Options", bound=msgspec.Struct)
 """A driver's own options: a frozen struct whose fields name their units and that refuses unknown fields."""
@@ -144,8 +147,8 @@ class LaserScan:
     ranges_m: float64[n], nan without a return; not clipped to the rated range, because a too-near obstacle is an
     obstacle. quality: uint8[n], strength of the return on the device's own scale, 0 for none.
     started_at, ended_at: arrival of the first and last sample (s of the caller's clock), interpolated in a batch.
-    repeats: how many scans in a row were identical in every decoded bit, this one included; a working lidar never
-    gives two equal ones, a stuck link does.
+    repeats: 1, and 1 more for each scan in a row that is identical, in every decoded bit, to one of the 64 before it,
+    this one included. A working lidar never gives two equal ones; a stuck link or a driver that replays a buffer does.
     """
 
     angles_rad: NDArray[np.float64]
@@ -171,19 +174,22 @@ class LidarSamples:
 
 
 class RepeatCounter:
-    """Counts how many scans in a row were identical, from the raw fields that a driver decoded."""
+    """Counts how many scans in a row repeat earlier ones, from the raw fields that a driver decoded.
+
+    The last 64 scans are remembered by their digests: noise never repeats a scan, a replayed buffer of up to 64 does.
+    """
 
     def __init__(self) -> None:
-        self._digest = b""
-        self._repeats = 0
+        self._digests: deque[bytes] = deque(maxlen=_REMEMBERED_SCANS)
+        self._repeats = 1
 
     def count(self, *fields: NDArray[np.generic]) -> int:
-        """Return how many scans in a row had exactly these fields, this one included."""
+        """Return 1 for a new scan; for one that equals an earlier one, 1 more than for the scan before it."""
         digest = hashlib.blake2b(digest_size=16)
         for field in fields:
             digest.update(field.tobytes())
-        self._repeats = self._repeats + 1 if digest.digest() == self._digest else 1
-        self._digest = digest.digest()
+        self._repeats = self._repeats + 1 if digest.digest() in self._digests else 1
+        self._digests.append(digest.digest())
         return self._repeats
 
 

@@ -314,10 +314,10 @@ def test_a_scan_has_counter_clockwise_angles_and_metres():
     assert (scan.angles_rad.dtype, scan.ranges_m.dtype) == (np.float64, np.float64)
 
 
-def test_identical_scans_are_counted_and_a_different_one_starts_anew():
+def test_scans_that_equal_an_earlier_one_are_counted_and_a_new_one_starts_anew():
     first, second = scan_bytes(random.Random(1)), scan_bytes(random.Random(2))
     scans = feed(rplidar.ScanAssembler(), first * 3 + second + first + first[:5])
-    assert [scan.repeats for scan in scans] == [1, 2, 3, 1, 1]
+    assert [scan.repeats for scan in scans] == [1, 2, 3, 1, 2]
 
 
 def test_the_piece_before_the_first_start_flag_is_no_scan():

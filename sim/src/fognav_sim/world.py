@@ -65,6 +65,8 @@ class World:
         self._rng = np.random.default_rng(seed)
         self._diameter_scale = [1.0 + self.noise.wheel_diameter * float(self._rng.standard_normal()) for _ in range(2)]
         self._wheel_commands = (0.0, 0.0)
+        self.no_return_rad: tuple[float, float] | None = None
+        """Sector of the lidar (from, to; rad, counter-clockwise) in which nothing returns its beams."""
         start = robot.start
         self._body = _Body(start.x, start.y, start.theta)
         clearance = self.clearance()
@@ -196,7 +198,11 @@ class World:
         """Measure as `lidar` does, with a lidar that is mounted elsewhere than on the robot's axis."""
         del now
         seen_along = -angles if place.mirrored else angles
-        return measure_lidar(self._floor, place.pose(self.pose), seen_along, self.noise, self._rng)
+        ranges = measure_lidar(self._floor, place.pose(self.pose), seen_along, self.noise, self._rng)
+        if self.no_return_rad is not None:
+            begin, end = self.no_return_rad
+            ranges[(angles - begin) % math.tau <= (end - begin) % math.tau] = np.nan
+        return ranges
 
     def sonar(self, node: NodeSite, index: int) -> float | None:
         """Measure with one sonar of a node: range of the nearest echo (m), None without an echo."""

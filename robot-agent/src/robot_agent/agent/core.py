@@ -58,7 +58,8 @@ if TYPE_CHECKING:
     from robot_agent.guardian.link import BaseFeedback, WheelCommand
     from robot_agent.hardware import LaserScan, LidarSamples
     from robot_agent.localization.absolute import AbsoluteObservation
-    from robot_agent.safety.gate import Request, SafetyOutputs
+    from robot_agent.safety.conditions import Request
+    from robot_agent.safety.gate import SafetyOutputs
 
 POSSIBLE_WHILE_SUSPENDED: Final = (0.5, 0.5)
 """How far (m, rad) a robot is expected to be moved by others while its computer is suspended."""
@@ -190,6 +191,7 @@ class AgentCore:
         self._lidar.on_scan(scan.repeats, now)
         if scan.repeats < self._config.safety.identical_scans:
             self._localizer.on_scan(scan, now)
+            self._guard.on_scan(scan, self.replica)
 
     def on_loop_health(self, health: LoopHealth) -> None:
         """Record how punctual the process's loops are."""

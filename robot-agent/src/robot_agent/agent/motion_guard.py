@@ -1,15 +1,17 @@
-"""The last word on every wheel command: the stop field over what the lidar has just seen."""
+"""The last word on every wheel command: the stop field over what the lidar has just seen, and what it did not see."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from robot_agent.agent.lidar_view import LidarView
 from robot_agent.agent.near_points import NearPoints
 from robot_agent.safety.stop_field import StopField
 
 if TYPE_CHECKING:
+    from fog_contracts.replica import Replica
     from robot_agent.config import AgentConfig
-    from robot_agent.hardware import LidarSamples
+    from robot_agent.hardware import LaserScan, LidarSamples
     from robot_agent.localization.localizer import Localizer
     from robot_agent.safety.stop_field import Wheels
 
@@ -19,6 +21,8 @@ class MotionGuard:
 
     def __init__(self, config: AgentConfig, localizer: Localizer) -> None:
         self._localizer = localizer
+        self._drive = config.drive_train
+        self._view = LidarView(config.localization, config.visibility)
         self._field = StopField(config.footprint, config.drive_train, config.stop_field)
         lidar = config.localization
         # A point may come nearer while it is remembered, and the lidar need not be in the middle.
@@ -32,9 +36,14 @@ class MotionGuard:
         """Handle the lidar's newest samples."""
         self._points.add(samples)
 
+    def on_scan(self, scan: LaserScan, replica: Replica) -> None:
+        """Handle a whole scan, after the localizer has."""
+        self._view.on_scan(scan, self._localizer.scan_pose(), replica)
+
     def limit(self, wheels: Wheels, now: float) -> Wheels:
         """Return the wheel speeds (m/s) that may be commanded at `now` (s, monotonic) instead of these."""
         points = self._points.seen_from(self._localizer, now)
-        limited = self._field.limit(wheels, points)
-        self.reason = limited.reason
-        return limited.wheels
+        seen = self._field.limit(wheels, points)
+        unseen = self._view.visibility.limit(seen.wheels, self._drive.twist(*seen.wheels))
+        self.reason = seen.reason or unseen.reason
+        return unseen.wheels

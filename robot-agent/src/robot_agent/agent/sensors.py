@@ -38,7 +38,7 @@ class LidarSource:
 
     def __init__(self) -> None:
         self.identical_scans = 1
-        """Number of identical scans in a row: a working lidar never gives two equal ones."""
+        """1, and 1 more for each scan in a row that equals an earlier one: a working lidar never repeats a scan."""
         self._samples_at = _NEVER
         self._scan_at = _NEVER
 
@@ -47,7 +47,7 @@ class LidarSource:
         self._samples_at = now
 
     def on_scan(self, repeats: int, now: float) -> None:
-        """Record that a whole scan arrived, the `repeats`-th equal one in a row."""
+        """Record that a whole scan arrived; `repeats` as in `LaserScan`."""
         self._scan_at = self._samples_at = now
         self.identical_scans = repeats
 

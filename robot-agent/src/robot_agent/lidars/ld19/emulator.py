@@ -7,6 +7,7 @@ revolutions have their samples at the same angles.
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
 
@@ -27,6 +28,7 @@ _SAMPLES: Final = 12
 _PACKET_S: Final = _SAMPLES / SAMPLES_PER_S
 # After a pause of the simulation, missed packets are not sent in a burst.
 _CATCH_UP_S: Final = 0.5
+_REVOLUTIONS_MAX: Final = 5
 # Packets per call of the measuring function: 11 ms.
 _CHUNK: Final = 4
 
@@ -34,8 +36,8 @@ _CHUNK: Final = 4
 class Ld19Emulator:
     """The lidar's end of the serial line; implements `fognav_sim.emulators.LidarEmulator`.
 
-    Two faults can be set at any time: `stalled` sends nothing more, `frozen` repeats the last revolution, as a stuck
-    serial bridge does.
+    Two faults can be set at any time: `stalled` sends nothing more, `frozen` repeats the last whole revolutions
+    (`frozen_revolutions`, 1 to 5), as a stuck serial bridge or a driver's ring buffer does.
     """
 
     def __init__(self, measure: Measure) -> None:
@@ -45,10 +47,11 @@ class Ld19Emulator:
         self._position = 0.25
         self._milliseconds = 0.0
         self._revolution: list[bytes] = []
-        self._last_revolution: list[bytes] = []
+        self._last_revolutions: deque[list[bytes]] = deque(maxlen=_REVOLUTIONS_MAX)
         self._replayed = 0
         self.stalled = False
         self.frozen = False
+        self.frozen_revolutions = 1
 
     @property
     def baud(self) -> int:
@@ -68,14 +71,16 @@ class Ld19Emulator:
             count = min(due, _CHUNK)
             due -= count
             self._sent_until += count * _PACKET_S
-            if self.frozen and self._last_revolution:
+            if self.frozen and self._last_revolutions:
                 sent += self._replay(count)
             elif not self.stalled:
                 sent += self._packets(count, self._sent_until)
         return b"".join(sent)
 
     def _replay(self, count: int) -> list[bytes]:
-        chosen = [self._last_revolution[(self._replayed + i) % len(self._last_revolution)] for i in range(count)]
+        recent = tuple(self._last_revolutions)[-self.frozen_revolutions :]
+        buffer = [packet for revolution in recent for packet in revolution]
+        chosen = [buffer[(self._replayed + i) % len(buffer)] for i in range(count)]
         self._replayed += count
         return chosen
 
@@ -111,7 +116,8 @@ class Ld19Emulator:
         self._position = (before + _SAMPLES * SCANS_PER_S / SAMPLES_PER_S) % 1.0
         self._milliseconds += 1000.0 * _PACKET_S
         if self._position < before:
-            self._last_revolution, self._revolution, self._replayed = self._revolution, [], 0
+            self._last_revolutions.append(self._revolution)
+            self._revolution, self._replayed = [], 0
         self._revolution.append(bytes(body))
         return bytes(body)
 

@@ -10,6 +10,7 @@ scan was requested.
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
 
@@ -32,14 +33,16 @@ _FULL_CIRCLE_Q6: Final = 360 * 64
 _CHUNK: Final = 32
 # After a pause of the simulation, missed nodes are not sent in a burst.
 _CATCH_UP_S: Final = 0.5
+_REVOLUTIONS_MAX: Final = 5
 
 
 class RplidarEmulator:
     """The lidar's end of the serial line; implements `fognav_sim.emulators.LidarEmulator`.
 
     The port calls `receive` and `outgoing`; `now` is any monotonic clock, seconds. `health` and `error_code` answer a
-    health request; `boot_text` follows a reset. Two faults can be set at any time: `stalled` sends nothing more,
-    `frozen` repeats the bytes of the last whole revolution, as a stuck serial bridge does.
+    health request; `boot_text` follows a reset. Three faults can be set at any time: `stalled` sends nothing more,
+    `frozen` repeats the bytes of the last whole revolutions (`frozen_revolutions`, 1 to 5), as a stuck serial bridge or
+    a driver's ring buffer does. In `blind_sector_rad` (from, to; counter-clockwise) it measures nothing.
     """
 
     def __init__(
@@ -68,6 +71,8 @@ class RplidarEmulator:
         self.boot_text = BOOT_TEXT
         self.stalled = False
         self.frozen = False
+        self.frozen_revolutions = 1
+        self.blind_sector_rad: tuple[float, float] | None = None
         self._incoming = bytearray()
         self._outgoing = bytearray()
         self._scanning = False
@@ -76,7 +81,7 @@ class RplidarEmulator:
         self._position = start_angle_rad / math.tau
         self._fresh_scan = False
         self._revolution = bytearray()
-        self._last_revolution = b""
+        self._last_revolutions: deque[bytes] = deque(maxlen=_REVOLUTIONS_MAX)
         self._replayed = 0
 
     @property
@@ -153,7 +158,7 @@ class RplidarEmulator:
         self._due_since = now
         self._fresh_scan = True
         self._revolution.clear()
-        self._last_revolution = b""
+        self._last_revolutions.clear()
 
     def _scan_until(self, now: float) -> None:
         rate = self._nodes_per_s * (2 if self._express else 1)
@@ -165,7 +170,7 @@ class RplidarEmulator:
             return
         if self.stalled:
             self._due_since += units * unit / rate
-        elif self.frozen and self._last_revolution and not self._express:
+        elif self.frozen and self._last_revolutions and not self._express:
             self._replay(units * 5)
             self._due_since += units / rate
         elif self._express:
@@ -193,10 +198,15 @@ class RplidarEmulator:
         raw[:, 2] = angle >> 7
         raw[:, 3] = distance & 0xFF
         raw[:, 4] = distance >> 8
+        if self.blind_sector_rad is not None:
+            low, high = self.blind_sector_rad
+            turned = (-np.radians(angle / 64.0) - low) % math.tau
+            keep = (turned > (high - low) % math.tau) | start
+            raw, start = raw[keep], start[keep]
         begin = 0
         for boundary in np.flatnonzero(start):
             self._revolution += raw[begin:boundary].tobytes()
-            self._last_revolution = bytes(self._revolution)
+            self._last_revolutions.append(bytes(self._revolution))
             self._revolution.clear()
             self._replayed = 0
             begin = int(boundary)
@@ -204,8 +214,9 @@ class RplidarEmulator:
         self._outgoing += raw.tobytes()
 
     def _replay(self, size: int) -> None:
+        buffer = b"".join(tuple(self._last_revolutions)[-self.frozen_revolutions :])
         for _ in range(size):
-            self._outgoing.append(self._last_revolution[self._replayed % len(self._last_revolution)])
+            self._outgoing.append(buffer[self._replayed % len(buffer)])
             self._replayed += 1
 
     def _capsule(self, now: float, rate: float) -> None:

@@ -1,0 +1,107 @@
+"""What the lidar does not see is not free: travel into directions without the returns that the map expects there.
+
+Glass, black surfaces and a blind lidar all give no return. Open space gives none either, so the map decides: only where
+it has a wall within a safe range is a missing return suspicious. Directions that the lidar does not measure at all, by
+its mask or by a defect, are blind whatever the map says. Pure.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final, Literal
+
+import numpy as np
+
+from robot_agent.safety.stop_field import Limited
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from robot_agent.config import VisibilityConfig
+    from robot_agent.hardware import Twist
+    from robot_agent.safety.stop_field import Wheels
+
+SECTORS: Final = 72
+"""Directions of the lidar, each 5 degrees wide, counter-clockwise from straight behind in `base`."""
+_EXPECTED_MIN: Final = 4
+"""With fewer sectors in which a return is expected, their share says nothing."""
+_LEAD_MAX_RAD: Final = math.radians(45.0)
+_LEAD_S: Final = 0.5
+"""A turning robot travels into the direction in which it will head after half of this."""
+_TURNING_IN_PLACE_M_S: Final = 0.01
+
+_Sight = Literal["clear", "poor", "blind"]
+
+
+def sector_of(angles: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the sector of each direction (n; rad in `base`)."""
+    turns = np.asarray(angles) / math.tau + 0.5
+    sectors: NDArray[np.int64] = np.floor((turns - np.floor(turns)) * SECTORS).astype(np.int64) % SECTORS
+    return sectors
+
+
+def sector_angles() -> NDArray[np.float64]:
+    """Return the middle (rad, in `base`) of each sector."""
+    return np.array([(sector + 0.5) * math.tau / SECTORS - math.pi for sector in range(SECTORS)])
+
+
+class Visibility:
+    """Which sectors the newest scans cover, and how fast the robot may travel into them."""
+
+    def __init__(self, config: VisibilityConfig) -> None:
+        self._config = config
+        self._blind = np.zeros(SECTORS, np.bool_)
+        self._missing = np.zeros(SECTORS, np.bool_)
+        self._expected = np.zeros(SECTORS, np.bool_)
+        self._returned_before = np.ones(SECTORS, np.bool_)
+        self._measured_before = np.ones(SECTORS, np.bool_)
+        self._sight: _Sight = "clear"
+
+    def update(self, angles: NDArray[np.float64], returned: NDArray[np.bool_], expected: NDArray[np.bool_]) -> None:
+        """Handle a whole scan: directions of its samples (n; rad in `base`), and which of them have a return.
+
+        expected: (SECTORS,) whether the map has a wall near in a sector. A sector is covered if it was in this scan or
+        in the one before it: single scans have gaps.
+        """
+        sectors = sector_of(angles)
+        measured = np.bincount(sectors, minlength=SECTORS)
+        returns = np.bincount(sectors[returned], minlength=SECTORS)
+        has_returns = (measured > 0) & (2 * returns >= measured)
+        self._blind = ~((measured > 0) | self._measured_before)
+        self._expected = expected & ~self._blind
+        self._missing = self._expected & ~(has_returns | self._returned_before)
+        self._returned_before, self._measured_before = has_returns, measured > 0
+
+    def limit(self, wheels: Wheels, twist: Twist) -> Limited:
+        """Limit wheel speeds, whose twist is given, by what is seen in the direction of travel; the arc is kept.
+
+        Turning in place is not limited: it is how a robot looks elsewhere.
+        """
+        if abs(twist.v) < _TURNING_IN_PLACE_M_S:
+            return Limited(wheels)
+        lead = min(max(0.5 * _LEAD_S * twist.w, -_LEAD_MAX_RAD), _LEAD_MAX_RAD)
+        heading = lead if twist.v > 0.0 else math.pi - lead
+        self._sight = self._sight_towards(heading)
+        if self._sight == "blind":
+            side = "ahead" if twist.v > 0.0 else "behind"
+            return Limited((0.0, 0.0), "stop", f"the lidar sees nothing {side}: it is blind there, or faces glass")
+        if self._sight == "poor" and abs(twist.v) > self._config.speed:
+            share = self._config.speed / abs(twist.v)
+            return Limited((wheels[0] * share, wheels[1] * share), "slow")
+        return Limited(wheels)
+
+    def _sight_towards(self, heading: float) -> _Sight:
+        offset = (sector_angles() - heading + math.pi) % math.tau - math.pi
+        ahead = np.abs(offset) <= self._config.half_width
+        blind = float(np.count_nonzero(self._blind & ahead) / np.count_nonzero(ahead))
+        expected = int(np.count_nonzero(self._expected & ahead))
+        missing = np.count_nonzero(self._missing & ahead) / expected if expected >= _EXPECTED_MIN else 0.0
+        config = self._config
+        # A limit that applies is lifted only well below the share at which it began.
+        refuse = config.lift if self._sight == "blind" else 1.0
+        slow = 1.0 if self._sight == "clear" else config.lift
+        if blind >= refuse * config.blind_refused or missing >= refuse * config.missing_refused:
+            return "blind"
+        if blind >= slow * config.blind_slow or missing >= slow * config.missing_slow:
+            return "poor"
+        return "clear"

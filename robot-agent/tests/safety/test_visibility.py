@@ -1,0 +1,126 @@
+"""Directions without expected returns: how the shares in the direction of travel slow and stop the robot."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robot_agent.config import VisibilityConfig
+from robot_agent.hardware import RepeatCounter, Twist
+from robot_agent.safety.visibility import Visibility, sector_angles, sector_of
+
+AROUND = np.radians(np.arange(-179.5, 180.0, 1.0))
+WALLS = np.ones(72, np.bool_)
+OPEN = np.zeros(72, np.bool_)
+FORWARD, BACKWARD, TURNING = Twist(0.3, 0.0), Twist(-0.3, 0.0), Twist(0.005, 1.0)
+
+
+def degrees_off(angles, middle):
+    return np.abs((np.degrees(angles) - middle + 180.0) % 360.0 - 180.0)
+
+
+def seeing(missing=0.0, blind=0.0, *, towards=0.0, walls=WALLS, scans=2, visibility=None):
+    """A lidar without returns within `missing` degrees to each side, and without samples within `blind`."""
+    visibility = visibility or Visibility(VisibilityConfig())
+    angles = AROUND[degrees_off(AROUND, towards) >= blind]
+    for _ in range(scans):
+        visibility.update(angles, degrees_off(angles, towards) >= missing, walls)
+    return visibility
+
+
+def zone(visibility, twist=FORWARD):
+    return visibility.limit((0.3, 0.3), twist).zone
+
+
+def test_lidar_that_sees_all_around_limits_nothing():
+    visibility = seeing()
+    assert [zone(visibility, twist) for twist in (FORWARD, BACKWARD, TURNING)] == ["free"] * 3
+    assert zone(Visibility(VisibilityConfig())) == "free"
+
+
+def test_no_return_in_120_degrees_ahead_refuses_travel_there_and_nowhere_else():
+    visibility = seeing(missing=60.0)
+    refused = visibility.limit((0.3, 0.3), FORWARD)
+    assert refused == ((0.0, 0.0), "stop", "the lidar sees nothing ahead: it is blind there, or faces glass")
+    assert zone(visibility, BACKWARD) == "free"
+    assert visibility.limit((-0.1, 0.11), TURNING) == ((-0.1, 0.11), "free", None)
+    assert "behind" in seeing(missing=60.0, towards=180.0).limit((-0.3, -0.3), BACKWARD).reason
+
+
+def test_half_of_the_expected_returns_missing_slows_to_a_tenth_of_a_metre_per_second_on_the_same_arc():
+    limited = seeing(missing=25.0).limit((0.2, 0.4), Twist(0.3, 0.0))
+    assert limited.zone == "slow"
+    assert limited.wheels == pytest.approx((0.2 / 3, 0.4 / 3))
+    assert seeing(missing=25.0).limit((0.1, 0.1), Twist(0.1, 0.0)).zone == "free"
+
+
+def test_open_space_gives_no_return_and_is_no_fault():
+    assert zone(seeing(missing=180.0, walls=OPEN)) == "free"
+    three = OPEN.copy()
+    three[35:38] = True
+    assert zone(seeing(missing=180.0, walls=three)) == "free"
+    four = OPEN.copy()
+    four[34:38] = True
+    assert zone(seeing(missing=180.0, walls=four)) == "stop"
+
+
+def test_directions_without_samples_are_blind_whatever_the_map_says():
+    assert zone(seeing(blind=3.0, walls=OPEN)) == "free"
+    assert zone(seeing(blind=10.0, walls=OPEN)) == "slow"
+    assert zone(seeing(blind=25.0, walls=OPEN)) == "stop"
+
+
+def test_one_scan_with_a_gap_changes_nothing():
+    visibility = seeing()
+    assert zone(seeing(missing=60.0, scans=1, visibility=visibility)) == "free"
+    assert zone(seeing(scans=1, visibility=visibility)) == "free"
+    assert zone(seeing(blind=60.0, scans=1, visibility=visibility)) == "free"
+    assert zone(seeing(blind=60.0, scans=1, visibility=visibility)) == "stop"
+
+
+def test_limit_is_lifted_only_well_below_the_share_at_which_it_began():
+    visibility = seeing(missing=40.0)
+    assert zone(visibility) == "stop"
+    assert zone(seeing(missing=32.5, visibility=visibility)) == "stop"
+    assert zone(seeing(missing=25.0, visibility=visibility)) == "slow"
+    assert zone(seeing(missing=17.5, visibility=visibility)) == "slow"
+    assert zone(seeing(missing=10.0, visibility=visibility)) == "free"
+    assert zone(seeing(missing=17.5, visibility=visibility)) == "free"
+
+
+def test_turning_robot_is_judged_where_it_will_head():
+    visibility = seeing(missing=40.0, towards=60.0)
+    assert zone(visibility, Twist(0.3, 0.0)) == "free"
+    assert zone(visibility, Twist(0.3, 2.7)) != "free"
+    assert zone(seeing(missing=40.0, towards=-60.0), Twist(0.3, 2.7)) == "free"
+    assert zone(seeing(missing=40.0, towards=-120.0), Twist(-0.3, 2.7)) == "free"
+    assert zone(seeing(missing=40.0, towards=140.0), Twist(-0.3, 2.7)) == "stop"
+
+
+@given(st.floats(-20.0, 20.0))
+def test_every_direction_has_a_sector_whose_middle_is_near(angle):
+    sector = int(sector_of(np.array([angle]))[0])
+    assert 0 <= sector < 72
+    off = math.remainder(sector_angles()[sector] - angle, math.tau)
+    assert abs(off) <= math.radians(2.5) + 1e-9
+
+
+@pytest.mark.parametrize("length", [1, 2, 3, 5, 64])
+def test_buffer_of_scans_that_is_replayed_is_counted_from_its_second_time_on(length):
+    rng, counter = np.random.default_rng(1), RepeatCounter()
+    buffer = [rng.normal(size=360) for _ in range(length)]
+    assert [counter.count(scan) for scan in buffer] == [1] * length
+    assert [counter.count(buffer[i % length]) for i in range(5)] == [2, 3, 4, 5, 6]
+    assert counter.count(rng.normal(size=360)) == 1
+
+
+def test_genuine_noise_never_counts_and_a_scan_of_long_ago_is_forgotten():
+    rng, counter = np.random.default_rng(1), RepeatCounter()
+    first = rng.normal(size=360)
+    counter.count(first)
+    assert {counter.count(rng.normal(size=360)) for _ in range(64)} == {1}
+    assert counter.count(first) == 1

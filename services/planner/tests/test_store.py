@@ -10,6 +10,8 @@ from fog_contracts.messages import Pose, RobotGoal
 from fog_runtime.clock import SystemClock
 from fog_runtime.health import Health
 from fog_runtime.idempotency import Attempt, IdempotencyError
+from fog_runtime.lease import Request
+from fog_runtime.lease_store import LeaseStore
 from fog_supervisor.servers import Server, start_redis
 from planner.mission_keeper import MissionKeeper
 from planner.store import Audit, RecoveryError, Store, StoredGoal, StoreError
@@ -69,11 +71,16 @@ async def test_restore_replaces_what_redis_has_and_later_writes_are_accepted(red
 
 
 async def test_mission_that_was_stored_although_its_request_failed_can_be_cancelled(redis: Server):
-    async with Store(redis.url, "test") as store:
+    async with (
+        Store(redis.url, "test", service="planner") as store,
+        LeaseStore(redis.url, "test", "planner") as leases,
+    ):
+        granted = await leases.acquire("p1", Request(epoch=0, floor=0, confirmed=False, sent_at=0.0))
+        assert granted is not None
         keeper = MissionKeeper(Mock(), store, SystemClock(), Health(), lambda _change: None)
         with pytest.raises(StoreError, match="not loaded yet"):
             await keeper.cancel("r1", "anna")
-        await keeper.lead(0, confirmed=True)
+        await keeper.lead(granted.epoch, confirmed=True)
         assert not await keeper.cancel("r1", "anna")
         await store.put("r1", goal("unacknowledged"), AUDIT)
         keeper._reload = True  # as after any write that failed

@@ -50,18 +50,20 @@ class LeaseRecords:
     """Grants leases as the script of `lease_store`, which `test_lease_store` compares with the real one."""
 
     def __init__(self) -> None:
-        self.highest = 0
+        self.highest = self.floor = 0
         self.lease: tuple[int, str, float] | None = None
 
     def acquire(self, holder: str, request, now: float):
         held = self.lease if self.lease is not None and now < self.lease[2] else None
         if held is not None and held[1] != holder:
+            self.floor = max(self.floor, request.floor if request.floor > held[0] else 0)
             return Held(held[0], held[1], held[2] - now)
         epoch, confirmed = request.epoch, request.confirmed
         if epoch == 0 and held is not None:
             epoch, confirmed = held[0], True
-        if epoch <= request.floor or epoch < self.highest or (epoch == self.highest and not confirmed):
-            epoch = max(self.highest, request.floor) + 1
+        floor = max(request.floor, self.floor)
+        if epoch <= floor or epoch < self.highest or (epoch == self.highest and not confirmed):
+            epoch = max(self.highest, floor) + 1
         self.highest = epoch
         self.lease = (epoch, holder, now + LEASE_S)
         return Granted(epoch)
@@ -336,6 +338,9 @@ class Copies(RuleBasedStateMachine):
     @rule()
     def lose_lease(self):
         self.world.records.lease = None
+        for process in self.world.processes.values():
+            # Whoever holds it learns that at its next renewal; another one may take it at once.
+            process.isolated_at = self.world.now
 
     @invariant()
     def accepted_messages_have_one_sender_and_growing_epochs(self):

@@ -188,18 +188,20 @@ class FakeRedis:
     """What the script of `lease_store` does, which `test_lease_store` compares with the real one."""
 
     def __init__(self) -> None:
-        self.stored = 0
+        self.stored = self.floor = 0
         self.lease: tuple[int, str, float] | None = None
 
     def acquire(self, holder: str, request, now: float, clock: int = 0):
         held = self.lease if self.lease is not None and now < self.lease[2] else None
         if held is not None and held[1] != holder:
+            self.floor = max(self.floor, request.floor if request.floor > held[0] else 0)
             return Held(held[0], held[1], held[2] - now)
         epoch, confirmed = request.epoch, request.confirmed
         if epoch == 0 and held is not None:
             epoch, confirmed = held[0], True
-        if epoch <= request.floor or epoch < self.stored or (epoch == self.stored and not confirmed):
-            epoch = max(self.stored + 1, request.floor + 1, clock)
+        floor = max(request.floor, self.floor)
+        if epoch <= floor or epoch < self.stored or (epoch == self.stored and not confirmed):
+            epoch = max(self.stored + 1, floor + 1, clock)
         self.stored = epoch
         self.lease = (epoch, holder, now + LEASE_S)
         return Granted(epoch)

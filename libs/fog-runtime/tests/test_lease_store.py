@@ -59,7 +59,7 @@ async def compare(redis: Server, steps) -> None:
                 expected.lease = None
             elif who == "forget":
                 await store._redis.write(("FLUSHALL",))
-                expected.lease, expected.stored = None, 0
+                expected.lease, expected.stored, expected.floor = None, 0, 0
             else:
                 request = Request(epoch, floor, confirmed, 0.0)
                 reply, wanted = await store.acquire(who, request), expected.acquire(who, request, 0.0, clock=3)
@@ -83,6 +83,18 @@ async def test_one_of_many_is_granted_the_lease_and_its_epoch_outlives_it(redis:
         later = await store.acquire("late", NEW)
         assert isinstance(later, Granted)
         assert later.epoch > granted[0].epoch
+
+
+async def test_leader_learns_at_its_renewal_of_a_higher_epoch_that_somebody_else_knows(redis: Server):
+    async with LeaseStore(redis.url, "higher", "planner") as store:
+        leader = await store.acquire("a", NEW)
+        assert isinstance(leader, Granted)
+        # The provisional epoch of a process that Redis did not answer, and that receivers have heard.
+        higher = leader.epoch + 1000
+        assert isinstance(await store.acquire("b", Request(epoch=0, floor=higher, confirmed=False, sent_at=0.0)), Held)
+        renewed = await store.acquire("a", Request(leader.epoch, leader.epoch - 1, confirmed=True, sent_at=0.0))
+        assert isinstance(renewed, Granted)
+        assert renewed.epoch > higher
 
 
 async def test_released_lease_is_free_at_once_and_nobody_releases_that_of_another(redis: Server):

@@ -14,6 +14,9 @@ if TYPE_CHECKING:
 
 # The lease is "EPOCH HOLDER" and expires; the epoch stays. An epoch that Redis has granted is renewed as long as nobody
 # drew another one, even if the lease expired or Redis lost it meanwhile; a provisional one must be above every other.
+# Whoever asks in vain, but knows of a higher epoch than the leader's, leaves that in Redis (the floor), and the leader
+# draws one above it at its next renewal. Else nobody might tell it of a provisional epoch that receivers heard, and
+# they would refuse it for ever.
 # The clock (ms) only keeps epochs growing that Redis and all who could know have forgotten.
 _ACQUIRE: Final = """
 local holder, epoch, floor, confirmed = ARGV[1], tonumber(ARGV[2]), tonumber(ARGV[3]), ARGV[4] == '1'
@@ -21,9 +24,12 @@ local stored = tonumber(redis.call('GET', KEYS[2]) or '0')
 local lease = redis.call('GET', KEYS[1])
 local held_epoch, held_by
 if lease then held_epoch, held_by = string.match(lease, '^(%d+) (.*)$') end
+local left = tonumber(redis.call('GET', KEYS[3]) or '0')
 if held_by and held_by ~= holder then
+  if floor > math.max(left, tonumber(held_epoch)) then redis.call('SET', KEYS[3], string.format('%.0f', floor)) end
   return {0, held_epoch, held_by, redis.call('PTTL', KEYS[1])}
 end
+floor = math.max(floor, left)
 if epoch == 0 and held_by then epoch, confirmed = tonumber(held_epoch), true end
 if epoch <= floor or epoch < stored or (epoch == stored and not confirmed) then
   epoch = math.max(stored + 1, floor + 1, tonumber(ARGV[5]))
@@ -45,7 +51,7 @@ class LeaseStore:
 
     def __init__(self, url: str, site: str, service: str) -> None:
         self._redis = RedisConnection(url, timeout_s=ATTEMPT_S)
-        self._lease, self._epoch = (f"fog:{site}:{service}:{name}" for name in ("lease", "epoch"))
+        self._lease, self._epoch, self._floor = (f"fog:{site}:{service}:{name}" for name in ("lease", "epoch", "floor"))
 
     async def __aenter__(self) -> Self:
         """Return the store; it connects with the first command."""
@@ -58,7 +64,7 @@ class LeaseStore:
     async def acquire(self, holder: str, request: Request) -> Reply:
         """Take or renew the lease; None when Redis did not answer in time: it may have done it all the same."""
         arguments = (holder, request.epoch, request.floor, int(request.confirmed), _now_ms(), round(LEASE_S * 1000))
-        reply = await self._attempt(("EVAL", _ACQUIRE, 2, self._lease, self._epoch, *arguments))
+        reply = await self._attempt(("EVAL", _ACQUIRE, 3, self._lease, self._epoch, self._floor, *arguments))
         if reply is None:
             return None
         granted, epoch, *held = reply

@@ -9,6 +9,7 @@ struct TestLink final : fognav::Link {
     void join_network() override { ++joins; }
     bool network_up() override { return network != 0; }
     void connect_broker() override { ++connects; }
+    void leave_broker() override { ++leaves; }
     bool broker_up() override { return broker != 0; }
     bool broker_failed() override { return failed != 0; }
     void announce() override { ++announcements; }
@@ -19,6 +20,7 @@ struct TestLink final : fognav::Link {
     int failed = 0;
     int joins = 0;
     int connects = 0;
+    int leaves = 0;
     int announcements = 0;
     int restarts = 0;
 };
@@ -50,7 +52,7 @@ TestConnection* fognav_connection_new(uint32_t seed) { return new TestConnection
 
 void fognav_connection_free(TestConnection* test) { delete test; }
 
-// Take a step with this state of the link; `counts` receives joins, connects, announcements and restarts so far. Returns
+// Take a step with this state of the link; `counts` receives joins, connects, announcements, restarts and leaves so far. Returns
 // 1 if the connection is up.
 int fognav_connection_step(TestConnection* test, uint32_t now_ms, int network, int broker, int failed, int* counts) {
     test->link.network = network;
@@ -61,6 +63,7 @@ int fognav_connection_step(TestConnection* test, uint32_t now_ms, int network, i
     counts[1] = test->link.connects;
     counts[2] = test->link.announcements;
     counts[3] = test->link.restarts;
+    counts[4] = test->link.leaves;
     return test->connection.up() ? 1 : 0;
 }
 

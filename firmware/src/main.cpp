@@ -26,6 +26,7 @@ namespace {
 constexpr const char* kSettingsFile = "/node.json";
 constexpr const char* kAuthorityFile = "/ca.pem";
 constexpr size_t kSettingsMax = 2048;
+constexpr size_t kAuthorityMax = 4096;
 constexpr uint32_t kComplainEveryMs = 5000;
 
 uint32_t random_bits() {
@@ -60,7 +61,7 @@ public:
             set_up(plain_);
             return true;
         }
-        authority_ = read_file(kAuthorityFile, kSettingsMax);
+        authority_ = read_file(kAuthorityFile, kAuthorityMax);
         if (authority_.length() == 0) return false;
 #if defined(ESP8266)
         static BearSSL::X509List trusted(authority_.c_str());
@@ -85,9 +86,11 @@ public:
         // Certificates have dates, and the board has no clock of its own: the fog node tells it the time.
         if (settings_.tls) configTime(0, 0, settings_.broker);
         failed_ = false;
-        settings_.tls ? secure_.disconnect(true) : plain_.disconnect(true);
         settings_.tls ? secure_.connect() : plain_.connect();
     }
+
+    // The library takes some turns of its loop for it, and connects no earlier.
+    void leave_broker() override { settings_.tls ? secure_.disconnect(true) : plain_.disconnect(true); }
 
     bool broker_up() override { return settings_.tls ? secure_.connected() : plain_.connected(); }
 
@@ -226,7 +229,7 @@ void setup() {
     if (text.length() == 0) complain("node.json is missing, empty or longer than 2 KB: see firmware/README.md");
     const char* problem = fognav::read_settings(text.c_str(), text.length(), settings);
     if (problem != nullptr) complain(problem);
-    if (!board.begin()) complain("ca.pem is missing: the certificate of the fog node's authority, or set tls to false");
+    if (!board.begin()) complain("ca.pem is missing, empty or longer than 4 KB: the certificate of the fog node's authority; or set tls to false");
 
     fognav::NodeSettings start;
     start.config.sonars = settings.sonars;

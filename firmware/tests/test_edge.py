@@ -81,11 +81,11 @@ class Connection:
         self._new.restype = ctypes.c_void_p
         self._test = ctypes.c_void_p(self._new(ctypes.c_uint32(seed)))
         self._now = start_ms
-        self._counts = (ctypes.c_int * 4)()
+        self._counts = (ctypes.c_int * 5)()
         self._joined_at = self._connected_at = None
         self.network = self.broker = True
         self.refused = False
-        self.joins, self.connects, self.announcements, self.restarts = [], [], [], []
+        self.joins, self.connects, self.announcements, self.restarts, self.leaves = [], [], [], [], []
         self.up = False
 
     def close(self):
@@ -103,7 +103,7 @@ class Connection:
         before = list(self._counts)
         arguments = (int(network), int(broker), int(bool(reached and self.refused)), self._counts)
         self.up = bool(self._step(self._test, ctypes.c_uint32(self._now % 2**32), *arguments))
-        times = (self.joins, self.connects, self.announcements, self.restarts)
+        times = (self.joins, self.connects, self.announcements, self.restarts, self.leaves)
         for moments, old, new in zip(times, before, self._counts, strict=True):
             assert new - old in {0, 1}
             moments.extend([self._now] * (new - old))
@@ -111,6 +111,8 @@ class Connection:
             self._joined_at = self._now
         if self.connects and self.connects[-1] == self._now:
             self._connected_at = self._now
+        if self.leaves and self.leaves[-1] == self._now:
+            self._connected_at = None
         if not self.network:
             self._joined_at = None
         if not (self.network and self.broker):
@@ -159,6 +161,11 @@ def test_refused_node_asks_ever_more_rarely(connection):
     assert gaps[0] < 3000
     assert all(15_000 <= gap <= 32_000 for gap in gaps[8:])
     assert len(connection.connects) < 40
+    # The MQTT library ignores an attempt that follows a disconnection at once.
+    assert all(
+        later - max(moment for moment in connection.leaves if moment <= later) >= 250
+        for later in connection.connects[1:]
+    )
 
 
 def test_hundred_nodes_do_not_come_back_at_one_moment(core):

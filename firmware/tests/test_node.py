@@ -10,7 +10,7 @@ from fog_contracts.channels import NODE_READING
 from fog_contracts.codec import decode, encode
 from fog_contracts.messages import NodeConfig, NodeReading
 from fog_contracts.site import NodeSite, Sonar
-from fognav_sim.firmware_node import FirmwareNode
+from fognav_sim.firmware_node import STEP_US, FirmwareNode
 from fognav_sim.node import SonarNode, classify, default_config
 
 SITE = NodeSite(id="n1", area="z1", x=0.0, y=0.0, theta=0.0, sonars=[Sonar(range_limit=2.0), Sonar(range_limit=2.5)])
@@ -122,6 +122,21 @@ def test_leak_of_the_trigger_and_bounces_are_no_echoes(core):
     node._trigger = trigger
     published = [reading for step in range(300) for reading in node.poll(None, step * 0.01)]
     assert {tuple(reading.range_m) for reading in published} == {(3.0, 3.0)}
+
+
+def test_edge_that_comes_after_the_loop_read_its_clock_is_no_missing_echo(core):
+    node = FirmwareNode(core, SITE, 7, 0.0)
+
+    def trigger(_world):
+        sonar, now = core.sonar(node._node), node._now_us
+        flight = round(2 * 3.0 / 343.42 * 1e6)
+        # The interrupt's clock is ahead of the one that the loop passes to the next step.
+        core.edge(node._node, sonar, 1, now + STEP_US + 3)
+        node._edges = [(now + STEP_US + 3 + flight, sonar, 0)]
+
+    node._trigger = trigger
+    published = [reading for step in range(300) for reading in node.poll(None, step * 0.01)]
+    assert {tuple(reading.status) for reading in published} == {("ok", "ok")}
 
 
 @pytest.mark.parametrize(("tenths", "metres"), [(-200, 2.787), (0, 2.894), (200, 3.0), (400, 3.106)])

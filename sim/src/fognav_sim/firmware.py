@@ -68,9 +68,12 @@ def build_library(cache: Path, flags: tuple[str, ...] = FLAGS) -> Path:
     sources = [str(file) for file in files if file.suffix == ".cpp"]
     includes = [f"-I{firmware / folder}" for folder in SOURCES]
     command = [find_compiler(), *flags, *includes, *sources, "-o", str(unfinished)]
-    done = subprocess.run(  # noqa: S603  # the compiler that this machine or its user names, on our own sources
-        command, check=False, capture_output=True, text=True, timeout=_BUILD_TIMEOUT_S
-    )
+    try:
+        done = subprocess.run(  # noqa: S603  # the compiler that this machine or its user names, on our own sources
+            command, check=False, capture_output=True, text=True, timeout=_BUILD_TIMEOUT_S
+        )
+    except subprocess.TimeoutExpired as error:
+        raise FirmwareError(f"the compiler did not finish the firmware's core in {_BUILD_TIMEOUT_S:.0f} s") from error
     if done.returncode != 0:
         raise FirmwareError(f"the firmware's core does not compile:\n{done.stderr.strip()}")
     unfinished.replace(library)

@@ -17,7 +17,8 @@ void EchoCapture::arm(uint32_t now_us) {
 bool EchoCapture::poll(uint32_t now_us, int16_t temperature_dc, const NoEchoSignature& signature, Sample& sample) {
     if (phase_ == Phase::idle) return false;
     const bool over = now_us - armed_us_ >= kWindowUs;
-    if (phase_ == Phase::rising && now_us - rose_us_ > kMaxFlightUs) {
+    // Signed: the interrupt may have come after the caller read its clock, and then the line rose in its future.
+    if (phase_ == Phase::rising && static_cast<int32_t>(now_us - rose_us_) > static_cast<int32_t>(kMaxFlightUs)) {
         // Whatever falls later comes from too far. A line that stays high will not rise at the next trigger.
         phase_ = Phase::idle;
         sample = {Status::no_echo, 0};

@@ -19,6 +19,7 @@ void Connection::enter(Phase phase, uint32_t now_ms) {
 }
 
 void Connection::wait(uint32_t now_ms) {
+    link_.leave_broker();
     delay_ms_ = backoff_.next_ms();
     enter(Phase::waiting, now_ms);
 }

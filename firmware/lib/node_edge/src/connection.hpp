@@ -18,7 +18,8 @@ public:
     virtual ~Link() = default;
     virtual void join_network() = 0;  // begin; forget what was begun before
     virtual bool network_up() = 0;
-    virtual void connect_broker() = 0;  // begin; forget what was begun before
+    virtual void connect_broker() = 0;  // begin
+    virtual void leave_broker() = 0;    // end what was begun, if anything; 250 ms pass until the next attempt
     virtual bool broker_up() = 0;
     virtual bool broker_failed() = 0;  // the attempt that was begun has ended without success
     virtual void announce() = 0;       // subscribe and say that the node is there

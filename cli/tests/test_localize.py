@@ -16,6 +16,7 @@ from fog_kernels.raycast import cast
 from fog_runtime.maps import load_map, save_map
 from fognav.__main__ import app
 from fognav.localization.logs import read_log
+from fognav.output import WrongUseError
 from robot_agent.localization.pose import Pose2
 
 BEAMS = np.arange(180) * math.pi / 180.0 - math.pi / 2.0
@@ -174,6 +175,29 @@ def test_log_that_can_not_be_used_is_refused_with_its_line(folder, tmp_path, tex
     )
     assert done.exit_code == 2
     assert problem in done.stderr
+
+
+def damaged_logs() -> dict[str, tuple[bytes, int]]:
+    """Logs by what is wrong with them, each with the number of the line that can't be read."""
+    line = b'{"t": 0, "odom": [0, 0, 0], "ranges": [1, 1]}\n'
+    packed = bytearray(gzip.compress(100 * line, mtime=0))
+    cut = bytes(packed[:-8])  # without length and checksum
+    packed[10] = 0xFF  # a kind of block that does not exist
+    return {
+        "cut off": (cut, 101),
+        "damaged gzip": (bytes(packed), 1),
+        "no UTF-8": (50 * line + b'{"t": "\xff"}\n' + line, 51),
+        "no object": (line + b"[1, 2]\n", 2),
+        "number too large": (line + line.replace(b'"t": 0', b'"t": 1' + 400 * b"0"), 2),
+    }
+
+
+@pytest.mark.parametrize("damage", damaged_logs())
+def test_damaged_log_is_refused_with_its_file_and_line(tmp_path, damage):
+    content, number = damaged_logs()[damage]
+    (tmp_path / "bad.jsonl.gz").write_bytes(content)
+    with pytest.raises(WrongUseError, match=rf"bad\.jsonl\.gz, line {number}\b"):
+        read_log(tmp_path / "bad.jsonl.gz")
 
 
 @pytest.mark.data

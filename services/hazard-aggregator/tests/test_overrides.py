@@ -121,8 +121,10 @@ def test_area_that_an_admin_declared_clear_is_passable_and_slow_but_never_clear(
     rig.put("clear")
     assert (rig.hazard.state, rig.hazard.penalty, rig.hazard.severity) == ("unknown", 200, 1)
     assert (rig.hazard.override.measured, rig.hazard.override.measured_penalty) == ("blocked", 254)
+    assert rig.hazard.cause == "ann declared the area clear, which its nodes do not: wet floor"
     rig.read("clear")
     assert (rig.hazard.state, rig.hazard.penalty) == ("unknown", 200), "constant while it holds"
+    assert rig.hazard.cause == "ann declared the area clear: wet floor", "its nodes agree by now"
     rig.read("blocked")
     rig.remove()
     assert (rig.hazard.state, rig.hazard.penalty) == ("blocked", 254)

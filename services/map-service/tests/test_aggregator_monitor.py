@@ -4,7 +4,7 @@ import contextlib
 from collections.abc import Sequence
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from msgspec import structs
 
@@ -174,6 +174,20 @@ def test_area_that_an_admin_declared_clear_is_passable_once_confirmed_and_measur
     assert fog.state() == ("unknown", 200), "its aggregator lives, and says that it still holds"
 
 
+def test_changed_definition_does_not_prolong_an_admins_clearance():
+    fog = running()
+    blocked, relief = hazard("blocked", 4), declared_clear(5)
+    fog.hear(blocked, relief)
+    fog.run(8.0, relief, GATE)
+    assert fog.state() == ("unknown", 200)
+    fog.layer.define(definition("hall", version=1), fog.at)
+    assert fog.state() == ("unknown", 200), "it holds for the changed area as well"
+    fog.run(1.6)
+    assert fog.state() == ("unknown", 200)
+    fog.run(1.4)
+    assert fog.state() == ("unknown", 254), "10 s are over, and nobody lives that would end it"
+
+
 def test_retained_word_of_an_operator_that_an_area_is_clear_does_not_count():
     fog = Fog()
     fog.hear(declared_clear(3))
@@ -303,6 +317,7 @@ STEPS = st.one_of(
 
 
 @given(st.lists(STEPS, max_size=40))
+@example([("change", "blocked"), ("beats", 4), ("foreign", "blocked", -1, 0)])
 @settings(max_examples=200, deadline=None)
 def test_clear_area_is_one_that_the_aggregator_announced_as_clear_within_the_limit(steps):
     fog = Fog("hall")
@@ -315,9 +330,8 @@ def test_clear_area_is_one_that_the_aggregator_announced_as_clear_within_the_lim
             if kind == "change":
                 fog.hear(hazard(state, seq, epoch=epoch))
         elif kind == "foreign":
-            # Nobody is refused but a replaced aggregator, and it only when it does not speak of a danger.
-            replaced = rest[0] < 0 and value != "blocked"
-            with contextlib.suppress(RefusedMessageError) if replaced else contextlib.nullcontext():
+            # Nobody is refused but a replaced aggregator, unless it speaks of a danger that is not known yet.
+            with contextlib.suppress(RefusedMessageError) if rest[0] < 0 else contextlib.nullcontext():
                 fog.hear(hazard(value, rest[1], epoch=epoch + rest[0]))
         elif kind == "restart":
             epoch, seq, state = epoch + 5, 1, value

@@ -9,6 +9,7 @@ from __future__ import annotations
 import gzip
 import json
 import math
+import zlib
 from dataclasses import dataclass, replace
 from typing import IO, TYPE_CHECKING, Final, Literal, cast, get_args
 
@@ -69,11 +70,7 @@ def read_log(path: Path, log_format: Format = "auto") -> LidarLog:
     """Read a log; raises `WrongUseError` with file, line and remedy when it can't be used."""
     if log_format not in get_args(Format):
         raise WrongUseError(f"the format must be one of {', '.join(get_args(Format))}, not {log_format!r}")
-    try:
-        with _opened(path) as file:
-            first = file.readline()
-    except (OSError, UnicodeDecodeError, EOFError) as error:
-        raise WrongUseError(f"{path} can't be read as a log: {error}. Name a .jsonl.gz or CARMEN file") from error
+    first = next(_lines(path), (0, ""))[1]
     found = log_format if log_format != "auto" else ("jsonl" if first.lstrip().startswith("{") else "carmen")
     if found == "rosbag2":
         raise WrongUseError(f"{path}: rosbag2 can't be read. Convert the bag to JSON lines or CARMEN")
@@ -84,22 +81,35 @@ def read_log(path: Path, log_format: Format = "auto") -> LidarLog:
     return _finished(scans)
 
 
-def _opened(path: Path) -> IO[str]:
+def _opened(path: Path) -> IO[bytes]:
     with path.open("rb") as file:
         packed = file.read(2) == _GZIP
-    return cast("IO[str]", gzip.open(path, "rt", encoding="utf-8") if packed else path.open(encoding="utf-8"))
+    return cast("IO[bytes]", gzip.open(path, "rb") if packed else path.open("rb"))
 
 
 def _scans(path: Path, reader: Callable[[str], LogScan | None]) -> Iterator[LogScan]:
-    with _opened(path) as file:
-        for number, line in enumerate(file, 1):
-            try:
-                scan = reader(line)
-            except (ValueError, KeyError, IndexError, TypeError) as error:
-                message = f"{path}, line {number}: {type(error).__name__}: {error}. Correct or remove the line"
-                raise WrongUseError(message) from error
-            if scan is not None:
-                yield scan
+    for number, line in _lines(path):
+        try:
+            scan = reader(line)
+        except (ValueError, KeyError, IndexError, TypeError, OverflowError) as error:
+            message = f"{path}, line {number}: {type(error).__name__}: {error}. Correct or remove the line"
+            raise WrongUseError(message) from error
+        if scan is not None:
+            yield scan
+
+
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
+    """Yield the lines with their numbers, from 1; raises `WrongUseError` where the file is damaged or cut off."""
+    number = 1
+    try:
+        with _opened(path) as file:
+            # Decoded one by one: a text file would fail up to 8 KiB before the damaged line.
+            for line in file:
+                yield number, line.decode()
+                number += 1
+    except (OSError, UnicodeDecodeError, EOFError, zlib.error) as error:
+        message = f"{path}, line {number}: can't be read as a log: {error}. Name a whole .jsonl.gz or CARMEN file"
+        raise WrongUseError(message) from error
 
 
 def _pose(values: Sequence[float] | Sequence[str]) -> Pose2:
@@ -127,6 +137,8 @@ class _JsonScans:
         if not line.strip():
             return None
         values = json.loads(line)
+        if not isinstance(values, dict):
+            raise ValueError("a line must be a JSON object")  # noqa: TRY004  # of a file's text, not of an argument
         if "ranges" not in values:
             self._field_of_view = math.radians(float(values.get("fov_deg", math.degrees(self._field_of_view))))
             return None

@@ -133,7 +133,8 @@ class WatchedArea:
             cause = f"{override.author} blocked the area: {override.reason}"
             return _Measured("blocked", LETHAL, SEVERITY["blocked"], cause, None)
         penalty = min(PASSABLE_PENALTY, self.definition.unknown.penalty)
-        cause = f"{override.author} declared the area clear, which its nodes do not: {override.reason}"
+        contradicted = "" if measured.state == "clear" else ", which its nodes do not"
+        cause = f"{override.author} declared the area clear{contradicted}: {override.reason}"
         return _Measured("unknown", penalty, SEVERITY["unknown"], cause, None)
 
     def _since(self, state: AreaState, stamp: float) -> float:

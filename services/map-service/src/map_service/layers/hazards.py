@@ -9,7 +9,7 @@ as that was meant to last, then it is what its nodes measured.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from msgspec import structs
@@ -103,9 +103,10 @@ class HazardsLayer(CostLayer):
         if definition.removed:
             return self._remove(definition.id)
         mask = rasterize(normalized_polygon(definition.polygon), self._geometry)
-        area = _Area(definition, mask, _unknown(definition, None, at.stamp))
-        if old is not None:
-            area.accepted, area.shown = old.accepted, old.shown
+        if old is None:
+            area = _Area(definition, mask, _unknown(definition, None, at.stamp))
+        else:
+            area = replace(old, definition=definition, mask=mask)
         self._areas[definition.id] = area
         self._removed.pop(definition.id, None)
         self._update(area, at)

@@ -91,6 +91,14 @@ def test_no_report_while_the_pose_or_scan_is_not_good_enough(change):
     assert report(TWO, **change) is None
 
 
+def test_place_that_the_robot_could_not_pass_is_reported_although_the_lidar_sees_nothing_there():
+    localizer, reporter = FakeLocalizer(TWO), ObstacleReporter(600.0, 1)
+    bar = np.array([(5.45, 4.81), (5.45, 4.9), (5.45, 5.0)])
+    reported = reporter.report(localizer, replica(), 0.1, Moment(0.0, 1_000.0), bar)
+    assert reported.points == [pytest.approx(p) for p in ((6.05, 5.05), (5.45, 4.85), (5.45, 4.95), (5.45, 5.05))]
+    assert reporter.is_self_reported(bar, 601.9).all()
+
+
 def test_obstacles_of_others_are_left_out_and_own_ones_repeated_until_forgotten():
     reporter, blocked = ObstacleReporter(10.0, 3), replica()
     blocked.cost[45:56, 55:66] = 254

@@ -123,6 +123,14 @@ ROWS = [
         "goal blocked",
     ),
     Row(
+        "no progress",
+        {"path_problem": "no progress along the path for 10 s: an obstacle is near"},
+        {"path_problem": None},
+        "HOLD",
+        "alone",
+        "no progress along the path for 10 s: an obstacle is near",
+    ),
+    Row(
         "planner late",
         {"plan_age": 1.51},
         {"plan_age": 1.5},

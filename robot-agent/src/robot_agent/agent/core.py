@@ -213,17 +213,15 @@ class AgentCore:
 
     def _evaluate_safety(self, now: float, request: Request | None = None) -> SafetyOutputs:
         pose = self._localizer.pose(now)
-        localized = pose is not None and self._localizer.status in {"good", "weak"}
+        trusted = pose if self._localizer.status in {"good", "weak"} else None
         inputs = safety_inputs(
             self._base,
             self._lidar,
             self._map,
             self._localizer,
             self._driving.mission,
-            path_problem=self._driving.path_problem(self.replica, now),
-            inside_blocked=self._places.containing(pose, self.replica, self._reporter, now)
-            if pose and localized
-            else None,
+            path_problem=self._driving.path_problem(self.replica, self._guard, self.safety, now),
+            inside_blocked=self._places.containing(trusted, self.replica, self._reporter, now) if trusted else None,
             caution=self._places.caution(pose) if pose else None,
             now=now,
         )
@@ -259,7 +257,8 @@ class AgentCore:
         return self._publishing.due(self.pose(at), self.state(at), partial(self._report_obstacles, at), at.now)
 
     def _report_obstacles(self, at: Moment) -> RobotObstacles | None:
-        return self._reporter.report(self._localizer, self.replica, self._lidar.scan_age(at.now), at)
+        scan_age, impassable = self._lidar.scan_age(at.now), self._driving.impassable(at.now)
+        return self._reporter.report(self._localizer, self.replica, scan_age, at, impassable)
 
     def pose(self, at: Moment) -> RobotPose | None:
         """Return the pose; None while it is unknown."""
@@ -267,14 +266,14 @@ class AgentCore:
 
     def state(self, at: Moment) -> RobotState:
         """Return mode, reasons, goal, path and map version as a message."""
-        mission, stuck_after = self._driving.mission, self._config.motion.stuck_after
+        mission = self._driving.mission
         driven = mission if mission.active and self.safety.stop == "none" else None
         return robot_state(
             self._safety.state,
             mission,
             self.replica.version,
             self._base.feedback,
-            hindrances=hindrances(driven, self._driving.wheels.decision, self._guard.reason, stuck_after, at.now),
+            hindrances=hindrances(driven, self._driving.wheels.decision, self._guard.reason),
             battery_low=self._config.battery_low,
             traces=self._driving.traces.recent,
             loop=self._loop_health,

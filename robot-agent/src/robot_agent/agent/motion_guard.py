@@ -31,6 +31,8 @@ class MotionGuard:
         self._points = NearPoints(lidar, reach, config.stop_field.memory)
         self.reason: str | None = None
         """Why the last command is zero although another one was requested; else None."""
+        self.unseeing = False
+        """Whether that is because the lidar does not see enough, and not because it sees an obstacle."""
 
     def on_samples(self, samples: LidarSamples) -> None:
         """Handle the lidar's newest samples."""
@@ -46,4 +48,5 @@ class MotionGuard:
         seen = self._field.limit(wheels, points)
         unseen = self._view.visibility.limit(seen.wheels, self._drive.twist(*seen.wheels))
         self.reason = seen.reason or unseen.reason
+        self.unseeing = seen.reason is None and unseen.reason is not None
         return unseen.wheels

@@ -31,6 +31,8 @@ _MEMORY_MARGIN_S: Final = 2.0
 _POINTS_MIN: Final = 2
 """Fewest points in a reported cell: a single beam may be a mixed echo off an edge."""
 
+_NOWHERE: Final = np.zeros((0, 2))
+
 Cell = tuple[int, int]
 
 
@@ -46,10 +48,18 @@ class ObstacleReporter:
         self._reported: dict[Cell, float] = {}
         """Until when each cell counts as reported by this robot."""
 
-    def report(self, localizer: Localizer, replica: Replica, scan_age: float, at: Moment) -> RobotObstacles | None:
+    def report(
+        self,
+        localizer: Localizer,
+        replica: Replica,
+        scan_age: float,
+        at: Moment,
+        impassable: NDArray[np.float64] = _NOWHERE,
+    ) -> RobotObstacles | None:
         """Return lidar points that the map does not explain; None while pose or scan is not good enough.
 
         Obstacles that others put on the map are left out; this robot's own are reported for as long as it sees them.
+        impassable: (n, 2) m, frame `map`: a place that it could not pass although nothing is seen there.
         """
         points, scan, pose = localizer.points_in_map(), localizer.scan, localizer.pose(at.now)
         if localizer.status != "good" or replica.geometry is None or points is None or scan is None or pose is None:
@@ -60,6 +70,7 @@ class ObstacleReporter:
         unexplained = points[near & (localizer.wall_distance(points) > _EXPLAINED_M)]
         unexplained = unexplained[self._is_reportable(unexplained, replica, replica.geometry, at.now)]
         cells = self._choose(unexplained, pose)
+        cells += [(cx, cy) for cx, cy in np.floor(impassable / _CELL_M).astype(np.int64).tolist()]
         self._remember(cells, at.now)
         return RobotObstacles(
             points=[((cx + 0.5) * _CELL_M, (cy + 0.5) * _CELL_M) for cx, cy in cells],

@@ -9,6 +9,7 @@ import numpy as np
 from robot_agent.agent.mission import Mission
 from robot_agent.agent.path_monitor import PathMonitor
 from robot_agent.agent.path_traces import PathTraces
+from robot_agent.agent.progress_monitor import Hindrance, ProgressMonitor
 from robot_agent.agent.wheel_control import WheelControl
 from robot_agent.motion.local_planner import make_job, twist
 from robot_agent.motion.recent_scans import RecentScans
@@ -16,9 +17,12 @@ from robot_agent.motion.recent_scans import RecentScans
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from numpy.typing import NDArray
+
     from fog_contracts.handlers import Moment
     from fog_contracts.messages import RobotGoal, RobotPath, RobotRelease
     from fog_contracts.replica import Replica
+    from robot_agent.agent.motion_guard import MotionGuard
     from robot_agent.config import AgentConfig
     from robot_agent.guardian.link import WheelCommand
     from robot_agent.localization.localizer import Localizer
@@ -41,6 +45,7 @@ class PathDriving:
         self.wheels = WheelControl(config)
         self.traces = PathTraces()
         self._monitor = PathMonitor()
+        self._progress = ProgressMonitor(config.motion.stuck_after, config.radius)
         self._scans = RecentScans()
 
     # --- goal and path ---
@@ -71,9 +76,19 @@ class PathDriving:
         """Look for blockages along the path; call it whenever the map may have changed."""
         self._monitor.check(self.mission, replica, now)
 
-    def path_problem(self, replica: Replica, now: float) -> str | None:
-        """Return why the path must not be driven; None when it may. Call it steadily: it measures durations."""
-        return self._monitor.problem(self.mission, replica.version, now)
+    def path_problem(self, replica: Replica, guard: MotionGuard, safety: SafetyOutputs, now: float) -> str | None:
+        """Return why the path must not be driven; None when it may. Call it steadily: it measures durations.
+
+        `guard` tells what limits the wheels, `safety` what the gate allowed last.
+        """
+        blocked = self.wheels.decision.blocked if self.wheels.decision else None
+        hindrance = Hindrance(guard.reason or blocked, guard.unseeing)
+        standstill = self._progress.problem(self.mission, hindrance, safety, now)
+        return self._monitor.problem(self.mission, replica.version, now) or standstill
+
+    def impassable(self, now: float) -> NDArray[np.float64]:
+        """Return the points (n, 2; m, frame `map`) of a place that the robot could not pass, for some time."""
+        return self._progress.impassable(now)
 
     def cancel_goal(self) -> str | None:
         """Cancel the goal; return its id, None without one."""
@@ -97,7 +112,6 @@ class PathDriving:
             return None
         follower.advance(pose.x, pose.y, now)
         if safety.stop != "none":
-            follower.restart_progress_timer(now)
             return None
         scan, scan_pose = localizer.scan, localizer.scan_pose()
         points = np.zeros((0, 2))

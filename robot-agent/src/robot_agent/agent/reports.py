@@ -90,9 +90,7 @@ def robot_state(  # noqa: PLR0913  # a message gathers from all parts of the age
     )
 
 
-def hindrances(
-    mission: Mission | None, decision: Decision | None, limited: str | None, stuck_after: float, now: float
-) -> list[str]:
+def hindrances(mission: Mission | None, decision: Decision | None, limited: str | None) -> list[str]:
     """Return why a robot makes little progress to its goal; `limited`: why it is stopped.
 
     mission: None while the robot must not drive or has no goal: then there is nothing to report.
@@ -104,6 +102,4 @@ def hindrances(
         found.append(decision.blocked)
     if mission.follower is None:
         found.append("waiting for a path")
-    elif (stuck := mission.follower.stuck_for(now)) > stuck_after:
-        found.append(f"no progress along the path for {stuck:.0f} s")
     return found

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from fog_kernels.components import Components
 from fognav.__main__ import app
-from fognav.bench import costmap, dwa, fleet, localization, office, rest
+from fognav.bench import costmap, dwa, fleet, fleet_live, localization, office, rest, site
 
 
 def test_office_is_connected_and_the_same_for_the_same_seed() -> None:
@@ -37,6 +37,24 @@ def test_every_robot_of_a_fleet_is_planned_refused_and_planned_again() -> None:
     assert path.route is not None
 
 
+@pytest.mark.live
+async def test_every_robot_of_a_real_planner_gets_its_path_its_refusal_and_a_path_again() -> None:
+    rng = np.random.default_rng(1)
+    map_ = fleet.FleetMap(office.make_office(60.0, 40.0), 10, rng)
+    seen: list[tuple[int, int]] = []
+    robots = fleet.place_fleet(map_, 4, 3, rng)
+    figures = await fleet_live.measure(map_, robots, 1, lambda done, total: seen.append((done, total)), quiet_s=0.5)
+    assert seen == [(1, 1)]
+    assert figures["replans"] == 4
+    for key in ("replan_p50_ms", "replan_p99_ms", "cut_off_ms", "cut_off_explained_ms", "back_ms", "goal_fields_mb"):
+        assert figures[key] > 0
+    assert figures["cut_off_explained_ms"] >= figures["cut_off_ms"]
+    assert figures["rss_mb"] > 50
+    # A path of two points has some 100 bytes, and a delta more; a heartbeat of the map comes ten times a second.
+    assert figures["bytes_per_robot"] > 200
+    assert figures["steady_bytes_per_robot_s"] > 100
+
+
 def test_figures_come_with_schema_machine_and_versions(monkeypatch: pytest.MonkeyPatch) -> None:
     small = office.make_office(60.0, 40.0)
     monkeypatch.setattr(office, "make_office", lambda **_: small)
@@ -63,7 +81,7 @@ def test_costmap_figures_are_of_the_whole_floor_and_of_legal_zones() -> None:
 @pytest.mark.live
 async def test_clients_of_every_kind_are_answered_while_the_heartbeat_is_timed(tmp_path) -> None:
     floor = office.make_office(60.0, 40.0)
-    rest.write_site(tmp_path, floor)
+    site.write_site(tmp_path, floor)
     figures = await rest.measure(tmp_path, floor, zones=50, clients=10, seconds=3.0, idle_s=0.5)
     assert (
         {"200", "201", "204", "413", "422"}

@@ -17,41 +17,51 @@ bench_app = typer.Typer(help="Measure parts of the system on this machine.", no_
 
 
 @bench_app.command("fleet", epilog="Example: fognav bench fleet --robots 50 --goals 50 --zones 300 --json")
-def fleet_command(
+def fleet_command(  # noqa: PLR0913  # the options of a command
     *,
     robots: Annotated[int, typer.Option("--robots", metavar="N", min=1, max=500, help="Robots with a goal.")] = 50,
     goals: Annotated[int, typer.Option("--goals", metavar="G", min=1, max=500, help="Different goals.")] = 50,
     zones: Annotated[int, typer.Option("--zones", metavar="Z", min=0, max=5000, help="No-go zones.")] = 300,
     trials: Annotated[int, typer.Option("--trials", metavar="T", min=1, help="Hazards of each kind.")] = 5,
     seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of floor, places and zones.")] = 1,
+    live: Annotated[
+        bool,
+        typer.Option("--live", help="Measure a planner's process, with a router, a store and robots' subscribers."),
+    ] = False,
     json: Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")] = False,
 ) -> None:
     """Measure the planner with many robots.
 
     One hazard lies across all paths, then one cuts all goals off, then they are reachable again. The map is an office
-    of 100 x 60 m at 5 cm. Times are in ms, from a change of the map to each robot's path or refusal.
+    of 100 x 60 m at 5 cm. Times are in ms, from a change of the map to each robot's path or refusal: within the
+    planner's core, or, with --live, from its publication to the robot's subscriber.
     """
     import numpy as np  # noqa: PLC0415  # keeps the other commands fast
 
-    from fognav.bench import machine  # noqa: PLC0415  # same
-    from fognav.bench.fleet import Fleet, FleetMap, measure  # noqa: PLC0415  # same
+    from fognav.bench import fleet_live, machine  # noqa: PLC0415  # same
+    from fognav.bench.fleet import Fleet, FleetMap, measure, place_fleet  # noqa: PLC0415  # same
     from fognav.bench.office import make_office  # noqa: PLC0415  # same
 
     kernels.warm_cache(lambda text: console.print(text, markup=False))
     rng = np.random.default_rng(seed)
-    with Progress(console=console, disable=not console.is_terminal) as progress:
+    with exit_codes(), Progress(console=console, disable=not console.is_terminal) as progress:
         task = progress.add_task("planning the first paths", total=trials)
         map_ = FleetMap(make_office(seed=seed), zones, rng)
-        fleet = Fleet(map_, robots, goals, rng)
-        figures = measure(
-            map_, fleet, trials, lambda done, _: progress.update(task, completed=done, description="hazards")
-        )
-    asked = {"robots": robots, "goals": goals, "zones": zones, "trials": trials, "seed": seed}
+
+        def show(done: int, _total: int) -> None:
+            progress.update(task, completed=done, description="hazards")
+
+        if live:
+            fleet = place_fleet(map_, robots, goals, rng)
+            figures = asyncio.run(fleet_live.measure(map_, fleet, trials, show))
+        else:
+            figures = measure(map_, Fleet(map_, robots, goals, rng), trials, show)
+    asked = {"robots": robots, "goals": goals, "zones": zones, "trials": trials, "seed": seed, "live": live}
     if json:
         print_json({"bench": "fleet", **asked, **figures, **machine.describe()})
         return
     for name, value in (asked | figures).items():
-        console.print(f"{name:22} {value}", markup=False)
+        console.print(f"{name:24} {value}", markup=False)
 
 
 @bench_app.command("costmap", epilog="Example: fognav bench costmap --zones 5000 --json")
@@ -124,11 +134,12 @@ def rest_command(
     """
     from fognav.bench import machine, rest  # noqa: PLC0415  # keeps the other commands fast
     from fognav.bench.office import make_office  # noqa: PLC0415  # same
+    from fognav.bench.site import write_site  # noqa: PLC0415  # same
 
     kernels.warm_cache(lambda text: console.print(text, markup=False))
     floor = make_office()
     with TemporaryDirectory(prefix="fognav-") as folder:
-        rest.write_site(Path(folder), floor)
+        write_site(Path(folder), floor)
         figures = asyncio.run(rest.measure(Path(folder), floor, zones=zones, clients=clients, seconds=seconds))
     asked = {"clients": clients, "seconds": seconds, "zones": zones}
     if json:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 import psutil
@@ -42,7 +42,7 @@ from fognav.bench.office import CORRIDOR, corridor_rows
 from planner.core import PlannerCore
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -50,11 +50,19 @@ if TYPE_CHECKING:
     from fog_contracts.handlers import Publication
 
     Polygon = list[tuple[float, float]]
+    PointXY = tuple[float, float]
 
 _QUIET_S: Final = 120.0
 """After a trial the clock is put forward so far that no earlier switch delays another one."""
 _STRIP: Final = 2.0
 """Width (m) of the hazards."""
+
+
+class Trip(NamedTuple):
+    """Where a robot stands, and its goal (m, frame `map`)."""
+
+    place: PointXY
+    goal: PointXY
 
 
 class FleetMap:
@@ -115,6 +123,24 @@ class FleetMap:
         return self.master.write([("cost", grown, cells)], [cause], [])
 
 
+def place_fleet(map_: FleetMap, robots: int, goals: int, rng: np.random.Generator) -> dict[str, Trip]:
+    """Return each robot's place in the west of the floor, and its goal in the east; robots share goals in turn."""
+    left, _, right, _ = map_.geometry.bounds
+    width = right - left
+    starts, ends = map_.free_cells(left, left + 0.2 * width), map_.free_cells(right - 0.2 * width, right)
+    places = [map_.geometry.centre(*starts[rng.integers(len(starts))].tolist()) for _ in range(robots)]
+    targets = [map_.geometry.centre(*ends[rng.integers(len(ends))].tolist()) for _ in range(goals)]
+    return {f"r{number}": Trip(place, targets[number % goals]) for number, place in enumerate(places)}
+
+
+def closures(map_: FleetMap, trials: int) -> Iterator[tuple[Polygon, Polygon]]:
+    """Yield the hazards of each trial: one across the corridor, one across the whole floor."""
+    left, bottom, right, top = map_.geometry.bounds
+    for number in range(trials):
+        x = left + (0.35 + 0.3 * number / max(1, trials - 1)) * (right - left)
+        yield strip(x, map_.corridor - CORRIDOR / 2, map_.corridor + CORRIDOR / 2), strip(x, bottom, top)
+
+
 def hazard_message(polygon: Polygon, seq: int, *, blocked: bool) -> HazardArea:
     """Return the hazard as the map-service publishes it."""
     hazard = AreaHazard(
@@ -152,17 +178,11 @@ class Fleet:
         self.core = PlannerCore(epoch=1)
         self.now = 100.0
         self.bytes_sent = 0
-        left, _, right, _ = map_.geometry.bounds
-        width = right - left
-        starts, ends = map_.free_cells(left, left + 0.2 * width), map_.free_cells(right - 0.2 * width, right)
-        self._poses = {
-            f"r{n}": map_.geometry.centre(*starts[rng.integers(len(starts))].tolist()) for n in range(robots)
-        }
-        places = [map_.geometry.centre(*ends[rng.integers(len(ends))].tolist()) for _ in range(goals)]
+        self._trips = place_fleet(map_, robots, goals, rng)
         self.core.load(map_.master.snapshot(), self.now)
         self._deliver(ch.ZONES, ZoneSet(epoch=1, seq=1, zones=map_.zones))
-        for number, robot in enumerate(self._poses):
-            x, y = places[number % goals]
+        for number, (robot, trip) in enumerate(self._trips.items()):
+            x, y = trip.goal
             goal = RobotGoal(goal_id=f"g{number}", pose=Pose(x=x, y=y, theta=0.0))
             self.core.set_goal(robot, goal, any_heading=True)
         self.settle()
@@ -177,7 +197,7 @@ class Fleet:
     def _refresh(self) -> None:
         """Deliver a heartbeat of the map and every robot's pose."""
         self._deliver(ch.MAP_HEARTBEAT, self.map.master.heartbeat(self.now))
-        for robot, (x, y) in self._poses.items():
+        for robot, ((x, y), _) in self._trips.items():
             pose = RobotPose(
                 x=x, y=y, theta=0.0, covariance=[0.0] * 9, v=0.0, w=0.0, radius=0.17, height=0.1, stamp=self.now
             )
@@ -252,24 +272,19 @@ def run_jobs(core: PlannerCore, at: Moment) -> None:
 
 def measure(map_: FleetMap, fleet: Fleet, trials: int, on_progress: Callable[[int, int], object]) -> dict[str, object]:
     """Run the trials and return the figures; times in ms."""
-    _, bottom, _, top = map_.geometry.bounds
-    left, _, right, _ = map_.geometry.bounds
     replans: list[float] = []
     cut_off: list[float] = []
     explained: list[float] = []
     back: list[float] = []
-    sent = changed = 0
-    for number in range(trials):
-        x = left + (0.35 + 0.3 * number / max(1, trials - 1)) * (right - left)
-        across = strip(x, map_.corridor - CORRIDOR / 2, map_.corridor + CORRIDOR / 2)
+    sent = deltas_sent = 0
+    for number, (across, wall) in enumerate(closures(map_, trials)):
         deltas = map_.put(across)
         before = fleet.bytes_sent
         replans += fleet.trial(deltas, hazard_message(across, 4 * number, blocked=True)).answered
-        sent += fleet.bytes_sent - before + sum(len(encode(ch.MAP_DELTA, delta)) for delta in deltas)
-        changed += 1
+        sent += fleet.bytes_sent - before
+        deltas_sent += sum(len(encode(ch.MAP_DELTA, delta)) for delta in deltas)
         fleet.trial(map_.clear(across), hazard_message(across, 4 * number + 1, blocked=False))
         fleet.settle()
-        wall = strip(x, bottom, top)
         times = fleet.trial(map_.put(wall), hazard_message(wall, 4 * number + 2, blocked=True))
         cut_off.append(max(times.answered, default=0.0))
         explained.append(times.explained)
@@ -279,16 +294,17 @@ def measure(map_: FleetMap, fleet: Fleet, trials: int, on_progress: Callable[[in
         on_progress(number + 1, trials)
     return {
         "replans": len(replans),
-        "replan_p50_ms": _percentile(replans, 50),
-        "replan_p99_ms": _percentile(replans, 99),
-        "cut_off_ms": _percentile(cut_off, 50),
-        "cut_off_explained_ms": _percentile(explained, 50),
-        "back_ms": _percentile(back, 50),
+        "replan_p50_ms": percentile(replans, 50),
+        "replan_p99_ms": percentile(replans, 99),
+        "cut_off_ms": percentile(cut_off, 50),
+        "cut_off_explained_ms": percentile(explained, 50),
+        "back_ms": percentile(back, 50),
         "rss_mb": round(psutil.Process().memory_info().rss / 1e6, 1),
         "goal_fields_mb": round(fleet.core.fields_bytes / 1e6, 1),
-        "bytes_per_robot": round(sent / max(1, changed) / max(1, len(replans) / max(1, changed))),
+        "bytes_per_robot": round(sent / max(1, len(replans)) + deltas_sent / trials),
     }
 
 
-def _percentile(values: Sequence[float], share: float) -> float:
+def percentile(values: Sequence[float], share: float) -> float:
+    """Return a percentile, rounded; 0 without values."""
     return round(float(np.percentile(values, share)), 2) if values else 0.0

@@ -16,10 +16,10 @@ import msgspec
 import numpy as np
 import psutil
 
-from fog_runtime.maps import save_map
 from fog_runtime.redis_store import Audit
 from fognav.bench.costmap import random_zones, worst_shapes
 from fognav.bench.rest_clients import Load
+from fognav.bench.site import SITE
 from fognav.stack import MAP_SERVICE, SERVERS, Stack, StackConfig
 from map_service.store import Store
 
@@ -30,16 +30,9 @@ if TYPE_CHECKING:
     from fog_contracts.grid import StaticMap
     from fog_contracts.messages import Zone
 
-SITE: Final = "bench"
 IDLE_S: Final = 5.0
 """How long the heartbeat is measured without clients, unless told otherwise."""
 _READY_S: Final = 120.0
-
-
-def write_site(folder: Path, floor: StaticMap) -> None:
-    """Write a site without areas and robots."""
-    save_map(folder / "map", floor)
-    (folder / "site.toml").write_text(f'id = "{SITE}"\nmap = "map.yaml"\n', "utf-8")
 
 
 async def measure(  # all that a run consists of, by name
@@ -47,7 +40,7 @@ async def measure(  # all that a run consists of, by name
 ) -> dict[str, float | int | dict[str, int]]:
     """Return the gaps between heartbeats (ms), without clients (`idle_`) and with them, and what these were answered.
 
-    `folder` holds a site (`write_site`) of this floor; `zones` are stored before.
+    `folder` holds a site (`site.write_site`) of this floor; `zones` are stored before.
     """
     config = StackConfig(site_dir=folder, robot="none", extra={"HAZARDS_WAIT_S": "0"})
     async with _map_service(config, random_zones(floor, zones)) as stack:

@@ -114,6 +114,12 @@ def test_wrong_arguments_are_refused(changes, error):
         first_contact(**{**given_, **changes})
 
 
+def test_horizon_of_one_turn_is_allowed_at_any_rate():
+    body, point = half_planes(BOX), np.array([(2.0, 0.0)])
+    for w in np.linspace(-6.0, 6.0, 1000).tolist():
+        assert first_contact(point, body, 0.0, w, horizon=math.tau / abs(w))[1] == -1
+
+
 def test_polygon_of_another_shape_is_refused():
     with pytest.raises(ValueError, match="polygon"):
         half_planes(np.zeros((2, 2)))

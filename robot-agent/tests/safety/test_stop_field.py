@@ -69,6 +69,20 @@ def test_round_body_that_hardly_advances_turns_in_place_only():
     assert CIRCLE.limit((0.009, 0.009), points((0.185, 0.0))).zone == "stop"
 
 
+def test_slow_arc_from_rest_is_no_turn_in_place():
+    # The first 50 ms at 0.1 m/s2: a robot that was turned in place instead would never drive off.
+    assert CIRCLE.limit((0.004, 0.005), points((1.0, 0.0))) == ((0.004, 0.005), "free", None)
+    assert CIRCLE.limit((0.004, 0.005), points((0.185, 0.0))).zone == "stop"
+
+
+def test_arc_of_a_whole_turn_is_judged_at_any_rate():
+    # At 0.8 m/s the braking time is longer than a turn; tau / |w| times |w| is more than tau at many rates.
+    drive = DriveTrain(axle_m=0.235, wheel_speed_max_m_s=0.8, deceleration_m_s2=0.3)
+    field = StopField(Footprint.circle(0.17), drive, StopFieldConfig())
+    for right in np.linspace(-0.65, -0.38, 200).tolist():
+        assert field.limit((0.8, right), points((1.0, 0.0))).zone == "free"
+
+
 def test_arc_is_kept_when_the_speed_is_lowered():
     limited = CIRCLE.limit((0.2, 0.3), points((0.28, 0.03)))
     assert limited.zone == "slow"

@@ -10,13 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robot_agent.config import VisibilityConfig
-from robot_agent.hardware import RepeatCounter, Twist
+from robot_agent.hardware import DriveTrain, RepeatCounter, Twist
+from robot_agent.safety.gate import SafetyOutputs
 from robot_agent.safety.visibility import Visibility, sector_angles, sector_of
+from robot_agent.safety.wheel_limits import limit_wheels
 
 AROUND = np.radians(np.arange(-179.5, 180.0, 1.0))
 WALLS = np.ones(72, np.bool_)
 OPEN = np.zeros(72, np.bool_)
-FORWARD, BACKWARD, TURNING = Twist(0.3, 0.0), Twist(-0.3, 0.0), Twist(0.005, 1.0)
+FORWARD, BACKWARD, TURNING = Twist(0.3, 0.0), Twist(-0.3, 0.0), Twist(0.0025, 1.0)
 
 
 def degrees_off(angles, middle):
@@ -47,8 +49,25 @@ def test_no_return_in_120_degrees_ahead_refuses_travel_there_and_nowhere_else():
     refused = visibility.limit((0.3, 0.3), FORWARD)
     assert refused == ((0.0, 0.0), "stop", "the lidar sees nothing ahead: it is blind there, or faces glass")
     assert zone(visibility, BACKWARD) == "free"
-    assert visibility.limit((-0.1, 0.11), TURNING) == ((-0.1, 0.11), "free", None)
+    assert visibility.limit((-0.1, 0.1), Twist(0.0, 1.0)) == ((-0.1, 0.1), "free", None)
+    assert visibility.limit((-0.1, 0.105), TURNING).wheels == pytest.approx((-0.1025, 0.1025))
     assert "behind" in seeing(missing=60.0, towards=180.0).limit((-0.3, -0.3), BACKWARD).reason
+
+
+@pytest.mark.parametrize("wheels", [(0.3, 0.3), (0.2, 0.3), (0.0, 0.3), (-0.1, 0.105), (-0.2, 0.2)])
+@pytest.mark.parametrize("acceleration", [0.1, 0.5])
+def test_robot_never_creeps_into_what_its_lidar_does_not_see(wheels, acceleration):
+    visibility = seeing(missing=60.0)
+    drive = DriveTrain(axle_m=0.235, wheel_speed_max_m_s=0.5)
+    outputs = SafetyOutputs(mode="NORMAL", reasons=(), cap=0.3, stop="none", changed=False, refusal=None)
+    last, advanced, turned = (0.0, 0.0), 0.0, 0.0
+    for _ in range(1200):
+        stepped = limit_wheels(wheels, last, outputs, 0.05, acceleration=acceleration, wheel_speed=0.5)
+        last = visibility.limit(stepped, drive.twist(*stepped)).wheels
+        twist = drive.twist(*last)
+        advanced, turned = advanced + 0.05 * abs(twist.v), turned + 0.05 * abs(twist.w)
+    assert advanced < 1e-9
+    assert (turned > 1.0) == (wheels in {(-0.1, 0.105), (-0.2, 0.2)})
 
 
 def test_half_of_the_expected_returns_missing_slows_to_a_tenth_of_a_metre_per_second_on_the_same_arc():

@@ -215,7 +215,8 @@ def first_contact(
     if not (math.isfinite(v) and math.isfinite(w)):
         raise ValueError(f"v and w must be finite, not {v} and {w}")
     rate = float(w) if abs(w) >= STRAIGHT_RAD_S else 0.0
-    if abs(rate) * horizon > math.tau:
+    # tau / |w| times |w| may be a little more than tau.
+    if abs(rate) * horizon > math.tau * (1.0 + 1e-9):
         raise ValueError(f"horizon must be at most one turn, {math.tau / abs(rate):.2f} s at {w} rad/s, not {horizon}")
     time = np.empty(1)
     index = _first_contact(

@@ -49,4 +49,9 @@ class MotionGuard:
         unseen = self._view.visibility.limit(seen.wheels, self._drive.twist(*seen.wheels))
         self.reason = seen.reason or unseen.reason
         self.unseeing = seen.reason is None and unseen.reason is not None
-        return unseen.wheels
+        if unseen.wheels == seen.wheels:
+            return seen.wheels
+        # Of an arc, sight may leave only the turn, and a body that is not round needs room for it.
+        left = self._field.limit(unseen.wheels, points)
+        self.reason = self.reason or left.reason
+        return left.wheels

@@ -68,10 +68,10 @@ class ScanBuilder:
 
     def take_samples(self) -> LidarSamples | None:
         """Return all samples since the last call, be their scan whole or not; None without any."""
-        if not sum(len(times) for _, _, times in self._newest):
+        newest, self._newest = self._newest, []
+        if not sum(len(times) for _, _, times in newest):
             return None
-        clockwise, ranges, times = (np.concatenate(fields) for fields in zip(*self._newest, strict=True))
-        self._newest = []
+        clockwise, ranges, times = (np.concatenate(fields) for fields in zip(*newest, strict=True))
         return LidarSamples(
             angles_rad=_counter_clockwise(clockwise).astype(np.float32),
             ranges_m=ranges.astype(np.float32),

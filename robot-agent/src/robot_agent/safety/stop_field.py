@@ -36,9 +36,20 @@ class Limited(NamedTuple):
 
 _ROUND_M: Final = 0.002
 """A footprint whose corners stand out by less is round: turning in place brings it nearer to nothing."""
-_IN_PLACE_M_S: Final = 0.01
-"""A round body that turns and advances by less turns in place, and does not advance."""
+_IN_PLACE_SHARE: Final = 0.05
+"""Wheels whose mean is less than this share of their turning part mean to turn in place."""
 _TOLERANCE_M: Final = 1e-6
+
+
+def turn_in_place(wheels: Wheels) -> Wheels | None:
+    """Return the turn without any advance, if these wheel speeds mean to turn in place; None for an arc.
+
+    Judged by the ratio of the wheels, not by a speed: from rest every arc begins slowly.
+    """
+    turning = 0.5 * (wheels[1] - wheels[0])
+    if abs(0.5 * (wheels[0] + wheels[1])) >= _IN_PLACE_SHARE * abs(turning):
+        return None
+    return -turning, turning
 
 
 class StopField:
@@ -68,9 +79,6 @@ class StopField:
         if fastest == 0.0:
             return Limited(wheels)
         v, w = self._drive.twist(*wheels)
-        if self._round and abs(v) < _IN_PLACE_M_S and w:
-            turning = 0.5 * (wheels[1] - wheels[0])
-            return Limited((-turning, turning))
         config, needed = self._config, self._braking_time(fastest)
         contact, index = first_contact(
             points,
@@ -83,6 +91,9 @@ class StopField:
         )
         if index < 0:
             return Limited(wheels)
+        turning = turn_in_place(wheels) if self._round else None
+        if turning is not None:
+            return Limited(turning)
         share = self._share(fastest, contact)
         if share * fastest < config.slowest:
             return Limited(

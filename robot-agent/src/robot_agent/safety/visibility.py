@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
-from robot_agent.safety.stop_field import Limited
+from robot_agent.safety.stop_field import Limited, turn_in_place
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -28,7 +28,6 @@ _EXPECTED_MIN: Final = 4
 _LEAD_MAX_RAD: Final = math.radians(45.0)
 _LEAD_S: Final = 0.5
 """A turning robot travels into the direction in which it will head after half of this."""
-_TURNING_IN_PLACE_M_S: Final = 0.01
 
 _Sight = Literal["clear", "poor", "blind"]
 
@@ -75,17 +74,21 @@ class Visibility:
     def limit(self, wheels: Wheels, twist: Twist) -> Limited:
         """Limit wheel speeds, whose twist is given, by what is seen in the direction of travel; the arc is kept.
 
-        Turning in place is not limited: it is how a robot looks elsewhere.
+        Turning in place is allowed, without the little advance that a command for it may have: it is how a robot looks
+        elsewhere. Slowness alone allows nothing, since slow steps add up.
         """
-        if abs(twist.v) < _TURNING_IN_PLACE_M_S:
+        if twist.v == 0.0:
             return Limited(wheels)
         lead = min(max(0.5 * _LEAD_S * twist.w, -_LEAD_MAX_RAD), _LEAD_MAX_RAD)
         heading = lead if twist.v > 0.0 else math.pi - lead
-        self._sight = self._sight_towards(heading)
-        if self._sight == "blind":
+        sight, turning = self._sight_towards(heading), turn_in_place(wheels)
+        if turning is not None:
+            return Limited(turning if sight == "blind" else wheels)
+        self._sight = sight
+        if sight == "blind":
             side = "ahead" if twist.v > 0.0 else "behind"
             return Limited((0.0, 0.0), "stop", f"the lidar sees nothing {side}: it is blind there, or faces glass")
-        if self._sight == "poor" and abs(twist.v) > self._config.speed:
+        if sight == "poor" and abs(twist.v) > self._config.speed:
             share = self._config.speed / abs(twist.v)
             return Limited((wheels[0] * share, wheels[1] * share), "slow")
         return Limited(wheels)

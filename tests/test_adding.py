@@ -32,8 +32,7 @@ MESSAGES = "libs/fog-contracts/src/fog_contracts/messages.py"
 CHANNELS = "libs/fog-contracts/src/fog_contracts/channels.py"
 SHAPES = "libs/fog-contracts/src/fog_contracts/shapes.py"
 DRAWING_COMMANDS = {
-    f"cli/src/fognav/{name}.py"
-    for name in ("area_command", "zone_command", "bench/costmap", "bench/fleet", "bench/rest_clients")
+    f"cli/src/fognav/{name}.py" for name in ("zone_command", "bench/costmap", "bench/fleet", "bench/rest_clients")
 }
 AGGREGATOR = "services/hazard-aggregator/src/hazard_aggregator/core.py"
 MAP_API = "services/map-service/src/map_service/api.py"
@@ -91,6 +90,10 @@ ROBOT_APPROACH    = _pub(  "robot_approach",    FOG + "robots/{robot}/approach",
 """),
     Edit(AGGREGATOR, r"^    from fog_contracts\.messages import", before="""\
     from fog_contracts.messages import NodeBattery, RobotApproach
+"""),
+    Edit(AGGREGATOR, r"^from fog_contracts import channels as ch$", before="""\
+import msgspec
+
 """),
     Edit(AGGREGATOR, r"^            ch\.NODE_READING: ", before="""\
             ch.NODE_BATTERY: self._on_battery,

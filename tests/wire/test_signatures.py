@@ -6,7 +6,7 @@ import random
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from fog_runtime import parts
@@ -75,6 +75,7 @@ def test_a_damaged_beginning_hides_no_device(name):
 
 @given(st.binary(max_size=600))
 def test_noise_is_nobody(data):
+    assume(b"\xa5\x5a" not in data)  # with five more bytes that is a lidar's descriptor
     assert not any(each.recognizes(data) for each in SIGNATURES.values())
     assert foreign("roomba600", data, SIGNATURES) is None
 

@@ -28,6 +28,7 @@ from fog_runtime.http import (
     make_app,
     unused,
 )
+from fog_runtime.http.link import CoreLink
 
 pytestmark = pytest.mark.live
 DEADLINE_S = 60.0
@@ -178,6 +179,20 @@ async def test_end_of_the_front_ends_the_service_with_an_error(tmp_path):
         os.kill(service.front._pid, signal.SIGKILL)
         with pytest.raises(FrontError, match="has ended"):
             await service.task
+
+
+async def test_calls_to_a_core_that_has_ended_are_to_be_repeated():
+    core, front = socket.socketpair()
+    link = await CoreLink.over(front)
+    running = asyncio.create_task(link.run(lambda: None))
+    calling = asyncio.create_task(link.call("GET /slow", b""))
+    await asyncio.to_thread(core.recv, 1)
+    core.close()
+    for call in (calling, link.call("GET /slow", b"")):
+        with pytest.raises(ProblemError) as refused:
+            await call
+        assert (refused.value.status, refused.value.headers) == (503, {"Retry-After": "1"})
+        await running
 
 
 def test_front_ends_with_a_killed_core(tmp_path):

@@ -351,11 +351,13 @@ class Copies(RuleBasedStateMachine):
     def teardown(self):
         for process in self.world.processes.values():
             process.running = process.store_reachable = process.network_reachable = process.loadable = True
-        self.world.run(2 * TAKEOVER_S)
-        assert len(self.world.leaders()) == 1, "one leads again"
-        self.accepted_messages_have_one_sender_and_growing_epochs()
-        self.world.close()
-        self.patch.undo()
+        try:
+            self.world.run(2 * TAKEOVER_S)
+            assert len(self.world.leaders()) == 1, "one leads again"
+            self.accepted_messages_have_one_sender_and_growing_epochs()
+        finally:
+            self.world.close()
+            self.patch.undo()
 
 
 Copies.TestCase.settings = settings(

@@ -253,20 +253,25 @@ class OverriddenArea(RuleBasedStateMachine):
 
     @rule()
     def restart(self):
+        if self.until is not None and self.rig.stored["hall"].boot != self.rig.boot:
+            self.expect_the_stored_rest()  # its deadline is still that of an earlier boot
         for each in (self.rig, self.plain):
             each.start()
 
     @rule()
     def reboot(self):
+        self.expect_the_stored_rest()
+        for each in (self.rig, self.plain):
+            each.boot = f"boot {next(each.boots)}"
+            each.start()
+
+    def expect_the_stored_rest(self):
         if self.until is not None:
             state, deadline = self.until
             rest, version = self.rig.rests.get("hall"), self.rig.stored["hall"].version
             left = rest.rest_s if rest and rest.version == version else self.rig.stored["hall"].ttl_s
             assert left >= deadline - self.rig.now - 1e-6, "a blockage is never cut short"
             self.until = None if state == "clear" or left == 0.0 else (state, self.rig.now + left)
-        for each in (self.rig, self.plain):
-            each.boot = f"boot {next(each.boots)}"
-            each.start()
 
     @invariant()
     def operators_word_counts_and_the_nodes_go_on_underneath(self):

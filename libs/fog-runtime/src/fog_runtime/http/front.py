@@ -151,5 +151,10 @@ async def _receive(app: FastAPI, listener: socket.socket, end: socket.socket) ->
     linked = asyncio.ensure_future(link.run(stop))
     serving = asyncio.ensure_future(server.serve(sockets=[listener]))
     done, _ = await asyncio.wait({linked, serving}, return_when=asyncio.FIRST_COMPLETED)
+    if linked in done:
+        for each in server.servers:
+            each.close()  # at once: the service is started again on this port
+        stop()  # open requests are still answered: their calls have failed
+        await asyncio.wait({serving}, timeout=END_S)
     for task in done:
         task.result()

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 from fastapi import Response
 
+from fog_runtime.http.problems import RETRY_AFTER, ProblemError
+
 if TYPE_CHECKING:
     import socket
     from collections.abc import Awaitable, Callable
@@ -93,6 +95,7 @@ class CoreLink:
         self._messages = messages
         self._ids = itertools.count()
         self._open: dict[int, asyncio.Future[Reply]] = {}
+        self._ended = False
 
     @classmethod
     async def over(cls, end: socket.socket) -> CoreLink:
@@ -114,9 +117,18 @@ class CoreLink:
                     called.set_result(message)
             elif isinstance(message, Stop):
                 stop()
+        self._ended = True
+        for called in self._open.values():
+            if not called.done():
+                called.set_exception(_core_ended())
 
     async def call(self, route: str, arguments: bytes) -> Response:
-        """Call a route in the core's process; return its response."""
+        """Call a route in the core's process; return its response.
+
+        Raises `ProblemError` (503) when that process has ended: it may have done what it was called for.
+        """
+        if self._ended:
+            raise _core_ended()
         number = next(self._ids)
         called = self._open[number] = asyncio.get_running_loop().create_future()
         try:
@@ -127,6 +139,10 @@ class CoreLink:
         response = Response(reply.body, reply.status)
         response.raw_headers = reply.headers
         return response
+
+
+def _core_ended() -> ProblemError:
+    return ProblemError(503, "the service has ended, and is started again", headers=RETRY_AFTER)
 
 
 class FrontLink:

@@ -374,7 +374,7 @@ def test_a_no_go_zone_over_the_robot_is_named_with_its_reason(driving):
     x = driving.x
     shape = PolygonShape(points=[(x - 1, 1), (x + 1, 1), (x + 1, 3), (x - 1, 3)])
     zone = Zone(id="wet-floor", kind="BLOCKED", shape=shape, reason="being mopped")
-    driving.send(ch.ZONES, ZoneSet(epoch=7, seq=1, zones=[zone]))
+    driving.send(ch.ZONES, ZoneSet(epoch=7, seq=1, zones=[zone], active=[zone.id]))
     driving.block(x - 1, 1.0, x + 1, 3.0)
     driving.run(0.1)
     assert any("wet-floor (being mopped)" in reason for reason in driving.state().reasons)

@@ -53,7 +53,8 @@ def drive_through_most_situations(world):
     corners = [(0.0, 0.0), (3.4, 0.0), (3.4, 3.0), (0.0, 3.0)]
     world.send(ch.HAZARD, HazardArea(hazard=area, polygon=corners, label="Z4", epoch=7))
     shape = PolygonShape(points=[(9.0, 1.0), (10.0, 1.0), (10.0, 2.0)])
-    world.send(ch.ZONES, ZoneSet(epoch=7, seq=1, zones=[Zone(id="wet", kind="BLOCKED", shape=shape, reason="mopped")]))
+    wet = Zone(id="wet", kind="BLOCKED", shape=shape, reason="mopped")
+    world.send(ch.ZONES, ZoneSet(epoch=7, seq=1, zones=[wet], active=["wet"]))
     world.drive_to([(world.x, world.y), (3.5, 2.0), (3.5, 3.8)], plan_id=2, traces=[trace()])
     world.run(6.0)
     world.agent.on_suspension(2.0)

@@ -139,7 +139,7 @@ def test_query_reaches_the_handler_of_its_ids_only(bus):
 
 
 def test_published_channel_can_be_queried_for_its_latest_message(bus):
-    zones = ZoneSet(epoch=1, seq=2, zones=[])
+    zones = ZoneSet(epoch=1, seq=2, zones=[], active=[])
     bus.serve({ch.ZONES: replying(zones)})
     assert bus.query(ch.ZONES, None, ZoneSet, AT) == zones
     with pytest.raises(ContractError, match="ZoneSet"):

@@ -38,7 +38,7 @@ def test_message_of_a_lower_epoch_is_refused_on_all_channels_of_its_sender():
     heartbeat = MapHeartbeat(epoch=5, seq=1, hash=0, sent=(0, 0.0))
     handlers[ch.MAP_HEARTBEAT]({}, heartbeat, AT)
     with pytest.raises(RefusedMessageError, match="its epoch 4 is below 5: another map-service has taken over"):
-        handlers[ch.ZONES]({}, ZoneSet(epoch=4, seq=9, zones=[]), AT)
+        handlers[ch.ZONES]({}, ZoneSet(epoch=4, seq=9, zones=[], active=[]), AT)
     handlers[ch.MAP_HEARTBEAT]({}, heartbeat, AT)
     assert handled == [heartbeat, heartbeat]
     assert fence.epochs == {"map-service": 5}

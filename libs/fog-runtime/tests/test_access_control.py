@@ -220,7 +220,7 @@ def heartbeat(seq):
 
 
 GOAL = m.RobotGoal(goal_id="g", pose=None)
-ZONES = m.ZoneSet(epoch=1, seq=1, zones=[])
+ZONES = m.ZoneSet(epoch=1, seq=1, zones=[], active=[])
 PLAN = m.PlanRequest(start=m.Pose(x=0.0, y=0.0, theta=0.0), goal=m.Pose(x=1.0, y=0.0, theta=0.0))
 
 

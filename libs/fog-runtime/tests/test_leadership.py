@@ -105,7 +105,7 @@ class Process:
         return MapHeartbeat(epoch=self.epoch, seq=1, hash=1, sent=(0, self.world.now))
 
     def zones(self) -> ZoneSet:
-        return ZoneSet(epoch=self.epoch, seq=1, zones=[])
+        return ZoneSet(epoch=self.epoch, seq=1, zones=[], active=[])
 
     def close(self) -> None:
         for task in self.tasks:

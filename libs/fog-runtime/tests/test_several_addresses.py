@@ -35,7 +35,7 @@ def hazard(seq: int) -> m.AreaHazard:
 
 
 def zones(seq: int) -> m.ZoneSet:
-    return m.ZoneSet(epoch=1, seq=seq, zones=[])
+    return m.ZoneSet(epoch=1, seq=seq, zones=[], active=[])
 
 
 class Received:

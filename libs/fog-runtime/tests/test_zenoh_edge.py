@@ -58,7 +58,7 @@ def delta(seq, size=10):
 
 
 def zones(seq):
-    return m.ZoneSet(epoch=1, seq=seq, zones=[])
+    return m.ZoneSet(epoch=1, seq=seq, zones=[], active=[])
 
 
 def counter(name, channel):
@@ -205,7 +205,7 @@ async def test_queries_are_answered_by_plain_and_async_handlers_with_ids(router)
         await asyncio.sleep(0)
         return m.CommandReply(accepted=True, reason=f"{ids['robot']} {request.kind}")
 
-    snapshot = m.ZoneSet(epoch=1, seq=7, zones=[])
+    snapshot = m.ZoneSet(epoch=1, seq=7, zones=[], active=[])
     async with edge(router.endpoint, "a") as a, edge(router.endpoint, "b") as b:
         a.serve(ch.ROBOT_COMMAND, command, robot="r1")
         a.serve(ch.ZONES, lambda *_: snapshot)

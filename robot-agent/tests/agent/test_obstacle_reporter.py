@@ -131,7 +131,8 @@ def places(hazards=(), zones=()):
             area="z4", state=state, severity=1, penalty=254, since=0.0, seq=1, epoch=1, cause="", nodes={}
         )
         found.handlers()[ch.HAZARD]({}, HazardArea(hazard=area, polygon=polygon, label="Z4"), at)
-    found.handlers()[ch.ZONES]({}, ZoneSet(epoch=1, seq=1, zones=list(zones)), at)
+    active = [zone.id for zone in zones if zone.enabled]
+    found.handlers()[ch.ZONES]({}, ZoneSet(epoch=1, seq=1, zones=list(zones), active=active), at)
     return found
 
 

@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -44,7 +45,7 @@ from map_service.core import MapCore
 from map_service.layers.base import CostLayer, write_cost
 from map_service.pending import merge_overlapping
 from map_service.registry import LayersError, make_layers
-from map_service.zone_validation import ZoneError, prepare_zone
+from map_service.zone_validation import ZoneError, list_size, prepare_zone
 
 
 @dataclass
@@ -485,6 +486,39 @@ def test_zone_is_in_force_between_its_start_and_expiry_and_while_enabled():
     assert rig.tick(21.0, 21.0).zones is None
     rig.put_zone(zone(enabled=False), 0.0)
     assert cost_and_speed(rig, 1.0, 1.0)[0] == 0
+
+
+def test_zones_are_published_again_with_the_ids_in_force_when_one_begins_or_ends():
+    rig = make_rig()
+    rig.put_zone(zone("always"), 0.0)
+    first = rig.put_zone(zone("later", starts_at=10.0, expires_at=20.0), 0.0)
+    assert ([z.id for z in first.zones.zones], first.zones.active) == (["always", "later"], ["always"])
+    listed = [(stamp, change.zones) for stamp in (9.9, 10.0, 19.9, 20.0) if (change := rig.tick(stamp, stamp)).zones]
+    assert [(stamp, zones.active) for stamp, zones in listed] == [(10.0, ["always", "later"]), (20.0, ["always"])]
+    assert [z.id for z in listed[-1][1].zones] == ["always", "later"]
+    assert listed[-1][1].seq == rig.map.version.seq
+    assert first.zones.active == ["always"], "what was published stays as it was"
+
+
+def test_zones_in_force_are_listed_by_the_rules_of_the_map_and_not_by_the_date():
+    core = make_core()
+    unknown = Moment(0.0, 5.0, synchronized=False)
+    core.load_zones([zone("later", starts_at=1e9), zone("off", enabled=False)], unknown)
+    (listed,) = [p.message for p in core.tick(unknown) if p.channel is ch.ZONES]
+    assert listed.active == ["later"], "nobody knows whether it has started"
+    (listed,) = [p.message for p in core.tick(Moment(1.0, 100.0)) if p.channel is ch.ZONES]
+    assert ([z.id for z in listed.zones], listed.active) == (["later", "off"], [])
+    assert core.query_handlers()[ch.ZONES]({}, None, moment(2.0)) == listed
+
+
+@given(st.integers(0, 40), st.integers(1, 32))
+@settings(max_examples=40, deadline=None)
+def test_list_with_all_zones_in_force_is_no_larger_than_what_is_checked_before_one_is_stored(count, length):
+    core = make_core()
+    core.load_zones([zone(f"{number:x<{length}}"[:length]) for number in range(count)], moment(0.0))
+    listed = core.zone_set()
+    assert len(listed.active) == len(listed.zones)
+    assert len(msgspec.msgpack.encode(listed)) <= list_size(core.zones.size)
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import itertools
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from fog_contracts import channels as ch
 from fog_contracts.grid import GridGeometry
 from fog_contracts.handlers import Moment, Publication
 from fog_contracts.messages import (
+    WEEKDAYS,
     CircleShape,
     CorridorShape,
     EgressRequest,
@@ -28,6 +30,8 @@ from fog_contracts.messages import (
     RobotRelease,
     RobotState,
     Trace,
+    WeeklySchedule,
+    WeeklyTime,
     Zone,
     ZoneSet,
 )
@@ -378,7 +382,7 @@ def test_no_go_zones_are_named_as_causes() -> None:
     drive.send(drive.map.put("circle", (9.2, 10.2, 10.8, 11.8)) + drive.map.put("strip", LOWER))
     circle = Zone(id="circle", kind="BLOCKED", shape=CircleShape(centre=(10.0, 11.0), radius=0.8), reason="wet floor")
     strip = Zone(id="strip", kind="BLOCKED", shape=CorridorShape(line=[(10.0, 0.0), (10.0, 2.0)], width=2.0))
-    drive.deliver(ch.ZONES, ZoneSet(epoch=1, seq=2, zones=[circle, strip]))
+    drive.deliver(ch.ZONES, ZoneSet(epoch=1, seq=2, zones=[circle, strip], active=["circle", "strip"]))
     refusal = drive.go(*RIGHT).refusal
     assert refusal
     assert [(cause.kind, cause.id) for cause in refusal.causes] == [("zone", "circle"), ("zone", "strip")]
@@ -568,6 +572,19 @@ def test_hazard_that_is_named_after_the_refusal_is_in_its_reason_at_once() -> No
     assert [cause.id for cause in named.causes] == ["z1", "z2"]
 
 
+ACROSS = CorridorShape(line=[(10.0, 0.0), (10.0, 12.0)], width=1.0)
+ZONE_TIMES: dict[str, dict[str, Any]] = {
+    "always": {},
+    "started": {"starts_at": 10.0},
+    "later": {"starts_at": 1e9},
+    "expired": {"expires_at": 10.0},
+    "scheduled": {
+        "schedule": WeeklySchedule(time_zone="UTC", times=[WeeklyTime(days=list(WEEKDAYS), begin="00:00", end="00:00")])
+    },
+}
+"""Times of zones: by the planner's clock some have come and others have not, which says nothing."""
+
+
 def test_refusal_never_blames_a_clear_area_in_a_wall_or_a_zone_that_is_off() -> None:
     drive = Drive(start=LEFT)
     drive.send(drive.map.put("z1", UPPER) + drive.map.put("z2", LOWER))
@@ -576,16 +593,41 @@ def test_refusal_never_blames_a_clear_area_in_a_wall_or_a_zone_that_is_off() -> 
     drive.map.areas["inside wall"] = (9.0, 9.0, 11.0, 10.2)  # its cells hold the wall, and a part of z1's inflation
     drive.deliver(ch.HAZARD, drive.map.hazard_area("inside wall", "clear"))
     del drive.map.areas["inside wall"]
-    across = CorridorShape(line=[(10.0, 0.0), (10.0, 12.0)], width=1.0)
-    zones = [
-        Zone(id="off", kind="BLOCKED", shape=across, enabled=False),
-        Zone(id="expired", kind="BLOCKED", shape=across, expires_at=10.0),
-        Zone(id="later", kind="BLOCKED", shape=across, starts_at=1e9),
-    ]
-    drive.deliver(ch.ZONES, ZoneSet(epoch=1, seq=2, zones=zones))
+    zones = [Zone(id=name, kind="BLOCKED", shape=ACROSS, **times) for name, times in ZONE_TIMES.items()]
+    drive.deliver(ch.ZONES, ZoneSet(epoch=1, seq=2, zones=zones, active=[]))
     refusal = drive.go(*RIGHT).refusal
     assert refusal
     assert [cause.id for cause in refusal.causes] == ["z1", "z2"]
+
+
+@pytest.mark.parametrize("name", list(ZONE_TIMES))
+def test_refusal_blames_a_zone_while_the_map_service_says_that_it_is_in_force(name: str) -> None:
+    drive = Drive(start=LEFT)
+    drive.send(drive.map.put("z1", UPPER) + drive.map.put("z2", LOWER))
+    for area in ("z1", "z2"):
+        drive.deliver(ch.HAZARD, drive.map.hazard_area(area))
+    zone = Zone(id=name, kind="BLOCKED", shape=ACROSS, **ZONE_TIMES[name])
+    drive.deliver(ch.ZONES, ZoneSet(epoch=1, seq=2, zones=[zone], active=[name]))
+    blaming = drive.go(*RIGHT).refusal
+    assert blaming
+    assert name in [cause.id for cause in blaming.causes]
+    drive.deliver(ch.ZONES, ZoneSet(epoch=1, seq=2, zones=[zone], active=[]))
+    drive.step()
+    ended = drive.paths[-1].refusal
+    assert ended
+    assert [cause.id for cause in ended.causes] == ["z1", "z2"]
+
+
+def test_robot_beside_an_obstacle_in_a_zone_that_is_off_gets_an_escape() -> None:
+    drive = Drive(start=(10.0, 11.0))
+    drive.send(drive.map.put("chair", (9.9, 10.9, 10.1, 11.1)))
+    zone = Zone(id="night", kind="BLOCKED", shape=ACROSS)
+    drive.deliver(ch.ZONES, ZoneSet(epoch=1, seq=2, zones=[zone], active=["night"]))
+    refusal = drive.go(*RIGHT).refusal
+    assert refusal
+    assert refusal.code == 205
+    drive.deliver(ch.ZONES, ZoneSet(epoch=1, seq=2, zones=[zone], active=[]))
+    assert drive.go(*RIGHT, name="g2").refusal is None
 
 
 def test_wall_is_said_to_be_a_wall_whatever_hazards_there_are() -> None:

@@ -2,6 +2,7 @@
 
 import math
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,19 @@ from fog_contracts import channels as ch
 from fog_contracts.costs import DEFAULT_INFLATION, INSCRIBED
 from fog_contracts.grid import GridGeometry
 from fog_contracts.handlers import Moment
-from fog_contracts.messages import MapDelta, PointXY, RectangleShape, Refusal, RobotRelease, Trace, Zone, ZoneSet
+from fog_contracts.messages import (
+    WEEKDAYS,
+    MapDelta,
+    PointXY,
+    RectangleShape,
+    Refusal,
+    RobotRelease,
+    Trace,
+    WeeklySchedule,
+    WeeklyTime,
+    Zone,
+    ZoneSet,
+)
 from fog_contracts.replica import MapError, Version
 from fog_contracts.shapes import rasterize_shape
 from fog_kernels.astar import Planner
@@ -35,6 +48,13 @@ from planner.route import Route
 CONFIG = PlannerConfig()
 TRACE = Trace(area="z1", epoch=1, seq=5)
 NOW = Moment(100.0, 5000.0)
+ALWAYS = WeeklySchedule(time_zone="UTC", times=[WeeklyTime(days=list(WEEKDAYS), begin="00:00", end="00:00")])
+NEVER = WeeklySchedule(time_zone="UTC", times=[WeeklyTime(days=["wed"], begin="03:00", end="03:01")])
+TIMES: list[dict[str, Any]] = [
+    {}, {"starts_at": 10.0}, {"starts_at": 1e9}, {"expires_at": 10.0}, {"expires_at": 1e9}, {"ttl_s": 1.0},
+    {"schedule": ALWAYS}, {"schedule": NEVER},
+]  # fmt: skip
+"""Times of zones that, by the clock of `NOW`, have come, have not, or have passed."""
 
 
 def make_tracker(ring_map: RingMap) -> MapTracker:
@@ -457,8 +477,8 @@ def sources(ring_map: RingMap, *names: str) -> BlockedRegions:
     return known
 
 
-def on(ring_map: RingMap, known: BlockedRegions, stamp: float = 0.0) -> list[Region]:
-    return Regions(DEFAULT_INFLATION).on(current(make_tracker(ring_map)), known.sources, stamp)
+def on(ring_map: RingMap, known: BlockedRegions) -> list[Region]:
+    return Regions(DEFAULT_INFLATION).on(current(make_tracker(ring_map)), known.sources)
 
 
 def test_region_is_on_only_while_all_its_cells_are_lethal() -> None:
@@ -487,23 +507,48 @@ def test_clear_area_and_disabled_zone_are_no_regions() -> None:
         Zone(id="off", kind="BLOCKED", shape=shape, enabled=False),
         Zone(id="slow", kind="SPEED_LIMIT", speed=0.1, shape=shape),
     ]
-    known.handlers()[ch.ZONES]({}, ZoneSet(epoch=1, seq=1, zones=zones), NOW)
+    known.handlers()[ch.ZONES]({}, zone_set(zones, "slow"), NOW)
     assert on(ring_map, known) == []
 
 
-def test_zone_outside_its_times_is_not_on_where_another_region_explains_its_cells() -> None:
+def zone_set(zones: list[Zone], *active: str) -> ZoneSet:
+    return ZoneSet(epoch=1, seq=1, zones=zones, active=list(active))
+
+
+@pytest.mark.parametrize("others", [[], ["z1"]], ids=["alone", "inside_a_hazard"])
+@pytest.mark.parametrize("times", TIMES)
+def test_zone_is_on_when_the_map_service_says_so_whatever_its_times(times: dict[str, Any], others: list[str]) -> None:
     ring_map = RingMap()
     ring_map.put("z1", UPPER)
-    known = sources(ring_map, "z1")
+    known = sources(ring_map, *others)
     inner = RectangleShape(corner=(9.5, 10.5), opposite=(10.5, 11.5))
-    later = Zone(id="later", kind="BLOCKED", shape=inner, starts_at=1000.0)
-    known.handlers()[ch.ZONES]({}, ZoneSet(epoch=1, seq=1, zones=[later]), NOW)
-    assert [region.cause.id for region in on(ring_map, known, stamp=500.0)] == ["z1"]
-    assert [region.cause.id for region in on(ring_map, known, stamp=1500.0)] == ["z1", "later"]
-    # The map decides, not the planner's clock: lethal cells that nothing else explains are the zone's.
+    zones = [Zone(id="wet", kind="BLOCKED", shape=inner, **times)]
+    known.handlers()[ch.ZONES]({}, zone_set(zones), NOW)
+    assert [region.cause.id for region in on(ring_map, known)] == others
+    known.handlers()[ch.ZONES]({}, zone_set(zones, "wet"), NOW)
+    assert [region.cause.id for region in on(ring_map, known)] == [*others, "wet"]
+    known.handlers()[ch.ZONES]({}, zone_set(zones), NOW)
+    assert [region.cause.id for region in on(ring_map, known)] == others
+
+
+def test_zone_in_force_that_is_not_on_the_map_yet_is_not_on() -> None:
+    ring_map = RingMap()
     known = BlockedRegions()
-    known.handlers()[ch.ZONES]({}, ZoneSet(epoch=1, seq=1, zones=[later]), NOW)
-    assert [region.cause.id for region in on(ring_map, known, stamp=500.0)] == ["later"]
+    shape = RectangleShape(corner=(9.5, 10.5), opposite=(10.5, 11.5))
+    known.handlers()[ch.ZONES]({}, zone_set([Zone(id="wet", kind="BLOCKED", shape=shape)], "wet"), NOW)
+    assert on(ring_map, known) == []
+
+
+def test_zones_are_new_only_when_they_or_those_in_force_changed() -> None:
+    known = BlockedRegions()
+    shape = RectangleShape(corner=(9.5, 10.5), opposite=(10.5, 11.5))
+    revisions, kept = [], []
+    for active in ((), ("wet",), ("wet",), (), ("wet",)):
+        known.handlers()[ch.ZONES]({}, zone_set([Zone(id="wet", kind="BLOCKED", shape=shape)], *active), NOW)
+        revisions.append(known.revision)
+        kept += known.sources
+    assert revisions == [1, 2, 2, 3, 4]
+    assert len({id(zone) for zone in kept}) == 1, "zones that did not change stay the same objects"
 
 
 def test_unchanged_shapes_are_not_rasterized_again() -> None:
@@ -512,9 +557,9 @@ def test_unchanged_shapes_are_not_rasterized_again() -> None:
     ring_map.put("z2", LOWER)
     known = sources(ring_map, "z1")
     regions, planning_map = Regions(DEFAULT_INFLATION), current(make_tracker(ring_map))
-    (first,) = regions.on(planning_map, known.sources, 0.0)
+    (first,) = regions.on(planning_map, known.sources)
     known.handlers()[ch.HAZARD]({"area": "z2"}, ring_map.hazard_area("z2"), NOW)
-    again, _ = regions.on(planning_map, known.sources, 0.0)
+    again, _ = regions.on(planning_map, known.sources)
     assert again is first
 
 
@@ -585,7 +630,7 @@ def test_egress_is_found_however_large_the_blocked_area_is() -> None:
     cost = inflate(raw, inflation_table(0.05, DEFAULT_INFLATION))
     static = np.zeros(geometry.shape, np.uint8)
     planning_map = PlanningMap(geometry, Version(1, 1, 1), cost, static, static, static)
-    regions = Regions(DEFAULT_INFLATION).on(planning_map, [zone], 0.0)
+    regions = Regions(DEFAULT_INFLATION).on(planning_map, [zone])
     out = find_egress(planning_map, regions, (18.0, 20.0), CONFIG, Planner(800, 800))
     assert out.route is not None
     x, y = out.route.corners[-1]

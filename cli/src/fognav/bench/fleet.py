@@ -92,6 +92,10 @@ class FleetMap:
         shape = RectangleShape(corner=(round(x, 2), round(y, 2)), opposite=opposite)
         return Zone(id=f"zone-{number}", kind="BLOCKED", shape=shape, reason="bench")
 
+    def zone_set(self) -> ZoneSet:
+        """Return the message that lists the zones, all of them in force."""
+        return ZoneSet(epoch=1, seq=1, zones=self.zones, active=[zone.id for zone in self.zones])
+
     def free_cells(self, left: float, right: float) -> NDArray[np.int64]:
         """Return cells ((n, 2), columns and rows) along the corridor, between two x (m), with a way to the rest."""
         components = Components(self._cost)
@@ -180,7 +184,7 @@ class Fleet:
         self.bytes_sent = 0
         self._trips = place_fleet(map_, robots, goals, rng)
         self.core.load(map_.master.snapshot(), self.now)
-        self._deliver(ch.ZONES, ZoneSet(epoch=1, seq=1, zones=map_.zones))
+        self._deliver(ch.ZONES, map_.zone_set())
         for number, (robot, trip) in enumerate(self._trips.items()):
             x, y = trip.goal
             goal = RobotGoal(goal_id=f"g{number}", pose=Pose(x=x, y=y, theta=0.0))

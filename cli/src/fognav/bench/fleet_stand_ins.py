@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from fog_contracts import channels as ch
 from fog_contracts.codec import decode
-from fog_contracts.messages import RobotPath, RobotPose, RobotState, ZoneSet
+from fog_contracts.messages import RobotPath, RobotPose, RobotState
 from fog_runtime.clock import SystemClock, ticker
 from fognav.output import FailedError
 
@@ -146,7 +146,7 @@ class StandIns:
         self._quiet_s = quiet_s
         self.receivers = receivers
         edge.serve(ch.MAP_SNAPSHOT, lambda _ids, _request: map_.master.snapshot())
-        edge.publish(ch.ZONES, ZoneSet(epoch=1, seq=1, zones=map_.zones))
+        edge.publish(ch.ZONES, map_.zone_set())
 
     async def publish_loop(self) -> None:
         """Publish the map's heartbeat, and the robots' poses and states, until cancelled."""

@@ -379,11 +379,15 @@ class Zone(Message, frozen=True, kw_only=True):
 
 
 class ZoneSet(Message, frozen=True, kw_only=True):
-    """All stored zones, with the map version that contains them."""
+    """All stored zones, with the map version that contains them; `active` are the ids of those in force.
+
+    Whether a zone is in force follows from no clock of the receiver: it is what the map-service has decided.
+    """
 
     epoch: Count
     seq: Count
     zones: list[Zone]
+    active: list[Id]
 
 
 # --- Planner (zenoh, msgpack) ---------------------------------------------------------------------------------------

@@ -113,9 +113,9 @@ class MapCore:
         return sum(layer.refused for layer in self._layers)
 
     def zone_set(self) -> ZoneSet:
-        """Return all zones with the map version that contains them."""
-        version = self.costmap.version
-        return ZoneSet(epoch=version.epoch, seq=version.seq, zones=self.zones.zones())
+        """Return all zones, and which of them are in force, with the map version that contains them."""
+        version, zones = self.costmap.version, self.zones
+        return ZoneSet(epoch=version.epoch, seq=version.seq, zones=zones.zones(), active=zones.active())
 
     @property
     def aggregator(self) -> AggregatorMonitor:

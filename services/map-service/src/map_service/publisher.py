@@ -91,7 +91,7 @@ class Publisher:
             _record_delta(message)
         elif isinstance(message, ZoneSet):
             ZONES.labels("stored").set(len(message.zones))
-            ZONES.labels("active").set(len(self._core.zones.active()))
+            ZONES.labels("active").set(len(message.active))
         elif isinstance(message, MapHeartbeat):
             now, last = self._now().now, self._last_heartbeat
             self._last_heartbeat = now

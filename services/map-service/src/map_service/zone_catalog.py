@@ -29,8 +29,8 @@ _CAPACITY: Final = 64
 
 
 def encoded_size(zone: Zone) -> int:
-    """Return the size (bytes) of a zone in the message that lists all zones."""
-    return len(msgspec.msgpack.encode(zone))
+    """Return the size (bytes) of a zone in the message that lists all zones, which names it again while in force."""
+    return len(msgspec.msgpack.encode(zone)) + len(msgspec.msgpack.encode(zone.id))
 
 
 @dataclass(eq=False)

@@ -127,5 +127,5 @@ def check_list_size(zone: Zone, others: int, known: int) -> None:
 
 
 _LARGEST: Final = 2**53
-_EMPTY_LIST: Final = len(msgspec.msgpack.encode(ZoneSet(epoch=_LARGEST, seq=_LARGEST, zones=[]))) + 4
-"""Size of a list without zones, and of the longer number of zones in it."""
+_EMPTY_LIST: Final = len(msgspec.msgpack.encode(ZoneSet(epoch=_LARGEST, seq=_LARGEST, zones=[], active=[]))) + 2 * 4
+"""Size of a list without zones, and of the longer numbers of zones and active ones in it."""

@@ -5,17 +5,19 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+from msgspec import structs
+
 from fog_contracts import channels as ch
+from fog_contracts.costs import LETHAL
 from fog_contracts.geometry import contains_point
 from fog_contracts.messages import HazardArea
 from fog_contracts.shapes import shape_contains
-from planner.regions import closes_floor
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from fog_contracts.handlers import Handler, Ids, Moment, Publication
-    from fog_contracts.messages import ZoneSet
+    from fog_contracts.messages import Zone, ZoneSet
     from planner.regions import Source
 
 
@@ -35,12 +37,14 @@ class BlockedRegions:
 
     @property
     def sources(self) -> tuple[Source, ...]:
-        """The hazards and zones that, by what they say of themselves, make cells lethal; the same until one changes."""
+        """The hazards and zones that make cells lethal; the same until one changes.
+
+        The map-service says which zones are in force: it decides by clocks and a history that nobody else has.
+        """
         if self._sources is None:
-            zones = self._zones.zones if self._zones else []
-            hazards = [self._hazards[area] for area in sorted(self._hazards)]
-            known: list[Source] = [*hazards, *zones]
-            self._sources = tuple(source for source in known if closes_floor(source))
+            hazards = (self._hazards[area] for area in sorted(self._hazards))
+            closing = [hazard for hazard in hazards if hazard.hazard.penalty == LETHAL]
+            self._sources = (*closing, *(_no_go_zones(self._zones) if self._zones else ()))
         return self._sources
 
     def _on_hazard(self, _ids: Ids, hazard: HazardArea, _at: Moment) -> Sequence[Publication]:
@@ -50,17 +54,23 @@ class BlockedRegions:
         return ()
 
     def _on_zones(self, _ids: Ids, zones: ZoneSet, _at: Moment) -> Sequence[Publication]:
-        if self._zones is None or self._zones.zones != zones.zones:
+        if self._zones is None or (self._zones.zones, self._zones.active) != (zones.zones, zones.active):
             # Zones that did not change stay the same objects, so that they are not rasterized again.
             known = {zone.id: zone for zone in self._zones.zones} if self._zones else {}
             kept = [known[zone.id] if known.get(zone.id) == zone else zone for zone in zones.zones]
-            self._zones = type(zones)(epoch=zones.epoch, seq=zones.seq, zones=kept)
+            self._zones = structs.replace(zones, zones=kept)
             self._change()
         return ()
 
     def _change(self) -> None:
         self._sources = None
         self.revision += 1
+
+
+def _no_go_zones(zones: ZoneSet) -> list[Zone]:
+    """Return the no-go zones in force."""
+    active = frozenset(zones.active)
+    return [zone for zone in zones.zones if zone.kind == "BLOCKED" and zone.id in active]
 
 
 def cover(sources: Sequence[Source], x: float, y: float, margin: float) -> bool:

@@ -276,7 +276,7 @@ class PlannerCore:
             new_map = known is not None and known[0] != version
             if new_regions or (new_map and at.now - plan.explained_at >= self.config.explain_period_s):
                 questions[robot] = plan, plan.question
-        view = self.view(at) if questions else None
+        view = self.view() if questions else None
         return None if view is None else ExplainJob(view, questions, self.answerer)
 
     @property
@@ -286,15 +286,13 @@ class PlannerCore:
 
     # --- Queries: answered without side effects ---------------------------------------------------------------------
 
-    def view(self, at: Moment) -> View | None:
+    def view(self) -> View | None:
         """Return what queries are answered on, by the thread of the `answerer`; None before the first map."""
         planning_map = self._map.copy()
         if planning_map is None:
             return None
         sources = self._regions.sources
-        return View(
-            planning_map, sources, self._regions.revision, partial(cover, sources), self._fields.fields, at.stamp
-        )
+        return View(planning_map, sources, self._regions.revision, partial(cover, sources), self._fields.fields)
 
     def answers(self) -> Mapping[ch.Channel, Callable[[View | None, Any], PlanReply]]:
         """Return what answers each query on a view, to be called on the thread of the `answerer`."""
@@ -304,8 +302,8 @@ class PlannerCore:
         """Return the handler of every query that the planner answers, where everything runs on one thread."""
         return {ch.PLANNER_PLAN: self._answer_plan, ch.PLANNER_EGRESS: self._answer_egress}
 
-    def _answer_plan(self, _ids: Ids, request: PlanRequest, at: Moment) -> PlanReply:
-        return self.answerer.plan(self.view(at), request)
+    def _answer_plan(self, _ids: Ids, request: PlanRequest, _at: Moment) -> PlanReply:
+        return self.answerer.plan(self.view(), request)
 
-    def _answer_egress(self, _ids: Ids, request: EgressRequest, at: Moment) -> PlanReply:
-        return self.answerer.egress(self.view(at), request)
+    def _answer_egress(self, _ids: Ids, request: EgressRequest, _at: Moment) -> PlanReply:
+        return self.answerer.egress(self.view(), request)

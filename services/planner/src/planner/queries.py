@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class View:
-    """What the core knows at one moment (`stamp`, s since the epoch), unchanged by later messages."""
+    """What the core knows at one moment, unchanged by later messages."""
 
     planning_map: PlanningMap
     sources: tuple[Source, ...]
@@ -38,7 +38,6 @@ class View:
     """The version of `sources`."""
     covers: Covers
     fields: Mapping[Cell, GoalField]
-    stamp: float
 
 
 class Answerer:
@@ -98,7 +97,7 @@ class Answerer:
     def _regions_on(self, view: View) -> list[Region]:
         """Return the regions that are on; the same list for the same map and sources."""
         if self._on is None or self._on[0] is not view.planning_map or self._on[1] != view.revision:
-            regions = self._regions.on(view.planning_map, view.sources, view.stamp)
+            regions = self._regions.on(view.planning_map, view.sources)
             self._on, self._cuts = (view.planning_map, view.revision, regions), None
         return self._on[2]
 

@@ -76,21 +76,6 @@ class Region:
         return bool(np.any(planning_map.static[rows, columns][looked_at] == FREE))
 
 
-def closes_floor(source: Source) -> bool:
-    """Whether a hazard or zone, by what it says of itself, makes its cells lethal: times of zones are not looked at."""
-    if isinstance(source, HazardArea):
-        return source.hazard.penalty == LETHAL
-    return source.kind == "BLOCKED" and source.enabled
-
-
-def in_its_time(source: Source, stamp: float) -> bool:
-    """Whether a zone has started and not expired at a time (s since the epoch); hazards have no times."""
-    if isinstance(source, HazardArea):
-        return True
-    started = source.starts_at is None or source.starts_at <= stamp
-    return started and (source.expires_at is None or stamp < source.expires_at)
-
-
 def region_of(source: Source, geometry: GridGeometry, inflation: Inflation) -> Region | None:
     """Return the region of a hazard or zone; None off the map, or for an invalid shape."""
     try:
@@ -126,11 +111,10 @@ class Regions:
         self._geometry: GridGeometry | None = None
         self._known: list[tuple[Source, Region | None]] = []
 
-    def on(self, planning_map: PlanningMap, sources: Sequence[Source], stamp: float) -> list[Region]:
-        """Return the regions that are on, in the order of their sources; `stamp` in s since the epoch.
+    def on(self, planning_map: PlanningMap, sources: Sequence[Source]) -> list[Region]:
+        """Return the regions that are on, in the order of their sources, which all make their cells lethal.
 
-        What counts are the map's cells, because the map-service decides by its own clock which zones are on. Only a
-        zone that is outside its times, and whose cells others have made lethal, is left out by its times.
+        A source may be newer or older than the map: a region counts only while the map shows its cells.
         """
         if self._geometry != planning_map.geometry:
             self._geometry, self._known = planning_map.geometry, []
@@ -138,23 +122,8 @@ class Regions:
         self._known = [
             known.get(id(source)) or (source, region_of(source, planning_map.geometry, self._inflation))
             for source in sources
-            if closes_floor(source)
         ]
-        regions = [region for _, region in self._known if region is not None and region.is_on(planning_map)]
-        certain = [region for region in regions if in_its_time(region.source, stamp)]
-        return [region for region in regions if region in certain or not _is_covered(region, certain, planning_map)]
-
-
-def _is_covered(region: Region, others: Sequence[Region], planning_map: PlanningMap) -> bool:
-    """Whether other regions or walls hold every cell of a region."""
-    rows, columns = region.window.rows, region.window.columns
-    open_cells = region.cells & (planning_map.static[rows, columns] == FREE)
-    for other in others:
-        part = overlap(region.window, other.window)
-        if part is not None:
-            mine, theirs = part
-            open_cells[mine] &= ~other.cells[theirs]
-    return not open_cells.any()
+        return [region for _, region in self._known if region is not None and region.is_on(planning_map)]
 
 
 Slices = tuple[slice, slice]

@@ -193,7 +193,7 @@ class Service:
 
     async def _answer(self, channel: ch.Channel, request: Message) -> PlanReply:
         """Answer a query on what the core knows now, which the core's thread only copies."""
-        view = await self._threads.run("core", lambda: self._core.view(self._edges.now()))
+        view = await self._threads.run("core", self._core.view)
         return await self._threads.run("query", partial(self._core.answers()[channel], view, request))
 
     # --- Leading and standing by ------------------------------------------------------------------------------------

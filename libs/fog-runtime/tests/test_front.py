@@ -85,6 +85,14 @@ class Service:
         async def encoded() -> Encoded[list[int]]:
             return Encoded(b"[1,2]")
 
+        @routes.get("/number")
+        async def number(value: int) -> int:
+            return value
+
+        @routes.put("/number")
+        async def put_number(body: Body[int]) -> int:
+            return body
+
         @routes.get("/client")
         async def client(host: ClientHost) -> str:
             return host
@@ -131,6 +139,16 @@ async def test_invalid_requests_do_not_reach_the_core(tmp_path):
         assert (await client.put("/zones/z1", content=b"x" * 10_001)).status_code == 413
         assert (await client.get("/nowhere")).status_code == 404
         assert service.calls == []
+
+
+@pytest.mark.parametrize("number", [2**64, -(2**63) - 1, 10**20])
+async def test_integer_that_the_link_can_not_carry_is_refused_and_the_largest_arrive(tmp_path, number):
+    async with serving(tmp_path) as (_, client):
+        for answer in (await client.get(f"/number?value={number}"), await client.put("/number", content=str(number))):
+            assert (answer.status_code, answer.headers["content-type"]) == (422, "application/problem+json")
+            assert "64 bits" in answer.json()["detail"]
+        for possible in (2**64 - 1, -(2**63)):
+            assert (await client.get(f"/number?value={possible}")).json() == possible
 
 
 async def test_errors_of_handlers_become_problems_with_their_headers_and_members(tmp_path):

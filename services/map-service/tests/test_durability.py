@@ -212,6 +212,9 @@ async def test_audit_is_paged_over_all_kinds_and_no_kind_pushes_out_another(clie
         seen += [(entry["kind"], entry["id"]) for entry in entries]
         path = page.links["next"]["url"] if "next" in page.links else ""
     assert seen == 10 * [("mission", "r1")] + [("zone", zone["id"]) for zone in reversed(created)]
+    for limit, count in ((10**20, 15), (1000, 15), (-(10**20), 1)):
+        entries = (await client.get(f"/api/v1/audit?limit={limit}", headers=tokens["viewer"])).json()
+        assert len(entries) == count
     for query in ("cursor=yesterday", "cursor=1-1.token", "kind=token"):
         assert (await client.get(f"/api/v1/audit?{query}", headers=tokens["viewer"])).status_code == 422
 

@@ -12,7 +12,7 @@ from urllib.parse import urlencode
 
 import msgspec
 import numpy as np
-from fastapi import FastAPI, Response
+from fastapi import Depends, FastAPI, Query, Response
 from PIL import Image
 
 from fog_contracts.messages import (
@@ -65,6 +65,16 @@ from map_service.zone_validation import ZoneError
 from map_service.zone_writer import ConflictError
 
 AuditKind = Literal["area", "mission", "override", "store", "zone"]
+
+
+def _page_size(
+    limit: Annotated[int, Query(description="The most entries of a page: at least 1 and at most 1000 count")] = 100,
+) -> int:
+    return max(1, min(limit, 1000))
+
+
+PageSize = Annotated[int, Depends(_page_size)]
+"""The parameter `limit`, brought into its bounds before it is passed on."""
 
 Image.preinit()  # the first picture would load PIL's formats, while the map is served
 
@@ -210,11 +220,10 @@ def _add_zone_writes(routes: Routes, service: Service, clock: Clock) -> None:
 def _add_audit(routes: Routes, service: Service) -> None:
     @routes.get("/api/v1/audit", raises=[CursorError, StoreError])
     async def audit(
-        _caller: Viewer, kind: AuditKind | None = None, cursor: str | None = None, limit: int = 100
+        _caller: Viewer, limit: PageSize, kind: AuditKind | None = None, cursor: str | None = None
     ) -> Answer[list[AuditEntry]]:
         """Return the audit trail of all services, newest first; the Link header has the next page's address."""
-        kinds, limit = KINDS if kind is None else (kind,), max(1, min(limit, 1000))
-        page = await service.audit(kinds, cursor, limit)
+        page = await service.audit(KINDS if kind is None else (kind,), cursor, limit)
         query = {"kind": kind, "cursor": page.next, "limit": limit}
         address = urlencode({name: value for name, value in query.items() if value is not None})
         return Answer(page.entries, {"Link": f'</api/v1/audit?{address}>; rel="next"'} if page.next else {})

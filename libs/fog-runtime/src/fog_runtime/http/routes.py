@@ -190,7 +190,11 @@ class Routes:
     def _responses(
         self, signature: "_Signature", statuses: Sequence[int], media_type: str, problems: Mapping[int, str]
     ) -> dict[int | str, dict[str, Any]]:
-        """Describe every response that a route may give: no other status is ever answered."""
+        """Describe the responses to requests that this route is for.
+
+        Any may also be answered with 503 by a service that is busy, and one with a body that none is declared for,
+        with 408 or 413.
+        """
         content: dict[str, Any] = {"content": {media_type or "application/json": {}}}
         if not media_type and 204 not in statuses:
             content = {"content": {"application/json": {"schema": schema(self._app, signature.answer)}}}
@@ -202,7 +206,11 @@ class Routes:
         if signature.has_parameters:
             described |= {422: "A parameter is invalid: `errors` names it"}
         if signature.body is not None:
-            described |= {413: "The body is too large", 422: "The body is invalid: `errors` names the fields"}
+            described |= {
+                408: "The body did not arrive in time",
+                413: "The body is too large",
+                422: "The body is invalid: `errors` names the fields",
+            }
         problem = {PROBLEM: {"schema": schema(self._app, Problem)}}
         return {
             **{status: {"description": _ANSWERS.get(status, "The answer"), **content} for status in statuses},
@@ -297,10 +305,18 @@ def _endpoint(
         core: CoreLink | None = app.state.core
         if core is None:
             return await run(**arguments)
-        return await core.call(route, msgspec.msgpack.encode(arguments))
+        return await core.call(route, _encoded(arguments))
 
     setattr(endpoint, "__signature__", inspect.Signature(signature.parameters))  # noqa: B010  # what FastAPI reads
     return endpoint
+
+
+def _encoded(arguments: dict[str, Any]) -> bytes:
+    """Return the arguments for the process with the handlers; a number that does not fit becomes a problem."""
+    try:
+        return msgspec.msgpack.encode(arguments)
+    except OverflowError as error:
+        raise ProblemError(422, "an integer needs more than 64 bits: use a smaller one") from error
 
 
 def _reader(kind: Any) -> Callable[[Request], Awaitable[Any]]:

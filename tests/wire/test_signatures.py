@@ -70,7 +70,7 @@ def test_a_damaged_beginning_hides_no_device(name):
     check = LineCheck("/dev/x", own, SIGNATURES)
     check.feed(damaged)
     assert check.settled
-    assert f"/dev/x: a {name} speaks on this port, not a {own}; nothing was written" in check.problem
+    assert f"/dev/x: a {name} speaks on this port, not a {own}; nothing but stop commands was written" in check.problem
 
 
 @given(st.binary(max_size=600))

@@ -1,7 +1,8 @@
-"""How to tell which device is on a serial line before anything is written to it.
+"""How to tell which device is on a serial line before anything but a stop command is written to it.
 
 Two adapters may be swapped, and what is harmless to one device may move another: whoever opens a port listens first,
-and leaves alone what sounds like another device. Imports only the standard library, because the guardian uses it.
+and leaves alone what sounds like another device. Only the watchdog writes before: the base's stop command, which no
+lidar obeys, because a base that moves can't wait. Imports only the standard library, because the guardian uses it.
 """
 
 from __future__ import annotations
@@ -45,8 +46,8 @@ def foreign(own: str, heard: bytes, signatures: Mapping[str, Signature]) -> str 
 def wrong_device(path: str, own: str, other: str) -> str:
     """Return the sentence for a port on which another device speaks."""
     return (
-        f"{path}: a {other} speaks on this port, not a {own}; nothing was written to it. Swap the ports in the robot "
-        "file, or the plugs"
+        f"{path}: a {other} speaks on this port, not a {own}; nothing but stop commands was written to it. Swap the "
+        "ports in the robot file, or the plugs"
     )
 
 

@@ -72,7 +72,11 @@ def test_installed_files_have_no_placeholder_left_and_are_not_writable_by_others
         assert not re.search(r"@[A-Z]+@", path.read_text()), path
         assert not path.stat().st_mode & 0o022
     assert (installed / "etc/fognav/operator.key").stat().st_mode & 0o007 == 0
-    assert "NTP=fog.local" in (installed / "etc/systemd/timesyncd.conf.d/fognav.conf").read_text()
+    # A fallback with others behind it: the fog node need not serve time, and must not replace a server that does.
+    servers = entries(installed / "etc/systemd/timesyncd.conf.d/fognav.conf", "FallbackNTP")[0].split()
+    assert servers[0] == "fog.local"
+    assert len(servers) > 1
+    assert entries(installed / "etc/systemd/timesyncd.conf.d/fognav.conf", "NTP") == []
 
 
 def test_a_second_installation_keeps_what_was_changed_on_the_robot(installed):
@@ -82,6 +86,65 @@ def test_a_second_installation_keeps_what_was_changed_on_the_robot(installed):
     install(installed)
     assert environment(installed)["FOGNAV_ROBOT"] == "r9"
     assert toml.read_text() == before
+
+
+class Update:
+    """The installer on a machine of stand-ins: a copy whose folders are below `home`, and commands that write a log."""
+
+    def __init__(self, home, *, state="active", pip_fails=False):
+        self.log, self.wheels, commands = home / "log", home / "wheels", home / "bin"
+        shutil.copytree(DEPLOY, home / "deploy/robot")
+        script = home / "deploy/robot/install"
+        script.write_text(re.sub(r"(?<!here)/(opt|etc|var)/", rf"{home}/\1/", script.read_text()))
+        for folder in (commands, self.wheels, home / "opt/fognav/venv/bin"):
+            folder.mkdir(parents=True)
+        answers = {
+            "id": "[ $1 != -u ] || echo 0",
+            "dpkg": "exit 1",
+            "systemctl": f"[ $1 != is-active ] || echo {state}",
+            **dict.fromkeys(("python3", "udevadm", "runuser", "install"), "true"),
+        }
+        for name, answer in answers.items():
+            self._command(commands / name, answer)
+        self._command(home / "opt/fognav/venv/bin/python", f"exit {int(pip_fails)}")
+        arguments = ["--robot", "r1", "--site", "lab", "--fog", "f", "--wheels", str(self.wheels)]
+        environ = {**os.environ, "PATH": f"{commands}:{os.environ['PATH']}"}
+        self.done = subprocess.run([script, *arguments], check=False, capture_output=True, text=True, env=environ)
+
+    def _command(self, path, answer):
+        path.write_text(f'#!/bin/sh\necho "{path.name} $*" >>{self.log}\n{answer}\n')
+        path.chmod(0o755)
+
+    @property
+    def steps(self):
+        """What stopped services and installed packages, in order."""
+        lines = self.log.read_text().splitlines()
+        return [line for line in lines if line.startswith("systemctl stop") or " pip " in line]
+
+
+def test_an_update_stops_the_services_before_it_replaces_their_packages(tmp_path):
+    update = Update(tmp_path)
+    assert update.done.returncode == 0, update.done.stderr
+    assert update.steps[:2] == ["systemctl stop fognav-agent.service", "systemctl stop fognav-watchdog.service"]
+    assert all(" install " in step for step in update.steps[2:])
+    assert "stopping fognav-watchdog.service for the update" in update.done.stderr
+
+
+def test_a_first_installation_stops_nothing(tmp_path):
+    assert "systemctl stop" not in "".join(Update(tmp_path, state="inactive").steps)
+
+
+def test_an_update_that_fails_says_that_the_robot_is_stopped(tmp_path):
+    update = Update(tmp_path, state="activating", pip_fails=True)
+    assert update.done.returncode == 1
+    assert "fognav-agent.service and fognav-watchdog.service stopped" in update.done.stderr
+
+
+def test_wheels_replace_packages_of_the_same_version(tmp_path):
+    update = Update(tmp_path)
+    dependencies, members = update.steps[2:]
+    assert dependencies.endswith(f"--find-links {update.wheels} --upgrade robot-agent")
+    assert "--no-deps --force-reinstall fog-contracts fog-kernels fog-runtime robot-agent" in members
 
 
 @pytest.mark.parametrize(

@@ -101,7 +101,6 @@ class BusEdge:
     def __init__(self, live: LiveServices, role: Role) -> None:
         self._live = live
         self._role = role
-        self._on_connect: list[Callable[[], Awaitable[None]]] = []
 
     def on(self, channel: Channel, handler: Any, kind: Any = None, *, numbers: Sequence[Any] = ()) -> None:
         assert channel.transport == "mqtt"
@@ -152,11 +151,7 @@ class BusEdge:
     async def add_number(self, channel: Channel, number: str | int) -> None: ...
 
     def on_connect(self, callback: Callable[[], Awaitable[None]]) -> None:
-        self._on_connect.append(callback)
-
-    async def connect(self) -> None:
-        for callback in self._on_connect:
-            await callback()
+        """The broker never connects again."""
 
 
 class MemoryStore:
@@ -269,7 +264,7 @@ class LiveServices:
         )
 
     async def start(self) -> None:
-        """Subscribe, load the stores and connect, at time 0; periodic loops do not run yet."""
+        """Subscribe, load the stores and lead, connected, at time 0; periodic loops do not run yet."""
         body = next(robot for robot in self._loaded.site.robots if robot.id == self._robot)
         await self.agent_map.restore(body)
         for service in (self.aggregator, self.map, self.planner, self.agent):
@@ -284,7 +279,6 @@ class LiveServices:
         await self.aggregator.lead(1, confirmed=True)
         await self.map.lead(1, confirmed=True)
         await self.planner.lead(1, confirmed=True)
-        await self.edges["hazard-aggregator"].connect()
         await self.run_until_idle()
 
     async def begin_loops(self) -> None:

@@ -172,8 +172,9 @@ class Service:
             self.records.mark_loaded()
         if epoch > self.core.epoch:
             self._publisher.publish(self.core.set_epoch(epoch))
-        # All but the deletions of what other aggregators left is published with the new epoch already.
-        self._publisher.publish([publication for publication in restored if publication.message is None])
+            # All but the deletions of what other aggregators left is published with the new epoch now.
+            restored = [publication for publication in restored if publication.message is None]
+        self._publisher.publish(restored)
         self._leading.set()
         self._publisher.write_pending.set()
 

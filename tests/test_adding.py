@@ -95,6 +95,9 @@ ROBOT_APPROACH    = _pub(  "robot_approach",    FOG + "robots/{robot}/approach",
 import msgspec
 
 """),
+    Edit(AGGREGATOR, r"^from hazard_aggregator\.publications import", before="""\
+from hazard_aggregator.publications import node_config
+"""),
     Edit(AGGREGATOR, r"^            ch\.NODE_READING: ", before="""\
             ch.NODE_BATTERY: self._on_battery,
             ch.ROBOT_APPROACH: self._on_approach,

@@ -251,7 +251,7 @@ def test_message_is_added_by_its_type_its_row_and_its_handlers(checkout: Path, c
 def test_route_is_added_by_one_function(checkout: Path, checked: str) -> None:
     assert (
         "| `POST /api/v1/zones/{zone_id}/extension` | Let a zone hold for so many more minutes. |  | Extension "
-        "| 200 Zone | 401, 403, 404, 409, 412, 413, 422, 500, 503 | yes |"
+        "| 200 Zone | 401, 403, 404, 408, 409, 412, 413, 422, 500, 503 | yes |"
     ) in (checkout / "docs" / "channels.md").read_text("utf-8")
     assert_passed("route", checked)
 

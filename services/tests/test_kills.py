@@ -10,6 +10,7 @@ import os
 import random
 import sys
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -197,7 +198,9 @@ class Node:
         self.mqtt = MqttEdge(self.fog.mosquitto.url, "kill-test", SystemClock(), site="test")
         self.mqtt.on(ch.AREA_HAZARD, self._on_hazard, AreaHazard)
 
-    def _on_hazard(self, _ids: object, hazard: AreaHazard) -> None:
+    def _on_hazard(self, ids: Mapping[str, str], hazard: AreaHazard) -> None:
+        if ids["area"] != "hall":  # the other area is the operators'
+            return
         # A restarted broker may have an older message; receivers ignore it by epoch and seq.
         if self.latest is not None and (hazard.epoch, hazard.seq) <= (self.latest.epoch, self.latest.seq):
             return

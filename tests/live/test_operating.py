@@ -82,7 +82,7 @@ def test_walk_through_a_running_demo_works_as_the_readme_says(tmp_path):
                 wait_for("^stopped: somebody sent the robot elsewhere", printed, demo)
         override = next(command for command in commands if " override " in command)
         again = terminal.run(f"{override} --json")
-        assert json.loads(again.stdout)["version"] == 2, again.stderr
+        assert json.loads(again.stdout)["override"]["version"] == 2, again.stderr
         status = json.loads((terminal.run("./fognav status --json")).stdout)
         (system,) = [system for system in status["systems"] if system["kind"] == "demo"]
         assert system["site"] == "estig"

@@ -1,6 +1,7 @@
 """Shared by all tests: hypothesis profiles, the folder of recordings, and which tests may run in parallel."""
 
 import os
+import signal
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -26,7 +27,13 @@ REACTION, COMPUTING, SYSTEM, LIVE, COMPOSE = range(5)
 
 
 def pytest_configure() -> None:
-    """Give each worker its own range of ports: two that search at the same moment would find the same free port."""
+    """Give each worker its own range of ports, and the programs that it starts the usual signals.
+
+    Two workers that search for a port at the same moment would find the same one.
+    """
+    if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN:
+        # Under nohup. What is ignored is inherited by the programs that tests start and hang up; a handler is not.
+        signal.signal(signal.SIGHUP, lambda *_: None)
     share = len(net.PORTS) // WORKERS
     net.PORTS = net.PORTS[int(WORKER) * share : (int(WORKER) + 1) * share]
 

@@ -123,7 +123,7 @@ def test_view_gives_the_nearest_return_of_each_sector_and_zero_without_one():
 # --- blocked places ---
 
 
-def places(hazards=(), zones=()):
+def places(hazards=(), zones=(), off=()):
     found = BlockedPlaces()
     at = Moment(0.0, 0.0)
     for state, polygon in hazards:
@@ -131,7 +131,7 @@ def places(hazards=(), zones=()):
             area="z4", state=state, severity=1, penalty=254, since=0.0, seq=1, epoch=1, cause="", nodes={}
         )
         found.handlers()[ch.HAZARD]({}, HazardArea(hazard=area, polygon=polygon, label="Z4"), at)
-    active = [zone.id for zone in zones if zone.enabled]
+    active = [zone.id for zone in zones if zone.enabled and zone.id not in off]
     found.handlers()[ch.ZONES]({}, ZoneSet(epoch=1, seq=1, zones=list(zones), active=active), at)
     return found
 
@@ -197,3 +197,11 @@ def test_robot_does_not_stop_for_an_obstacle_that_it_reported_under_itself():
     assert report([(5.02, 5.02), (5.04, 5.04)], reporter=reporter).points
     assert places().containing(HERE, lethal(), reporter, 0.0) is None
     assert places().containing(HERE, lethal(), reporter, 13.0) == "a blocked part of the map"
+
+
+def test_zone_that_is_not_in_force_is_no_reason_to_stop_for_an_own_obstacle():
+    reporter = ObstacleReporter(10.0, 3)
+    assert report([(5.02, 5.02), (5.04, 5.04)], reporter=reporter).points
+    zone = Zone(id="nights", kind="BLOCKED", shape=CircleShape(centre=(5.0, 5.0), radius=1.0))
+    assert places(zones=[zone]).containing(HERE, lethal(), reporter, 0.0) == "the no-go zone nights"
+    assert places(zones=[zone], off=["nights"]).containing(HERE, lethal(), reporter, 0.0) is None

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class BlockedPlaces:
-    """The newest state of every watched area, and all no-go zones."""
+    """The newest state of every watched area, and the no-go zones in force."""
 
     def __init__(self) -> None:
         self._hazards: dict[str, HazardArea] = {}
@@ -37,7 +37,8 @@ class BlockedPlaces:
         return ()
 
     def _on_zones(self, _ids: Ids, zones: ZoneSet, _at: Moment) -> Sequence[Publication]:
-        self._zones = [zone for zone in zones.zones if zone.enabled and zone.kind == "BLOCKED"]
+        active = frozenset(zones.active)
+        self._zones = [zone for zone in zones.zones if zone.id in active and zone.kind == "BLOCKED"]
         return ()
 
     def containing(self, pose: Pose2, replica: Replica, reporter: ObstacleReporter, now: float) -> str | None:

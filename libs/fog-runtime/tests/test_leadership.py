@@ -11,6 +11,7 @@ import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
+from lease_model import LeaseModel
 
 from fog_contracts import channels as ch
 from fog_contracts.fencing import Fence
@@ -21,7 +22,6 @@ from fog_runtime.clock import ManualClock
 from fog_runtime.edges import Edges
 from fog_runtime.health import Health
 from fog_runtime.leadership import Leadership
-from fog_runtime.lease import LEASE_S, Granted, Held
 from fog_runtime.redis_connection import StoreError
 
 STEP_S = 0.01
@@ -44,29 +44,6 @@ class SimulatedLoop(asyncio.SelectorEventLoop):
         for _ in range(4):
             self.call_soon(self.stop)
             self.run_forever()
-
-
-class LeaseRecords:
-    """Grants leases as the script of `lease_store`, which `test_lease_store` compares with the real one."""
-
-    def __init__(self) -> None:
-        self.highest = self.floor = 0
-        self.lease: tuple[int, str, float] | None = None
-
-    def acquire(self, holder: str, request, now: float):
-        held = self.lease if self.lease is not None and now < self.lease[2] else None
-        if held is not None and held[1] != holder:
-            self.floor = max(self.floor, request.floor if request.floor > held[0] else 0)
-            return Held(held[0], held[1], held[2] - now)
-        epoch, confirmed = request.epoch, request.confirmed
-        if epoch == 0 and held is not None:
-            epoch, confirmed = held[0], True
-        floor = max(request.floor, self.floor)
-        if epoch <= floor or epoch < self.highest or (epoch == self.highest and not confirmed):
-            epoch = max(self.highest, floor) + 1
-        self.highest = epoch
-        self.lease = (epoch, holder, now + LEASE_S)
-        return Granted(epoch)
 
 
 class Process:
@@ -159,7 +136,7 @@ class Process:
 class World:
     def __init__(self) -> None:
         self.now = 1000.0
-        self.records = LeaseRecords()
+        self.records = LeaseModel()
         self.receiver = Fence()
         self.received: list[tuple[float, str, int]] = []
         self.owners: dict[int, str] = {}

@@ -9,10 +9,11 @@ import os
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
+from lease_model import LEASE_S, LeaseModel
 
 from fog_runtime.lease import Granted, Held, Lease
 
-LEASE_S, ATTEMPT_S, STEP_S = 1.2, 0.4, 0.05
+ATTEMPT_S, STEP_S = 0.4, 0.05
 TAKEOVER_S = 2.0
 
 
@@ -184,29 +185,6 @@ def test_leader_without_redis_gives_way_to_a_living_leader_with_a_higher_epoch_o
 # --- A model: three processes, Redis, one receiver ------------------------------------------------------------------
 
 
-class FakeRedis:
-    """What the script of `lease_store` does, which `test_lease_store` compares with the real one."""
-
-    def __init__(self) -> None:
-        self.stored = self.floor = 0
-        self.lease: tuple[int, str, float] | None = None
-
-    def acquire(self, holder: str, request, now: float, clock: int = 0):
-        held = self.lease if self.lease is not None and now < self.lease[2] else None
-        if held is not None and held[1] != holder:
-            self.floor = max(self.floor, request.floor if request.floor > held[0] else 0)
-            return Held(held[0], held[1], held[2] - now)
-        epoch, confirmed = request.epoch, request.confirmed
-        if epoch == 0 and held is not None:
-            epoch, confirmed = held[0], True
-        floor = max(request.floor, self.floor)
-        if epoch <= floor or epoch < self.stored or (epoch == self.stored and not confirmed):
-            epoch = max(self.stored + 1, floor + 1, clock)
-        self.stored = epoch
-        self.lease = (epoch, holder, now + LEASE_S)
-        return Granted(epoch)
-
-
 class Process:
     """A process that runs its loop every 50 ms, unless it is stopped; `rate` is that of its clock."""
 
@@ -229,7 +207,7 @@ class Cluster(RuleBasedStateMachine):
     @initialize(rates=st.tuples(*[st.sampled_from([0.96, 1.0, 1.04])] * 3))
     def start(self, rates):
         self.now = 0.0
-        self.redis, self.redis_up = FakeRedis(), True
+        self.redis, self.redis_up = LeaseModel(), True
         self.names = 0
         self.rates = rates
         self.processes = [self.process(index) for index in range(3)]
@@ -266,7 +244,7 @@ class Cluster(RuleBasedStateMachine):
     def redis_restarts(self, up, lost):
         self.redis_up = up
         if lost:
-            self.redis = FakeRedis()
+            self.redis = LeaseModel()
             self.lost_at = self.now
 
     @rule(delay=st.sampled_from([0.0, 0.1, 0.3, 0.6]))

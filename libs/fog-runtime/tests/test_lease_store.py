@@ -1,27 +1,18 @@
 """The lease in a real Redis: the same decisions as the model of the state machine's tests, and one holder of many."""
 
 import asyncio
-import importlib.util
 from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from lease_model import LeaseModel
 
 from fog_runtime.lease import ATTEMPT_S, Granted, Held, Request
 from fog_runtime.lease_store import LeaseStore
 from fog_supervisor.servers import Server, start_redis
 
 pytestmark = pytest.mark.live
-
-
-def model():
-    spec = importlib.util.spec_from_file_location("lease_model", Path(__file__).with_name("test_lease.py"))
-    assert spec is not None
-    assert spec.loader is not None
-    made = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(made)
-    return made.FakeRedis()
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +41,7 @@ def test_redis_decides_as_the_model_does(redis: Server, steps, monkeypatch):
 
 
 async def compare(redis: Server, steps) -> None:
-    expected = model()
+    expected = LeaseModel()
     async with LeaseStore(redis.url, "test", "planner") as store:
         await store._redis.write(("FLUSHALL",))
         for who, epoch, floor, confirmed in steps:

@@ -29,7 +29,7 @@ class ConflictError(Exception):
 class AreaWriter:
     """Stores areas, and puts them into force."""
 
-    def __init__(  # the process's parts
+    def __init__(
         self, core: Aggregator, store: Store, records: Records, publisher: Publisher, edges: Edges, clock: Clock
     ) -> None:
         self._core = core

@@ -1,0 +1,79 @@
+"""What a sensor node draws at 5 V, and how long a power bank lasts, for both ways to publish.
+
+Run: python hardware/power.py. Estimated from data sheets; nothing here was measured. Put a USB meter between supply and
+node before you rely on it.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+# ESP8266EX data sheet, table of the power consumption: currents at 3.3 V in mA. The board's linear regulator passes on
+# the same current from 5 V.
+CPU_MA: Final = 15.0
+"""The processor runs and the radio sleeps between beacons (modem sleep)."""
+LISTENING_MA: Final = 56.0
+"""The processor runs and the radio receives (802.11n)."""
+SENDING_MA: Final = 120.0
+"""The processor runs and the radio sends (802.11n, 13 dBm)."""
+# HC-SR04 data sheet.
+SONAR_IDLE_MA: Final = 2.0
+SONAR_MEASURING_MA: Final = 15.0
+
+BOARD_MA: Final = 3.0
+"""The regulator's own and the USB chip's; an estimate."""
+AWAKE_S: Final = 0.1
+"""How long the radio stays awake after it sent something; an estimate, access points differ."""
+ON_AIR_S: Final = 0.002
+"""One message with TLS, TCP and its acknowledgement, retries included; an estimate."""
+BEACON_S: Final = (0.1024, 0.003)
+"""The period of an access point's beacons, and how long the radio is awake for one."""
+ECHO_S: Final = 0.020
+"""A sonar's mean time per measurement: 3 m take 17 ms, no echo takes 38 ms."""
+BANK_MAH: Final = 10_000
+"""The capacity that is printed on a power bank: of its cells."""
+CELL_V: Final = 3.7
+SUPPLY_V: Final = 5.0
+CONVERTER: Final = 0.85
+"""The share that a power bank's converter leaves."""
+
+
+@dataclass(frozen=True)
+class Mode:
+    """How a node publishes: its messages, and its readings, in 1/s."""
+
+    name: str
+    messages: float
+    readings: float
+
+
+MODES: Final = (Mode("heartbeat (default)", 1.0, 8.0), Mode("every reading (the thesis's)", 8.0, 8.0))
+
+
+def current_ma(mode: Mode) -> float:
+    """Return the mean current (mA) at 5 V."""
+    awake = min(1.0, mode.messages * AWAKE_S + BEACON_S[1] / BEACON_S[0])
+    sending = min(1.0, mode.messages * ON_AIR_S)
+    radio = (LISTENING_MA - CPU_MA) * awake + (SENDING_MA - LISTENING_MA) * sending
+    # One reading is one measurement by each of two sonars.
+    sonars = 2 * (SONAR_IDLE_MA + (SONAR_MEASURING_MA - SONAR_IDLE_MA) * mode.readings * ECHO_S)
+    return CPU_MA + BOARD_MA + radio + sonars
+
+
+def bank_hours(mode: Mode) -> float:
+    """Return how long a full power bank lasts (h), if it does not switch itself off."""
+    return BANK_MAH * CELL_V / SUPPLY_V * CONVERTER / current_ma(mode)
+
+
+def table() -> str:
+    """Return both modes as a Markdown table."""
+    rows = [
+        f"| {mode.name} | {current_ma(mode):.0f} mA | {current_ma(mode) * SUPPLY_V / 1000:.2f} W | "
+        f"{current_ma(mode) * SUPPLY_V * 24 * 365 / 1e6:.1f} kWh | {bank_hours(mode) / 24:.1f} days |"
+        for mode in MODES
+    ]
+    head = ("| publishing | mean current at 5 V | power | in a year | 10,000 mAh power bank |", "|---|---|---|---|---|")
+    return "\n".join([*head, *rows])
+
+
+if __name__ == "__main__":
+    print(table())

@@ -7,11 +7,17 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from fog_contracts.bus import Bus
 from fog_contracts.geometry import contains_point
 from fog_runtime.site import load_site
 from fognav_experiments.lockstep import run_lockstep
+from fognav_experiments.rigs import FogRig
 from fognav_sim.barrier import BarrierError
 from fognav_sim.drive.hazard import HazardRequest
+from fognav_sim.firmware import FirmwareError, find_compiler
+from fognav_sim.firmware_node import FirmwareNode
+from fognav_sim.floor import Floor
+from fognav_sim.world import World
 
 ESTIG = Path(__file__).parents[2] / "sites" / "estig"
 _spec = importlib.util.spec_from_file_location("ring_site", Path(__file__).parent / "ring_site.py")
@@ -92,6 +98,19 @@ def test_robot_without_nodes_meets_the_barrier_once_and_remembers_it():
 def test_same_seed_repeats_the_drive_exactly_and_another_seed_changes_it(warned, free):
     assert msgspec.json.encode(drive(3, BLOCKED)) == msgspec.json.encode(warned)
     assert drive(4).track != free.track
+
+
+def test_sensor_nodes_run_the_firmware_wherever_it_compiles():
+    try:
+        find_compiler()
+    except FirmwareError as error:
+        pytest.skip(str(error))
+    site = ring.ring_site()
+    rig = FogRig(
+        site, World(Floor(site.map.geometry, site.map.cells), site.site.robots[0], 1, axle_m=0.235), Bus(), 1, 0.0
+    )
+    assert rig.nodes
+    assert all(isinstance(node, FirmwareNode) for node in rig.nodes)
 
 
 def test_unknown_area_is_refused_with_the_known_ones():

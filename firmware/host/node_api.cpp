@@ -31,6 +31,17 @@ void fognav_node_free(Node* node) { delete node; }
 // 0: nothing, 1: trigger sonar `fognav_node_sonar`, 2: publish `fognav_node_message`.
 int fognav_node_step(Node* node, uint32_t now_us) { return static_cast<int>(node->step(now_us)); }
 
+// Step from `now_us` on, every `period_us`, up to and with `until_us` or the first event, which is returned as above;
+// `now_us` becomes the time of the next step. For whoever steps many nodes: a call from Python takes longer than a step.
+int fognav_node_run(Node* node, uint64_t* now_us, uint64_t until_us, uint32_t period_us) {
+    while (*now_us <= until_us) {
+        const Node::Event event = node->step(static_cast<uint32_t>(*now_us));
+        *now_us += period_us;
+        if (event != Node::Event::none) return static_cast<int>(event);
+    }
+    return static_cast<int>(Node::Event::none);
+}
+
 int fognav_node_sonar(const Node* node) { return node->sonar(); }
 
 const char* fognav_node_message(const Node* node) { return node->message(); }

@@ -103,7 +103,7 @@ def test_silence_is_clear_only_where_it_was_calibrated(make_node, run):
 def test_sonar_without_an_answer_is_stuck_and_unknown(core):
     node = FirmwareNode(core, SITE, 7, 0.0)
     # Nothing moves the echo lines.
-    node._trigger = lambda _world: None
+    node._trigger = lambda _world, _at_us: None
     published = [reading for step in range(300) for reading in node.poll(None, step * 0.01)]
     assert published[-1].status == ["stuck", "stuck"]
     assert {reading.state for reading in published} == {"unknown"}
@@ -112,8 +112,8 @@ def test_sonar_without_an_answer_is_stuck_and_unknown(core):
 def test_leak_of_the_trigger_and_bounces_are_no_echoes(core):
     node = FirmwareNode(core, SITE, 7, 0.0)
 
-    def trigger(_world):
-        sonar, now = core.sonar(node._node), node._now_us
+    def trigger(_world, now):
+        sonar = core.sonar(node._node)
         flight = round(2 * 3.0 / 343.42 * 1e6)
         leak = [(now + 10, sonar, 1), (now + 60, sonar, 0)]
         bounce = [(now + 300, sonar, 1), (now + 320, sonar, 0)]
@@ -127,8 +127,8 @@ def test_leak_of_the_trigger_and_bounces_are_no_echoes(core):
 def test_edge_that_comes_after_the_loop_read_its_clock_is_no_missing_echo(core):
     node = FirmwareNode(core, SITE, 7, 0.0)
 
-    def trigger(_world):
-        sonar, now = core.sonar(node._node), node._now_us
+    def trigger(_world, now):
+        sonar = core.sonar(node._node)
         flight = round(2 * 3.0 / 343.42 * 1e6)
         # The interrupt's clock is ahead of the one that the loop passes to the next step.
         core.edge(node._node, sonar, 1, now + STEP_US + 3)

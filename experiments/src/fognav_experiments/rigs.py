@@ -19,7 +19,7 @@ from fognav_experiments.processes import AgentProcess, Fog
 from fognav_sim import devices
 from fognav_sim.floor import Floor
 from fognav_sim.hardware import STEP_S, Hardware
-from fognav_sim.node import SonarNode
+from fognav_sim.nodes import make_nodes
 from fognav_sim.world import World
 from hazard_aggregator.core import Aggregator
 from hazard_aggregator.fusion import AreaFusion
@@ -186,15 +186,12 @@ class FogRig(Fog):
         self._bus = bus
         self._world = world
         # The nodes were switched on at different times.
-        self._nodes = [
-            SonarNode(node, boot=seed + index, start=start + 0.013 * (index % 8))
-            for index, node in enumerate(site.site.nodes)
-        ]
+        self.nodes = make_nodes(site.site.nodes, seed, start, apart=0.013)
         self.start(moment(start))
 
     def measure(self, now: float) -> None:
         """Let the nodes publish the readings that are due."""
-        for node in self._nodes:
+        for node in self.nodes:
             ids = {"node": node.node.id}
             self._bus.publish(Publication(ch.NODE_READING, reading, ids) for reading in node.poll(self._world, now))
 

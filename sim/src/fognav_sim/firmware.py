@@ -99,7 +99,7 @@ class Core(ctypes.CDLL):
                 ),
             ),
             "free": (None, (node,)),
-            "step": (ctypes.c_int, (node, ctypes.c_uint32)),
+            "run": (ctypes.c_int, (node, ctypes.POINTER(ctypes.c_uint64), ctypes.c_uint64, ctypes.c_uint32)),
             "sonar": (ctypes.c_int, (node,)),
             "message": (ctypes.c_char_p, (node,)),
             "edge": (None, (node, ctypes.c_int, ctypes.c_int, ctypes.c_uint32)),

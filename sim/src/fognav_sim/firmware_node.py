@@ -76,17 +76,23 @@ class FirmwareNode:
             while self._edges and self._edges[0][0] <= self._now_us:
                 at, sonar, high = self._edges.pop(0)
                 self._core.edge(self._node, sonar, high, ctypes.c_uint32(at))
-            event = self._core.step(self._node, ctypes.c_uint32(self._now_us))
+            event = self._run(min(until, self._edges[0][0] - 1) if self._edges else until)
             if event == _TRIGGER:
-                self._trigger(world)
+                self._trigger(world, self._now_us - STEP_US)
             elif event == _PUBLISH:
                 readings.append(msgspec.json.decode(self._core.message(self._node), type=NodeReading))
-            self._now_us += STEP_US
         return readings
 
-    def _trigger(self, world: World) -> None:
+    def _run(self, until: int) -> int:
+        """Step up to and with `until` (us), or to the first event, which is returned."""
+        now = ctypes.c_uint64(self._now_us)
+        event = self._core.run(self._node, ctypes.byref(now), until, STEP_US)
+        self._now_us = now.value
+        return int(event)
+
+    def _trigger(self, world: World, at_us: int) -> None:
         sonar = self._core.sonar(self._node)
         measured = world.sonar(self.node, sonar)
         flight_us = NO_ECHO_US if measured is None else round(2 * measured / SOUND_M_S * _US)
-        rise = self._now_us + BURST_US
+        rise = at_us + BURST_US
         self._edges = [(rise, sonar, 1), (rise + flight_us, sonar, 0)]

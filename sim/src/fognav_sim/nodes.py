@@ -35,9 +35,14 @@ class SensorNode(Protocol):
 
 
 def make_nodes(
-    nodes: Sequence[NodeSite], boot: int, start: float, kind: Literal["auto", "firmware", "model"]
+    nodes: Sequence[NodeSite],
+    boot: int,
+    start: float,
+    kind: Literal["auto", "firmware", "model"] = "auto",
+    *,
+    apart: float = 0.0,
 ) -> list[SensorNode]:
-    """Return the site's nodes, switched on at `start` (s).
+    """Return the site's nodes, switched on at `start` (s), `apart` (s) one after the other, in groups of eight.
 
     Raises `FirmwareError` if `firmware` is asked for and can't be built.
     """
@@ -50,5 +55,5 @@ def make_nodes(
             _log.info("nodes_run_a_model", reason=str(error))
         else:
             _log.info("nodes_run_the_firmware")
-            return [FirmwareNode(core, node, boot + index, start) for index, node in enumerate(nodes)]
-    return [SonarNode(node, boot, start) for node in nodes]
+            return [FirmwareNode(core, node, boot + i, start + apart * (i % 8)) for i, node in enumerate(nodes)]
+    return [SonarNode(node, boot + i, start + apart * (i % 8)) for i, node in enumerate(nodes)]

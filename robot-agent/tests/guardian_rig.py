@@ -52,6 +52,8 @@ class Base:
         self.robot = robot or RoombaEmulator()
         self.lock = threading.Lock()
         self.stopped_at: float | None = time.monotonic()
+        self.send_in_pieces = False
+        """Pass on a few bytes at a time, as adapters with a short latency timer do."""
         self._port: PtyPort | None = None
         self._ends = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -108,7 +110,11 @@ class Base:
                     self.robot.tick(now, now - before)
                     sent = self.robot.outgoing(now)
                     if heard:
-                        self._port.write(sent)
+                        size = 12 if self.send_in_pieces else max(len(sent), 1)
+                        for begin in range(0, len(sent), size):
+                            self._port.write(sent[begin : begin + size])
+                            if self.send_in_pieces:
+                                time.sleep(0.001)
             before = now
             if self.robot.wheel_speeds_m_s != (0.0, 0.0):
                 self.stopped_at = None

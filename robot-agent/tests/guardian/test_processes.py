@@ -79,6 +79,32 @@ def test_wheels_stop_when_the_agent_falls_silent(rig):
     rig.drive()
 
 
+def wakeups(pid: int) -> int:
+    """How often a process has waited and was woken: its voluntary context switches."""
+    status = Path(f"/proc/{pid}/status").read_text()
+    return int(status.split("voluntary_ctxt_switches:")[1].split()[0])
+
+
+def wakeups_per_feedback(rig, messages: int) -> float:
+    """Wake-ups of the guardian for each message that the agent receives: a busy machine delays both."""
+    guardian, first = rig.watchdog.guardian(), rig.agent.feedback.seq
+    before = wakeups(guardian)
+    wait_for(lambda: rig.agent.feedback.seq >= first + messages, "the guardian reports")
+    return (wakeups(guardian) - before) / (rig.agent.feedback.seq - first)
+
+
+def test_guardian_is_woken_for_whole_frames_while_driving_and_by_the_agent_alone_at_rest(rig):
+    rig.base.send_in_pieces = True
+    rig.drive()
+    assert wakeups_per_feedback(rig, 30) < 5.0, "three frames a message, read once a frame"
+    rig.agent.wheels = (0.0, 0.0)
+    wait_for(lambda: not rig.base.moving, "the wheels stop")
+    assert wakeups_per_feedback(rig, 10) < 4.0, "two commands of the agent a message"
+    rig.drive()
+    rig.base.robot.world.bump_left = True
+    assert rig.base.stopped_within(time.monotonic()) < STOP_S
+
+
 def children(pid: int) -> list[int]:
     return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 

@@ -12,7 +12,7 @@ When both end, the robot starts in INIT, and an operator must enable it as after
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import msgspec
 
@@ -46,8 +46,7 @@ class Limits:
     acceleration: float = 3.0
 
 
-@dataclass(frozen=True)
-class Output:
+class Output(NamedTuple):
     """Result of an input: bytes for the base, feedback for the agent, and what to try on a silent base."""
 
     data: bytes = b""
@@ -86,6 +85,8 @@ class GuardianCore:
         self._stepped_at: float | None = None
         self._feedback_at = -1.0e9
         self._feedback_key: object = None
+        self._told_status: BaseStatus | None = None
+        self._told_alarms: BaseStatus | None = None
         self._feedback_odometry: WheelOdometry | None = None
         self._seq = 0
 
@@ -93,6 +94,11 @@ class GuardianCore:
     def latched(self) -> str | None:
         """The fault that stops the wheels until a reset; None without one."""
         return self._latched
+
+    @property
+    def moving(self) -> bool:
+        """Whether a wheel is told to turn."""
+        return self._wheels != (0.0, 0.0)
 
     @property
     def unanswered(self) -> str | None:
@@ -135,7 +141,7 @@ class GuardianCore:
         return self._drive(now)
 
     def tick(self, now: float) -> Output:
-        """Advance time (50 Hz or more): stale commands, a silent base, repeated stops."""
+        """Advance time (50 Hz while `moving`, else 15 Hz or more): stale commands, a silent base, repeated stops."""
         base, timing = self._base, self.driver.timing
         if not base.awake:
             due = base.woken_at is None or now - base.woken_at > timing.wake_timeout
@@ -253,12 +259,11 @@ class GuardianCore:
         return self.driver.drive(*wheels)
 
     def _feedback(self, reading: BaseReading, now: float) -> BaseFeedback | None:
-        # Any change counts but that of measurements, which change all the time.
-        key = (
-            msgspec.structs.replace(reading.status, battery=None, power=None, proximity=()),
-            self._latched,
-            self._base.awake,
-        )
+        if reading.status is not self._told_status:
+            self._told_status = reading.status
+            # Any change counts but that of measurements, which change all the time.
+            self._told_alarms = msgspec.structs.replace(reading.status, battery=None, power=None, proximity=())
+        key = (self._told_alarms, self._latched, self._base.awake)
         rests = reading.odometry == self._feedback_odometry and self._wheels == (0.0, 0.0)
         period = FEEDBACK_AT_REST_S if rests else FEEDBACK_S
         if key == self._feedback_key and now - self._feedback_at < period:

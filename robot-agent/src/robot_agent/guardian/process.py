@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import os
 import select
-import selectors
 import signal
 import socket
 from contextlib import suppress
@@ -34,13 +33,21 @@ from robot_agent.registry import make_base, signatures
 from robot_agent.serial_port import Port, PortLost
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from types import FrameType
 
     from fog_contracts.robot import MotionSettings
     from robot_agent.guardian.revival import Attempt
 
-TICK_S: Final = 0.02
-HEARTBEAT_S: Final = 0.05
+MOVING_S: Final = 0.015
+"""Period of looking at base and agent while a wheel turns: a sensor frame of the fastest base.
+
+Waiting for bytes would wake the process for each piece of a frame, which some adapters pass on every millisecond.
+"""
+RESTING_S: Final = 0.055
+"""The same while no wheel turns; but a command of the agent is applied at once, and comes a little more often."""
+HEARTBEAT_S: Final = 0.045
+"""Shortest time between two heartbeats: they share the wake-ups above."""
 AGENT_LIVES_S: Final = 1.0
 """An agent sends a command every 0.05 s; one that was silent for longer than this hangs: another may take its place."""
 REFUSE_S: Final = 2.0
@@ -74,7 +81,9 @@ class Guardian:
         self._core = core
         self._check = check
         self._port = Port.from_fd(settings.base_fd, settings.base_port or None)
-        self._selector = selectors.DefaultSelector()
+        self._poll = select.poll()
+        self._events: dict[int, Callable[[], None]] = {}
+        self._moving = False
         self._agent: socket.socket | None = None
         self._agent_heard_at = -1.0
         self._heartbeat_at = -1.0
@@ -88,28 +97,53 @@ class Guardian:
 
     def run(self) -> int:
         """Guard until the watchdog or a signal ends it; returns the exit code."""
-        listener = self._listener
-        self._selector.register(self._port, selectors.EVENT_READ, self._read_base)
-        self._selector.register(self._settings.watchdog_fd, selectors.EVENT_READ, self._on_watchdog_lost)
-        self._selector.register(listener, selectors.EVENT_READ, lambda: self._accept(listener))
+        self._register(self._settings.watchdog_fd, self._on_watchdog_lost)
+        self._register(self._listener.fileno(), self._accept)
         try:
             # Bytes that arrived before this process started are stale.
             self._port.discard_input()
             if (problem := self._wrong_device()) is not None:
                 return self._refuse_port(problem)
             while not self._ended and self._signal is None:
-                for key, _ in self._selector.select(self._clock.real(TICK_S)):
-                    key.data()
-                self._apply(self._core.tick(self._clock.now()))
-                self._end_pulse()
-                self._tell_unanswered()
-                self._send_heartbeat()
+                self._wait(MOVING_S if self._moving else RESTING_S)
+                self._cycle()
             self._port.write(self._core.stop_command())
         except PortLost as error:
             self._log.error("port_lost", reason=str(error))
             return PORT_LOST
         self._log.info("ended", signal=self._signal and signal.Signals(self._signal).name)
         return 0
+
+    def _register(self, descriptor: int, handler: Callable[[], None]) -> None:
+        self._events[descriptor] = handler
+        self._poll.register(descriptor, select.POLLIN)
+
+    def _wait(self, seconds: float) -> None:
+        """Wait for an event, `seconds` at most, and handle it."""
+        for descriptor, _ in self._poll.poll(1000.0 * self._clock.real(seconds)):
+            if (handler := self._events.get(descriptor)) is not None:  # None: closed by the handler before
+                handler()
+
+    def _cycle(self) -> None:
+        """Look at base and agent, and advance time."""
+        if self._moving and self._agent is not None:
+            self._read_agent()
+        self._read_base()
+        self._apply(self._core.tick(self._clock.now()))
+        self._end_pulse()
+        self._tell_unanswered()
+        self._send_heartbeat()
+        if self._core.moving != self._moving:
+            self._moving = not self._moving
+            self._watch_agent()
+
+    def _watch_agent(self) -> None:
+        """Let the agent's commands wake this process while the wheels rest; later they are read in each cycle.
+
+        The end of the link wakes it always.
+        """
+        if self._agent is not None:
+            self._poll.register(self._agent.fileno(), 0 if self._moving else select.POLLIN)
 
     def _wrong_device(self) -> str | None:
         """Listen until the line sounds like a known device; return the sentence for another one than the base.
@@ -118,7 +152,7 @@ class Guardian:
         """
         check, until = self._check, self._clock.now() + LISTEN_S
         while not check.settled and self._clock.now() < until and self._signal is None:
-            select.select((self._port,), (), (), self._clock.real(TICK_S))
+            select.select((self._port,), (), (), self._clock.real(MOVING_S))
             check.feed(self._port.read_available())
             self._send_heartbeat()
         return check.problem
@@ -127,14 +161,10 @@ class Guardian:
         """Tell agents for a while why there is no base; the watchdog opens the port again, perhaps after a re-plug."""
         self._log.error("wrong_device", reason=problem)
         until = self._clock.now() + REFUSE_S
+        self._events[self._listener.fileno()] = lambda: self._refuse_agent(problem)
         while self._clock.now() < until and not self._ended and self._signal is None:
-            for key, _ in self._selector.select(self._clock.real(TICK_S)):
-                if key.fileobj is self._listener:
-                    self._refuse_agent(problem)
-                elif key.fileobj is self._port:
-                    self._port.read_available()
-                else:
-                    key.data()
+            self._wait(RESTING_S)
+            self._port.read_available()
             self._send_heartbeat()
         return PORT_LOST
 
@@ -148,8 +178,9 @@ class Guardian:
         self._signal = signum
 
     def _read_base(self) -> None:
-        now = self._clock.now()
-        self._apply(self._core.on_bytes(self._port.read_available(), now))
+        data, now = self._port.read_available(), self._clock.now()
+        if data:
+            self._apply(self._core.on_bytes(data, now))
         if self._core.corrupted != self._corrupted:
             self._corrupted = self._core.corrupted
             self._limited_log.warning("frames_corrupted", "frames_corrupted", now, total=self._corrupted)
@@ -159,9 +190,9 @@ class Guardian:
             self._log.error("watchdog_lost", remedy="the watchdog ended: start it again, it starts the guardian")
         self._ended = True
 
-    def _accept(self, listener: socket.socket) -> None:
+    def _accept(self) -> None:
         try:
-            agent, _ = listener.accept()
+            agent, _ = self._listener.accept()
         except (BlockingIOError, ConnectionError):
             return  # it disconnected already
         agent.settimeout(0)
@@ -176,7 +207,7 @@ class Guardian:
             return
         self._drop_agent(f"another agent connected, and this one has sent no command for {AGENT_LIVES_S:g} s")
         self._agent, self._agent_heard_at = agent, now
-        self._selector.register(agent, selectors.EVENT_READ, lambda: self._read_agent(agent))
+        self._register(agent.fileno(), self._read_agent)
         self._log.info("agent_connected")
 
     def _refuse(self, agent: socket.socket, reason: str) -> None:
@@ -186,8 +217,9 @@ class Guardian:
             # A command left unread would reset the link, and the reason with it.
             agent.recv(PACKET_LIMIT)
 
-    def _read_agent(self, agent: socket.socket) -> None:
-        if agent is not self._agent:
+    def _read_agent(self) -> None:
+        agent = self._agent
+        if agent is None:
             return  # dropped earlier in this cycle
         newest: WheelCommand | None = None
         reset = False
@@ -209,14 +241,15 @@ class Guardian:
                 continue
             reset = reset or newest.reset
         if newest is not None:
-            command = msgspec.structs.replace(newest, reset=reset)
+            command = newest if newest.reset == reset else msgspec.structs.replace(newest, reset=reset)
             self._agent_heard_at = self._clock.now()
             self._apply(self._core.on_command(command, self._agent_heard_at))
 
     def _drop_agent(self, reason: str) -> None:
         if self._agent is None:
             return
-        self._selector.unregister(self._agent)
+        self._poll.unregister(self._agent)
+        del self._events[self._agent.fileno()]
         self._agent.close()
         self._agent = None
         self._log.warning("agent_lost", reason=reason)

@@ -17,6 +17,7 @@ SAME_FRAMES: Final = 3
 """The offset is learned from so many equal frames."""
 NOISE_S: Final = 0.1
 """A number that is no mode is ignored for so long."""
+_MODES: Final = {mode.value: mode for mode in Mode}
 
 
 class ModeMonitor:
@@ -59,8 +60,8 @@ class ModeMonitor:
             self.mode = Mode.PASSIVE
 
     def _follow(self, value: int, now: float) -> None:
-        if value in set(Mode):
-            self.mode, self._noise_since = Mode(value), None
+        if (mode := _MODES.get(value)) is not None:
+            self.mode, self._noise_since = mode, None
         elif self._noise_since is None:
             self._noise_since = now
         elif now - self._noise_since > NOISE_S:

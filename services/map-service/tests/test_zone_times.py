@@ -4,11 +4,12 @@ from datetime import date, datetime
 from zoneinfo import ZoneInfo
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from fog_contracts.handlers import Moment
 from fog_contracts.messages import CircleShape, WeeklySchedule, WeeklyTime, Zone
+from map_service import zone_times
 from map_service.zone_times import ZoneTimes, window_of
 
 T0 = datetime(2026, 11, 21, 12, 0, tzinfo=ZoneInfo("UTC")).timestamp()  # a Saturday
@@ -152,18 +153,37 @@ def test_window_that_has_begun_ends_no_earlier_than_its_length_after_a_step(step
     assert not active(times, 2 * HOUR + 60.0, T0 + 2 * HOUR + 60.0 + step)
 
 
+ZONES = [LISBON, "UTC", "Pacific/Kiritimati", "America/St_Johns", "Asia/Tokyo", "Pacific/Pago_Pago"]
+
+
 @settings(max_examples=100, deadline=None)
-@given(st.floats(0.0, 2e9), st.sampled_from([LISBON, "UTC", "Pacific/Kiritimati", "America/St_Johns"]))
-def test_schedule_computed_for_days_ahead_equals_the_definition(stamp, name):
+@given(st.floats(0.0, 2e9), st.sampled_from(ZONES), st.floats(0.0, 9.0))
+# 03:15 on a Sunday whose 02:00 was 03:00: the window's end, 02:30, did not occur.
+@example(datetime(1986, 4, 27, 1, 15, tzinfo=ZoneInfo("America/St_Johns")).timestamp(), "America/St_Johns", 3.0)
+@example(datetime(1970, 4, 26, 3, 15, tzinfo=ZoneInfo("America/St_Johns")).timestamp(), "America/St_Johns", 3.0)
+# A Friday before a Saturday that a change of the date line left out.
+@example(datetime(1994, 12, 30, 23, 45, tzinfo=ZoneInfo("Pacific/Kiritimati")).timestamp(), "Pacific/Kiritimati", 3.0)
+def test_schedule_computed_for_days_ahead_equals_the_definition(stamp, name, days):
     schedule = WeeklySchedule(time_zone=name, times=[weekly("sat", "23:30", "01:15"), weekly("sun", "01:00", "02:30")])
     local = datetime.fromtimestamp(stamp, tz=ZoneInfo(name))
     text, day = local.strftime("%H:%M"), local.weekday()
     expected = (day == 5 and text >= "23:30") or (day == 6 and (text < "01:15" or "01:00" <= text < "02:30"))
     times = ZoneTimes(zone(schedule=schedule))
-    active(times, 0.0, stamp - 3 * 86_400.0)
-    found = active(times, 3 * 86_400.0, stamp)
-    # Where local times repeat or are missing, windows may be longer.
+    active(times, 0.0, stamp - days * 86_400.0)
+    found = active(times, days * 86_400.0, stamp)
+    # Where local times repeat or are missing within a day of it, windows may be longer.
     assert found >= expected
-    shifted = {ZoneInfo(name).utcoffset(local), ZoneInfo(name).utcoffset(local.replace(hour=12))}
-    if len(shifted) == 1:
+    nearby = (datetime.fromtimestamp(stamp + shift, tz=ZoneInfo(name)) for shift in (-86_400.0, 0.0, 86_400.0))
+    if len({moment.utcoffset() for moment in nearby}) == 1:
         assert found == expected, local
+
+
+@pytest.mark.parametrize("name", ZONES)
+def test_windows_of_a_schedule_are_computed_once_in_days_at_any_time_of_the_day(name, monkeypatch):
+    computed = []
+    compute = zone_times.window_of
+    monkeypatch.setattr(zone_times, "window_of", lambda *arguments: computed.append(1) or compute(*arguments))
+    times = ZoneTimes(zone(schedule=WeeklySchedule(time_zone=name, times=[weekly("wed", "08:00", "09:00")])))
+    for hour in range(48):
+        active(times, hour * HOUR, T0 + hour * HOUR)
+    assert len(computed) <= 2, "each computation has one or two Wednesdays"

@@ -149,7 +149,7 @@ class _Windows:
     def _compute(self, stamp: float) -> None:
         zone = ZoneInfo(self._schedule.time_zone)
         today = datetime.fromtimestamp(stamp, tz=zone).date()
-        days = [today + timedelta(days=offset) for offset in range(-2, _DAYS_AHEAD + 1)]
+        days = [today + timedelta(days=offset) for offset in range(-3, _DAYS_AHEAD + 1)]
         windows = sorted(
             window_of(day, span.begin, span.end, zone)
             for day in days
@@ -163,9 +163,10 @@ class _Windows:
             else:
                 self._begins.append(begin)
                 self._ends.append(end)
-        # A day before and after is certain, whatever the offset from UTC.
+        # Whatever the offset from UTC: today has begun by then, and the local date is at most two days earlier, whose
+        # windows may have begun on the day before; two days before the last one, no later window has begun.
         begin_of = datetime.combine(today - timedelta(days=1), time(), tzinfo=UTC).timestamp()
-        self._valid = begin_of + 86_400.0, begin_of + 86_400.0 * (_DAYS_AHEAD - 2)
+        self._valid = begin_of, begin_of + 86_400.0 * (_DAYS_AHEAD - 1)
 
 
 def window_of(day: date, begin: str, end: str, zone: ZoneInfo) -> tuple[float, float]:

@@ -11,7 +11,7 @@ from fog_contracts.messages import Message
 from fog_runtime import metrics
 from fog_runtime.health import Health
 from fog_runtime.http.problems import RETRY_AFTER, add_problem_handlers, problem
-from fog_runtime.http.routes import Answer, Routes
+from fog_runtime.http.routes import ALWAYS_SERVED, Answer, Routes
 from fog_runtime.http.tokens import Tokens
 from fog_runtime.version import VERSION
 
@@ -23,7 +23,6 @@ BODY_S: Final = 10.0
 """How long a body may take to arrive: a client that sends slowly must not hold a place for long."""
 MAX_OPEN_REQUESTS: Final = 128
 """Most requests that are served at the same time."""
-_ALWAYS_SERVED: Final = frozenset({"/healthz", "/readyz", "/metrics"})
 
 Scope = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
@@ -99,7 +98,7 @@ class _OpenLimit:
         self._open = 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or scope["path"] in _ALWAYS_SERVED:
+        if scope["type"] != "http" or scope["path"] in ALWAYS_SERVED:
             await self._app(scope, receive, send)
             return
         if self._open >= self._limit:

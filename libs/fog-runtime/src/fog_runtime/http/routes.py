@@ -44,6 +44,9 @@ Handler = TypeVar("Handler", bound=Callable[..., Awaitable[object]])
 
 _ANSWERS: Final = {201: "The new record", 204: "Done", 503: "The answer while something is missing"}
 _SCHEMAS: Final = "#/components/schemas/{name}"
+ALWAYS_SERVED: Final = frozenset({"/healthz", "/readyz", "/metrics"})
+"""Routes that are served however many requests are open."""
+_UNAVAILABLE: Final = "The service is started again, or serves too many requests: `Retry-After` says when to try again"
 
 
 class _BodyMarker:
@@ -174,7 +177,7 @@ class Routes:
                 status_code=statuses[0],
                 response_model=None,
                 response_class=Response,
-                responses=self._responses(signature, statuses, media_type, described),
+                responses=self._responses(path, signature, statuses, media_type, described),
                 openapi_extra=self._body(signature),
             )
             return handler
@@ -188,34 +191,44 @@ class Routes:
         return {"requestBody": {"required": True, "content": content}}
 
     def _responses(
-        self, signature: "_Signature", statuses: Sequence[int], media_type: str, problems: Mapping[int, str]
+        self, path: str, signature: "_Signature", statuses: Sequence[int], media_type: str, problems: Mapping[int, str]
     ) -> dict[int | str, dict[str, Any]]:
         """Describe the responses to requests that this route is for.
 
-        Any may also be answered with 503 by a service that is busy, and one with a body that none is declared for,
-        with 408 or 413.
+        One with a body that none is declared for may also be answered with 408 or 413.
         """
-        content: dict[str, Any] = {"content": {media_type or "application/json": {}}}
+        content: dict[str, Any] = {media_type or "application/json": {}}
         if not media_type and 204 not in statuses:
-            content = {"content": {"application/json": {"schema": schema(self._app, signature.answer)}}}
+            content = {"application/json": {"schema": schema(self._app, signature.answer)}}
         elif 204 in statuses:
             content = {}
-        described: dict[int, str] = {500: "The service failed: its log names the reason"}
-        if signature.needs_token:
-            described |= {401: "The token is missing or unknown", 403: "The token's role does not allow this"}
-        if signature.has_parameters:
-            described |= {422: "A parameter is invalid: `errors` names it"}
-        if signature.body is not None:
-            described |= {
-                408: "The body did not arrive in time",
-                413: "The body is too large",
-                422: "The body is invalid: `errors` names the fields",
-            }
-        problem = {PROBLEM: {"schema": schema(self._app, Problem)}}
-        return {
-            **{status: {"description": _ANSWERS.get(status, "The answer"), **content} for status in statuses},
-            **{code: {"description": text, "content": problem} for code, text in {**described, **problems}.items()},
+        responses: dict[int | str, dict[str, Any]] = {
+            status: {"description": _ANSWERS.get(status, "The answer"), **({"content": content} if content else {})}
+            for status in statuses
         }
+        for status, text in _problems(path, signature, problems).items():
+            response = responses.setdefault(status, {"description": text})
+            response["content"] = {**response.get("content", {}), PROBLEM: {"schema": schema(self._app, Problem)}}
+        return responses
+
+
+def _problems(path: str, signature: "_Signature", problems: Mapping[int, str]) -> dict[int, str]:
+    """Return the description of each problem document that a route may answer with; `problems` are its own."""
+    described: dict[int, str] = {500: "The service failed: its log names the reason"}
+    if signature.needs_token:
+        described |= {401: "The token is missing or unknown", 403: "The token's role does not allow this"}
+    if signature.has_parameters:
+        described |= {422: "A parameter is invalid: `errors` names it"}
+    if signature.body is not None:
+        described |= {
+            408: "The body did not arrive in time",
+            413: "The body is too large",
+            422: "The body is invalid: `errors` names the fields",
+        }
+    described |= problems
+    unavailable = "The service is started again" if path in ALWAYS_SERVED else _UNAVAILABLE
+    described[503] = f"{problems[503]}. {unavailable}" if 503 in problems else unavailable
+    return described
 
 
 class _Signature:

@@ -58,7 +58,7 @@ async def test_version_stored_by_another_writer_is_loaded_after_the_conflict(fog
     async with Redis.from_url(fog.redis.url) as raw:
         await raw.hset("fog:test:areas", "hall", msgspec.json.encode(other))
     body = {"polygon": POLYGON, "nodes": ["n1"]}
-    refused = await client.put("/api/v1/areas/hall", json=body, headers=tokens["operator"])
+    refused = await client.put("/api/v1/areas/hall", json=body, headers={**tokens["operator"], "If-Match": '"0"'})
     assert refused.status_code == 412
     async with asyncio.timeout(60):
         for _ in iter(int, 1):

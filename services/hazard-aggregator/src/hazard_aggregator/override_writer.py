@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Final
 
 from fog_runtime import logs
 from hazard_aggregator.area_override import AreaOverride
-from hazard_aggregator.area_writer import ConflictError
+from hazard_aggregator.area_writer import ATTEMPTS, ConflictError
 from hazard_aggregator.store import Audit
 
 if TYPE_CHECKING:
@@ -60,36 +60,39 @@ class OverrideWriter:
     ) -> AreaOverride:
         """Store an override instead of the area's former one, then put it into force.
 
-        With `expected`, only if that is the former one's version. An `attempt` that succeeded before returns its
-        override again. Raises `ConflictError`, `IdempotencyError`, and `StoreError`: then it may be stored or not.
+        With `expected`, only if that is the former one's version; else it replaces whatever is stored. An `attempt`
+        that succeeded before returns its override again. Raises `ConflictError`, `IdempotencyError`, and `StoreError`:
+        then it may be stored or not.
         """
         async with self._records.lock:
-            with self._records.uncertain_write():
-                if (earlier := await self._store.earlier_override(attempt)) is not None:
+            for _ in range(ATTEMPTS):
+                with self._records.uncertain_write():
                     await self._records.reload_locked()
-                    return earlier
-            old = self._core.overrides.known(area)
-            if expected is not None and (old is None or old.version != expected):
-                raise ConflictError(area)
-            override = AreaOverride(
-                area=area,
-                state=state,
-                author=who,
-                reason=reason,
-                ttl_s=ttl_s,
-                set_at=self._clock.stamp(),
-                boot=self._boot,
-                deadline=self._clock.now() + ttl_s,
-                version=0 if old is None else old.version,
-            )
-            audit = Audit(override.set_at, who, "override", attempt)
-            with self._records.uncertain_write():
-                outcome, override = await self._store.put_override(override, audit)
-            if outcome != "ok":
+                    if (earlier := await self._store.earlier_override(attempt)) is not None:
+                        await self._records.load_again()
+                        return earlier
+                old = self._core.overrides.known(area)
+                if expected is not None and (old is None or old.version != expected):
+                    raise ConflictError(area)
+                override = AreaOverride(
+                    area=area,
+                    state=state,
+                    author=who,
+                    reason=reason,
+                    ttl_s=ttl_s,
+                    set_at=self._clock.stamp(),
+                    boot=self._boot,
+                    deadline=self._clock.now() + ttl_s,
+                    version=0 if old is None else old.version,
+                )
+                audit = Audit(override.set_at, who, "override", attempt)
+                with self._records.uncertain_write():
+                    outcome, override = await self._store.put_override(override, audit)
+                if outcome == "ok":
+                    self._publisher.announce(self._core.put_override(override, self._edges.now()))
+                    return override
                 self._records.request_reload()
-                raise ConflictError(area)
-            self._publisher.announce(self._core.put_override(override, self._edges.now()))
-        return override
+        raise ConflictError(area)
 
     async def remove(self, area: str, who: str) -> bool:
         """Delete an area's override, and let its nodes count again; return whether there was one.

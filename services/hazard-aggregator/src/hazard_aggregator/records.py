@@ -108,6 +108,11 @@ class Records:
         self._publisher.announce(self._core.load_overrides(overrides, self._edges.now()))
         self._reload_due = False
 
+    async def load_again(self) -> None:
+        """Put the stored records into force whether or not they may differ, for a caller that holds `lock`."""
+        self._reload_due = True
+        await self.reload_locked()
+
     async def subscribe_numbers(self) -> None:
         """Subscribe to the thesis's topics of all areas."""
         for number in self._core.thesis_numbers():

@@ -167,6 +167,7 @@ class Service:
         except StoreError as error:
             if confirmed and not isinstance(error, StoreLostError):
                 raise
+            self.records.request_reload()
             self._health.set("store", ok=False, detail=str(error))
         else:
             self.records.mark_loaded()

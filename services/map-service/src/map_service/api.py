@@ -203,8 +203,8 @@ def _add_zone_writes(routes: Routes, service: Service, clock: Clock) -> None:
         if new:
             return await _put_new(service, zone, caller.name, attempt)
         await service.zones.reload_after_uncertain_write()
-        old = _find_matching(service, zone_id, if_match)
-        zone = await service.zones.replace(zone, old.version, caller.name, attempt)
+        _require_matching(service, zone_id, if_match)
+        zone = await service.zones.replace(zone, expected_version(if_match), caller.name, attempt)
         return Answer(zone, etag(zone.version))
 
     @routes.delete("/api/v1/zones/{zone_id}", raises=[ConflictError, StoreError], problems=_NO_SUCH_ZONE)
@@ -214,7 +214,8 @@ def _add_zone_writes(routes: Routes, service: Service, clock: Clock) -> None:
         if zone_id in service.zones.unusable.reasons:
             await service.zones.delete_unusable(zone_id, caller.name)
             return
-        await service.zones.delete(_find_matching(service, zone_id, if_match), caller.name)
+        _require_matching(service, zone_id, if_match)
+        await service.zones.delete(zone_id, expected_version(if_match), caller.name)
 
 
 def _add_audit(routes: Routes, service: Service) -> None:
@@ -244,13 +245,17 @@ def _add_errors(routes: Routes) -> None:
     routes.raises(
         ConflictError,
         {409: "A zone with this id exists already", 412: "Somebody else changed the zone"},
-        lambda error: (
-            ProblemError(409, f"zone {error.zone} exists already: choose another id, or PUT it")
-            if error.outcome == "exists"
-            else ProblemError(412, f"zone {error.zone} was changed by somebody else: read it again, then retry")
-        ),
+        _conflict,
     )
     routes.raises(InvalidBodyError, {}, _with_remedies)
+
+
+def _conflict(error: ConflictError) -> ProblemError:
+    if error.outcome == "exists":
+        return ProblemError(409, f"zone {error.zone} exists already: choose another id, or PUT it")
+    if error.outcome == "missing":
+        return ProblemError(404, f"there is no zone {error.zone} any more")
+    return ProblemError(412, f"zone {error.zone} was changed by somebody else: read it again, then retry")
 
 
 def _with_remedies(error: InvalidBodyError) -> InvalidBodyError:
@@ -379,12 +384,11 @@ def _find_zone(service: Service, zone_id: str) -> Zone:
     return entry.zone
 
 
-def _find_matching(service: Service, zone_id: str, if_match: str | None) -> Zone:
+def _require_matching(service: Service, zone_id: str, if_match: str | None) -> None:
     zone = _find_zone(service, zone_id)
     if expected_version(if_match) not in (None, zone.version):
         detail = f"zone {zone_id} is at version {zone.version}, not {if_match}: read it again, then retry"
         raise ProblemError(412, detail)
-    return zone
 
 
 def _zone_from_body(body: ZoneBody, zone_id: str, author: str, stamp: float) -> Zone:

@@ -90,39 +90,40 @@ class ZoneWriter:
             audit = Audit(self._now().stamp, who, "create", attempt)
             with self._uncertain_write():
                 outcome, zone = await self._store.create(prepared.zone, audit)
-            self._require_ok(outcome, zone.id)
+            if (earlier := await self._unless_ok(outcome, zone.id, attempt)) is not None:
+                return earlier
             self._publisher.publish(self._core.put_zone(zone, self._now(), prepared.spans))
         await self._publisher.all_on_map()
         return zone
 
-    async def replace(self, zone: Zone, expected: int, who: str, attempt: Attempt | None = None) -> Zone:
-        """Store a new version of a zone; raises `ZoneError`, `ConflictError` (stale, missing), `StoreError`.
+    async def replace(self, zone: Zone, expected: int | None, who: str, attempt: Attempt | None = None) -> Zone:
+        """Store a new version of a zone; with `expected`, only if that is its version. `attempt` as in `create`.
 
-        `attempt` as in `create`.
+        Raises `ZoneError`, `ConflictError` (stale, missing), and `StoreError`.
         """
         async with self._lock:
             if (earlier := await self._earlier_result(attempt)) is not None:
                 return earlier
-            known = self._core.zones.get(zone.id)
-            if known is None or known.zone.version != expected:
-                # The store would treat an identical zone as a repeated attempt.
-                raise ConflictError("stale", zone.id)
-            prepared = await self._prepare(structs.replace(zone, version=expected + 1))
+            # The store would treat an identical zone as a repeated attempt.
+            old = self._require(zone.id, expected)
+            prepared = await self._prepare(structs.replace(zone, version=old.version + 1))
             audit = Audit(self._now().stamp, who, "replace", attempt)
             with self._uncertain_write():
-                outcome = await self._store.replace(prepared.zone, expected=expected, audit=audit)
-            self._require_ok(outcome, zone.id)
+                outcome = await self._store.replace(prepared.zone, expected=old.version, audit=audit)
+            if (earlier := await self._unless_ok(outcome, zone.id, attempt)) is not None:
+                return earlier
             self._publisher.publish(self._core.put_zone(prepared.zone, self._now(), prepared.spans))
         await self._publisher.all_on_map()
         return prepared.zone
 
-    async def delete(self, zone: Zone, who: str) -> None:
-        """Delete this version of a zone; raises `ConflictError` (stale) and `StoreError`."""
+    async def delete(self, zone_id: str, expected: int | None, who: str) -> None:
+        """Delete a zone; with `expected`, only this version. Raises `ConflictError` (stale, missing), `StoreError`."""
         async with self._lock:
+            zone = self._require(zone_id, expected)
             with self._uncertain_write():
                 outcome = await self._store.delete(zone, Audit(self._now().stamp, who, "delete"))
-            self._require_ok(outcome, zone.id)
-            self._publisher.publish(self._core.remove_zone(zone.id, self._now()))
+            await self._unless_ok(outcome, zone_id)
+            self._publisher.publish(self._core.remove_zone(zone_id, self._now()))
         await self._publisher.all_on_map()
 
     async def delete_unusable(self, zone_id: str, who: str) -> None:
@@ -227,8 +228,25 @@ class ZoneWriter:
             ZONE_WRITES.labels("failed").inc()
             raise
 
-    def _require_ok(self, outcome: Outcome, zone_id: str) -> None:
+    def _require(self, zone_id: str, version: int | None) -> Zone:
+        """Return a zone as it is on the map; raises `ConflictError` if there is none, or it has another version."""
+        known = self._core.zones.get(zone_id)
+        if known is None:
+            raise ConflictError("missing", zone_id)
+        if version not in (None, known.zone.version):
+            raise ConflictError("stale", zone_id)
+        return known.zone
+
+    async def _unless_ok(self, outcome: Outcome, zone_id: str, attempt: Attempt | None = None) -> Zone | None:
+        """Return None for a write that was done.
+
+        Otherwise return the zone that an earlier attempt stored, which a hanging Redis carried out only now; raises
+        `ConflictError` without one, and `StoreError`.
+        """
         ZONE_WRITES.labels(outcome).inc()
-        if outcome != "ok":
-            self.must_reload = True
+        if outcome == "ok":
+            return None
+        self.must_reload = True
+        if (earlier := await self._earlier_result(attempt)) is None:
             raise ConflictError(outcome, zone_id)
+        return earlier

@@ -16,6 +16,7 @@ from fognav import __version__, checkout, doctor, kernels, system
 from fognav.area_command import area_app
 from fognav.bench_command import bench_app
 from fognav.channels_command import channels_command
+from fognav.coverage_command import site_coverage
 from fognav.localize_command import localize_command
 from fognav.map_command import map_app
 from fognav.operate.options import NUMBERS, JsonOption
@@ -65,6 +66,7 @@ robot_app.command("new", epilog="Example: fognav robot new --base roomba600 --li
     robot_new
 )
 robot_app.command("check", epilog="Example: fognav robot check robot.toml")(robot_check)
+site_app.command("coverage", epilog="Example: fognav site coverage sites/estig --png coverage.png")(site_coverage)
 app.command("channels", epilog="Example: fognav channels --format acl --broker mqtt")(channels_command)
 
 Yes = Annotated[bool, typer.Option("--yes", help="Install missing system packages without asking (as does CI=true).")]

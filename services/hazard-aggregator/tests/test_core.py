@@ -30,7 +30,9 @@ class Rig:
     """A core that gets messages through its handlers, 0.1 s apart."""
 
     def __init__(self, *restored: AreaHazard, complete: bool = True) -> None:
-        self.core = Aggregator(AreaFusion([AREA], [NODE], 5, restored, registry=find_rule), complete=complete)
+        self.core = Aggregator(
+            AreaFusion([AREA], [NODE], 5, restored, registry=find_rule, default_rule="consecutive"), complete=complete
+        )
         self.now = 100.0
         self.seq = 0
         self.published: list[Publication] = []

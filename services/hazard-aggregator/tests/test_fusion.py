@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from fog_contracts.messages import AreaDefinition, AreaHazard, NodeReading, RobotPose
 from fog_contracts.site import NodeSite, Sonar
-from hazard_aggregator.debounce import DebounceError, RuleFactory
+from hazard_aggregator.debounce import DebounceError, Observation, RuleFactory
 from hazard_aggregator.fusion import AreaFusion
 from hazard_aggregator.reading_order import ReadingOrder
 from hazard_aggregator.registry import find_rule
@@ -48,7 +48,14 @@ class Rig:
     """A fusion with a clock that moves one node period per reading."""
 
     def __init__(self, *nodes: NodeSite, restored: list[AreaHazard] | None = None, **fields) -> None:
-        self.core = AreaFusion([area(*(n.id for n in nodes), **fields)], nodes, 1, restored or [], registry=find_rule)
+        self.core = AreaFusion(
+            [area(*(n.id for n in nodes), **fields)],
+            nodes,
+            1,
+            restored or [],
+            registry=find_rule,
+            default_rule="consecutive",
+        )
         self.now = 100.0
         self.seq = 0
         self.changes: list[AreaHazard] = []
@@ -409,7 +416,7 @@ def test_explained_echoes_do_not_depend_on_the_sites_rotation(rotation, distance
     def outcome(theta: float) -> str:
         x, y = distance * math.cos(theta + bearing), distance * math.sin(theta + bearing)
         node = NodeSite(id="n1", area="hall", x=0.0, y=0.0, theta=theta, sonars=[Sonar(range_limit=1.25)])
-        core = AreaFusion([area("n1")], [node], 1, registry=find_rule)
+        core = AreaFusion([area("n1")], [node], 1, registry=find_rule, default_rule="consecutive")
         core.on_pose("r1", pose(x, y), 0.0)
         for seq in range(5):
             echo = NodeReading(
@@ -512,7 +519,9 @@ def test_hazard_keeps_its_since_across_a_restart(state, penalty):
 
 
 def test_reading_before_the_first_tick_leaves_the_restored_state():
-    core = AreaFusion([area("n1")], [site("n1")], 2, [stored("blocked", 254)], registry=find_rule)
+    core = AreaFusion(
+        [area("n1")], [site("n1")], 2, [stored("blocked", 254)], registry=find_rule, default_rule="consecutive"
+    )
     reading = NodeReading(seq=1, boot=1, uptime_ms=0, range_m=[3.0, 3.0], status=["ok", "ok"], state="clear")
     core.on_reading("n1", reading, 1000.0, 0.0)
     core.tick(1000.1, 0.1)
@@ -552,7 +561,7 @@ def _with_penalty(definition: AreaDefinition, penalty: int) -> AreaDefinition:
 
 
 def test_thesis_nodes_block_their_area():
-    core = AreaFusion([area()], [], 1, registry=find_rule)
+    core = AreaFusion([area()], [], 1, registry=find_rule, default_rule="consecutive")
     core.tick(0.0, 0.0)
     for i in range(5):
         changed = core.on_thesis_state(7, "blocked", i / 10, i / 10)
@@ -588,7 +597,7 @@ def test_invalid_debounce_settings_are_refused_naming_area_field_and_known_value
     with pytest.raises(DebounceError, match=message):
         Rig(site("n1"), debounce=choice)
     with pytest.raises(DebounceError, match=message):
-        AreaFusion([area(debounce=choice)], [], 1, registry=find_rule)
+        AreaFusion([area(debounce=choice)], [], 1, registry=find_rule, default_rule="consecutive")
 
 
 class Sustained:
@@ -600,10 +609,10 @@ class Sustained:
     def __init__(self, options: Options) -> None:
         self.seconds, self.state, self.since = options.seconds, None, 0.0
 
-    def update(self, state: str, now: float) -> str | None:
-        if state != self.state:
-            self.state, self.since = state, now
-        return state if now - self.since >= self.seconds else None
+    def update(self, seen: Observation, now: float) -> str | None:
+        if seen.state != self.state:
+            self.state, self.since = seen.state, now
+        return seen.state if now - self.since >= self.seconds else None
 
     def reset(self) -> None:
         self.state = None

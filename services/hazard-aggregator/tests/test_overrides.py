@@ -49,7 +49,7 @@ class Rig:
 
     def start(self, *, with_store: bool = True) -> None:
         restored = self.stored_hazards.values() if with_store else ()
-        fusion = AreaFusion([self.area], [NODE], 0, restored, registry=find_rule)
+        fusion = AreaFusion([self.area], [NODE], 0, restored, registry=find_rule, default_rule="consecutive")
         self.core = Aggregator(fusion, complete=with_store)
         if with_store:
             self.load()

@@ -93,7 +93,7 @@ def hazard(state: str, seq: int) -> AreaHazard:
     return AreaHazard(area="hall", state=state, severity=3, penalty=penalty, since=0, seq=seq, epoch=1, cause="test")
 
 
-async def test_five_blocked_readings_become_lethal_cells_on_the_robots_map(fog, until):
+async def test_blocked_readings_become_lethal_cells_on_the_robots_map(fog, until):
     pytest.importorskip("hazard_aggregator")
     async with running(fog, "hazard_aggregator", "map_service") as (_, robot, mqtt):
         await fog.ready("hazard_aggregator")

@@ -81,7 +81,7 @@ class NodeState:
         if classification.state != self.run_state and not (classification.state == "unknown" and self.run_state):
             self.run_state = classification.state
             self.run_began = stamp
-        confirmed = self.rule.update(classification.state, taken_at)
+        confirmed = self.rule.update(classification.observation, taken_at)
         if confirmed is None:
             return
         self.last_confirmed = taken_at

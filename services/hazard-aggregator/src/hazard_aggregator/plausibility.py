@@ -8,8 +8,10 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, NamedTuple
 
+from hazard_aggregator.debounce import Observation, SonarSample
+
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Container, Iterable
     from typing import Final
 
     from fog_contracts.messages import AreaState, NodeReading, RobotPose
@@ -36,6 +38,12 @@ class Classification(NamedTuple):
     state: AreaState
     reason: str
     explained_by: str | None = None
+    sonars: tuple[SonarSample, ...] = ()
+
+    @property
+    def observation(self) -> Observation:
+        """What a debounce rule sees of the reading."""
+        return Observation(self.state, self.sonars)
 
 
 def classify_sonar(sonar: Sonar, status: str, measured: float | None, shift: float = 0.0) -> tuple[AreaState, str]:
@@ -121,15 +129,38 @@ def classify_reading(site: NodeSite, reading: NodeReading, poses: Iterable[tuple
         else:
             return _contradiction(reading, classified, fused)
     if fused == "blocked":
-        blocking = [i for i, (state, _) in enumerate(classified) if state == "blocked"]
-        known = list(poses)
-        robots = [explaining_robot(site, site.sonars[i], reading.range_m[i] or 0.0, known) for i in blocking]
-        for index, robot in zip(blocking, robots, strict=True):
-            if robot is None:
-                return Classification("blocked", f"sonar {index}: {classified[index][1]}")
-        return Classification("blocked", f"sonar {blocking[0]} sees the robot {robots[0]}", explained_by=robots[0])
+        return _classify_blocked(site, reading, classified, list(poses))
     index = next(i for i, (state, _) in enumerate(classified) if state == fused)
-    return Classification(fused, f"sonar {index}: {classified[index][1]}")
+    return Classification(fused, f"sonar {index}: {classified[index][1]}", sonars=_samples(site, reading, classified))
+
+
+def _classify_blocked(
+    site: NodeSite, reading: NodeReading, classified: list[tuple[AreaState, str]], poses: list[tuple[str, RobotPose]]
+) -> Classification:
+    """Return what a reading with blocking echoes shows: it is explained if robots explain all of them."""
+    blocking = [i for i, (state, _) in enumerate(classified) if state == "blocked"]
+    robots = {i: explaining_robot(site, site.sonars[i], reading.range_m[i] or 0.0, poses) for i in blocking}
+    explained = {i for i, robot in robots.items() if robot is not None}
+    samples = _samples(site, reading, classified, explained)
+    for index in blocking:
+        if robots[index] is None:
+            return Classification("blocked", f"sonar {index}: {classified[index][1]}", sonars=samples)
+    first = blocking[0]
+    return Classification("blocked", f"sonar {first} sees the robot {robots[first]}", robots[first], samples)
+
+
+def _samples(
+    site: NodeSite,
+    reading: NodeReading,
+    classified: list[tuple[AreaState, str]],
+    explained: Container[int] = (),
+) -> tuple[SonarSample, ...]:
+    return tuple(
+        SonarSample(state, measured, sonar.range_limit, index in explained)
+        for index, (sonar, measured, (state, _)) in enumerate(
+            zip(site.sonars, reading.range_m, classified, strict=True)
+        )
+    )
 
 
 def _fuse(site: NodeSite, reading: NodeReading, shift: float) -> tuple[list[tuple[AreaState, str]], AreaState]:

@@ -10,6 +10,7 @@ from hazard_aggregator.debounce import RuleFactory
 
 if TYPE_CHECKING:
     from fog_contracts.messages import AreaState
+    from hazard_aggregator.debounce import Observation
 
 
 class Options(Struct, frozen=True, kw_only=True):
@@ -31,9 +32,9 @@ class Consecutive:
         self._needed = {"blocked": options.to_blocked, "unknown": options.to_blocked, "clear": options.to_clear}
         self._count = dict.fromkeys(self._needed, 0)
 
-    def update(self, state: AreaState, now: float) -> AreaState | None:  # noqa: ARG002  # it counts, whatever the time
+    def update(self, seen: Observation, now: float) -> AreaState | None:  # noqa: ARG002  # it counts, whatever the time
         """Count one reading's state; return the state from its N-th reading on."""
-        count = self._count
+        count, state = self._count, seen.state
         if state == "unknown":
             count["clear"] = max(0, count["clear"] - 1)
         else:

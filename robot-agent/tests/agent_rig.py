@@ -25,7 +25,8 @@ from little_world import KEY, L_PATH, L_ROOMS, grid_of
 
 from fog_contracts import channels as ch
 from fog_contracts.commands import sign
-from fog_contracts.costs import Inflation
+from fog_contracts.costs import LETHAL, Inflation
+from fog_contracts.grid import Window
 from fog_contracts.messages import (
     CommandReply,
     Pose,
@@ -106,6 +107,7 @@ class Fog:
         self.edge = edge
         self.clock = clock
         table = inflation_table(body.geometry.resolution, Inflation(cost_scaling=6.0))
+        self._table = table
         cost = inflate(body.static.copy(), table)
         self.master = MasterMap(SITE, body.geometry, body.static, cost, epoch=7)
         self.goal: RobotGoal | None = None
@@ -160,6 +162,15 @@ class Fog:
             map_seq=version.seq,
         )
         self.edge.publish(ch.ROBOT_RELEASE, release, robot=ROBOT)
+
+    def block(self, left: float, bottom: float, right: float, top: float) -> None:
+        """Make a rectangle (m) lethal in the master costmap."""
+        g = self.master.geometry
+        window = g.window_around(left, bottom, right - 1e-6, top - 1e-6)
+        raw = self.master.static.copy()
+        raw[window.rows, window.columns] = LETHAL
+        for delta in self.master.write([("cost", Window(0, 0, g.width, g.height), inflate(raw, self._table))], [], []):
+            self.edge.publish(ch.MAP_DELTA, delta)
 
     def send_robot_to_the_corner(self) -> None:
         self.points = L_PATH[:3]

@@ -576,12 +576,6 @@ def test_driving_robot_is_stopped_by_anyone_with_any_clock(world, issued_at):
     assert world.ask(stop).accepted
 
 
-def test_egress_is_refused_with_a_plain_reason(world):
-    reply = world.command("egress")
-    assert not reply.accepted
-    assert "by hand" in reply.reason
-
-
 @pytest.mark.parametrize(
     ("pose", "word"),
     [(None, "no pose"), (Pose(x=99.0, y=0.0, theta=0.0), "off the map"), (Pose(x=0.2, y=0.2, theta=0.0), "wall")],

@@ -28,7 +28,6 @@ NOT_YET: Final[frozenset[tuple[Role, Channel]]] = frozenset(
     {
         ("hazard-aggregator", ch.NODE_VALUE),
         ("hazard-aggregator", ch.HOME_ASSISTANT),
-        ("robot-agent", ch.PLANNER_EGRESS),
         ("console", ch.PLANNER_PLAN),
         ("console", ch.LIVE),
     }

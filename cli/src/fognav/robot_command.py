@@ -46,6 +46,15 @@ def robot_reset(*, robot: RobotOption = None, fog: FogOption = None, json: JsonO
     _run_command("reset", robot, fog, json=json)
 
 
+@robot_app.command("egress", epilog="Example: fognav robot egress && fognav robot watch --seconds 30")
+def robot_egress(*, robot: RobotOption = None, fog: FogOption = None, json: JsonOption = False) -> None:
+    """Let a robot leave the blocked area or zone that it stands in.
+
+    It drives out slowly, for 60 s at most, and then waits to be enabled. Watch it: the area is blocked for a reason.
+    """
+    _run_command("egress", robot, fog, json=json)
+
+
 @robot_app.command("stop", epilog="Example: fognav robot stop")
 def robot_stop(*, robot: RobotOption = None, fog: FogOption = None, json: JsonOption = False) -> None:
     """Stop a robot at once and end its mission."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from fog_contracts import channels as ch
-from fog_contracts.messages import MapSnapshot
+from fog_contracts.messages import MapSnapshot, PlanReply
 from robot_agent.agent.core import decide
 
 if TYPE_CHECKING:
@@ -154,6 +154,8 @@ class AgentProcess:
     def tick(self, at: Moment) -> None:
         """Tick the core; call it ten times a second."""
         self._bus.publish(self.core.tick(at))
+        if (request := self.core.egress_request(at.now)) is not None:
+            self.core.on_egress_reply(self._bus.query(ch.PLANNER_EGRESS, request, PlanReply, at), at.now)
 
 
 class Fog:

@@ -56,6 +56,14 @@ class SafetyConfig:
     stops_within: float = 60.0
     ramp: float = 0.5
     """Time in which a ramp brings the fastest possible wheel to rest."""
+    egress_max: float = 60.0
+    egress_stall: float = 10.0
+    """How long the way out may not become shorter by `egress_step` (m): planning and turning take some seconds."""
+    egress_step: float = 0.05
+    egress_back: float = 0.10
+    """By how much (m) the way out may become longer again: the pose's noise."""
+    egress_end: float = 0.05
+    """The way out is driven to within this (m) of its end."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -11,7 +11,9 @@ import pytest
 from agent_rig import Robot, until
 from guardian_rig import STOP_S
 
+from fog_contracts import channels as ch
 from fog_contracts.grid import Window
+from fog_contracts.messages import PlanReply
 from fog_runtime.signals import TERMINAL_STOPS
 from fog_supervisor.servers import start_router
 from robot_agent.agent.replay import replay
@@ -190,3 +192,28 @@ async def test_log_of_a_live_agent_replays_to_the_same_commands_and_publications
     assert result.inputs["DecisionMade"] > 5
     assert "NORMAL" in result.modes
     assert result.modes[-1] == "INIT"
+
+
+async def test_robot_leaves_a_blocked_area_by_the_planners_way_on_a_signed_single_use_command(robot):
+    def way_out(_ids, _request):
+        return PlanReply(points=[(2.0, 2.0), (2.7, 2.0)], length=0.7)
+
+    robot.fog.edge.serve(ch.PLANNER_EGRESS, way_out)
+    await enabled(robot)
+    robot.fog.block(1.5, 1.0, 2.4, 3.0)
+    await until(lambda: robot.fog.state.mode == "PROTECTIVE_STOP", "it stops in the blocked area")
+    wrong = await robot.fog.command("egress", key=b"x" * 32)
+    assert "signature" in wrong.reason
+    reply = await robot.fog.command("egress")
+    assert reply.accepted, reply
+    again = await robot.fog.repeat_command()
+    assert "already carried out" in again.reason
+    ended = "the egress ended: the robot is out"
+    await until(lambda: robot.fog.state.mode == "EGRESS" or ended in robot.fog.state.reasons, "it begins")
+    await until(lambda: robot.fog.state.mode != "EGRESS", "it ends")
+    while ended not in robot.fog.state.reasons:
+        # Anything that would stop a robot ends an egress, a late scan on a busy machine too: then it is commanded again.
+        await robot.fog.command("egress")
+        await until(lambda: robot.fog.state.mode != "EGRESS", "it ends")
+    assert robot.fog.state.mode == "INIT"
+    assert 2.6 < robot.body.pose[0] < 2.8

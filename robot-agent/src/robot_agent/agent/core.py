@@ -6,6 +6,7 @@ Values and times go in, values come out. `now` is the robot's own monotonic cloc
 - calls `stream` 20 times a second and sends the wheel command to the guardian;
 - runs `decide(control_job(now))` 5 times a second, on any thread, and passes the decision to `accept`;
 - calls `tick` 10 times a second and publishes what it returns;
+- sends the query of `egress_request` to the planner, and passes the reply to `on_egress_reply`;
 - requests a snapshot of the map while `wants_snapshot`, passes what `prepare_map` makes of it to
   `load`, and stores what `pose_to_store` returns.
 """
@@ -20,6 +21,8 @@ from fog_contracts.fencing import Fence
 from fog_contracts.follower import MapFollower
 from fog_contracts.messages import LoopHealth
 from robot_agent.agent.blocked_places import BlockedPlaces
+from robot_agent.agent.egress import Egress
+from robot_agent.agent.fog_inputs import FogInputs
 from robot_agent.agent.motion_guard import MotionGuard
 from robot_agent.agent.obstacle_reporter import ObstacleReporter
 from robot_agent.agent.operator_commands import OperatorCommands, initial_pose_refusal
@@ -40,16 +43,13 @@ if TYPE_CHECKING:
     from fog_contracts.handlers import Handler, Ids, Moment, Publication, QueryHandler
     from fog_contracts.messages import (
         CommandReply,
-        MapDelta,
-        MapHeartbeat,
+        EgressRequest,
         MapSnapshot,
+        PlanReply,
         Pose,
         RobotCommand,
-        RobotGoal,
         RobotObstacles,
-        RobotPath,
         RobotPose,
-        RobotRelease,
         RobotState,
         Trace,
     )
@@ -81,6 +81,8 @@ class AgentCore:
         self._map = MapFollower()
         self._places = BlockedPlaces()
         self._driving = PathDriving(config)
+        self._fog = FogInputs(self._map, self._places, self._driving, self._localizer)
+        self._egress = Egress(config)
         self._guard = MotionGuard(config, self._localizer)
         self._safety = SafetySupervisor(config.safety)
         self._reporter = ObstacleReporter(config.obstacle_ttl, config.obstacle_limit)
@@ -97,41 +99,11 @@ class AgentCore:
 
     def handlers(self) -> Mapping[ch.Channel, Handler]:
         """Return the handlers of all subscribed channels; of channels with `{robot}` the robot's own only."""
-        return self._fence.guarded(
-            {
-                ch.MAP_DELTA: self._on_delta,
-                ch.MAP_HEARTBEAT: self._on_heartbeat,
-                **self._places.handlers(),
-                ch.ROBOT_GOAL: self._on_goal,
-                ch.ROBOT_PATH: self._on_path,
-                ch.ROBOT_RELEASE: self._on_release,
-            }
-        )
+        return self._fence.guarded(self._fog.handlers())
 
     def query_handlers(self) -> Mapping[ch.Channel, QueryHandler]:
         """Return the handlers of all served queries."""
         return {ch.ROBOT_COMMAND: self._on_command}
-
-    def _on_delta(self, _ids: Ids, delta: MapDelta, at: Moment) -> Sequence[Publication]:
-        if self._map.on_delta(delta, at.now) is not None:
-            self._driving.check_path(self.replica, at.now)
-        return ()
-
-    def _on_heartbeat(self, _ids: Ids, heartbeat: MapHeartbeat, at: Moment) -> Sequence[Publication]:
-        self._map.on_heartbeat(heartbeat, at.now)
-        return ()
-
-    def _on_goal(self, _ids: Ids, goal: RobotGoal, at: Moment) -> Sequence[Publication]:
-        self._driving.on_goal(goal, self._localizer.pose(at.now), self.replica, at)
-        return ()
-
-    def _on_path(self, _ids: Ids, path: RobotPath, at: Moment) -> Sequence[Publication]:
-        self._driving.on_path(path, self._localizer.pose(at.now), self.replica, at)
-        return ()
-
-    def _on_release(self, _ids: Ids, release: RobotRelease, at: Moment) -> Sequence[Publication]:
-        self._driving.on_release(release, self.replica, at.now)
-        return ()
 
     def _on_command(self, _ids: Ids, command: RobotCommand, at: Moment) -> CommandReply:
         return self._commands.answer(command, at)
@@ -201,7 +173,19 @@ class AgentCore:
 
     def stream(self, now: float, stamp: float) -> WheelCommand:
         """Evaluate safety and return the wheel speeds to send now; call it 20 times a second."""
-        return self._driving.command(self._evaluate_safety(now), self._guard.limit, now, stamp)
+        safety = self._evaluate_safety(now)
+        if safety.mode == "EGRESS":
+            wheels = self._egress.wheels(self._localizer.pose(now))
+            return self._driving.command_directly(wheels, safety, self._guard.limit, now)
+        return self._driving.command(safety, self._guard.limit, now, stamp)
+
+    def egress_request(self, now: float) -> EgressRequest | None:
+        """Return the query for a way out of a blocked area that is due; pass its reply to `on_egress_reply`."""
+        return self._egress.request(self._localizer.pose(now), self.safety, now)
+
+    def on_egress_reply(self, reply: PlanReply | None, now: float) -> None:
+        """Handle the planner's reply to an `egress_request`; None when it did not answer."""
+        self._egress.on_reply(reply, self._localizer.pose(now), now)
 
     def control_job(self, now: float) -> Job | None:
         """Return the inputs of the next decision; None while there is no goal or the robot must not drive."""
@@ -214,6 +198,7 @@ class AgentCore:
     def _evaluate_safety(self, now: float, request: Request | None = None) -> SafetyOutputs:
         pose = self._localizer.pose(now)
         trusted = pose if self._localizer.status in {"good", "weak"} else None
+        self._egress.advance(trusted, now)
         inputs = safety_inputs(
             self._base,
             self._lidar,
@@ -222,6 +207,7 @@ class AgentCore:
             self._driving.mission,
             path_problem=self._driving.path_problem(self.replica, self._guard, self.safety, now),
             inside_blocked=self._places.containing(trusted, self.replica, self._reporter, now) if trusted else None,
+            egress=(self._egress.remaining, self._egress.problem(self._guard.reason)),
             caution=self._places.caution(pose) if pose else None,
             now=now,
         )
@@ -233,6 +219,8 @@ class AgentCore:
 
     def request(self, request: Request, now: float) -> SafetyOutputs:
         """Pass an operator's request to the safety gate; the outputs carry its refusal."""
+        if request == "egress" and self.safety.mode != "EGRESS":
+            self._egress.begin()
         outputs = self._evaluate_safety(now, request)
         if request == "reset" and outputs.refusal is None:
             self._driving.wheels.pass_reset()
@@ -267,7 +255,7 @@ class AgentCore:
     def state(self, at: Moment) -> RobotState:
         """Return mode, reasons, goal, path and map version as a message."""
         mission = self._driving.mission
-        driven = mission if mission.active and self.safety.stop == "none" else None
+        driven = mission if mission.active and self.safety.mission_may_drive else None
         return robot_state(
             self._safety.state,
             mission,

@@ -21,7 +21,7 @@ import numpy as np
 from fog_contracts import channels as ch
 from fog_contracts.commands import sign
 from fog_contracts.handlers import completed
-from fog_contracts.messages import LoopHealth, MapSnapshot, Mode, RobotCommand
+from fog_contracts.messages import LoopHealth, MapSnapshot, Mode, PlanReply, RobotCommand
 from robot_agent.agent.core import AgentCore
 from robot_agent.agent.prepared_map import PreparedMap
 from robot_agent.config import AgentConfig
@@ -194,6 +194,13 @@ class ScanReceived(Input, frozen=True, kw_only=True):
         )
 
 
+class EgressReplied(Input, frozen=True, kw_only=True):
+    """The planner's reply to the query for a way out of a blocked area; None when it did not answer."""
+
+    reply: PlanReply | None
+    now: float
+
+
 class LoopHealthReceived(Input, frozen=True, kw_only=True):
     """How punctual the process's loops are."""
 
@@ -268,7 +275,7 @@ class EntriesLost(Entry, frozen=True, kw_only=True):
 _KINDS: Final[tuple[type[Entry], ...]] = (
     Started, PoseRestored, SnapshotLoaded, MessageReceived, QueryReceived, BaseReceived, BaseLost, SuspensionNoticed,
     PoseObserved, LidarSamplesReceived, ScanReceived, LoopHealthReceived, ControlCycle, DecisionMade, StreamCycle, Tick,
-    StorageCheck, WheelsCommanded, Published, Answered, PoseStored, EntriesLost,
+    StorageCheck, EgressReplied, WheelsCommanded, Published, Answered, PoseStored, EntriesLost,
 )  # fmt: skip
 ENTRY_OF_TOPIC: Final[Mapping[str, type[Entry]]] = {f"agent/{kind.__name__}": kind for kind in _KINDS}
 TOPIC_OF_ENTRY: Final[Mapping[type[Entry], str]] = {kind: topic for topic, kind in ENTRY_OF_TOPIC.items()}
@@ -356,6 +363,11 @@ class LoggedAgent(AgentCore):
         """Log the scan and handle it."""
         self._write(ScanReceived.of(scan, now))
         super().on_scan(scan, now)
+
+    def on_egress_reply(self, reply: PlanReply | None, now: float) -> None:
+        """Log the reply and handle it."""
+        self._write(EgressReplied(reply=reply, now=now))
+        super().on_egress_reply(reply, now)
 
     def on_loop_health(self, health: LoopHealth) -> None:
         """Log the loops' health and record it."""

@@ -45,14 +45,12 @@ class OperatorCommands:
         if refusal is not None:
             return _refused(refusal)
         match command.kind:
-            case "enable" | "disable" | "reset":
+            case "enable" | "disable" | "reset" | "egress":
                 return self._request(command.kind, at.now)
             case "cancel":
                 return self._cancel()
             case "initial_pose":
                 return self._start_localization(command.pose)
-            case "egress":
-                return _refused("this robot can't leave a blocked area by itself yet: end the block or move it by hand")
 
     def _cancel(self) -> CommandReply:
         goal = self._robot.cancel_goal()
@@ -72,6 +70,8 @@ class OperatorCommands:
             return _refused(outputs.refusal)
         if request == "reset":
             return CommandReply(accepted=True, reason="the fault is reset; enable the robot to let it drive")
+        if request == "egress":
+            return CommandReply(accepted=True, reason="the robot leaves the blocked area slowly; watch it")
         return CommandReply(accepted=True, reason=f"{request}d; the mode is {outputs.mode}")
 
 

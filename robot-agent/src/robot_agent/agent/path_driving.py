@@ -11,7 +11,7 @@ from robot_agent.agent.path_monitor import PathMonitor
 from robot_agent.agent.path_traces import PathTraces
 from robot_agent.agent.progress_monitor import Hindrance, ProgressMonitor
 from robot_agent.agent.wheel_control import WheelControl
-from robot_agent.motion.local_planner import make_job, twist
+from robot_agent.motion.local_planner import Decision, make_job, twist
 from robot_agent.motion.recent_scans import RecentScans
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from robot_agent.guardian.link import WheelCommand
     from robot_agent.localization.localizer import Localizer
     from robot_agent.localization.pose import Pose2
-    from robot_agent.motion.local_planner import Decision, Job
+    from robot_agent.motion.local_planner import Job
     from robot_agent.safety.gate import SafetyOutputs
     from robot_agent.safety.stop_field import Wheels
 
@@ -111,7 +111,7 @@ class PathDriving:
         if follower is None or path is None or pose is None or replica.geometry is None or not mission.active:
             return None
         follower.advance(pose.x, pose.y, now)
-        if safety.stop != "none":
+        if not safety.mission_may_drive:
             return None
         scan, scan_pose = localizer.scan, localizer.scan_pose()
         points = np.zeros((0, 2))
@@ -148,6 +148,14 @@ class PathDriving:
         """Drop the decision when the safety gate stops the robot."""
         if safety.stop == "immediate" or (safety.changed and safety.stop != "none"):
             self.wheels.decision = None
+
+    def command_directly(
+        self, wheels: Wheels, safety: SafetyOutputs, guard: Callable[[Wheels, float], Wheels], now: float
+    ) -> WheelCommand:
+        """Return the wheel speeds to send now for these (m/s) of a maneuver, within the same limits as a path's."""
+        left, right = wheels
+        self.wheels.decision = Decision(plan_id=0, planner_epoch=0, made_at=now, left=left, right=right)
+        return self.wheels.command(safety, guard, now)
 
     def command(
         self, safety: SafetyOutputs, guard: Callable[[Wheels, float], Wheels], now: float, stamp: float

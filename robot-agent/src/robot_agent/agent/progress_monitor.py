@@ -73,7 +73,7 @@ class ProgressMonitor:
         follower = mission.follower
         if follower is None or not mission.active:
             return None
-        if safety.stop != "none" or _waits_for_release(follower):
+        if not safety.mission_may_drive or _waits_for_release(follower):
             follower.restart_progress_timer(now)
         if self._standstill is None and follower.stuck_for(now) > self._stuck_after:
             self._hold(mission.path_id, follower, now)

@@ -153,8 +153,8 @@ class _Run:
                 self._agent.on_suspension(entry.seconds)
             case log.PoseObserved():
                 self._agent.on_absolute_observation(entry.observation())
-            case log.LoopHealthReceived():
-                self._agent.on_loop_health(entry.health)
+            case log.EgressReplied() | log.LoopHealthReceived():
+                self._from_process(entry)
             case log.ControlCycle() | log.DecisionMade() | log.StreamCycle() | log.Tick() | log.StorageCheck():
                 self._cycle(entry)
             case _:
@@ -167,6 +167,12 @@ class _Run:
         else:
             request = None if channel.message is None else msgspec.convert(entry.request, channel.message)
             self._agent.query_handlers()[channel](entry.ids, request, at)
+
+    def _from_process(self, entry: log.EgressReplied | log.LoopHealthReceived) -> None:
+        if isinstance(entry, log.EgressReplied):
+            self._agent.on_egress_reply(entry.reply, entry.now)
+        else:
+            self._agent.on_loop_health(entry.health)
 
     def _load(self, entry: log.SnapshotLoaded | log.PoseRestored) -> None:
         if isinstance(entry, log.PoseRestored):

@@ -41,10 +41,14 @@ def safety_inputs(  # noqa: PLR0913  # the gate weighs every source of the agent
     *,
     path_problem: str | None,
     inside_blocked: str | None,
+    egress: tuple[float, str | None],
     caution: str | None,
     now: float,
 ) -> SafetyInputs:
-    """Gather age, value and fault of every source at `now` (s, monotonic)."""
+    """Gather age, value and fault of every source at `now` (s, monotonic).
+
+    egress: m to the end of the way out of a blocked area, and what keeps the robot from taking it.
+    """
     feedback, follower = base.feedback, mission.follower
     return SafetyInputs(
         map_loaded=map_follower.version is not None,
@@ -67,5 +71,7 @@ def safety_inputs(  # noqa: PLR0913  # the gate weighs every source of the agent
         released_remaining=follower.released_remaining if follower else 0.0,
         path_problem=path_problem,
         inside_blocked=inside_blocked,
+        egress_remaining=egress[0],
+        egress_problem=egress[1],
         caution=caution,
     )

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Final
 
 from prometheus_client import Counter, Gauge
 
-from fog_contracts.messages import CommandReply, LoopHealth, RobotCommand, RobotState
+from fog_contracts import channels as ch
+from fog_contracts.codec import ContractError
+from fog_contracts.messages import CommandReply, LoopHealth, PlanReply, RobotCommand, RobotState
 from fog_runtime import logs, metrics
 from fog_runtime.clock import Phase, Ticker
 from fog_runtime.edges import Edges
@@ -20,9 +22,8 @@ from robot_agent.agent.power_metrics import observe_power
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from fog_contracts import channels as ch
     from fog_contracts.handlers import Publication
-    from fog_contracts.messages import Message
+    from fog_contracts.messages import EgressRequest, Message
     from fog_runtime.clock import Clock
     from fog_runtime.health import Health
     from fog_runtime.zenoh_edge import ZenohEdge
@@ -37,6 +38,8 @@ STREAM_S: Final = 0.05
 CONTROL_S: Final = 0.2
 PUBLISH_S: Final = 0.1
 HOUSEKEEPING_S: Final = 1.0
+EGRESS_TIMEOUT_S: Final = 3.0
+"""Timeout of a query for the way out of a blocked area."""
 
 SCANS = Counter("fognav_lidar_scans_total", "Whole scans of the lidar")
 LATENESS = Gauge("fognav_loop_lateness_p99_seconds", "99th percentile of a loop's lateness", ["loop"])
@@ -56,7 +59,9 @@ class Service:
 
     def __init__(self, core: AgentCore, zenoh: ZenohEdge, store: Store, clock: Clock, health: Health) -> None:
         self._core = core
+        self._zenoh = zenoh
         self._edges = Edges(clock, zenoh=zenoh)
+        self._tasks: set[asyncio.Task[None]] = set()
         self._store = store
         self._clock = clock
         self._health = health
@@ -174,9 +179,25 @@ class Service:
     async def publish_loop(self) -> None:
         """Tick the core at 10 Hz, publish what it returns, and observe traces."""
         async for _ in self._ticker(PUBLISH_S):
-            self._publish(self._core.tick(self._edges.now()))
+            at = self._edges.now()
+            self._publish(self._core.tick(at))
+            if (request := self._core.egress_request(at.now)) is not None:
+                self._ask_for_way_out(request)
             for trace in self._core.finished_traces():
                 metrics.observe_trace(trace, ["deliver", "command", "total"])
+
+    def _ask_for_way_out(self, request: EgressRequest) -> None:
+        task = asyncio.get_running_loop().create_task(self._fetch_way_out(request), name="egress")
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _fetch_way_out(self, request: EgressRequest) -> None:
+        try:
+            reply = await self._zenoh.query(ch.PLANNER_EGRESS, request, PlanReply, EGRESS_TIMEOUT_S)
+        except ContractError as error:
+            _log.warning("egress_refused", reason=str(error))
+            reply = None
+        self._core.on_egress_reply(reply, self._clock.now())
 
     def _publish(self, publications: Sequence[Publication]) -> None:
         for publication in publications:

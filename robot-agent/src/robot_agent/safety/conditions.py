@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from robot_agent.config import SafetyConfig
 
 Localization = Literal["good", "weak", "lost", "none"]
-Request = Literal["enable", "disable", "reset"]
+Request = Literal["enable", "disable", "reset", "egress"]
 
 
 class Level(IntEnum):
@@ -36,8 +36,9 @@ class SafetyInputs:
     map_age: since the map copy was last confirmed to be the newest version. map_gap: for how long deltas have been
     missing, 0 when none are. plan_age: since the planner's last message about the goal. released_remaining: m of
     released path ahead. path_problem: why the path must not be driven. inside_blocked: the blocked area or zone that
-    the robot is in. caution: a reason to drive slowly here. guardian_lost: why there is no link to the guardian.
-    base_stopped: why the guardian keeps the wheels at zero.
+    the robot is in. egress_remaining: m to the end of the way out of it, infinite while none is known. egress_problem:
+    what keeps the robot from taking it. caution: a reason to drive slowly here. guardian_lost: why there is no link to
+    the guardian. base_stopped: why the guardian keeps the wheels at zero.
     """
 
     map_loaded: bool = False
@@ -60,6 +61,8 @@ class SafetyInputs:
     released_remaining: float = 0.0
     path_problem: str | None = None
     inside_blocked: str | None = None
+    egress_remaining: float = math.inf
+    egress_problem: str | None = None
     caution: str | None = None
     request: Request | None = None
 

@@ -13,7 +13,9 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final, Literal
 
 from robot_agent.config import SafetyConfig
+from robot_agent.safety import maneuver
 from robot_agent.safety.conditions import Finding, Level, SafetyInputs, collect_findings
+from robot_agent.safety.maneuver import Maneuver
 
 if TYPE_CHECKING:
     from fog_contracts.messages import Mode
@@ -26,8 +28,9 @@ MODE_OF: Final[dict[Level, Mode]] = {
     Level.FAULT: "FAULT",
 }
 STOPPED_MODES: Final[frozenset[Mode]] = frozenset({"INIT", "HOLD", "PROTECTIVE_STOP", "FAULT"})
-"""Modes in which no wheel turns (in HOLD after a ramp). EGRESS and DOCK drive slowly; nothing enters them yet."""
+"""Modes in which no wheel turns (in HOLD after a ramp). EGRESS and DOCK drive slowly."""
 IMMEDIATE_STOP_MODES: Final[frozenset[Mode]] = frozenset({"INIT", "PROTECTIVE_STOP", "FAULT"})
+MANEUVERS: Final[frozenset[Mode]] = frozenset({"EGRESS", "DOCK"})
 _NEVER: Final = -math.inf
 
 
@@ -48,6 +51,9 @@ class SafetyState:
     reasons: tuple[str, ...] = field(default=("just started",))
     last_reasons: tuple[str, ...] = ()
     """Reasons of the last escalation, reported during the 2 s before the mode is relaxed."""
+    maneuver: Maneuver | None = None
+    maneuver_end: str = ""
+    """Why the last maneuver ended, until the robot is enabled; empty without one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +70,11 @@ class SafetyOutputs:
     changed: bool
     refusal: str | None
 
+    @property
+    def mission_may_drive(self) -> bool:
+        """Whether the robot may follow the planner's path: not while it is stopped or on a maneuver."""
+        return self.stop == "none" and self.mode not in MANEUVERS
+
 
 def step(
     state: SafetyState, inputs: SafetyInputs, now: float, config: SafetyConfig | None = None
@@ -74,7 +85,7 @@ def step(
     conformity.
     """
     config = config or SafetyConfig()
-    findings = collect_findings(inputs, config)
+    findings = collect_findings(inputs if state.maneuver is None else maneuver.relevant(inputs), config)
     map_held_at = state.map_held_at
     if any(finding.about_map for finding in findings):
         map_held_at = now
@@ -86,11 +97,13 @@ def step(
         now if demanded >= level else last for level, last in zip(Level, state.last_demanded, strict=True)
     )
     state = replace(state, last_demanded=last_demanded, map_held_at=map_held_at)
-    state, refusal = _apply_request(state, inputs, findings, config)
+    state, refusal = _apply_request(state, inputs, findings, now, config)
 
     mode = state.mode
     if mode == "FAULT":
         new = state
+    elif state.maneuver is not None:
+        new = _maneuver(state, state.maneuver, inputs, now, config)
     elif not state.enabled:
         worst = tuple(finding.reason for finding in findings if finding.level == demanded)
         new = replace(
@@ -108,34 +121,76 @@ def step(
 
 
 def _apply_request(
-    state: SafetyState, inputs: SafetyInputs, findings: list[Finding], config: SafetyConfig
+    state: SafetyState, inputs: SafetyInputs, findings: list[Finding], now: float, config: SafetyConfig
 ) -> tuple[SafetyState, str | None]:
-    if inputs.request is None:
-        return state, None
-    if inputs.request == "disable":
-        return replace(state, enabled=False), None
-    if inputs.request == "reset":
-        if state.mode != "FAULT" and inputs.base_fault is None:
-            return state, f"there is no fault to reset: the mode is {state.mode}"
-        # The guardian latches the base's own faults, and checks their causes again when it is reset.
-        causes = collect_findings(replace(inputs, base_fault=None), config)
-        present = [finding.reason for finding in causes if finding.level == Level.FAULT]
-        if present:
-            return state, f"the cause is still there: {'; '.join(present)}"
-        return replace(state, mode="INIT", enabled=False, latched=(), stops=()), None
-    return _enable(state, inputs, findings)
+    match inputs.request:
+        case None:
+            return state, None
+        case "disable":
+            return replace(state, enabled=False, maneuver=None), None
+        case "reset":
+            return _reset(state, inputs, config)
+        case "egress":
+            return _begin_egress(state, inputs, now, config)
+        case "enable":
+            return _enable(state, inputs, findings)
+
+
+def _reset(state: SafetyState, inputs: SafetyInputs, config: SafetyConfig) -> tuple[SafetyState, str | None]:
+    if state.mode != "FAULT" and inputs.base_fault is None:
+        return state, f"there is no fault to reset: the mode is {state.mode}"
+    # The guardian latches the base's own faults, and checks their causes again when it is reset.
+    causes = collect_findings(replace(inputs, base_fault=None), config)
+    present = [finding.reason for finding in causes if finding.level == Level.FAULT]
+    if present:
+        return state, f"the cause is still there: {'; '.join(present)}"
+    return replace(state, mode="INIT", enabled=False, latched=(), stops=()), None
+
+
+def _begin_egress(
+    state: SafetyState, inputs: SafetyInputs, now: float, config: SafetyConfig
+) -> tuple[SafetyState, str | None]:
+    if state.mode == "FAULT":
+        return state, _latched_fault(state)
+    if state.maneuver is not None:
+        return state, "the robot is leaving the blocked area already"
+    begun = maneuver.begin(inputs, now, config)
+    if isinstance(begun, str):
+        return state, begun
+    return replace(state, enabled=False, latched=(), maneuver=begun), None
+
+
+def _latched_fault(state: SafetyState) -> str:
+    return f"a fault is latched, reset it first: {'; '.join(f.reason for f in state.latched)}"
 
 
 def _enable(state: SafetyState, inputs: SafetyInputs, findings: list[Finding]) -> tuple[SafetyState, str | None]:
     if state.mode == "FAULT":
-        return state, f"a fault is latched, reset it first: {'; '.join(f.reason for f in state.latched)}"
+        return state, _latched_fault(state)
+    if state.maneuver is not None:
+        return state, "the robot is leaving a blocked area: wait until it is out, or disable it"
     limit = min((finding.level for finding in state.latched), default=Level.PROTECTIVE_STOP)
     if not inputs.map_loaded:
         limit = Level.HOLD
     present = [finding.reason for finding in findings if finding.level >= limit]
     if present:
         return state, f"the cause is still there: {'; '.join(present)}"
-    return replace(state, enabled=True, latched=(), stopped_since=math.inf), None
+    return replace(state, enabled=True, latched=(), stopped_since=math.inf, maneuver_end=""), None
+
+
+def _maneuver(
+    state: SafetyState, running: Maneuver, inputs: SafetyInputs, now: float, config: SafetyConfig
+) -> SafetyState:
+    """Go on with a maneuver, or end it: in FAULT, or waiting to be enabled."""
+    findings = collect_findings(maneuver.relevant(inputs), config)
+    result = maneuver.proceed(running, inputs, findings, now, config)
+    if isinstance(result, Maneuver):
+        return replace(state, mode="EGRESS", stops=(), stopped_since=math.inf, maneuver=result)
+    ended = replace(state, mode="INIT", maneuver=None, maneuver_end=f"the egress ended: {result}")
+    faults = tuple(finding for finding in findings if finding.level == Level.FAULT)
+    if not faults:
+        return ended
+    return replace(ended, mode="FAULT", latched=faults, last_reasons=tuple(fault.reason for fault in faults))
 
 
 def _advance(
@@ -205,7 +260,10 @@ def _reasons(state: SafetyState, findings: list[Finding]) -> tuple[str, ...]:
         latched = [finding.reason for finding in state.latched]
         return (*latched, *(reason for reason in current if reason not in latched))
     if state.mode == "INIT":
-        return (*current, "waiting for an operator to enable")
+        ended = (state.maneuver_end,) if state.maneuver_end else ()
+        return (*current, *ended, "waiting for an operator to enable")
+    if state.mode == "EGRESS":
+        return (*current, "leaving a blocked area on an operator's command")
     latched = [f"{f.reason} (an operator must enable again)" for f in state.latched if f.reason not in current]
     reasons = (*current, *latched)
     if not reasons and state.mode != "NORMAL":

@@ -1,0 +1,86 @@
+"""The way out of a blocked area, on an operator's command: asked of the planner, then driven slowly.
+
+The safety gate decides whether the robot may move (`robot_agent.safety.maneuver`); the stop field guards each command.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from fog_contracts.geometry import PATH_SPACING_M, sampled
+from fog_contracts.messages import EgressRequest, Pose
+from robot_agent.motion.local_planner import wheels
+from robot_agent.motion.path_follower import PathFollower
+from robot_agent.motion.slow_follower import follow_slowly
+
+if TYPE_CHECKING:
+    from fog_contracts.messages import PlanReply
+    from robot_agent.config import AgentConfig
+    from robot_agent.localization.pose import Pose2
+    from robot_agent.safety.gate import SafetyOutputs
+    from robot_agent.safety.stop_field import Wheels
+
+_ASK_AGAIN_S: Final = 1.0
+"""Pause before the planner is asked again, after it gave no way out or did not answer."""
+
+
+class Egress:
+    """The way out, while the robot is on it. `now` is s of the robot's monotonic clock."""
+
+    def __init__(self, config: AgentConfig) -> None:
+        self._config = config
+        self._follower: PathFollower | None = None
+        self._problem: str | None = None
+        self._ask_at = -math.inf
+
+    def begin(self) -> None:
+        """Forget the way out of an earlier egress."""
+        self._follower = self._problem = None
+        self._ask_at = -math.inf
+
+    def request(self, pose: Pose2 | None, safety: SafetyOutputs, now: float) -> EgressRequest | None:
+        """Return the query to send to the planner now; None when none is due."""
+        if safety.mode != "EGRESS" or self._follower is not None or pose is None or now < self._ask_at:
+            return None
+        self._ask_at = now + _ASK_AGAIN_S
+        return EgressRequest(robot=self._config.robot, pose=Pose(x=pose.x, y=pose.y, theta=pose.theta))
+
+    def on_reply(self, reply: PlanReply | None, pose: Pose2 | None, now: float) -> None:
+        """Handle the planner's reply; None when it did not answer."""
+        if self._follower is not None:
+            return
+        if reply is None:
+            self._problem = "the planner does not answer"
+        elif reply.refusal is not None:
+            self._problem = reply.refusal.reason
+        elif len(reply.points) > 1:
+            self._problem = None
+            corners = np.array(reply.points, dtype=np.float64)
+            self._follower = PathFollower(sampled(corners, PATH_SPACING_M), math.inf)
+            if pose is not None:
+                self._follower.advance(pose.x, pose.y, now)
+
+    def advance(self, pose: Pose2 | None, now: float) -> None:
+        """Update the robot's place on the way out."""
+        if self._follower is not None and pose is not None:
+            self._follower.advance(pose.x, pose.y, now)
+
+    @property
+    def remaining(self) -> float:
+        """Metres to the end of the way out, by way of its nearest point; infinite while there is none."""
+        follower = self._follower
+        return math.inf if follower is None else follower.remaining + follower.distance
+
+    def problem(self, limited: str | None) -> str | None:
+        """Return what keeps the robot from the way out; `limited`: why its wheels are stopped."""
+        return self._problem or limited
+
+    def wheels(self, pose: Pose2 | None) -> Wheels:
+        """Return the wheel speeds (m/s) along the way out; zero while there is none."""
+        if self._follower is None or pose is None:
+            return 0.0, 0.0
+        motion = follow_slowly(self._follower, pose, self._config.safety.speed_egress)
+        return wheels(motion.v, motion.w, self._config.drive_train.axle_m)

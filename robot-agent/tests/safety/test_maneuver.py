@@ -1,0 +1,149 @@
+"""Leaving a blocked area: what the gate lets pass meanwhile, and everything that ends it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from robot_agent.safety.conditions import SafetyInputs
+from robot_agent.safety.gate import SafetyState, step
+from robot_agent.safety.maneuver import Maneuver
+
+DT = 0.05
+HEALTHY = {
+    "map_loaded": True, "map_age": 0.1, "localization": "good", "lidar_age": 0.02, "scan_age": 0.1, "base_age": 0.02,
+}  # fmt: skip
+INSIDE = {"inside_blocked": "the no-go zone wet"}
+
+
+class Gate:
+    """A gate whose robot stands in a no-go zone; `remaining` shrinks by 0.10 m/s while it leaves."""
+
+    def __init__(self) -> None:
+        self.state = SafetyState()
+        self.now = 100.0
+        self.remaining = math.inf
+        self.out = None
+
+    def run(self, seconds: float = DT, *, speed: float = 0.0, request: str | None = None, **changes):
+        given = {**HEALTHY, **INSIDE, **changes}
+        for _ in range(max(1, round(seconds / DT))):
+            self.now += DT
+            self.remaining = max(0.0, self.remaining - speed * DT)
+            values = {"egress_remaining": self.remaining, **given}
+            self.state, self.out = step(self.state, SafetyInputs(**values, request=request), self.now)
+            request = None
+        return self.out
+
+    def leaving(self) -> Gate:
+        out = self.run(request="egress")
+        assert (out.refusal, out.mode) == (None, "EGRESS")
+        self.remaining = 2.0
+        assert self.run(0.2, speed=0.1).mode == "EGRESS"
+        return self
+
+
+def test_egress_ignores_only_the_blocked_area_drives_slowly_and_ends_outside_in_init():
+    gate = Gate()
+    assert "no-go zone wet" in gate.run(request="enable").refusal
+    out = gate.leaving().out
+    assert (out.cap, out.stop, out.mission_may_drive) == (0.10, "none", False)
+    assert out.reasons == ("leaving a blocked area on an operator's command",)
+    gate.remaining = 0.5
+    assert gate.run(4.4, speed=0.1).mode == "EGRESS"
+    out = gate.run(0.2, speed=0.1, inside_blocked=None)
+    assert (out.mode, out.stop, out.cap) == ("INIT", "immediate", 0.0)
+    assert out.reasons == ("the egress ended: the robot is out", "waiting for an operator to enable")
+    assert gate.run(request="enable", inside_blocked=None).refusal is None
+    assert gate.state.maneuver_end == ""
+
+
+def test_egress_that_ends_inside_says_so():
+    gate = Gate().leaving()
+    out = gate.run(egress_remaining=0.05)
+    assert out.mode == "INIT"
+    assert "the egress ended: the way out ends, and the robot is still in the no-go zone wet" in out.reasons
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"lidar_age": 0.31}, "the lidar has been silent"),
+        ({"scan_age": 0.46}, "no complete scan"),
+        ({"identical_scans": 3}, "the lidar repeats itself"),
+        ({"localization": "lost"}, "the pose is lost"),
+        ({"map_age": 3.01}, "the map is 3.0 s old"),
+        ({"map_gap": 1.01}, "changes of the map"),
+        ({"base_age": 0.31}, "no message from the guardian"),
+        ({"base_stopped": "not awake"}, "the guardian holds the wheels"),
+    ],
+)
+def test_condition_that_stops_a_robot_refuses_an_egress_and_ends_one_for_good(changes, words):
+    assert words in Gate().run(request="egress", **changes).refusal
+    gate = Gate().leaving()
+    out = gate.run(speed=0.1, **changes)
+    assert (out.mode, out.stop) == ("INIT", "immediate")
+    assert any(reason.startswith("the egress ended: ") and words in reason for reason in out.reasons)
+    assert gate.run(5.0, speed=0.1).mode == "INIT"
+
+
+def test_missions_conditions_do_not_concern_an_egress():
+    out = Gate().leaving().run(1.0, speed=0.1, mission=True, path_problem="the path is blocked", plan_age=9.0)
+    assert out.mode == "EGRESS"
+
+
+@pytest.mark.parametrize("fault", ["bumper", "cliff", "wheel_drop"])
+def test_fault_during_an_egress_is_latched(fault):
+    gate = Gate().leaving()
+    assert gate.run(**{fault: True}).mode == "FAULT"
+    assert gate.run(5.0).mode == "FAULT"
+    assert "reset it first" in gate.run(request="egress").refusal
+    assert gate.run(request="reset").mode == "INIT"
+
+
+def test_egress_is_refused_outside_and_an_enable_during_one():
+    assert "nothing to leave" in Gate().run(request="egress", inside_blocked=None).refusal
+    gate = Gate().leaving()
+    assert "leaving a blocked area" in gate.run(speed=0.1, request="enable").refusal
+    assert "already" in gate.run(speed=0.1, request="egress").refusal
+    assert gate.out.mode == "EGRESS"
+
+
+def test_disable_ends_an_egress_at_once():
+    out = Gate().leaving().run(request="disable")
+    assert (out.mode, out.stop) == ("INIT", "immediate")
+
+
+def test_distance_to_the_edge_must_shrink():
+    gate = Gate().leaving()
+    assert gate.run(9.0).mode == "EGRESS"
+    out = gate.run(1.5, egress_problem="an obstacle ahead")
+    assert out.mode == "INIT"
+    assert "no nearer to its end for 10 s: an obstacle ahead" in "; ".join(out.reasons)
+    gate = Gate().leaving()
+    gate.remaining += 0.09
+    assert gate.run().mode == "EGRESS"
+    gate.remaining += 0.04
+    assert "moved away" in "; ".join(gate.run().reasons)
+
+
+def test_egress_without_a_way_out_ends_after_ten_seconds():
+    gate = Gate()
+    gate.run(request="egress")
+    assert gate.run(9.8).mode == "EGRESS"
+    assert "no nearer" in "; ".join(gate.run(0.3, egress_problem="the planner does not answer").reasons)
+
+
+def test_egress_ends_after_sixty_seconds():
+    gate = Gate().leaving()
+    gate.remaining = 1e3
+    gate.state = replace(gate.state, maneuver=Maneuver(gate.now, 1e3, gate.now))
+    assert gate.run(59.9, speed=0.1).mode == "EGRESS"
+    assert "longer than 60 s" in "; ".join(gate.run(0.2, speed=0.1).reasons)
+
+
+@pytest.mark.parametrize("remaining", [math.nan, -math.inf])
+def test_impossible_distance_ends_an_egress(remaining):
+    assert Gate().leaving().run(egress_remaining=remaining).mode == "INIT"

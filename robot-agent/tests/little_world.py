@@ -16,7 +16,7 @@ from fog_contracts.commands import sign
 from fog_contracts.costs import Inflation
 from fog_contracts.grid import GridGeometry, Window
 from fog_contracts.handlers import Moment
-from fog_contracts.messages import Pose, RobotCommand, RobotGoal, RobotPath, RobotRelease, RobotState, Trace
+from fog_contracts.messages import PlanReply, Pose, RobotCommand, RobotGoal, RobotPath, RobotRelease, RobotState, Trace
 from fog_contracts.replica import MasterMap
 from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.raycast import cast
@@ -99,6 +99,7 @@ class LittleWorld:
         self.repeats = RepeatCounter()
         self.frozen_scan = None
         self.decide_on = True
+        self.way_out = []
         self.resets = 0
         self.restarts = 0
         self.published = []
@@ -246,6 +247,8 @@ class LittleWorld:
                 self.worst_error = tuple(max(pair) for pair in zip(self.worst_error, self.error(), strict=True))
         if self.steps % 10 == 0:
             self.published.extend(self.agent.tick(self.moment))
+            if self.agent.egress_request(self.now) is not None:
+                self.agent.on_egress_reply(PlanReply(points=self.way_out), self.now)
 
     def _publish_as_planner(self):
         """Publish goal and release, and the path while the robot does not name it."""

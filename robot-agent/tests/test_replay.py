@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import subprocess
 import sys
@@ -76,6 +77,13 @@ def drive_through_most_situations(world):
     world.run(3.0)
     assert world.command("cancel").accepted
     world.run(1.0)
+    left, bottom = (math.floor(value / 0.05) * 0.05 for value in (world.x - 0.2, world.y - 0.2))
+    world.block(left, bottom, left + 0.4, bottom + 0.4)
+    world.run(0.2)
+    assert world.command("egress").accepted
+    world.way_out = [(world.x, world.y), (world.x, world.y - 1.0)]
+    world.run(2.0)
+    assert world.state().mode == "EGRESS"
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +103,7 @@ def test_a_replay_repeats_every_command_mode_publication_and_answer(drive):
     assert result.differences == []
     assert result.outputs["WheelsCommanded"] == len(world.commands)
     assert result.outputs["Published"] == len(world.published)
-    assert result.outputs["Answered"] == result.inputs["QueryReceived"] == 7
+    assert result.outputs["Answered"] == result.inputs["QueryReceived"] == 8
     assert result.inputs["DecisionMade"] > 50
     assert {"INIT", "NORMAL", "HOLD", "FAULT"} <= set(result.modes)
     assert set(result.inputs) == {kind.__name__ for kind in log.TOPIC_OF_ENTRY if issubclass(kind, log.Input)} - {
@@ -171,7 +179,7 @@ def test_a_log_holds_no_operators_key_and_none_of_its_signatures(drive):
     assert AGENT.operator_key == KEY
     commands = [entry for entry in entries_of(path) if isinstance(entry, log.QueryReceived)]
     kinds = [entry.request["kind"] for entry in commands]
-    assert kinds == ["initial_pose", "enable", "enable", "enable", "reset", "enable", "cancel"]
+    assert kinds == ["initial_pose", "enable", "enable", "enable", "reset", "enable", "cancel", "egress"]
     for entry in commands:
         command = msgspec.convert(entry.request, RobotCommand)
         assert command.signature in {b"", sign(command, log.LOG_KEY).signature}

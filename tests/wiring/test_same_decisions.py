@@ -24,6 +24,7 @@ from fog_contracts.handlers import Core, Publication
 from fog_contracts.messages import (
     AreaHazard,
     CircleShape,
+    CommandKind,
     CommandReply,
     EgressRequest,
     LoopHealth,
@@ -75,6 +76,7 @@ SEED = 3
 STEPS = 1500
 ENABLE, GOAL, BARRIER, EXTERNAL = 350, 400, 500, 620
 ZONES, QUERIES, ARRIVAL, ZONE_AROUND_ROBOT = 910, 1000, 1100, 1250
+COMMANDS: dict[int, CommandKind] = {ENABLE: "enable", 1320: "egress"}
 GOAL_ID = "goal-of-the-drive"
 EXTERNAL_CHANNELS = {ch.NODE_READING, ch.NODE_AVAILABILITY, ch.THESIS_AREA}
 ROBOT_CHANNELS = {ch.ROBOT_POSE, ch.ROBOT_STATE, ch.ROBOT_OBSTACLES}
@@ -155,8 +157,8 @@ def comparable(message: Any) -> Any:
     return msgspec.structs.replace(message, loop=LoopHealth()) if isinstance(message, RobotState) else message
 
 
-def enable(now: float) -> RobotCommand:
-    unsigned = RobotCommand(kind="enable", robot="r1", operator="test", nonce="n" * 16, boot=BOOT, issued_at=now)
+def signed(kind: CommandKind, now: float) -> RobotCommand:
+    unsigned = RobotCommand(kind=kind, robot="r1", operator="test", nonce=f"{kind:n<16}", boot=BOOT, issued_at=now)
     return sign(unsigned, OPERATOR_KEY)
 
 
@@ -219,8 +221,8 @@ def drive_in_lockstep() -> Run:
         run.wheels += [entry.command for entry in entries if isinstance(entry, log.WheelsCommanded)]
         run.times.append(system.now)
         at = moment(system.now)
-        if step == ENABLE:
-            command = enable(at.now)
+        if step in COMMANDS:
+            command = signed(COMMANDS[step], at.now)
             run.replies.append(bus.query(ch.ROBOT_COMMAND, command, CommandReply, at, robot="r1"))
         if step == BARRIER:
             system.world.place(barrier_across(site.site.areas[0], site.site, site.map, SEED))
@@ -282,8 +284,8 @@ async def drive_live(recorded: Run) -> tuple[Run, Any]:
             await live.begin_loops()
         else:
             await live.clock.wake(live.run_until_idle)
-        if step == ENABLE:
-            command = enable(now)
+        if step in COMMANDS:
+            command = signed(COMMANDS[step], now)
             run.replies.append(await live.run(live.query(ch.ROBOT_COMMAND, command, CommandReply, robot="r1")))
         if step == GOAL:
             pose = goal(0.0).pose
@@ -327,7 +329,7 @@ def live(lockstep: Run) -> tuple[Run, Any]:
 def test_recorded_drive_contains_all_kinds_of_decisions(lockstep):
     decisions = lockstep.decisions()
     modes = {state.mode for _, _, state in decisions["robot_state"]}
-    assert {"INIT", "NORMAL", "DEGRADED", "PROTECTIVE_STOP"} <= modes
+    assert {"INIT", "NORMAL", "DEGRADED", "PROTECTIVE_STOP", "EGRESS"} <= modes
     assert {"clear", "blocked", "unknown"} <= {hazard.state for _, _, hazard in decisions["area_hazard"]}
     assert OTHER_ROBOT in {hazard.explained_by for _, _, hazard in decisions["area_hazard"]}
     assert len({path.plan_id for _, _, path in decisions["robot_path"]}) >= 3

@@ -212,7 +212,7 @@ async def test_robot_leaves_a_blocked_area_by_the_planners_way_on_a_signed_singl
     await until(lambda: robot.fog.state.mode == "EGRESS" or ended in robot.fog.state.reasons, "it begins")
     await until(lambda: robot.fog.state.mode != "EGRESS", "it ends")
     while ended not in robot.fog.state.reasons:
-        # Anything that would stop a robot ends an egress, a late scan on a busy machine too: then it is commanded again.
+        # Whatever stops a robot ends an egress, a late scan on a busy machine too: then it is commanded again.
         await robot.fog.command("egress")
         await until(lambda: robot.fog.state.mode != "EGRESS", "it ends")
     assert robot.fog.state.mode == "INIT"

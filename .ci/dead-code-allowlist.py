@@ -15,6 +15,9 @@ _.severity
 _.uptime_ms  # messages: of a sensor node
 _.rssi
 _.fw
+_.config_version  # messages: what a node has learned, and its next firmware
+_.no_echo_us
+_.board
 _.area_entered  # the demo's report and lockstep's result
 _.area_clearance_m
 _.operator_commands  # lockstep: fields of its result
@@ -28,6 +31,7 @@ _.path_received
 _.first_command
 NODE_VALUE  # channels: rows of the table for other people's programs, which no service of ours uses yet
 HOME_ASSISTANT
+NODE_UPDATE  # the firmware on a board subscribes to it
 _.ROLES
 _.DURABILITIES
 

@@ -107,7 +107,11 @@ def test_sensor_nodes_run_the_firmware_wherever_it_compiles():
         pytest.skip(str(error))
     site = ring.ring_site()
     rig = FogRig(
-        site, World(Floor(site.map.geometry, site.map.cells), site.site.robots[0], 1, axle_m=0.235), Bus(), 1, 0.0
+        site,
+        World(Floor(site.map.geometry, site.map.cells), site.site.robots[0], 1, axle_m=0.235),
+        Bus(site.site.id),
+        1,
+        0.0,
     )
     assert rig.nodes
     assert all(isinstance(node, FirmwareNode) for node in rig.nodes)

@@ -18,7 +18,8 @@ Node* fognav_node_new(const FognavSonar* sonars, int count, uint32_t boot, int p
     settings.config.sonars = count;
     settings.config.pause_ms = static_cast<uint16_t>(pause_ms);
     for (int i = 0; i < count; ++i) {
-        settings.config.limits[i] = {sonars[i].limit_mm, sonars[i].no_echo_is_clear != 0};
+        settings.config.limits[i].limit_mm = sonars[i].limit_mm;
+        settings.config.limits[i].no_echo_is_clear = sonars[i].no_echo_is_clear != 0;
     }
     settings.boot = boot;
     settings.publish = every_reading != 0 ? fognav::PublishMode::every_reading : fognav::PublishMode::on_change;
@@ -28,7 +29,7 @@ Node* fognav_node_new(const FognavSonar* sonars, int count, uint32_t boot, int p
 
 void fognav_node_free(Node* node) { delete node; }
 
-// 0: nothing, 1: trigger sonar `fognav_node_sonar`, 2: publish `fognav_node_message`.
+// 0: nothing, 1: trigger sonar `fognav_node_sonar`, 2: publish `fognav_node_message`, 3: it is a calibration.
 int fognav_node_step(Node* node, uint32_t now_us) { return static_cast<int>(node->step(now_us)); }
 
 // Step from `now_us` on, every `period_us`, up to and with `until_us` or the first event, which is returned as above;
@@ -59,7 +60,10 @@ void fognav_node_temperature(Node* node, int temperature_dc) {
 
 void fognav_node_rssi(Node* node, int rssi) { node->set_rssi(static_cast<int16_t>(rssi)); }
 
-void fognav_node_calibrate(Node* node) { node->calibrate(); }
+// A command, or a calibration that was stored; each returns a null pointer, or what is wrong with it.
+const char* fognav_node_command(Node* node, const char* text, uint32_t size) { return node->command(text, size); }
+
+const char* fognav_node_restore(Node* node, const char* text, uint32_t size) { return node->restore(text, size); }
 
 int fognav_node_calibrating(const Node* node) { return node->calibrating() ? 1 : 0; }
 
@@ -70,6 +74,8 @@ const char* fognav_node_describe_calibration(int result) {
 }
 
 int32_t fognav_node_limit_mm(const Node* node, int sonar) { return node->config().limits[sonar].limit_mm; }
+
+uint32_t fognav_node_no_echo_us(const Node* node, int sonar) { return node->config().limits[sonar].no_echo_us; }
 
 int fognav_node_no_echo_is_clear(const Node* node, int sonar) {
     return node->config().limits[sonar].no_echo_is_clear ? 1 : 0;

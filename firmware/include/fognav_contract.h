@@ -100,6 +100,79 @@
 #define FOGNAV_NODE_CONFIG_PAUSE_MS_MAX 60000L
 #define FOGNAV_NODE_CONFIG_PAUSE_MS_DEFAULT 50
 
+/* node_command, subscribed by a node: what a node is to learn while nobody is in its sonars' way */
+#define FOGNAV_NODE_COMMAND_TOPIC "fog/v1/%s/nodes/%s/command" /* site, node */
+#define FOGNAV_NODE_COMMAND_TOPIC_SIZE 87
+#define FOGNAV_NODE_COMMAND_LIMIT 32 /* bytes */
+#define FOGNAV_NODE_COMMAND_QOS 1
+#define FOGNAV_NODE_COMMAND_RETAINED 0
+#define FOGNAV_NODE_COMMAND_CALIBRATE "calibrate"
+#define FOGNAV_NODE_COMMAND_LEARN_NO_ECHO "learn-no-echo"
+
+/* node_calibration, published by a node: What a node has learned on command; it holds until a configuration with another version comes. Per sonar: how it ended, the settings that count now, and the pulse (us, 0: none) by which its board says "no echo". */
+#define FOGNAV_NODE_CALIBRATION_TOPIC "fog/v1/%s/nodes/%s/calibration" /* site, node */
+#define FOGNAV_NODE_CALIBRATION_TOPIC_SIZE 91
+#define FOGNAV_NODE_CALIBRATION_LIMIT 1024 /* bytes */
+#define FOGNAV_NODE_CALIBRATION_QOS 1
+#define FOGNAV_NODE_CALIBRATION_RETAINED 1
+#define FOGNAV_NODE_CALIBRATION_BOOT_FIELD "boot"
+#define FOGNAV_NODE_CALIBRATION_BOOT_MIN 0
+#define FOGNAV_NODE_CALIBRATION_BOOT_MAX 9007199254740992LL
+#define FOGNAV_NODE_CALIBRATION_CONFIG_VERSION_FIELD "config_version"
+#define FOGNAV_NODE_CALIBRATION_CONFIG_VERSION_MIN 0
+#define FOGNAV_NODE_CALIBRATION_CONFIG_VERSION_MAX 9007199254740992LL
+#define FOGNAV_NODE_CALIBRATION_RESULT_FIELD "result"
+#define FOGNAV_NODE_CALIBRATION_RESULT_ITEMS_MIN 1
+#define FOGNAV_NODE_CALIBRATION_RESULT_ITEMS_MAX 8
+#define FOGNAV_NODE_CALIBRATION_RESULT_DONE "done"
+#define FOGNAV_NODE_CALIBRATION_RESULT_STUCK "stuck"
+#define FOGNAV_NODE_CALIBRATION_RESULT_TOO_NEAR "too_near"
+#define FOGNAV_NODE_CALIBRATION_RESULT_UNSTEADY "unsteady"
+#define FOGNAV_NODE_CALIBRATION_RANGE_LIMIT_M_FIELD "range_limit_m" /* m */
+#define FOGNAV_NODE_CALIBRATION_RANGE_LIMIT_M_ITEMS_MIN 1
+#define FOGNAV_NODE_CALIBRATION_RANGE_LIMIT_M_ITEMS_MAX 8
+#define FOGNAV_NODE_CALIBRATION_RANGE_LIMIT_M_MIN 0.0
+#define FOGNAV_NODE_CALIBRATION_RANGE_LIMIT_M_MIN_EXCLUSIVE 1
+#define FOGNAV_NODE_CALIBRATION_RANGE_LIMIT_M_MAX 20.0
+#define FOGNAV_NODE_CALIBRATION_NO_ECHO_IS_CLEAR_FIELD "no_echo_is_clear"
+#define FOGNAV_NODE_CALIBRATION_NO_ECHO_IS_CLEAR_ITEMS_MIN 1
+#define FOGNAV_NODE_CALIBRATION_NO_ECHO_IS_CLEAR_ITEMS_MAX 8
+#define FOGNAV_NODE_CALIBRATION_NO_ECHO_US_FIELD "no_echo_us"
+#define FOGNAV_NODE_CALIBRATION_NO_ECHO_US_ITEMS_MIN 1
+#define FOGNAV_NODE_CALIBRATION_NO_ECHO_US_ITEMS_MAX 8
+#define FOGNAV_NODE_CALIBRATION_NO_ECHO_US_MIN 0
+#define FOGNAV_NODE_CALIBRATION_NO_ECHO_US_MAX 80000L
+
+/* node_update, subscribed by a node: A node's next firmware: where it is, and its maker's signature (ECDSA P-256) of number, board, size, SHA-256. */
+#define FOGNAV_NODE_UPDATE_TOPIC "fog/v1/%s/nodes/%s/update" /* site, node */
+#define FOGNAV_NODE_UPDATE_TOPIC_SIZE 86
+#define FOGNAV_NODE_UPDATE_LIMIT 1024 /* bytes */
+#define FOGNAV_NODE_UPDATE_QOS 1
+#define FOGNAV_NODE_UPDATE_RETAINED 1
+#define FOGNAV_NODE_UPDATE_NUMBER_FIELD "number"
+#define FOGNAV_NODE_UPDATE_NUMBER_MIN 1
+#define FOGNAV_NODE_UPDATE_NUMBER_MAX 2147483647L
+#define FOGNAV_NODE_UPDATE_BOARD_FIELD "board"
+#define FOGNAV_NODE_UPDATE_SIZE_FIELD "size"
+#define FOGNAV_NODE_UPDATE_SIZE_MIN 1
+#define FOGNAV_NODE_UPDATE_SIZE_MAX 4194304L
+#define FOGNAV_NODE_UPDATE_SHA256_FIELD "sha256"
+#define FOGNAV_NODE_UPDATE_SHA256_LENGTH_MIN 64
+#define FOGNAV_NODE_UPDATE_SHA256_LENGTH_MAX 64
+#define FOGNAV_NODE_UPDATE_SIGNATURE_FIELD "signature"
+#define FOGNAV_NODE_UPDATE_SIGNATURE_LENGTH_MIN 16
+#define FOGNAV_NODE_UPDATE_SIGNATURE_LENGTH_MAX 144
+#define FOGNAV_NODE_UPDATE_URL_FIELD "url"
+#define FOGNAV_NODE_UPDATE_URL_LENGTH_MIN 8
+#define FOGNAV_NODE_UPDATE_URL_LENGTH_MAX 200
+
+/* node_problem, published by a node: why a node refused its latest configuration, command or update, in words; empty: nothing refused */
+#define FOGNAV_NODE_PROBLEM_TOPIC "fog/v1/%s/nodes/%s/problem" /* site, node */
+#define FOGNAV_NODE_PROBLEM_TOPIC_SIZE 87
+#define FOGNAV_NODE_PROBLEM_LIMIT 256 /* bytes */
+#define FOGNAV_NODE_PROBLEM_QOS 1
+#define FOGNAV_NODE_PROBLEM_RETAINED 1
+
 /* home_assistant, published by a node: Home Assistant's device discovery (JSON) */
 #define FOGNAV_HOME_ASSISTANT_TOPIC "homeassistant/device/%s/config" /* node */
 #define FOGNAV_HOME_ASSISTANT_TOPIC_SIZE 61

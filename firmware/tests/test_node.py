@@ -2,13 +2,15 @@
 
 import itertools
 
+import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fog_contracts import channels as ch
 from fog_contracts.channels import NODE_READING
 from fog_contracts.codec import decode, encode
-from fog_contracts.messages import NodeConfig, NodeReading
+from fog_contracts.messages import NodeCalibration, NodeConfig, NodeReading
 from fog_contracts.site import NodeSite, Sonar
 from fognav_sim.firmware_node import STEP_US, FirmwareNode
 from fognav_sim.node import SonarNode, classify, default_config
@@ -181,7 +183,7 @@ def test_readings_go_out_as_after_a_change_when_connection_or_configuration_is_n
 def test_calibration_learns_the_free_distance(core, make_node, run, free, learned):
     node = make_node()
     run(node, (3.0, 3.0), 1.0)
-    node.calibrate()
+    assert node.command(ch.CALIBRATE) is None
     assert {reading.state for reading in run(node, free, 2.0)} == {"unknown"}
     run(node, free, 10.0)
     assert not core.calibrating(node._node)
@@ -193,9 +195,72 @@ def test_calibration_learns_the_free_distance(core, make_node, run, free, learne
 
 def test_calibration_refuses_a_sonar_that_is_disturbed(core, make_node, run):
     node = make_node()
-    node.calibrate()
+    assert node.command(ch.CALIBRATE) is None
     for step in range(60):
         run(node, (3.0 if step % 2 else 1.5, 3.0), 0.2)
     assert not core.calibrating(node._node)
     assert b"unsteady" in core.describe_calibration(core.calibration(node._node, 0))
     assert core.limit_mm(node._node, 0) == 2000
+
+
+def calibrated(run, node, command, metres):
+    """Return what the node reports after a command."""
+    assert node.command(command) is None
+    run(node, metres, 12.0)
+    report = node.take_calibration()
+    assert decode(ch.NODE_CALIBRATION, encode(ch.NODE_CALIBRATION, report), NodeCalibration) == report
+    return report
+
+
+def test_calibration_is_reported_with_the_version_that_it_replaces(make_node, run):
+    node = make_node()
+    config = NodeConfig(version=9, range_limit_m=[1.0, 1.0], no_echo_is_clear=[False, False])
+    assert node.configure(config)
+    report = calibrated(run, node, ch.CALIBRATE, (3.0, 0.4))
+    assert (report.boot, report.config_version, report.result) == (7, 9, ["done", "too_near"])
+    assert report.range_limit_m == [pytest.approx(2.8, abs=0.02), 1.0]
+    assert report.no_echo_is_clear == [False, False]
+    assert node.take_calibration() is None
+
+
+def test_calibration_holds_until_another_version_comes_and_over_a_restart(core, make_node, run):
+    config = NodeConfig(version=9, range_limit_m=[1.0, 1.0], no_echo_is_clear=[False, False])
+    node = make_node()
+    assert node.configure(config)
+    report = calibrated(run, node, ch.CALIBRATE, (3.0, 3.0))
+    again = make_node()
+    assert again.restore(report)
+    for each in (node, again):
+        assert each.configure(msgspec.structs.replace(config, pause_ms=60))  # delivered again with each connection
+        assert core.limit_mm(each._node, 0) == pytest.approx(2800, abs=20)
+        assert each.configure(msgspec.structs.replace(config, version=10, range_limit_m=[1.5, 1.5]))
+        assert core.limit_mm(each._node, 0) == 1500
+
+
+def test_stored_calibration_for_other_sonars_is_refused(make_node, run):
+    report = calibrated(run, make_node(), ch.CALIBRATE, (3.0, 3.0))
+    one = msgspec.structs.replace(
+        report, result=["done"], range_limit_m=[1.0], no_echo_is_clear=[False], no_echo_us=[0]
+    )
+    assert not make_node().restore(one)
+
+
+def test_clone_that_says_no_echo_by_a_short_pulse_is_learned(make_node, run):
+    """Some clones answer as if something stood at 0.4 m, when nothing is in their range."""
+    node = make_node()
+    assert run(node, (0.4, 3.0), 2.0)[-1].state == "blocked"
+    report = calibrated(run, node, ch.LEARN_NO_ECHO, (0.4, None))
+    assert report.result == ["done", "done"]
+    assert report.no_echo_us == [pytest.approx(2 * 0.4 / 343.42 * 1e6, abs=5), 0]
+    learned = run(node, (0.4, 3.0), 2.0)[-1]
+    assert (learned.status, learned.state) == (["no_echo", "ok"], "unknown")
+    assert run(node, (0.5, 3.0), 2.0)[-1].state == "blocked"
+    restarted = make_node()
+    assert restarted.restore(report)
+    assert run(restarted, (0.4, 3.0), 2.0)[-1].status == ["no_echo", "ok"]
+
+
+def test_command_that_is_not_known_is_refused_in_words(make_node):
+    assert make_node().command("dance") == (
+        "this firmware does not know the command: it knows calibrate and learn-no-echo"
+    )

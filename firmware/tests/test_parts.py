@@ -160,3 +160,34 @@ def test_recorded_spikes_are_filtered_and_the_hand_is_not(core, recordings):
     assert all(agree(out[at], samples[at - 1]) for at in spikes)
     held = sum(not agree(a, b) for a, b in zip(samples, out, strict=True))
     assert held <= len(spikes) + math.ceil(0.1 * len(samples))
+
+
+@pytest.mark.data
+def test_recorded_single_spike_never_changes_the_state_whatever_the_limit(core, recordings):
+    lines = (recordings / "hcsr04" / "hand_and_object_25s.csv").read_text().splitlines()[1:]
+    samples = [(OK, round(float(line.split(",")[1]) * 10)) for line in lines]
+    ranges = [metres for _, metres in samples]
+    array = ctypes.c_int32 * len(samples)
+    changes = 0
+    for limit in range(min(ranges) + 1, max(ranges) + 50, 7):
+        states = array()
+        core["fognav_states"](array(), array(*ranges), len(samples), limit, states)
+        for at in range(1, len(samples)):
+            if states[at] == states[at - 1]:
+                continue
+            changes += 1
+            alone = not agree(samples[at], samples[at - 1])
+            # Three samples in a row of which no two agree: the newest counts, since hiding it may hide somebody.
+            scattered = alone and at >= 2 and not agree(samples[at - 1], samples[at - 2])
+            assert not alone or scattered, f"sample {at} changed the state by itself, with a limit of {limit} mm"
+    assert changes > 100
+
+
+def test_line_that_is_held_high_or_low_is_stuck(core, make_node, run):
+    node = make_node()
+    # A line that is held high rises once, when its module is switched on.
+    node._trigger = lambda _world, at_us: core.edge(node._node, 0, 1, at_us + 500)
+    assert run(node, (3.0, 3.0), 2.0)[0].status == ["no_echo", "stuck"]
+    node._trigger = lambda _world, _at_us: None
+    last = run(node, (3.0, 3.0), 2.0)[-1]
+    assert (last.status, last.state) == (["stuck", "stuck"], "unknown")

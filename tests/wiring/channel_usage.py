@@ -28,6 +28,10 @@ NOT_YET: Final[frozenset[tuple[Role, Channel]]] = frozenset(
     {
         ("hazard-aggregator", ch.NODE_VALUE),
         ("hazard-aggregator", ch.HOME_ASSISTANT),
+        ("console", ch.NODE_COMMAND),
+        ("console", ch.NODE_CALIBRATION),
+        ("console", ch.NODE_UPDATE),
+        ("console", ch.NODE_PROBLEM),
         ("console", ch.PLANNER_PLAN),
         ("console", ch.LIVE),
     }

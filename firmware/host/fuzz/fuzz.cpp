@@ -22,6 +22,8 @@ int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
     settings.firmware = "fuzz \"\\";
     fognav::Node node(settings);
     node.configure(text, size);
+    node.command(text, size);
+    node.restore(text, size);
     fognav::JsonReader(text, size).skip_value();
     fognav::Settings found;
     static char description[FOGNAV_HOME_ASSISTANT_LIMIT];
@@ -34,7 +36,8 @@ int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
         now_us += static_cast<uint32_t>(data[i + 1]) << (data[i + 2] % 16);
         switch (data[i] % 8) {
             case 0:
-                node.calibrate();
+                node.command(data[i + 1] % 2 != 0 ? FOGNAV_NODE_COMMAND_CALIBRATE : FOGNAV_NODE_COMMAND_LEARN_NO_ECHO,
+                             data[i + 1] % 2 != 0 ? 9 : 13);
                 break;
             case 1:
                 node.configure(text + i, size - i);
@@ -47,7 +50,17 @@ int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
                 node.set_temperature(static_cast<int16_t>(data[i + 1] * 4 - 400));
                 break;
             default:
-                if (node.step(now_us) != fognav::Node::Event::publish) break;
+                switch (node.step(now_us)) {
+                    case fognav::Node::Event::none:
+                    case fognav::Node::Event::trigger:
+                        continue;
+                    case fognav::Node::Event::calibrated:
+                        // What a node has stored, it must be able to read.
+                        if (node.restore(node.message(), node.message_length()) != nullptr) abort();
+                        break;
+                    case fognav::Node::Event::publish:
+                        break;
+                }
                 if (node.message_length() == 0 || node.message_length() >= FOGNAV_NODE_READING_LIMIT) abort();
                 if (node.message_length() != strlen(node.message())) abort();
         }

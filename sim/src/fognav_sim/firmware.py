@@ -107,12 +107,14 @@ class Core(ctypes.CDLL):
             "connected": (None, (node,)),
             "temperature": (None, (node, ctypes.c_int)),
             "rssi": (None, (node, ctypes.c_int)),
-            "calibrate": (None, (node,)),
+            "command": (ctypes.c_char_p, (node, ctypes.c_char_p, ctypes.c_uint32)),
+            "restore": (ctypes.c_char_p, (node, ctypes.c_char_p, ctypes.c_uint32)),
             "calibrating": (ctypes.c_int, (node,)),
             "calibration": (ctypes.c_int, (node, ctypes.c_int)),
             "describe_calibration": (ctypes.c_char_p, (ctypes.c_int,)),
             "limit_mm": (ctypes.c_int32, (node, ctypes.c_int)),
             "no_echo_is_clear": (ctypes.c_int, (node, ctypes.c_int)),
+            "no_echo_us": (ctypes.c_uint32, (node, ctypes.c_int)),
         }
         for name, (result, arguments) in signatures.items():
             function = self[f"fognav_node_{name}"]

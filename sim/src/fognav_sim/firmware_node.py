@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 import msgspec
 
-from fog_contracts.messages import NodeReading
+from fog_contracts.messages import NodeCalibration, NodeReading
 from fognav_sim.firmware import Sonar
 from fognav_sim.node import default_config
 from fognav_sim.sensors import SOUND_M_S
@@ -30,6 +30,7 @@ NO_ECHO_US: Final = 38_000
 _RSSI_DBM: Final = -55
 _TRIGGER: Final = 1
 _PUBLISH: Final = 2
+_CALIBRATED: Final = 3
 _US: Final = 1_000_000
 
 
@@ -49,6 +50,7 @@ class FirmwareNode:
         self._start = start
         self._now_us = 0
         self._edges: list[tuple[int, int, int]] = []
+        self._calibration: NodeCalibration | None = None
 
     def __del__(self) -> None:
         self._core.free(self._node)
@@ -61,9 +63,20 @@ class FirmwareNode:
         self.config = config
         return True
 
-    def calibrate(self) -> None:
-        """Learn the limits anew; the node's state is unknown meanwhile."""
-        self._core.calibrate(self._node)
+    def command(self, text: str) -> str | None:
+        """Begin what a command asks for, as learning the limits anew; return None, or why not."""
+        problem = self._core.command(self._node, text.encode(), len(text.encode()))
+        return None if problem is None else str(problem.decode())
+
+    def restore(self, calibration: NodeCalibration) -> bool:
+        """Apply a calibration from before the node was switched off; return False if it is for other sonars."""
+        text = msgspec.json.encode(calibration)
+        return self._core.restore(self._node, text, len(text)) is None
+
+    def take_calibration(self) -> NodeCalibration | None:
+        """Return the calibration that has ended since the last call, if one has."""
+        calibration, self._calibration = self._calibration, None
+        return calibration
 
     def poll(self, world: World, now: float) -> list[NodeReading]:
         """Run the firmware up to `now` (s); return the readings that it published, oldest first."""
@@ -81,6 +94,8 @@ class FirmwareNode:
                 self._trigger(world, self._now_us - STEP_US)
             elif event == _PUBLISH:
                 readings.append(msgspec.json.decode(self._core.message(self._node), type=NodeReading))
+            elif event == _CALIBRATED:
+                self._calibration = msgspec.json.decode(self._core.message(self._node), type=NodeCalibration)
         return readings
 
     def _run(self, until: int) -> int:

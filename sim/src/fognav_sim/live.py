@@ -182,6 +182,8 @@ class VirtualNode:
         will = Will(ch.NODE_AVAILABILITY, ch.OFFLINE, {"node": self._id})
         self._mqtt = MqttEdge(url, f"node-{self._id}", clock, site=site, will=will)
         self._mqtt.on(ch.NODE_CONFIG, self._on_config, NodeConfig)
+        self._mqtt.on(ch.NODE_COMMAND, self._on_command)
+        self._problem: str | None = None
         self._mqtt.on_connect(self._announce)
 
     async def connect(self) -> None:
@@ -195,12 +197,21 @@ class VirtualNode:
         if ids["node"] == self._id and not self._sonars.configure(config):
             _log.warning("config_ignored", node=self._id, reason="its number of sonars does not match")
 
+    def _on_command(self, ids: Mapping[str, str], command: str) -> None:
+        if ids["node"] == self._id:
+            self._problem = self._sonars.command(command) or ""
+
     async def measure(self) -> None:
         """Publish the readings that are due."""
         for reading in self._sonars.poll(self._world.world, self._world.now):
             # A node that is not connected, or silenced by a scenario, measures but does not publish.
             if self._mqtt.connected and self._id not in self._world.silent_nodes:
                 await self._mqtt.publish(ch.NODE_READING, reading, node=self._id)
+        if (calibration := self._sonars.take_calibration()) is not None:
+            await self._mqtt.publish(ch.NODE_CALIBRATION, calibration, node=self._id)
+        if self._problem is not None:
+            problem, self._problem = self._problem, None
+            await self._mqtt.publish(ch.NODE_PROBLEM, problem, node=self._id)
 
 
 async def run_nodes(nodes: list[VirtualNode], clock: Clock) -> None:

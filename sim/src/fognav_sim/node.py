@@ -13,6 +13,7 @@ from fog_contracts.messages import AreaState, NodeConfig, NodeReading, SonarStat
 from fognav_sim.sensors import SOUND_M_S
 
 if TYPE_CHECKING:
+    from fog_contracts.messages import NodeCalibration
     from fog_contracts.site import NodeSite
     from fognav_sim.world import World
 
@@ -61,6 +62,14 @@ class SonarNode:
             return False
         self.config = config
         return True
+
+    def command(self, _text: str) -> str | None:
+        """Return why no command is obeyed."""
+        return "the model of a node obeys no commands: install a C++ compiler, and it runs the firmware"
+
+    def take_calibration(self) -> NodeCalibration | None:
+        """Return None: a model learns nothing."""
+        return None
 
     def poll(self, world: World, now: float) -> list[NodeReading]:
         """Measure up to `now` (s); return the readings that were due, oldest first."""

@@ -12,7 +12,7 @@ from fognav_sim.node import SonarNode
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from fog_contracts.messages import NodeConfig, NodeReading
+    from fog_contracts.messages import NodeCalibration, NodeConfig, NodeReading
     from fog_contracts.site import NodeSite
     from fognav_sim.world import World
 
@@ -29,6 +29,12 @@ class SensorNode(Protocol):
 
     def configure(self, config: NodeConfig) -> bool:
         """Apply a configuration; return False if it is for another number of sonars, and ignore it."""
+
+    def command(self, text: str) -> str | None:
+        """Begin what a command asks for, as learning the limits anew; return None, or why not."""
+
+    def take_calibration(self) -> NodeCalibration | None:
+        """Return the calibration that has ended since the last call, if one has."""
 
     def poll(self, world: World, now: float) -> list[NodeReading]:
         """Run the node up to `now` (s); return the readings that it publishes, oldest first."""

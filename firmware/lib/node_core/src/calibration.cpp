@@ -24,7 +24,7 @@ const char* describe(CalibrationResult result) {
     return "";
 }
 
-void Calibration::update(const Sample& sample) {
+void Calibration::update(const Sample& sample, uint32_t pulse_us) {
     if (result() != CalibrationResult::running) return;
     if (sample.status == Status::stuck) {
         ++stuck_;
@@ -34,31 +34,41 @@ void Calibration::update(const Sample& sample) {
         ++silent_;
         return;
     }
+    const int32_t value = goal_ == CalibrationGoal::no_echo ? static_cast<int32_t>(pulse_us) : sample.range_mm;
     int at = echoes_++;
-    for (; at > 0 && ranges_mm_[at - 1] > sample.range_mm; --at) ranges_mm_[at] = ranges_mm_[at - 1];
-    ranges_mm_[at] = sample.range_mm;
+    for (; at > 0 && echoes_seen_[at - 1] > value; --at) echoes_seen_[at] = echoes_seen_[at - 1];
+    echoes_seen_[at] = value;
 }
 
 CalibrationResult Calibration::result() const {
     if (stuck_ >= kCalibrationSamples / 4) return CalibrationResult::stuck;
-    const int measured = echoes_ + silent_;
-    if (measured < kCalibrationSamples) return CalibrationResult::running;
-    if (!no_echo_is_clear()) {
-        // Neither steadily silent nor steadily heard: no rule could tell its silence from a coat.
-        if (echoes_ * 100 < kSilentShare * measured) return CalibrationResult::unsteady;
-        if (quartile(3) - quartile(1) > kMaxSpreadMm) return CalibrationResult::unsteady;
-    }
+    if (echoes_ + silent_ < kCalibrationSamples) return CalibrationResult::running;
+    if (goal_ == CalibrationGoal::free_distance) return free_distance();
+    const bool alike = silent() || (heard() && spread() <= kMaxPulseSpreadUs);
+    return alike ? CalibrationResult::done : CalibrationResult::unsteady;
+}
+
+CalibrationResult Calibration::free_distance() const {
+    // Neither steadily silent nor steadily heard: no rule could tell its silence from a coat.
+    if (!silent() && (!heard() || spread() > kMaxSpreadMm)) return CalibrationResult::unsteady;
     return limit_mm() < kMinLimitMm ? CalibrationResult::too_near : CalibrationResult::done;
 }
 
-bool Calibration::no_echo_is_clear() const { return silent_ * 100 >= kSilentShare * (echoes_ + silent_); }
+void Calibration::apply(SonarLimit& limit) const {
+    if (goal_ == CalibrationGoal::no_echo) {
+        limit.no_echo_us = silent() ? 0 : static_cast<uint32_t>(quartile(2));
+        return;
+    }
+    limit.limit_mm = limit_mm();
+    limit.no_echo_is_clear = silent();
+}
 
-int32_t Calibration::quartile(int which) const { return ranges_mm_[(echoes_ - 1) * which / 4]; }
+int32_t Calibration::quartile(int which) const { return echoes_seen_[(echoes_ - 1) * which / 4]; }
 
 int32_t Calibration::limit_mm() const {
-    if (no_echo_is_clear()) return echoes_ == 0 ? kRangeMm : ranges_mm_[0] - kMarginMm;
-    const int32_t spread = 3 * (quartile(3) - quartile(1));
-    return quartile(1) - (spread > kMarginMm ? spread : kMarginMm);
+    if (silent()) return echoes_ == 0 ? kRangeMm : echoes_seen_[0] - kMarginMm;
+    const int32_t margin = 3 * spread();
+    return quartile(1) - (margin > kMarginMm ? margin : kMarginMm);
 }
 
 }  // namespace fognav

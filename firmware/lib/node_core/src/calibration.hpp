@@ -1,8 +1,9 @@
-// Learns what a sonar measures while nobody is in its way: the limit below which an echo means `blocked`, and whether
-// "no echo" is what free space looks like. The thesis did this by hand (Mendes 2022, section 5.1).
+// Learns what a sensor measures while nobody is in its way: the limit below which an echo means `blocked`, and whether
+// "no echo" is what free space looks like. The thesis did this by hand (Mendes 2022, section 5.1). Or it learns the pulse
+// by which a clone of the HC-SR04 says "no echo", while nothing at all is in its range.
 #pragma once
 
-#include "echo.hpp"
+#include "classifier.hpp"
 
 namespace fognav {
 
@@ -10,8 +11,10 @@ constexpr int kCalibrationSamples = 64;
 constexpr int32_t kMarginMm = 200;       // the limit is at least so much nearer than the free distance
 constexpr int32_t kMinLimitMm = 300;     // nearer, a free distance guards nothing
 constexpr int32_t kMaxSpreadMm = 150;    // between the quartiles; more means that something moved
-constexpr int kSilentShare = 90;         // percent of samples without an echo that make "no echo" the free state
+constexpr int kSteadyShare = 90;         // percent of samples that must be alike: silent, or with an echo
+constexpr int32_t kMaxPulseSpreadUs = 100;  // between the quartiles of what a module says for "no echo"
 
+enum class CalibrationGoal : uint8_t { free_distance, no_echo };
 enum class CalibrationResult : uint8_t { running, done, stuck, unsteady, too_near };
 
 // In words, with the remedy.
@@ -19,20 +22,28 @@ const char* describe(CalibrationResult result);
 
 class Calibration {
 public:
-    // Take a sample as measured, not filtered. No more are taken once it has ended.
-    void update(const Sample& sample);
+    explicit Calibration(CalibrationGoal goal = CalibrationGoal::free_distance) : goal_(goal) {}
+
+    // Take a sample as measured, not filtered, and the width of its pulse. No more are taken once it has ended.
+    void update(const Sample& sample, uint32_t pulse_us);
 
     CalibrationResult result() const;
 
-    // Valid when the result is `done`. Where free space is silent, the limit is the range of the module, or lies before
-    // the nearest of the rare echoes.
-    int32_t limit_mm() const;
-    bool no_echo_is_clear() const;
+    // Put what was learned into the sensor's limit, and leave the rest of it alone; the result must be `done`.
+    void apply(SonarLimit& limit) const;
 
 private:
+    CalibrationResult free_distance() const;
+
+    // Where free space is silent, the limit is the range of the module, or lies before the nearest of the rare echoes.
+    int32_t limit_mm() const;
+    bool silent() const { return silent_ * 100 >= kSteadyShare * (echoes_ + silent_); }
+    bool heard() const { return echoes_ * 100 >= kSteadyShare * (echoes_ + silent_); }
+    int32_t spread() const { return quartile(3) - quartile(1); }
     int32_t quartile(int which) const;
 
-    int32_t ranges_mm_[kCalibrationSamples] = {};  // those with an echo, ascending
+    CalibrationGoal goal_;
+    int32_t echoes_seen_[kCalibrationSamples] = {};  // ascending: ranges (mm) or, for `no_echo`, pulses (us)
     uint8_t echoes_ = 0;
     uint8_t silent_ = 0;
     uint8_t stuck_ = 0;

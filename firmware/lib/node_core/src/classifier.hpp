@@ -10,6 +10,7 @@ namespace fognav {
 struct SonarLimit {
     int32_t limit_mm = 0;
     bool no_echo_is_clear = false;  // true only where calibration found nothing in range
+    uint32_t no_echo_us = 0;        // the pulse by which a clone says "no echo"; 0: none
 };
 
 constexpr int32_t kHysteresisMm = 50;

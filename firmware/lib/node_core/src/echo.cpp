@@ -14,7 +14,7 @@ void EchoCapture::arm(uint32_t now_us) {
     phase_ = Phase::armed;
 }
 
-bool EchoCapture::poll(uint32_t now_us, int16_t temperature_dc, const NoEchoSignature& signature, Sample& sample) {
+bool EchoCapture::poll(uint32_t now_us, int16_t temperature_dc, uint32_t no_echo_us, Sample& sample) {
     if (phase_ == Phase::idle) return false;
     const bool over = now_us - armed_us_ >= kWindowUs;
     // Signed: the interrupt may have come after the caller read its clock, and then the line rose in its future.
@@ -31,11 +31,11 @@ bool EchoCapture::poll(uint32_t now_us, int16_t temperature_dc, const NoEchoSign
         return true;
     }
     phase_ = Phase::idle;
-    const uint32_t flight_us = fell_us_ - rose_us_;
-    const uint32_t off = flight_us > signature.flight_us ? flight_us - signature.flight_us : signature.flight_us - flight_us;
-    const bool signs_no_echo = signature.flight_us != 0 && off <= signature.tolerance_us;
+    const uint32_t flight_us = pulse_us();
+    const uint32_t off = flight_us > no_echo_us ? flight_us - no_echo_us : no_echo_us - flight_us;
+    const bool says_no_echo = no_echo_us != 0 && off <= kSameNoEchoUs;
     const int32_t range = range_mm(flight_us, temperature_dc);
-    if (flight_us > kMaxFlightUs || signs_no_echo) {
+    if (flight_us > kMaxFlightUs || says_no_echo) {
         sample = {Status::no_echo, 0};
     } else if (range < kMinRangeMm) {
         sample = {Status::stuck, 0};

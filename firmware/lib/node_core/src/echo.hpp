@@ -6,7 +6,7 @@
 // comes within 100 us of the trigger or lasts less than 50 us is not an echo.
 #pragma once
 
-#include "sample.hpp"
+#include "range_sensor.hpp"
 
 namespace fognav {
 
@@ -15,17 +15,11 @@ constexpr uint32_t kLeakUs = 100;         // after the trigger, edges are its le
 constexpr uint32_t kBounceUs = 50;        // a shorter pulse is a bounce
 constexpr uint32_t kWindowUs = 80000;     // after the trigger, until a measurement ends without a pulse
 constexpr uint32_t kMaxFlightUs = 24500;  // 4.2 m at 20 degrees: a longer pulse is a module's "no echo"
-constexpr int32_t kMinRangeMm = 20;       // nearer, a module measures its own ringing
+constexpr uint32_t kSameNoEchoUs = 150;   // 2.6 cm: pulses of a clone's "no echo" are equal but for its clock
 
 // Range (mm) of a time of flight there and back (us), at a temperature of the air in tenths of a degree Celsius. Speed of
 // sound in dry air: 331.3 + 0.606 T m/s, good to 0.1 % from -20 to 40 degrees.
 int32_t range_mm(uint32_t flight_us, int16_t temperature_dc);
-
-// The pulse by which a board says "no echo" if it is not a long one: some clones answer as if something stood at 0.4 m.
-struct NoEchoSignature {
-    uint32_t flight_us = 0;  // 0: none, a pulse beyond kMaxFlightUs says it
-    uint32_t tolerance_us = 0;
-};
 
 // The edges of one measurement. `on_edge` is for the interrupt: it stores two times and judges nothing.
 class EchoCapture {
@@ -48,8 +42,11 @@ public:
         }
     }
 
-    // True once there is a result; `sample` then holds it, and the measurement ends.
-    bool poll(uint32_t now_us, int16_t temperature_dc, const NoEchoSignature& signature, Sample& sample);
+    // True once there is a result; `sample` then holds it, and the measurement ends. `no_echo_us` is the pulse by which
+    // a clone says "no echo" as if something stood at 0.4 m; 0: a pulse beyond kMaxFlightUs says it.
+    bool poll(uint32_t now_us, int16_t temperature_dc, uint32_t no_echo_us, Sample& sample);
+
+    uint32_t pulse_us() const { return fell_us_ - rose_us_; }
 
 private:
     enum class Phase : uint8_t { idle, armed, rising, done };

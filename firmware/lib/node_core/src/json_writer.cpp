@@ -67,10 +67,15 @@ void JsonWriter::value(const char* text) {
     put('"');
 }
 
-void JsonWriter::metres(int32_t millimetres) {
+void JsonWriter::value(bool flag) {
     separate();
-    if (millimetres < 0) put('-');
-    const uint64_t magnitude = static_cast<uint64_t>(millimetres < 0 ? -static_cast<int64_t>(millimetres) : millimetres);
+    put(flag ? "true" : "false");
+}
+
+void JsonWriter::thousandths(int32_t number) {
+    separate();
+    if (number < 0) put('-');
+    const uint64_t magnitude = static_cast<uint64_t>(number < 0 ? -static_cast<int64_t>(number) : number);
     digits(magnitude / 1000, 1);
     put('.');
     digits(magnitude % 1000, 3);

@@ -19,8 +19,9 @@ public:
 
     void value(uint64_t number);
     void value(int32_t number);
+    void value(bool flag);
     void value(const char* text);  // printable ASCII; what else it holds is left out
-    void metres(int32_t millimetres);
+    void thousandths(int32_t number);  // of a metre, for instance, written in metres
     void null();
 
     // The length without the terminating zero, or 0 if the buffer was too small.

@@ -3,7 +3,7 @@
 
 #include <stddef.h>
 
-#include "classifier.hpp"
+#include "calibration.hpp"
 
 namespace fognav {
 
@@ -28,8 +28,15 @@ struct NodeConfig {
     uint16_t pause_ms = 50;
 };
 
-// Read a configuration for a node with so many sonars. Return nullptr, or what is wrong with it; `config` is then
-// unchanged. Unknown members are ignored.
-const char* read_config(const char* text, size_t size, int sonars, NodeConfig& config);
+// What a node has learned: how it ended for each sonar, and the settings that count now. The configuration's version is
+// that of the one that it replaces.
+struct CalibrationReport {
+    uint32_t boot = 0;
+    CalibrationResult results[kMaxSonars] = {};
+    NodeConfig config;
+};
+
+// Write it as JSON; return its length, or 0 if the buffer is too small for it.
+size_t write_calibration(const CalibrationReport& report, char* buffer, size_t size);
 
 }  // namespace fognav

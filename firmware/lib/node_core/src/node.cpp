@@ -1,5 +1,7 @@
 #include "node.hpp"
 
+#include <string.h>
+
 #include "fognav_contract.h"
 
 namespace fognav {
@@ -8,8 +10,10 @@ static_assert(kMessageSize <= FOGNAV_NODE_READING_LIMIT, "a reading may be longe
 
 Node::Node(const NodeSettings& settings)
     : config_(settings.config), cycle_(settings.config.sonars, settings.boot), publish_(settings.publish) {
-    for (int i = 0; i < kMaxSonars; ++i) no_echo_[i] = settings.no_echo[i];
-    cycle_.set_pause(config_.pause_ms);
+    for (int i = 0; i < kMaxSonars; ++i) {
+        sensors_[i] = settings.sensors[i] != nullptr ? settings.sensors[i] : &sonars_[i];
+    }
+    apply_limits();
     reading_.boot = settings.boot;
     reading_.sonars = config_.sonars;
     reading_.firmware = settings.firmware;
@@ -22,12 +26,11 @@ Node::Event Node::step(uint32_t now_us) {
     seen_us_ = now_us;
     switch (cycle_.step(now_us)) {
         case MeasurementCycle::Action::trigger:
-            captures_[cycle_.current()].arm(now_us);
+            sensors_[cycle_.current()]->start(now_us);
             return Event::trigger;
         case MeasurementCycle::Action::listen: {
             Sample sample;
-            const int sonar = cycle_.current();
-            if (captures_[sonar].poll(now_us, temperature_dc_, no_echo_[sonar], sample)) take(sample);
+            if (sensors_[cycle_.current()]->poll(now_us, temperature_dc_, sample)) take(sample);
             return Event::none;
         }
         case MeasurementCycle::Action::finished:
@@ -40,7 +43,7 @@ Node::Event Node::step(uint32_t now_us) {
 
 void Node::take(const Sample& sample) {
     const int sonar = cycle_.current();
-    if (calibrating_) calibrations_[sonar].update(sample);
+    if (calibrating_) calibrations_[sonar].update(sample, sonars_[sonar].pulse_us());
     const Sample counts = filters_[sonar].update(sample);
     reading_.samples[sonar] = counts;
     states_[sonar] = classify(counts, config_.limits[sonar], states_[sonar]);
@@ -48,7 +51,7 @@ void Node::take(const Sample& sample) {
 }
 
 Node::Event Node::finish() {
-    if (calibrating_) end_calibration();
+    if (calibrating_ && calibration_ended()) return report_calibration();
     reading_.uptime_ms = uptime_us_ / 1000;
     reading_.state = calibrating_ ? State::unknown : fuse(states_, reading_.sonars);
     if (!publish_.update(reading_.state, reading_.uptime_ms)) return Event::none;
@@ -58,28 +61,77 @@ Node::Event Node::finish() {
 }
 
 const char* Node::configure(const char* text, size_t size) {
-    const char* problem = read_config(text, size, config_.sonars, config_);
+    NodeConfig found = config_;
+    const char* problem = read_config(text, size, config_.sonars, found);
     if (problem != nullptr) return problem;
-    cycle_.set_pause(config_.pause_ms);
+    if (calibrated_ && found.version == config_.version) {
+        config_.pause_ms = found.pause_ms;
+    } else {
+        config_ = found;
+        calibrated_ = false;
+    }
+    apply_limits();
     publish_.restart();
     return nullptr;
 }
 
-void Node::calibrate() {
-    for (int i = 0; i < config_.sonars; ++i) calibrations_[i] = Calibration();
+const char* Node::command(const char* text, size_t size) {
+    const auto is = [&](const char* command) { return strlen(command) == size && memcmp(text, command, size) == 0; };
+    if (is(FOGNAV_NODE_COMMAND_CALIBRATE)) {
+        calibrate(CalibrationGoal::free_distance);
+    } else if (is(FOGNAV_NODE_COMMAND_LEARN_NO_ECHO)) {
+        calibrate(CalibrationGoal::no_echo);
+    } else {
+        return "this firmware does not know the command: it knows " FOGNAV_NODE_COMMAND_CALIBRATE
+               " and " FOGNAV_NODE_COMMAND_LEARN_NO_ECHO;
+    }
+    return nullptr;
+}
+
+const char* Node::restore(const char* text, size_t size) {
+    const char* problem = read_calibration(text, size, config_.sonars, config_);
+    if (problem != nullptr) return problem;
+    calibrated_ = true;
+    apply_limits();
+    return nullptr;
+}
+
+void Node::apply_limits() {
+    cycle_.set_pause(config_.pause_ms);
+    for (int i = 0; i < config_.sonars; ++i) sonars_[i].set_no_echo(config_.limits[i].no_echo_us);
+}
+
+void Node::calibrate(CalibrationGoal goal) {
+    apply_limits();
+    for (int i = 0; i < config_.sonars; ++i) {
+        calibrations_[i] = Calibration(goal);
+        // What it says for "no echo" is what it says now.
+        if (goal == CalibrationGoal::no_echo) sonars_[i].set_no_echo(0);
+    }
     calibrating_ = true;
 }
 
-void Node::end_calibration() {
+bool Node::calibration_ended() const {
     for (int i = 0; i < config_.sonars; ++i) {
-        if (calibrations_[i].result() == CalibrationResult::running) return;
+        if (calibrations_[i].result() == CalibrationResult::running) return false;
     }
+    return true;
+}
+
+Node::Event Node::report_calibration() {
+    CalibrationReport report;
     calibrating_ = false;
+    calibrated_ = true;
     for (int i = 0; i < config_.sonars; ++i) {
-        if (calibrations_[i].result() != CalibrationResult::done) continue;
-        config_.limits[i].limit_mm = calibrations_[i].limit_mm();
-        config_.limits[i].no_echo_is_clear = calibrations_[i].no_echo_is_clear();
+        report.results[i] = calibrations_[i].result();
+        if (report.results[i] == CalibrationResult::done) calibrations_[i].apply(config_.limits[i]);
     }
+    apply_limits();
+    publish_.restart();
+    report.boot = reading_.boot;
+    report.config = config_;
+    length_ = write_calibration(report, message_, sizeof message_);
+    return Event::calibrated;
 }
 
 }  // namespace fognav

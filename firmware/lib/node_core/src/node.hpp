@@ -1,24 +1,25 @@
 // A sensor node without its board: measurement cycle, spike filter, classification, calibration and publishing. The edge
 // (src/ for a board, host/ for a computer) calls `step` in its loop, triggers the sonar that it names, passes the echo
-// lines' edges to `on_edge`, and publishes the message when there is one.
+// lines' edges to `on_edge`, and publishes the message when there is one. "Sonar" is also said of the other sensors of
+// range that are given instead.
 #pragma once
 
-#include "calibration.hpp"
+#include "config_reader.hpp"
 #include "cycle.hpp"
-#include "messages.hpp"
 #include "publishing.hpp"
+#include "sonar.hpp"
 #include "spike_filter.hpp"
 
 namespace fognav {
 
-// A reading of eight sonars with the longest name of a firmware has 380 characters.
+// A reading of eight sonars with the longest name of a firmware has 380 characters, a calibration 430.
 constexpr size_t kMessageSize = 512;
 
 struct NodeSettings {
     NodeConfig config;
     uint32_t boot = 0;  // random, new at each boot; 0 also switches the jitter of the pause off
     PublishMode publish = PublishMode::on_change;
-    NoEchoSignature no_echo[kMaxSonars] = {};
+    RangeSensor* sensors[kMaxSonars] = {};  // nullptr: an HC-SR04; others must live as long as the node
     const char* firmware = "";
 };
 
@@ -26,28 +27,32 @@ class Node {
 public:
     enum class Event : uint8_t {
         none,
-        trigger,  // raise the trigger of sonar `sonar()` for kTriggerUs, at once
-        publish   // publish `message()`
+        trigger,    // raise the trigger of sonar `sonar()` for kTriggerUs, at once; for another sensor: nothing
+        publish,    // publish `message()`, a reading
+        calibrated  // store `message()` and publish it: a calibration has ended
     };
 
     explicit Node(const NodeSettings& settings);
+    Node(const Node&) = delete;
+    Node& operator=(const Node&) = delete;
 
     // Take the next step at this time: micros(), 32 bits that wrap; call it at least once in 30 minutes.
     Event step(uint32_t now_us);
 
     // For the interrupt of a sonar's echo line.
-    __attribute__((always_inline)) void on_edge(int sonar, bool high, uint32_t now_us) { captures_[sonar].on_edge(high, now_us); }
+    __attribute__((always_inline)) void on_edge(int sonar, bool high, uint32_t now_us) { sonars_[sonar].on_edge(high, now_us); }
 
     int sonar() const { return cycle_.current(); }
 
-    // Written by the step that returned `publish`, valid until the next step.
+    // Written by the step that returned `publish` or `calibrated`, valid until the next step.
     const char* message() const { return message_; }
     size_t message_length() const { return length_; }
 
     // What the last cycle measured; the state is that of all sonars.
     const Reading& reading() const { return reading_; }
 
-    // Apply a configuration (JSON); return nullptr, or what is wrong with it.
+    // Apply a configuration (JSON); return nullptr, or what is wrong with it. After a calibration, the configuration that
+    // was there before changes the pause only: the broker delivers it again with each connection.
     const char* configure(const char* text, size_t size);
     const NodeConfig& config() const { return config_; }
 
@@ -59,26 +64,34 @@ public:
     // The connection has come back: readings go out as after a change.
     void on_connected() { publish_.restart(); }
 
-    // Learn the limits anew. While it is under way the node's state is unknown: its sonars' way is to be kept free. When
-    // all sonars are done, their limits are in `config`, for the edge to store; a sonar that fails keeps its limit.
-    void calibrate();
+    // Begin what a command asks for: learn the limits anew, or the pulses for "no echo". Return nullptr, or why not. While
+    // it is under way the node's state is unknown: its sonars' way is to be kept free. Then `calibrated` comes; a sonar
+    // that fails keeps its limit.
+    const char* command(const char* text, size_t size);
     bool calibrating() const { return calibrating_; }
     CalibrationResult calibration(int sonar) const { return calibrations_[sonar].result(); }
+
+    // Apply a calibration that was stored, before the first step. Return nullptr, or what is wrong with it.
+    const char* restore(const char* text, size_t size);
 
 private:
     void take(const Sample& sample);
     Event finish();
-    void end_calibration();
+    void calibrate(CalibrationGoal goal);
+    bool calibration_ended() const;
+    Event report_calibration();
+    void apply_limits();
 
     NodeConfig config_;
-    NoEchoSignature no_echo_[kMaxSonars];
     MeasurementCycle cycle_;
     PublishPolicy publish_;
-    EchoCapture captures_[kMaxSonars];
+    Sonar sonars_[kMaxSonars];
+    RangeSensor* sensors_[kMaxSonars] = {};
     SpikeFilter filters_[kMaxSonars];
     State states_[kMaxSonars] = {};
     Calibration calibrations_[kMaxSonars];
     bool calibrating_ = false;
+    bool calibrated_ = false;  // by itself, since the configuration with the version that is in `config_`
     int16_t temperature_dc_ = 200;
     bool started_ = false;
     uint32_t seen_us_ = 0;

@@ -156,6 +156,8 @@ OFFLINE: Final = "offline"
 BLOCKED: Final = "blocked"
 CLEAR: Final = "clear"
 REPUBLISH: Final = "republish"
+CALIBRATE: Final = "calibrate"
+LEARN_NO_ECHO: Final = "learn-no-echo"
 
 _mqtt = partial(Channel, transport="mqtt", kind="pub", encoding="json")
 _text = partial(Channel, transport="mqtt", kind="pub", encoding="text", message=None)
@@ -175,6 +177,16 @@ NODE_VALUE        = _mqtt( "node_value",        V1 + "nodes/{node}/value",      
     publishers=(NODE,),          subscribers=(AGGREGATOR,),       durability=VOLATILE, qos=0)
 NODE_CONFIG       = _mqtt( "node_config",       V1 + "nodes/{node}/config",           m.NodeConfig,     limit=KIB,
     publishers=(AGGREGATOR,),    subscribers=(NODE,),             durability=LATEST,   qos=1)
+NODE_COMMAND      = _text( "node_command",      V1 + "nodes/{node}/command",                            limit=32,
+    publishers=(CONSOLE,),       subscribers=(NODE,),             durability=VOLATILE, qos=1,
+    values=(CALIBRATE, LEARN_NO_ECHO), about="what a node is to learn while nobody is in its sonars' way")
+NODE_CALIBRATION  = _mqtt( "node_calibration",  V1 + "nodes/{node}/calibration",      m.NodeCalibration, limit=KIB,
+    publishers=(NODE,),          subscribers=(CONSOLE,),          durability=LATEST,   qos=1)
+NODE_UPDATE       = _mqtt( "node_update",       V1 + "nodes/{node}/update",           m.NodeUpdate,     limit=KIB,
+    publishers=(CONSOLE,),       subscribers=(NODE,),             durability=LATEST,   qos=1)
+NODE_PROBLEM      = _text( "node_problem",      V1 + "nodes/{node}/problem",                            limit=256,
+    publishers=(NODE,),          subscribers=(CONSOLE,),          durability=LATEST,   qos=1,
+    about="why a node refused its latest configuration, command or update, in words; empty: nothing refused")
 AREA_HAZARD       = _mqtt( "area_hazard",       V1 + "areas/{area}/hazard",           m.AreaHazard,     limit=8 * KIB,
     publishers=(AGGREGATOR,),    subscribers=(AGGREGATOR, MAP),   durability=LATEST,   qos=1, epoch="epoch")
 AREA_DEFINITION   = _mqtt( "area_definition",   V1 + "areas/{area}/definition",       m.AreaDefinition, limit=32 * KIB,

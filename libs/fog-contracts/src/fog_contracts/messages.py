@@ -40,6 +40,7 @@ Ring = Annotated[list[PointXY], Meta(min_length=3, max_length=500)]
 
 AreaState = Literal["blocked", "clear", "unknown"]
 SonarStatus = Literal["ok", "no_echo", "stuck"]
+CalibrationResult = Literal["done", "stuck", "unsteady", "too_near"]
 
 
 class Message(Struct, frozen=True, kw_only=True):
@@ -103,6 +104,31 @@ class NodeConfig(Message, frozen=True, kw_only=True):
     range_limit_m: Annotated[list[Annotated[float, Meta(gt=0.0, le=20.0)]], Meta(min_length=1, max_length=8)]
     no_echo_is_clear: Annotated[list[bool], Meta(min_length=1, max_length=8)]
     pause_ms: Annotated[int, Meta(ge=10, le=60_000)] = 50
+
+
+class NodeCalibration(Message, frozen=True, kw_only=True):
+    """What a node has learned on command; it holds until a configuration with another version comes.
+
+    Per sonar: how it ended, the settings that count now, and the pulse (us, 0: none) by which its board says "no echo".
+    """
+
+    boot: Count
+    config_version: Count
+    result: Annotated[list[CalibrationResult], Meta(min_length=1, max_length=8)]
+    range_limit_m: Annotated[list[Annotated[float, Meta(gt=0.0, le=20.0)]], Meta(min_length=1, max_length=8)]
+    no_echo_is_clear: Annotated[list[bool], Meta(min_length=1, max_length=8)]
+    no_echo_us: Annotated[list[Annotated[int, Meta(ge=0, le=80_000)]], Meta(min_length=1, max_length=8)]
+
+
+class NodeUpdate(Message, frozen=True, kw_only=True):
+    """A node's next firmware: where it is, and its maker's signature (ECDSA P-256) of number, board, size, SHA-256."""
+
+    number: Annotated[int, Meta(ge=1, le=2**31 - 1)]
+    board: Id
+    size: Annotated[int, Meta(ge=1, le=4_194_304)]
+    sha256: Annotated[str, Meta(min_length=64, max_length=64)]
+    signature: Annotated[str, Meta(min_length=16, max_length=144)]
+    url: Annotated[str, Meta(min_length=8, max_length=200)]
 
 
 class Trace(Message, frozen=True, kw_only=True):

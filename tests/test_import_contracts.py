@@ -24,7 +24,7 @@ SOURCES = sorted({path.parent for path in ROOT.glob("*/src/*/__init__.py")} | {
 
 EDGES = {
     "fog_runtime", "fog_supervisor", "fognav_experiments.gaps", "fognav_experiments.lockstep",
-    "fognav_experiments.rigs",
+    "fognav_experiments.rigs", "fognav_experiments.smoothness",
     "fognav.__main__", "fognav.bench", "fognav.bench_command",
     "fognav.area_command", "fognav.channels_command", "fognav.checkout", "fognav.checks", "fognav.coverage_command",
     "fognav.demo.attempt", "fognav.demo.background", "fognav.demo.operator", "fognav.demo.options",

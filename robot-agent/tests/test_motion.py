@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -169,3 +170,18 @@ def test_wholly_released_path_ends_at_its_goal_despite_rounded_points():
     assert follower.released_ahead(2.5)[1]
     follower.release(4.5)
     assert not follower.released_ahead(2.5)[1]
+
+
+def test_robot_that_has_arrived_turns_to_its_heading_whatever_the_noise_of_its_pose_says():
+    follower = PathFollower(np.array([(1.0, 1.0), (3.0, 1.0)]), math.inf)
+    pose = Pose2(2.925, 1.0, 1.0)  # outside the tolerance of 0.06 m, but where a robot that has arrived stays
+    follower.advance(pose.x, pose.y, 0.0)
+    coming = decide(job(follower, pose, speeds=(0.0, 0.0), theta=2.0))
+    assert not coming.arrived
+    assert coming.v > 0.0 or coming.w < 0.0
+    there = decide(replace(job(follower, pose, speeds=(0.0, 0.0), theta=2.0), arrived=True))
+    assert there.arrived
+    assert there.w > 0.0
+    assert not there.at_goal
+    moved = Pose2(2.9, 1.0, 1.0)
+    assert not decide(replace(job(follower, moved, speeds=(0.0, 0.0), theta=2.0), arrived=True)).arrived

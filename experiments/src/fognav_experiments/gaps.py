@@ -18,21 +18,23 @@ import numpy as np
 
 from fog_contracts.costs import ROBOT_RADIUS
 from fog_contracts.grid import GridGeometry
-from fog_kernels.dwa import DwaLimits
-from robot_agent.config import MotionConfig
+from robot_agent.agent.wheel_control import WheelControl
+from robot_agent.config import agent_config
 from robot_agent.footprint import Footprint
+from robot_agent.hardware import DriveTrain, LidarTraits
 from robot_agent.localization.deskew import DeskewedScan
 from robot_agent.localization.pose import Pose2
 from robot_agent.motion.local_planner import decide, make_job, twist
 from robot_agent.motion.path_follower import PathFollower
 from robot_agent.motion.recent_scans import RecentScans
+from robot_agent.safety.gate import SafetyOutputs
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
-    from robot_agent.motion.local_planner import Decision
+    from robot_agent.safety.stop_field import Wheels
 
 GAPS: Final = tuple(round(0.20 + 0.04 * step, 2) for step in range(11))
 """Widths of the gaps (m)."""
@@ -51,7 +53,13 @@ _RANGE_M: Final = (0.15, 6.0)
 _TIME_S: Final = 45.0
 _GRID: Final = GridGeometry(120, 100, 0.05, -1.0, -2.5)
 _END_X: Final = 3.6
-_CONFIG: Final = MotionConfig(limits=DwaLimits(axle=0.235, wheel_max=0.5))
+_DRIVE: Final = DriveTrain(axle_m=0.235, wheel_speed_max_m_s=0.5)
+_LIDAR: Final = LidarTraits(range_min_m=_RANGE_M[0], range_max_m=_RANGE_M[1], scan_period_s=_SCAN * _STEP_S)
+_AGENT: Final = agent_config("gaps", b"", _DRIVE, _LIDAR, boot="gaps")
+_CONFIG: Final = _AGENT.motion
+_ALLOWED: Final = SafetyOutputs(
+    mode="NORMAL", reasons=(), cap=_CONFIG.limits.v_max, stop="none", changed=False, refusal=None
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,7 +206,7 @@ KINDS: Final[dict[str, Callable[[float, np.random.Generator], Scene]]] = {
 
 
 class _Robot:
-    """A body on two wheels that follows commands within the base's acceleration, and its lidar."""
+    """A body on two wheels that follow commands as the base can, and its lidar."""
 
     def __init__(self, scene: Scene, rng: np.random.Generator) -> None:
         self.scene, self._rng = scene, rng
@@ -221,8 +229,8 @@ class _Robot:
         self.points = self._scans.points(self.pose, now)
 
     def move(self, target: tuple[float, float]) -> None:
-        """Drive for a step; each wheel approaches its target within the base's acceleration."""
-        change = _CONFIG.limits.acc_v * _STEP_S
+        """Drive for a step; each wheel approaches its target as fast as the base stops at least."""
+        change = _DRIVE.deceleration_m_s2 * _STEP_S
         left, right = (
             now + min(max(wanted - now, -change), change) for now, wanted in zip(self.wheels, target, strict=True)
         )
@@ -235,13 +243,17 @@ class _Robot:
         self.clearance = min(self.clearance, self.scene.clearance(self.pose.x, self.pose.y))
 
 
+def _unguarded(wheels: Wheels, _now: float) -> Wheels:
+    """Let every command pass: the stop field would hide what the local planner gets wrong."""
+    return wheels
+
+
 def drive(scene: Scene, rng: np.random.Generator, seconds: float = _TIME_S) -> Outcome:
-    """Let the robot follow the scene's path for a time, or until it has passed or touched something."""
+    """Let the robot follow the scene's path for a time, or until it has passed, touched something or got stuck."""
     robot = _Robot(scene, rng)
     follower = PathFollower(scene.path, math.inf)
     free = np.zeros(_GRID.shape, np.uint8)
-    decision: Decision | None = None
-    target = (0.0, 0.0)
+    wheels = WheelControl(_AGENT)
     reversals, turning = 0, 0.0
     step = 0
     while step < round(seconds / _STEP_S) and robot.pose.x < _END_X - 0.15 and robot.clearance > 0.0:
@@ -250,19 +262,21 @@ def drive(scene: Scene, rng: np.random.Generator, seconds: float = _TIME_S) -> O
             robot.scan(now)
         if step % _CONTROL == 0:
             follower.advance(robot.pose.x, robot.pose.y, now)
+            if follower.stuck_for(now) > _CONFIG.stuck_after:
+                break
             job = make_job(
                 follower, plan_id=1, planner_epoch=1, now=now, pose=robot.pose,
-                speeds=twist(*robot.wheels, _CONFIG.limits.axle), goal_theta=None, cap=_CONFIG.limits.v_max, cost=free,
+                speeds=twist(*wheels.speeds, _CONFIG.limits.axle), goal_theta=None, cap=_CONFIG.limits.v_max, cost=free,
                 speed_limits=free, geometry=_GRID, lidar_points=robot.points,
                 footprint=Footprint.circle(ROBOT_RADIUS), config=_CONFIG,
             )  # fmt: skip
-            decision = None if job is None else decide(job)
+            wheels.decision = decision = None if job is None else decide(job)
             if decision is not None and abs(decision.w) > 0.05:
                 reversals += turning * decision.w < 0.0
                 turning = decision.w
         if step % _STREAM == 0:
-            target = (0.0, 0.0) if decision is None else (decision.left, decision.right)
-        robot.move(target)
+            wheels.command(_ALLOWED, _unguarded, now)
+        robot.move(wheels.speeds)
         step += 1
     return Outcome(
         passed=robot.pose.x >= _END_X - 0.15,

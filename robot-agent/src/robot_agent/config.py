@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from fog_contracts.channels import MAP_HEARTBEAT, ROBOT_RELEASE
 from fog_contracts.costs import DEFAULT_INFLATION, DEGRADED_SPEED, ROBOT_RADIUS, Inflation
+from fog_contracts.robot import MotionSettings
 from fog_kernels.dwa import DwaLimits, DwaSettings
 from robot_agent.footprint import Footprint
 from robot_agent.hardware import DriveTrain  # noqa: TC001  # read at run time, when a configuration is decoded
@@ -138,7 +139,15 @@ class MotionConfig:
     """Path follower and dynamic window (Fox, Burgard, Thrun 1997): the base's limits, and how arcs are chosen."""
 
     limits: DwaLimits
-    arcs: DwaSettings = field(default_factory=DwaSettings)
+    arcs: DwaSettings = field(default_factory=partial(DwaSettings, goal_tolerance=0.06, heading_tolerance=0.12))
+    """At a goal the pose that is believed may be 4 cm and 3 degrees off, and the robot shall truly be within 0.10 m and
+    0.17 rad of it."""
+    jerk_v: float = 5.0
+    jerk_w: float = 20.0
+    """How fast (m/s3, rad/s3) the accelerations may grow."""
+    arrived_within: float = 0.09
+    """A robot that has come within its tolerance of the goal drives on only beyond this distance (m): it turns to the
+    goal's heading, whatever the noise of its pose says meanwhile."""
     window: float = 2.0
     inflation: Inflation = LOCAL_INFLATION
     stuck_after: float = 10.0
@@ -217,12 +226,12 @@ def agent_config(  # noqa: PLR0913  # what the process knows about its robot
         footprint = Footprint.circle(radius)
     inflation = replace(config.motion.inflation, inscribed_radius=inscribed)
     config = replace(config, footprint=footprint, radius=radius, motion=replace(config.motion, inflation=inflation))
+    config = _with_motion(config, MotionSettings() if settings is None else settings.motion)
     return config if settings is None else _with_settings(config, settings)
 
 
-def _with_settings(config: AgentConfig, settings: RobotSettings) -> AgentConfig:
-    """Return the configuration with the speeds, the lidar's pose and the odometry's noise of the robot's settings."""
-    motion, lidar = settings.motion, settings.lidar
+def _with_motion(config: AgentConfig, motion: MotionSettings) -> AgentConfig:
+    """Return the configuration of a robot that may move so."""
     limits = replace(
         config.motion.limits,
         v_max=motion.speed_m_s,
@@ -236,6 +245,13 @@ def _with_settings(config: AgentConfig, settings: RobotSettings) -> AgentConfig:
         speed_degraded=motion.degraded_speed_m_s,
         speed_egress=min(config.safety.speed_egress, motion.degraded_speed_m_s),
     )
+    moving = replace(config.motion, limits=limits, jerk_v=motion.jerk_m_s3, jerk_w=motion.turn_jerk_rad_s3)
+    return replace(config, motion=moving, safety=safety)
+
+
+def _with_settings(config: AgentConfig, settings: RobotSettings) -> AgentConfig:
+    """Return the configuration with the lidar's pose, the odometry's noise and the battery of the robot's settings."""
+    lidar = settings.lidar
     localization = replace(
         config.localization,
         alphas=settings.odometry.alphas,
@@ -243,10 +259,4 @@ def _with_settings(config: AgentConfig, settings: RobotSettings) -> AgentConfig:
         lidar_y=lidar.y_m,
         lidar_yaw=lidar.yaw_rad,
     )
-    return replace(
-        config,
-        motion=replace(config.motion, limits=limits),
-        safety=safety,
-        localization=localization,
-        battery_low=settings.power.low_fraction,
-    )
+    return replace(config, localization=localization, battery_low=settings.power.low_fraction)

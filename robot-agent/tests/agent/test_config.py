@@ -65,6 +65,8 @@ def test_every_setting_of_the_robot_file_reaches_the_configuration():
             turn_rad_s=1.5,
             acceleration_m_s2=0.5,
             turn_acceleration_rad_s2=0.9,
+            jerk_m_s3=3.0,
+            turn_jerk_rad_s3=8.0,
         ),
         power=PowerSettings(low_fraction=0.3),
     )
@@ -72,11 +74,12 @@ def test_every_setting_of_the_robot_file_reaches_the_configuration():
     assert config.battery_low == 0.3
     limits, where = config.motion.limits, config.localization
     assert (limits.v_max, limits.w_max, limits.acc_v, limits.acc_w) == (0.2, 1.5, 0.5, 0.9)
+    assert (config.motion.jerk_v, config.motion.jerk_w) == (3.0, 8.0)
     assert (limits.axle, limits.wheel_max) == (0.3, 0.4)
     safety = config.safety
     assert (safety.speed_normal, safety.speed_degraded, safety.speed_egress) == (0.2, 0.08, 0.08)
     assert (where.lidar_x, where.lidar_y, where.lidar_yaw, where.alphas) == (0.1, -0.02, 1.5, (0.1, 0.2, 0.3, 0.4))
-    assert limits_of(settings.motion) == Limits(linear=0.21, acceleration=0.6)
+    assert limits_of(settings.motion, 0.3) == Limits(linear=0.21, acceleration=0.76)
 
 
 def test_default_settings_are_the_defaults_of_agent_and_guardian():
@@ -84,7 +87,7 @@ def test_default_settings_are_the_defaults_of_agent_and_guardian():
     assert agent_config("r1", KEY, BASE, LIDAR, BODY, boot="b1", settings=settings) == agent_config(
         "r1", KEY, BASE, LIDAR, BODY, boot="b1"
     )
-    assert limits_of(settings.motion) == Limits()
+    assert limits_of(settings.motion, 0.235) == Limits()
 
 
 def test_defaults_apply_without_a_site():

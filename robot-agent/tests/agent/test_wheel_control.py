@@ -31,30 +31,37 @@ def decision(made_at=0.0, left=0.2, right=0.3):
 @pytest.fixture
 def driving():
     control = WheelControl(CONFIG)
-    for step in range(5):
+    for step in range(20):
         control.decision = decision(step * DT)
         control.command(outputs(), free, step * DT)
     assert control.speeds == pytest.approx((0.2, 0.3))
     return control
 
 
-def test_commands_are_numbered_and_approach_the_decision_within_the_acceleration(driving):
-    control = WheelControl(CONFIG)
+def test_commands_are_numbered_and_approach_the_decision_within_acceleration_and_jerk(driving):
+    control, motion = WheelControl(CONFIG), CONFIG.motion
     control.decision = decision()
     first, second = control.command(outputs(), free, 0.0), control.command(outputs(), free, DT)
     assert (first.seq, first.left, first.right) == (1, 0.0, 0.0)
     assert second.seq == 2
-    assert second.right == pytest.approx(CONFIG.motion.limits.acc_v * DT)
-    assert second.left == pytest.approx(second.right * 0.2 / 0.3)
+    assert 0.5 * (second.left + second.right) == pytest.approx(motion.jerk_v * DT**2)
+    assert (second.right - second.left) / motion.limits.axle == pytest.approx(motion.jerk_w * DT**2)
     assert driving.following
+
+
+def test_robot_that_the_guard_slowed_down_starts_gently_again(driving):
+    driving.decision = decision(1.0)
+    driving.command(outputs(), lambda _wheels, _now: (0.0, 0.0), 1.0)
+    command = driving.command(outputs(), free, 1.05)
+    assert 0.5 * (command.left + command.right) == pytest.approx(CONFIG.motion.jerk_v * DT**2)
 
 
 @pytest.mark.parametrize(
     ("stale", "stop"), [(False, "ramp"), (True, "none"), (True, "ramp")], ids=["held", "stale", "both"]
 )
 def test_hold_and_stale_decision_ramp_the_wheels_to_rest(driving, stale, stop):
-    driving.decision = decision(0.0 - CONFIG.decision_max_age if stale else 0.25)
-    before, now = driving.speeds, 5 * DT
+    driving.decision = decision(0.0 - CONFIG.decision_max_age if stale else 1.0)
+    before, now = driving.speeds, 20 * DT
     driving.command(outputs(stop), free, now)
     assert 0.0 < driving.speeds[1] < before[1]
     assert driving.speeds[0] / driving.speeds[1] == pytest.approx(before[0] / before[1])
@@ -62,12 +69,12 @@ def test_hold_and_stale_decision_ramp_the_wheels_to_rest(driving, stale, stop):
     while not driving.at_rest:
         now += DT
         driving.command(outputs(stop), free, now)
-    assert now <= 5 * DT + CONFIG.safety.ramp
+    assert now <= 20 * DT + CONFIG.safety.ramp
 
 
 def test_protective_stop_sets_zero_speed_immediately(driving):
-    driving.decision = decision(0.25)
-    driving.command(outputs("immediate", cap=0.0), free, 0.25)
+    driving.decision = decision(1.0)
+    driving.command(outputs("immediate", cap=0.0), free, 1.0)
     assert driving.at_rest
     assert not driving.following
 
@@ -87,15 +94,15 @@ def test_reset_is_passed_on_once():
 
 
 def test_guard_has_the_last_word_on_decisions_and_ramps(driving):
-    driving.decision = decision(0.25)
+    driving.decision = decision(1.0)
     asked = []
 
     def half(wheels, now):
         asked.append((wheels, now))
         return wheels[0] / 2, wheels[1] / 2
 
-    command = driving.command(outputs(), half, 0.25)
+    command = driving.command(outputs(), half, 1.0)
     assert (command.left, command.right) == driving.speeds == pytest.approx((0.1, 0.15))
-    ramped = driving.command(outputs("ramp"), half, 0.30)
+    ramped = driving.command(outputs("ramp"), half, 1.05)
     assert asked[1][0][1] < 0.15
     assert ramped.right == asked[1][0][1] / 2

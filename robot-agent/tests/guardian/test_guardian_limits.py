@@ -90,11 +90,11 @@ def test_unchanged_command_is_repeated_every_0_05_s(at, expected) -> None:
     assert rig.wheels(rig.core.tick(at)) == expected
 
 
-def test_wheel_gains_3_m_s2_and_at_most_0_06_s_at_once() -> None:
+def test_wheel_gains_1_65_m_s2_and_at_most_0_06_s_at_once() -> None:
     rig = Rig()
-    assert rig.wheels(rig.command(0.12, 0.3, 0.3)) == pytest.approx((0.06, 0.06), abs=1e-4)
+    assert rig.wheels(rig.command(0.12, 0.3, 0.3)) == pytest.approx((0.033, 0.033), abs=1e-4)
     rig.frame(0.3)
-    assert rig.wheels(rig.command(0.32, 0.3, 0.3)) == pytest.approx((0.24, 0.24), abs=1e-4)
+    assert rig.wheels(rig.command(0.32, 0.3, 0.3)) == pytest.approx((0.132, 0.132), abs=1e-4)
 
 
 def test_wheel_slows_down_at_once_and_reverses_through_zero() -> None:
@@ -102,7 +102,7 @@ def test_wheel_slows_down_at_once_and_reverses_through_zero() -> None:
     rig.drive(0.1, 1.0, 0.3, 0.3)
     assert rig.wheels(rig.command(1.001, 0.05, 0.05)) == (0.05, 0.05)
     left, right = rig.wheels(rig.command(1.011, -0.3, -0.3))
-    assert (left, right) == pytest.approx((-0.03, -0.03), abs=1e-4)
+    assert (left, right) == pytest.approx((-0.0165, -0.0165), abs=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -181,12 +181,12 @@ def test_each_fault_stops_the_wheels_in_its_frame_and_the_first_one_stays(status
     rig.frame(1.16)
     assert rig.wheels(rig.command(1.165)) is None, "frames within 0.1 s of the wake command may be older"
     rig.frame(1.18)
-    assert rig.wheels(rig.command(1.2)) == pytest.approx((0.06, 0.06), abs=1e-4)
+    assert rig.wheels(rig.command(1.2)) == pytest.approx((0.033, 0.033), abs=1e-4)
 
 
 def test_reset_without_a_fault_is_an_ordinary_command() -> None:
     rig = Rig()
-    assert rig.wheels(rig.command(0.12, reset=True)) == pytest.approx((0.06, 0.06), abs=1e-4)
+    assert rig.wheels(rig.command(0.12, reset=True)) == pytest.approx((0.033, 0.033), abs=1e-4)
 
 
 def test_lost_agent_stops_the_wheels_at_once() -> None:

@@ -100,10 +100,19 @@ class MotionSettings(_Table, frozen=True, kw_only=True):
         Meta(description="top speed while the map, the link or the pose is doubtful"),
     ] = DEGRADED_SPEED / 100
     turn_rad_s: Annotated[Annotated[float, Meta(ge=0.2, le=2.75)], Meta(description="top turning rate")] = 2.75
-    acceleration_m_s2: Annotated[Annotated[float, Meta(ge=0.1, le=2.5)], Meta(description="acceleration")] = 2.5
+    acceleration_m_s2: Annotated[
+        Annotated[float, Meta(ge=0.1, le=2.5)],
+        Meta(description="acceleration, at which no wheel slips on the smoothest floor"),
+    ] = 1.0
     turn_acceleration_rad_s2: Annotated[
         Annotated[float, Meta(ge=0.2, le=3.2)], Meta(description="angular acceleration")
     ] = 3.2
+    jerk_m_s3: Annotated[
+        Annotated[float, Meta(ge=0.5, le=50.0)], Meta(description="how fast the acceleration may change")
+    ] = 5.0
+    turn_jerk_rad_s3: Annotated[
+        Annotated[float, Meta(ge=1.0, le=100.0)], Meta(description="how fast the angular acceleration may change")
+    ] = 20.0
 
     def __post_init__(self) -> None:
         if self.degraded_speed_m_s > self.speed_m_s:

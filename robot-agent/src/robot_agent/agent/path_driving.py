@@ -47,6 +47,8 @@ class PathDriving:
         self._monitor = PathMonitor()
         self._progress = ProgressMonitor(config.motion.stuck_after, config.radius)
         self._scans = RecentScans()
+        self._arrived = False
+        """Whether the last decision was made within the tolerance of the path's end."""
 
     # --- goal and path ---
 
@@ -65,6 +67,7 @@ class PathDriving:
                 mission.follower.advance(pose.x, pose.y, at.now)
             self.traces.begin(path.traces, at.stamp)
             self._monitor.begin()
+            self._arrived = False
         self.check_path(replica, at.now)
 
     def on_release(self, release: RobotRelease, replica: Replica, now: float) -> None:
@@ -100,6 +103,7 @@ class PathDriving:
     def _stop_following(self) -> None:
         """Forget decision and blockage of the path that the mission dropped."""
         self.wheels.decision = None
+        self._arrived = False
         self._monitor.reset()
 
     # --- decisions and wheels ---
@@ -126,6 +130,7 @@ class PathDriving:
             pose=pose,
             speeds=twist(*self.wheels.speeds, self._config.limits.axle),
             goal_theta=path.goal_theta,
+            arrived=self._arrived,
             cap=safety.cap,
             cost=replica.cost,
             speed_limits=replica.speed,
@@ -140,6 +145,7 @@ class PathDriving:
         if self.mission.path_id != (decision.planner_epoch, decision.plan_id) or not self.mission.active:
             return
         self.wheels.decision = decision
+        self._arrived = decision.arrived
         if decision.at_goal:
             self.mission.reach()
             self._stop_following()

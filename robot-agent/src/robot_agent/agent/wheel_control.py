@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Final
 
 from robot_agent.guardian.link import WheelCommand
-from robot_agent.safety.wheel_limits import limit_wheels, ramp_down
+from robot_agent.motion.local_planner import twist, wheels
+from robot_agent.motion.smoothing import Limits, approach
+from robot_agent.safety.wheel_limits import capped, limit_wheels, ramp_down
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -15,6 +18,8 @@ if TYPE_CHECKING:
     from robot_agent.safety.gate import SafetyOutputs
     from robot_agent.safety.stop_field import Wheels
 
+_SAME_M_S: Final = 1e-6
+"""Wheel speeds nearer than this are the same."""
 _STEP_MAX_S: Final = 0.2
 """After a longer pause the wheel speeds change by no more than within this time."""
 
@@ -30,6 +35,11 @@ class WheelControl:
         """Speeds of the left and right wheel (m/s) in the last command."""
         self.following = False
         """Whether the last command follows a decision."""
+        motion = config.motion
+        self._advance = Limits(motion.limits.acc_v, motion.jerk_v)
+        self._turn = Limits(motion.limits.acc_w, motion.jerk_w)
+        self._rates = (0.0, 0.0)
+        """Accelerations (m/s2, rad/s2) at which advance and turn grow in the last command."""
         self._seq = 0
         self._streamed_at: float | None = None
         self._reset_pending = False
@@ -47,25 +57,40 @@ class WheelControl:
         """Return the wheel speeds to send at `now` (s, monotonic); `guard` has the last word on them."""
         dt = 0.0 if self._streamed_at is None else min(max(now - self._streamed_at, 0.0), _STEP_MAX_S)
         self._streamed_at = now
-        limits, safety = self._config.motion.limits, self._config.safety
+        limits, safety, last = self._config.motion.limits, self._config.safety, self.speeds
         # A decision is as old as its inputs, so a hung control loop stops the robot too.
         decision = self.decision
         if decision is not None and now - decision.made_at > self._config.decision_max_age:
             decision = None
+        wanted = last
         if outputs.stop == "none" and decision is None:
-            self.speeds = ramp_down(self.speeds, dt, limits.wheel_max / safety.ramp)
+            self.speeds = ramp_down(last, dt, limits.wheel_max / safety.ramp)
         else:
+            if decision is not None:
+                wanted = self._smoothed((decision.left, decision.right), outputs.cap, dt)
             self.speeds = limit_wheels(
-                (0.0, 0.0) if decision is None else (decision.left, decision.right),
-                self.speeds,
+                wanted,
+                last,
                 outputs,
                 dt,
-                acceleration=limits.acc_v,
+                acceleration=limits.acc_v + 0.5 * limits.axle * limits.acc_w,
                 wheel_speed=limits.wheel_max,
                 config=safety,
             )
         self.speeds = guard(self.speeds, now)
+        if math.dist(self.speeds, wanted) > _SAME_M_S:
+            self._rates = (0.0, 0.0)  # who was slowed down starts gently again
         self.following = decision is not None and outputs.stop == "none"
         self._seq += 1
         reset, self._reset_pending = self._reset_pending, False
         return WheelCommand(seq=self._seq, left=self.speeds[0], right=self.speeds[1], reset=reset)
+
+    def _smoothed(self, requested: Wheels, cap: float, dt: float) -> Wheels:
+        """Return the wheel speeds (m/s) on the way to those requested, within acceleration and jerk."""
+        limits = self._config.motion.limits
+        v, w = twist(*self.speeds, limits.axle)
+        to_v, to_w = twist(*capped(requested, cap, limits.wheel_max), limits.axle)
+        v, advance = approach(v, to_v, self._rates[0], dt, self._advance)
+        w, turn = approach(w, to_w, self._rates[1], dt, self._turn)
+        self._rates = advance, turn
+        return wheels(v, w, limits.axle)

@@ -43,7 +43,7 @@ class Limits:
 
     wheel: float = WHEEL_SPEED_MAX_M_S
     linear: float = 0.31
-    acceleration: float = 3.0
+    acceleration: float = 1.65
 
 
 class Output(NamedTuple):

@@ -336,9 +336,13 @@ def set_realtime_priority(priority: int) -> str:
     return f"SCHED_RR {priority}"
 
 
-def limits_of(motion: MotionSettings) -> Limits:
-    """Return the guardian's limits of a robot that may move so: a little above what its agent asks for."""
-    return Limits(linear=round(motion.speed_m_s + 0.01, 3), acceleration=round(1.2 * motion.acceleration_m_s2, 3))
+def limits_of(motion: MotionSettings, axle_m: float) -> Limits:
+    """Return the guardian's limits of a robot that may move so: a little above what its agent asks for.
+
+    axle_m: m between the wheels. The outer wheel of a curve gains from the turn, too.
+    """
+    wheel = motion.acceleration_m_s2 + 0.5 * axle_m * motion.turn_acceleration_rad_s2
+    return Limits(linear=round(motion.speed_m_s + 0.01, 3), acceleration=round(1.2 * wheel, 2))
 
 
 def main() -> int:
@@ -346,7 +350,8 @@ def main() -> int:
     try:
         settings = load(GuardianSettings, environ=os.environ)
         robot = load_robot(os.environ)
-        core = GuardianCore(make_base(robot), limits_of(robot.settings.motion))
+        driver = make_base(robot)
+        core = GuardianCore(driver, limits_of(robot.settings.motion, driver.drive_train.axle_m))
         check = LineCheck(settings.base_port, robot.settings.base.driver, signatures())
         listener = _listen(settings.guardian_socket)
     except SettingsError as error:

@@ -42,7 +42,8 @@ class Job:
     """The inputs of one decision; immutable.
 
     pose, v, w: where the robot is and how fast (m, rad, m/s, rad/s). path: (n, 2) m, the released rest of the path,
-    starting beside the robot. ends_here: whether its last point is the goal; goal_theta: heading wanted there.
+    starting beside the robot. ends_here: whether its last point is the goal; goal_theta: heading wanted there; arrived:
+    whether the robot has come to this point already.
     cap: the gate's limit on speed (m/s). cost: uint8 (h, w), the master costmap around the robot, geometry `window`.
     lidar_points: (m, 2) m, points of the newest scan.
     """
@@ -56,6 +57,7 @@ class Job:
     path: NDArray[np.float64]
     ends_here: bool
     goal_theta: float | None
+    arrived: bool
     cap: float
     cost: NDArray[np.uint8]
     window: GridGeometry
@@ -68,7 +70,8 @@ class Job:
 class Decision:
     """Speeds v, w (m/s, rad/s) and the wheels' speeds (m/s) for the next period.
 
-    `at_goal`: position and heading of the goal are reached. `blocked`: why the robot can't move although it should.
+    `arrived`: the path's end is reached. `at_goal`: that is the goal, and its heading is reached, too. `blocked`: why
+    the robot can't move although it should.
     """
 
     plan_id: int
@@ -78,6 +81,7 @@ class Decision:
     w: float = 0.0
     left: float = 0.0
     right: float = 0.0
+    arrived: bool = False
     at_goal: bool = False
     blocked: str | None = None
 
@@ -118,6 +122,7 @@ def decide(job: Job) -> Decision:
     room = room_beside(around, path, body.inscribed, config.slow_within)
     end = job.path[-1]
     goal_theta = job.goal_theta if job.ends_here else None
+    tolerance = config.arrived_within if job.arrived else config.arcs.goal_tolerance
     chosen = dwa(
         job.v,
         job.w,
@@ -130,12 +135,16 @@ def decide(job: Job) -> Decision:
         body,
         replace(limits, v_max=min(limits.v_max, config.speed_narrow + (limits.v_max - config.speed_narrow) * room)),
         # In a narrow curve an arc that aims far ahead cuts the corner.
-        replace(config.arcs, lookahead=config.arcs.lookahead * max(room, config.lookahead_narrow)),
+        replace(
+            config.arcs,
+            lookahead=config.arcs.lookahead * max(room, config.lookahead_narrow),
+            goal_tolerance=tolerance,
+        ),
     )
-    at_position = math.hypot(end[0] - job.pose.x, end[1] - job.pose.y) <= config.arcs.goal_tolerance
+    arrived = math.hypot(end[0] - job.pose.x, end[1] - job.pose.y) <= tolerance
     at_heading = goal_theta is None or abs(wrap(goal_theta - job.pose.theta)) <= config.arcs.heading_tolerance
     blocked = None
-    if chosen.n_admissible == 0 and not at_position:
+    if chosen.n_admissible == 0 and not arrived:
         blocked = "an obstacle is so near that no arc is free"
     left, right = wheels(chosen.v, chosen.w, limits.axle)
     return Decision(
@@ -146,7 +155,8 @@ def decide(job: Job) -> Decision:
         w=chosen.w,
         left=left,
         right=right,
-        at_goal=job.ends_here and at_position and at_heading,
+        arrived=arrived,
+        at_goal=job.ends_here and arrived and at_heading,
         blocked=blocked,
     )
 
@@ -176,6 +186,7 @@ def make_job(  # noqa: PLR0913  # a job holds all that a decision rests on
     pose: Pose2,
     speeds: tuple[float, float],
     goal_theta: float | None,
+    arrived: bool = False,
     cap: float,
     cost: NDArray[np.uint8],
     speed_limits: NDArray[np.uint8],
@@ -206,6 +217,7 @@ def make_job(  # noqa: PLR0913  # a job holds all that a decision rests on
         path=path,
         ends_here=ends_here,
         goal_theta=goal_theta,
+        arrived=arrived and ends_here,
         cap=min(cap, limit),
         cost=np.ascontiguousarray(cost[window.rows, window.columns]),
         window=part,

@@ -35,20 +35,26 @@ def limit_wheels(  # noqa: PLR0913  # the gate knows nothing of the motion's set
     left, right = requested
     if not (math.isfinite(left) and math.isfinite(right)):
         return ramp_down(last, dt, wheel_speed / config.ramp)
-    scale = 1.0
-    centre = 0.5 * abs(left + right)
-    if centre > outputs.cap:
-        scale = outputs.cap / centre
-    fastest = max(abs(left), abs(right)) * scale
-    if fastest > wheel_speed:
-        scale *= wheel_speed / fastest
-    target = left * scale, right * scale
+    target = capped(requested, outputs.cap, wheel_speed)
     change = acceleration * max(dt, 0.0)
     largest = max(abs(target[0] - last[0]), abs(target[1] - last[1]))
     if largest <= change:
         return target
     share = change / largest
     return last[0] + (target[0] - last[0]) * share, last[1] + (target[1] - last[1]) * share
+
+
+def capped(requested: tuple[float, float], cap: float, wheel_speed: float) -> tuple[float, float]:
+    """Return wheel speeds (m/s) of the same arc whose mean is at most `cap`, and none faster than `wheel_speed`."""
+    left, right = requested
+    scale = 1.0
+    centre = 0.5 * abs(left + right)
+    if centre > cap:
+        scale = cap / centre
+    fastest = max(abs(left), abs(right)) * scale
+    if fastest > wheel_speed:
+        scale *= wheel_speed / fastest
+    return left * scale, right * scale
 
 
 def ramp_down(last: tuple[float, float], dt: float, deceleration: float) -> tuple[float, float]:

@@ -283,6 +283,48 @@ def test_areas_are_listed_with_their_state(demo: Service) -> None:
     assert json.loads(run("area", "list", "--json"))["areas"] == areas
 
 
+def test_source_is_added_to_an_area_listed_and_removed(demo: Service) -> None:
+    definition = {"id": "hall", "polygon": [[0, 0], [1, 0], [1, 1]], "nodes": ["n1"], "version": 3}
+    demo.answers["GET", "/api/v1/areas/hall"] = (200, {"definition": definition})
+    demo.answers["PUT", "/api/v1/areas/hall"] = (200, definition)
+    options = ["--area", "hall", "--profile", "tasmota-distance", "--device", "corridor", "--below", "120"]
+    assert run("source", "add", "sonar", *options) == "source sonar watches area hall"
+    body = demo.requests[-1][2]
+    assert isinstance(body, dict)
+    assert body["nodes"] == ["n1"]
+    (source,) = body["sources"]
+    assert (source["id"], source["profile"], source["device"]) == ("sonar", "tasmota-distance", "corridor")
+    assert source["number"]["below"] == 120
+    assert "version" not in body
+    with_source = {**definition, "sources": body["sources"]}
+    demo.answers["GET", "/api/v1/areas/hall"] = (200, {"definition": with_source})
+    demo.answers["GET", "/api/v1/areas"] = (200, [{"definition": with_source}])
+    node = {"id": "sonar", "area": "hall", "state": "blocked", "reason": "62 is below 120"}
+    demo.answers["GET", "/api/v1/nodes"] = (200, [node])
+    assert run("source", "list") == "hall/sonar: blocked, 62 is below 120"
+    assert json.loads(run("source", "list", "--json"))["sources"][0]["health"] == node
+    assert "area hall has no source other (it has: sonar)" in run("source", "remove", "other", "--area", "hall", code=1)
+    assert run("source", "remove", "sonar", "--area", "hall") == "source sonar no longer watches area hall"
+    removed = demo.requests[-1][2]
+    assert isinstance(removed, dict)
+    assert removed["sources"] == []
+
+
+def test_source_may_be_given_as_json_and_wrong_ones_are_refused_before_anything_is_asked(demo: Service) -> None:
+    definition = {"id": "hall", "polygon": [[0, 0], [1, 0], [1, 1]], "version": 3}
+    demo.answers["GET", "/api/v1/areas/hall"] = (200, {"definition": definition})
+    demo.answers["PUT", "/api/v1/areas/hall"] = (200, definition)
+    text = '{"topic": "t", "pointer": "/gas", "number": {"above": 400}, "period_s": 5}'
+    added = json.loads(run("source", "add", "gas", "--area", "hall", "--source", text, "--penalty", "120", "--json"))
+    assert (added["source"]["pointer"], added["source"]["penalty"]) == ("/gas", 120)
+    asked = len(demo.requests)
+    assert "--source is no JSON object" in run("source", "add", "gas", "--area", "hall", "--source", "[", code=2)
+    assert "source gas: Expected" in run("source", "add", "gas", "--area", "hall", "--source", '{"topic": 7}', code=2)
+    assert len(demo.requests) == asked
+    assert "zigbee2mqtt-contact: zigbee2mqtt/{device}" in run("source", "profiles")
+    assert "home-assistant" in json.loads(run("source", "profiles", "--json"))["profiles"]
+
+
 def test_area_is_overridden_for_a_time_and_the_override_removed(demo: Service) -> None:
     path = "/api/v1/areas/hall/override"
     demo.answers["PUT", path] = (200, {"state": "blocked", "author": "ann", "rest_s": 59.9})

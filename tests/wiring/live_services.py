@@ -29,7 +29,7 @@ from robot_agent.agent.map_loader import MapLoader
 from robot_agent.agent.service import Service as AgentService
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Coroutine, Sequence
+    from collections.abc import Awaitable, Callable, Coroutine, Iterable, Sequence
 
     from fog_contracts.channels import Channel, Role
     from fog_contracts.messages import Message
@@ -149,6 +149,8 @@ class BusEdge:
         self._live.bus.refused.append(f"{key}: {reason}")
 
     async def add_number(self, channel: Channel, number: str | int) -> None: ...
+
+    async def listen_to_foreign(self, topics: Iterable[str], handler: Callable[[str, bytes, bool], object]) -> None: ...
 
     def on_connect(self, callback: Callable[[], Awaitable[None]]) -> None:
         """The broker never connects again."""

@@ -34,6 +34,7 @@ from fognav.output import (
 )
 from fognav.robot_command import robot_app, robot_goal
 from fognav.robot_file_command import robot_check, robot_new
+from fognav.source_command import source_app
 from fognav.status_command import status_command
 from fognav.store_command import store_app
 from fognav.token_command import token_app
@@ -52,6 +53,7 @@ site_app = typer.Typer(help="Create and check sites.", no_args_is_help=True)
 app.add_typer(site_app, name="site")
 app.add_typer(zone_app, name="zone")
 app.add_typer(area_app, name="area")
+app.add_typer(source_app, name="source")
 app.add_typer(robot_app, name="robot")
 app.add_typer(token_app, name="token")
 app.add_typer(map_app, name="map")

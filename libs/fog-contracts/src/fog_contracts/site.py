@@ -3,9 +3,21 @@
 from typing import Annotated, Any
 
 from msgspec import Meta, field
+from msgspec.structs import asdict
 
 from fog_contracts.costs import ROBOT_RADIUS
-from fog_contracts.messages import AreaDefinition, Id, Message, Metres, Pose, Radians, Ring, UnknownPolicy
+from fog_contracts.messages import (
+    AreaDefinition,
+    FusionPolicy,
+    Id,
+    Message,
+    Metres,
+    Pose,
+    Radians,
+    Ring,
+    Source,
+    UnknownPolicy,
+)
 
 
 class Place(Message, frozen=True, kw_only=True):
@@ -49,7 +61,19 @@ class AreaSite(Message, frozen=True, kw_only=True):
     polygon: Ring
     number: Annotated[int, Meta(ge=0, le=9999)] | None = None
     debounce: dict[str, Any] = field(default_factory=dict)
+    fusion: FusionPolicy = FusionPolicy()
     unknown: UnknownPolicy = UnknownPolicy()
+
+
+class SourceSite(Source, frozen=True, kw_only=True):
+    """A sensor that speaks MQTT, and the area that it watches."""
+
+    area: Id
+
+    @property
+    def source(self) -> Source:
+        """The source without its area, as the area's definition has it."""
+        return Source(**{name: value for name, value in asdict(self).items() if name != "area"})
 
 
 class RobotSite(Message, frozen=True, kw_only=True):
@@ -82,6 +106,7 @@ class Site(Message, frozen=True, kw_only=True):
     places: dict[Id, Place] = field(default_factory=dict)
     areas: list[AreaSite] = field(default_factory=list)
     nodes: list[NodeSite] = field(default_factory=list)
+    sources: list[SourceSite] = field(default_factory=list)
     robots: list[RobotSite] = field(default_factory=list)
     layers: list[str | dict[str, Any]] = field(default_factory=list)
     demo: DemoPlan | None = None
@@ -94,8 +119,10 @@ class Site(Message, frozen=True, kw_only=True):
                 label=area.label,
                 polygon=area.polygon,
                 nodes=[node.id for node in self.nodes if node.area == area.id],
+                sources=[source.source for source in self.sources if source.area == area.id],
                 number=area.number,
                 debounce=area.debounce,
+                fusion=area.fusion,
                 unknown=area.unknown,
             )
             for area in self.areas

@@ -7,7 +7,7 @@ state that must survive is retained, or published again by `on_connect`, never k
 import asyncio
 import random
 from collections import deque
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, TypeVar, overload
 
@@ -22,7 +22,7 @@ from fog_runtime import logs, metrics
 from fog_runtime.cancellation import raise_if_cancelled
 from fog_runtime.clock import Clock
 from fog_runtime.mqtt_broker import Broker
-from fog_runtime.mqtt_subscriptions import Ids, Subscriptions
+from fog_runtime.mqtt_subscriptions import ForeignHandler, Ids, Subscriptions
 
 M = TypeVar("M", bound=Message)
 T = TypeVar("T")
@@ -134,6 +134,23 @@ class MqttEdge:
             await _subscribe(client, {topic: channel.qos})
         except aiomqtt.MqttError as error:
             self._limited.warning("subscription_failed", topic, self._clock.now(), topic=topic, reason=str(error))
+
+    async def listen_to_foreign(self, topics: Iterable[str], handler: ForeignHandler) -> None:
+        """Call `handler(topic, payload, retained)` for each message of these topics, which are no channel's.
+
+        They replace those of the call before, now and after every connection.
+        """
+        added, dropped = self._subscriptions.set_foreign(topics, handler)
+        client = self._client
+        if client is None:
+            return
+        try:
+            if added:
+                await _subscribe(client, dict.fromkeys(added, 1))
+            if dropped:
+                await client.unsubscribe(dropped)
+        except aiomqtt.MqttError as error:
+            self._limited.warning("subscription_failed", "foreign", self._clock.now(), topic=added, reason=str(error))
 
     def on_connect(self, callback: Callable[[], Awaitable[None]]) -> None:
         """Run `callback` after every connection, once all subscriptions are made."""

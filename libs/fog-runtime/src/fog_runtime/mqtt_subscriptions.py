@@ -1,8 +1,8 @@
 """The subscriptions of one MQTT connection: their topics, and the delivery of messages to their handlers."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import aiomqtt
 
@@ -14,6 +14,12 @@ from fog_runtime import logs, metrics
 from fog_runtime.clock import Clock
 
 Ids = dict[str, str]
+ForeignHandler = Callable[[str, bytes, bool], object]
+"""Handles a message of a topic that is no channel's: the topic, the payload, and whether it was retained."""
+FOREIGN_LIMIT: Final = 16 * 1024
+"""Bytes of the longest payload of such a topic."""
+FOREIGN: Final = "foreign"
+"""The label of such messages in metrics, in place of a channel's name."""
 
 _log = logs.get("mqtt_edge")
 
@@ -33,6 +39,7 @@ class Subscriptions:
         self._clock = clock
         self._site = site
         self._subscriptions: list[_Subscription] = []
+        self._foreign: dict[str, ForeignHandler] = {}
         self._limited = logs.RateLimited(_log)
 
     def add(
@@ -59,13 +66,25 @@ class Subscriptions:
             subscription.topics.append(topic)
         return bool(without)
 
+    def set_foreign(self, topics: Iterable[str], handler: ForeignHandler) -> tuple[list[str], list[str]]:
+        """Pass the messages of these topics, which are no channel's, to a handler, and those of others no more.
+
+        Returns the topics to subscribe to and those to unsubscribe from.
+        """
+        old, self._foreign = self._foreign, dict.fromkeys(topics, handler)
+        kept = self.qos_by_topic().keys()
+        return sorted(self._foreign.keys() - old.keys()), sorted(old.keys() - kept)
+
     def qos_by_topic(self) -> dict[str, int]:
         """Return every topic to subscribe to, with its quality of service."""
-        return {topic: one.channel.qos for one in self._subscriptions for topic in one.topics}
+        foreign = dict.fromkeys(self._foreign, 1)
+        return foreign | {topic: one.channel.qos for one in self._subscriptions for topic in one.topics}
 
     def deliver(self, message: aiomqtt.Message) -> None:
         """Pass a message to the handlers of its channel; count and log it when it breaks the channel's contract."""
         topic = message.topic.value
+        for handler in {self._foreign[pattern] for pattern in self._foreign if message.topic.matches(pattern)}:
+            self._deliver_foreign(handler, message)
         for subscription in self._subscriptions:
             channel = subscription.channel
             ids = channel.match(topic)
@@ -100,6 +119,20 @@ class Subscriptions:
             except Exception as error:  # noqa: BLE001  # one message must not end the process; the bug is logged
                 metrics.HANDLER_ERRORS.labels(channel.name).inc()
                 _log.error("handler_failed", error=error, channel=channel.name, topic=topic)
+
+    def _deliver_foreign(self, handler: ForeignHandler, message: aiomqtt.Message) -> None:
+        topic, data = message.topic.value, message.payload
+        if len(data) > FOREIGN_LIMIT:
+            metrics.REFUSED.labels(FOREIGN).inc()
+            reason = f"{len(data)} bytes are over the limit of {FOREIGN_LIMIT}"
+            self._limited.warning("message_refused", topic, self._clock.now(), topic=topic, reason=reason)
+            return
+        metrics.RECEIVED.labels(FOREIGN).inc()
+        try:
+            handler(topic, data, message.retain)
+        except Exception as error:  # noqa: BLE001  # one message must not end the process; the bug is logged
+            metrics.HANDLER_ERRORS.labels(FOREIGN).inc()
+            _log.error("handler_failed", error=error, channel=FOREIGN, topic=topic)
 
     def _refuse(self, channel: Channel, topic: str, reason: str) -> None:
         metrics.REFUSED.labels(channel.name).inc()

@@ -138,9 +138,11 @@ def _check_ids(file: Path, site: Site) -> None:
             if name in ROLES:
                 remedy = "Rename it: the brokers would give it that role's rights"
                 raise SiteError(file, f"{kind}[{index}].id", f"{name!r} is the name of a role", remedy)
+    _check_unique(file, "nodes.id and sources.id", [*(n.id for n in site.nodes), *(s.id for s in site.sources)])
     areas = [area.id for area in site.areas]
-    for index, node in enumerate(site.nodes):
-        _check_known(file, f"nodes[{index}].area", node.area, areas)
+    for kind, watched in (("nodes", [n.area for n in site.nodes]), ("sources", [s.area for s in site.sources])):
+        for index, area in enumerate(watched):
+            _check_known(file, f"{kind}[{index}].area", area, areas)
     if site.demo:
         _check_known(file, "demo.start", site.demo.start, site.places)
         _check_known(file, "demo.goal", site.demo.goal, site.places)

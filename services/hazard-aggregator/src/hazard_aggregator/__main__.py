@@ -18,8 +18,8 @@ from fog_runtime.site import load_site
 from fog_runtime.zenoh_edge import ZenohEdge
 from hazard_aggregator.api import make_api
 from hazard_aggregator.core import Aggregator
-from hazard_aggregator.debounce import make_rule
 from hazard_aggregator.fusion import AreaFusion
+from hazard_aggregator.members import Members
 from hazard_aggregator.overrides import StoredOverrides
 from hazard_aggregator.registry import find_rule
 from hazard_aggregator.service import Service
@@ -49,9 +49,8 @@ async def main() -> None:
         LeaseStore(settings.redis_url, site, "hazard-aggregator") as keeper,
     ):
         stored, loaded_from_store = await load_at_start(store)
-        usable = usable_areas(
-            stored.definitions, lambda area: make_rule(area.id, area.debounce, find_rule, settings.debounce)
-        )
+        nodes = {node.id: node for node in loaded.site.nodes}
+        usable = usable_areas(stored.definitions, Members(nodes, find_rule, settings.debounce).check)
         definitions = {d.id: d for d in [*loaded.site.definitions(), *usable]}
         fusion = AreaFusion(
             definitions.values(), loaded.site.nodes, 0, stored.hazards,
@@ -73,6 +72,7 @@ async def main() -> None:
                 )
                 service.records.mark_loaded()
             service.subscribe()
+            await service.records.subscribe()
             leadership.subscribe()
             zenoh.declare_liveliness("hazard-aggregator", site)
             app = make_api(service, loaded.map.geometry, clock, health, tokens, leadership.standby_reason)

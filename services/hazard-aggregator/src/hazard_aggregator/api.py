@@ -12,9 +12,11 @@ from fog_contracts.messages import (
     AreaDefinition,
     AreaHazard,
     AreaState,
+    FusionPolicy,
     Id,
     Message,
     Ring,
+    Source,
     UnknownPolicy,
 )
 from fog_runtime.clock import Clock
@@ -51,8 +53,10 @@ class AreaBody(Message, frozen=True, kw_only=True):
     label: Annotated[str, msgspec.Meta(max_length=100)] = ""
     polygon: Ring
     nodes: list[Id] = msgspec.field(default_factory=list)
+    sources: Annotated[list[Source], msgspec.Meta(max_length=50)] = msgspec.field(default_factory=list)
     number: Annotated[int, msgspec.Meta(ge=0, le=9999)] | None = None
     debounce: dict[str, Any] = msgspec.field(default_factory=dict)
+    fusion: FusionPolicy = FusionPolicy()
     unknown: UnknownPolicy = UnknownPolicy()
     removed: bool = False
 
@@ -70,7 +74,7 @@ class AreaView(Message, frozen=True, kw_only=True):
 
 
 class NodeView(Message, frozen=True, kw_only=True):
-    """Health of a node; `age_s` is the time since its last reading, null before the first one."""
+    """Health of a node or source; `age_s` is the time since its last message, null before the first one."""
 
     id: str
     area: str
@@ -165,7 +169,7 @@ def _add_areas(routes: Routes, service: Service, geometry: GridGeometry, clock: 
 def _add_nodes(routes: Routes, service: Service, clock: Clock) -> None:
     @routes.get("/api/v1/nodes")
     async def nodes() -> list[NodeView]:
-        """Return the health of every node in each area that it watches."""
+        """Return the health of every node and source in each area that it watches."""
         return [
             NodeView(
                 id=node.id,

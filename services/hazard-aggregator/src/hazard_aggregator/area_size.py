@@ -35,7 +35,7 @@ def check_size(definition: AreaDefinition) -> None:
         seq=_LARGEST,
         epoch=_LARGEST,
         cause=_WIDEST * SENTENCE_MAX,
-        nodes=dict.fromkeys(definition.nodes, "unknown"),
+        nodes=dict.fromkeys([*definition.nodes, *(source.id for source in definition.sources)], "unknown"),
         explained_by="x" * 32,
         override=HazardOverride(
             state="blocked",

@@ -81,7 +81,7 @@ class AreaWriter:
                 self._records.request_reload()
             else:
                 raise ConflictError(definition.id)
-        await self._records.subscribe_numbers()
+        await self._records.subscribe()
         return stored
 
     async def _known(self, area: str, attempt: Attempt | None) -> AreaDefinition | _Earlier | None:

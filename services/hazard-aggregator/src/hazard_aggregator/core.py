@@ -75,13 +75,17 @@ class Aggregator:
         """Return the area numbers under which the thesis's nodes may report."""
         return sorted({d.number for d in self.definitions() if d.number is not None and not d.removed})
 
+    def source_topics(self) -> set[str]:
+        """Return the topics of all areas' sources, which may contain wildcards."""
+        return self._fusion.source_topics()
+
     def node_reports(self, now: float) -> list[NodeReport]:
         """Return the health of every node of every area."""
         return self._fusion.node_reports(now)
 
     def check(self, definition: AreaDefinition) -> None:
-        """Raise `DebounceError` when an area's debounce rule or its options are invalid."""
-        self._fusion.new_rule(definition)
+        """Raise `AreaError` when an area's debounce settings, sources or fusion are invalid."""
+        self._fusion.check(definition)
 
     def pop_foreign(self) -> list[ForeignMessage]:
         """Return the messages of others on this aggregator's topics since the last call, for logs and metrics."""
@@ -116,6 +120,10 @@ class Aggregator:
     def query_handlers(self) -> Mapping[Channel, QueryHandler]:
         """Return the handler of every query: the aggregator answers none."""
         return {}
+
+    def on_source(self, topic: str, payload: bytes, at: Moment, *, retained: bool) -> list[Publication]:
+        """Handle a message on one of the `source_topics`: they are the sensors' own, no channels of Fognav."""
+        return self._announce(self._fusion.on_source(topic, payload, at.now, at.stamp, retained=retained))
 
     def tick(self, at: Moment) -> list[Publication]:
         """End overrides, detect silent and flapping nodes, publish the heartbeat if it is due; call it at 10 Hz."""

@@ -10,27 +10,28 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from fog_contracts.channels import BLOCKED, CLEAR, ROBOT_POSE
-from hazard_aggregator.debounce import DEFAULT_RULE, make_rule
-from hazard_aggregator.node_state import NodeState
+from fog_contracts.channels import BLOCKED, CLEAR
+from hazard_aggregator.debounce import DEFAULT_RULE
+from hazard_aggregator.members import THESIS_NODE, Members
 from hazard_aggregator.plausibility import Classification, classify_reading
 from hazard_aggregator.reading_order import ReadingOrder, Taken
+from hazard_aggregator.robot_poses import RobotPoses
+from hazard_aggregator.sources import Sources
 from hazard_aggregator.watched_area import WatchedArea
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable
     from typing import Final
 
     from fog_contracts.messages import AreaDefinition, AreaHazard, AreaState, NodeReading, RobotPose
     from fog_contracts.site import NodeSite
     from hazard_aggregator.area_override import AreaOverride
-    from hazard_aggregator.debounce import Registry, Rule
+    from hazard_aggregator.debounce import Registry
+    from hazard_aggregator.node_state import NodeState
     from hazard_aggregator.reading_order import Rejection
 
 LATE_TICK_S: Final = 0.5
 """A longer gap (s) between two ticks means that the process itself was stalled."""
-THESIS_NODE: Final = "thesis-area-{number}"
-"""The id of a thesis node, which has none of its own, within its area."""
 THESIS_EXPIRY_S: Final = 60.0
 """A thesis node that has been silent for so long (s) is gone: no site lists it, and one stray message made it."""
 _MAX_REJECTIONS: Final = 10_000
@@ -71,12 +72,12 @@ class AreaFusion:
     ) -> None:
         self.epoch = epoch
         self.nodes = {node.id: node for node in nodes}
-        self._registry = registry
-        self._default_rule = default_rule
+        self._members = Members(self.nodes, registry, default_rule)
+        self._sources = Sources()
         self._areas: dict[str, WatchedArea] = {}
         self._overrides: dict[str, AreaOverride] = {}
         self._tombstones: dict[str, AreaDefinition] = {}
-        self._poses: dict[str, tuple[float, RobotPose]] = {}
+        self._poses = RobotPoses()
         self._seqs: dict[str, int] = {}
         self._by_node: dict[str, list[tuple[WatchedArea, NodeState]]] = {}
         self._orders: dict[str, ReadingOrder] = {}
@@ -103,6 +104,10 @@ class AreaFusion:
         """Return the definition of an area that is not removed."""
         found = self._areas.get(area)
         return found.definition if found is not None else None
+
+    def source_topics(self) -> set[str]:
+        """Return the topics of all sources, which may contain wildcards."""
+        return self._sources.topics
 
     def node_reports(self, now: float) -> list[NodeReport]:
         """Return the health of every node of every area."""
@@ -154,10 +159,19 @@ class AreaFusion:
             name = THESIS_NODE.format(number=number)
             node = area.nodes.get(name)
             if node is None:
-                node = area.nodes[name] = NodeState(name, None, self.new_rule(area.definition))
+                node = area.nodes[name] = self._members.thesis_node(area.definition)
             reported: AreaState = BLOCKED if state == BLOCKED else CLEAR if state == CLEAR else "unknown"
             reason = f"it reports {reported}" if reported != "unknown" else f"it reports neither {BLOCKED} nor {CLEAR}"
             node.apply(Classification(reported, reason), now, stamp)
+            changed += self._evaluate(area, stamp)
+        return changed
+
+    def on_source(self, topic: str, payload: bytes, now: float, stamp: float, *, retained: bool) -> list[AreaHazard]:
+        """Apply a message of the sensors that areas name as sources."""
+        changed: list[AreaHazard] = []
+        for area, source, understood in self._sources.apply(topic, payload, now, stamp, retained=retained):
+            if not understood:
+                self._reject(source.id, "implausible")
             changed += self._evaluate(area, stamp)
         return changed
 
@@ -174,7 +188,7 @@ class AreaFusion:
 
     def on_pose(self, robot: str, pose: RobotPose, now: float) -> list[AreaHazard]:
         """Record a robot's pose, which may explain later readings."""
-        self._poses[robot] = (now, pose)
+        self._poses.add(robot, pose, now)
         return []
 
     def tick(self, now: float, stamp: float) -> list[AreaHazard]:
@@ -193,9 +207,9 @@ class AreaFusion:
                 if self._is_undefined(area, name) and node.silent_for(now) > THESIS_EXPIRY_S:
                     del area.nodes[name]
                 else:
-                    node.check_silence(area.definition.unknown.silent_after_s, now)
+                    node.check_silence(node.silent_after(area.definition.unknown), now)
             changed += self._evaluate(area, stamp)
-        self._poses = {robot: entry for robot, entry in self._poses.items() if now - entry[0] <= ROBOT_POSE.max_age_s}
+        self._poses.forget_old(now)
         return changed
 
     def put_area(self, definition: AreaDefinition, stamp: float) -> list[AreaHazard]:
@@ -233,21 +247,21 @@ class AreaFusion:
         rejections, self._rejections = self._rejections, []
         return rejections
 
-    def new_rule(self, definition: AreaDefinition) -> Rule:
-        """Return a fresh debounce rule for a node of an area; raises `DebounceError` for invalid settings."""
-        return make_rule(definition.id, definition.debounce, self._registry, self._default_rule)
+    def check(self, definition: AreaDefinition) -> None:
+        """Raise `AreaError` when an area's debounce settings, sources or fusion are invalid."""
+        self._members.check(definition)
 
     # --- Inside -----------------------------------------------------------------------------------------------------
 
     def _define(self, definition: AreaDefinition) -> None:
-        self.new_rule(definition)  # an area without nodes must not hide invalid debounce settings
+        self.check(definition)
         old = self._areas.get(definition.id)
         if definition.removed:
             self._areas.pop(definition.id, None)
             self._tombstones[definition.id] = definition
         else:
             self._tombstones.pop(definition.id, None)
-            nodes = self._nodes_of(definition, old)
+            nodes = self._members.of_area(definition, old)
             if old is None:
                 self._areas[definition.id] = WatchedArea(definition, nodes)
             else:
@@ -256,42 +270,22 @@ class AreaFusion:
         for area in self._areas.values():
             for node in area.nodes.values():
                 self._by_node.setdefault(node.id, []).append((area, node))
-
-    def _nodes_of(self, definition: AreaDefinition, old: WatchedArea | None) -> dict[str, NodeState]:
-        """Return the nodes of an area; those that it had under its `old` definition keep their states."""
-        known = old.nodes if old is not None else {}
-        keep_rules = old is not None and old.definition.debounce == definition.debounce
-        thesis = THESIS_NODE.format(number=definition.number)
-        names = list(dict.fromkeys([*definition.nodes, *({thesis} & known.keys() - self.nodes.keys())]))
-        nodes: dict[str, NodeState] = {}
-        for name in names:
-            node = known.get(name)
-            if node is None:
-                node = NodeState(name, self.nodes.get(name), self.new_rule(definition))
-            elif not keep_rules:
-                node.rule = self.new_rule(definition)
-            nodes[name] = node
-        return nodes
+        self._sources = Sources(self._areas.values())
 
     @staticmethod
     def _is_undefined(area: WatchedArea, node: str) -> bool:
         """Whether a node reports only under the area's number on the thesis's topics."""
-        return node not in area.definition.nodes
+        return node == THESIS_NODE.format(number=area.definition.number) and node not in area.definition.nodes
 
     def _classify(self, node_id: str, reading: NodeReading, now: float) -> Classification:
         site = self.nodes.get(node_id)
         if site is None:
             return Classification(reading.state, f"the node reports {reading.state} (the site does not define it)")
-        return classify_reading(site, reading, self._fresh_poses(now))
+        return classify_reading(site, reading, self._poses.fresh(now))
 
     def _reject(self, node_id: str, reason: Rejection) -> None:
         if len(self._rejections) < _MAX_REJECTIONS:
             self._rejections.append((node_id, reason))
-
-    def _fresh_poses(self, now: float) -> Iterator[tuple[str, RobotPose]]:
-        for robot, (received, pose) in self._poses.items():
-            if now - received <= ROBOT_POSE.max_age_s and pose.localized:
-                yield robot, pose
 
     def _evaluate(self, area: WatchedArea, stamp: float) -> list[AreaHazard]:
         """Return the area's hazard when it changed."""

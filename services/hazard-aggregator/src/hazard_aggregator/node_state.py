@@ -1,15 +1,23 @@
-"""The confirmed state of one node in one area: debounced readings, silence, contradictions. Pure."""
+"""The confirmed state of one node or source in one area: debounce, silence, contradictions, flapping. Pure."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+from fog_contracts.messages import UnknownPolicy
+from hazard_aggregator.flapping import FlapDetector
 
 if TYPE_CHECKING:
-    from fog_contracts.messages import AreaState
+    from fog_contracts.messages import AreaState, Source
     from fog_contracts.site import NodeSite
     from hazard_aggregator.debounce import Rule
     from hazard_aggregator.plausibility import Classification
+    from hazard_aggregator.source_reader import SourceReader
+
+_PERIODS: Final = 3
+"""A source is silent after so many of its periods."""
 
 
 @dataclass
@@ -31,6 +39,16 @@ class NodeState:
     run_began: float = 0.0
     received: int = 0
     ignored: int = 0
+    flaps: FlapDetector = field(default_factory=lambda: FlapDetector(UnknownPolicy().max_changes))
+
+    @property
+    def penalty(self) -> int | None:
+        """The cost of the area while this one alone is blocked; None: the area is impassable then."""
+        return None
+
+    def silent_after(self, policy: UnknownPolicy) -> float:
+        """Return after how long a silence (s) the state is unknown."""
+        return policy.silent_after_s
 
     def silent_for(self, now: float) -> float:
         """Return the time (s) since the last reading was taken; without one, since the first call."""
@@ -61,16 +79,20 @@ class NodeState:
         elif now - self.last_confirmed > limit and self.state != "unknown":
             self.invalidate("its readings contradict one another")
 
-    def apply(self, classification: Classification, taken_at: float, stamp: float, *, counts: bool = True) -> None:
-        """Apply one classified reading, taken at `taken_at` (s, the receiver's clock).
-
-        One that does not count is a sign of life, but no measurement of its own.
-        """
+    def receive(self, taken_at: float) -> None:
+        """Record a sign of life (s, the receiver's clock)."""
         self.silent_for(taken_at)
         self.received += 1
         self.last_reading = taken_at
         self.ever_received = True
         self.online = True
+
+    def apply(self, classification: Classification, taken_at: float, stamp: float, *, counts: bool = True) -> None:
+        """Apply one classified reading, taken at `taken_at` (s, the receiver's clock).
+
+        One that does not count is a sign of life, but no measurement of its own.
+        """
+        self.receive(taken_at)
         if classification.explained_by is not None:
             # Counts neither way: the debounce rule does not see it, and the timer that detects flapping restarts.
             self.explained_by = classification.explained_by
@@ -88,6 +110,35 @@ class NodeState:
         self.explained_by = None
         if confirmed == "unknown":
             self.run_state = None
+        elif self.flaps.update(confirmed, taken_at):
+            reason = f"it flaps: it changed more than {self.flaps.max_changes} times within a minute"
+            if self.reason != reason:
+                self.invalidate(reason)
+            return
         if confirmed != self.state or self.unconfirmed:
             # Later readings of the same state leave the reason: the hazard would change with every centimetre.
             self.state, self.reason, self.unconfirmed = confirmed, classification.reason, False
+
+
+@dataclass
+class SourceState(NodeState):
+    """One source of one area, with its profile filled in; `pending` is a retained message of unknown age."""
+
+    source: Source | None = None
+    reader: SourceReader | None = None
+    pending: bytes | None = None
+
+    @property
+    def penalty(self) -> int | None:
+        """The cost of the area while this source alone is blocked; None: the area is impassable then."""
+        return None if self.source is None else self.source.penalty
+
+    def silent_after(self, policy: UnknownPolicy) -> float:  # noqa: ARG002  # a source has its own period
+        """Return after how long a silence (s) the state is unknown: never, if the source publishes on change."""
+        return math.inf if self.source is None or self.source.period_s is None else _PERIODS * self.source.period_s
+
+    def invalidate(self, reason: str) -> None:
+        """Set the state to unknown until messages confirm another one."""
+        super().invalidate(reason)
+        if self.reader is not None:
+            self.reader.reset()

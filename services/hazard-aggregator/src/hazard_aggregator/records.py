@@ -85,7 +85,7 @@ class Records:
             overrides = StoredOverrides(stored.overrides, stored.rests, self._boot)
             changed = self._core.load_overrides(overrides, self._edges.now())
             publications = [*changed, *self._core.restore(usable, stored.hazards, self._edges.now())]
-        await self.subscribe_numbers()
+        await self.subscribe()
         return publications
 
     async def reload(self) -> None:
@@ -94,10 +94,10 @@ class Records:
             return
         async with self.lock:
             await self.reload_locked()
-        await self.subscribe_numbers()
+        await self.subscribe()
 
     async def reload_locked(self) -> None:
-        """Do the same for a caller that holds `lock`, who calls `subscribe_numbers` then."""
+        """Do the same for a caller that holds `lock`, who calls `subscribe` then."""
         if not self._reload_due:
             return
         known = {definition.id: definition for definition in self._core.definitions()}
@@ -113,10 +113,14 @@ class Records:
         self._reload_due = True
         await self.reload_locked()
 
-    async def subscribe_numbers(self) -> None:
-        """Subscribe to the thesis's topics of all areas."""
+    async def subscribe(self) -> None:
+        """Subscribe to the thesis's topics of all areas, and to their sources' own."""
+        await self._mqtt.listen_to_foreign(self._core.source_topics(), self._on_source)
         for number in self._core.thesis_numbers():
             await self._mqtt.add_number(ch.THESIS_AREA, number)
+
+    def _on_source(self, topic: str, payload: bytes, retained: bool) -> None:  # noqa: FBT001  # as the edge calls it
+        self._publisher.announce(self._core.on_source(topic, payload, self._edges.now(), retained=retained))
 
     async def store_status(self) -> StoreStatus:
         """Return what Redis and this process have; raises `StoreError`."""

@@ -11,6 +11,8 @@ from msgspec import structs
 
 from fog_contracts.costs import LETHAL
 from fog_contracts.messages import SEVERITY, AreaHazard, HazardOverride, Trace
+from hazard_aggregator.node_state import SourceState
+from hazard_aggregator.voting import fuse
 
 if TYPE_CHECKING:
     from fog_contracts.messages import AreaDefinition, AreaState
@@ -113,9 +115,15 @@ class WatchedArea:
     def _measure(self) -> _Measured:
         """Return the state of the nodes, and remember whether the area was blocked when it was last known."""
         state, deciding = self._fuse()
+        caution = self._caution() if state == "clear" else None
         if state != "unknown":
             self._last_known_blocked = state == "blocked"
             self._confirmed = self._confirmed or (deciding is not None and deciding.ever_received)
+        if caution is not None and caution.state == "blocked":
+            cause = self._cause("unknown", caution)
+            return _Measured("unknown", caution.penalty or 0, SEVERITY["unknown"], cause, caution)
+        if caution is not None:
+            state, deciding = "unknown", caution
         penalty = LETHAL if state == "blocked" or (state == "unknown" and self._last_known_blocked) else 0
         if state == "unknown" and not self._last_known_blocked:
             penalty = self.definition.unknown.penalty
@@ -150,20 +158,32 @@ class WatchedArea:
         return min(since, restored.since) if restored is not None and restored.state == state and unchanged else since
 
     def _fuse(self) -> tuple[AreaState, NodeState | None]:
-        """Return the area's state and the node that decided it: blocked needs one node, clear needs all of them."""
-        nodes = list(self.nodes.values())
-        for state in ("blocked", "unknown"):
-            for node in nodes:
-                if node.state == state:
-                    return state, node
-        return ("clear", nodes[0]) if nodes else ("unknown", None)
+        """Return the state of nodes and sources that can make the area impassable, and one that decided it.
+
+        Without any such one, the area is clear for all that is known.
+        """
+        blocking = {name: node for name, node in self.nodes.items() if node.penalty is None}
+        if not blocking:
+            return ("clear", next(iter(self.nodes.values()))) if self.nodes else ("unknown", None)
+        state = fuse({name: node.state for name, node in blocking.items()}, self.definition.fusion)
+        deciding = next((node for node in blocking.values() if node.state == state), None)
+        return state, deciding or next(iter(blocking.values()))
+
+    def _caution(self) -> NodeState | None:
+        """Return the source that makes a clear area costly, by its highest penalty, or else one that is unknown."""
+        cautions = [node for node in self.nodes.values() if node.penalty is not None]
+        blocked = [node for node in cautions if node.state == "blocked"]
+        if blocked:
+            return max(blocked, key=lambda node: node.penalty or 0)
+        return next((node for node in cautions if node.state == "unknown"), None)
 
     def _cause(self, state: AreaState, deciding: NodeState | None) -> str:
         """Return a sentence on why the area is in its state."""
         if deciding is None:
             return "no node watches this area"
-        sentence = f"node {deciding.id}: {deciding.reason}"
-        if state == "clear" and len(self.nodes) > 1:
+        kind = "source" if isinstance(deciding, SourceState) else "node"
+        sentence = f"{kind} {deciding.id}: {deciding.reason}"
+        if state == "clear" and len(self.nodes) > 1 and all(node.state == "clear" for node in self.nodes.values()):
             sentence = f"all {len(self.nodes)} nodes agree; {sentence}"
         if state == "unknown":
             sentence += "; it was blocked before and stays impassable" if self._last_known_blocked else ""

@@ -1,0 +1,376 @@
+"""Any sensor that speaks MQTT as evidence for an area: profiles, numbers, availability, silence, changed formats."""
+
+import json
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fog_contracts.messages import (
+    AreaDefinition,
+    AreaHazard,
+    Availability,
+    FusionPolicy,
+    Limits,
+    Source,
+    UnknownPolicy,
+)
+from hazard_aggregator.area_size import AreaError
+from hazard_aggregator.flapping import FlapDetector
+from hazard_aggregator.fusion import AreaFusion
+from hazard_aggregator.registry import find_rule
+from hazard_aggregator.source_profiles import PROFILES
+from hazard_aggregator.voting import fuse
+
+SQUARE = [(0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (0.0, 1.0)]
+ABOVE_40 = Limits(above=40.0, hysteresis=2.0, minimum=-40.0, maximum=120.0)
+
+
+def text(value: object) -> bytes:
+    return value.encode() if isinstance(value, str) else json.dumps(value).encode()
+
+
+class Rig:
+    """An area with sources, whose messages arrive at a clock that the test moves."""
+
+    def __init__(self, *sources: Source, **fields) -> None:
+        definition = AreaDefinition(id="hall", polygon=SQUARE, sources=list(sources), **fields)
+        self.fusion = AreaFusion([definition], [], 1, registry=find_rule)
+        self.now = 100.0
+        self.wait(0.0)
+
+    def send(self, topic: str, value: object, *, retained: bool = False) -> str:
+        self.fusion.on_source(topic, text(value), self.now, self.now, retained=retained)
+        return self.hazard.state
+
+    def wait(self, seconds: float) -> str:
+        end = self.now + seconds
+        while self.now < end:
+            self.now = min(self.now + 0.25, end)
+            self.fusion.tick(self.now, self.now)
+        self.fusion.tick(self.now, self.now)
+        return self.hazard.state
+
+    @property
+    def states(self) -> dict[str, str]:
+        return {report.id: report.state for report in self.fusion.node_reports(self.now)}
+
+    @property
+    def hazard(self) -> AreaHazard:
+        return self.fusion.hazards()[0]
+
+
+# Device, topic and payloads that mean blocked and clear, as the projects' documentation describes them.
+DOCUMENTED = {
+    "zigbee2mqtt-occupancy": (
+        "hall_motion",
+        "zigbee2mqtt/hall_motion",
+        {"battery": 88, "illuminance": 12, "linkquality": 102, "occupancy": True, "voltage": 2995},
+        {"battery": 88, "illuminance": 14, "linkquality": 96, "occupancy": False, "voltage": 2995},
+    ),
+    "zigbee2mqtt-contact": (
+        "fire door",
+        "zigbee2mqtt/fire door",
+        {"battery": 100, "contact": True, "linkquality": 80, "tamper": False},
+        {"battery": 100, "contact": False, "linkquality": 78, "tamper": False},
+    ),
+    "esphome-distance": (
+        "garage-node/sensor/parking_distance",
+        "garage-node/sensor/parking_distance/state",
+        "0.62",
+        "2.31",
+    ),
+    "esphome-binary": ("gate/binary_sensor/beam", "gate/binary_sensor/beam/state", "ON", "OFF"),
+    "tasmota-distance": (
+        "corridor",
+        "tele/corridor/SENSOR",
+        {"Time": "2026-11-21T10:00:00", "SR04": {"Distance": 62.4}},
+        {"Time": "2026-11-21T10:00:10", "SR04": {"Distance": 231.0}},
+    ),
+    "shelly-door-gen1": ("shellydw2-A1B2C3", "shellies/shellydw2-A1B2C3/sensor/state", "close", "open"),
+    "shelly-door-gen2": (
+        "shellyplusi4-a0a3b3c4d5e6",
+        "shellyplusi4-a0a3b3c4d5e6/status/input:0",
+        {"id": 0, "state": True},
+        {"id": 0, "state": False},
+    ),
+    "home-assistant": ("ha/binary_sensor/lift_door", "ha/binary_sensor/lift_door/state", "on", "off"),
+}
+LIMITS = {"esphome-distance": Limits(below=1.2, hysteresis=0.1), "tasmota-distance": Limits(below=120.0)}
+
+
+def test_every_profile_is_tested_on_documented_payloads():
+    assert DOCUMENTED.keys() == PROFILES.keys()
+
+
+@pytest.mark.parametrize("profile", DOCUMENTED)
+def test_profile_understands_the_documented_payloads(profile):
+    device, topic, blocked, clear = DOCUMENTED[profile]
+    rig = Rig(Source(id="s1", profile=profile, device=device, number=LIMITS.get(profile)))
+    assert topic in rig.fusion.source_topics()
+    assert rig.hazard.state == "unknown"
+    assert rig.send(topic, blocked) == "blocked"
+    assert rig.send(topic, clear) == "clear"
+    assert rig.hazard.nodes == {"s1": "clear"}
+
+
+@pytest.mark.parametrize(
+    ("profile", "availability", "offline", "online"),
+    [
+        ("zigbee2mqtt-occupancy", "zigbee2mqtt/hall_motion/availability", {"state": "offline"}, {"state": "online"}),
+        ("esphome-binary", "gate/status", "offline", "online"),
+        ("tasmota-distance", "tele/corridor/LWT", "Offline", "Online"),
+        ("shelly-door-gen2", "shellyplusi4-a0a3b3c4d5e6/online", "false", "true"),
+        ("home-assistant", "homeassistant/status", "offline", "online"),
+    ],
+)
+def test_disconnected_sensor_is_unknown_until_its_next_message(profile, availability, offline, online):
+    device, topic, _, clear = DOCUMENTED[profile]
+    rig = Rig(Source(id="s1", profile=profile, device=device, number=LIMITS.get(profile)))
+    rig.send(topic, clear)
+    assert rig.send(availability, offline) == "unknown"
+    assert "offline" in rig.hazard.cause
+    assert rig.send(availability, online) == "unknown"
+    assert rig.send(topic, clear) == "clear"
+
+
+@pytest.mark.parametrize("state", ["unavailable", "unknown", ""])
+def test_state_that_means_nothing_is_unknown_with_what_it_said(state):
+    rig = Rig(Source(id="s1", profile="home-assistant", device="ha/binary_sensor/d"))
+    rig.send("ha/binary_sensor/d/state", "off")
+    assert rig.send("ha/binary_sensor/d/state", state) == "unknown"
+    assert f"{state!r} means neither blocked nor clear" in rig.hazard.cause
+
+
+@pytest.mark.parametrize(
+    ("payload", "reason"),
+    [
+        ({"presence": True}, "there is no /occupancy in it"),
+        ("occupied", "is not JSON text"),
+        ("[1, 2", "is not JSON text"),
+        ([True], "there is no /occupancy in it"),
+        ({"occupancy": 1}, "means neither blocked nor clear"),
+        ({"occupancy": None}, "means neither blocked nor clear"),
+    ],
+)
+def test_changed_format_is_unknown_with_the_reason_and_back_with_the_old_format(payload, reason):
+    rig = Rig(Source(id="s1", profile="zigbee2mqtt-occupancy", device="m"))
+    rig.send("zigbee2mqtt/m", {"occupancy": False})
+    assert rig.send("zigbee2mqtt/m", payload) == "unknown"
+    assert reason in rig.hazard.cause
+    assert rig.fusion.pop_rejections() == [("s1", "implausible")]
+    assert rig.send("zigbee2mqtt/m", {"occupancy": False}) == "clear"
+
+
+def test_source_with_a_period_is_unknown_after_three_of_them():
+    rig = Rig(Source(id="s1", topic="t", blocked=["1"], clear=["0"], period_s=2.0))
+    rig.send("t", "0")
+    assert rig.wait(5.5) == "clear"
+    assert rig.wait(1.0) == "unknown"
+    assert "silent for more than 6 s" in rig.hazard.cause
+    assert rig.send("t", "0") == "clear"
+
+
+def test_source_that_publishes_on_change_keeps_its_state_while_its_sensor_is_connected():
+    rig = Rig(Source(id="s1", profile="shelly-door-gen2", device="d"))
+    rig.send("d/online", "true")
+    rig.send("d/status/input:0", {"id": 0, "state": False})
+    assert rig.wait(120.0) == "clear"
+
+
+def test_retained_message_counts_only_for_a_connected_sensor_that_publishes_on_change():
+    periodic = Rig(Source(id="s1", topic="t", blocked=["1"], clear=["0"], period_s=2.0))
+    assert periodic.send("t", "0", retained=True) == "unknown"
+    door = Rig(Source(id="s1", profile="shelly-door-gen2", device="d"))
+    assert door.send("d/status/input:0", {"state": False}, retained=True) == "unknown"
+    assert door.send("d/online", "false", retained=True) == "unknown"
+    assert door.send("d/online", "true") == "unknown"
+    assert door.send("d/status/input:0", {"state": False}, retained=True) == "clear"
+    late = Rig(Source(id="s1", profile="shelly-door-gen2", device="d"))
+    late.send("d/status/input:0", {"state": False}, retained=True)
+    assert late.send("d/online", "true", retained=True) == "clear"
+
+
+def test_number_has_limits_with_hysteresis_and_a_plausible_range():
+    rig = Rig(Source(id="s1", topic="t", pointer="/t", number=ABOVE_40, period_s=10.0))
+    assert rig.send("t", {"t": 39.5}) == "blocked"  # within the hysteresis, and no side known: counts as a danger
+    assert rig.send("t", {"t": 37.9}) == "clear"
+    assert rig.send("t", {"t": 39.9}) == "clear"
+    assert rig.send("t", {"t": 40.1}) == "blocked"
+    assert "40.1 is above 40" in rig.hazard.cause
+    assert rig.send("t", {"t": 38.1}) == "blocked"
+    assert rig.send("t", {"t": 121}) == "unknown"
+    assert rig.hazard.penalty == 254  # it was blocked before
+    assert rig.send("t", {"t": 37.0}) == "clear"
+
+
+@pytest.mark.parametrize("value", [True, "hot", None, [], "nan", "inf", 10**400])
+def test_value_that_is_no_number_is_a_changed_format(value):
+    rig = Rig(Source(id="s1", topic="t", pointer="/t", number=ABOVE_40, period_s=10.0))
+    payload = value if isinstance(value, int) and value > 1 else json.dumps({"t": value})
+    rig.send("t", {"t": 20})
+    assert rig.send("t", payload if isinstance(payload, str) else f'{{"t": {payload}}}') == "unknown"
+
+
+@given(st.lists(st.floats(-40.0, 120.0), min_size=1, max_size=40))
+def test_number_is_blocked_above_its_limit_and_clear_only_below_its_hysteresis(values):
+    rig = Rig(Source(id="s1", topic="t", number=ABOVE_40, period_s=10.0))
+    before = "unknown"
+    for value in values:
+        state = rig.send("t", repr(value))
+        assert state == ("blocked" if value > 40.0 else "clear" if value <= 38.0 else state)
+        if 38.0 < value <= 40.0:
+            assert state == (before if before != "unknown" else "blocked")
+        before = state
+
+
+def test_source_with_a_penalty_makes_a_clear_area_costly_and_never_impassable():
+    hot = Source(id="hot", topic="t", number=ABOVE_40, period_s=10.0, penalty=120)
+    door = Source(id="door", topic="d", blocked=["1"], clear=["0"], period_s=10.0)
+    rig = Rig(hot, door)
+    rig.send("d", "0")
+    assert rig.send("t", "20") == "clear"
+    assert rig.send("t", "50") == "unknown"
+    assert (rig.hazard.penalty, rig.hazard.severity) == (120, 1)
+    assert "source hot: 50 is above 40" in rig.hazard.cause
+    assert rig.send("d", "1") == "blocked"
+    assert rig.send("d", "0") == "unknown"
+    assert rig.hazard.penalty == 120
+    assert rig.send("t", "20") == "clear"
+    alone = Rig(hot)
+    assert alone.send("t", "50") == "unknown"
+    assert alone.hazard.penalty == 120
+    assert alone.send("t", "20") == "clear"
+
+
+def test_topic_with_wildcards_and_one_message_for_two_sources():
+    any_door = Source(id="any", topic="doors/+/state", blocked=["1"], clear=["0"], period_s=10.0)
+    below = Source(id="below", topic="doors/#", blocked=["1"], clear=["0"], period_s=10.0)
+    rig = Rig(any_door, below)
+    assert rig.fusion.source_topics() == {"doors/+/state", "doors/#"}
+    assert rig.send("doors/a/state", "1") == "blocked"
+    assert rig.states == {"any": "blocked", "below": "blocked"}
+    rig.send("doors", "0")
+    assert rig.states == {"any": "blocked", "below": "clear"}
+    rig.send("doors/a/b/state", "1")
+    assert rig.states == {"any": "blocked", "below": "blocked"}
+
+
+def test_changed_area_keeps_the_states_of_sources_that_did_not_change():
+    door = Source(id="door", topic="d", blocked=["1"], clear=["0"], period_s=10.0)
+    rig = Rig(door)
+    rig.send("d", "0")
+    other = Source(id="other", topic="o", blocked=["1"], clear=["0"], period_s=10.0)
+    changed = AreaDefinition(id="hall", polygon=SQUARE, sources=[door, other])
+    rig.fusion.put_area(changed, rig.now)
+    assert rig.states == {"door": "clear", "other": "unknown"}
+    assert rig.send("o", "0") == "clear"
+    rig.fusion.put_area(AreaDefinition(id="hall", polygon=SQUARE), rig.now)
+    assert rig.fusion.source_topics() == set()
+    assert rig.wait(70.0) == "unknown"
+
+
+BAD = Source(id="s1", topic="t", blocked=["1"], clear=["0"], period_s=1.0)
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        (Source(id="s1"), r"area hall: sources\.s1\.topic: it has none"),
+        (Source(id="s1", profile="knx"), r"sources\.s1\.profile: there is no knx \(known: zigbee2mqtt-occupancy"),
+        (Source(id="s1", profile="home-assistant"), r"sources\.s1\.device: the profile home-assistant needs one"),
+        (Source(id="s1", topic="t", period_s=1.0), "neither which values mean blocked and clear"),
+        (Source(id="s1", topic="t", period_s=1.0, number=Limits()), "it needs `above` or `below`"),
+        (Source(id="s1", topic="t", blocked=["1"], clear=["0"]), "nobody would notice that it is dead"),
+        (Source(id="s1", topic="a/b+/c", blocked=["1"], clear=["0"], period_s=1.0), "stand for whole levels"),
+        (Source(id="s1", topic="a/#/c", blocked=["1"], clear=["0"], period_s=1.0), "stand for whole levels"),
+        (
+            Source(id="s1", topic="t", blocked=["1"], clear=["0"], availability=Availability(topic="x#")),
+            "stand for whole levels",
+        ),
+        (Source(id="s1", topic="t", blocked=["1"], clear=["0"], period_s=1.0, debounce={"rule": "x"}), "debounce.rule"),
+    ],
+)
+def test_invalid_source_is_refused_naming_area_source_field_and_remedy(source, message):
+    with pytest.raises(AreaError, match=message):
+        Rig(source)
+
+
+def test_two_sources_with_one_id_and_a_quorum_out_of_reach_are_refused():
+    with pytest.raises(AreaError, match=r"sources\.s1: another node or source"):
+        Rig(BAD, BAD)
+    with pytest.raises(AreaError, match=r"fusion\.at_least: 3 is more than all nodes and sources have together \(1\)"):
+        Rig(BAD, fusion=FusionPolicy(rule="quorum", at_least=3))
+
+
+def test_flapping_source_is_unknown_until_it_keeps_one_state():
+    policy = UnknownPolicy(max_changes=4)
+    rig = Rig(Source(id="s1", topic="t", blocked=["1"], clear=["0"], period_s=10.0), unknown=policy)
+    for i in range(5):
+        rig.send("t", str(i % 2))
+        rig.wait(1.0)
+    assert rig.send("t", "1") == "unknown"
+    assert "it flaps: it changed more than 4 times within a minute" in rig.hazard.cause
+    rig.send("t", "0")
+    rig.wait(4.0)
+    assert rig.send("t", "0") == "unknown"
+    rig.wait(2.0)
+    assert rig.send("t", "0") == "clear"
+
+
+@given(st.lists(st.tuples(st.floats(0.0, 30.0), st.sampled_from(["blocked", "clear"])), max_size=60))
+def test_few_changes_within_a_minute_are_no_flapping(steps):
+    detector, now, changes, last = FlapDetector(5), 0.0, [], None
+    for pause, state in steps:
+        now += pause
+        if last is not None and state != last:
+            changes.append(now)
+        last = state
+        if detector.update(state, now):
+            assert len([at for at in changes if now - at <= 66.0]) > 5
+
+
+STATES = st.dictionaries(st.sampled_from(list("abcdef")), st.sampled_from(["blocked", "clear", "unknown"]))
+POLICIES = st.builds(
+    FusionPolicy,
+    rule=st.sampled_from(["any", "all", "quorum", "weighted"]),
+    at_least=st.integers(1, 6).map(float),
+    weights=st.dictionaries(st.sampled_from(list("abcdef")), st.integers(0, 3).map(float)),
+)
+
+
+@given(STATES, POLICIES)
+def test_unknown_means_that_the_unknown_ones_decide(states, policy):
+    """Whatever the unknown ones would say: blocked and clear areas stay so, and unknown ones could become either."""
+    outcomes = {
+        fuse({name: guess if state == "unknown" else state for name, state in states.items()}, policy)
+        for guess in ("blocked", "clear")
+    }
+    fused = fuse(states, policy)
+    if not states:
+        assert fused == "unknown"
+    elif fused == "unknown":
+        assert outcomes == {"blocked", "clear"}
+    else:
+        assert outcomes == {fused}
+
+
+@pytest.mark.parametrize(
+    ("rule", "at_least", "states", "expected"),
+    [
+        ("any", 1, "bcc", "blocked"), ("any", 1, "cuc", "unknown"), ("any", 1, "ccc", "clear"),
+        ("all", 1, "bbc", "clear"), ("all", 1, "bbb", "blocked"), ("all", 1, "bbu", "unknown"),
+        ("quorum", 2, "bbc", "blocked"), ("quorum", 2, "buc", "unknown"), ("quorum", 2, "ucc", "clear"),
+    ],
+)  # fmt: skip
+def test_fusion_rules(rule, at_least, states, expected):
+    named = {"b": "blocked", "c": "clear", "u": "unknown"}
+    members = {f"n{i}": named[letter] for i, letter in enumerate(states)}
+    assert fuse(members, FusionPolicy(rule=rule, at_least=at_least)) == expected
+
+
+def test_weights_count_as_evidence():
+    policy = FusionPolicy(rule="weighted", at_least=2, weights={"camera": 2, "pir": 0.5})
+    assert fuse({"camera": "blocked", "pir": "clear"}, policy) == "blocked"
+    assert fuse({"camera": "clear", "pir": "blocked"}, policy) == "clear"
+    assert fuse({"camera": "unknown", "pir": "clear"}, policy) == "unknown"

@@ -1,0 +1,71 @@
+"""Sources in the running aggregator: from the site file and over REST, through a real broker, kept across a kill."""
+
+import asyncio
+
+import aiomqtt
+import httpx
+import pytest
+
+pytestmark = pytest.mark.live
+
+POLYGON = [[1.0, 1.0], [2.0, 1.0], [2.0, 2.0], [1.0, 2.0]]
+SITE_SOURCE = """
+[[sources]]
+id = "gate"
+area = "hall"
+profile = "esphome-binary"
+device = "gate/binary_sensor/beam"
+"""
+DOOR = {"id": "door", "profile": "zigbee2mqtt-contact", "device": "fire_door"}
+
+
+async def wait_for(client, area: str, condition) -> dict:
+    async with asyncio.timeout(60):
+        while True:
+            view = (await client.get(f"/api/v1/areas/{area}")).json()
+            if view["hazard"] is not None and condition(view["hazard"]):
+                return view["hazard"]
+            await asyncio.sleep(0.05)
+
+
+def broker(fog) -> aiomqtt.Client:
+    return aiomqtt.Client("127.0.0.1", int(fog.mosquitto.url.rsplit(":", maxsplit=1)[1]))
+
+
+async def test_sources_of_the_site_and_over_rest_decide_their_areas_and_survive_a_kill(fog, tokens):
+    file = fog.site / "site.toml"
+    file.write_text(file.read_text().split("[[nodes]]")[0] + SITE_SOURCE)
+    fog.start("hazard_aggregator")
+    url = await fog.ready("hazard_aggregator")
+    async with httpx.AsyncClient(base_url=url, timeout=15) as client, broker(fog) as mqtt:
+        await mqtt.publish("gate/binary_sensor/beam/state", "OFF")
+        await wait_for(client, "hall", lambda hazard: hazard["state"] == "clear")
+        await mqtt.publish("gate/status", "offline")
+        offline = await wait_for(client, "hall", lambda hazard: hazard["state"] == "unknown")
+        assert offline["cause"] == "source gate: it went offline"
+        body = {"polygon": POLYGON, "sources": [DOOR]}
+        put = await client.put("/api/v1/areas/yard", json=body, headers=tokens["operator"])
+        assert put.status_code == 200, put.text
+        await mqtt.publish("zigbee2mqtt/fire_door", '{"contact": true, "battery": 100}')
+        blocked = await wait_for(client, "yard", lambda hazard: hazard["state"] == "blocked")
+        assert blocked["nodes"] == {"door": "blocked"}
+        nodes = {node["id"]: node for node in (await client.get("/api/v1/nodes")).json()}
+        assert nodes["door"]["area"] == "yard"
+    fog.kill("hazard_aggregator")
+    fog.start("hazard_aggregator")
+    url = await fog.ready("hazard_aggregator")
+    async with httpx.AsyncClient(base_url=url, timeout=15) as client, broker(fog) as mqtt:
+        kept = await wait_for(client, "yard", lambda hazard: hazard["penalty"] == 254)
+        assert kept["state"] == "blocked"
+        await mqtt.publish("zigbee2mqtt/fire_door", '{"contact": false}')
+        await wait_for(client, "yard", lambda hazard: hazard["state"] == "clear")
+
+
+async def test_invalid_source_is_refused_with_the_field(fog, tokens):
+    fog.start("hazard_aggregator")
+    async with httpx.AsyncClient(base_url=await fog.ready("hazard_aggregator"), timeout=15) as client:
+        body = {"polygon": POLYGON, "sources": [{"id": "s1", "profile": "knx"}]}
+        answer = await client.put("/api/v1/areas/yard", json=body, headers=tokens["operator"])
+    assert answer.status_code == 422
+    assert answer.json()["errors"][0]["field"] == "body.sources.s1.profile"
+    assert "zigbee2mqtt-occupancy" in answer.json()["detail"]

@@ -130,6 +130,26 @@ def test_area_that_an_admin_declared_clear_is_passable_and_slow_but_never_clear(
     assert (rig.hazard.state, rig.hazard.penalty) == ("blocked", 254)
 
 
+@pytest.mark.parametrize("restarts", [False, True])
+@pytest.mark.parametrize("state", ["blocked", "clear"])
+def test_area_that_is_defined_again_does_not_meet_the_override_of_the_removed_one(state, restarts):
+    rig = Rig()
+    rig.read("blocked")
+    rig.put(state)
+    removed = structs.replace(AREA, version=1, removed=True)
+    if restarts:
+        # It ended after the removal was stored, and before the override was deleted.
+        rig.area = removed
+        rig.start()
+    else:
+        rig.core.put_area(removed, rig.at)
+    assert [override.area for override in rig.core.overrides.ended()] == ([] if restarts else ["hall"])
+    rig.core.put_area(structs.replace(AREA, version=2), rig.at)
+    rig.settle()
+    assert (rig.hazard.state, rig.hazard.penalty, rig.hazard.override) == ("unknown", 200, None)
+    assert rig.stored == {}, "it is deleted"
+
+
 def test_area_declared_clear_costs_no_more_than_its_policy_for_unknown():
     rig = Rig(structs.replace(AREA, unknown=UnknownPolicy(penalty=90)))
     rig.put("clear")

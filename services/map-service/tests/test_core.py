@@ -295,6 +295,20 @@ def test_moved_or_removed_area_leaves_no_costs_behind():
     assert np.array_equal(rig.cost, initial)
 
 
+@pytest.mark.parametrize("state", ["clear", "blocked"])
+def test_area_that_is_defined_again_does_not_meet_the_hazard_of_the_removed_one(state):
+    rig = make_rig()
+    rig.on_definition(definition(version=1), 0.0)
+    rig.on_hazard(hazard(state, 7), 0.0)
+    rig.on_definition(definition(version=2, removed=True), 0.1)
+    change = rig.on_definition(definition(version=3, x=1.5), 0.2)
+    assert (change.hazards[0].hazard.state, change.hazards[0].confirmed) == ("unknown", False)
+    rig.receive(hazard(state, 7), 0.3)  # a late duplicate, while the newest heartbeat still lists it
+    assert cost_and_speed(rig, 1.75, 0.75) == (200, 15)
+    rig.on_hazard(hazard("clear", 8), 0.4)
+    assert cost_and_speed(rig, 1.75, 0.75) == (0, 0)
+
+
 def test_no_area_is_clear_while_the_aggregator_is_lost():
     rig = make_rig()
     rig.on_definition(definition(), 0.0)

@@ -151,7 +151,8 @@ class Aggregator:
         changed = self._fusion.put_area(definition, at.stamp)
         if definition.removed:
             self._outbox.forget(definition.id)
-            return [self._definition_publication(definition), *deletions(definition.id)]
+            ended = self._announce(self.overrides.tick(at))
+            return [self._definition_publication(definition), *deletions(definition.id), *ended]
         return [self._definition_publication(definition), *self._announce(changed)]
 
     def put_override(self, override: AreaOverride, at: Moment) -> list[Publication]:

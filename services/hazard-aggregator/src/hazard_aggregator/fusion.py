@@ -109,6 +109,10 @@ class AreaFusion:
         """Return the topics of all sources, which may contain wildcards."""
         return self._sources.topics
 
+    def is_removed(self, area: str) -> bool:
+        """Whether there was an area of this id, and is none now."""
+        return area in self._tombstones
+
     def node_reports(self, now: float) -> list[NodeReport]:
         """Return the health of every node of every area."""
         return [

@@ -102,8 +102,12 @@ class Overrides:
         return [*changed, *self.tick(at)]
 
     def tick(self, at: Moment) -> list[AreaHazard]:
-        """End the overrides whose time is over."""
-        over = [entry.override for entry in self._entries.values() if at.now >= entry.deadline]
+        """End the overrides whose time is over, and those of removed areas: one that is defined again is another."""
+        over = [
+            entry.override
+            for area, entry in self._entries.items()
+            if at.now >= entry.deadline or self._fusion.is_removed(area)
+        ]
         changed: list[AreaHazard] = []
         for override in over:
             changed += self.remove(override.area, at)

@@ -63,6 +63,8 @@ class HazardsLayer(CostLayer):
         self._areas: dict[str, _Area] = {}
         self._received: dict[str, AreaHazard] = {}
         self._removed: dict[str, HazardArea] = {}
+        self._last_of_removed: dict[str, tuple[int, int]] = {}
+        """Epoch and seq of the last hazard of each removed area: neither it nor one before it is another area's."""
         self._fence = Fence()
         self.aggregator = AggregatorMonitor()
 
@@ -125,6 +127,9 @@ class HazardsLayer(CostLayer):
         if hazard.area != ids["area"]:
             raise RefusedMessageError(f"it is about another area, {hazard.area}")
         old = self._received.get(hazard.area)
+        last_of_removed = self._last_of_removed.get(hazard.area, (0, 0))
+        if hazard.epoch == last_of_removed[0] and hazard.seq <= last_of_removed[1]:
+            return []
         if old is not None:
             if hazard.epoch == old.epoch and hazard.seq <= old.seq:
                 return []
@@ -186,6 +191,8 @@ class HazardsLayer(CostLayer):
             area.shown, state="clear", severity=SEVERITY["clear"], penalty=0, cause="the area was removed", trace=None
         )
         self._removed[name] = _described(area)
+        if (last := self._received.pop(name, None)) is not None:
+            self._last_of_removed[name] = last.epoch, last.seq
         return [_publication(area)]
 
     def _refresh_all(self, at: Moment) -> list[Publication]:

@@ -7,6 +7,8 @@ import pytest
 from typer.testing import CliRunner
 
 from fog_kernels.components import Components
+from fog_supervisor.servers import ServerError
+from fog_supervisor.supervisor import NotReadyError
 from fognav.__main__ import app
 from fognav.bench import costmap, dwa, fleet, fleet_live, localization, office, rest, site
 
@@ -92,6 +94,16 @@ async def test_clients_of_every_kind_are_answered_while_the_heartbeat_is_timed(t
         assert figures[f"idle_{key}"] > 0
         assert figures[key] > 0
     assert figures["rss_mb"] > 50
+
+
+@pytest.mark.parametrize("error", [NotReadyError("redis: exited with 1"), ServerError("mosquitto is not installed")])
+def test_system_that_does_not_start_is_a_sentence_and_no_traceback(monkeypatch, error):
+    async def measure(*_: object, **_options: object) -> None:
+        raise error
+
+    monkeypatch.setattr(rest, "measure", measure)
+    done = CliRunner().invoke(app, ["bench", "rest"])
+    assert (done.exit_code, f"fognav: {error}" in done.output) == (1, True)
 
 
 def test_localization_figures_are_there_and_the_search_and_match_ran() -> None:

@@ -138,7 +138,7 @@ def rest_command(
 
     kernels.warm_cache(lambda text: console.print(text, markup=False))
     floor = make_office()
-    with TemporaryDirectory(prefix="fognav-") as folder:
+    with exit_codes(), TemporaryDirectory(prefix="fognav-") as folder:
         write_site(Path(folder), floor)
         figures = asyncio.run(rest.measure(Path(folder), floor, zones=zones, clients=clients, seconds=seconds))
     asked = {"clients": clients, "seconds": seconds, "zones": zones}

@@ -11,6 +11,8 @@ from typing import Final, NoReturn
 import typer
 from rich.console import Console
 
+from fog_supervisor.servers import ServerError
+from fog_supervisor.supervisor import NotReadyError
 from fognav import __version__
 
 SCHEMA: Final = 1
@@ -50,7 +52,7 @@ def exit_codes() -> Iterator[None]:
         yield
     except WrongUseError as error:
         fail(str(error), WRONG_USE)
-    except FailedError as error:
+    except (FailedError, NotReadyError, ServerError) as error:
         fail(str(error))
 
 

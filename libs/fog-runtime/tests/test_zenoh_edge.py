@@ -5,6 +5,7 @@ import contextlib
 import itertools
 import json
 import time
+from collections import Counter
 
 import pytest
 import zenoh
@@ -16,7 +17,7 @@ from fog_contracts.codec import ContractError, encode
 from fog_contracts.handlers import RefusedMessageError
 from fog_runtime.clock import SystemClock
 from fog_runtime.reply_parts import PART_BYTES, decode_announcement
-from fog_runtime.zenoh_edge import ZenohEdge, session_config
+from fog_runtime.zenoh_edge import ASKER, ZenohEdge, session_config
 from fog_supervisor.net import free_port
 from fog_supervisor.servers import start_router
 
@@ -229,6 +230,28 @@ async def test_large_reply_arrives_complete(router):
         a.serve(ch.PLANNER_PLAN, lambda _, request: m.PlanReply(length=request.goal.x))
         await query_until_answered(b, 1.0)
         assert await b.query(ch.MAP_SNAPSHOT, None, m.MapSnapshot, 20.0) == big
+
+
+async def test_session_that_asks_too_much_leaves_the_others_their_answers(router):
+    asked, answers = [], asyncio.Event()
+
+    async def slow(_ids, _request):
+        asked.append(ASKER.get())
+        await answers.wait()
+        return zones(1)
+
+    async with edge(router.endpoint, "a") as a, edge(router.endpoint, "b") as b, edge(router.endpoint, "c") as c:
+        a.serve(ch.ZONES, slow)
+        async with asyncio.timeout(60), asyncio.TaskGroup() as tasks:
+            greedy = [tasks.create_task(b.query(ch.ZONES, None, m.ZoneSet, 50.0)) for _ in range(40)]
+            await until(lambda: sum(query.done() for query in greedy) == 24, "queries above the limit end at once")
+            modest = tasks.create_task(c.query(ch.ZONES, None, m.ZoneSet, 50.0))
+            await until(lambda: len(asked) == 17, "another session's query is answered")
+            answers.set()
+    assert Counter(query.result() is not None for query in greedy) == {True: 16, False: 24}
+    assert modest.result() is not None
+    assert sorted(Counter(asked).values()) == [1, 16]
+    assert "" not in asked
 
 
 async def test_query_reports_a_failing_and_a_silent_handler(router):

@@ -16,6 +16,7 @@ from fog_contracts.messages import EgressRequest, PlanRequest, Pose, RobotGoal, 
 from fog_runtime.clock import ManualClock
 from fog_runtime.health import Health
 from fog_runtime.http import Tokens
+from fog_runtime.zenoh_edge import ASKER
 from planner.api import make_api
 from planner.core import PlannerCore
 from planner.cycle import MOST_SEARCHING_S, CycleResult
@@ -223,10 +224,26 @@ def test_paths_are_published_one_by_one_and_a_long_cycle_leaves_the_rest_for_the
 
 
 class FullQueue:
-    """Refuses every query."""
+    """Refuses every query, and keeps who asked."""
 
-    async def run(self, _kind: str, _asker: str, _work: object) -> object:
+    def __init__(self) -> None:
+        self.askers: list[str] = []
+
+    async def run(self, _kind: str, asker: str, _work: object) -> object:
+        self.askers.append(asker)
         raise BusyError("4 of your queries are waiting already")
+
+
+async def test_each_session_that_asks_over_zenoh_is_an_asker_of_its_own(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rig.service, "_queue", queue := FullQueue())
+    at = Pose(x=1.0, y=7.0, theta=0.0)
+    for session in ("a1", "b2"):
+        asking = ASKER.set(session)
+        await rig.service._serve_plan({}, PlanRequest(start=at, goal=at))
+        ASKER.reset(asking)
+    assert len(set(queue.askers)) == 2
 
 
 async def test_queries_that_do_not_fit_are_answered_with_503_and_over_zenoh_with_when_to_ask_again(

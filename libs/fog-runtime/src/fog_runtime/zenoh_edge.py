@@ -10,10 +10,11 @@ import inspect
 import json
 import random
 import threading
-from collections import deque
+from collections import Counter, deque
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
+from contextvars import ContextVar
 from functools import partial
 from typing import Any, Final, Generic, Literal, TypeVar
 
@@ -42,6 +43,10 @@ _CACHE_DEPTH: Final[Mapping[Durability, int]] = {"volatile": 0, "latest": 1, "re
 _QUEUE: Final = 4096
 """Messages of a recovered channel that may wait for the loop; further ones are dropped, which their versions show."""
 _PENDING_QUERIES: Final = 64
+_PENDING_OF_ONE: Final = 16
+"""How many queries on one key may wait for their answers: of all askers, and of one session."""
+ASKER: Final[ContextVar[str]] = ContextVar("asker", default="")
+"""The session that asks, by its id, in the handler of a query; empty if it did not say."""
 _RETRY_S: Final = (0.2, 1.0)
 
 _log = logs.get("zenoh")
@@ -70,6 +75,12 @@ def session_config(
 def _finish(query: Any) -> None:  # noqa: ANN401  # `drop` has no types in zenoh's stubs
     """Tell the querier that no further reply will come."""
     query.drop()
+
+
+def _asker(query: Any) -> str:  # noqa: ANN401  # as above
+    """Return the id of the session that asks; empty if it did not say."""
+    source = query.source_info
+    return "" if source is None else str(source.source_id.zid)
 
 
 class _Publisher:
@@ -210,7 +221,7 @@ class _Queryable:
         self._handler = handler
         self._key = key
         self._ids = edge.ids(channel, key) or {}
-        self._pending = 0
+        self._pending: Counter[str] = Counter()
         self._last: tuple[Message, bytes] | None = None
         self._large = LargeReplies()
 
@@ -223,14 +234,21 @@ class _Queryable:
             _finish(query)
 
     def _begin(self, query: zenoh.Query) -> None:
-        if self._pending >= _PENDING_QUERIES:
-            self._edge.refuse(self._channel, self._key, f"more than {_PENDING_QUERIES} queries at once")
+        asker = _asker(query)
+        refusal = ""
+        if self._pending.total() >= _PENDING_QUERIES:
+            refusal = f"more than {_PENDING_QUERIES} queries at once"
+        elif self._pending[asker] >= _PENDING_OF_ONE:
+            refusal = f"more than {_PENDING_OF_ONE} queries at once of session {asker or 'without id'}"
+        if refusal:
+            self._edge.refuse(self._channel, self._key, refusal)
             _finish(query)
             return
-        self._pending += 1
-        self._edge.spawn(self._answer(query))
+        self._pending[asker] += 1
+        self._edge.spawn(self._answer(query, asker))
 
-    async def _answer(self, query: zenoh.Query) -> None:
+    async def _answer(self, query: zenoh.Query, asker: str) -> None:
+        ASKER.set(asker)
         try:
             if (reply := query.parameters.get(REPLY)) is not None:
                 await self._send_part(query, reply, query.parameters.get(PART) or "")
@@ -261,7 +279,9 @@ class _Queryable:
                 metrics.count_bytes(self._channel.name, "sent", len(data))
             metrics.ANSWERED.labels(self._channel.name).inc()
         finally:
-            self._pending -= 1
+            self._pending[asker] -= 1
+            if not self._pending[asker]:
+                del self._pending[asker]
             _finish(query)
 
     async def _send_part(self, query: zenoh.Query, reply: str, number: str) -> None:

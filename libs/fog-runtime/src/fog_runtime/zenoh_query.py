@@ -138,6 +138,8 @@ class _Query:
             zenoh.handlers.Callback(on_reply, lambda: self.threads.call(set_answer, None)),
             payload=request,
             timeout=timeout_s,
+            # By it the answering side tells askers apart, each of whom may have only so many answers at once.
+            source_info=zenoh.SourceInfo(self.session.id, 0),
             # Replies are sent as their query asks: on a congested link they are dropped, and others are not held up.
             congestion_control=zenoh.CongestionControl.DROP,
         )

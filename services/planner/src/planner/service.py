@@ -19,6 +19,7 @@ from fog_contracts.messages import PlanReply, RobotPath, RobotPose, RobotRelease
 from fog_runtime import logs, metrics
 from fog_runtime.clock import ticker
 from fog_runtime.edges import Edges
+from fog_runtime.zenoh_edge import ASKER
 from planner.cycle import Cycle
 from planner.map_keeper import MapKeeper
 from planner.mission_keeper import MissionKeeper
@@ -179,7 +180,7 @@ class Service:
         if not self._answers:
             return None
         try:
-            return await self.preview(request, "zenoh")
+            return await self.preview(request, f"zenoh {ASKER.get()}")
         except BusyError as error:
             return PlanReply(refusal=busy(str(error)), retry_after=error.retry_after)
 

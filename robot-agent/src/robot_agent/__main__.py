@@ -29,6 +29,7 @@ from robot_agent.agent.settings import Settings, read_footprint, read_operator_k
 from robot_agent.agent.store import Store
 from robot_agent.config import agent_config
 from robot_agent.device_signature import LineCheck
+from robot_agent.guardian.protection import run_in_real_time
 
 _log = logs.get("agent")
 
@@ -81,6 +82,9 @@ async def main() -> None:
             # What the start has made stays: no later collection of garbage looks at it, and delays a wheel command.
             release_startup_memory()
             gc.freeze()
+            # After the start, which takes all the time that it gets.
+            priority = settings.agent_realtime_priority if settings.speed == 1.0 else 0
+            _log.info("started", priority=run_in_real_time(priority))
             async with asyncio.TaskGroup() as tasks:
                 tasks.create_task(guardian.run(), name="base")
                 tasks.create_task(lidar.run(), name="lidar")

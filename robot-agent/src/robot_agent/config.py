@@ -55,6 +55,10 @@ class SafetyConfig:
     hold_needs_operator_after: float = 60.0
     stops_to_fault: int = 3
     stops_within: float = 60.0
+    late: float = 0.15
+    """The agent streams every 0.05 s; when it did not for this long, its computer ran it too late."""
+    late_explains: float = 0.5
+    """For how long such a delay explains old sensor data: until another scan and messages of the guardian are in."""
     ramp: float = 0.5
     """Time in which a ramp brings the fastest possible wheel to rest."""
     egress_max: float = 60.0

@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 
 _REMEMBERED_SCANS: Final = 64
 
+NO_FRESH_COMMAND: Final = "no fresh command from the agent"
+"""Why the guardian keeps the wheels at zero when the agent is silent or late."""
+
 Options = TypeVar("Options", bound=msgspec.Struct)
 """A driver's own options: a frozen struct whose fields name their units and that refuses unknown fields."""
 

@@ -5,6 +5,7 @@ import json
 import os
 import signal
 import time
+from pathlib import Path
 
 import msgspec
 import pytest
@@ -32,6 +33,10 @@ def router(tmp_path_factory):
 async def robot(tmp_path, router):
     async with Robot(tmp_path, router) as running:
         yield running
+
+
+def threads_of(pid: int) -> list[int]:
+    return [int(thread.name) for thread in Path(f"/proc/{pid}/task").iterdir()]
 
 
 async def enabled(robot) -> None:
@@ -63,6 +68,13 @@ async def test_agent_localizes_refuses_a_wrong_key_and_drives_a_path(robot):
     assert 'fognav_robot_mode{mode="NORMAL"} 1.0' in text
     status, text = robot.agent.get("/readyz")
     assert (status, json.loads(text)["missing"]) == (200, [])
+    priority = next(event["priority"] for event in robot.agent.events if event["event"] == "started")
+    threads = threads_of(robot.agent.process.pid)
+    if priority == "SCHED_RR 5":
+        assert {os.sched_getscheduler(thread) for thread in threads} == {os.SCHED_RR}
+        assert {os.sched_getparam(thread).sched_priority for thread in threads} == {5}
+    else:
+        assert priority == "refused: grant CAP_SYS_NICE or an rtprio limit"
 
 
 async def test_wheels_stop_when_the_agent_is_killed_and_the_next_one_asks_for_an_enable(robot):
@@ -119,6 +131,22 @@ async def test_wheels_stop_when_the_agent_hangs_or_the_lidar_is_silent_and_conti
     await until(lambda: any(e["event"] == "lidar_problem" for e in robot.agent.events), "the silence is logged")
     robot.body.scanner.stalled = False
     await until(lambda: robot.body.moving, "it drives on")
+
+
+async def test_robot_that_its_computer_stops_again_and_again_drives_on_without_a_fault(robot):
+    await enabled(robot)
+    robot.fog.send_robot_to_the_corner()
+    for number in range(1, 4):
+        await until(lambda: robot.body.moving and robot.fog.state.mode == "NORMAL", "it drives")
+        robot.agent.process.send_signal(signal.SIGSTOP)
+        begun = time.monotonic()
+        assert robot.body.stopped_within(begun) < STOP_S
+        await until(lambda begun=begun: time.monotonic() - begun > 0.6, "the delay lasts")
+        robot.agent.process.send_signal(signal.SIGCONT)
+        await until(lambda count=number: robot.fog.state.loop.late_stops == count, "the stop is counted")
+    await until(lambda: robot.body.moving, "it drives on")
+    assert "FAULT" not in {state.mode for state in robot.fog.states}
+    assert any("this computer was" in reason for state in robot.fog.states for reason in state.reasons)
 
 
 async def test_a_bumper_needs_an_authenticated_reset_that_reaches_the_guardian(robot):

@@ -105,6 +105,21 @@ def test_guardian_is_woken_for_whole_frames_while_driving_and_by_the_agent_alone
     assert rig.base.stopped_within(time.monotonic()) < STOP_S
 
 
+def test_watchdog_tells_the_service_manager_that_it_lives(tmp_path):
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager, rigs.Base(tmp_path / "base") as base:
+        manager.bind(str(tmp_path / "manager"))
+        manager.settimeout(rigs.DEADLINE_S)
+        watchdog = rigs.Watchdog(tmp_path, base.link)
+        watchdog.environment["NOTIFY_SOCKET"] = str(tmp_path / "manager")
+        with watchdog:
+            assert manager.recv(4096) == b"READY=1"
+            wait_for(watchdog.guardian, "the guardian runs")
+            for _ in range(3):
+                assert manager.recv(4096).startswith(b"WATCHDOG=1\n")
+            started = next(line for line in watchdog.events if line["event"] == "started" and "priority" in line)
+            assert started["priority"] in {"SCHED_RR 15", "refused: grant CAP_SYS_NICE or an rtprio limit"}
+
+
 def children(pid: int) -> list[int]:
     return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 

@@ -191,6 +191,64 @@ def test_third_protective_stop_within_a_minute_is_a_fault():
     assert "3 protective stops" in out.reasons[0]
 
 
+LATE_STOPS = [
+    ({"base_age": 0.31}, "no message from the guardian for 0.3 s"),
+    (
+        {"base_stopped": "no fresh command from the agent"},
+        "the guardian holds the wheels: no fresh command from the agent",
+    ),
+    ({"lidar_age": 0.31}, "the lidar has been silent for 0.3 s"),
+    ({"scan_age": 0.46}, "no complete scan of the lidar for 0.5 s"),
+]
+
+
+@pytest.mark.parametrize(("cause", "words"), LATE_STOPS)
+def test_stops_that_only_a_late_computer_explains_are_no_fault_but_counted_and_told(cause, words):
+    gate = Gate().enabled()
+    for number in range(1, 6):
+        out = gate.run(DT, **cause, late_age=0.5, late_by=0.42)
+        assert (out.mode, out.stop, out.reasons) == (
+            "PROTECTIVE_STOP", "immediate", (f"{words}; this computer was 0.4 s late",)
+        )  # fmt: skip
+        assert gate.run(1.9).mode == "PROTECTIVE_STOP"
+        assert gate.run(0.3).mode == "NORMAL"
+        assert (gate.state.late_stops, gate.state.stops) == (number, ())
+
+
+@pytest.mark.parametrize("cause", [
+    {"identical_scans": 3}, {"guardian_lost": "closed"}, {"base_stopped": "the base is on its charger"},
+    {"lidar_age": 0.31, "identical_scans": 3},
+])  # fmt: skip
+def test_stop_for_another_cause_counts_however_late_the_computer_is(cause):
+    gate = Gate().enabled()
+    for _ in range(2):
+        assert gate.run(DT, **cause, late_age=0.0, late_by=0.42).mode == "PROTECTIVE_STOP"
+        assert gate.run(2.2).mode == "NORMAL"
+    assert gate.run(DT, **cause, late_age=0.0, late_by=0.42).mode == "FAULT"
+    assert gate.state.late_stops == 0
+
+
+def test_stop_that_outlasts_the_delay_which_explains_it_counts_once():
+    gate = Gate().enabled()
+    for number in (1, 2):
+        gate.run(DT, lidar_age=0.4, late_age=0.5, late_by=0.4)
+        assert gate.run(3.0, lidar_age=0.9, late_age=0.51).mode == "PROTECTIVE_STOP"
+        assert len(gate.state.stops) == number
+        assert gate.run(2.2).mode == "NORMAL"
+    gate.run(DT, lidar_age=0.4, late_age=0.5, late_by=0.4)
+    assert gate.run(DT, lidar_age=0.9, late_age=0.51).mode == "FAULT"
+
+
+def test_excused_stop_before_a_disable_excuses_and_counts_nothing_later():
+    gate = Gate().enabled()
+    gate.run(DT, lidar_age=0.4, late_age=0.1, late_by=0.4)
+    gate.run(DT, request="disable")
+    gate.run(2.2)
+    gate.run(DT, request="enable")
+    assert gate.run(DT, lidar_age=0.4).mode == "PROTECTIVE_STOP"
+    assert (len(gate.state.stops), gate.state.late_stops) == (1, 1)
+
+
 def test_protective_stops_half_a_minute_apart_are_no_fault():
     gate = Gate().enabled()
     for _ in range(4):

@@ -621,11 +621,15 @@ Mode = Literal["INIT", "NORMAL", "DEGRADED", "HOLD", "PROTECTIVE_STOP", "FAULT",
 
 
 class LoopHealth(Message, frozen=True, kw_only=True):
-    """How well the agent's loops keep their periods (seconds) since its start."""
+    """How well the agent's loops keep their periods (seconds) since its start.
+
+    `late_stops`: protective stops that a delay of its computer explains; they do not count towards a fault.
+    """
 
     control_p99_s: Finite = 0.0
     stream_p99_s: Finite = 0.0
     late: Count = 0
+    late_stops: Count = 0
 
 
 Charging = Literal["no", "reconditioning", "bulk", "trickle", "waiting", "fault"]

@@ -34,8 +34,13 @@ class Health:
     @property
     def ready(self) -> bool:
         """Whether every condition is met."""
+        return not self.missing
+
+    @property
+    def missing(self) -> list[str]:
+        """The names of the unmet conditions."""
         with self._lock:
-            return all(ok for ok, _ in self._conditions.values())
+            return [name for name, (ok, _) in self._conditions.items() if not ok]
 
     def report(self) -> dict[str, Any]:
         """Return readiness, the names of the unmet conditions, and every condition with its detail."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
+import msgspec
 import numpy as np
 
 from fog_contracts.messages import LoopHealth, RobotPose, RobotState
@@ -79,7 +80,7 @@ def robot_state(  # noqa: PLR0913  # a message gathers from all parts of the age
         planner_epoch=path.planner_epoch if path else None,
         goal_reached=mission.reached,
         goal_distance=mission.follower.remaining if mission.follower else None,
-        loop=loop,
+        loop=msgspec.structs.replace(loop, late_stops=safety.late_stops),
         traces=list(traces),
         stamp=at.stamp,
         epochs=epochs,

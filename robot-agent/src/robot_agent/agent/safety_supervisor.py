@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -25,10 +26,17 @@ class SafetySupervisor:
         self._config = config
         self.state = SafetyState()
         self.outputs = step(self.state, SafetyInputs(), 0.0, config)[1]
+        self._evaluated_at = math.inf
+        self._late_at, self._late_by = -math.inf, 0.0
 
     def evaluate(self, inputs: SafetyInputs, now: float, request: Request | None = None) -> SafetyOutputs:
-        """Step the gate at `now` (s, monotonic), with an operator's request if there is one."""
-        self.state, self.outputs = step(self.state, replace(inputs, request=request), now, self._config)
+        """Step the gate at `now` (s, monotonic): steadily, and with each operator's request."""
+        pause = now - self._evaluated_at
+        self._evaluated_at = now
+        if pause > self._config.late:
+            self._late_at, self._late_by = now, pause
+        inputs = replace(inputs, request=request, late_age=now - self._late_at, late_by=self._late_by)
+        self.state, self.outputs = step(self.state, inputs, now, self._config)
         return self.outputs
 
 

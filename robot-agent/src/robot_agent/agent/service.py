@@ -15,6 +15,7 @@ from fog_contracts.messages import CommandReply, LoopHealth, PlanReply, RobotCom
 from fog_runtime import logs, metrics
 from fog_runtime.clock import Phase, Ticker
 from fog_runtime.edges import Edges
+from fog_runtime.service_manager import ServiceManager
 from fog_runtime.suspension import SuspensionMonitor
 from robot_agent.agent.core import decide
 from robot_agent.agent.power_metrics import observe_power
@@ -76,6 +77,7 @@ class Service:
         self._last_feedback_at = -math.inf
         self._last_scan_at = -math.inf
         self._base_reason = "the guardian is not connected yet"
+        self._manager = ServiceManager()
 
     def _ticker(self, period: float) -> Ticker:
         return Ticker(self._clock, period, self.phase)
@@ -85,8 +87,11 @@ class Service:
     async def housekeeping_loop(self, lidar: LidarEdge) -> None:
         """Once a second: store the pose if it changed, and report the health; more often until the robot is ready."""
         due = -math.inf
+        self._manager.ready()
         async for now in self._ticker(PUBLISH_S):
             if now >= due:
+                missing = self._health.missing
+                self._manager.alive(f"waiting for {', '.join(missing)}" if missing else "ready")
                 due = now + HOUSEKEEPING_S - PUBLISH_S / 2
                 self._core.on_loop_health(self._loop_health())
                 await self._store_pose(now)

@@ -34,6 +34,8 @@ class Settings(CommonSettings, frozen=True, kw_only=True):
     `obstacle_memory_s`: how long (s) a reported obstacle counts while no lidar looks there again.
 
     `site_dir` is optional here: a robot without the site's folder needs `site`, and an initial pose or a global search.
+
+    `agent_realtime_priority`: of all its threads, below the guardian's; 0 for none. On a clock of another speed: none.
     """
 
     robot: Id
@@ -42,6 +44,7 @@ class Settings(CommonSettings, frozen=True, kw_only=True):
     seed: Annotated[int, Meta(ge=0)] = 0
     input_log: Path | None = None
     obstacle_memory_s: Annotated[float, Meta(gt=0.0, le=600.0)] = 600.0
+    agent_realtime_priority: Annotated[int, Meta(ge=0, le=9)] = 5
 
 
 def read_site(settings: Settings) -> tuple[str, RobotSite | None]:

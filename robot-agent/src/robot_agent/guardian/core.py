@@ -19,6 +19,7 @@ import msgspec
 from fog_contracts.messages import SENTENCE_MAX
 from robot_agent.guardian.link import WHEEL_SPEED_MAX_M_S, BaseFeedback, WheelCommand
 from robot_agent.guardian.revival import Attempt, Revival
+from robot_agent.hardware import NO_FRESH_COMMAND
 
 if TYPE_CHECKING:
     from robot_agent.hardware import BaseDriver, BaseReading, BaseStatus, WheelOdometry
@@ -285,7 +286,7 @@ class GuardianCore:
         elif self._charging(now):
             stopped = "the base is on its charger, where it does not drive: take it off first"
         elif self._command is None or now - self._command_at > COMMAND_FRESH_S:
-            stopped = "no fresh command from the agent"
+            stopped = NO_FRESH_COMMAND
         return BaseFeedback(
             seq=self._seq, status=reading.status, odometry=reading.odometry, fault=self._latched, stopped=stopped
         )

@@ -27,7 +27,7 @@ from fog_runtime.settings import SettingsError, load
 from robot_agent.device_signature import LISTEN_S, LineCheck
 from robot_agent.guardian.core import GuardianCore, Limits, Output
 from robot_agent.guardian.link import PACKET_LIMIT, WheelCommand, decode_command, encode
-from robot_agent.guardian.protection import lock_memory
+from robot_agent.guardian.protection import lock_memory, run_in_real_time
 from robot_agent.guardian.watchdog import BAD_SETTINGS, PORT_LOST
 from robot_agent.registry import make_base, signatures
 from robot_agent.serial_port import Port, PortLost
@@ -325,17 +325,6 @@ def _listen(path: str) -> socket.socket:
     return listener
 
 
-def set_realtime_priority(priority: int) -> str:
-    """Set a real-time priority, so that a busy machine can't delay a stop; return the result as text."""
-    if priority <= 0:
-        return "not requested"
-    try:
-        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(priority))
-    except PermissionError:
-        return "refused: grant CAP_SYS_NICE or an rtprio limit"
-    return f"SCHED_RR {priority}"
-
-
 def limits_of(motion: MotionSettings, axle_m: float) -> Limits:
     """Return the guardian's limits of a robot that may move so: a little above what its agent asks for.
 
@@ -363,7 +352,7 @@ def main() -> int:
     for number in signals.ENDING:
         signal.signal(number, guardian.end)
     signals.ignore_terminal_stops()
-    priority = set_realtime_priority(settings.realtime_priority)
+    priority = run_in_real_time(settings.realtime_priority)
     logs.get("guardian").info(
         "started", base=robot.settings.base.driver, port=settings.base_port, priority=priority, memory=lock_memory()
     )

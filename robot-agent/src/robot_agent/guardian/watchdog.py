@@ -22,7 +22,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from fog_runtime import parts, signals
 from fog_runtime.default_parts import DEFAULT_BASE
-from robot_agent.guardian.protection import lock_memory
+from fog_runtime.service_manager import ServiceManager
+from robot_agent.guardian.protection import lock_memory, run_in_real_time
 from robot_agent.port_names import PortNameError
 from robot_agent.serial_port import Port, PortLost, open_port, refuse_speed
 from robot_agent.stop_command import StopCommand
@@ -44,9 +45,14 @@ REPEAT_S: Final = 0.1
 RESTART_S: Final = 0.3
 REOPEN_S: Final = 1.0
 TERMINATE_S: Final = 1.0
+REALTIME_PRIORITY: Final = 15
+"""Above the guardian's 10 and the agent's 5: each must be able to act when the next one takes all the time."""
 
 STOPS: Final = "fognav.base_stops"
 """Entry points of the stop command of each base: plain bytes in a module separate from its driver."""
+
+
+MANAGER: Final = ServiceManager()
 
 
 class _Terminated(Exception):  # noqa: N818  # an end, not an error
@@ -120,6 +126,7 @@ def _monitor(
     """Return when the guardian has ended or hangs, with the reason; hold the wheels until its first heartbeat."""
     starts_until: float | None = time.monotonic() + STARTUP_S
     while True:
+        MANAGER.alive()
         if starts_until is None:
             timeout = silence_s
         else:
@@ -173,11 +180,12 @@ def _end(guardian: subprocess.Popen[bytes]) -> int:
 
 
 class Settings(NamedTuple):
-    """Settings from the environment: the base's port, its stop command, and the ratio of simulated to wall time."""
+    """Settings from the environment: the base's port, its stop command, simulated over wall time, and the priority."""
 
     path: str
     base: StopCommand
     speed: float
+    realtime_priority: int
 
 
 def _base() -> tuple[str, str, int | None]:
@@ -228,7 +236,9 @@ def read_settings() -> Settings:
         base = parts.load(STOPS, driver, StopCommand)
     except parts.PartError as error:
         raise BadSettings(f"base.driver: {error}") from error
-    return Settings(path, base if baud is None else base._replace(baud=baud), speed)
+    # The guardian validates its own priority: 0 asks for none, for both.
+    priority = 0 if os.environ.get("FOGNAV_REALTIME_PRIORITY") == "0" else REALTIME_PRIORITY
+    return Settings(path, base if baud is None else base._replace(baud=baud), speed, priority)
 
 
 def _guard(port: Port, settings: Settings) -> int:
@@ -271,6 +281,7 @@ def _guard_always(settings: Settings) -> int:
             if str(error) != last_logged:
                 last_logged = str(error)
                 log_event("port_lost", reason=last_logged)
+        MANAGER.alive(last_logged)
         time.sleep(REOPEN_S / settings.speed)
 
 
@@ -287,9 +298,10 @@ def main() -> int:
         _own_session()
         signals.ignore_terminal_stops()
         settings = read_settings()
-        log_event("started", memory=lock_memory())
+        log_event("started", priority=run_in_real_time(settings.realtime_priority), memory=lock_memory())
         for number in signals.ending():
             signal.signal(number, _terminate)
+        MANAGER.ready()
         return _guard_always(settings)
     except BadSettings as error:
         log_event("bad_settings", reason=str(error))

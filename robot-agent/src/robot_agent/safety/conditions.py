@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
+from robot_agent.hardware import NO_FRESH_COMMAND
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -36,9 +38,15 @@ class SafetyInputs:
     map_age: since the map copy was last confirmed to be the newest version. map_gap: for how long deltas have been
     missing, 0 when none are. plan_age: since the planner's last message about the goal. released_remaining: m of
     released path ahead. path_problem: why the path must not be driven. inside_blocked: the blocked area or zone that
+    <<<<<<< HEAD
     the robot is in. egress_remaining: m to the end of the way out of it, infinite while none is known. egress_problem:
     what keeps the robot from taking it. caution: a reason to drive slowly here. guardian_lost: why there is no link to
     the guardian. base_stopped: why the guardian keeps the wheels at zero.
+    =======
+    the robot is in. caution: a reason to drive slowly here. guardian_lost: why there is no link to the guardian.
+    base_stopped: why the guardian keeps the wheels at zero. late_age: since this computer last ran the agent too late,
+    by `late_by`.
+    >>>>>>> f450160 (Do not call a late computer a fault of the robot)
     """
 
     map_loaded: bool = False
@@ -64,23 +72,37 @@ class SafetyInputs:
     egress_remaining: float = math.inf
     egress_problem: str | None = None
     caution: str | None = None
+    late_age: float = math.inf
+    late_by: float = 0.0
     request: Request | None = None
 
 
 class Finding(NamedTuple):
     """One reason to restrict the robot: the level, the reason, and whether an operator must enable it again.
 
-    `about_map`: the plan that the robot has may rest on another map, and must be followed by a newer one.
+    `about_map`: the plan that the robot has may rest on another map, and must be followed by a newer one. `late`: the
+    delay of this computer explains it, so that it says nothing about the robot's devices.
     """
 
     level: Level
     reason: str
     operator: bool = False
     about_map: bool = False
+    late: bool = False
+
+
+def _never(_: SafetyInputs) -> bool:
+    return False
+
+
+def _always(_: SafetyInputs) -> bool:
+    return True
 
 
 class Condition(NamedTuple):
     """One row of the table; `holds` gets inputs and limits, `sentence` gets the inputs. The rest as in `Finding`.
+
+    `by_delay`: whether a computer that ran late explains it.
 
     An age that is no number fails every comparison with its limit, so it counts as too old.
     """
@@ -90,6 +112,7 @@ class Condition(NamedTuple):
     sentence: Callable[[SafetyInputs], str]
     operator: bool = False
     about_map: bool = False
+    by_delay: Callable[[SafetyInputs], bool] = _never
 
 
 def _seconds(age: float) -> str:
@@ -123,22 +146,26 @@ CONDITIONS: Final[tuple[Condition, ...]] = (
         Level.PROTECTIVE_STOP,
         lambda i, c: i.guardian_lost is None and not _guardian_heard(i, c),
         lambda i: f"no message from the guardian for {_seconds(i.base_age)}",
+        by_delay=_always,
     ),
     Condition(
         Level.PROTECTIVE_STOP,
         lambda i, c: _guardian_heard(i, c) and i.base_stopped is not None,
         lambda i: f"the guardian holds the wheels: {i.base_stopped}",
+        by_delay=lambda i: i.base_stopped == NO_FRESH_COMMAND,
     ),
     # --- lidar ---
     Condition(
         Level.PROTECTIVE_STOP,
         lambda i, c: not i.lidar_age <= c.lidar_lost,
         lambda i: f"the lidar has been silent for {_seconds(i.lidar_age)}",
+        by_delay=_always,
     ),
     Condition(
         Level.PROTECTIVE_STOP,
         lambda i, c: not i.scan_age <= c.scan_lost,
         lambda i: f"no complete scan of the lidar for {_seconds(i.scan_age)}",
+        by_delay=_always,
     ),
     Condition(
         Level.PROTECTIVE_STOP,
@@ -203,8 +230,10 @@ CONDITIONS: Final[tuple[Condition, ...]] = (
 
 def collect_findings(inputs: SafetyInputs, config: SafetyConfig) -> list[Finding]:
     """Return every finding that restricts the robot, in the table's order."""
-    return [
-        Finding(condition.level, condition.sentence(inputs), condition.operator, condition.about_map)
-        for condition in CONDITIONS
-        if condition.holds(inputs, config)
-    ]
+    return [_finding(condition, inputs, config) for condition in CONDITIONS if condition.holds(inputs, config)]
+
+
+def _finding(condition: Condition, inputs: SafetyInputs, config: SafetyConfig) -> Finding:
+    late = inputs.late_age <= config.late_explains and condition.by_delay(inputs)
+    cause = f"; this computer was {inputs.late_by:.1f} s late" if late else ""
+    return Finding(condition.level, condition.sentence(inputs) + cause, condition.operator, condition.about_map, late)

@@ -46,6 +46,11 @@ class SafetyState:
     """When the map was last a reason to hold: a path must be newer than that."""
     stopped_since: float = math.inf
     stops: tuple[float, ...] = ()
+    """When protective stops began that count towards a fault."""
+    late_stops: int = 0
+    """Number of protective stops that a delay of the robot's computer explains: they count towards nothing."""
+    excused: bool = False
+    """Whether the last protective stop is one of these, so far."""
     latched: tuple[Finding, ...] = ()
     """Findings that stay until an operator acts: faults until a reset, the others until an enable."""
     reasons: tuple[str, ...] = field(default=("just started",))
@@ -203,9 +208,8 @@ def _advance(
     if needing and not any(finding.level >= Level.PROTECTIVE_STOP for finding in latched):
         latched = (*latched, *needing)
 
-    stops = tuple(stop for stop in state.stops if now - stop < config.stops_within)
-    if demanded >= Level.PROTECTIVE_STOP and state.mode not in {"INIT", "PROTECTIVE_STOP", "FAULT"}:
-        stops = (*stops, now)
+    state = _count_stop(state, findings, demanded, now, config)
+    stops = state.stops
     faults = tuple(finding for finding in findings if finding.level == Level.FAULT)
     if not faults and len(stops) >= config.stops_to_fault:
         causes = "; ".join(finding.reason for finding in findings if finding.level == Level.PROTECTIVE_STOP)
@@ -247,6 +251,20 @@ def _advance(
         stopped_since=stopped_since,
         last_reasons=worst if demanded >= level and worst else state.last_reasons,
     )
+
+
+def _count_stop(
+    state: SafetyState, findings: list[Finding], demanded: Level, now: float, config: SafetyConfig
+) -> SafetyState:
+    """Count a protective stop when it begins; one that a delay explains, as soon as it outlasts the explanation."""
+    stops = tuple(stop for stop in state.stops if now - stop < config.stops_within)
+    begins = state.mode not in {"INIT", "PROTECTIVE_STOP", "FAULT"}
+    goes_on = state.excused and state.mode == "PROTECTIVE_STOP"
+    if demanded < Level.PROTECTIVE_STOP or not (begins or goes_on):
+        return replace(state, stops=stops)
+    if all(finding.late for finding in findings if finding.level >= Level.PROTECTIVE_STOP):
+        return replace(state, stops=stops, late_stops=state.late_stops + begins, excused=True)
+    return replace(state, stops=(*stops, now), excused=False)
 
 
 def _is_recent(level: Level, last_demanded: float, now: float, config: SafetyConfig) -> bool:

@@ -389,13 +389,34 @@ def test_robot_must_be_named_where_there_are_several(service: Service) -> None:
 
 
 @pytest.mark.parametrize("command", ["disable", "stop"])
-def test_stop_needs_no_key(demo: Service, command: str) -> None:
-    assert "the zenoh router tcp/127.0.0.1:1 can't be reached" in run("robot", command, code=1)
+def test_stop_needs_neither_key_nor_token_and_takes_the_way_that_works(service: Service, runtime, command) -> None:
+    with Registration(lambda: system("demo-1", service.url)) as registration:
+        registration.update()
+        output = run("robot", command, code=1)
+        assert "the zenoh router tcp/127.0.0.1:1 can't be reached" in output
+        assert "the planner refused it" in output
+        answer = {"accepted": True, "reason": "disabled", "mode": "NORMAL"}
+        service.answers["POST", "/api/v1/robots/r1/stop"] = (200, answer)
+        assert run("robot", command).startswith("accepted: disabled")
+
+
+def test_commands_go_through_the_planner_for_who_has_a_token_and_no_key(demo: Service) -> None:
+    path = "/api/v1/robots/r1/commands"
+    demo.answers["POST", path] = (200, {"accepted": True, "reason": "enabled; the mode is NORMAL", "mode": "INIT"})
+    demo.answers["GET", "/api/v1/robots/r1"] = (200, {"state": {"mode": "NORMAL"}})
+    done = json.loads(run("robot", "enable", "--json"))
+    assert (done["accepted"], done["reason"], done["mode"]) == (True, "enabled; the mode is NORMAL", "NORMAL")
+    demo.answers["POST", path] = (409, {"detail": "there is no fault to reset", "mode": "INIT"})
+    assert run("robot", "reset", code=1) == "refused: there is no fault to reset (mode INIT)"
+    demo.answers["POST", path] = (403, {"detail": "this request needs the role operator"})
+    assert "needs the role operator" in run("robot", "egress", code=1)
+    assert "needs the role operator" in run("robot", "pose", "1,2,0", code=1)
 
 
 @pytest.mark.parametrize("command", ["enable", "reset"])
 def test_signed_command_needs_a_key_and_a_router(demo: Service, tmp_path, monkeypatch, command: str) -> None:
-    assert "set FOGNAV_OPERATOR_KEY_FILE to the site's operator.key" in run("robot", command, code=2)
+    (tmp_path / "token").unlink()
+    assert "the token file" in run("robot", command, code=2)
     monkeypatch.setenv("FOGNAV_OPERATOR_KEY_FILE", str(tmp_path / "key"))
     (tmp_path / "key").write_text("aa")
     assert "is only 1 bytes long" in run("robot", command, code=2)

@@ -197,6 +197,9 @@ class MemoryStore:
         self.writes.append(args)
         return "ok"
 
+    async def record_command(self, *args: Any) -> None:
+        self.writes.append(args)
+
     # The agent's store is a folder.
     def snapshot(self, _site: str) -> None:
         return None

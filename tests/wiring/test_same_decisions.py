@@ -50,6 +50,7 @@ from hazard_aggregator.registry import find_rule
 from map_service.core import MapCore
 from map_service.registry import make_layers
 from planner.core import PlannerCore
+from planner.robot_commands import CommandError
 from robot_agent.agent import input_log as log
 from robot_agent.agent.core import AgentCore
 
@@ -301,6 +302,8 @@ async def drive_live(recorded: Run) -> tuple[Run, Any]:
             run.replies.append(await live.run(live.query(ch.PLANNER_PLAN, PLAN, PlanReply)))
             run.replies.append(await live.run(live.query(ch.PLANNER_EGRESS, EGRESS, PlanReply)))
             run.replies.append(await live.run(live.query(ch.ZONES, None, ZoneSet)))
+            with pytest.raises(CommandError, match="did not answer"):
+                await live.run(live.planner.operator.send("disable", OTHER_ROBOT, "tester"))
         await live.run_until_idle()
     run.wheels = live.link.sent
     await live.stop()

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import math
 import sys
 import time
 from collections.abc import Mapping
@@ -11,8 +12,9 @@ import msgspec
 import typer
 
 from fog_contracts.commands import STOPS
-from fog_contracts.messages import CommandKind, Pose, RobotPose, RobotState
+from fog_contracts.messages import CommandKind, Pose
 from fog_runtime import logs
+from fognav.operate import rest_commands
 from fognav.operate.fog import Fog, RefusedError, find_fog
 from fognav.operate.options import NUMBERS, FogOption, JsonOption, RobotOption, numbers
 from fognav.operate.outcome import Outcome
@@ -61,7 +63,7 @@ def robot_stop(*, robot: RobotOption = None, fog: FogOption = None, json: JsonOp
     with exit_codes():
         found = find_fog(fog)
         chosen = found.robot(robot)
-        outcome = asyncio.run(_command(found, chosen, "disable"))
+        outcome = _send(found, chosen, "disable")
         # The robot comes first: it stops whether or not the planner answers.
         reason = f"{outcome.reason}; {_end_mission(found, chosen)}"
         _report(msgspec.structs.replace(outcome, reason=reason), json=json)
@@ -82,7 +84,7 @@ def robot_pose(pose: Start, *, robot: RobotOption = None, fog: FogOption = None,
             raise WrongUseError(f"place {pose} has no heading: give {place['x']},{place['y']},THETA")
         else:
             x, y, theta = place["x"], place["y"], place["theta"]
-        outcome = asyncio.run(_command(found, found.robot(robot), "initial_pose", Pose(x=x, y=y, theta=theta)))
+        outcome = _send(found, found.robot(robot), "initial_pose", Pose(x=x, y=y, theta=theta))
         _report(outcome, json=json)
 
 
@@ -116,7 +118,7 @@ def robot_cancel(*, robot: RobotOption = None, fog: FogOption = None, json: Json
             _report(Outcome(accepted=False, reason=str(error), mode=_view(found, chosen)[1]), json=json)
         except FailedError as error:
             # Without the planner the robot can drop its goal itself, until the planner is back.
-            outcome = asyncio.run(_command(found, chosen, "cancel"))
+            outcome = _send(found, chosen, "cancel")
             _report(msgspec.structs.replace(outcome, reason=f"{outcome.reason}; {error}"), json=json)
         _report(
             Outcome(accepted=True, reason=f"the mission of robot {chosen} is ended", mode=_view(found, chosen)[1]),
@@ -154,13 +156,35 @@ def robot_watch(
     """
     with exit_codes(), contextlib.suppress(KeyboardInterrupt):
         found = find_fog(fog)
-        asyncio.run(_watch(found, found.robot(robot), seconds, json=json))
+        chosen = found.robot(robot)
+        if found.commands_by_rest:
+            _watch_by_rest(found, chosen, seconds, json=json)
+        else:
+            asyncio.run(_watch(found, chosen, seconds, json=json))
 
 
 def _run_command(kind: CommandKind, robot: str | None, fog: str | None, *, json: bool) -> None:
     with exit_codes():
         found = find_fog(fog)
-        _report(asyncio.run(_command(found, found.robot(robot), kind)), json=json)
+        _report(_send(found, found.robot(robot), kind), json=json)
+
+
+def _send(fog: Fog, robot: str, kind: CommandKind, pose: Pose | None = None) -> Outcome:
+    """Command a robot: by a command signed here, or through the planner, which signs it for who has a token.
+
+    A stop takes the other way where the first one fails. Raises `FailedError`, `WrongUseError`.
+    """
+    if fog.commands_by_rest and kind not in STOPS:
+        return rest_commands.command(fog, robot, kind, pose)
+    try:
+        return asyncio.run(_command(fog, robot, kind, pose))
+    except FailedError as error:
+        if kind != "disable":
+            raise
+        try:
+            return rest_commands.stop(fog, robot)
+        except FailedError as other:
+            raise FailedError(f"{error}; {other}") from other
 
 
 async def _command(fog: Fog, robot: str, kind: CommandKind, pose: Pose | None = None) -> Outcome:
@@ -229,11 +253,18 @@ async def _watch(fog: Fog, robot: str, seconds: float, *, json: bool) -> None:
             state = await connected.next_state()
             if state is None:
                 raise FailedError(f"robot {robot} publishes no state: check that its agent runs and is connected")
-            _print_state(robot, state, connected.pose, json=json)
+            _print_state(robot, msgspec.to_builtins(state), msgspec.to_builtins(connected.pose), json=json)
 
 
-def _print_state(robot: str, state_message: RobotState, pose_message: RobotPose | None, *, json: bool) -> None:
-    state, pose = msgspec.to_builtins(state_message), msgspec.to_builtins(pose_message)
+def _watch_by_rest(fog: Fog, robot: str, seconds: float, *, json: bool) -> None:
+    ends = time.monotonic() + seconds if seconds else math.inf
+    for view in rest_commands.states(fog, robot):
+        _print_state(robot, view["state"], view["pose"], json=json)
+        if time.monotonic() >= ends:
+            return
+
+
+def _print_state(robot: str, state: Mapping[str, Any], pose: Mapping[str, Any] | None, *, json: bool) -> None:
     if json:
         sys.stdout.write(msgspec.json.encode(envelope({"robot": robot, **state, "pose": pose})).decode() + "\n")
         sys.stdout.flush()

@@ -8,22 +8,26 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 
 import httpx
+import msgspec
 import numpy as np
 import programs
 import pytest
 
 from fog_contracts import channels as ch
+from fog_contracts.commands import CommandGate
 from fog_contracts.costs import DEFAULT_INFLATION
 from fog_contracts.grid import GridGeometry, Window
 from fog_contracts.messages import (
     AreaHazard,
     Cause,
+    CommandReply,
     EgressRequest,
     HazardArea,
     MapSnapshot,
     PlanReply,
     PlanRequest,
     Pose,
+    RobotCommand,
     RobotGoal,
     RobotPath,
     RobotPose,
@@ -34,6 +38,7 @@ from fog_contracts.replica import MasterMap
 from fog_kernels.inflation import inflate, inflation_table
 from fog_runtime.clock import SystemClock, ticker
 from fog_runtime.http import token_hash
+from fog_runtime.redis_connection import RedisConnection
 from fog_runtime.zenoh_edge import ZenohEdge
 from fog_supervisor.servers import Server, start_redis, start_router
 
@@ -93,7 +98,16 @@ def write_site(folder: Path) -> None:
 class Environment:
     """The planner's environment: servers, a map-service and a robot."""
 
-    def __init__(self, folder: Path, router: Server, redis: Server, edge: ZenohEdge, clock: SystemClock) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        router: Server,
+        redis: Server,
+        edge: ZenohEdge,
+        clock: SystemClock,
+        further: dict[str, str] | None = None,
+    ) -> None:
+        self.further = further or {}
         self.folder, self.router, self.redis, self.edge, self.clock = folder, router, redis, edge, clock
         self.geometry = GridGeometry(200, 120, 0.1, 0.0, 0.0)
         self.static = static_map()
@@ -116,6 +130,7 @@ class Environment:
             "FOGNAV_ZENOH_CONNECT": self.router.endpoint,
             "FOGNAV_PORT_FILE": str(port_file),
             "FOGNAV_TOKENS_FILE": str(self.folder / "tokens.toml"),
+            **self.further,
         }
         self.process = programs.start("planner", environ, self.folder / "planner.log")
 
@@ -173,12 +188,12 @@ class Environment:
 
 
 @asynccontextmanager
-async def running_planner(folder: Path) -> AsyncIterator[Environment]:
+async def running_planner(folder: Path, **further: str) -> AsyncIterator[Environment]:
     write_site(folder / "site")
     clock = SystemClock()
     with start_router(folder / "router") as router, start_redis(folder / "redis") as redis:
         async with ZenohEdge.open(connect=[router.endpoint], clock=clock, role="test", id="test", site="test") as edge:
-            env = Environment(folder / "site", router, redis, edge, clock)
+            env = Environment(folder / "site", router, redis, edge, clock, further)
             env.start()
             publishing = asyncio.create_task(env.publish_heartbeats_and_poses())
             try:
@@ -188,6 +203,45 @@ async def running_planner(folder: Path) -> AsyncIterator[Environment]:
                 await asyncio.gather(publishing, return_exceptions=True)
                 if env.process and env.process.poll() is None:
                     env.stop(kill=True)
+
+
+async def test_operator_without_a_key_enables_a_robot_through_the_planner_and_the_trail_names_them(
+    tmp_path: Path,
+) -> None:
+    key = tmp_path / "operator.key"
+    key.write_text("ab" * 32)
+    gate = CommandGate("r1", bytes.fromhex("ab" * 32), "run-1")
+
+    async with running_planner(tmp_path, FOGNAV_OPERATOR_KEY_FILE=str(key)) as env:
+
+        def answer(_ids: object, command: RobotCommand) -> CommandReply:
+            refusal = gate.refusal(command, env.clock.now())
+            return CommandReply(accepted=refusal is None, reason=refusal or f"{command.operator} may {command.kind}")
+
+        env.edge.serve(ch.ROBOT_COMMAND, answer, robot="r1")
+        state = RobotState(
+            mode="INIT", reasons=[], enabled=False, battery=None, goal_id=None, map_epoch=5, map_seq=0, plan_id=None,
+            boot="run-1",
+        )  # fmt: skip
+        async with env.ready() as client:
+            deadline = time.monotonic() + DEADLINE_S
+            while True:
+                env.edge.publish(ch.ROBOT_STATE, msgspec.structs.replace(state, clock=env.clock.now()), robot="r1")
+                done = await client.post("/api/v1/robots/r1/commands", json={"kind": "enable"}, headers=OPERATOR)
+                if done.status_code == 200:
+                    break
+                assert time.monotonic() < deadline, done.text
+                await asyncio.sleep(0.1)
+            assert done.json()["reason"] == "operator may enable"
+            stopped = await client.post("/api/v1/robots/r1/stop")
+            assert stopped.json()["reason"] == "stop from 127.0.0.1 may disable"
+        redis = RedisConnection(env.redis.url)
+        trail = await redis.read("XRANGE", "fog:test:audit:robot", "-", "+")
+        await redis.aclose()
+        entries = [fields for _, fields in trail]
+        assert [(e[b"who"], e[b"action"], e[b"id"]) for e in entries[-2:]] == [
+            (b"operator", b"enable", b"r1"), (b"stop from 127.0.0.1", b"disable", b"r1"),
+        ]  # fmt: skip
 
 
 def via(path: RobotPath) -> str:

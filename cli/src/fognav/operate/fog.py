@@ -27,11 +27,17 @@ _GIVE_TOKEN: Final = f"Set {TOKEN} to an operator's token, or {TOKEN_FILE} to a 
 
 
 class RefusedError(FailedError):
-    """A service refused a request; `status` is that of its problem document."""
+    """A service refused a request; `status` and `reason` are those of its problem document."""
 
-    def __init__(self, message: str, status: int) -> None:
+    def __init__(self, message: str, status: int, problem: object = None) -> None:
         super().__init__(message)
         self.status = status
+        self.problem: Mapping[str, Any] = problem if isinstance(problem, dict) else {}
+
+    @property
+    def reason(self) -> str:
+        """The service's own words."""
+        return str(self.problem.get("detail") or self)
 
 
 @dataclass(frozen=True)
@@ -58,13 +64,19 @@ class Fog:
         except (OSError, UnicodeDecodeError) as error:
             raise WrongUseError(f"the token file {file} can't be read: {error}. {_GIVE_TOKEN}") from error
 
+    @property
+    def commands_by_rest(self) -> bool:
+        """Whether commands to robots go through the planner: the caller has a token, and not the operators' key."""
+        return not (os.environ.get(KEY_FILE) or self.system.key_file) and self.token is not None
+
     @cached_property
     def operator_key(self) -> bytes:
         """The key that signs commands to robots; raises `WrongUseError` without one."""
         file = os.environ.get(KEY_FILE) or self.system.key_file
         if file is None:
             raise WrongUseError(
-                f"commands to the robots of {self.system.name} are signed: set {KEY_FILE} to the site's operator.key"
+                f"commands to the robots of {self.system.name} are signed: set {KEY_FILE} to the site's operator.key, "
+                f"or let the planner sign them. {_GIVE_TOKEN}"
             )
         try:
             return read_operator_key(Path(file))
@@ -111,7 +123,7 @@ class Fog:
             ) from error
         if response.status >= http.client.BAD_REQUEST:
             remedy = f". {_GIVE_TOKEN}" if response.status == http.client.UNAUTHORIZED else ""
-            raise RefusedError(f"the {service} refused it: {response.reason}{remedy}", response.status)
+            raise RefusedError(f"the {service} refused it: {response.reason}{remedy}", response.status, response.body)
         return response.body
 
 

@@ -239,7 +239,7 @@ ROBOT_STATE       = _pub(  "robot_state",       FOG + "robots/{robot}/state",   
 ROBOT_OBSTACLES   = _pub(  "robot_obstacles",   FOG + "robots/{robot}/obstacles", m.RobotObstacles, limit=64 * KIB,
     publishers=(ROBOT,),   subscribers=(MAP, CONSOLE),     durability=VOLATILE, rate_hz=1)
 ROBOT_COMMAND     = _query("robot_command",     FOG + "robots/{robot}/command",   m.RobotCommand,   limit=KIB,
-    publishers=(ROBOT,),   subscribers=(CONSOLE,),         reply=m.CommandReply, reply_limit=2 * KIB)
+    publishers=(ROBOT,),   subscribers=(PLANNER, CONSOLE), reply=m.CommandReply, reply_limit=2 * KIB)
 LEADER            = _pub(  "leader",            FOG + "leaders/{role}", m.Leader, limit=KIB,
     publishers=(AGGREGATOR, MAP, PLANNER), subscribers=(AGGREGATOR, MAP, PLANNER), durability=VOLATILE, rate_hz=4,
     max_age_s=1.5)

@@ -18,8 +18,11 @@ if TYPE_CHECKING:
 
     from fog_runtime.redis_connection import RedisConnection
 
-KINDS: Final = ("area", "mission", "override", "store", "zone")
-"""The kinds of records that have an audit trail; `store`: what an administrator decided after a loss."""
+KINDS: Final = ("area", "mission", "override", "robot", "store", "zone")
+"""The kinds of records that have an audit trail.
+
+`store`: what an administrator decided after a loss; `robot`: operators' commands to robots.
+"""
 
 _CURSOR: Final = re.compile(r"([0-9]{1,16})-([0-9]{1,16})\.([a-z]+)")
 

@@ -249,6 +249,13 @@ class RedisStore:
         self._floors[table.name] = max(int(details or b"0"), self._floor(table.name))
         return cast("Outcome", outcome)
 
+    async def _record(self, subject: str, name: str, after: bytes, audit: Audit) -> None:
+        """Add an entry of a kind (`KINDS`) to the audit trail, of something that is not stored; `after` is JSON."""
+        entry = {"at": f"{audit.at:.3f}", "who": audit.who, "action": audit.action, "id": name, "before": ""}
+        fields = [text for pair in entry.items() for text in pair]
+        trail = (self._key(f"audit:{subject}"), "MAXLEN", "~", store_scripts.AUDIT_ENTRIES, "*")
+        await self._redis.write(("XADD", *trail, *fields, "after", after))
+
     def _floor(self, table: str) -> int:
         """Return the highest version that a deleted record of the table had: versions are never used again."""
         return self._floors.get(table, 0)

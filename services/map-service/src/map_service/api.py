@@ -64,7 +64,7 @@ from map_service.store import StoreError
 from map_service.zone_validation import ZoneError
 from map_service.zone_writer import ConflictError
 
-AuditKind = Literal["area", "mission", "override", "store", "zone"]
+AuditKind = Literal["area", "mission", "override", "robot", "store", "zone"]
 
 
 def _page_size(

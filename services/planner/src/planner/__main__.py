@@ -19,7 +19,7 @@ from planner.api import make_api
 from planner.config import PlannerConfig
 from planner.core import PlannerCore
 from planner.service import Service
-from planner.settings import Settings
+from planner.settings import Settings, read_key
 from planner.store import Store
 
 _log = logs.get("planner")
@@ -36,6 +36,7 @@ async def main() -> None:
     clock = SystemClock(settings.speed)
     health = Health("store", "goals", "map", "zenoh")
     tokens = load_tokens(settings.tokens_file)
+    key = read_key(settings.operator_key_file)
     front = Front.fork(lambda: make_api(unused(), loaded.site, health, tokens), settings.http_host, settings.http_port)
     config = PlannerConfig(inflation=settings.inflation, release_length=settings.release_m)
     async with (
@@ -47,7 +48,7 @@ async def main() -> None:
         leadership = Leadership(
             "planner", keeper, zenoh, health, connected=lambda: zenoh.connected, epochs=lambda: core.fence.epochs
         )
-        service = Service(core, store, zenoh, clock, health, leadership)
+        service = Service(core, store, zenoh, clock, health, leadership, key=key)
         service.subscribe()
         leadership.subscribe()
         zenoh.declare_liveliness("planner", site)

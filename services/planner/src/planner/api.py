@@ -8,6 +8,7 @@ from fog_contracts.messages import (
     Id,
     Message,
     Metres,
+    Mode,
     PlanReply,
     PlanRequest,
     Pose,
@@ -35,7 +36,9 @@ from fog_runtime.http import (
     make_app,
 )
 from fog_runtime.idempotency import IdempotencyError
+from planner.command_api import add_commands
 from planner.query_queue import BusyError
+from planner.robot_commands import CommandError
 from planner.service import Service
 from planner.store import StoredGoal, StoreError
 
@@ -130,6 +133,11 @@ class _Robots:
         if robot not in known:
             raise ProblemError(404, f"there is no robot {robot}; known robots: {', '.join(known) or 'none'}")
 
+    def mode(self, robot: str) -> Mode | None:
+        """Return a robot's mode, None without a state."""
+        state = self._service.states.get(robot)
+        return None if state is None else state.mode
+
     def view(self, robot: str) -> RobotView:
         """Return a known robot with pose, state, mission and plan."""
         service = self._service
@@ -163,6 +171,7 @@ def make_api(service: Service, site: Site, health: Health, tokens: Tokens, stand
     robots = _Robots(service, site)
     routes = Routes(app, "robots")
     add_store_errors(routes)
+    add_commands(routes, service.operator, site, check=robots.check, mode=robots.mode)
     _add_views(routes, service, robots)
     _add_orders(routes, service, robots, site)
     _add_plan(Routes(app, "plan"), service)
@@ -179,6 +188,17 @@ def _add_views(routes: Routes, service: Service, robots: _Robots) -> None:
     async def list_robots(_caller: Viewer) -> list[RobotView]:
         """List all robots with pose, state, mission and plan."""
         return [robots.view(robot) for robot in robots.ids()]
+
+    @routes.get("/api/v1/robots/{robot}", raises=[CommandError], problems={404: "No robot has this id"})
+    async def get_robot(robot: str, _caller: Viewer, after: float | None = None) -> RobotView:
+        """Return a robot with pose, state, mission and plan.
+
+        With `after`, the `clock` of a state that was read before, only when the robot has another one: to watch it.
+        """
+        robots.check(robot)
+        if after is not None:
+            await service.operator.next_state(robot, after)
+        return robots.view(robot)
 
     @routes.get("/api/v1/robots/{robot}/goal", problems={404: "No robot has this id, or it has no mission"})
     async def get_goal(robot: str, _caller: Viewer) -> GoalView:

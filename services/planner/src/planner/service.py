@@ -25,6 +25,7 @@ from planner.map_keeper import MapKeeper
 from planner.mission_keeper import MissionKeeper
 from planner.query_queue import BusyError, QueryQueue
 from planner.refusals import busy
+from planner.robot_commands import RobotOperator
 from planner.threads import Threads
 
 if TYPE_CHECKING:
@@ -65,7 +66,7 @@ _log = logs.get("planner")
 class Service:
     """The running planner; its loops are tasks of the process."""
 
-    def __init__(
+    def __init__(  # noqa: PLR0913  # the process's parts
         self,
         core: PlannerCore,
         store: Store,
@@ -73,8 +74,10 @@ class Service:
         clock: Clock,
         health: Health,
         gate: Gate | None = None,
+        *,
+        key: bytes | None = None,
     ) -> None:
-        """Prepare; `gate` decides whether this process leads or stands by."""
+        """Prepare; `gate` decides whether this process leads or stands by, `key` signs commands to robots."""
         self._core = core
         self._zenoh = zenoh
         self._gate = gate
@@ -87,6 +90,7 @@ class Service:
         self._cycle = Cycle(core, zenoh)
         self._missions = MissionKeeper(core, store, clock, health, self._change_goal)
         self._map = MapKeeper(core, zenoh, clock, health, self._queue, on_loaded=self._wake.set)
+        self.operator = RobotOperator(zenoh, store, clock, key)
         self._jobs: set[asyncio.Task[None]] = set()
         self._exported_counts: dict[tuple[int, object], int] = {}
         self.poses: dict[str, RobotPose] = {}
@@ -164,6 +168,7 @@ class Service:
                 self.poses[ids["robot"]] = message
             elif isinstance(message, RobotState):
                 self.states[ids["robot"]] = message
+                self.operator.on_state(ids["robot"], message, at.now)
             self._cycle.queue_message(channel, handler, ids, message, at)
             if channel in self._core.URGENT:
                 self._wake.set()

@@ -1,6 +1,9 @@
 """The settings of the planner (environment FOGNAV_*), on top of those of every process."""
 
-from fog_runtime.settings import InflationSettings
+from pathlib import Path
+
+from fog_runtime.operator_key import OperatorKeyError, read_operator_key
+from fog_runtime.settings import InflationSettings, SettingsError
 
 
 class Settings(InflationSettings, frozen=True, kw_only=True):
@@ -10,3 +13,16 @@ class Settings(InflationSettings, frozen=True, kw_only=True):
     """
 
     release_m: float = 15.0
+
+
+def read_key(file: Path | None) -> bytes | None:
+    """Return the key that signs commands to robots, None without a file; raises `SettingsError` for an unusable one.
+
+    Without it the planner can stop robots, but not enable them.
+    """
+    if file is None:
+        return None
+    try:
+        return read_operator_key(file)
+    except OperatorKeyError as error:
+        raise SettingsError(str(error)) from error

@@ -44,6 +44,10 @@ class Store(RedisStore):
         """Delete a mission durably if it is still this one: a newer one stays."""
         await self._swap(_GOALS, robot, None, goal_id, audit)
 
+    async def record_command(self, robot: str, command: bytes, audit: Audit) -> None:
+        """Record an operator's command to a robot (JSON) in the audit trail."""
+        await self._record("robot", robot, command, audit)
+
     async def earlier_result(self, attempt: Attempt | None) -> StoredGoal | None:
         """Return the mission that an earlier attempt with the same idempotency key stored."""
         return await self.recall(attempt, StoredGoal)

@@ -1,0 +1,50 @@
+"""Commands to a robot through the planner's REST API, for who has a token and not the operators' key."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import msgspec
+
+from fog_contracts.messages import CommandKind, Pose
+from fognav.operate.fog import Fog, RefusedError
+from fognav.operate.outcome import Outcome
+from fognav.operate.systems import PLANNER
+
+
+def command(fog: Fog, robot: str, kind: CommandKind, pose: Pose | None = None) -> Outcome:
+    """Let the planner sign and send a command; raises `FailedError` when it can't, or has no reply."""
+    given = {} if pose is None else {"pose": msgspec.to_builtins(pose)}
+    return _outcome(fog, robot, f"/api/v1/robots/{robot}/commands", {"kind": kind, **given})
+
+
+def stop(fog: Fog, robot: str) -> Outcome:
+    """Stop a robot through the planner, which needs no token; raises `FailedError`."""
+    return _outcome(fog, robot, f"/api/v1/robots/{robot}/stop", None)
+
+
+def states(fog: Fog, robot: str) -> Iterator[Mapping[str, Any]]:
+    """Yield the planner's view of a robot, now and whenever its state changes; raises `FailedError`."""
+    path = f"/api/v1/robots/{robot}"
+    view: Mapping[str, Any] = fog.get(PLANNER, path)
+    while True:
+        state = view["state"]
+        if state is not None:
+            yield view
+        view = fog.get(PLANNER, f"{path}?after={state['clock'] if state is not None else 0.0}")
+
+
+def _outcome(fog: Fog, robot: str, path: str, body: object) -> Outcome:
+    try:
+        answer = fog.send("POST", PLANNER, path, body)
+    except RefusedError as error:
+        if error.status != 409:
+            raise
+        return Outcome(accepted=False, reason=error.reason, mode=error.problem.get("mode"))
+    return Outcome(accepted=True, reason=answer["reason"], mode=_mode(fog, robot) or answer["mode"])
+
+
+def _mode(fog: Fog, robot: str) -> Any:  # noqa: ANN401  # a mode, or None without a token that may read it
+    if fog.token is None:
+        return None
+    state = fog.get(PLANNER, f"/api/v1/robots/{robot}")["state"]
+    return state and state["mode"]

@@ -1,0 +1,92 @@
+"""REST under /api/v1/robots/ID: an operator's commands to a robot."""
+
+from collections.abc import Callable
+
+from fog_contracts.messages import CommandKind, Id, Message, Metres, Mode, Pose, Radians
+from fog_contracts.site import Site
+from fog_runtime.http import Body, ClientHost, Operator, ProblemError, Routes
+from planner.robot_commands import CommandError, RobotOperator
+from planner.store import StoreError
+
+
+class StartPose(Message, frozen=True, kw_only=True):
+    """Where a robot stands: m and rad, frame `map`."""
+
+    x: Metres
+    y: Metres
+    theta: Radians
+
+
+class CommandBody(Message, frozen=True, kw_only=True):
+    """A command; `initial_pose` comes with a pose, or with the id of a place that has a heading."""
+
+    kind: CommandKind
+    pose: StartPose | None = None
+    place: Id | None = None
+
+
+class CommandOutcome(Message, frozen=True, kw_only=True):
+    """An accepted command: what the robot says of it, and the robot's mode before it."""
+
+    accepted: bool
+    reason: str
+    mode: Mode | None
+
+
+def add_commands(
+    routes: Routes,
+    operator: RobotOperator,
+    site: Site,
+    *,
+    check: Callable[[str], None],
+    mode: Callable[[str], Mode | None],
+) -> None:
+    """Add the routes; `check` raises a `ProblemError` for an unknown robot, `mode` returns a robot's mode."""
+    routes.raises(
+        CommandError,
+        {504: "The robot does not answer, or this service has no operators' key: `detail` names the remedy"},
+        lambda error: ProblemError(504, str(error)),
+    )
+
+    async def send(robot: str, kind: CommandKind, who: str, pose: Pose | None = None) -> CommandOutcome:
+        check(robot)
+        reply = await operator.send(kind, robot, who, pose)
+        if not reply.accepted:
+            raise ProblemError(409, reply.reason, mode=mode(robot))
+        return CommandOutcome(accepted=True, reason=reply.reason, mode=mode(robot))
+
+    @routes.post(
+        "/api/v1/robots/{robot}/commands",
+        raises=[CommandError, StoreError],
+        problems={404: "No robot has this id", 409: "The robot refuses: `detail` has its reason, `mode` its mode"},
+    )
+    async def post_command(robot: str, body: Body[CommandBody], caller: Operator) -> CommandOutcome:
+        """Command a robot; the robot itself accepts or refuses."""
+        return await send(robot, body.kind, caller.name, _pose(body, site))
+
+    @routes.post(
+        "/api/v1/robots/{robot}/stop",
+        raises=[CommandError],
+        problems={404: "No robot has this id", 409: "The robot refuses: `detail` has its reason"},
+    )
+    async def stop(robot: str, client: ClientHost) -> CommandOutcome:
+        """Stop a robot at once. Anybody may: this needs no token. An operator must enable it again."""
+        return await send(robot, "disable", f"stop from {client or 'an unknown address'}")
+
+
+def _pose(body: CommandBody, site: Site) -> Pose | None:
+    """Return the pose of a command; raises a `ProblemError` for one that does not belong to it, or lacks."""
+    if body.kind != "initial_pose":
+        if body.pose is not None or body.place is not None:
+            raise ProblemError(422, f"{body.kind} takes neither pose nor place: leave them out", field="body.pose")
+        return None
+    if (body.pose is None) == (body.place is None):
+        raise ProblemError(422, "give either a pose or a place, and not both", field="body.pose")
+    if body.pose is not None:
+        return Pose(x=body.pose.x, y=body.pose.y, theta=body.pose.theta)
+    place = site.places.get(body.place or "")
+    if place is None or place.theta is None:
+        known = ", ".join(sorted(name for name, found in site.places.items() if found.theta is not None)) or "none"
+        detail = f"there is no place {body.place} with a heading; places that have one: {known}"
+        raise ProblemError(422, detail, field="body.place")
+    return Pose(x=place.x, y=place.y, theta=place.theta)

@@ -1,0 +1,120 @@
+"""Operators' commands to robots, for callers without a key: signed here, recorded, answered by the robot itself.
+
+The planner's leader is the only service that signs (docs/adr/0031). It keeps no command: one that did not reach its
+robot must be sent again by a person.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Final
+
+import msgspec
+
+from fog_contracts.codec import ContractError
+from fog_contracts.commands import STOPS
+from fog_runtime import logs
+from fog_runtime.robot_commands import REPLY_TIMEOUT_S, RobotCommands
+from planner.store import Audit, StoreError
+
+if TYPE_CHECKING:
+    from fog_contracts.messages import CommandKind, CommandReply, Pose, RobotState
+    from fog_runtime.clock import Clock
+    from fog_runtime.zenoh_edge import ZenohEdge
+    from planner.store import Store
+
+STATE_MAX_AGE_S: Final = 3.0
+"""A command names the robot's clock by its latest state, which comes once a second."""
+
+_log = logs.get("planner")
+
+
+class CommandError(Exception):
+    """A command did not reach its robot, or its reply did not come back; the message names the remedy."""
+
+
+class RobotOperator:
+    """Commands one site's robots with its operators' key; without a key it only stops them."""
+
+    def __init__(self, zenoh: ZenohEdge, store: Store, clock: Clock, key: bytes | None) -> None:
+        self._zenoh = zenoh
+        self._store = store
+        self._clock = clock
+        self._key = key
+        self._states: dict[str, tuple[RobotState, float]] = {}
+        self._changed: dict[str, asyncio.Event] = {}
+
+    def on_state(self, robot: str, state: RobotState, now: float) -> None:
+        """Record a robot's state, which arrived at `now` (s, monotonic)."""
+        self._states[robot] = state, now
+        if (waiting := self._changed.pop(robot, None)) is not None:
+            waiting.set()
+
+    async def next_state(self, robot: str, after: float) -> RobotState:
+        """Return the robot's first state whose `clock` is not `after`; raises `CommandError` when none comes."""
+        found = self._states.get(robot)
+        if found is not None and found[0].clock != after and self._age(found[1]) <= STATE_MAX_AGE_S:
+            return found[0]
+        waiting = self._changed.setdefault(robot, asyncio.Event())
+        try:
+            async with asyncio.timeout(STATE_MAX_AGE_S):
+                await waiting.wait()
+        except TimeoutError:
+            raise CommandError(_silent(robot)) from None
+        return self._states[robot][0]
+
+    async def send(self, kind: CommandKind, robot: str, who: str, pose: Pose | None = None) -> CommandReply:
+        """Send a command (`initial_pose` with a pose) in the name of `who`; return the robot's reply.
+
+        It is recorded in the audit trail first, a stop afterwards. Raises `CommandError`, and `StoreError` for a
+        command that could not be recorded and was not sent.
+        """
+        state = None if kind in STOPS else self._fresh_state(robot)
+        if kind not in STOPS:
+            await self._record(kind, robot, who, pose)
+        commands = RobotCommands(self._zenoh, operator=who, key=self._key)
+        try:
+            reply = await commands.send(kind, robot, state, pose, REPLY_TIMEOUT_S * max(1.0, self._clock.speed))
+        except ContractError as error:
+            raise CommandError(f"robot {robot} gave an invalid reply: {error}. Check that versions match") from error
+        finally:
+            if kind in STOPS:
+                await self._record_stop(kind, robot, who)
+        if reply is None:
+            raise CommandError(
+                f"robot {robot} did not answer within {REPLY_TIMEOUT_S:.0f} s: check that its agent runs and is"
+                " connected, and whether it has carried the command out"
+            )
+        _log.info("robot_commanded", robot=robot, kind=kind, who=who, accepted=reply.accepted, reason=reply.reason)
+        return reply
+
+    def _fresh_state(self, robot: str) -> RobotState:
+        if self._key is None:
+            raise CommandError(
+                "this planner has no operators' key, so it can only stop robots: set FOGNAV_OPERATOR_KEY_FILE to the"
+                " site's operator.key, and restart it"
+            )
+        found = self._states.get(robot)
+        if found is None or self._age(found[1]) > STATE_MAX_AGE_S:
+            raise CommandError(_silent(robot))
+        return found[0]
+
+    def _age(self, received_at: float) -> float:
+        return self._clock.now() - received_at
+
+    async def _record(self, kind: CommandKind, robot: str, who: str, pose: Pose | None) -> None:
+        detail = msgspec.json.encode({"kind": kind, **({} if pose is None else {"pose": pose})})
+        await self._store.record_command(robot, detail, Audit(self._clock.stamp(), who, kind))
+
+    async def _record_stop(self, kind: CommandKind, robot: str, who: str) -> None:
+        """Record a stop once it was sent: it must reach the robot whatever the store does."""
+        try:
+            await self._record(kind, robot, who, None)
+        except StoreError as error:
+            _log.error("stop_not_recorded", robot=robot, who=who, reason=str(error))
+
+
+def _silent(robot: str) -> str:
+    return (
+        f"robot {robot} has published no state for {STATE_MAX_AGE_S:.0f} s: check that its agent runs and is connected"
+    )

@@ -1,0 +1,189 @@
+"""Operators' commands to robots over REST: who may give them, what the robot checks, and what is recorded."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, cast
+
+import httpx
+import pytest
+
+from fog_contracts import channels as ch
+from fog_contracts.commands import CommandGate
+from fog_contracts.messages import CommandReply, RobotCommand, RobotState
+from fog_contracts.site import Place
+from fog_runtime.clock import ManualClock
+from fog_runtime.health import Health
+from fog_runtime.http import Tokens
+from fog_runtime.token_file import TokenEntry, token_hash
+from planner.api import make_api
+from planner.core import PlannerCore
+from planner.robot_commands import CommandError
+from planner.service import Service
+from planner.store import StoreError
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+KEY = b"k" * 32
+OPERATOR = {"Authorization": "Bearer operator-token"}
+VIEWER = {"Authorization": "Bearer viewer-token"}
+SITE = cast("Any", SimpleNamespace(
+    robots=[SimpleNamespace(id="r1")],
+    places={"dock": Place(x=1.0, y=2.0, theta=0.5), "b": Place(x=1.0, y=2.0, theta=None)},
+))  # fmt: skip
+
+
+class Robot:
+    """A session with one robot that checks commands as an agent does, and a store that records them."""
+
+    def __init__(self) -> None:
+        self.gate = CommandGate("r1", KEY, "run-1")
+        self.clock = ManualClock(100.0)
+        self.received: list[RobotCommand] = []
+        self.records: list[tuple[str, str, bytes]] = []
+        self.answers = True
+        self.refusal = ""
+        self.store_error: Exception | None = None
+        self.published: dict[ch.Channel, Any] = {}
+
+    def subscribe(self, channel: ch.Channel, _kind: type, handler: Any, **_ids: str) -> None:
+        self.published[channel] = handler
+
+    def serve(self, *_: object, **__: str) -> None: ...
+
+    async def query(self, _channel: ch.Channel, command: RobotCommand, *_: object, **__: str) -> CommandReply | None:
+        if not self.answers:
+            return None
+        self.received.append(command)
+        refusal = self.gate.refusal(command, self.clock.now()) or self.refusal
+        return CommandReply(accepted=not refusal, reason=refusal or f"{command.kind} is done")
+
+    async def record_command(self, robot: str, command: bytes, audit: Any) -> None:
+        if self.store_error:
+            raise self.store_error
+        self.records.append((robot, audit.who, command))
+
+    def state(self, mode: Any = "INIT") -> None:
+        state = RobotState(
+            mode=mode, reasons=[], enabled=False, battery=None, goal_id=None, map_epoch=1, map_seq=1, plan_id=None,
+            boot="run-1", clock=self.clock.now(),
+        )  # fmt: skip
+        self.published[ch.ROBOT_STATE]({"robot": "r1"}, state)
+
+
+class Rig:
+    def __init__(self, *, key: bytes | None = KEY) -> None:
+        self.robot = Robot()
+        session = cast("Any", self.robot)
+        service = Service(PlannerCore(epoch=1), session, session, self.robot.clock, Health(), key=key)
+        service.subscribe()
+        self.operator = service.operator
+        tokens = Tokens([
+            TokenEntry(name=role, role=cast("Any", role), sha256=token_hash(f"{role}-token"))
+            for role in ("operator", "viewer")
+        ])  # fmt: skip
+        self.standby = ""
+        app = make_api(service, SITE, Health(), tokens, lambda: self.standby)
+        self.client = httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://planner")
+
+    async def command(self, body: object, headers: dict[str, str] | None = None) -> httpx.Response:
+        return await self.client.post("/api/v1/robots/r1/commands", json=body, headers=headers or OPERATOR)
+
+
+@pytest.fixture
+async def rig() -> AsyncIterator[Rig]:
+    rig = Rig()
+    rig.robot.state()
+    async with rig.client:
+        yield rig
+
+
+@pytest.mark.parametrize("kind", ["enable", "reset", "egress"])
+async def test_operator_without_a_key_commands_a_robot_and_is_recorded(rig: Rig, kind: str) -> None:
+    answer = await rig.command({"kind": kind})
+    assert answer.json() == {"accepted": True, "reason": f"{kind} is done", "mode": "INIT"}
+    (command,) = rig.robot.received
+    assert (command.kind, command.operator) == (kind, "operator")
+    assert rig.robot.records == [("r1", "operator", f'{{"kind":"{kind}"}}'.encode())]
+    assert (await rig.command({"kind": kind})).status_code == 200
+    assert rig.robot.received[1].nonce != command.nonce
+
+
+async def test_initial_pose_is_a_pose_or_a_place_with_a_heading(rig: Rig) -> None:
+    assert (await rig.command({"kind": "initial_pose", "place": "dock"})).status_code == 200
+    assert rig.robot.received[0].pose is not None
+    assert rig.robot.received[0].pose.theta == 0.5
+    pose = {"x": 3.0, "y": 4.0, "theta": 0.0}
+    assert (await rig.command({"kind": "initial_pose", "pose": pose})).status_code == 200
+    assert b'"pose":{"x":3.0' in rig.robot.records[1][2]
+    for body in ({}, {"pose": pose, "place": "dock"}, {"place": "b"}, {"pose": {"x": 1.0, "y": 2.0}}):
+        assert (await rig.command({"kind": "initial_pose", **body})).status_code == 422
+    assert (await rig.command({"kind": "enable", "pose": pose})).status_code == 422
+    assert len(rig.robot.received) == 2
+
+
+async def test_robots_refusal_is_a_problem_with_its_reason_and_mode(rig: Rig) -> None:
+    rig.robot.refusal = "the cause is still there: the bumper is pressed"
+    rig.robot.state("FAULT")
+    answer = await rig.command({"kind": "reset"})
+    assert (answer.status_code, answer.headers["content-type"]) == (409, "application/problem+json")
+    assert (answer.json()["detail"], answer.json()["mode"]) == (rig.robot.refusal, "FAULT")
+
+
+async def test_only_operators_command_and_only_known_robots(rig: Rig) -> None:
+    assert (await rig.command({"kind": "enable"}, VIEWER)).status_code == 403
+    assert (await rig.client.post("/api/v1/robots/r1/commands", json={"kind": "enable"})).status_code == 401
+    assert (await rig.client.post("/api/v1/robots/r9/stop")).status_code == 404
+    assert (await rig.command({"kind": "dance"})).status_code == 422
+    assert rig.robot.received == []
+
+
+async def test_anybody_stops_a_robot_whatever_else_is_missing(rig: Rig) -> None:
+    rig.robot.store_error = StoreError("Redis is away")
+    rig.standby = "another planner leads"
+    answer = await rig.client.post("/api/v1/robots/r1/stop")
+    assert answer.status_code == 200
+    assert [(c.kind, c.signature) for c in rig.robot.received] == [("disable", b"")]
+    assert rig.robot.received[0].operator.startswith("stop from ")
+    rig.robot.clock.advance(60.0)
+    assert (await rig.client.post("/api/v1/robots/r1/stop")).status_code == 200
+
+
+async def test_command_that_can_not_be_recorded_or_is_not_the_leaders_is_not_sent(rig: Rig) -> None:
+    rig.robot.store_error = StoreError("Redis is away")
+    assert (await rig.command({"kind": "enable"})).status_code == 503
+    rig.robot.store_error, rig.standby = None, "another planner leads"
+    assert (await rig.command({"kind": "enable"})).status_code == 503
+    assert rig.robot.received == []
+
+
+async def test_silent_robot_is_named_with_a_remedy(rig: Rig) -> None:
+    rig.robot.answers = False
+    answer = await rig.command({"kind": "enable"})
+    assert answer.status_code == 504
+    assert "did not answer within 2 s" in answer.json()["detail"]
+    rig.robot.clock.advance(3.1)
+    assert "has published no state for 3 s" in (await rig.command({"kind": "enable"})).json()["detail"]
+
+
+async def test_planner_without_a_key_says_so_and_still_stops() -> None:
+    rig = Rig(key=None)
+    rig.robot.state()
+    answer = await rig.command({"kind": "enable"})
+    assert (answer.status_code, rig.robot.received) == (504, [])
+    assert "FOGNAV_OPERATOR_KEY_FILE" in answer.json()["detail"]
+    assert (await rig.command({"kind": "disable"})).status_code == 200
+    assert rig.robot.records == [("r1", "operator", b'{"kind":"disable"}')]
+
+
+async def test_watching_a_robot_waits_for_its_next_state(rig: Rig) -> None:
+    view = (await rig.client.get("/api/v1/robots/r1", headers=VIEWER)).json()
+    assert (view["id"], view["state"]["clock"]) == ("r1", 100.0)
+    assert (await rig.operator.next_state("r1", 99.0)).clock == 100.0
+    rig.robot.clock.advance(1.0)
+    waiting = rig.client.get("/api/v1/robots/r1?after=100.0", headers=VIEWER)
+    rig.robot.state("NORMAL")
+    assert (await waiting).json()["state"]["mode"] == "NORMAL"
+    with pytest.raises(CommandError, match="no state for 3 s"):
+        await rig.operator.next_state("r1", 101.0)

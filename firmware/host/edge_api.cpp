@@ -31,20 +31,30 @@ struct TestConnection {
     fognav::Connection connection;
 };
 
+const fognav::BoardPins& board(int is_esp32) { return is_esp32 != 0 ? fognav::kD1Mini32 : fognav::kD1Mini; }
+
 }  // namespace
 
 extern "C" {
 
 // nullptr, or what is wrong with these settings.
-const char* fognav_settings_problem(const char* text, uint32_t size) {
+const char* fognav_settings_problem(const char* text, uint32_t size, int is_esp32) {
     fognav::Settings settings;
-    return fognav::read_settings(text, size, settings);
+    return fognav::read_settings(text, size, board(is_esp32), settings);
+}
+
+// The pins of sensor `index` with these settings: trigger and echo; -1 if they are invalid.
+void fognav_settings_pins(const char* text, uint32_t size, int is_esp32, int index, int* trigger, int* echo) {
+    fognav::Settings settings;
+    fognav::read_settings(text, size, board(is_esp32), settings);
+    *trigger = settings.sensors[index].pins.trigger;
+    *echo = settings.sensors[index].pins.echo;
 }
 
 // The length of Home Assistant's description of the node with these settings, which must be valid.
 uint32_t fognav_discovery(const char* text, uint32_t size, char* buffer, uint32_t buffer_size) {
     fognav::Settings settings;
-    if (fognav::read_settings(text, size, settings) != nullptr) return 0;
+    if (fognav::read_settings(text, size, fognav::kD1Mini, settings) != nullptr) return 0;
     return static_cast<uint32_t>(fognav::write_discovery(settings, "host", buffer, buffer_size));
 }
 

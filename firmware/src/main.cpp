@@ -1,200 +1,119 @@
 // The node on its board: Wemos D1 mini (ESP8266) or D1 mini 32 (ESP32). What it decides is in lib/node_core, how it stays
-// connected in lib/node_edge; here are only pins, radio, files and the MQTT library.
-#include <Arduino.h>
+// connected, is set up and is updated in lib/node_edge; the files here connect both to pins, radio, flash and libraries.
 #include <LittleFS.h>
-#include <espMqttClient.h>
-#include <time.h>
 
-#if defined(ESP8266)
-#include <ESP8266WiFi.h>
-#else
-#include <WiFi.h>
-#endif
-
+#include "board.hpp"
 #include "connection.hpp"
-#include "discovery.hpp"
-#include "fognav_contract.h"
-#include "node.hpp"
-#include "settings.hpp"
-
-#ifndef FOGNAV_FIRMWARE
-#define FOGNAV_FIRMWARE "unknown"
-#endif
+#include "files.hpp"
+#include "link.hpp"
+#include "portal_server.hpp"
+#include "sensors.hpp"
+#include "update_board.hpp"
 
 namespace {
 
-constexpr const char* kSettingsFile = "/node.json";
-constexpr const char* kAuthorityFile = "/ca.pem";
-constexpr size_t kSettingsMax = 2048;
-constexpr size_t kAuthorityMax = 4096;
+using namespace fognav;
+
 constexpr uint32_t kComplainEveryMs = 5000;
 
-uint32_t random_bits() {
-#if defined(ESP8266)
-    return RANDOM_REG32;  // the hardware's generator
-#else
-    return esp_random();
-#endif
-}
-
-// A file as text with a terminating zero; an empty one if it is missing or larger than `size_max`.
-String read_file(const char* name, size_t size_max) {
-    File file = LittleFS.open(name, "r");
-    if (!file || file.size() > size_max) return String();
-    return file.readString();
-}
-
-class Board : public fognav::Link {
+// All of a node that has settings.
+class Device final : Receiver {
 public:
-    explicit Board(const fognav::Settings& settings) : settings_(settings) {}
+    explicit Device(const Settings& settings)
+        : settings_(settings),
+          link_(settings, *this),
+          connection_(link_, random_bits()),
+          node_(start(settings)),
+          values_(node_.reading().boot),
+          flash_(settings),
+          updater_(flash_, kBoard.name, FOGNAV_FIRMWARE_NUMBER, remembered_update()) {}
 
-    // Prepare the client of the broker. False if the certificate authority is missing.
-    bool begin() {
-        snprintf(availability_, sizeof availability_, FOGNAV_NODE_AVAILABILITY_TOPIC, settings_.site, settings_.node);
-        snprintf(reading_, sizeof reading_, FOGNAV_NODE_READING_TOPIC, settings_.site, settings_.node);
-        snprintf(config_, sizeof config_, FOGNAV_NODE_CONFIG_TOPIC, settings_.site, settings_.node);
-        snprintf(client_id_, sizeof client_id_, "node-%s", settings_.node);
-        WiFi.persistent(false);  // the flash is not made for a write at every start
-        WiFi.mode(WIFI_STA);
-        WiFi.setAutoReconnect(false);  // `Connection` decides when
-        if (!settings_.tls) {
-            set_up(plain_);
-            return true;
+    void begin(const char* authority) {
+        link_.begin(authority);
+        const String calibration = read_file(kCalibrationFile, FOGNAV_NODE_CALIBRATION_LIMIT);
+        if (calibration.length() > 0) {
+            link_.report(node_.restore(calibration.c_str(), calibration.length()));
+            link_.set_calibration(calibration);
         }
-        authority_ = read_file(kAuthorityFile, kAuthorityMax);
-        if (authority_.length() == 0) return false;
-#if defined(ESP8266)
-        static BearSSL::X509List trusted(authority_.c_str());
-        secure_.setTrustAnchors(&trusted);
-#else
-        secure_.setCACert(authority_.c_str());
-#endif
-        set_up(secure_);
-        return true;
+        node_.set_temperature(static_cast<int16_t>(settings_.temperature_dc));
+        begin_values(settings_, values_);
+        begin_sonars(settings_, node_);
     }
 
-    void loop() { settings_.tls ? secure_.loop() : plain_.loop(); }
-
-    void join_network() override {
-        WiFi.disconnect();
-        WiFi.begin(settings_.wifi_name, settings_.wifi_password);
-    }
-
-    bool network_up() override { return WiFi.status() == WL_CONNECTED; }
-
-    void connect_broker() override {
-        // Certificates have dates, and the board has no clock of its own: the fog node tells it the time.
-        if (settings_.tls) configTime(0, 0, settings_.broker);
-        failed_ = false;
-        settings_.tls ? secure_.connect() : plain_.connect();
-    }
-
-    // The library takes some turns of its loop for it, and connects no earlier.
-    void leave_broker() override { settings_.tls ? secure_.disconnect(true) : plain_.disconnect(true); }
-
-    bool broker_up() override { return settings_.tls ? secure_.connected() : plain_.connected(); }
-
-    bool broker_failed() override { return failed_; }
-
-    void announce() override {
-        subscribe(config_, FOGNAV_NODE_CONFIG_QOS);
-        publish(availability_, FOGNAV_NODE_AVAILABILITY_QOS, true, FOGNAV_NODE_AVAILABILITY_ONLINE);
-        if (settings_.home_assistant) announce_to_home_assistant();
-        node_->on_connected();
-    }
-
-    void restart() override { ESP.restart(); }
-
-    void serve(fognav::Node& node) { node_ = &node; }
-
-    int rssi() { return WiFi.RSSI(); }
-
-    void publish_reading() {
-        if (!broker_up()) return;  // a reading that is late is worth nothing
-        publish(reading_, FOGNAV_NODE_READING_QOS, false, node_->message());
-        const fognav::State state = node_->reading().state;
-        if (settings_.thesis_area == 0 || state == fognav::State::unknown) return;
-        char topic[24];
-        snprintf(topic, sizeof topic, "area %u", static_cast<unsigned>(settings_.thesis_area));
-        publish(topic, 0, false, state == fognav::State::blocked ? "blocked" : "clear");
+    void loop() {
+        const bool was_up = connection_.up();
+        connection_.step(millis());
+        if (connection_.up() && !was_up) node_.on_connected();
+        link_.loop();
+        measure();
+        if (values_.step(millis())) take_value();
+        const char* problem = updater_.step(millis());
+        if (problem != nullptr) link_.report(problem);
     }
 
 private:
-    template <class Client>
-    void set_up(Client& client) {
-        client.setServer(settings_.broker, settings_.port);
-        client.setClientId(client_id_);
-        if (settings_.user[0] != 0) client.setCredentials(settings_.user, settings_.password);
-        client.setWill(availability_, FOGNAV_NODE_AVAILABILITY_QOS, true, FOGNAV_NODE_AVAILABILITY_OFFLINE);
-        client.onDisconnect([this](espMqttClientTypes::DisconnectReason) { failed_ = true; });
-        client.onMessage([this](const espMqttClientTypes::MessageProperties&, const char*, const uint8_t* payload,
-                                size_t length, size_t index, size_t total) { take(payload, length, index, total); });
+    static NodeSettings start(const Settings& settings) {
+        NodeSettings start;
+        start.config.sonars = settings.sonars;
+        for (int i = 0; i < settings.sonars; ++i) start.config.limits[i] = settings.limits[i];
+        start.boot = random_bits();
+        start.publish = settings.publish;
+        start.firmware = FOGNAV_FIRMWARE;
+        begin_rangers(settings, start.sensors);
+        return start;
     }
 
-    // A part of the only message that the node subscribes to. Longer ones than the contract allows are left out.
-    void take(const uint8_t* payload, size_t length, size_t index, size_t total) {
-        if (total > sizeof message_ || index + length > total) return;
-        memcpy(message_ + index, payload, length);
-        if (index + length < total) return;
-        const char* problem = node_->configure(message_, total);
-        if (problem != nullptr) Serial.printf("the configuration is refused: %s\n", problem);
+    const char* receive(Topic topic, const char* text, size_t size) override {
+        if (topic == Topic::config) return node_.configure(text, size);
+        if (topic == Topic::command) return node_.command(text, size);
+        return updater_.offer(text, size, millis());
     }
 
-    void subscribe(const char* topic, uint8_t qos) {
-        settings_.tls ? secure_.subscribe(topic, qos) : plain_.subscribe(topic, qos);
+    void measure() {
+        switch (node_.step(micros())) {
+            case Node::Event::none:
+                break;
+            case Node::Event::trigger:
+                trigger(settings_, node_.sonar());
+                break;
+            case Node::Event::publish:
+                link_.publish_reading(node_);
+                node_.set_rssi(static_cast<int16_t>(link_.rssi()));
+                break;
+            case Node::Event::calibrated:
+                end_calibration();
+        }
     }
 
-    void publish(const char* topic, uint8_t qos, bool retain, const char* payload) {
-        settings_.tls ? secure_.publish(topic, qos, retain, payload) : plain_.publish(topic, qos, retain, payload);
+    void end_calibration() {
+        const bool stored = write_file(kCalibrationFile, node_.message());
+        link_.report(stored ? nullptr : "the calibration can't be stored, and ends with the next restart: the flash is full");
+        link_.set_calibration(node_.message());
+        for (int i = 0; i < settings_.sonars; ++i) Serial.printf("sonar %d: %s\n", i, describe(node_.calibration(i)));
     }
 
-    void announce_to_home_assistant() {
-        char topic[FOGNAV_HOME_ASSISTANT_TOPIC_SIZE];
-        static char text[2048];  // too much for the stack of an ESP8266
-        snprintf(topic, sizeof topic, FOGNAV_HOME_ASSISTANT_TOPIC, settings_.node);
-        if (fognav::write_discovery(settings_, FOGNAV_FIRMWARE, text, sizeof text) == 0) return;
-        publish(topic, FOGNAV_HOME_ASSISTANT_QOS, true, text);
+    void take_value() {
+        link_.publish_value(values_.message());
+        if (strcmp(values_.value().kind, "temperature") != 0) return;
+        node_.set_temperature(static_cast<int16_t>(values_.value().thousandths / 100));
     }
 
-    const fognav::Settings& settings_;
-    fognav::Node* node_ = nullptr;
-#if defined(ESP8266)
-    espMqttClient plain_;
-    espMqttClientSecure secure_;
-#else
-    // Without a task of its own: callbacks come from `loop`, and so never while the node takes a step.
-    espMqttClient plain_{espMqttClientTypes::UseInternalTask::NO};
-    espMqttClientSecure secure_{espMqttClientTypes::UseInternalTask::NO};
-#endif
-    String authority_;
-    bool failed_ = false;
-    char availability_[FOGNAV_NODE_AVAILABILITY_TOPIC_SIZE];
-    char reading_[FOGNAV_NODE_READING_TOPIC_SIZE];
-    char config_[FOGNAV_NODE_CONFIG_TOPIC_SIZE];
-    char client_id_[fognav::kIdSize + 5];
-    char message_[FOGNAV_NODE_CONFIG_LIMIT];
+    const Settings& settings_;
+    BoardLink link_;
+    Connection connection_;
+    Node node_;
+    Values values_;
+    FlashBoard flash_;
+    Updater updater_;
 };
 
-// One echo line, for its interrupt.
-struct EchoLine {
-    fognav::Node* node;
-    int sonar;
-    int pin;
-};
+Settings settings;
+String authority;
+Device* device = nullptr;
+PortalSwitch* portal = nullptr;
+PortalServer* server = nullptr;
 
-EchoLine echo_lines[fognav::kMaxSonars];
-
-void IRAM_ATTR on_echo(void* argument) {
-    const EchoLine& line = *static_cast<EchoLine*>(argument);
-    line.node->on_edge(line.sonar, digitalRead(line.pin) == HIGH, micros());
-}
-
-fognav::Settings settings;
-Board board(settings);
-fognav::Node* node = nullptr;
-fognav::Connection* connection = nullptr;
-
-// Say it on the serial port until somebody reads it: without settings there is nothing else to do.
+// Without a file system there is nothing else to do.
 [[noreturn]] void complain(const char* problem) {
     for (;;) {
         Serial.printf("%s\n", problem);
@@ -202,58 +121,54 @@ fognav::Connection* connection = nullptr;
     }
 }
 
-void trigger(int sonar) {
-    const uint8_t pin = static_cast<uint8_t>(settings.pins[sonar].trigger);
-    digitalWrite(pin, HIGH);
-    delayMicroseconds(fognav::kTriggerUs);
-    digitalWrite(pin, LOW);
+// nullptr, or why the node can't begin with what is on its flash.
+const char* read_flash() {
+    const String text = read_file(kSettingsFile, kSettingsMax);
+    if (text.length() == 0) return "node.json is missing, empty or longer than 2 KB";
+    const char* problem = read_settings(text.c_str(), text.length(), kBoard, settings);
+    if (problem != nullptr) return problem;
+    authority = read_file(kAuthorityFile, kAuthorityMax);
+    return authority_problem(authority.c_str(), settings);
 }
 
-void set_up_sonars() {
-    for (int i = 0; i < settings.sonars; ++i) {
-        const fognav::SonarPins& pins = settings.pins[i];
-        pinMode(static_cast<uint8_t>(pins.trigger), OUTPUT);
-        digitalWrite(static_cast<uint8_t>(pins.trigger), LOW);
-        pinMode(static_cast<uint8_t>(pins.echo), INPUT);
-        echo_lines[i] = {node, i, pins.echo};
-        attachInterruptArg(digitalPinToInterrupt(pins.echo), on_echo, &echo_lines[i], CHANGE);
-    }
+void open_portal() {
+    static PortalServer the_server(*portal);
+    server = &the_server;
+    the_server.begin();
 }
+
+bool button_pressed() { return settings.button != kNoPin && digitalRead(settings.button) == LOW; }
 
 }  // namespace
 
 void setup() {
     Serial.begin(115200);
     if (!LittleFS.begin()) complain("the board has no file system: run `pio run --target uploadfs`");
-    const String text = read_file(kSettingsFile, kSettingsMax);
-    if (text.length() == 0) complain("node.json is missing, empty or longer than 2 KB: see firmware/README.md");
-    const char* problem = fognav::read_settings(text.c_str(), text.length(), settings);
-    if (problem != nullptr) complain(problem);
-    if (!board.begin()) complain("ca.pem is missing, empty or longer than 4 KB: the certificate of the fog node's authority; or set tls to false");
-
-    fognav::NodeSettings start;
-    start.config.sonars = settings.sonars;
-    for (int i = 0; i < settings.sonars; ++i) start.config.limits[i] = settings.limits[i];
-    start.boot = random_bits();
-    start.publish = settings.publish;
-    start.firmware = FOGNAV_FIRMWARE;
-    static fognav::Node the_node(start);
-    static fognav::Connection the_connection(board, random_bits());
-    node = &the_node;
-    connection = &the_connection;
-    board.serve(the_node);
-    set_up_sonars();
+    const char* problem = read_flash();
+    static PortalSwitch the_portal(problem == nullptr);
+    portal = &the_portal;
+    if (problem != nullptr) {
+        Serial.printf("%s\n", problem);
+        open_portal();
+        return;
+    }
+    if (settings.button != kNoPin) pinMode(static_cast<uint8_t>(settings.button), INPUT_PULLUP);
+    static Device the_device(settings);
+    device = &the_device;
+    device->begin(authority.c_str());
+#if defined(ESP32)
+    enableLoopWDT();  // an ESP8266's watches the loop by itself
+#endif
 }
 
-// The board's own watchdog restarts it if a turn of this loop does not end.
 void loop() {
-    connection->step(millis());
-    board.loop();
-    const fognav::Node::Event event = node->step(micros());
-    if (event == fognav::Node::Event::trigger) {
-        trigger(node->sonar());
-    } else if (event == fognav::Node::Event::publish) {
-        board.publish_reading();
-        node->set_rssi(static_cast<int16_t>(board.rssi()));
+    portal->step(button_pressed(), millis());
+    if (server != nullptr) {
+        server->loop();
+        if (!portal->open()) ESP.restart();
+    } else if (portal->open()) {
+        open_portal();
+    } else {
+        device->loop();
     }
 }

@@ -4,7 +4,7 @@ import ctypes
 import json
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fog_contracts import channels as ch
@@ -20,11 +20,11 @@ SETTINGS = {
 }
 
 
-def problem(core, settings, **options):
+def problem(core, settings, *, esp32=False, **options):
     text = json.dumps(settings, **options) if isinstance(settings, dict) else settings
     function = core["fognav_settings_problem"]
     function.restype = ctypes.c_char_p
-    found = function(text.encode(), ctypes.c_uint32(len(text.encode())))
+    found = function(text.encode(), ctypes.c_uint32(len(text.encode())), int(esp32))
     return found and found.decode()
 
 
@@ -33,6 +33,86 @@ def test_settings_with_any_text_are_valid(core, ascii_only):
     assert problem(core, SETTINGS, ensure_ascii=ascii_only) is None
     options = {"port": 1883, "tls": False, "user": "u", "password": "p", "thesis_area": 4, "home_assistant": True}
     assert problem(core, {**SETTINGS, **options, "every_reading": True}) is None
+
+
+KEY = "04" + "ab" * 64
+
+
+def pins(core, settings, index, *, esp32=False):
+    text = json.dumps(settings).encode()
+    trigger, echo = ctypes.c_int(), ctypes.c_int()
+    core["fognav_settings_pins"](
+        text, ctypes.c_uint32(len(text)), int(esp32), index, ctypes.byref(trigger), ctypes.byref(echo)
+    )
+    return trigger.value, echo.value
+
+
+@pytest.mark.parametrize(
+    ("profile", "esp32", "expected"),
+    [
+        ("standard", False, [(14, 5), (12, 4)]),
+        ("thesis", False, [(16, 5), (0, 12)]),
+        ("standard", True, [(18, 22), (19, 21)]),
+        ("thesis", True, [(26, 22), (17, 19)]),
+    ],
+)
+def test_sonars_without_pins_get_those_of_the_profile(core, profile, esp32, expected):
+    settings = {**SETTINGS, "profile": profile, "sonars": [{"range_limit_m": 1}, {"range_limit_m": 2}]}
+    assert problem(core, settings, esp32=esp32) is None
+    assert [pins(core, settings, index, esp32=esp32) for index in range(2)] == expected
+
+
+@pytest.mark.parametrize(
+    ("sonar", "esp32", "words"),
+    [
+        ({"trigger": 14, "echo": 16}, False, "can't tell of edges"),
+        ({"trigger": 6, "echo": 5}, False, "can't be driven"),
+        ({"trigger": 34, "echo": 22}, True, "can't be driven"),
+        ({"trigger": 17, "echo": 34}, True, None),
+        ({"trigger": 17, "echo": 5}, False, "can't be driven"),
+    ],
+)
+def test_pins_that_a_board_does_not_have_are_refused(core, sonar, esp32, words):
+    found = problem(core, {**SETTINGS, "sonars": [{**sonar, "range_limit_m": 1}]}, esp32=esp32)
+    assert found is None if words is None else words in found
+
+
+def ranger(**more):
+    return {"sensor": "vl53l1x", "range_limit_m": 1, **more}
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"sonars": [ranger()]}, None),
+        ({"sonars": [ranger(shutdown=14), ranger(shutdown=12), ranger()]}, None),
+        ({"sonars": [ranger(), ranger()]}, "several rangers"),
+        ({"sonars": [ranger(), PINS[0]]}, "I2C"),
+        ({"sonars": [ranger(sensor="radar")]}, "none of hc-sr04"),
+        ({"values": [{"kind": "temperature", "sensor": "ds18b20", "pin": 13}]}, None),
+        ({"values": [{"kind": "gas", "sensor": "analog", "full_scale_v": 3.2}]}, None),
+        ({"values": [{"kind": "temperature", "sensor": "ds18b20"}]}, "can't be driven"),
+        ({"values": [{"kind": "temperature", "sensor": "ds18b20", "pin": 14}]}, "share a pin"),
+        ({"values": [{"kind": "Gas", "sensor": "analog"}]}, "a value's kind"),
+        ({"values": [{"kind": "gas", "sensor": "nose"}]}, "neither ds18b20"),
+        ({"values": [{"kind": "gas", "sensor": "analog", "full_scale_v": 0}]}, "full_scale_v"),
+        ({"values": [{"kind": "gas", "sensor": "analog", "x": 0}]}, "a value in node.json"),
+        ({"values": [{"kind": "gas", "sensor": "analog"}] * 5}, "four values"),
+        ({"button": 13}, None),
+        ({"button": 5}, "share a pin"),
+        ({"button": 40}, "0 to 39"),
+        ({"temperature_c": -5.5}, None),
+        ({"temperature_c": 80}, "temperature_c"),
+        ({"profile": "best"}, "neither standard"),
+        ({"update_key": KEY}, None),
+        ({"update_key": KEY[:-2]}, "update_key"),
+        ({"update_key": "05" + KEY[2:]}, "update_key"),
+        ({"update_key": KEY[:-1] + "G"}, "update_key"),
+    ],
+)
+def test_further_settings(core, change, words):
+    found = problem(core, {**SETTINGS, **change})
+    assert found is None if words is None else words in found, found
 
 
 @pytest.mark.parametrize("name", ["site", "node", "wifi_name", "broker", "sonars"])
@@ -187,6 +267,7 @@ def test_board_restarts_after_ten_minutes_without_a_broker_and_only_then(connect
     assert len(connection.restarts) == 1
 
 
+@settings(deadline=None)
 @given(
     st.integers(0, 2**32 - 1),
     st.lists(st.tuples(st.booleans(), st.booleans(), st.booleans(), st.floats(0.1, 40.0)), max_size=12),

@@ -1,17 +1,25 @@
-// A stand-in for the board's file system.
+// A stand-in for the board's file system: a folder of the computer.
 #pragma once
 
 #include "Arduino.h"
 
 class File {
 public:
-    explicit operator bool() const;
+    File() = default;
+    File(const std::string& path, const char* mode);
+    explicit operator bool() const { return file_ != nullptr; }
     size_t size() const;
     String readString();
+    size_t write(const uint8_t* data, size_t size);
+    void close();
+
+private:
+    FILE* file_ = nullptr;
 };
 
 struct FileSystem {
     bool begin();
     File open(const char* name, const char* mode);
+    bool rename(const char* from, const char* to);
 };
 extern FileSystem LittleFS;

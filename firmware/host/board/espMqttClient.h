@@ -21,19 +21,25 @@ using OnMessageCallback =
 
 class espMqttClient {
 public:
-    explicit espMqttClient(espMqttClientTypes::UseInternalTask task = espMqttClientTypes::UseInternalTask::YES);
+    explicit espMqttClient(espMqttClientTypes::UseInternalTask = espMqttClientTypes::UseInternalTask::YES) {}
     espMqttClient& setServer(const char* host, uint16_t port);
     espMqttClient& setClientId(const char* id);
     espMqttClient& setCredentials(const char* user, const char* password);
     espMqttClient& setWill(const char* topic, uint8_t qos, bool retain, const char* payload);
     espMqttClient& onDisconnect(espMqttClientTypes::OnDisconnectCallback callback);
     espMqttClient& onMessage(espMqttClientTypes::OnMessageCallback callback);
-    bool connected() const;
+    bool connected() const { return connected_; }
     bool connect();
     bool disconnect(bool force = false);
     uint16_t subscribe(const char* topic, uint8_t qos);
     uint16_t publish(const char* topic, uint8_t qos, bool retain, const char* payload);
     void loop();
+
+private:
+    bool connected_ = false;
+    bool connecting_ = false;
+    espMqttClientTypes::OnDisconnectCallback on_disconnect_;
+    espMqttClientTypes::OnMessageCallback on_message_;
 };
 
 class espMqttClientSecure : public espMqttClient {

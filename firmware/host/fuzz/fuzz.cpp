@@ -9,6 +9,7 @@
 #include "json_reader.hpp"
 #include "node.hpp"
 #include "settings.hpp"
+#include "update.hpp"
 
 extern "C" int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size);
 
@@ -25,9 +26,12 @@ int LLVMFuzzerTestOneInput(const uint8_t* data, size_t size) {
     node.command(text, size);
     node.restore(text, size);
     fognav::JsonReader(text, size).skip_value();
+    fognav::UpdateOffer offer;
+    char lines[fognav::kSignedTextSize];
+    if (fognav::read_update(text, size, offer) == nullptr && fognav::signed_text(offer, lines, sizeof lines) >= sizeof lines) abort();
     fognav::Settings found;
     static char description[FOGNAV_HOME_ASSISTANT_LIMIT];
-    if (fognav::read_settings(text, size, found) == nullptr &&
+    if (size > 0 && fognav::read_settings(text, size, data[0] % 2 != 0 ? fognav::kD1Mini : fognav::kD1Mini32, found) == nullptr &&
         fognav::write_discovery(found, settings.firmware, description, sizeof description) == 0) {
         abort();
     }

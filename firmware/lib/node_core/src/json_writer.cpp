@@ -61,8 +61,9 @@ void JsonWriter::value(const char* text) {
     separate();
     put('"');
     for (; *text != 0; ++text) {
-        if (*text == '"' || *text == '\\') put('\\');
-        if (*text >= ' ' && *text <= '~') put(*text);
+        const unsigned char byte = static_cast<unsigned char>(*text);
+        if (byte == '"' || byte == '\\') put('\\');
+        if (byte >= ' ' && byte != 0x7F) put(*text);
     }
     put('"');
 }

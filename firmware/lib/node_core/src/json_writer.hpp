@@ -20,7 +20,7 @@ public:
     void value(uint64_t number);
     void value(int32_t number);
     void value(bool flag);
-    void value(const char* text);  // printable ASCII; what else it holds is left out
+    void value(const char* text);  // UTF-8; control characters are left out
     void thousandths(int32_t number);  // of a metre, for instance, written in metres
     void null();
 

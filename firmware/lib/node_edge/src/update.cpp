@@ -1,0 +1,176 @@
+#include "update.hpp"
+
+#include <stdio.h>
+#include <string.h>
+
+#include "hexadecimal.hpp"
+#include "json_reader.hpp"
+
+namespace fognav {
+
+namespace {
+
+constexpr int64_t kMilli = 1000;
+
+bool is(const char* key, size_t length, const char* field) {
+    return strlen(field) == length && memcmp(key, field, length) == 0;
+}
+
+class OfferReader {
+public:
+    explicit OfferReader(UpdateOffer& offer) : offer_(offer) {}
+
+    const char* read(const char* text, size_t size) {
+        JsonReader json(text, size);
+        const char* key = nullptr;
+        size_t length = 0;
+        if (json.begin_object()) {
+            while (json.next_member(key, length)) member(json, key, length);
+        }
+        if (!json.at_end()) return "the update is not a JSON object, or a member has the wrong type or is too long";
+        if (problem_ != nullptr) return problem_;
+        const bool complete = offer_.number != 0 && offer_.board[0] != 0 && offer_.size != 0 && has_hash_ &&
+                              offer_.signature_size != 0 && offer_.url[0] != 0;
+        return complete ? nullptr : "the update lacks its number, board, size, sha256, signature or url";
+    }
+
+private:
+    void member(JsonReader& json, const char* key, size_t length) {
+        if (is(key, length, FOGNAV_NODE_UPDATE_NUMBER_FIELD)) {
+            offer_.number = number(json, FOGNAV_NODE_UPDATE_NUMBER_MAX);
+        } else if (is(key, length, FOGNAV_NODE_UPDATE_BOARD_FIELD)) {
+            json.text(offer_.board, sizeof offer_.board);
+        } else if (is(key, length, FOGNAV_NODE_UPDATE_SIZE_FIELD)) {
+            offer_.size = number(json, FOGNAV_NODE_UPDATE_SIZE_MAX);
+        } else if (is(key, length, FOGNAV_NODE_UPDATE_SHA256_FIELD)) {
+            char text[2 * kHashSize + 1];
+            if (!json.text(text, sizeof text)) return;
+            has_hash_ = bytes(text, offer_.hash, kHashSize) == static_cast<int>(kHashSize);
+            if (!has_hash_) problem_ = "the update's sha256 is not 64 hexadecimal digits";
+        } else if (is(key, length, FOGNAV_NODE_UPDATE_SIGNATURE_FIELD)) {
+            char text[2 * kSignatureMax + 1];
+            if (!json.text(text, sizeof text)) return;
+            const int found = bytes(text, offer_.signature, kSignatureMax);
+            if (found < 0) problem_ = "the update's signature is not made of hexadecimal digits";
+            offer_.signature_size = found < 0 ? 0 : static_cast<size_t>(found);
+        } else if (is(key, length, FOGNAV_NODE_UPDATE_URL_FIELD)) {
+            json.text(offer_.url, sizeof offer_.url);
+        } else {
+            json.skip_value();
+        }
+    }
+
+    uint32_t number(JsonReader& json, int64_t most) {
+        int64_t milli = 0;
+        if (!json.number_milli(milli)) return 0;
+        if (milli % kMilli == 0 && milli > 0 && milli / kMilli <= most) return static_cast<uint32_t>(milli / kMilli);
+        problem_ = "the update's number or size is not a whole number in its limits";
+        return 0;
+    }
+
+    UpdateOffer& offer_;
+    const char* problem_ = nullptr;
+    bool has_hash_ = false;
+};
+
+}  // namespace
+
+const char* read_update(const char* text, size_t size, UpdateOffer& offer) {
+    offer = UpdateOffer();
+    return OfferReader(offer).read(text, size);
+}
+
+size_t signed_text(const UpdateOffer& offer, char* buffer, size_t size) {
+    char hash[2 * kHashSize + 1];
+    for (size_t i = 0; i < kHashSize; ++i) snprintf(hash + 2 * i, 3, "%02x", offer.hash[i]);
+    const int length = snprintf(buffer, size, "fognav-firmware\n%s\n%lu\n%lu\n%s\n", offer.board,
+                                static_cast<unsigned long>(offer.number), static_cast<unsigned long>(offer.size), hash);
+    return static_cast<size_t>(length);
+}
+
+const char* Updater::offer(const char* text, size_t size, uint32_t now_ms) {
+    // What is under way goes on.
+    if (busy()) return nullptr;
+    const uint32_t tried = attempts_ > 0 ? offer_.number : 0;
+    const char* problem = read_update(text, size, offer_);
+    if (problem != nullptr) return problem;
+    if (offer_.number == number_) return nullptr;
+    if (offer_.number < number_) return "the update is older than what runs: sign one with a higher number";
+    if (strcmp(offer_.board, board_) != 0) return "the update is for another board";
+    // The broker delivers it again with each connection.
+    if (offer_.number == tried) return nullptr;
+    char signed_lines[kSignedTextSize];
+    const size_t length = signed_text(offer_, signed_lines, sizeof signed_lines);
+    if (!port_.signature_is_good(signed_lines, length, offer_.signature, offer_.signature_size)) {
+        return "the update is not signed by the key in update_key of node.json";
+    }
+    attempts_ = 0;
+    wait_ms_ = 0;
+    since_ms_ = now_ms;
+    phase_ = Phase::due;
+    return nullptr;
+}
+
+const char* Updater::step(uint32_t now_ms) {
+    switch (phase_) {
+        case Phase::idle:
+            return nullptr;
+        case Phase::due:
+            return now_ms - since_ms_ < wait_ms_ ? nullptr : begin(now_ms);
+        case Phase::fetching:
+            break;
+    }
+    return fetch(now_ms);
+}
+
+const char* Updater::begin(uint32_t now_ms) {
+    ++attempts_;
+    phase_ = Phase::fetching;
+    fetched_ = 0;
+    since_ms_ = now_ms;
+    if (!port_.open(offer_.url, offer_.size)) return fail("the update's url does not answer with its size", now_ms);
+    port_.begin_hash();
+    return port_.begin_flash(offer_.size) ? nullptr : fail("the update is too large for the flash", now_ms);
+}
+
+const char* Updater::fetch(uint32_t now_ms) {
+    uint8_t piece[kPieceSize];
+    const uint32_t missing = offer_.size - fetched_;
+    const int count = port_.fetch(piece, missing < kPieceSize ? missing : kPieceSize);
+    if (count < 0) return fail("the connection to the update's url was lost", now_ms);
+    if (count == 0) {
+        const bool lost = now_ms - since_ms_ >= kFetchTimeoutMs;
+        return lost ? fail("the update's url has sent nothing for 30 s", now_ms) : nullptr;
+    }
+    since_ms_ = now_ms;
+    port_.add_to_hash(piece, static_cast<size_t>(count));
+    if (!port_.write_flash(piece, static_cast<size_t>(count))) return fail("the flash can't be written", now_ms);
+    fetched_ += static_cast<uint32_t>(count);
+    if (fetched_ < offer_.size) return nullptr;
+    uint8_t hash[kHashSize];
+    port_.end_hash(hash);
+    if (memcmp(hash, offer_.hash, kHashSize) != 0) return fail("what the update's url sent is not what was signed", now_ms);
+    port_.close();
+    return finish();
+}
+
+const char* Updater::finish() {
+    phase_ = Phase::idle;
+    // Before the commit: a board that is reset in between keeps what runs, and takes the next number.
+    port_.remember(offer_.number);
+    number_ = offer_.number;
+    if (!port_.commit_flash()) return "the board refuses the update: it is not for this board or this size of flash";
+    port_.restart();
+    return nullptr;
+}
+
+const char* Updater::fail(const char* problem, uint32_t now_ms) {
+    port_.close();
+    port_.abandon_flash();
+    since_ms_ = now_ms;
+    wait_ms_ = kRetryAfterMs;
+    phase_ = attempts_ < kUpdateAttempts ? Phase::due : Phase::idle;
+    return problem;
+}
+
+}  // namespace fognav

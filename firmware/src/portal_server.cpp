@@ -1,0 +1,63 @@
+#include "portal_server.hpp"
+
+#include "files.hpp"
+
+namespace fognav {
+
+namespace {
+
+constexpr uint16_t kDnsPort = 53;
+constexpr uint32_t kAnswerMs = 1000;  // until the answer has left, before the restart
+
+}  // namespace
+
+void PortalServer::begin() {
+    char name[16];
+    portal_name(chip_number(), name);
+    WiFi.persistent(false);
+    WiFi.mode(WIFI_AP);
+    WiFi.softAP(name);
+    names_.start(kDnsPort, "*", WiFi.softAPIP());
+    server_.on("/", [this] {
+        portal_.on_request(millis());
+        server_.send(200, "text/html", kPortalPage);
+    });
+    server_.on("/settings", HTTP_POST, [this] { submit(); });
+    // Phones ask for pages of their makers, and show what they get instead as the place to log in.
+    server_.onNotFound([this] {
+        server_.sendHeader("Location", "http://192.168.4.1/");
+        server_.send(302, "text/plain", "");
+    });
+    server_.begin();
+    Serial.printf("set-up: join the network %s and open http://192.168.4.1/\n", name);
+}
+
+void PortalServer::loop() {
+    names_.processNextRequest();
+    server_.handleClient();
+}
+
+const char* PortalServer::field(const char* name) const {
+    field_ = server_.arg(name);
+    return field_.c_str();
+}
+
+void PortalServer::submit() {
+    portal_.on_request(millis());
+    static char text[kSettingsMax + 1];  // too much for the stack of an ESP8266, as are the settings
+    static Settings settings;
+    const char* problem = settings_from_form(*this, kBoard, text, sizeof text, settings);
+    if (problem == nullptr) problem = authority_problem(field("authority"), settings);
+    if (problem == nullptr && settings.tls && !write_file(kAuthorityFile, field("authority"))) problem = "the flash is full";
+    // Last: only with it the node counts as set up.
+    if (problem == nullptr && !write_file(kSettingsFile, text)) problem = "the flash is full";
+    if (problem != nullptr) {
+        server_.send(400, "text/plain", problem);
+        return;
+    }
+    server_.send(200, "text/plain", "Saved. The node restarts and joins your network.");
+    delay(kAnswerMs);
+    ESP.restart();
+}
+
+}  // namespace fognav

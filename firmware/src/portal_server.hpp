@@ -1,0 +1,41 @@
+// The set-up portal on the board: its own network, on which every name leads to its page.
+#pragma once
+
+#include <DNSServer.h>
+
+#include "board.hpp"
+
+#if defined(ESP8266)
+#include <ESP8266WebServer.h>
+#else
+#include <WebServer.h>
+#endif
+
+#include "portal.hpp"
+
+namespace fognav {
+
+class PortalServer final : Form {
+public:
+    explicit PortalServer(PortalSwitch& portal) : portal_(portal) {}
+
+    void begin();
+    void loop();
+
+    const char* field(const char* name) const override;
+
+private:
+    void submit();
+
+#if defined(ESP8266)
+    using Server = ESP8266WebServer;
+#else
+    using Server = WebServer;
+#endif
+    PortalSwitch& portal_;
+    DNSServer names_;
+    mutable Server server_{80};
+    mutable String field_;  // what `field` returned last
+};
+
+}  // namespace fognav

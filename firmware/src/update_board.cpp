@@ -1,0 +1,56 @@
+#include "update_board.hpp"
+
+#if defined(ESP8266)
+#include <Updater.h>
+#else
+#include <Update.h>
+#endif
+
+#include <stdlib.h>
+
+#include "files.hpp"
+
+namespace fognav {
+
+namespace {
+
+constexpr uint16_t kAnswerMs = 3000;  // the node does not measure while it waits for the first answer
+
+}  // namespace
+
+uint32_t remembered_update() { return static_cast<uint32_t>(strtoul(read_file(kUpdateFile, 16).c_str(), nullptr, 10)); }
+
+bool FlashBoard::signature_is_good(const char* text, size_t size, const uint8_t* signature, size_t signature_size) {
+    return settings_.updates && verify(settings_.update_key, kUpdateKeySize, text, size, signature, signature_size);
+}
+
+bool FlashBoard::open(const char* url, uint32_t size) {
+    http_.setTimeout(kAnswerMs);
+    // Not encrypted: what comes is checked against a hash that is signed.
+    return http_.begin(client_, url) && http_.GET() == HTTP_CODE_OK && http_.getSize() == static_cast<int>(size);
+}
+
+int FlashBoard::fetch(uint8_t* buffer, size_t size) {
+    const int available = client_.available();
+    if (available <= 0) return client_.connected() ? 0 : -1;
+    return client_.read(buffer, size < static_cast<size_t>(available) ? size : static_cast<size_t>(available));
+}
+
+bool FlashBoard::begin_flash(uint32_t size) { return Update.begin(size); }
+
+bool FlashBoard::write_flash(const uint8_t* data, size_t size) {
+    return Update.write(const_cast<uint8_t*>(data), size) == size;  // its interface forgot the const
+}
+
+bool FlashBoard::commit_flash() { return Update.end(); }
+
+// Ending before all has come discards it.
+void FlashBoard::abandon_flash() { Update.end(); }
+
+void FlashBoard::remember(uint32_t number) {
+    char text[12];
+    snprintf(text, sizeof text, "%lu", static_cast<unsigned long>(number));
+    if (!write_file(kUpdateFile, text)) Serial.printf("the number of the update can't be stored: the flash is full\n");
+}
+
+}  // namespace fognav

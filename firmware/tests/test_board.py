@@ -1,0 +1,359 @@
+"""The whole firmware of the board on this computer, in simulated time, behind stand-ins for the board's libraries."""
+
+import json
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from fog_contracts import channels as ch
+from fog_contracts.codec import decode, encode
+from fog_contracts.messages import NodeCalibration, NodeConfig, NodeReading, NodeUpdate, NodeValue
+
+BOARDS = {"esp8266": ("ESP8266", [(14, 5), (12, 4)]), "esp32": ("ESP32", [(18, 22), (19, 21)])}
+SETTINGS = {
+    "site": "lab", "node": "n1", "wifi_name": "net", "wifi_password": "secret", "broker": "fog.local", "tls": False,
+    "port": 1883, "user": "n1", "every_reading": True, "sonars": [{"range_limit_m": 1.5}, {"range_limit_m": 2}],
+}  # fmt: skip
+PEM = "-----BEGIN CERTIFICATE----- MIIB -----END CERTIFICATE-----"
+
+
+@pytest.fixture(scope="session")
+def programs(firmware, compiler, tmp_path_factory):
+    """The firmware of each board as a program of this computer."""
+    built = {}
+    for board, (macro, _) in BOARDS.items():
+        program = tmp_path_factory.mktemp("board") / board
+        stand_ins = firmware / "host" / "board"
+        folders = ("src", "lib/node_core/src", "lib/node_edge/src", "host/board", "host/board/crypto")
+        files = [str(file) for folder in folders for file in sorted((firmware / folder).glob("*.cpp"))]
+        includes = [f"-I{firmware / folder}" for folder in ("include", *folders[1:])]
+        options = [f"-D{macro}", '-DFOGNAV_FIRMWARE="test"', "-std=gnu++17", "-g", "-fsanitize=address,undefined"]
+        command = [compiler, *options, "-fno-sanitize-recover=all", *includes, *files, "-o", str(program)]
+        done = subprocess.run(command, check=False, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        assert stand_ins.is_dir()
+        built[board] = program
+    return built
+
+
+class Board:
+    """A board that is switched on: it runs as long as a test lets time pass, and tells what it does."""
+
+    def __init__(self, program, pins, flash):
+        self.pins = pins
+        self.flash = flash
+        self._process = subprocess.Popen(
+            [program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+            env={"FLASH": str(flash), "ASAN_OPTIONS": "detect_leaks=0"},
+        )  # fmt: skip
+        self.restarted = False
+        self.started = self._read()
+
+    def _read(self):
+        lines = []
+        for line in self._process.stdout:
+            if line == "done\n":
+                return lines
+            lines.append(line.rstrip("\n"))
+        self.restarted = "restart" in lines
+        assert self.restarted, f"it ended without a restart: {lines[-5:]}"
+        return lines
+
+    def tell(self, *lines):
+        """Return what the firmware does upon these lines."""
+        found = []
+        for line in lines:
+            self._process.stdin.write(line + "\n")
+            self._process.stdin.flush()
+            found += self._read()
+            if self.restarted:
+                break
+        return found
+
+    def run(self, seconds):
+        return self.tell(f"run {round(seconds * 1000)}")
+
+    def measures(self, *millimetres):
+        """Let the sonars measure these ranges from now on."""
+        pairs = zip(self.pins, millimetres, strict=True)
+        self.tell(*(f"sonar {trigger} {echo} {metres}" for (trigger, echo), metres in pairs))
+
+    def send(self, channel, message):
+        text = message if isinstance(message, str) else encode(channel, message).decode()
+        self.tell(f"message {channel.key(site='lab', node='n1')} {text}")
+
+    def close(self):
+        self._process.communicate(timeout=10)  # the end of its input ends it
+
+
+@pytest.fixture
+def switch_on(programs, tmp_path):
+    boards = []
+
+    def switch_on(settings=None, board="esp8266", authority=None):
+        if settings is not None:
+            Path(tmp_path / "node.json").write_text(json.dumps(settings))
+        if authority is not None:
+            Path(tmp_path / "ca.pem").write_text(authority)
+        boards.append(Board(programs[board], BOARDS[board][1], tmp_path))
+        return boards[-1]
+
+    yield switch_on
+    for each in boards:
+        each.close()
+
+
+def published(lines, channel, kind=None, **ids):
+    """Return the messages of a channel among what the firmware did."""
+    topic = channel.key(**(ids or {"site": "lab", "node": "n1"}))
+    texts = []
+    for line in lines:
+        found, _, rest = line.removeprefix("publish ").partition("|")
+        if line.startswith("publish ") and found == topic:
+            qos, retained, text = rest.split("|", 2)
+            assert (int(qos), bool(int(retained))) == (channel.qos, channel.retained)
+            texts.append(text if kind is None else decode(channel, text.encode(), kind))
+    return texts
+
+
+@pytest.mark.parametrize("kind", BOARDS)
+def test_node_joins_connects_announces_itself_and_publishes_what_it_measures(switch_on, kind):
+    board = switch_on(SETTINGS, kind)
+    board.measures(1000, 3000)
+    lines = board.run(5)
+    assert board.started[:4] == [
+        "server fog.local 1883", "client node-n1", "user n1", "will fog/v1/lab/nodes/n1/availability 1 1 offline",
+    ]  # fmt: skip
+    assert lines[:2] == ["join net", "connect"]
+    assert [f"subscribe {row.key(site='lab', node='n1')} 1" in lines for row in (
+        ch.NODE_CONFIG, ch.NODE_COMMAND, ch.NODE_UPDATE)] == [True] * 3  # fmt: skip
+    assert published(lines, ch.NODE_AVAILABILITY) == ["online"]
+    assert published(lines, ch.NODE_PROBLEM) == [""]
+    last = published(lines, ch.NODE_READING, NodeReading)[-1]
+    assert last.range_m == [pytest.approx(1.0, abs=0.005), pytest.approx(3.0, abs=0.005)]
+    assert (last.status, last.state, last.rssi, last.fw) == (["ok", "ok"], "blocked", -60, "test")
+
+
+def test_node_comes_back_after_a_loss_and_announces_itself_again(switch_on):
+    board = switch_on(SETTINGS)
+    board.measures(3000, 3000)
+    board.run(5)
+    board.tell("broker 0")
+    assert published(board.run(20), ch.NODE_READING)[1:] == []
+    board.tell("broker 1")
+    lines = board.run(40)
+    assert published(lines, ch.NODE_AVAILABILITY) == ["online"]
+    assert len(published(lines, ch.NODE_READING)) > 20
+    board.tell("network 0")
+    board.run(20)
+    board.tell("network 1")
+    assert published(board.run(60), ch.NODE_AVAILABILITY) == ["online"]
+
+
+def test_board_restarts_after_ten_minutes_without_a_broker(switch_on):
+    board = switch_on(SETTINGS)
+    board.tell("broker 0")
+    board.run(590)
+    assert not board.restarted
+    board.run(20)
+    assert board.restarted
+
+
+def test_encrypted_node_trusts_its_authority_alone_and_asks_the_fog_for_the_time(switch_on):
+    settings = {key: value for key, value in SETTINGS.items() if key not in {"tls", "port"}}
+    board = switch_on(settings, authority=PEM)
+    assert board.started[:2] == ["trust", "server fog.local 8883"]
+    lines = board.run(5)
+    assert "time from fog.local" in lines
+    assert published(lines, ch.NODE_AVAILABILITY) == ["online"]
+
+
+def test_configuration_counts_and_one_that_is_refused_is_told(switch_on):
+    board = switch_on(SETTINGS)
+    board.measures(1000, 3000)
+    board.run(5)
+    board.send(ch.NODE_CONFIG, NodeConfig(version=1, range_limit_m=[0.5, 0.5], no_echo_is_clear=[False, False]))
+    assert published(board.run(2), ch.NODE_READING, NodeReading)[-1].state == "clear"
+    board.send(ch.NODE_CONFIG, NodeConfig(version=2, range_limit_m=[0.5], no_echo_is_clear=[False]))
+    assert published(board.run(1), ch.NODE_PROBLEM) == ["range_limit_m is for another number of sonars"]
+    board.send(ch.NODE_CONFIG, NodeConfig(version=3, range_limit_m=[2.0, 2.0], no_echo_is_clear=[False, False]))
+    lines = board.run(2)
+    assert published(lines, ch.NODE_PROBLEM) == [""]
+    assert published(lines, ch.NODE_READING, NodeReading)[-1].state == "blocked"
+
+
+def test_calibration_on_command_is_stored_reported_and_outlives_a_restart(switch_on):
+    board = switch_on(SETTINGS)
+    board.measures(1000, -1)
+    board.run(5)
+    board.send(ch.NODE_COMMAND, ch.CALIBRATE)
+    lines = board.run(15)
+    assert "write /calibration.json" in lines
+    (report,) = published(lines, ch.NODE_CALIBRATION, NodeCalibration)
+    assert (report.result, report.no_echo_is_clear) == (["done", "done"], [False, True])
+    assert report.range_limit_m == [pytest.approx(0.8, abs=0.01), 4.0]
+    assert published(lines, ch.NODE_READING, NodeReading)[-1].state == "clear"
+    board.close()
+    again = switch_on()
+    again.measures(1000, -1)
+    lines = again.run(5)
+    assert published(lines, ch.NODE_CALIBRATION, NodeCalibration) == [report]
+    assert published(lines, ch.NODE_READING, NodeReading)[-1].state == "clear"
+
+
+def test_command_that_is_not_known_is_told(switch_on):
+    board = switch_on(SETTINGS)
+    board.run(5)
+    board.send(ch.NODE_COMMAND, "dance")
+    assert "does not know" in published(board.run(1), ch.NODE_PROBLEM)[0]
+
+
+def test_thesis_topic_home_assistant_and_values_are_options(switch_on):
+    values = [{"kind": "temperature", "sensor": "ds18b20", "pin": 13}, {"kind": "gas", "sensor": "analog"}]
+    board = switch_on({**SETTINGS, "thesis_area": 4, "home_assistant": True, "values": values})
+    board.measures(1000, 3000)
+    board.tell("celsius 30.5", "analog 512")
+    lines = board.run(6)
+    assert set(published(lines, ch.THESIS_AREA, number="4")) == {"blocked"}
+    (description,) = published(lines, ch.HOME_ASSISTANT, node="n1")
+    assert json.loads(description)["dev"]["ids"] == "fognav-lab-n1"
+    found = {(value.kind, value.value, value.unit) for value in published(lines, ch.NODE_VALUE, NodeValue)}
+    assert found == {("temperature", 30.5, "C"), ("gas", 1.651, "V")}
+    # 30 degrees: sound is faster than at 20.
+    assert published(lines, ch.NODE_READING, NodeReading)[-1].range_m[0] == pytest.approx(1.018, abs=0.004)
+    board.tell("celsius -127")
+    assert {value.kind for value in published(board.run(3), ch.NODE_VALUE, NodeValue)} == {"gas"}
+
+
+@pytest.mark.parametrize("sensor", ["vl53l0x", "vl53l1x"])
+def test_rangers_share_the_bus_and_measure(switch_on, sensor):
+    each = {"sensor": sensor, "range_limit_m": 1}
+    board = switch_on({**SETTINGS, "sonars": [{**each, "shutdown": 14}, each]})
+    board.tell("range 640")
+    lines = board.started + board.run(5)
+    # The one without a pin leaves the common address before the other wakes up.
+    assert lines[:3] == ["i2c 4 5", f"ranger {sensor} at 49", f"ranger {sensor} at 48"]
+    last = published(lines, ch.NODE_READING, NodeReading)[-1]
+    assert (last.range_m, last.state) == ([0.64, 0.64], "blocked")
+
+
+def test_node_without_settings_opens_a_portal_and_is_set_up_there(switch_on):
+    board = switch_on()
+    assert "network fognav-c0ffee" in board.started
+    assert "answer 200 <!doctype html><html lang=en>" in board.tell("request /", "run 10")[0]
+    assert board.tell("request /generate_204", "run 10") == ["header Location http://192.168.4.1/", "answer 302 "]
+    fields = {"site": "lab", "node": "n1", "wifi_name": "net", "tls": "1", "range_limit_m_0": "1.5"}
+    board.tell(*(f"field {name} {text}" for name, text in fields.items()))
+    assert board.tell("request /settings", "run 10") == [
+        "answer 400 broker is missing: the name or address of the fog node"
+    ]
+    board.tell("field broker fog.local")
+    assert "answer 400 ca.pem is missing" in board.tell("request /settings", "run 10")[0]
+    board.tell(f"field authority {PEM}")
+    lines = board.tell("request /settings", "run 10")
+    assert lines[:3] == [
+        "write /ca.pem",
+        "write /node.json",
+        "answer 200 Saved. The node restarts and joins your network.",
+    ]
+    assert board.restarted
+    again = switch_on()
+    again.pins = again.pins[:1]
+    again.measures(1000)
+    assert published(again.run(5), ch.NODE_AVAILABILITY) == ["online"]
+
+
+@pytest.mark.parametrize("text", ["", "{}", "x" * 3000])
+def test_node_with_damaged_settings_says_so_and_opens_a_portal(switch_on, tmp_path, text):
+    Path(tmp_path / "node.json").write_text(text)
+    board = switch_on()
+    assert board.started[0].startswith("serial ")
+    assert "network fognav-c0ffee" in board.started
+
+
+def test_button_held_for_three_seconds_opens_the_portal_until_nobody_uses_it(switch_on):
+    board = switch_on({**SETTINGS, "button": 13})
+    board.run(5)
+    assert not any(line.startswith("network") for line in board.tell("pin 13 0", "run 2500", "pin 13 1", "run 1000"))
+    assert "network fognav-c0ffee" in board.tell("pin 13 0", "run 3500", "pin 13 1")
+    board.run(590)
+    assert not board.restarted
+    board.run(20)
+    assert board.restarted
+
+
+def test_update_with_a_signature_that_is_not_good_is_told_and_fetches_nothing(switch_on):
+    board = switch_on({**SETTINGS, "update_key": "04" + "ab" * 64})
+    board.run(5)
+    update = NodeUpdate(
+        number=9, board="d1-mini", size=1000, sha256="ab" * 32, signature="3006020101020101", url="http://fog/n1.bin"
+    )
+    board.send(ch.NODE_UPDATE, update)
+    assert published(board.run(2), ch.NODE_PROBLEM) == [
+        "the update is not signed by the key in update_key of node.json"
+    ]
+
+
+SIGNATURES = r"""
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include "hexadecimal.hpp"
+#include "signature.hpp"
+int main(int, char** arguments) {
+    uint8_t key[65], signature[80], hash[32];
+    if (fognav::bytes(arguments[1], key, sizeof key) != 65) return 2;
+    const int size = fognav::bytes(arguments[2], signature, sizeof signature);
+    fognav::Sha256 sha;
+    sha.add(arguments[3], strlen(arguments[3]));
+    sha.end(hash);
+    for (const uint8_t byte : hash) printf("%02x", byte);
+    const size_t length = strlen(arguments[3]);
+    printf(" %d\n", fognav::verify(key, sizeof key, arguments[3], length, signature, static_cast<size_t>(size)));
+}
+"""
+
+
+@pytest.mark.parametrize(
+    ("macro", "header", "libraries"),
+    [("ESP8266", "bearssl/bearssl.h", ["-lbearssl"]), ("ESP32", "mbedtls/ecdsa.h", ["-lmbedcrypto"])],
+)
+def test_signature_by_openssl_is_good_for_the_boards_library_and_nothing_else_is(
+    firmware, compiler, tmp_path, macro, header, libraries
+):
+    if not Path("/usr/include", header).is_file() or shutil.which("openssl") is None:
+        pytest.skip(f"no {header} or no openssl: apt-get install libbearssl-dev libmbedtls-dev openssl")
+    main = tmp_path / "main.cpp"
+    main.write_text(SIGNATURES)
+    folders = ("include", "src", "lib/node_edge/src")
+    files = [main, firmware / "src" / "signature.cpp", firmware / "lib" / "node_edge" / "src" / "hexadecimal.cpp"]
+    includes = [f"-I{firmware / folder}" for folder in folders]
+    command = [compiler, f"-D{macro}", "-std=gnu++17", "-Wall", "-Wextra", "-Werror", *includes, *map(str, files)]
+    subprocess.run([*command, *libraries, "-o", str(tmp_path / "program")], check=True, capture_output=True)
+
+    def openssl(*arguments, text=None):
+        done = subprocess.run(["openssl", *arguments], cwd=tmp_path, input=text, check=True, capture_output=True)
+        return done.stdout
+
+    openssl("ecparam", "-name", "prime256v1", "-genkey", "-noout", "-out", "key.pem")
+    key = openssl("ec", "-in", "key.pem", "-pubout", "-outform", "DER")[-65:].hex()
+    text = "fognav-firmware\nd1-mini\n6\n1000\nabcd\n"
+    signature = openssl("dgst", "-sha256", "-sign", "key.pem", text=text.encode()).hex()
+
+    def checked(*arguments):
+        return subprocess.run([tmp_path / "program", *arguments], check=True, capture_output=True, text=True).stdout
+
+    digest = openssl("dgst", "-sha256", "-hex", text=text.encode()).decode().split()[-1]
+    assert checked(key, signature, text) == f"{digest} 1\n"
+    assert checked(key, signature, text + " ").endswith(" 0\n")
+    flipped = f"{int(signature[20], 16) ^ 1:x}"
+    assert checked(key, signature[:20] + flipped + signature[21:], text).endswith(" 0\n")
+    assert checked(key, "", text).endswith(" 0\n")
+    other = openssl("ecparam", "-name", "prime256v1", "-genkey", "-noout", "-out", "other.pem")
+    assert other == b""
+    foreign = openssl("ec", "-in", "other.pem", "-pubout", "-outform", "DER")[-65:].hex()
+    assert checked(foreign, signature, text).endswith(" 0\n")
+    off_the_curve = "04" + "01" * 64
+    assert checked(off_the_curve, signature, text).endswith(" 0\n")

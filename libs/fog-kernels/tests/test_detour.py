@@ -14,7 +14,7 @@ from shortest_paths import cell_of, costmaps, dijkstra
 
 from fog_kernels.astar import STRAIGHT, Planner
 from fog_kernels.detour import Shadow
-from fog_kernels.guides import border_costs
+from fog_kernels.tiles import TilePatterns
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -33,12 +33,12 @@ def raise_somewhere(costmap: NDArray[np.uint8], data: st.DataObject) -> NDArray[
 @settings(max_examples=examples(200), deadline=None)
 @given(costmaps(), st.data())
 def test_searches_guided_by_field_and_detour_equal_full_searches(bound: NDArray[np.uint8], data: st.DataObject) -> None:
-    planner = Planner(bound.shape[1], bound.shape[0])
-    reference = planner.goal_field(bound, cell_of(data, bound))
+    planner, patterns = Planner(bound.shape[1], bound.shape[0]), TilePatterns(10**6)
+    reference = planner.goal_field(bound, cell_of(data, bound), patterns)
     closed = raise_somewhere(raise_somewhere(bound, data), data)
     starts = [cell_of(data, bound) for _ in range(data.draw(st.integers(1, 4)))]
     shadow = Shadow(closed, bound, reference, starts, planner)
-    levels = np.maximum(border_costs(reference, shadow.border), 0)
+    levels = np.maximum(reference.costs(shadow.border), 0)
     detour = shadow.detour(levels + data.draw(st.integers(0, 10**6)) * np.arange(len(levels)))
     if detour is None:
         assert len(shadow.border) == 0
@@ -46,9 +46,9 @@ def test_searches_guided_by_field_and_detour_equal_full_searches(bound: NDArray[
     for costmap in (closed, raise_somewhere(closed, data)):
         for start in starts:
             goal = cell_of(data, bound)
-            if not detour.covers(start) or shadow.contains(goal):
+            if not shadow.contains(start) or shadow.contains(goal):
                 continue
-            field = planner.goal_field(bound, goal)
+            field = planner.goal_field(bound, goal, patterns)
             for _ in range(data.draw(st.integers(0, 2))):
                 field = field.coarser()
             expected = dijkstra(costmap, start).get(goal)
@@ -56,7 +56,8 @@ def test_searches_guided_by_field_and_detour_equal_full_searches(bound: NDArray[
             assert found.cost == (math.inf if expected is None else expected / (2 * STRAIGHT))
             offset = detour.offset(field)
             if expected is not None and offset is not None:
-                assert int(detour.costs[start[1], start[0]]) * detour.unit + offset <= expected
+                assert min(int(detour.costs[start[1], start[0]]), detour.highest) + offset <= expected
+                assert detour.covers(start)
 
 
 def test_closed_corridor_is_its_own_shadow_and_is_left_by_its_ends_only() -> None:
@@ -67,7 +68,7 @@ def test_closed_corridor_is_its_own_shadow_and_is_left_by_its_ends_only() -> Non
     closed = bound.copy()
     closed[4, 30] = 254
     planner = Planner(40, 9)
-    shadow = Shadow(closed, bound, planner.goal_field(bound, (38, 4)), [(10, 4)], planner)
+    shadow = Shadow(closed, bound, planner.goal_field(bound, (38, 4), TilePatterns(10**6)), [(10, 4)], planner)
     assert shadow.contains((10, 4))
     assert shadow.contains((29, 4))
     assert not shadow.contains((30, 4))
@@ -82,9 +83,10 @@ def test_detour_saves_the_flood_of_a_closed_room() -> None:
     closed = bound.copy()
     closed[5:55, 40] = closed[5, 10:40] = closed[54, 10:40] = 254  # a pocket that opens to the left
     planner = Planner(60, 60)
-    fields = [planner.goal_field(bound, goal) for goal in ((55, 30), (55, 33))]
+    patterns = TilePatterns(10**6)
+    fields = [planner.goal_field(bound, goal, patterns) for goal in ((55, 30), (55, 33))]
     shadow = Shadow(closed, bound, fields[0], [(30, 30), (20, 35)], planner)
-    detour = shadow.detour(border_costs(fields[0], shadow.border))
+    detour = shadow.detour(fields[0].costs(shadow.border))
     assert detour is not None
     flooded = planner.plan(closed, (20, 35), (55, 33), field=fields[1])
     guided = planner.plan(closed, (20, 35), (55, 33), field=fields[1], detour=detour)
@@ -95,5 +97,6 @@ def test_detour_saves_the_flood_of_a_closed_room() -> None:
 def test_shadow_of_a_coarse_field_is_refused() -> None:
     bound = np.zeros((8, 8), np.uint8)
     planner = Planner(8, 8)
-    with pytest.raises(ValueError, match="blocks of 2 cells"):
-        Shadow(bound, bound, planner.goal_field(bound, (1, 1)).coarser(), [(6, 6)], planner)
+    field = planner.goal_field(bound, (1, 1), TilePatterns(10**6))
+    with pytest.raises(ValueError, match="exact"):
+        Shadow(bound, bound, field.coarser(), [(6, 6)], planner)

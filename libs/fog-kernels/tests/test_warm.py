@@ -19,7 +19,7 @@ from fog_contracts.costs import DEFAULT_INFLATION
 from fog_kernels import warm
 warm.warm()
 from fog_kernels import amcl, astar, body, clearance, components, distance, dwa, dwa_settings, inflation, likelihood
-from fog_kernels import raycast
+from fog_kernels import raycast, tiles
 raw = np.zeros((60, 60), np.uint8)
 raw[0] = 254
 shut = raw.copy()
@@ -31,7 +31,9 @@ for source in (raw, shut):
     distance.squared_distance_capped(source, 5)
     field = likelihood.likelihood_field(source == 254, 0.05)
     planner = astar.Planner(60, 60)
-    guide = planner.goal_field(cost, (50, 50)).coarser()
+    patterns = tiles.TilePatterns(10**6)
+    guide = planner.goal_field(cost, (50, 50), patterns)
+    patterns.compacted([guide]), planner.goal_field(cost, (9, 9), tiles.TilePatterns(0), 2).coarser()
     cells = planner.plan(cost, (20, 20), (50, 50), field=guide).cells
     planner.plan(cost, (np.int64(20), np.int32(20)), (40, 50), max_expansions=10)
     planner.shortcut(cost, cells)

@@ -513,7 +513,7 @@ def test_goal_field_keeps_the_path_length_and_is_discarded_when_costs_fall_below
     assert drive.core.jobs(drive.moment) == []
     job.run()
     assert not drive.core.add(job, drive.now)
-    assert drive.core.fields_bytes == 2 * drive.map.static.size
+    assert 0 < drive.core.fields_bytes < 2 * drive.map.static.size
     guided = drive.go(*RIGHT)
     assert length(guided) == pytest.approx(length(Drive(start=LEFT).go(*RIGHT)), rel=0.01)
     # A door in the static wall opens: the map-service got another floor plan under the same epoch.

@@ -359,7 +359,7 @@ def test_field_is_computed_once_per_goal_and_discarded_with_its_lower_bound() ->
     assert again.bound is not BOUND
 
 
-def test_fields_guide_on_until_the_risen_costs_have_theirs_and_a_coarse_one_guides_after_a_fall() -> None:
+def test_fields_guide_on_until_the_risen_costs_have_theirs_and_one_over_the_walls_guides_after_a_fall() -> None:
     fields = GoalFields(10_000)
     fields.set_bounds(BOUND, BOUND)
     (job,) = fields.jobs([(3, 3)])
@@ -374,14 +374,15 @@ def test_fields_guide_on_until_the_risen_costs_have_theirs_and_a_coarse_one_guid
     after = fields.guide((3, 3))
     assert after is not None
     assert before is not None
-    assert after.costs[5, 15] > before.costs[5, 15]
+    behind = np.array([5 * 20 + 15])
+    assert after.costs(behind) > before.costs(behind)
     assert fields.jobs([(3, 3)]) == []
     fields.set_bounds(BOUND, BOUND.copy())
-    coarse = fields.guide((3, 3))
-    assert coarse is not None
-    assert coarse.bits == 3
+    fallback = fields.guide((3, 3))
+    assert fallback is not None
+    assert fallback.costs(behind) == before.costs(behind)
     planner = Planner(20, 12)
-    assert planner.plan(BOUND, (15, 5), (3, 3), field=coarse).cost == planner.plan(BOUND, (15, 5), (3, 3)).cost
+    assert planner.plan(BOUND, (15, 5), (3, 3), field=fallback).cost == planner.plan(BOUND, (15, 5), (3, 3)).cost
     assert [again.goal for again in fields.jobs([(3, 3)])] == [(3, 3)]
 
 
@@ -439,32 +440,32 @@ def test_field_over_an_outdated_lower_bound_is_not_computed_and_dropped() -> Non
 
 
 def test_every_goal_has_a_field_within_the_bound_of_memory_and_a_goal_in_a_wall_gets_none() -> None:
-    fields = GoalFields(2 * BOUND.size + 200)  # one field at full resolution and a bit
+    fields = GoalFields(2 * 1024)  # half of it for patterns: one, where a field has two
     walled = BOUND.copy()
     walled[5, 5] = 254
     fields.set_bounds(walled, walled)
     assert fields.jobs([(5, 5)]) == []
     (first,) = fields.jobs([(1, 1)])
     run(fields, first)
-    assert fields.size == 2 * BOUND.size
+    assert fields.size == 4 * BOUND.size
     goals = [(1, 1), *((x, 2) for x in range(2, 14))]
     for job in fields.jobs(goals):
         run(fields, job)
-        assert fields.size <= 2 * BOUND.size + 200
+        assert fields.size <= 2 * 1024
     assert all(fields.guide(goal) is not None for goal in goals)
     assert fields.fields.keys() == set(goals)
 
 
 def test_fields_of_goals_that_ended_make_room_for_new_ones() -> None:
-    fields = GoalFields(2 * BOUND.size)
-    fields.set_bounds(BOUND, BOUND)
-    for goal_cell in ((1, 1), (2, 2)):
+    rng = np.random.default_rng(2)
+    bound = rng.integers(0, 253, (64, 64)).astype(np.uint8)  # no tile is like another
+    fields = GoalFields(2 * 24 * 1024)  # patterns of one field and a half
+    fields.set_bounds(bound, bound)
+    for goal_cell in ((1, 1), (60, 2), (30, 60)):
         (job,) = fields.jobs([goal_cell])
         run(fields, job)
-        guide = fields.guide(goal_cell)
-        assert guide is not None
-        assert guide.bits == 0
-    assert fields.guide((1, 1)) is None
+        assert fields.exact.keys() == {goal_cell}
+        assert fields.size <= 2 * 24 * 1024
 
 
 # --- Regions, search, egress ---

@@ -23,16 +23,17 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numba import float64, int64, njit, types, void
+from numba import float64, int64, njit, types
 
 from fog_contracts.costs import COST_WEIGHT, INSCRIBED, NEUTRAL_WEIGHT, PENALTY_MAX
 from fog_kernels import _arrays
-from fog_kernels.guides import UNREACHABLE, GoalField
+from fog_kernels.guides import TILE, TILE_BITS, GoalField
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from fog_kernels.guides import Detour
+    from fog_kernels.tiles import TilePatterns
 
 STRAIGHT = 408
 DIAGONAL = 577
@@ -48,9 +49,6 @@ type_cells = _arrays.I32_FLAT
 type_scratch = _arrays.I32_OUT
 
 
-_U16_FLAT = types.Array(types.uint16, 1, "C", readonly=True)
-
-
 def _search_signature(costs: Any) -> Any:
     write = types.Array(costs, 1, "C")
     return types.void(
@@ -59,12 +57,14 @@ def _search_signature(costs: Any) -> Any:
         _arrays.I32_FLAT,  # weight
         int64,  # start
         int64,  # goal
-        _U16_FLAT,  # field
+        _arrays.I32_FLAT,  # lowest
         int64,  # field_width
         int64,  # field_bits
         int64,  # field_unit
-        _U16_FLAT,  # detour
-        int64,  # detour_unit
+        _arrays.I32_FLAT,  # slots
+        _arrays.I32_FLAT,  # patterns
+        _arrays.I32_FLAT,  # detour
+        int64,  # detour_highest
         int64,  # detour_offset
         write,  # g
         type_scratch,  # queue_cell
@@ -84,12 +84,14 @@ def _search(
     weight: Any,
     start: int,
     goal: int,
-    field: Any,
+    lowest: Any,
     field_width: int,
     field_bits: int,
     field_unit: int,
+    slots: Any,
+    patterns: Any,
     detour: Any,
-    detour_unit: int,
+    detour_highest: int,
     detour_offset: int,
     g: Any,
     queue_cell: Any,
@@ -100,7 +102,7 @@ def _search(
     max_expansions: int,
     result: Any,
 ) -> None:
-    """Search from start to goal; an empty field (see `GoalField`) means the octile heuristic, and no detour.
+    """Search from start to goal; an empty `lowest` (see `GoalField`) means the octile heuristic, and no detour.
 
     `g` holds its largest value everywhere before and after. A negative g is the complement of an expanded cell's
     cost. `result` receives status, cost, path length, expansions; the path itself ends in queue_cell, goal first.
@@ -111,10 +113,12 @@ def _search(
     height = costmap.size // width
     mask = heads.size - 1
     capacity = queue_cell.size
-    use_field = field.size > 0
+    use_field = lowest.size > 0
+    use_patterns = slots.size > 0
     use_detour = detour.size > 0
     goal_x = goal % width
     goal_y = goal // width
+    last = TILE - 1
     cheapest = 2 * np.int64(weight[0])
     step_straight = STRAIGHT * cheapest
     step_extra = (DIAGONAL - STRAIGHT) * cheapest
@@ -131,12 +135,20 @@ def _search(
         result[2] = 1
         return
     if use_field:
-        block = np.int64(field[(start // width >> field_bits) * field_width + (start % width >> field_bits)])
-        if block == UNREACHABLE:
+        y = start // width
+        x = start % width
+        block = np.uint64((y >> field_bits) * field_width + (x >> field_bits))
+        remaining = np.int64(lowest[block]) * field_unit
+        if remaining < 0:
             return
-        remaining = block * field_unit
-        if use_detour and detour[start] != UNREACHABLE:
-            remaining = max(remaining, np.int64(detour[start]) * detour_unit + detour_offset)
+        if use_patterns:
+            place = (np.int64(slots[block]) << (2 * TILE_BITS)) + ((y & last) << TILE_BITS) + (x & last)
+            rise = np.int64(patterns[np.uint64(place)])
+            if rise < 0:
+                return
+            remaining += rise
+        if use_detour and detour[start] > 0:
+            remaining = max(remaining, min(np.int64(detour[start]), detour_highest) + detour_offset)
         bucket = remaining >> shift
     else:
         dx = abs(start % width - goal_x)
@@ -187,12 +199,15 @@ def _search(
         x = cell - y * width
         if best != highest:
             if use_field:
-                block = np.int64(field[np.uint64((y >> field_bits) * field_width + (x >> field_bits))])
-                remaining = block * field_unit
+                block = np.uint64((y >> field_bits) * field_width + (x >> field_bits))
+                remaining = np.int64(lowest[block]) * field_unit
+                if use_patterns:
+                    place = (np.int64(slots[block]) << (2 * TILE_BITS)) + ((y & last) << TILE_BITS) + (x & last)
+                    remaining += np.int64(patterns[np.uint64(place)])
                 if use_detour:
                     bound = np.int64(detour[np.uint64(cell)])
-                    if bound != UNREACHABLE:
-                        remaining = max(remaining, bound * detour_unit + detour_offset)
+                    if bound > 0:
+                        remaining = max(remaining, min(bound, detour_highest) + detour_offset)
                 f = here + remaining
             else:
                 dx = abs(x - goal_x)
@@ -242,14 +257,20 @@ def _search(
             nx = x + columns[k]
             ny = y + rows[k]
             if use_field:
-                block = np.int64(field[np.uint64((ny >> field_bits) * field_width + (nx >> field_bits))])
-                if block == UNREACHABLE:
+                block = np.uint64((ny >> field_bits) * field_width + (nx >> field_bits))
+                remaining = np.int64(lowest[block]) * field_unit
+                if remaining < 0:
                     continue
-                remaining = block * field_unit
+                if use_patterns:
+                    place = (np.int64(slots[block]) << (2 * TILE_BITS)) + ((ny & last) << TILE_BITS) + (nx & last)
+                    rise = np.int64(patterns[np.uint64(place)])
+                    if rise < 0:
+                        continue
+                    remaining += rise
                 if use_detour:
                     bound = np.int64(detour[np.uint64(neighbour)])
-                    if bound != UNREACHABLE:
-                        remaining = max(remaining, bound * detour_unit + detour_offset)
+                    if bound > 0:
+                        remaining = max(remaining, min(bound, detour_highest) + detour_offset)
             else:
                 dx = abs(nx - goal_x)
                 dy = abs(ny - goal_y)
@@ -445,18 +466,6 @@ def _fill_field(
     if exits.size > 0 and exit_cell < 0:
         return _NOT_FOUND, exit_cell
     return _FOUND, exit_cell
-
-
-def _compact_signature(costs: Any) -> Any:
-    return void(types.Array(costs, 1, "C", readonly=True), int64, int64, types.Array(types.uint16, 1, "C"))
-
-
-@njit([_compact_signature(types.int32), _compact_signature(types.int64)], cache=True, nogil=True)
-def _compact(field: Any, unset: int, unit: int, out: Any) -> None:
-    """Write the field in multiples of `unit`, rounded down."""
-    for cell in range(field.size):
-        cost = np.int64(field[cell])
-        out[cell] = UNREACHABLE if cost == unset else cost // unit
 
 
 def _descend_signature(costs: Any) -> Any:
@@ -665,7 +674,7 @@ def _weights(neutral: int, factor: float) -> NDArray[np.int32]:
 _DEFAULT_WEIGHTS = _weights(NEUTRAL_WEIGHT, COST_WEIGHT)
 
 
-_NO_FIELD: NDArray[np.uint16] = np.empty(0, np.uint16)
+_NO_GUIDE: NDArray[np.int32] = np.empty(0, np.int32)
 _NO_EXITS: NDArray[np.uint8] = np.empty(0, np.uint8)
 
 
@@ -768,17 +777,7 @@ class Planner:
         costmap = self._grid(costmap)
         first = self._index(start, "start")
         last = self._index(goal, "goal")
-        around, around_unit, offset = _NO_FIELD, 0, None
-        if field is None:
-            guide, columns, bits, unit = _NO_FIELD, 0, 0, 0
-        elif field.goal == (int(goal[0]), int(goal[1])) and (field.width, field.height) == (self.width, self.height):
-            guide, columns = field.costs.ravel(), field.costs.shape[1]
-            bits, unit = field.bits, field.unit
-            if detour is not None and (offset := detour.offset(field)) is not None:
-                around, around_unit = detour.costs.ravel(), detour.unit
-        else:
-            size = f"{field.width} x {field.height}"
-            raise ValueError(f"the field is of goal {field.goal} on {size} cells: pass that of this goal and map")
+        guides = self._guides((int(goal[0]), int(goal[1])), field, detour)
         while True:
             _search(
                 costmap.ravel(),
@@ -786,13 +785,7 @@ class Planner:
                 self.weight,
                 first,
                 last,
-                guide,
-                columns,
-                bits,
-                unit,
-                around,
-                around_unit,
-                offset or 0,
+                *guides,
                 self._g,
                 self._queue_cell,
                 self._queue_next,
@@ -824,25 +817,39 @@ class Planner:
         np.subtract(flat, cells[:, 1] * self.width, out=cells[:, 0])
         return PlanResult(found=True, cost=cost / (2.0 * STRAIGHT), cells=cells, expansions=expansions)
 
+    def _guides(self, goal: tuple[int, int], field: GoalField | None, detour: Detour | None) -> tuple[object, ...]:
+        """Return the kernel's arguments for field and detour; raises ValueError for a field of another goal or map."""
+        if field is None:
+            return _NO_GUIDE, 0, 0, 0, _NO_GUIDE, _NO_GUIDE, _NO_GUIDE, 0, 0
+        if field.goal != goal or (field.width, field.height) != (self.width, self.height):
+            size = f"{field.width} x {field.height}"
+            raise ValueError(f"the field is of goal {field.goal} on {size} cells: pass that of this goal and map")
+        around, highest, offset = _NO_GUIDE, 0, None
+        if detour is not None and (offset := detour.offset(field)) is not None:
+            around, highest = detour.costs.ravel(), detour.highest
+        return (
+            field.lowest.ravel(), field.lowest.shape[1], field.bits, field.unit, field.slots.ravel(),
+            field.patterns.ravel(), around, highest, offset or 0,
+        )  # fmt: skip
+
     def _widen(self) -> None:
         """Switch to 64-bit costs permanently: a path's cost exceeds 32 bits."""
         self._costs = np.int64
         self._allocate()
 
-    def goal_field(self, costmap: NDArray[np.uint8], goal: tuple[int, int]) -> GoalField:
+    def goal_field(
+        self, costmap: NDArray[np.uint8], goal: tuple[int, int], patterns: TilePatterns, bits: int = TILE_BITS
+    ) -> GoalField:
         """Return the field of a goal (column, row), which guides `plan` on this costmap and on any with raised costs.
 
-        Takes as long as a Dijkstra search of the whole map. Raises ValueError as `plan` does.
+        Its tiles are added to `patterns`; if they don't fit, it has blocks of 2^bits cells. Takes as long as a Dijkstra
+        search of the whole map. Raises ValueError as `plan` does.
         """
         costmap = self._grid(costmap)
         self._fill(costmap, self._index(goal, "goal"), _NO_EXITS)
-        unset = np.iinfo(self._costs).max
-        highest = int(self._g.max(where=self._g != unset, initial=0))
-        unit = highest // (UNREACHABLE - 1) + 1
-        costs = np.empty((self.height, self.width), np.uint16)
-        _compact(self._g, unset, unit, costs.ravel())
-        self._g.fill(unset)
-        return GoalField((int(goal[0]), int(goal[1])), self.width, self.height, 0, costs, unit)
+        field = patterns.field(self._g, (int(goal[0]), int(goal[1])), self.width, self.height, bits)
+        self._g.fill(np.iinfo(self._costs).max)
+        return field
 
     def exit_path(
         self, costmap: NDArray[np.uint8], exits: NDArray[np.uint8], start: tuple[int, int]

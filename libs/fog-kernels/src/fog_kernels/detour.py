@@ -26,7 +26,7 @@ from numba import int64, njit, types, void
 
 from fog_kernels import _arrays
 from fog_kernels.astar import DIAGONAL, STRAIGHT
-from fog_kernels.guides import UNREACHABLE, Detour
+from fog_kernels.guides import TILE, TILE_BITS, Detour
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -39,15 +39,13 @@ if TYPE_CHECKING:
 _QUEUED = 1
 _SHADOW = 2
 _LIT = 3
-_INSIDE = 4
-_BORDER = 5
+_BORDER = 4
+_INSIDE = 5
+_START = 6
 
 _BUCKETS = 65536
-"""One for every value of a goal field."""
 _UNSET = 2147483647
 
-_U16_FLAT = types.Array(types.uint16, 1, "C", readonly=True)
-_U16_OUT = types.Array(types.uint16, 1, "C")
 _U8_OUT = types.Array(types.uint8, 1, "C")
 _I64_FLAT = types.Array(types.int64, 1, "C", readonly=True)
 
@@ -60,74 +58,90 @@ def _steps(width: int) -> tuple[Any, Any, Any, Any]:
     return columns, rows, rows * width + columns, np.where(columns * rows == 0, STRAIGHT, DIAGONAL)
 
 
+@njit(inline="always")
+def _cost_to_goal(lowest: Any, columns: int, slots: Any, patterns: Any, x: int, y: int) -> int:
+    """Return the cost of a cell in an exact field; -1 where no path leads to the goal."""
+    tile = np.uint64((y >> TILE_BITS) * columns + (x >> TILE_BITS))
+    last = TILE - 1
+    place = (np.int64(slots[tile]) << (2 * TILE_BITS)) + ((y & last) << TILE_BITS) + (x & last)
+    rise = np.int64(patterns[np.uint64(place)])
+    return rise if rise < 0 or lowest[tile] < 0 else rise + np.int64(lowest[tile])
+
+
 @njit(
     int64(
-        _arrays.U8_FLAT, int64, _arrays.I32_FLAT, _U16_FLAT, int64, _arrays.I32_FLAT, _U8_OUT,
-        _arrays.I32_OUT, _arrays.I32_OUT,
+        _arrays.U8_FLAT, int64, _arrays.I32_FLAT, _arrays.I32_FLAT, int64, _arrays.I32_FLAT, _arrays.I32_FLAT,
+        _arrays.I32_FLAT, _U8_OUT, _arrays.I32_OUT, _arrays.I32_OUT, int64,
     ),
     cache=True, nogil=True, error_model="numpy",
 )  # fmt: skip
 def _mark_shadow(
-    costmap: Any, width: int, weight: Any, field: Any, unit: int, raised: Any, mark: Any, chain: Any, heads: Any
-) -> int:
+    costmap: Any, width: int, weight: Any, lowest: Any, tile_columns: int, slots: Any, patterns: Any,
+    raised: Any, mark: Any, chain: Any, heads: Any, shift: int,
+) -> int:  # fmt: skip
     """Mark the cells whose cheapest path leads through raised cells, in the order of the field; return their number.
 
     A cell is lit, not in the shadow, when a step to a cell outside the shadow leads on at the cost that the field
-    gives, but for its rounding. Each cell is queued once, so the queue is a chain through the cells themselves.
+    gives. Each cell is queued once, so the queue is a chain through the cells themselves. A bucket is no wider than the
+    cheapest step, so the cells that one leads on to are marked before it.
     """
     height = costmap.size // width
     columns, rows, steps, lengths = _steps(width)
     heads[:] = -1
     for i in range(raised.size):
         cell: Any = np.int64(raised[i])
-        reached = np.int64(field[np.uint64(cell)])
-        if reached != UNREACHABLE:
+        y: Any = np.int64(np.uint32(cell) // np.uint32(width))
+        cost = _cost_to_goal(lowest, tile_columns, slots, patterns, cell - y * width, y)
+        if cost >= 0:
             mark[np.uint64(cell)] = _QUEUED
-            chain[np.uint64(cell)] = heads[np.uint64(reached)]
-            heads[np.uint64(reached)] = cell
+            chain[np.uint64(cell)] = heads[np.uint64(cost >> shift)]
+            heads[np.uint64(cost >> shift)] = cell
     count = 0
-    for level in range(_BUCKETS - 1):
-        while heads[np.uint64(level)] >= 0:
-            cell = np.int64(heads[np.uint64(level)])
-            heads[np.uint64(level)] = chain[np.uint64(cell)]
-            y: Any = np.int64(np.uint32(cell) // np.uint32(width))
+    around = np.empty(8, np.int64)
+    for bucket in range(heads.size):
+        while heads[np.uint64(bucket)] >= 0:
+            cell = np.int64(heads[np.uint64(bucket)])
+            heads[np.uint64(bucket)] = chain[np.uint64(cell)]
+            y = np.int64(np.uint32(cell) // np.uint32(width))
             x = cell - y * width
             own = np.int64(weight[costmap[np.uint64(cell)]])
-            lit = False
-            if own > 0:
-                lit = level == 0
-                for k in range(8):
-                    if not (0 <= x + columns[k] < width and 0 <= y + rows[k] < height):
+            cost = _cost_to_goal(lowest, tile_columns, slots, patterns, x, y)
+            lit = own > 0 and cost == 0
+            for k in range(8):
+                around[k] = -1
+                if lit or not (0 <= x + columns[k] < width and 0 <= y + rows[k] < height):
+                    continue
+                other = cell + steps[k]
+                known = mark[np.uint64(other)]
+                if known == _LIT and own == 0:
+                    continue
+                there = _cost_to_goal(lowest, tile_columns, slots, patterns, x + columns[k], y + rows[k])
+                if there > cost:
+                    if known == 0:
+                        around[k] = there
+                    continue
+                if there < 0 or known == _SHADOW or own == 0:
+                    continue
+                weight_there = np.int64(weight[costmap[np.uint64(other)]])
+                if weight_there == 0 or there + lengths[k] * (own + weight_there) > cost:
+                    continue
+                if columns[k] != 0 and rows[k] != 0:
+                    aside, along = np.uint64(cell + columns[k]), np.uint64(cell + steps[k] - columns[k])
+                    if weight[costmap[aside]] == 0 or weight[costmap[along]] == 0:
                         continue
-                    other = cell + steps[k]
-                    if np.int64(field[np.uint64(other)]) >= level or mark[np.uint64(other)] == _SHADOW:
-                        continue
-                    there = np.int64(weight[costmap[np.uint64(other)]])
-                    if there == 0:
-                        continue
-                    if columns[k] != 0 and rows[k] != 0:
-                        aside, along = np.uint64(cell + columns[k]), np.uint64(cell + steps[k] - columns[k])
-                        if weight[costmap[aside]] == 0 or weight[costmap[along]] == 0:
-                            continue
-                    if np.int64(field[np.uint64(other)]) * unit + lengths[k] * (own + there) < (level + 1) * unit:
-                        lit = True
-                        break
+                lit = True
             if lit:
                 mark[np.uint64(cell)] = _LIT
                 continue
             mark[np.uint64(cell)] = _SHADOW
             count += 1
             for k in range(8):
-                if not (0 <= x + columns[k] < width and 0 <= y + rows[k] < height):
-                    continue
-                other = cell + steps[k]
-                if mark[np.uint64(other)] != 0:
-                    continue
-                reached = np.int64(field[np.uint64(other)])
-                if level < reached < UNREACHABLE:
+                if around[k] >= 0:
+                    other = cell + steps[k]
+                    slot = np.uint64(around[k] >> shift)
                     mark[np.uint64(other)] = _QUEUED
-                    chain[np.uint64(other)] = heads[np.uint64(reached)]
-                    heads[np.uint64(reached)] = other
+                    chain[np.uint64(other)] = heads[slot]
+                    heads[slot] = other
     return count
 
 
@@ -165,7 +179,7 @@ def _enclose(
             if not (0 <= x + columns[k] < width and 0 <= y + rows[k] < height):
                 continue
             other = cell + steps[k]
-            if mark[np.uint64(other)] >= _INSIDE:
+            if mark[np.uint64(other)] >= _BORDER:
                 continue
             there = np.int64(weight[costmap[np.uint64(other)]])
             if there == 0:
@@ -188,26 +202,27 @@ def _enclose(
 
 @njit(
     int64(
-        _arrays.U8_FLAT, int64, _arrays.I32_FLAT, _arrays.I32_FLAT, _I64_FLAT, _U8_OUT, _arrays.I32_OUT,
+        _arrays.U8_FLAT, int64, _arrays.I32_FLAT, _arrays.I32_FLAT, _I64_FLAT, int64, _U8_OUT, _arrays.I32_OUT,
         _arrays.I32_OUT, _arrays.I32_OUT, _arrays.I32_OUT, int64,
     ),
     cache=True, nogil=True, error_model="numpy",
 )  # fmt: skip
 def _fill(
-    costmap: Any, width: int, weight: Any, border: Any, levels: Any, mark: Any, label: Any,
+    costmap: Any, width: int, weight: Any, border: Any, levels: Any, starts: int, mark: Any, label: Any,
     queue_cell: Any, queue_next: Any, heads: Any, shift: int,
 ) -> int:  # fmt: skip
-    """Write the lowest cost from every cell inside to a border cell, plus that cell's level.
+    """Write the lowest cost from cells inside to a border cell, plus that cell's level, until all starts have theirs.
 
-    Return the highest, or -1 when the costs or the queue exceed their limits.
+    Return below which costs they are final; costs that are not lower are not lower in truth, either. -1 when the costs
+    or the queue exceed their limits.
     """
     height = costmap.size // width
     columns, rows, steps, lengths = _steps(width)
     heads[:] = -1
     free: Any = np.int64(-1)
     used: Any = np.int64(0)
-    highest: Any = np.int64(0)
     bucket: Any = np.int64(-1)  # the border's cells come first
+    ended: Any = np.int64(-1)  # the bucket in which the last start was
     i: Any = np.int64(0)
     while True:
         if i < border.size:
@@ -218,8 +233,8 @@ def _fill(
             bucket = max(bucket, 0)
             while bucket < heads.size and heads[np.uint64(bucket)] < 0:
                 bucket += 1
-            if bucket == heads.size:
-                return int(highest)
+            if bucket == heads.size or (starts == 0 and bucket > ended):
+                return int(bucket << shift)
             entry: Any = np.int64(heads[np.uint64(bucket)])
             heads[np.uint64(bucket)] = queue_next[np.uint64(entry)]
             queue_next[np.uint64(entry)] = free
@@ -228,7 +243,10 @@ def _fill(
             here = np.int64(label[np.uint64(cell)])
             if here >> shift != bucket:
                 continue  # a stale entry: the cell was expanded from a lower bucket
-            highest = max(highest, here)
+            if mark[np.uint64(cell)] == _START:
+                mark[np.uint64(cell)] = _INSIDE
+                starts -= 1
+                ended = bucket
         y: Any = np.int64(np.uint32(cell) // np.uint32(width))
         x = cell - y * width
         own = np.int64(weight[costmap[np.uint64(cell)]])
@@ -236,7 +254,7 @@ def _fill(
             if not (0 <= x + columns[k] < width and 0 <= y + rows[k] < height):
                 continue
             other = cell + steps[k]
-            if mark[np.uint64(other)] != _INSIDE:
+            if mark[np.uint64(other)] < _INSIDE:
                 continue
             there = np.int64(weight[costmap[np.uint64(other)]])
             if there == 0:
@@ -265,15 +283,6 @@ def _fill(
             heads[np.uint64(slot)] = entry
 
 
-@njit(void(_arrays.I32_FLAT, _arrays.I32_FLAT, int64, _U16_OUT), cache=True, nogil=True)
-def _compact(inside: Any, label: Any, unit: int, costs: Any) -> None:
-    """Write the labels of the cells inside in multiples of `unit`, rounded down."""
-    for i in range(inside.size):
-        cell = np.uint64(inside[i])
-        if label[cell] != _UNSET:
-            costs[cell] = label[cell] // unit
-
-
 class Shadow:
     """The part of the floor that the starts share and whose cheapest paths to a goal lead through raised cells."""
 
@@ -285,12 +294,12 @@ class Shadow:
         starts: Iterable[tuple[int, int]],
         planner: Planner,
     ) -> None:
-        """Find it on a uint8 (h, w) costmap; `field` is one of single cells over the costmap `bound`.
+        """Find it on a uint8 (h, w) costmap; `field` is an exact one over the costmap `bound`.
 
-        Takes some 50 ns for each of its cells. Raises ValueError for a coarser field.
+        Takes some 50 ns for each of its cells. Raises ValueError for a field that is not exact.
         """
-        if field.bits != 0:
-            raise ValueError(f"the field has blocks of {1 << field.bits} cells: pass one of single cells")
+        if not field.exact:
+            raise ValueError(f"the field of goal {field.goal} has one cost for several cells: pass an exact one")
         self._costmap = _arrays.grid(costmap, "costmap")
         self._planner = planner
         self._mark = np.zeros(costmap.size, np.uint8)
@@ -299,20 +308,24 @@ class Shadow:
         heads = np.empty(_BUCKETS, np.int32)
         flat, width, weight = costmap.ravel(), planner.width, planner.weight
         count = int(
-            _mark_shadow(flat, width, weight, field.costs.ravel(), field.unit, raised, self._mark, memory, heads)
-        )
+            _mark_shadow(
+                flat, width, weight, field.lowest.ravel(), field.lowest.shape[1], field.slots.ravel(),
+                field.patterns.ravel(), raised, self._mark, memory, heads, planner.bucket_shift,
+            )
+        )  # fmt: skip
         first = np.array([row * width + column for column, row in starts], np.int32)
         inside, border = np.empty(count, np.int32), np.empty(costmap.size, np.int32)
         result = np.empty(2, np.int64)
         _enclose(flat, width, weight, first, self._mark, inside, border, result)
         number, leaving = result.tolist()
         self._inside = inside[:number]
+        self._starts = np.unique(first[self._mark[first] == _INSIDE])
         self.border = border[:leaving].copy()
         """The flat indexes of the cells through which every path leaves it."""
 
     def contains(self, cell: tuple[int, int]) -> bool:
         """Whether a cell (column, row) is part of it."""
-        return bool(self._mark[cell[1] * self._planner.width + cell[0]] == _INSIDE)
+        return bool(self._mark[cell[1] * self._planner.width + cell[0]] >= _INSIDE)
 
     def exit_of(self, cells: NDArray[np.int32]) -> int | None:
         """Return by which border cell a path (int32 (n, 2) as (column, row)) leaves the shadow: its place in `border`.
@@ -320,13 +333,13 @@ class Shadow:
         None for a path that never was inside, or that ends there.
         """
         flat = cells[:, 1] * self._planner.width + cells[:, 0]
-        within = np.flatnonzero(self._mark[flat] == _INSIDE)
+        within = np.flatnonzero(self._mark[flat] >= _INSIDE)
         if len(within) == 0 or within[-1] + 1 == len(flat):
             return None
         return int(np.flatnonzero(self.border == flat[within[-1] + 1])[0])
 
     def detour(self, levels: NDArray[np.int64]) -> Detour | None:
-        """Return the bound that begins with a level at each border cell.
+        """Return the bound that begins with a level at each border cell, in full for cells as near to it as the starts.
 
         None when nothing leads out of the shadow, or when costs exceed 32 bits. Takes some 50 ns for each cell.
         """
@@ -334,18 +347,14 @@ class Shadow:
             return None
         size, planner = self._costmap.size, self._planner
         levels = levels - levels.min()
-        label, memory = np.empty(size, np.int32), np.empty((2, size), np.int32)
+        label, memory = np.zeros(size, np.int32), np.empty((2, size), np.int32)
         label[self._inside] = _UNSET
+        self._mark[self._starts] = _START
         heads = np.empty(_BUCKETS, np.int32)
         highest = int(
             _fill(
-                self._costmap.ravel(), planner.width, planner.weight, self.border, levels, self._mark, label,
-                memory[0], memory[1], heads, planner.bucket_shift,
+                self._costmap.ravel(), planner.width, planner.weight, self.border, levels, len(self._starts),
+                self._mark, label, memory[0], memory[1], heads, planner.bucket_shift,
             )
         )  # fmt: skip
-        if highest < 0:
-            return None
-        unit = highest // (UNREACHABLE - 1) + 1
-        costs = np.full(self._costmap.shape, UNREACHABLE, np.uint16)
-        _compact(self._inside, label, unit, costs.ravel())
-        return Detour(costs, unit, self.border, levels)
+        return None if highest < 0 else Detour(label.reshape(self._costmap.shape), highest, self.border, levels)

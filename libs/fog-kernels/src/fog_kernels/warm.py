@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 PROFILES: dict[str, tuple[str, ...]] = {
     "robot": ("amcl", "astar", "clearance", "distance", "dwa", "inflation", "likelihood", "raycast", "sweep"),
-    "planner": ("astar", "components", "detour", "distance", "inflation"),
+    "planner": ("astar", "components", "detour", "distance", "inflation", "tiles"),
     "map": ("distance", "inflation", "spans"),
     "sim": ("distance", "raycast"),
     "all": (
@@ -38,6 +38,7 @@ PROFILES: dict[str, tuple[str, ...]] = {
         "raycast",
         "spans",
         "sweep",
+        "tiles",
     ),
 }
 

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from fog_contracts.costs import NEUTRAL_WEIGHT
+from fog_kernels.astar import STRAIGHT
 from fog_kernels.detour import Shadow
-from fog_kernels.guides import border_costs
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -26,11 +27,13 @@ if TYPE_CHECKING:
     from planner.planning_map import Cell, PlanningMap
 
 _KEPT: Final = 2
-"""How many bounds are kept: each takes 2 bytes for every cell of the map."""
+"""How many bounds are kept: each takes up to 4 bytes for every cell of the map."""
 _ATTEMPTS: Final = 2
 """How many are computed at most for one version of the map, because each takes as long as a few searches."""
-_CANDIDATES: Final = 16
+_CANDIDATES: Final = 64
 """Among the border costs of so many goals those that fit the others best are chosen."""
+_WORTHWHILE: Final = 2 * STRAIGHT * NEUTRAL_WEIGHT
+"""By how much each bound must gain, on average, to begin anew with another goal's costs: a step over a free cell."""
 
 Trip = tuple["Cell", "Cell"]
 """Start and goal of a search."""
@@ -44,6 +47,7 @@ class Detours:
         self._known: list[Detour] = []
         self._version: Version | None = None
         self._attempts = 0
+        self._reference_goal: Cell | None = None
         self.computed = 0
         """Number of bounds computed."""
 
@@ -65,38 +69,47 @@ class Detours:
         """
         if self._version != planning_map.version:
             self._version, self._attempts = planning_map.version, 0
-        reference = self._fields.reference
+        exact = self._fields.exact
+        start, goal = _cell(cells[0]), _cell(cells[-1])
+        reference = next((exact[known] for known in (self._reference_goal, goal, *exact) if known in exact), None)
         if self._attempts >= _ATTEMPTS or reference is None:
             return
         self._attempts += 1
-        starts = [(int(cells[0, 0]), int(cells[0, 1])), *(start for start, _ in trips)]
+        starts = [start, *(other for other, _ in trips)]
         shadow = Shadow(planning_map.cost, self._fields.bound, reference, starts, planner)
-        behind = [(start, goal) for start, goal in trips if shadow.contains(start) and not shadow.contains(goal)]
-        fields = [field for _, goal in behind if (field := self._fields.guide(goal)) is not None]
-        way_out = shadow.exit_of(cells)
-        if not fields or way_out is None:
-            return
-        detour = shadow.detour(_levels(fields, shadow.border, way_out))
+        others = [other for begin, other in trips if shadow.contains(begin) and not shadow.contains(other)]
+        better = _better([reference, *(exact[known] for known in (goal, *others) if known in exact)], shadow.border)
+        if better is not None:
+            reference = better
+            shadow = Shadow(planning_map.cost, self._fields.bound, reference, starts, planner)
+        detour = shadow.detour(np.maximum(reference.costs(shadow.border), 0))
         if detour is not None:
+            self._reference_goal = reference.goal
             self._known = [detour, *self._known][:_KEPT]
             self.computed += 1
 
 
-def _levels(fields: Sequence[GoalField], border: NDArray[np.int32], way_out: int) -> NDArray[np.int64]:
-    """Return the border costs of the goal that serves the others best.
+def _cell(cell: NDArray[np.int32]) -> Cell:
+    return int(cell[0]), int(cell[1])
 
-    A bound is tight for a goal whose costs differ from them at the way out by no more than elsewhere; the excess is
-    what is lost.
+
+def _better(fields: Sequence[GoalField], border: NDArray[np.int32]) -> GoalField | None:
+    """Return the field that the bounds should begin with instead of the first one; None if that serves them well.
+
+    The second field is that of a goal whose cheapest way from the shadow costs c. So a way to a border cell b costs at
+    least c - second(b); beginning with field r, the bound for goal i is not below
+
+        c + min over b of (r(b) - second(b)) + min over b of (i(b) - r(b)).
+
+    The field with the highest sum over all goals is chosen.
     """
-    costs: NDArray[np.int64] = np.stack([border_costs(field, border) for field in fields])
-    reached = np.all(costs >= 0, axis=0)
-    if not reached[way_out]:
-        return np.zeros(len(border), np.int64)
-    candidates = range(0, len(fields), -(-len(fields) // _CANDIDATES))
-    losses = []
-    for candidate in candidates:
-        differences = costs - costs[candidate]
-        losses.append(float(np.sum(differences[:, way_out] - differences[:, reached].min(axis=1))))
-    chosen: NDArray[np.int64] = costs[candidates[int(np.argmin(losses))]]
-    chosen[~reached] = chosen.max()
-    return chosen
+    if len(fields) < 3 or len(border) == 0:  # the reference and the goal that was searched, but no other
+        return None
+    fields = [*fields[:2], *fields[2 :: (len(fields) - 2) // _CANDIDATES + 1]]
+    costs: NDArray[np.int64] = np.stack([field.costs(border) for field in fields])
+    costs = costs[:, np.all(costs >= 0, axis=0)]
+    if costs.size == 0:
+        return None
+    gains = np.array([(costs - own).min(axis=1).sum() + len(fields) * (own - costs[1]).min() for own in costs])
+    best = int(np.argmax(gains))
+    return fields[best] if gains[best] - gains[0] > _WORTHWHILE * len(fields) else None

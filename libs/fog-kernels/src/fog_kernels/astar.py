@@ -35,6 +35,9 @@ if TYPE_CHECKING:
     from fog_kernels.guides import Detour
     from fog_kernels.tiles import TilePatterns
 
+    _Cells = NDArray[np.int32]
+    _Guides = tuple[_Cells, int, int, int, _Cells, _Cells, _Cells, int, int]
+
 STRAIGHT = 408
 DIAGONAL = 577
 BUCKETS = 1024  # heads fit the first-level cache; a power of two
@@ -91,7 +94,7 @@ def _search(
     slots: Any,
     patterns: Any,
     detour: Any,
-    detour_highest: int,
+    detour_highest: Any,
     detour_offset: int,
     g: Any,
     queue_cell: Any,
@@ -134,11 +137,11 @@ def _search(
         result[0] = _FOUND
         result[2] = 1
         return
+    y: Any = start // width
+    x: Any = start % width
     if use_field:
-        y = start // width
-        x = start % width
         block = np.uint64((y >> field_bits) * field_width + (x >> field_bits))
-        remaining = np.int64(lowest[block]) * field_unit
+        remaining: Any = np.int64(lowest[block]) * field_unit
         if remaining < 0:
             return
         if use_patterns:
@@ -195,7 +198,7 @@ def _search(
         here = np.int64(g[np.uint64(cell)])
         if here < 0:
             continue  # a stale entry: the cell was expanded at its current cost
-        y: Any = np.int64(np.uint32(cell) // np.uint32(width))
+        y = np.int64(np.uint32(cell) // np.uint32(width))
         x = cell - y * width
         if best != highest:
             if use_field:
@@ -817,7 +820,7 @@ class Planner:
         np.subtract(flat, cells[:, 1] * self.width, out=cells[:, 0])
         return PlanResult(found=True, cost=cost / (2.0 * STRAIGHT), cells=cells, expansions=expansions)
 
-    def _guides(self, goal: tuple[int, int], field: GoalField | None, detour: Detour | None) -> tuple[object, ...]:
+    def _guides(self, goal: tuple[int, int], field: GoalField | None, detour: Detour | None) -> _Guides:
         """Return the kernel's arguments for field and detour; raises ValueError for a field of another goal or map."""
         if field is None:
             return _NO_GUIDE, 0, 0, 0, _NO_GUIDE, _NO_GUIDE, _NO_GUIDE, 0, 0

@@ -59,7 +59,7 @@ def _steps(width: int) -> tuple[Any, Any, Any, Any]:
 
 
 @njit(inline="always")
-def _cost_to_goal(lowest: Any, columns: int, slots: Any, patterns: Any, x: int, y: int) -> int:
+def _cost_to_goal(lowest: Any, columns: int, slots: Any, patterns: Any, x: Any, y: Any) -> Any:
     """Return the cost of a cell in an exact field; -1 where no path leads to the goal."""
     tile = np.uint64((y >> TILE_BITS) * columns + (x >> TILE_BITS))
     last = TILE - 1
@@ -326,17 +326,6 @@ class Shadow:
     def contains(self, cell: tuple[int, int]) -> bool:
         """Whether a cell (column, row) is part of it."""
         return bool(self._mark[cell[1] * self._planner.width + cell[0]] >= _INSIDE)
-
-    def exit_of(self, cells: NDArray[np.int32]) -> int | None:
-        """Return by which border cell a path (int32 (n, 2) as (column, row)) leaves the shadow: its place in `border`.
-
-        None for a path that never was inside, or that ends there.
-        """
-        flat = cells[:, 1] * self._planner.width + cells[:, 0]
-        within = np.flatnonzero(self._mark[flat] >= _INSIDE)
-        if len(within) == 0 or within[-1] + 1 == len(flat):
-            return None
-        return int(np.flatnonzero(self.border == flat[within[-1] + 1])[0])
 
     def detour(self, levels: NDArray[np.int64]) -> Detour | None:
         """Return the bound that begins with a level at each border cell, in full for cells as near to it as the starts.

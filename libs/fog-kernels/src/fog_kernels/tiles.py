@@ -56,7 +56,7 @@ def _place(patterns: Any, number: int, index: Any) -> int:
 
 
 @njit(inline="always")
-def _write(costs: Any, unset: int, width: int, height: int, tile: int, least: int, patterns: Any, number: int) -> None:
+def _write(costs: Any, unset: int, width: int, height: int, tile: int, least: Any, patterns: Any, number: int) -> None:
     """Write by how much the costs of a tile's cells exceed the lowest one."""
     columns = (width + TILE - 1) // TILE
     left, top = tile % columns * TILE, tile // columns * TILE

@@ -19,6 +19,7 @@ from fognav.channels_command import channels_command
 from fognav.coverage_command import site_coverage
 from fognav.localize_command import localize_command
 from fognav.map_command import map_app
+from fognav.node_command import node_app
 from fognav.operate.options import NUMBERS, JsonOption
 from fognav.output import (
     NOT_TRUE,
@@ -54,6 +55,7 @@ app.add_typer(site_app, name="site")
 app.add_typer(zone_app, name="zone")
 app.add_typer(area_app, name="area")
 app.add_typer(source_app, name="source")
+app.add_typer(node_app, name="node")
 app.add_typer(robot_app, name="robot")
 app.add_typer(token_app, name="token")
 app.add_typer(map_app, name="map")

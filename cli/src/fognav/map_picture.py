@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from fog_contracts.costs import FREE, LETHAL
-from fog_runtime.files import atomic_write
+from fog_runtime.files import SHARED, atomic_write
 from fognav.output import WrongUseError
 
 if TYPE_CHECKING:
@@ -62,6 +62,6 @@ class MapPicture:
         data = io.BytesIO()
         self._image.save(data, format="PNG")
         try:
-            atomic_write(file, data.getvalue())
+            atomic_write(file, data.getvalue(), mode=SHARED)
         except OSError as error:
             raise WrongUseError(f"{file} can't be written: {error.strerror}. Name another file") from error

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from fog_runtime.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
-from fog_runtime.files import atomic_write
+from fog_runtime.files import SHARED, atomic_write
 from fog_runtime.robot_file import ROBOT_FILE, RobotFile, default_robot, describe_robot, load_robot
 from fog_runtime.settings import SettingsError
 from fognav.operate.options import JsonOption
@@ -30,7 +30,7 @@ def robot_new(
             raise WrongUseError(f"{out} already exists: name another file with --out, or remove it")
         try:
             text = robot_text(default_robot(base, lidar))
-            atomic_write(out, text.encode())
+            atomic_write(out, text.encode(), mode=SHARED)
         except SettingsError as error:
             raise WrongUseError(str(error)) from error
         except OSError as error:

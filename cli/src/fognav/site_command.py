@@ -4,10 +4,11 @@ import re
 from pathlib import Path
 from typing import Final
 
-from fog_runtime.files import atomic_write
+from fog_runtime.files import SHARED, atomic_write
 from fog_runtime.maps import MapFileError, load_map, save_map
 from fog_runtime.site import SITE_FILE, SiteError, load_site
 from fognav.output import WrongUseError
+from fognav.site_text import to_toml
 
 _ID_LENGTH = 32
 _MAP: Final = "map.yaml"
@@ -36,7 +37,7 @@ def _map_in(out: Path, map_file: Path) -> str:
 def new_site(map_file: Path, out: Path, seed: int) -> dict[str, object]:
     """Write `out`/site.toml for a map, and copy the map there; raises `WrongUseError`, and then writes nothing."""
     # Checking a site must not wait for the kernels, which only a proposal needs.
-    from fognav.site_proposal import NoSiteError, propose, to_toml  # noqa: PLC0415  # see above
+    from fognav.site_proposal import NoSiteError, propose  # noqa: PLC0415  # see above
 
     target = out / SITE_FILE
     if target.exists():
@@ -51,7 +52,7 @@ def new_site(map_file: Path, out: Path, seed: int) -> dict[str, object]:
     try:
         if copied is not None:
             save_map(copied.with_suffix(""), static)
-        atomic_write(target, to_toml(site).encode())
+        atomic_write(target, to_toml(site).encode(), mode=SHARED)
     except OSError as error:
         raise WrongUseError(f"{target} can't be written: {error.strerror}. Name another folder with --out") from error
     try:

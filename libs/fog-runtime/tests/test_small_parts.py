@@ -4,6 +4,7 @@ import asyncio
 import json
 import logging
 import math
+import stat
 import urllib.error
 import urllib.request
 from pathlib import Path
@@ -16,7 +17,7 @@ from prometheus_client import REGISTRY
 from fog_contracts.messages import Trace
 from fog_contracts.stages import SPANS
 from fog_runtime import logs, metrics
-from fog_runtime.files import atomic_write
+from fog_runtime.files import SHARED, atomic_write
 from fog_runtime.health import Health, serve_health
 from fog_runtime.settings import CommonSettings, InflationSettings, Secret, SettingsError, describe, load
 from fog_runtime.slots import Slot
@@ -201,6 +202,14 @@ def test_stage_that_ends_before_it_begins_is_counted_as_skew():
     metrics.observe_trace(Trace(area="a1", epoch=1, seq=1, first_reading=10.0, confirmed=9.0), ["debounce"])
     assert skew() == before + 1
     assert stage_sum("debounce") == seconds
+
+
+def test_written_file_is_private_unless_it_is_for_programs_of_other_users(tmp_path):
+    atomic_write(tmp_path / "token", b"secret")
+    atomic_write(tmp_path / "site.toml", b"old")
+    atomic_write(tmp_path / "site.toml", b"new", mode=SHARED)
+    assert stat.S_IMODE((tmp_path / "token").stat().st_mode) == 0o600
+    assert stat.S_IMODE((tmp_path / "site.toml").stat().st_mode) == 0o644
 
 
 def test_failed_atomic_write_leaves_the_old_file(tmp_path):

@@ -6,7 +6,7 @@ import asyncio
 import time
 from collections import deque
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Final, Self
+from typing import TYPE_CHECKING, Final, Protocol, Self
 
 import msgspec
 from prometheus_client import Gauge
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from fog_runtime.zenoh_edge import ZenohEdge
     from fognav_sim.hardware import Hardware
     from fognav_sim.nodes import SensorNode
+    from fognav_sim.world import World
 
 LOG_S: Final = 0.01
 CATCH_UP_S: Final = 0.25
@@ -171,12 +172,23 @@ class LiveWorld:
             edge.publish(ch.SIM_TRUTH, truth, robot=robot)
 
 
+class MeasuredFloor(Protocol):
+    """What virtual nodes measure: a world at a time (s), and who of them is silenced."""
+
+    world: World
+    silent_nodes: frozenset[str]
+
+    @property
+    def now(self) -> float:
+        """The time up to which the world has been simulated (s of the clock)."""
+
+
 class VirtualNode:
     """A simulated sensor node with its own MQTT connection, as a real one has."""
 
-    def __init__(self, sonars: SensorNode, live_world: LiveWorld, url: str, clock: Clock, site: str) -> None:
+    def __init__(self, sonars: SensorNode, floor: MeasuredFloor, url: str, clock: Clock, site: str) -> None:
         self._sonars = sonars
-        self._world = live_world
+        self._world = floor
         self._clock = clock
         self._id = sonars.node.id
         will = Will(ch.NODE_AVAILABILITY, ch.OFFLINE, {"node": self._id})

@@ -18,6 +18,7 @@ AGGREGATOR: Final = "hazard-aggregator"
 MAP_SERVICE: Final = "map-service"
 PLANNER: Final = "planner"
 ROUTER: Final = "zenoh-router"
+BROKER: Final = "mosquitto"
 
 SERVICE_PORTS: Final = {
     AGGREGATOR: ("FOGNAV_AGGREGATOR_PORT", 8001),
@@ -26,6 +27,7 @@ SERVICE_PORTS: Final = {
 }
 """The ports of a fog node's REST APIs: the variables that docker-compose.yml reads, and its defaults."""
 ZENOH_PORT: Final = ("FOGNAV_ZENOH_PORT", 7447)
+MQTT_PORT: Final = ("FOGNAV_MQTT_PORT", 1883)
 
 _FOG_MODULES: Final = {"hazard_aggregator": AGGREGATOR, "map_service": MAP_SERVICE, "planner": PLANNER}
 _ROBOT_MODULES: Final = {
@@ -50,10 +52,10 @@ def port(setting: tuple[str, int]) -> int:
 
 
 def addresses(host: str) -> dict[str, str]:
-    """Return the addresses of a fog node's REST APIs and router on a host."""
+    """Return the addresses of a fog node's REST APIs, router and broker on a host."""
     shown = f"[{host}]" if ":" in host else host  # IPv6
     urls = {name: f"http://{shown}:{port(setting)}" for name, setting in SERVICE_PORTS.items()}
-    return {**urls, ROUTER: f"tcp/{shown}:{port(ZENOH_PORT)}"}
+    return {**urls, ROUTER: f"tcp/{shown}:{port(ZENOH_PORT)}", BROKER: f"mqtt://{shown}:{port(MQTT_PORT)}"}
 
 
 def _module(process: psutil.Process) -> str:
@@ -99,7 +101,7 @@ def _fog_node(processes: list[tuple[str, psutil.Process]]) -> System | None:
         name=FOG_NODE,
         kind="fog node",
         site=_site(port(SERVICE_PORTS[MAP_SERVICE])) if MAP_SERVICE in answering else "",
-        urls={name: url for name, url in urls.items() if name in answering or name == ROUTER},
+        urls={name: url for name, url in urls.items() if name in answering or name in (ROUTER, BROKER)},
         pids={name: process.pid for name, process in processes},
     )
 

@@ -3,14 +3,24 @@
 import os
 import tempfile
 from pathlib import Path
+from typing import Final
+
+PRIVATE: Final = 0o600
+"""Only the owner reads and writes: secrets, and what a process stores for itself."""
+SHARED: Final = 0o644
+"""Everyone reads: what a person makes with one command and gives to programs of other users, such as a site."""
 
 
-def atomic_write(path: Path, data: bytes) -> None:
-    """Write a file durably; readers, even after a power cut, see either the old content or the new, never a part."""
+def atomic_write(path: Path, data: bytes, *, mode: int = PRIVATE) -> None:
+    """Write a file durably; readers, even after a power cut, see either the old content or the new, never a part.
+
+    `mode` are the file's permissions, whatever those of an earlier one were.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
         with os.fdopen(descriptor, "wb") as file:
+            os.fchmod(descriptor, mode)
             file.write(data)
             file.flush()
             os.fsync(file.fileno())

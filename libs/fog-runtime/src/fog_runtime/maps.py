@@ -24,7 +24,7 @@ from PIL import Image, UnidentifiedImageError
 from fog_contracts.costs import FREE, LETHAL, UNKNOWN
 from fog_contracts.grid import GridGeometry, StaticMap
 from fog_contracts.messages import MAX_CELLS
-from fog_runtime.files import atomic_write
+from fog_runtime.files import SHARED, atomic_write
 
 Mode = Literal["trinary", "scale", "raw"]
 
@@ -311,11 +311,11 @@ def save_map(path_prefix: Path, static: StaticMap) -> None:
     image = io.BytesIO()
     Image.fromarray(np.ascontiguousarray(shades[static.cells][::-1])).save(image, format="PPM")
     image_file = path_prefix.with_name(f"{path_prefix.name}.pgm")
-    atomic_write(image_file, image.getvalue())
+    atomic_write(image_file, image.getvalue(), mode=SHARED)
     g = static.geometry
     text = (
         f"image: {image_file.name}\nmode: trinary\nresolution: {g.resolution!r}\n"
         f"origin: [{g.origin_x!r}, {g.origin_y!r}, 0.0]\nnegate: 0\n"
         f"occupied_thresh: {_WRITTEN_OCCUPIED}\nfree_thresh: {_WRITTEN_FREE}\n"
     )
-    atomic_write(path_prefix.with_name(f"{path_prefix.name}.yaml"), text.encode())
+    atomic_write(path_prefix.with_name(f"{path_prefix.name}.yaml"), text.encode(), mode=SHARED)

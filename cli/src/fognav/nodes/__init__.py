@@ -1,0 +1,1 @@
+"""Sensor nodes from the command line: in the site's file, on the broker, and simulated."""

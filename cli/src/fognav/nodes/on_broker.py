@@ -1,0 +1,103 @@
+"""Sensor nodes on a broker: their readings as they come, and what they learn on command."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING, Final
+
+import aiomqtt
+from paho.mqtt.subscribeoptions import SubscribeOptions
+
+from fog_contracts import channels as ch
+from fog_contracts.codec import ContractError, decode, decode_text, encode_text
+from fog_contracts.messages import NodeCalibration, NodeReading
+from fog_runtime.mqtt_broker import Broker
+from fognav.output import FailedError, WrongUseError
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from fog_contracts.channels import Channel
+
+CALIBRATION_S: Final = 60.0
+"""A node measures some seconds per sonar; without an answer after this it is not there, or its firmware is too old."""
+
+
+@asynccontextmanager
+async def _connected(url: str, topics: dict[str, int]) -> AsyncIterator[aiomqtt.Client]:
+    try:
+        broker = Broker.of(url)
+    except ValueError as error:
+        raise WrongUseError(f"--broker {url}: {error}") from error
+    try:
+        async with broker.client(f"fognav-node-{os.getpid()}", None) as client:
+            await client.subscribe([(topic, SubscribeOptions(qos=qos)) for topic, qos in topics.items()])
+            yield client
+    except aiomqtt.MqttError as error:
+        raise FailedError(
+            f"the broker at {broker} can't be used: {error}. Check its address and your password"
+        ) from error
+
+
+async def readings(url: str, site: str, node: str) -> AsyncIterator[NodeReading | str]:
+    """Yield what a node publishes, until cancelled: readings, and `online` or `offline`.
+
+    Raises `FailedError` for a broker that can't be used, or when the connection ends.
+    """
+    reading, availability = (channel.key(site=site, node=node) for channel in (ch.NODE_READING, ch.NODE_AVAILABILITY))
+    async with _connected(url, {reading: 0, availability: 1}) as client:
+        async for message in client.messages:
+            data = _bytes(message)
+            try:
+                if message.topic.value == reading:
+                    yield decode(ch.NODE_READING, data, NodeReading)
+                elif data:
+                    yield decode_text(ch.NODE_AVAILABILITY, data)
+            except ContractError as error:
+                yield f"not understood: {error}"
+
+
+async def learn(url: str, site: str, node: str, command: str) -> NodeCalibration:
+    """Let a node learn its limits (`CALIBRATE`) or its board's "no echo" (`LEARN_NO_ECHO`), and return what it learned.
+
+    Raises `FailedError` with the node's own words if it refused, or if it does not answer within 60 s.
+    """
+    keys = {channel: channel.key(site=site, node=node) for channel in (ch.NODE_CALIBRATION, ch.NODE_PROBLEM)}
+    try:
+        async with asyncio.timeout(CALIBRATION_S), _connected(url, dict.fromkeys(keys.values(), 1)) as client:
+            await client.publish(
+                ch.NODE_COMMAND.key(site=site, node=node),
+                encode_text(ch.NODE_COMMAND, command),
+                qos=ch.NODE_COMMAND.qos,
+            )
+            async for message in client.messages:
+                if message.retain:
+                    continue  # an earlier answer, which the broker kept
+                found = _answer(keys, message)
+                if isinstance(found, NodeCalibration):
+                    return found
+                if found:
+                    raise FailedError(f"node {node} refused: {found}")
+    except TimeoutError:
+        raise FailedError(
+            f"node {node} did not answer within {CALIBRATION_S:.0f} s: check that it is online (fognav node list)"
+        ) from None
+    raise FailedError(f"the broker closed the connection before node {node} answered: try again")
+
+
+def _answer(keys: dict[Channel, str], message: aiomqtt.Message) -> NodeCalibration | str:
+    data = _bytes(message)
+    if not data:
+        return ""
+    try:
+        if message.topic.value == keys[ch.NODE_CALIBRATION]:
+            return decode(ch.NODE_CALIBRATION, data, NodeCalibration)
+        return decode_text(ch.NODE_PROBLEM, data)
+    except ContractError as error:
+        raise FailedError(f"the node's answer was not understood: {error}. Is its firmware of this version?") from error
+
+
+def _bytes(message: aiomqtt.Message) -> bytes:
+    return bytes(message.payload)

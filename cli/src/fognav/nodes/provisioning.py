@@ -1,0 +1,99 @@
+"""What a board gets when it is set up (`node.json`), and the broker's entry for it."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import secrets
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+from fog_runtime.files import atomic_write
+from fognav.output import WrongUseError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from fog_contracts.site import NodeSite
+
+SETTINGS_FILE: Final = "node.json"
+PINS: Final[dict[str, tuple[tuple[int, int], ...]]] = {
+    "d1_mini": ((14, 5), (12, 4)),
+    "d1_mini-thesis": ((16, 5), (0, 12)),
+}
+"""Trigger and echo pin (GPIO) of each sonar by wiring; docs/hardware.md draws both."""
+_ITERATIONS: Final = 20_000
+
+
+@dataclass(frozen=True)
+class Access:
+    """How a board reaches the broker: Wi-Fi, the fog node's name, and whether the connection is encrypted."""
+
+    wifi_name: str
+    wifi_password: str
+    broker: str
+    port: int
+    tls: bool
+
+
+def new_password() -> str:
+    """Return a password that nobody has to type: 120 bits."""
+    return secrets.token_urlsafe(15)
+
+
+def settings(site: str, node: NodeSite, access: Access, password: str, wiring: str) -> dict[str, Any]:
+    """Return the members of a board's `node.json`; raises `WrongUseError` for more sonars than the wiring has."""
+    pins = PINS[wiring]
+    if len(node.sonars) > len(pins):
+        raise WrongUseError(f"the wiring {wiring} has {len(pins)} sonars and node {node.id} has {len(node.sonars)}")
+    return {
+        "site": site,
+        "node": node.id,
+        "wifi_name": access.wifi_name,
+        "wifi_password": access.wifi_password,
+        "broker": access.broker,
+        "port": access.port,
+        "tls": access.tls,
+        "user": node.id,
+        "password": password,
+        "sonars": [
+            {
+                "trigger": trigger,
+                "echo": echo,
+                "range_limit_m": sonar.range_limit,
+                "no_echo_is_clear": sonar.no_echo_is_clear,
+            }
+            for (trigger, echo), sonar in zip(pins, node.sonars, strict=False)
+        ],
+    }
+
+
+def write_settings(file: Path, members: dict[str, Any]) -> None:
+    """Write `node.json`, readable for its owner only; raises `WrongUseError`."""
+    _write(file, (json.dumps(members, indent=2) + "\n").encode())
+
+
+def set_password(file: Path, user: str, password: str) -> None:
+    """Set a user's password in a Mosquitto password file, which is created if it is missing; raises `WrongUseError`."""
+    try:
+        lines = file.read_text("utf-8").splitlines() if file.exists() else []
+    except (OSError, UnicodeDecodeError) as error:
+        raise WrongUseError(f"the broker's password file {file} can't be read: {error}") from error
+    kept = [line for line in lines if line.partition(":")[0] != user]
+    _write(file, ("\n".join([*kept, f"{user}:{_hashed(password)}"]) + "\n").encode())
+
+
+def _hashed(password: str) -> str:
+    """Return a password as Mosquitto stores it: `$7$`, PBKDF2 with SHA-512 (mosquitto_passwd(1))."""
+    salt = secrets.token_bytes(12)
+    key = hashlib.pbkdf2_hmac("sha512", password.encode(), salt, _ITERATIONS)
+    return f"$7${_ITERATIONS}${base64.b64encode(salt).decode()}${base64.b64encode(key).decode()}"
+
+
+def _write(file: Path, data: bytes) -> None:
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        atomic_write(file, data)
+    except OSError as error:
+        raise WrongUseError(f"{file} can't be written: {error.strerror}") from error

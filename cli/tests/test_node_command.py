@@ -1,0 +1,180 @@
+"""`fognav node`: a site, a board and a broker take what it writes, and what can't work is refused with the reason."""
+
+import ctypes
+import json
+import shutil
+import stat
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import msgspec
+import paho.mqtt.client as paho
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from paho.mqtt.enums import CallbackAPIVersion
+
+from fog_contracts.site import NodeSite, Sonar
+from fog_runtime.site import load_site
+from fog_supervisor.servers import start_mosquitto
+from fognav.nodes import on_broker, provisioning, site_file
+from fognav.output import FailedError
+from fognav_sim.firmware import Core, FirmwareError, build_library, find_compiler
+
+ROOT = Path(__file__).parents[2]
+WALL_BELOW_Z4 = "33.20,38.15,1.5708"
+
+
+@pytest.fixture
+def floor(tmp_path: Path) -> Path:
+    return Path(shutil.copytree(ROOT / "sites" / "estig", tmp_path / "floor"))
+
+
+def run(*command: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "fognav", "node", *command], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+
+
+def add(floor: Path, pose: str = WALL_BELOW_Z4, **options: str) -> subprocess.CompletedProcess[str]:
+    values = {"area": "z4", "wifi": "Lab", "out": str(floor / "board"), "site": str(floor), **options}
+    words = [word for name, value in values.items() for word in (f"--{name}", value)]
+    return run("add", "n8", "--pose", pose, "--json", *words)
+
+
+def test_added_node_is_in_the_site_and_its_board_accepts_its_settings(floor: Path, tmp_path: Path) -> None:
+    before = (floor / "site.toml").read_text("utf-8")
+    done = add(floor, passwords=str(tmp_path / "passwords"))
+    assert done.returncode == 0, done.stderr
+    node = load_site(floor).site.nodes[-1]
+    assert (node.id, node.area, node.x, node.y) == ("n8", "z4", 33.2, 38.15)
+    assert [round(sonar.range_limit, 2) for sonar in node.sonars] == json.loads(done.stdout)["range_limit_m"]
+    assert (floor / "site.toml").read_text("utf-8").startswith(before.rstrip("\n"))
+    written = floor / "board" / "node.json"
+    assert stat.S_IMODE(written.stat().st_mode) == 0o600
+    assert stat.S_IMODE((floor / "site.toml").stat().st_mode) == 0o644
+    try:
+        find_compiler()
+        core = Core(build_library(tmp_path / "firmware"))
+    except FirmwareError as error:
+        pytest.skip(str(error))
+    problem, text = core["fognav_settings_problem"], written.read_bytes()
+    problem.restype = ctypes.c_char_p
+    assert problem(text, ctypes.c_uint32(len(text))) is None
+
+
+@pytest.mark.parametrize(
+    ("pose", "options", "says"),
+    [
+        ("33.2,38.15,-1.5708", {}, "looks at a wall"),
+        ("33.2,38.15,1.5708", {"area": "z1"}, "nothing of area z1"),
+        ("33.2,38.15,1.5708", {"area": "nowhere"}, "no area 'nowhere'"),
+        ("33.2,37.0,1.5708", {}, "in a wall"),
+        ("-50,0,0", {}, "not on the map"),
+        ("33.2,38.15", {}, "give 3 numbers"),
+        ("33.2,38.15,nan", {}, "give 3 numbers"),
+    ],
+)
+def test_node_that_would_be_of_no_use_is_refused_and_nothing_is_written(floor, pose, options, says) -> None:
+    before = (floor / "site.toml").read_bytes()
+    done = add(floor, pose, **options)
+    assert done.returncode == 2
+    assert says in done.stderr.replace("\n", " ")
+    assert (floor / "site.toml").read_bytes() == before
+    assert not (floor / "board").exists()
+
+
+def test_settings_of_another_board_are_never_overwritten_by_add(floor: Path) -> None:
+    (floor / "board").mkdir()
+    (floor / "board" / "node.json").write_text("{}")
+    before = (floor / "site.toml").read_bytes()
+    done = add(floor)
+    assert done.returncode == 2
+    assert "another node's" in done.stderr.replace("\n", " ")
+    assert (floor / "site.toml").read_bytes() == before
+
+
+def test_replaced_board_has_a_new_password_and_the_same_place(floor: Path, tmp_path: Path) -> None:
+    passwords = tmp_path / "passwords"
+    provisioning.set_password(passwords, "n1", "old")
+    words = ("--wifi", "Lab", "--site", str(floor), "--out", str(tmp_path), "--passwords", str(passwords))
+    done = run("replace", "n1", *words)
+    assert done.returncode == 0, done.stderr
+    first = json.loads((tmp_path / "node.json").read_text())
+    assert run("replace", "n1", *words).returncode == 0
+    second = json.loads((tmp_path / "node.json").read_text())
+    assert first["password"] != second["password"]
+    assert {**first, "password": ""} == {**second, "password": ""}
+    assert passwords.read_text().count("n1:") == 1
+    assert run("replace", "n99", *words).returncode == 2
+
+
+@pytest.mark.live
+def test_broker_accepts_the_stored_password_and_no_other(tmp_path: Path) -> None:
+    passwords = tmp_path / "passwords"
+    provisioning.set_password(passwords, "n2", "of another node")
+    provisioning.set_password(passwords, "n1", "s3cret")
+    provisioning.set_password(passwords, "n1", "newer")
+    passwords.chmod(0o644)  # the broker may run as another user
+    with start_mosquitto(tmp_path / "broker", extra=f"allow_anonymous false\npassword_file {passwords}") as server:
+        codes = {}
+        for password in ("newer", "s3cret"):
+            client = paho.Client(CallbackAPIVersion.VERSION2, protocol=paho.MQTTv5)
+            client.username_pw_set("n1", password)
+            client.on_connect = lambda _c, _u, _f, code, _p, password=password: codes.update({password: code})
+            client.connect("127.0.0.1", server.port)
+            for _ in range(200):
+                client.loop(0.1)
+                if password in codes:
+                    break
+            client.disconnect()
+    assert not codes["newer"].is_failure
+    assert codes["s3cret"].is_failure
+
+
+@given(
+    index=st.integers(0, 6),
+    limits=st.lists(st.integers(50, 400), min_size=1, max_size=3),
+    silent=st.booleans(),
+    after=st.sampled_from(["", "\n# the last words\n\n# about it\n[[robots]]\nid = 'r2'\n", "\n[x] # y\nz = 1"]),
+)
+def test_replacing_a_node_leaves_every_other_line_of_the_site(index, limits, silent, after) -> None:
+    text = (ROOT / "sites" / "estig" / "site.toml").read_text("utf-8") + after
+    nodes = msgspec.convert(tomllib.loads(text)["nodes"], list[NodeSite])
+    sonars = [Sonar(range_limit=limit / 100, no_echo_is_clear=silent) for limit in limits]
+    nodes[index] = msgspec.structs.replace(nodes[index], sonars=sonars)
+    changed = site_file.replaced(text, nodes[index])
+    assert changed is not None
+    found, before = tomllib.loads(changed), tomllib.loads(text)
+    assert msgspec.convert(found.pop("nodes"), list[NodeSite]) == nodes
+    before.pop("nodes")
+    assert found == before
+    comments = [line for line in text.splitlines() if line.startswith("#")]
+    assert [line for line in changed.splitlines() if line.startswith("#")] == comments
+
+
+def test_node_in_a_table_of_another_form_is_not_touched() -> None:
+    node = NodeSite(id="n1", area="z1", x=0.0, y=0.0, theta=0.0, sonars=[Sonar(range_limit=1.0)])
+    assert site_file.replaced('nodes = [{ id = "n1", area = "z1" }]\n', node) is None
+
+
+def test_invalid_change_leaves_the_site_as_it_was(tmp_path: Path) -> None:
+    floor = tmp_path / "floor"
+    shutil.copytree(ROOT / "sites" / "estig", floor)
+    loaded = load_site(floor)
+    before = (floor / "site.toml").read_bytes()
+    with pytest.raises(Exception, match=r"used twice.*nothing was changed"):
+        site_file.add(loaded, loaded.site.nodes[0])
+    assert (floor / "site.toml").read_bytes() == before
+
+
+@pytest.mark.live
+async def test_node_that_does_not_answer_and_broker_that_is_not_there_are_said(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(on_broker, "CALIBRATION_S", 0.5)
+    refusal = pytest.raises(FailedError, match=r"n1 did not answer .*fognav node list")
+    with start_mosquitto(tmp_path / "broker") as server, refusal:
+        await on_broker.learn(server.url, "estig", "n1", "calibrate")
+    with pytest.raises(FailedError, match="can't be used"):
+        await on_broker.learn(server.url, "estig", "n1", "calibrate")

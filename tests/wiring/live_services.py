@@ -225,7 +225,7 @@ class Link:
     def send(self, command: WheelCommand) -> None:
         self.sent.append(command)
 
-    def poll(self, now: float) -> None:
+    def poll(self, now: float, *, on: bool) -> None:
         """The lidar is silent."""
 
 

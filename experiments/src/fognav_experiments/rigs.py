@@ -98,6 +98,7 @@ class RobotRig:
         self._to_base = b""
         self._to_lidar = self._lidar_driver.begin(start)
         self._from_lidar = b""
+        self._lidar_on = True
         self._steps = 0
         self._nonce = 0
 
@@ -140,6 +141,12 @@ class RobotRig:
     def _run_lidar(self, data: bytes, now: float) -> None:
         self._from_lidar += data
         if self._steps % _LIDAR_STEPS:
+            return
+        if self.agent.lidar_on is not self._lidar_on:
+            self._lidar_on, driver = self.agent.lidar_on, self._lidar_driver
+            self._to_lidar += driver.begin(now) if self._lidar_on else driver.stop_command
+        if not self._lidar_on:
+            self._from_lidar = b""
             return
         received = self._lidar_driver.receive(self._from_lidar, now)
         self._from_lidar = b""

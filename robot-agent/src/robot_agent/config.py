@@ -181,6 +181,8 @@ class AgentConfig:
     obstacle_ttl: float = 600.0
     """How long (s) a reported obstacle counts while no lidar looks there again: longer than a detour takes."""
     obstacle_limit: int = 400
+    rest_after: float = 0.0
+    """How long (s) an idle robot waits before it rests, with its lidar's motor at a standstill; 0: it never does."""
     battery_low: float = 0.2
     """Charge (of 1) below which the robot announces a low battery."""
     safety: SafetyConfig = field(default_factory=SafetyConfig)
@@ -231,7 +233,7 @@ def agent_config(  # noqa: PLR0913  # what the process knows about its robot
     inflation = replace(config.motion.inflation, inscribed_radius=inscribed)
     config = replace(config, footprint=footprint, radius=radius, motion=replace(config.motion, inflation=inflation))
     config = _with_motion(config, MotionSettings() if settings is None else settings.motion)
-    return config if settings is None else _with_settings(config, settings)
+    return config if settings is None else _with_settings(config, settings, can_rest=lidar.can_rest)
 
 
 def _with_motion(config: AgentConfig, motion: MotionSettings) -> AgentConfig:
@@ -253,8 +255,9 @@ def _with_motion(config: AgentConfig, motion: MotionSettings) -> AgentConfig:
     return replace(config, motion=moving, safety=safety)
 
 
-def _with_settings(config: AgentConfig, settings: RobotSettings) -> AgentConfig:
+def _with_settings(config: AgentConfig, settings: RobotSettings, *, can_rest: bool) -> AgentConfig:
     """Return the configuration with the lidar's pose, the odometry's noise and the battery of the robot's settings."""
+    rest_after = settings.power.rest_after_s if can_rest else 0.0
     lidar = settings.lidar
     localization = replace(
         config.localization,
@@ -263,4 +266,4 @@ def _with_settings(config: AgentConfig, settings: RobotSettings) -> AgentConfig:
         lidar_y=lidar.y_m,
         lidar_yaw=lidar.yaw_rad,
     )
-    return replace(config, localization=localization, battery_low=settings.power.low_fraction)
+    return replace(config, localization=localization, battery_low=settings.power.low_fraction, rest_after=rest_after)

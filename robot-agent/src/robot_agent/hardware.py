@@ -258,11 +258,12 @@ class SerialSettings(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LidarTraits:
-    """Rated ranges (m) and the time of one revolution (s)."""
+    """Rated ranges (m), the time of one revolution (s), and whether it can stand still while the robot rests."""
 
     range_min_m: float
     range_max_m: float
     scan_period_s: float
+    can_rest: bool = False
 
 
 class LidarEvents(NamedTuple):

@@ -68,10 +68,12 @@ def test_every_setting_of_the_robot_file_reaches_the_configuration():
             jerk_m_s3=3.0,
             turn_jerk_rad_s3=8.0,
         ),
-        power=PowerSettings(low_fraction=0.3),
+        power=PowerSettings(low_fraction=0.3, rest_after_s=90.0),
     )
     config = agent_config("r1", KEY, BASE, LIDAR, BODY, boot="b1", settings=settings)
-    assert config.battery_low == 0.3
+    assert (config.battery_low, config.rest_after) == (0.3, 0.0)
+    can_rest = replace(LIDAR, can_rest=True)
+    assert agent_config("r1", KEY, BASE, can_rest, BODY, boot="b1", settings=settings).rest_after == 90.0
     limits, where = config.motion.limits, config.localization
     assert (limits.v_max, limits.w_max, limits.acc_v, limits.acc_w) == (0.2, 1.5, 0.5, 0.9)
     assert (config.motion.jerk_v, config.motion.jerk_w) == (3.0, 8.0)

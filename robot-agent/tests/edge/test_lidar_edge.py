@@ -274,6 +274,39 @@ async def test_a_lidar_that_scans_or_is_silent_passes_the_check(tmp_path, comman
             await asyncio.gather(task, return_exceptions=True)
 
 
+class Motor:
+    """A port that records what is done to it."""
+
+    def __init__(self):
+        self.done = []
+
+    def set_line(self, name, *, on):
+        self.done.append((name, on))
+
+    def write(self, data):
+        if data:
+            self.done.append(data)
+
+    def discard_input(self):
+        self.done.append("discarded")
+
+    def read_available(self):
+        return b""
+
+
+async def test_resting_lidar_is_stopped_with_its_motor_and_started_anew():
+    edge = LidarEdge("/dev/none", RplidarA1Driver(), SystemClock(), lambda *_: None, lambda *_: None)
+    port = Motor()
+    edge._port, edge._lost = port, asyncio.get_running_loop().create_future()
+    for now in (1.0, 1.05, 1.1):
+        edge.poll(now, on=False)
+    assert port.done == [rplidar.stop(), ("dtr", True)]
+    port.done.clear()
+    edge.poll(90.0, on=True)
+    edge.poll(90.1 + STOP_S, on=True)
+    assert port.done == [("dtr", False), "discarded", rplidar.stop(), rplidar.get_health()]
+
+
 @pytest.mark.live
 async def test_a_port_named_by_its_number_ends_the_agent_with_the_remedy():
     edge = LidarEdge("/dev/ttyUSB7", RplidarA1Driver(), SystemClock(), lambda *_: None, lambda *_: None)

@@ -56,7 +56,8 @@ class FakeLidar:
     def __init__(self):
         self.polled = []
 
-    def poll(self, now):
+    def poll(self, now, *, on):
+        assert on
         self.polled.append(now)
 
 

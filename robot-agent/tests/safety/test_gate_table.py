@@ -91,6 +91,7 @@ ROWS = [
         "alone",
         "the lidar repeats itself",
     ),
+    Row("at rest", {"resting": "at rest"}, {}, "HOLD", "alone", "at rest"),
     Row("pose unknown", {"localization": "none"}, {}, "PROTECTIVE_STOP", "operator", "the pose is not known yet"),
     Row(
         "pose lost",
@@ -387,3 +388,18 @@ def test_disable_forgets_latches_and_stops():
     gate.run(request="disable")
     assert (gate.state.latched, gate.state.stops, gate.state.enabled) == ((), (), False)
     assert gate.run(request="enable").refusal is None
+
+
+RESTING = {"resting": "at rest", "lidar_age": 700.0, "scan_age": 700.0, "identical_scans": 3}
+
+
+def test_resting_robot_holds_without_a_stop_and_needs_no_operator_afterwards():
+    gate = Gate()
+    out = gate.run(100.0, **RESTING)
+    assert (out.mode, out.reasons, gate.state.latched, gate.state.stops) == ("HOLD", ("at rest",), (), ())
+    assert gate.run(2.1).mode == "NORMAL"
+    assert Gate("INIT").run(request="enable", **RESTING).refusal is None
+
+
+def test_silent_lidar_of_a_robot_that_does_not_rest_is_a_stop():
+    assert Gate().run(**{**RESTING, "resting": None}).mode == "PROTECTIVE_STOP"

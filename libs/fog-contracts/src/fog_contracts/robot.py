@@ -122,12 +122,19 @@ class MotionSettings(_Table, frozen=True, kw_only=True):
 
 
 class PowerSettings(_Table, frozen=True, kw_only=True):
-    """When the robot announces that its battery is low."""
+    """When the robot announces that its battery is low, and when it rests."""
 
     low_fraction: Annotated[
         Annotated[float, Meta(ge=0.0, le=0.9)],
         Meta(description="charge, of 1, below which its state says so; 0: never"),
     ] = 0.2
+    rest_after_s: Annotated[
+        Annotated[float, Meta(ge=0.0, le=86_400.0)],
+        Meta(
+            description="idle time after which the robot rests: its lidar, if its motor can be switched, stands still "
+            "until a goal or an operator's command wakes it; 0: never"
+        ),
+    ] = 600.0
 
 
 class RobotSettings(_Table, frozen=True, kw_only=True):

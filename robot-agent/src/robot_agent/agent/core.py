@@ -7,6 +7,7 @@ Values and times go in, values come out. `now` is the robot's own monotonic cloc
 - runs `decide(control_job(now))` 5 times a second, on any thread, and passes the decision to `accept`;
 - calls `tick` 10 times a second and publishes what it returns;
 - sends the query of `egress_request` to the planner, and passes the reply to `on_egress_reply`;
+- lets the lidar's motor turn while `lidar_on`;
 - requests a snapshot of the map while `wants_snapshot`, passes what `prepare_map` makes of it to
   `load`, and stores what `pose_to_store` returns.
 """
@@ -31,6 +32,7 @@ from robot_agent.agent.pose_keeper import PoseKeeper
 from robot_agent.agent.prepared_map import PreparedMap, prepare_map
 from robot_agent.agent.publishing import PublishingPolicy
 from robot_agent.agent.reports import hindrances, robot_pose, robot_state
+from robot_agent.agent.rest_policy import RestPolicy
 from robot_agent.agent.safety_supervisor import SafetySupervisor, safety_inputs
 from robot_agent.agent.sensors import BaseSource, LidarSource
 from robot_agent.localization.localizer import Localizer, SavedPose
@@ -85,6 +87,7 @@ class AgentCore:
         self._egress = Egress(config)
         self._guard = MotionGuard(config, self._localizer)
         self._safety = SafetySupervisor(config.safety)
+        self._rest = RestPolicy(config.rest_after)
         self._reporter = ObstacleReporter(config.obstacle_ttl, config.obstacle_limit)
         self._commands = OperatorCommands(config, self)
         self._publishing = PublishingPolicy(config.robot)
@@ -161,6 +164,7 @@ class AgentCore:
     def on_scan(self, scan: LaserScan, now: float) -> None:
         """Handle a whole scan that arrived at `now`; repeated identical scans don't correct the pose."""
         self._lidar.on_scan(scan.repeats, now)
+        self._rest.on_scan()
         if scan.repeats < self._config.safety.identical_scans:
             self._localizer.on_scan(scan, now)
             self._guard.on_scan(scan, self.replica)
@@ -173,6 +177,8 @@ class AgentCore:
 
     def stream(self, now: float, stamp: float) -> WheelCommand:
         """Evaluate safety and return the wheel speeds to send now; call it 20 times a second."""
+        busy = self._localizer.searching or self._driving.busy(self._safety.state, self.safety)
+        self._rest.update(busy=busy, goal_id=self._driving.mission.goal_id, now=now)
         safety = self._evaluate_safety(now)
         if safety.mode == "EGRESS":
             wheels = self._egress.wheels(self._localizer.pose(now))
@@ -209,6 +215,7 @@ class AgentCore:
             inside_blocked=self._places.containing(trusted, self.replica, self._reporter, now) if trusted else None,
             egress=(self._egress.remaining, self._egress.problem(self._guard.reason)),
             caution=self._places.caution(pose) if pose else None,
+            resting=self._rest.reason,
             now=now,
         )
         outputs = self._safety.evaluate(inputs, now, request)
@@ -219,6 +226,7 @@ class AgentCore:
 
     def request(self, request: Request, now: float) -> SafetyOutputs:
         """Pass an operator's request to the safety gate; the outputs carry its refusal."""
+        self._rest.on_request(request)
         if request == "egress" and self.safety.mode != "EGRESS":
             self._egress.begin()
         outputs = self._evaluate_safety(now, request)
@@ -234,6 +242,7 @@ class AgentCore:
         """Start localization at a pose in `map`; return why the pose is refused, None when it is accepted."""
         refusal = initial_pose_refusal(pose, self.replica, at_rest=self._driving.wheels.at_rest)
         if refusal is None and pose is not None:
+            self._rest.wake()
             self._localizer.initial_pose(pose.x, pose.y, pose.theta)
         return refusal
 
@@ -290,6 +299,11 @@ class AgentCore:
     def localizer(self) -> Localizer:
         """The pose estimator."""
         return self._localizer
+
+    @property
+    def lidar_on(self) -> bool:
+        """Whether the lidar has to run: not while the robot rests."""
+        return self._rest.lidar_on
 
     @property
     def encoder_faults(self) -> int:

@@ -52,6 +52,7 @@ class LidarEdge:
         self._on_scan = on_scan
         self._check = check
         self._last_logged = ""
+        self._resting = False
         self._port: Port | None = None
         self._lost: asyncio.Future[None] | None = None
         self.problem = "the lidar's port was not opened yet"
@@ -79,13 +80,13 @@ class LidarEdge:
     async def _scan(self, port: Port) -> None:
         """Let `poll` use an open port until it is lost; raises `PortLost`."""
         driver = self._driver
-        if driver.serial.dtr is not None:
-            port.set_line("dtr", on=driver.serial.dtr)
+        self._set_motor(port, on=True)
         port.discard_input()
         if (problem := await self._wrong_device(port)) is not None:
             self._report(problem)
             return
         port.write(driver.begin(self._clock.now()))
+        self._resting = False
         self._port, self._lost = port, asyncio.get_running_loop().create_future()
         try:
             await self._lost
@@ -95,8 +96,13 @@ class LidarEdge:
             # its state when the port is closed.
             with suppress(PortLost):
                 port.write(driver.stop_command)
-                if driver.serial.dtr is not None:
-                    port.set_line("dtr", on=not driver.serial.dtr)
+                self._set_motor(port, on=False)
+
+    def _set_motor(self, port: Port, *, on: bool) -> None:
+        """Let the motor turn, or stand still, as far as the device has a line for it."""
+        running = self._driver.serial.dtr
+        if running is not None:
+            port.set_line("dtr", on=running is on)
 
     async def _wrong_device(self, port: Port) -> str | None:
         """Listen before anything is written; return the sentence for another device on this port."""
@@ -116,12 +122,19 @@ class LidarEdge:
                 return problem
         return None
 
-    def poll(self, now: float) -> None:
-        """Read what has arrived, and pass it on; nothing while the port is closed. Call it 20 times a second."""
+    def poll(self, now: float, *, on: bool = True) -> None:
+        """Read what has arrived, and pass it on; nothing while the port is closed. Call it 20 times a second.
+
+        Without `on` the lidar rests: its scan and motor are stopped, and started again when it is on.
+        """
         port, driver, lost = self._port, self._driver, self._lost
         if port is None or lost is None:
             return
         try:
+            if on is self._resting:
+                self._switch(port, now, on=on)
+            if self._resting:
+                return
             events = driver.receive(port.read_available(), now)
             if events.samples is not None:
                 self._on_samples(events.samples, now)
@@ -134,6 +147,15 @@ class LidarEdge:
             if not lost.done():
                 lost.set_exception(error)
         self._report(driver.problem)
+
+    def _switch(self, port: Port, now: float, *, on: bool) -> None:
+        self._resting = not on
+        if not on:
+            port.write(self._driver.stop_command)
+        self._set_motor(port, on=on)
+        if on:
+            port.discard_input()
+            port.write(self._driver.begin(now))
 
     def _report(self, problem: str) -> None:
         self.problem = problem

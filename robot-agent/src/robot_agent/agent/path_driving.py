@@ -13,6 +13,7 @@ from robot_agent.agent.progress_monitor import Hindrance, ProgressMonitor
 from robot_agent.agent.wheel_control import WheelControl
 from robot_agent.motion.local_planner import Decision, make_job, twist
 from robot_agent.motion.recent_scans import RecentScans
+from robot_agent.safety.gate import MANEUVERS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     from robot_agent.localization.localizer import Localizer
     from robot_agent.localization.pose import Pose2
     from robot_agent.motion.local_planner import Job
-    from robot_agent.safety.gate import SafetyOutputs
+    from robot_agent.safety.gate import SafetyOutputs, SafetyState
     from robot_agent.safety.stop_field import Wheels
 
 
@@ -149,6 +150,10 @@ class PathDriving:
         if decision.at_goal:
             self.mission.reach()
             self._stop_following()
+
+    def busy(self, state: SafetyState, safety: SafetyOutputs) -> bool:
+        """Return whether the robot moves, or will by itself: on a mission or a maneuver that it may drive."""
+        return not self.wheels.at_rest or safety.mode in MANEUVERS or (state.enabled and self.mission.active)
 
     def obey(self, safety: SafetyOutputs) -> None:
         """Drop the decision when the safety gate stops the robot."""

@@ -51,6 +51,7 @@ def safety_inputs(  # noqa: PLR0913  # the gate weighs every source of the agent
     inside_blocked: str | None,
     egress: tuple[float, str | None],
     caution: str | None,
+    resting: str | None,
     now: float,
 ) -> SafetyInputs:
     """Gather age, value and fault of every source at `now` (s, monotonic).
@@ -82,4 +83,5 @@ def safety_inputs(  # noqa: PLR0913  # the gate weighs every source of the agent
         egress_remaining=egress[0],
         egress_problem=egress[1],
         caution=caution,
+        resting=resting,
     )

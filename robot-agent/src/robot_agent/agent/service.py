@@ -113,7 +113,9 @@ class Service:
         health.set("map", loaded, "" if loaded else "no snapshot of the map has been received yet")
         status = core.localizer.status
         health.set("pose", status in {"good", "weak"}, f"{status}: {core.localizer.detail}".rstrip(": "))
-        health.set("lidar", now - self._last_scan_at < HOUSEKEEPING_S, lidar.problem)
+        resting = not core.lidar_on
+        scans = now - self._last_scan_at < HOUSEKEEPING_S
+        health.set("lidar", resting or scans, "at rest" if resting else lidar.problem)
         base_ok = now - self._last_feedback_at < HOUSEKEEPING_S
         health.set("base", base_ok, "" if base_ok else self._base_reason)
         ENCODER_FAULTS.inc(core.encoder_faults - self._encoder_faults)
@@ -151,7 +153,7 @@ class Service:
                 SUSPENSIONS.inc()
                 _log.warning("computer_was_suspended", seconds=round(seconds, 1))
                 self._core.on_suspension(seconds)
-            lidar.poll(now)
+            lidar.poll(now, on=self._core.lidar_on)
             guardian.send(self._core.stream(now, self._clock.stamp()))
 
     async def control_loop(self) -> None:

@@ -38,15 +38,10 @@ class SafetyInputs:
     map_age: since the map copy was last confirmed to be the newest version. map_gap: for how long deltas have been
     missing, 0 when none are. plan_age: since the planner's last message about the goal. released_remaining: m of
     released path ahead. path_problem: why the path must not be driven. inside_blocked: the blocked area or zone that
-    <<<<<<< HEAD
     the robot is in. egress_remaining: m to the end of the way out of it, infinite while none is known. egress_problem:
     what keeps the robot from taking it. caution: a reason to drive slowly here. guardian_lost: why there is no link to
-    the guardian. base_stopped: why the guardian keeps the wheels at zero.
-    =======
-    the robot is in. caution: a reason to drive slowly here. guardian_lost: why there is no link to the guardian.
-    base_stopped: why the guardian keeps the wheels at zero. late_age: since this computer last ran the agent too late,
-    by `late_by`.
-    >>>>>>> f450160 (Do not call a late computer a fault of the robot)
+    the guardian. base_stopped: why the guardian keeps the wheels at zero. late_age: since this computer last ran the
+    agent too late, by `late_by`. resting: why the lidar stands still on purpose, or is being started.
     """
 
     map_loaded: bool = False
@@ -72,6 +67,7 @@ class SafetyInputs:
     egress_remaining: float = math.inf
     egress_problem: str | None = None
     caution: str | None = None
+    resting: str | None = None
     late_age: float = math.inf
     late_by: float = 0.0
     request: Request | None = None
@@ -81,7 +77,8 @@ class Finding(NamedTuple):
     """One reason to restrict the robot: the level, the reason, and whether an operator must enable it again.
 
     `about_map`: the plan that the robot has may rest on another map, and must be followed by a newer one. `late`: the
-    delay of this computer explains it, so that it says nothing about the robot's devices.
+    delay of this computer explains it, so that it says nothing about the robot's devices. `rest`: the robot rests on
+    purpose, for as long as it likes.
     """
 
     level: Level
@@ -89,6 +86,7 @@ class Finding(NamedTuple):
     operator: bool = False
     about_map: bool = False
     late: bool = False
+    rest: bool = False
 
 
 def _never(_: SafetyInputs) -> bool:
@@ -113,6 +111,7 @@ class Condition(NamedTuple):
     operator: bool = False
     about_map: bool = False
     by_delay: Callable[[SafetyInputs], bool] = _never
+    rest: bool = False
 
 
 def _seconds(age: float) -> str:
@@ -157,21 +156,22 @@ CONDITIONS: Final[tuple[Condition, ...]] = (
     # --- lidar ---
     Condition(
         Level.PROTECTIVE_STOP,
-        lambda i, c: not i.lidar_age <= c.lidar_lost,
+        lambda i, c: i.resting is None and not i.lidar_age <= c.lidar_lost,
         lambda i: f"the lidar has been silent for {_seconds(i.lidar_age)}",
         by_delay=_always,
     ),
     Condition(
         Level.PROTECTIVE_STOP,
-        lambda i, c: not i.scan_age <= c.scan_lost,
+        lambda i, c: i.resting is None and not i.scan_age <= c.scan_lost,
         lambda i: f"no complete scan of the lidar for {_seconds(i.scan_age)}",
         by_delay=_always,
     ),
     Condition(
         Level.PROTECTIVE_STOP,
-        lambda i, c: i.identical_scans >= c.identical_scans,
+        lambda i, c: i.resting is None and i.identical_scans >= c.identical_scans,
         lambda i: f"the lidar repeats itself: {i.identical_scans - 1} scans in a row equal earlier ones",
     ),
+    Condition(Level.HOLD, lambda i, _: i.resting is not None, lambda i: str(i.resting), rest=True),
     # --- pose ---
     Condition(
         Level.PROTECTIVE_STOP,
@@ -236,4 +236,11 @@ def collect_findings(inputs: SafetyInputs, config: SafetyConfig) -> list[Finding
 def _finding(condition: Condition, inputs: SafetyInputs, config: SafetyConfig) -> Finding:
     late = inputs.late_age <= config.late_explains and condition.by_delay(inputs)
     cause = f"; this computer was {inputs.late_by:.1f} s late" if late else ""
-    return Finding(condition.level, condition.sentence(inputs) + cause, condition.operator, condition.about_map, late)
+    return Finding(
+        condition.level,
+        condition.sentence(inputs) + cause,
+        condition.operator,
+        condition.about_map,
+        late,
+        condition.rest,
+    )

@@ -232,7 +232,7 @@ def _advance(
     # A fault that was reset a moment ago still counts during 2 s, but only its latch keeps the mode FAULT.
     level = min(max(recent, latch), Level.PROTECTIVE_STOP)
     stopped_since = state.stopped_since
-    if level < Level.HOLD:
+    if level < Level.HOLD or any(finding.rest for finding in findings):
         stopped_since = math.inf
     elif stopped_since == math.inf:
         stopped_since = now

@@ -39,7 +39,9 @@ class RplidarA1Driver:
 
     def __init__(self, options: RplidarA1Options | None = None) -> None:
         range_max_m = (options or RplidarA1Options()).range_max_m
-        self.traits = LidarTraits(range_min_m=rplidar.RANGE_MIN_M, range_max_m=range_max_m, scan_period_s=1 / 5.5)
+        self.traits = LidarTraits(
+            range_min_m=rplidar.RANGE_MIN_M, range_max_m=range_max_m, scan_period_s=1 / 5.5, can_rest=True
+        )
         self._parser = rplidar.Parser()
         self._assembler = rplidar.ScanAssembler()
         self._phase: Literal["closed", "stopping", "checking", "scanning", "resetting"] = "closed"

@@ -198,7 +198,9 @@ class Fog:
 class AgentProcess:
     """The agent, as `python -m robot_agent` starts it."""
 
-    def __init__(self, folder: Path, router: str, watchdog: Watchdog, body: Body, start=(2.0, 2.0, 0.0)) -> None:
+    def __init__(
+        self, folder: Path, router: str, watchdog: Watchdog, body: Body, further=None, start=(2.0, 2.0, 0.0)
+    ) -> None:
         self.log_file = folder / "agent.log"
         self.data = folder / "data"
         self.input_log = folder / "inputs.mcap"
@@ -221,6 +223,7 @@ class AgentProcess:
             "FOGNAV_PORT_FILE": str(self._port_file),
             "FOGNAV_SEED": "1",
             "FOGNAV_INPUT_LOG": str(self.input_log),
+            **(further or {}),
         }
         self.process: programs.Program | None = None
 
@@ -270,10 +273,11 @@ async def until(condition, expected: str, deadline_s: float = DEADLINE_S):
 class Robot:
     """The whole robot, started; `fog` is None until `async with`."""
 
-    def __init__(self, folder: Path, router: str) -> None:
+    def __init__(self, folder: Path, router: str, **further: str) -> None:
+        """Prepare; `further` variables configure the agent."""
         self.body = Body(folder)
         self.watchdog = Watchdog(folder, self.body.link)
-        self.agent = AgentProcess(folder, router, self.watchdog, self.body)
+        self.agent = AgentProcess(folder, router, self.watchdog, self.body, further)
         self.fog: Fog | None = None
         self._router = router
         self._parts = ExitStack()

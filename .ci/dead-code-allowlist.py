@@ -101,3 +101,4 @@ _.skipped_bytes
 _.odom_at
 _.subscribe_liveliness  # zenoh: presence, for operators' tools
 _.reveal  # the way to the value of a secret setting
+_.get_code  # Python's import calls it

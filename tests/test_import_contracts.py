@@ -33,6 +33,7 @@ EDGES = {
     "fognav.generated", "fognav.kernels", "fognav.operate", "fognav.output", "fognav.page.app",
     "fognav.pytest_progress", "fognav.recording", "fognav.robot_command", "fognav.robot_file_command",
     "fognav.localization", "fognav.localize_command", "fognav.map_command", "fognav.map_picture",
+    "fognav.mutation",
     "fognav.node_command", "fognav.nodes.on_broker", "fognav.nodes.provisioning", "fognav.nodes.simulated",
     "fognav.nodes.site_file", "fognav.site_command", "fognav.source_command", "fognav.stack",
     "fognav.status_command", "fognav.store_command", "fognav.system", "fognav.testing", "fognav.token_command",

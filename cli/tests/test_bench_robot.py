@@ -1,6 +1,5 @@
 """`fognav bench robot`: how the figures are made; the whole measurement takes minutes, and is no test."""
 
-import json
 import os
 import threading
 import time
@@ -9,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from fog_runtime.site import load_site
-from fognav.bench import cpu_quota, office, reactions, robot, robot_system, task_usage
+from fognav.bench import cpu_quota, office, robot, robot_system, task_usage
 from fognav.output import WrongUseError
 
 
@@ -106,28 +105,6 @@ def test_quota_that_the_system_refuses_is_named_with_the_remedy(tmp_path: Path) 
         cpu_quota.cpu_quota(0.2, tmp_path / "none"),
     ):
         pass
-
-
-def truth(*entries: tuple[float, float]) -> list[bytes]:
-    return [json.dumps({"t_mono": at, "left": speed, "right": -speed}).encode() for at, speed in entries]
-
-
-def test_stopping_time_ends_with_the_last_line_in_which_a_wheel_turns() -> None:
-    lines = truth((9.0, 0.3), (10.0, 0.3), (10.1, 0.0), (10.2, 0.3), (10.3, 0.0), (12.9, 0.0))
-    assert reactions.stopping_time(lines, 9.5) == pytest.approx(0.7)
-    assert reactions.stopping_time(truth((9.0, 0.3), (10.0, 0.0)), 9.5) == 0.0
-    assert reactions.stopping_time(truth((10.0, 0.0), (12.9, 0.3)), 9.5) is None
-    assert reactions.stopping_time(truth((9.0, 0.0)), 9.5) is None, "nothing is known about the time since"
-
-
-def test_trials_without_a_stop_count_but_have_no_time() -> None:
-    fault = reactions.FAULTS[0]
-    values = reactions.row(fault, [0.1, None, 0.3])
-    assert values == {
-        "fault": "agent killed", "trials": 3, "stopped": 2, "median_s": 0.2, "max_s": 0.3, "limit_s": 0.3
-    }  # fmt: skip
-    assert reactions.row(fault, [None])["max_s"] is None
-    assert "| agent killed | 3 | 2 | 0.2 | 0.3 | 0.3 |" in reactions.markdown([values], "a machine")
 
 
 def test_site_of_the_benchmark_is_valid_and_its_robot_stands_on_free_floor(tmp_path: Path) -> None:

@@ -36,6 +36,7 @@ def _warm_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
         ["bench", "fleet"],
         ["bench", "robot"],
         ["bench", "reactions"],
+        ["bench", "mutation"],
         ["bench", "rest"],
         ["goal"],
         ["area", "list"],

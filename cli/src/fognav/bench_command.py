@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated
@@ -11,7 +12,7 @@ import typer
 from rich.progress import Progress
 
 from fognav import kernels
-from fognav.output import WrongUseError, check_writable, console, exit_codes, print_json
+from fognav.output import NOT_TRUE, WrongUseError, check_writable, console, exit_codes, print_json
 
 bench_app = typer.Typer(help="Measure parts of the system on this machine.", no_args_is_help=True)
 
@@ -244,28 +245,94 @@ def debounce_command(
 @bench_app.command("reactions", epilog="Example: fognav bench reactions --trials 200 --write docs/reaction-times.md")
 def reactions_command(
     *,
-    trials: Annotated[int, typer.Option("--trials", metavar="N", min=1, help="Trials of each fault.")] = 3,
+    trials: Annotated[
+        int, typer.Option("--trials", metavar="N", min=1, help="Trials of each process or pair that dies or hangs.")
+    ] = 3,
+    others: Annotated[
+        int | None, typer.Option("--others", metavar="N", min=0, help="Trials of each other fault; default: as many.")
+    ] = None,
+    robots: Annotated[int, typer.Option("--robots", metavar="N", min=1, max=32, help="Robots at once.")] = 2,
+    log: Annotated[
+        Path | None, typer.Option("--log", metavar="FILE", help="Keep each trial there, and continue the ones there.")
+    ] = None,
     write: Annotated[
-        Path | None, typer.Option("--write", metavar="FILE", help="Write the table to a Markdown file.")
+        Path | None, typer.Option("--write", metavar="FILE", help="Write the tables to a Markdown file.")
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")] = False,
 ) -> None:
     """Measure how soon the wheels stop.
 
-    Agent, guardian and watchdog of a driving robot are killed or stopped, one by one and in pairs; the time ends when
-    the emulated base's wheels stand. A trial takes some ten seconds.
+    Processes of driving robots are killed or stopped, one by one and in pairs; sensors, lidar, map, planner and network
+    fail; an operator stops the robot. The time ends when the emulated base's wheels are commanded to stand, or to be
+    slow. A trial takes some five seconds. Exit code 1: a trial was beyond its limit.
     """
-    from fognav.bench import machine, reactions  # noqa: PLC0415  # keeps the other commands fast
+    from fognav.bench import machine  # noqa: PLC0415  # keeps the other commands fast
+    from fognav.bench.reactions import page  # noqa: PLC0415  # same
+    from fognav.bench.reactions.faults import FAULTS  # noqa: PLC0415  # same
+    from fognav.bench.reactions.trials import due, measure, read_log, row  # noqa: PLC0415  # same
 
     kernels.warm_cache(lambda text: console.print(text, markup=False))
     with exit_codes():
+        check_writable(log)
         check_writable(write)
-        rows = reactions.measure(trials, lambda text: console.print(text, markup=False))
-    described = machine.describe()
+        times = read_log(log)
+        other = trials if others is None else others
+        waiting = due(times, lambda fault: trials if fault.kind == "process" else other)
+        found = asyncio.run(measure(waiting, robots, log, lambda text: console.print(text, markup=False)))
+    rows = [row(fault, every) for fault in FAULTS if (every := times.get(fault.name, []) + found.get(fault.name, []))]
     if write is not None:
-        write.write_text(reactions.markdown(rows, machine.sentence()), "utf-8")
+        command = f"fognav bench reactions --trials {trials} --others {other} --robots {robots} --log FILE --write PAGE"
+        write.write_text(page.markdown(rows, command, machine.sentence(), robots), "utf-8")
     if json:
-        print_json({"bench": "reactions", "trials": trials, "rows": rows, **described})
-        return
-    for values in rows:
-        console.print("  ".join(f"{name} {value}" for name, value in values.items()), markup=False)
+        print_json({"bench": "reactions", "trials": trials, "others": other, "rows": rows, **machine.describe()})
+    else:
+        for values in rows:
+            console.print("  ".join(f"{name} {value}" for name, value in values.items()), markup=False)
+    if any(each["beyond_limit"] for each in rows):
+        raise typer.Exit(NOT_TRUE)
+
+
+@bench_app.command("mutation", epilog="Example: fognav bench mutation --part guardian --module core")
+def mutation_command(
+    *,
+    part: Annotated[
+        list[str] | None, typer.Option("--part", metavar="NAME", help="Only this part; may be repeated.")
+    ] = None,
+    module: Annotated[
+        str, typer.Option("--module", metavar="NAME", help="Only mutants of modules whose name ends so.")
+    ] = "",
+    coverage: Annotated[
+        bool, typer.Option("--coverage", help="Measure only which lines and branches the tests reach.")
+    ] = False,
+    jobs: Annotated[int, typer.Option("--jobs", metavar="N", min=0, help="Mutants at once; 0: one per core.")] = 0,
+    json: Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")] = False,
+) -> None:
+    """Test the tests of what stops the robot.
+
+    Changes one operator, number or statement of safety gate or guardian at a time, and runs their tests, which must
+    notice it; prints each change that none does. Exit code 1: a line or branch that no test reaches, or fewer than
+    90 percent of the changes noticed.
+    """
+    from fognav import checkout  # noqa: PLC0415  # keeps the other commands fast
+    from fognav.mutation import report  # noqa: PLC0415  # same
+    from fognav.mutation.parts import parts_named  # noqa: PLC0415  # same
+    from fognav.mutation.run import measure  # noqa: PLC0415  # same
+
+    def tell(text: str) -> None:
+        console.print(text, markup=False, soft_wrap=True)
+
+    with exit_codes():
+        root, chosen = checkout.root(), parts_named(part or [])
+        figures = {
+            each.name: measure(
+                each, root, jobs=jobs or os.cpu_count() or 1, only=None if coverage else module, tell=tell
+            )
+            for each in chosen
+        }
+    if json:
+        print_json({"bench": "mutation", "parts": report.values(figures)})
+    else:
+        for line in report.lines(figures):
+            tell(line)
+    if not report.passes(figures):
+        raise typer.Exit(NOT_TRUE)

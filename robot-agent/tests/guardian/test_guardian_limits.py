@@ -2,75 +2,10 @@
 
 from __future__ import annotations
 
-import msgspec
 import pytest
+from plain_base import Rig
 
-from robot_agent.guardian.core import GuardianCore, Limits
-from robot_agent.guardian.link import WheelCommand
-from robot_agent.hardware import Awakening, BaseReading, BaseStatus, BaseTiming, DriveTrain, WheelOdometry
-
-
-class PlainBase:
-    """A base whose commands are readable: its driver returns what it was asked for."""
-
-    timing = BaseTiming(frame_timeout=0.3, wake_timeout=1.0, ignored_after_wake=0.1)
-    corrupted = 0
-    awakening = Awakening(bauds=(115_200,))
-
-    def __init__(self, top_speed: float = 0.5) -> None:
-        self.drive_train = DriveTrain(axle_m=0.235, wheel_speed_max_m_s=top_speed)
-        self.frames: list[BaseReading] = []
-
-    def receive_data(self, data: bytes, now: float) -> None:
-        del data, now
-
-    def next_event(self) -> BaseReading | None:
-        return self.frames.pop(0) if self.frames else None
-
-    def wake(self) -> bytes:
-        return b"wake;"
-
-    def respond(self) -> bytes:
-        return b""
-
-    def use_baud(self, baud: int) -> None:
-        del baud
-
-    def drive(self, left_m_s: float, right_m_s: float) -> bytes:
-        return f"{left_m_s:.4f},{right_m_s:.4f};".encode()
-
-
-class Rig:
-    """A guardian on a plain base, awake since t = 0.1 s."""
-
-    def __init__(self, limits: Limits | None = None, top_speed: float = 0.5, *, awake: bool = True) -> None:
-        self.base = PlainBase(top_speed)
-        self.core = GuardianCore(self.base, limits or Limits())
-        self.travel = 0.0
-        assert self.core.tick(0.0).data == b"wake;"
-        if awake:
-            self.frame(0.1)
-
-    def frame(self, now: float, travel: float = 0.0, **status: object):
-        odometry = WheelOdometry(left_m=travel, right_m=travel)
-        self.base.frames.append(BaseReading(msgspec.convert(status, BaseStatus), odometry))
-        return self.core.on_bytes(b"", now)
-
-    def command(self, now: float, left: float = 0.1, right: float = 0.1, *, reset: bool = False):
-        return self.core.on_command(WheelCommand(seq=1, left=left, right=right, reset=reset), now)
-
-    def wheels(self, output) -> tuple[float, float] | None:
-        words = [word for word in output.data.decode().split(";") if "," in word]
-        return tuple(float(part) for part in words[-1].split(",")) if words else None
-
-    def drive(self, begin: float, end: float, left: float = 0.1, right: float = 0.1) -> tuple[float, float]:
-        """Command every 0.02 s, with a frame each time; return the last wheel speeds."""
-        latest, steps = (0.0, 0.0), round((end - begin) / 0.02)
-        for step in range(steps + 1):
-            now = begin + step * (end - begin) / steps
-            self.frame(now)
-            latest = self.wheels(self.command(now, left, right)) or latest
-        return latest
+from robot_agent.guardian.core import Limits
 
 
 def test_command_is_fresh_for_0_2_s_and_no_longer() -> None:

@@ -89,8 +89,7 @@ class RobotSystem:
         contexts = self._contexts
         folder = Path(contexts.enter_context(TemporaryDirectory(prefix="fognav-bench-")))
         site = await asyncio.to_thread(write_site, folder, make_office(*FLOOR_M))
-        self.truth_log = folder / "truth.jsonl"
-        config = StackConfig(site_dir=site, robot=NAME, extra={"TRUTH_LOG": str(self.truth_log)})
+        config = StackConfig(site_dir=site, robot=NAME)
         self.stack = await contexts.enter_async_context(Stack(config, self._on_event))
         await self.stack.start()
         edge = await contexts.enter_async_context(
@@ -154,14 +153,6 @@ class RobotSystem:
     async def start_drive(self) -> None:
         """Send the robot to the other end of the floor, some two minutes away or more, and wait until it drives."""
         await self._send_goal()
-        await self._until(lambda: self.speed > _DRIVING_M_S, "the robot drives")
-
-    async def wait_driving(self) -> None:
-        """Wait until the robot drives (again), and send it to the other end of the floor if it has no goal."""
-        await self.wait_enabled()
-        state = self.state
-        if state is None or state.goal_id is None or state.goal_reached:
-            await self._send_goal()
         await self._until(lambda: self.speed > _DRIVING_M_S, "the robot drives")
 
     async def _send_goal(self) -> None:

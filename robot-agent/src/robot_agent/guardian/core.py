@@ -11,6 +11,7 @@ When both end, the robot starts in INIT, and an operator must enable it as after
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -34,6 +35,7 @@ FEEDBACK_S: Final = 0.045
 """The agent gets every third sensor frame while the wheels turn, and every change immediately."""
 FEEDBACK_AT_REST_S: Final = 0.09
 """And every seventh while they do not: an idle robot shall cost little."""
+_NEVER: Final = -math.inf
 STEP_S: Final = 0.06
 """Longest time step of acceleration: after a pause the guardian must not catch up in one step."""
 
@@ -60,7 +62,7 @@ class _Base:
     """State of the base."""
 
     reading: BaseReading | None = None
-    reading_at: float = -1.0e9
+    reading_at: float = _NEVER
     awake: bool = False
     woken_at: float | None = None
     overcurrent_since: float | None = None
@@ -78,13 +80,13 @@ class GuardianCore:
         self._base = _Base()
         self._revival = Revival(self.driver.awakening)
         self._command: WheelCommand | None = None
-        self._command_at = -1.0e9
+        self._command_at = _NEVER
         self._latched: str | None = None
         self._wheels = (0.0, 0.0)
         self._sent: tuple[float, float] | None = None
-        self._sent_at = -1.0e9
+        self._sent_at = _NEVER
         self._stepped_at: float | None = None
-        self._feedback_at = -1.0e9
+        self._feedback_at = _NEVER
         self._feedback_key: object = None
         self._told_status: BaseStatus | None = None
         self._told_alarms: BaseStatus | None = None
@@ -240,20 +242,18 @@ class GuardianCore:
         return Output(self._send(self._wheels, now))
 
     def _target(self, now: float) -> tuple[float, float]:
-        command = self._command
-        stale = command is None or now - self._command_at > COMMAND_FRESH_S
-        if command is None or stale or self._latched is not None or self._charging(now):
+        command = self._fresh_command(now)
+        if command is None or self._latched is not None or self._charging(now):
             return 0.0, 0.0
         left, right = command.left, command.right
         mean = abs(left + right) / 2
         fastest = max(abs(left), abs(right))
         # One factor for both wheels keeps the curve of the command.
-        scale = min(
-            1.0,
-            self.limits.linear / mean if mean > self.limits.linear else 1.0,
-            self._wheel_limit / fastest if fastest > self._wheel_limit else 1.0,
-        )
-        return left * scale, right * scale
+        excess = max(1.0, mean / self.limits.linear, fastest / self._wheel_limit)
+        return left / excess, right / excess
+
+    def _fresh_command(self, now: float) -> WheelCommand | None:
+        return self._command if now - self._command_at <= COMMAND_FRESH_S else None
 
     def _send(self, wheels: tuple[float, float], now: float) -> bytes:
         self._sent, self._sent_at = wheels, now
@@ -285,7 +285,7 @@ class GuardianCore:
             stopped = "the base is on its charger" if self._charging(now) else "the base is not ready to drive yet"
         elif self._charging(now):
             stopped = "the base is on its charger, where it does not drive: take it off first"
-        elif self._command is None or now - self._command_at > COMMAND_FRESH_S:
+        elif self._fresh_command(now) is None:
             stopped = NO_FRESH_COMMAND
         return BaseFeedback(
             seq=self._seq, status=reading.status, odometry=reading.odometry, fault=self._latched, stopped=stopped

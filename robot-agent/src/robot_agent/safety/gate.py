@@ -137,8 +137,7 @@ def _apply_request(
             return _reset(state, inputs, config)
         case "egress":
             return _begin_egress(state, inputs, now, config)
-        case "enable":
-            return _enable(state, inputs, findings)
+    return _enable(state, inputs, findings)
 
 
 def _reset(state: SafetyState, inputs: SafetyInputs, config: SafetyConfig) -> tuple[SafetyState, str | None]:

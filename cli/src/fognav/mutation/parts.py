@@ -1,0 +1,89 @@
+"""The parts of the robot whose tests are tested: their modules, their tests, and the mutants that change nothing."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from fognav.output import WrongUseError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from fognav.mutation.mutants import Mutant
+
+LEAST_SCORE: Final = 0.9
+"""Share of the mutants that the tests of a part must notice, those that change nothing left out."""
+
+
+class Equivalent(NamedTuple):
+    """A mutant that no test can notice: the module's last name, code and change as the report prints them, and why."""
+
+    module: str
+    code: str
+    change: str
+    reason: str
+
+
+class Part(NamedTuple):
+    """A part of the robot.
+
+    modules: names below `robot_agent`; a package stands for all its modules. tests: files or folders below
+    `robot-agent/tests`. preload: what the tests import besides these modules and is the same for every mutant.
+    """
+
+    name: str
+    modules: tuple[str, ...]
+    tests: tuple[str, ...]
+    preload: tuple[str, ...]
+    equivalent: tuple[Equivalent, ...] = ()
+
+    def why_equivalent(self, module: str, mutant: Mutant) -> str | None:
+        """Return why no test can notice this mutant; None for one that tests must notice."""
+        last, change = module.rpartition(".")[2], f"{mutant.before} -> {mutant.after}"
+        for known in self.equivalent:
+            if (known.module, known.code, known.change) == (last, mutant.code, change):
+                return known.reason
+        return None
+
+    def files(self, root: Path) -> dict[str, Path]:
+        """Return the source of each module, by its full name, in a checkout."""
+        package = root / "robot-agent/src/robot_agent"
+        found: dict[str, Path] = {}
+        for name in self.modules:
+            path = package.joinpath(*name.split("."))
+            files = sorted(path.glob("*.py")) if path.is_dir() else [path.with_suffix(".py")]
+            for file in files:
+                if file.stem != "__init__":
+                    found[".".join(("robot_agent", *file.relative_to(package).with_suffix("").parts))] = file
+        return found
+
+
+def parts_named(names: Sequence[str]) -> list[Part]:
+    """Return the parts of these names, or all; raises `WrongUseError` for an unknown name."""
+    known = {part.name: part for part in PARTS}
+    for name in names:
+        if name not in known:
+            raise WrongUseError(f"there is no part {name!r}: name one of {', '.join(known)}")
+    return [known[name] for name in names] or list(PARTS)
+
+
+PARTS: Final = (
+    Part(
+        "safety",
+        ("safety",),
+        ("safety",),
+        ("numpy", "hypothesis.strategies", "fog_kernels.sweep", "robot_agent.config", "robot_agent.footprint"),
+    ),
+    Part(
+        "guardian",
+        ("guardian.core", "guardian.link", "guardian.revival"),
+        (
+            "guardian/test_guardian_core.py",
+            "guardian/test_guardian_limits.py",
+            "guardian/test_guardian_moments.py",
+            "guardian/test_revival.py",
+        ),
+        ("numpy", "hypothesis.strategies", "robot_agent.config"),
+    ),
+)

@@ -1,0 +1,77 @@
+"""The attempts on a base that does not answer, by hand: when, in which order, and what is told in the end."""
+
+from __future__ import annotations
+
+import pytest
+
+from robot_agent.guardian.revival import Attempt, Revival
+from robot_agent.hardware import Awakening, WakeLine
+
+RTS = WakeLine(name="rts", seconds=1.1)
+ONE_RATE = "the base does not answer at 115200 baud: wake it"
+TWO_RATES = "the base does not answer at 115200 or 19200 baud: wake it"
+
+
+def revival(*bauds: int, line: WakeLine | None = None) -> Revival:
+    return Revival(Awakening(bauds=bauds, line=line, remedy="wake it"))
+
+
+def attempts(tried: Revival, count: int, begin: float = 10.0) -> list[Attempt | None]:
+    """Ask every 3 s; the first time only begins the wait."""
+    return [tried.attempt(begin + 3.0 * number) for number in range(count + 1)][1:]
+
+
+def test_attempts_are_three_seconds_apart() -> None:
+    tried = revival(115_200, line=RTS)
+    asked = {at: tried.attempt(at) is not None for at in (10.0, 12.9, 12.99, 13.0, 13.01, 15.9, 15.99, 16.0)}
+    assert [at for at, due in asked.items() if due] == [13.0, 16.0]
+
+
+def test_base_with_one_rate_and_no_line_is_given_up_at_once_but_asked_on() -> None:
+    tried = revival(115_200)
+    assert tried.attempt(10.0) is None
+    assert tried.problem is None
+    assert attempts(tried, 3, 10.0) == [None, None, None]
+    assert (tried.baud, tried.problem) == (115_200, ONE_RATE)
+
+
+def test_line_is_pulsed_twice_before_a_base_of_one_rate_is_given_up_and_on() -> None:
+    tried = revival(115_200, line=RTS)
+    assert attempts(tried, 1) == [Attempt(line=RTS)]
+    assert tried.problem is None
+    assert attempts(tried, 4, 13.0) == [Attempt(line=RTS)] * 4
+    assert tried.problem == ONE_RATE
+
+
+def test_each_rate_is_tried_once_and_then_the_first_for_good() -> None:
+    tried = revival(115_200, 19_200)
+    assert tried.baud == 115_200
+    assert attempts(tried, 1) == [Attempt(baud=19_200)]
+    assert (tried.baud, tried.problem) == (19_200, None)
+    assert attempts(tried, 1, 13.0) == [Attempt(baud=115_200)]
+    assert (tried.baud, tried.problem) == (115_200, TWO_RATES)
+    assert attempts(tried, 5, 16.0) == [None] * 5
+    assert tried.baud == 115_200
+
+
+def test_line_is_pulsed_at_each_rate() -> None:
+    tried = revival(115_200, 19_200, line=RTS)
+    pulse = Attempt(line=RTS)
+    expected = [pulse, Attempt(baud=19_200), pulse, Attempt(baud=115_200), pulse, pulse]
+    assert attempts(tried, 3) == expected[:3]
+    assert tried.problem is None
+    assert attempts(tried, 3, 19.0) == expected[3:]
+    assert tried.problem == TWO_RATES
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_rate_at_which_the_base_answered_is_kept_and_all_begins_anew(count: int) -> None:
+    tried = revival(115_200, 19_200)
+    attempts(tried, count)
+    answered = tried.baud
+    tried.on_answer()
+    assert (tried.baud, tried.problem) == (answered, None)
+    assert tried.attempt(100.0) is None
+    assert tried.attempt(102.9) is None
+    assert tried.attempt(103.0) is None, "there is no other rate"
+    assert (tried.baud, tried.problem) == (answered, TWO_RATES)

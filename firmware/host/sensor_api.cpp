@@ -26,10 +26,11 @@ struct TestRanger final : fognav::Ranger {
 
 // A node with one sonar and one ranger.
 struct RangerNode {
-    explicit RangerNode(fognav::NodeSettings settings) : node(with(settings, sensor)) {}
-    static const fognav::NodeSettings& with(fognav::NodeSettings& settings, fognav::RangeSensor& sensor) {
-        settings.sensors[1] = &sensor;
-        return settings;
+    explicit RangerNode(const fognav::NodeSettings& settings) : node(with(settings, sensor)) {}
+    static fognav::NodeSettings with(const fognav::NodeSettings& settings, fognav::RangeSensor& sensor) {
+        fognav::NodeSettings changed = settings;
+        changed.sensors[1] = &sensor;
+        return changed;
     }
     TestRanger ranger;
     fognav::TimeOfFlight sensor{ranger, fognav::vl53l1x_sample};

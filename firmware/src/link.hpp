@@ -72,12 +72,12 @@ private:
     bool failed_ = false;
     const char* problem_ = nullptr;
     String calibration_;
-    char availability_[FOGNAV_NODE_AVAILABILITY_TOPIC_SIZE];
-    char reading_[FOGNAV_NODE_READING_TOPIC_SIZE];
-    char value_[FOGNAV_NODE_VALUE_TOPIC_SIZE];
-    char calibration_topic_[FOGNAV_NODE_CALIBRATION_TOPIC_SIZE];
-    char problem_topic_[FOGNAV_NODE_PROBLEM_TOPIC_SIZE];
-    char client_id_[kIdSize + 5];
+    char availability_[FOGNAV_NODE_AVAILABILITY_TOPIC_SIZE] = "";
+    char reading_[FOGNAV_NODE_READING_TOPIC_SIZE] = "";
+    char value_[FOGNAV_NODE_VALUE_TOPIC_SIZE] = "";
+    char calibration_topic_[FOGNAV_NODE_CALIBRATION_TOPIC_SIZE] = "";
+    char problem_topic_[FOGNAV_NODE_PROBLEM_TOPIC_SIZE] = "";
+    char client_id_[kIdSize + 5] = "";
 };
 
 }  // namespace fognav

@@ -150,8 +150,11 @@ private:
 // As with the rangers: places for what the settings ask for.
 template <class Sensor>
 Sensor& make_value(int index, const ValueSettings& settings) {
-    alignas(Sensor) static unsigned char places[kMaxValues][sizeof(Sensor)];
-    return *new (places[index]) Sensor(settings);
+    struct Place {
+        alignas(Sensor) unsigned char bytes[sizeof(Sensor)];
+    };
+    static Place places[kMaxValues];
+    return *new (&places[index]) Sensor(settings);
 }
 
 }  // namespace

@@ -44,7 +44,7 @@ bool FlashBoard::write_flash(const uint8_t* data, size_t size) {
 
 bool FlashBoard::commit_flash() { return Update.end(); }
 
-// Ending before all has come discards it.
+// Ending before all was written discards it; ending after that would start it.
 void FlashBoard::abandon_flash() { Update.end(); }
 
 void FlashBoard::remember(uint32_t number) {

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from fog_contracts.site import NodeSite, Sonar
-from fognav_sim.firmware import Core, FirmwareError, build_library, find_compiler, find_firmware
+from fognav_sim.firmware import FLAGS, Core, FirmwareError, build_library, find_compiler, find_firmware
 from fognav_sim.firmware_node import FirmwareNode
 
 SITE = NodeSite(id="n1", area="z1", x=0.0, y=0.0, theta=0.0, sonars=[Sonar(range_limit=2.0), Sonar(range_limit=2.5)])
@@ -31,8 +31,16 @@ def compiler():
 
 
 @pytest.fixture(scope="session")
-def library(compiler, tmp_path_factory):
-    return build_library(tmp_path_factory.mktemp("firmware"))
+def built(tmp_path_factory):
+    """Where what is compiled goes, and the further options: those that count lines, when `.ci/firmware` asks for it."""
+    counted = os.environ.get("FOGNAV_FIRMWARE_COVERAGE")
+    return (Path(counted), ("--coverage", "-O0")) if counted else (tmp_path_factory.mktemp("firmware"), ())
+
+
+@pytest.fixture(scope="session")
+def library(compiler, built):
+    folder, options = built
+    return build_library(folder, (*FLAGS, *options))
 
 
 @pytest.fixture(scope="session")

@@ -1,16 +1,21 @@
 """The whole firmware of the board on this computer, in simulated time, behind stand-ins for the board's libraries."""
 
+import hashlib
 import json
 import shutil
 import subprocess
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from fog_contracts import channels as ch
 from fog_contracts.codec import decode, encode
 from fog_contracts.messages import NodeCalibration, NodeConfig, NodeReading, NodeUpdate, NodeValue
 
+# Of the cryptographic library that each board's core brings along: a header, and how a program is linked with it.
+CRYPTOGRAPHY = {"esp8266": ("bearssl/bearssl.h", "-lbearssl"), "esp32": ("mbedtls/ecdsa.h", "-lmbedcrypto")}
+NO_CRYPTOGRAPHY = "no {}, or no openssl: apt-get install libbearssl-dev libmbedtls-dev openssl"
 BOARDS = {"esp8266": ("ESP8266", [(14, 5), (12, 4)]), "esp32": ("ESP32", [(18, 22), (19, 21)])}
 SETTINGS = {
     "site": "lab", "node": "n1", "wifi_name": "net", "wifi_password": "secret", "broker": "fog.local", "tls": False,
@@ -20,22 +25,37 @@ PEM = "-----BEGIN CERTIFICATE----- MIIB -----END CERTIFICATE-----"
 
 
 @pytest.fixture(scope="session")
-def programs(firmware, compiler, tmp_path_factory):
+def programs(firmware, compiler, built):
     """The firmware of each board as a program of this computer."""
-    built = {}
+    folder, counted = built
+    warnings = ("-Wall", "-Wextra", "-Wshadow", "-Werror")
+    checked = counted or ("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
     for board, (macro, _) in BOARDS.items():
-        program = tmp_path_factory.mktemp("board") / board
-        stand_ins = firmware / "host" / "board"
-        folders = ("src", "lib/node_core/src", "lib/node_edge/src", "host/board", "host/board/crypto")
-        files = [str(file) for folder in folders for file in sorted((firmware / folder).glob("*.cpp"))]
-        includes = [f"-I{firmware / folder}" for folder in ("include", *folders[1:])]
-        options = [f"-D{macro}", '-DFOGNAV_FIRMWARE="test"', "-std=gnu++17", "-g", "-fsanitize=address,undefined"]
-        command = [compiler, *options, "-fno-sanitize-recover=all", *includes, *files, "-o", str(program)]
+        stand_ins = [] if cryptography(board) else ["host/board/crypto"]
+        folders = ["src", "lib/node_core/src", "lib/node_edge/src", "host/board", *stand_ins]
+        files = [str(file) for source in folders for file in sorted((firmware / source).glob("*.cpp"))]
+        includes = [f"-I{firmware / source}" for source in ("include", *folders[1:])]
+        options = [f"-D{macro}", '-DFOGNAV_FIRMWARE="test"', "-std=gnu++17", *warnings, *checked]
+        command = [compiler, *options, *includes, *files, *cryptography(board), "-o", str(folder / board)]
         done = subprocess.run(command, check=False, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
-        assert stand_ins.is_dir()
-        built[board] = program
-    return built
+    return {board: folder / board for board in BOARDS}
+
+
+def cryptography(board):
+    """How a board's program is linked with the real library, if that is installed here."""
+    header, library = CRYPTOGRAPHY[board]
+    return [library] if Path("/usr/include", header).is_file() and shutil.which("openssl") else []
+
+
+def openssl(folder, *arguments, text=None):
+    return subprocess.run(["openssl", *arguments], cwd=folder, input=text, check=True, capture_output=True).stdout
+
+
+def make_key(folder, name):
+    """Return the public key of a new private one, as `update_key` takes it."""
+    openssl(folder, "ecparam", "-name", "prime256v1", "-genkey", "-noout", "-out", name)
+    return openssl(folder, "ec", "-in", name, "-pubout", "-outform", "DER")[-65:].hex()
 
 
 class Board:
@@ -296,64 +316,85 @@ def test_update_with_a_signature_that_is_not_good_is_told_and_fetches_nothing(sw
     ]
 
 
-SIGNATURES = r"""
-#include <stdio.h>
-#include <stdlib.h>
-#include <string.h>
-#include "hexadecimal.hpp"
-#include "signature.hpp"
-int main(int, char** arguments) {
-    uint8_t key[65], signature[80], hash[32];
-    if (fognav::bytes(arguments[1], key, sizeof key) != 65) return 2;
-    const int size = fognav::bytes(arguments[2], signature, sizeof signature);
-    fognav::Sha256 sha;
-    sha.add(arguments[3], strlen(arguments[3]));
-    sha.end(hash);
-    for (const uint8_t byte : hash) printf("%02x", byte);
-    const size_t length = strlen(arguments[3]);
-    printf(" %d\n", fognav::verify(key, sizeof key, arguments[3], length, signature, static_cast<size_t>(size)));
-}
-"""
+IMAGE = bytes(range(256)) * 40
+NAMES = {"esp8266": "d1-mini", "esp32": "d1-mini32"}
+
+
+def signed_update(folder, board, key="key.pem", image=IMAGE, **change):
+    """Return an update to this image, signed as the README says."""
+    digest, number = hashlib.sha256(image).hexdigest(), 2
+    text = f"fognav-firmware\n{NAMES[board]}\n{number}\n{len(image)}\n{digest}\n"
+    signature = openssl(folder, "dgst", "-sha256", "-sign", key, text=text.encode()).hex()
+    update = NodeUpdate(
+        number=number, board=NAMES[board], size=len(image), sha256=digest, signature=signature, url="http://fog/n1.bin"
+    )
+    return msgspec.structs.replace(update, **change)
+
+
+@pytest.fixture(params=BOARDS)
+def updatable(request, switch_on, tmp_path):
+    """A board with the key of `key.pem`, and its name."""
+    if not cryptography(request.param):
+        pytest.skip(NO_CRYPTOGRAPHY.format(CRYPTOGRAPHY[request.param][0]))
+    board = switch_on({**SETTINGS, "update_key": make_key(tmp_path, "key.pem")}, request.param)
+    board.measures(3000, 3000)
+    board.run(5)
+    return board, request.param
+
+
+def test_signed_update_is_installed_while_the_node_goes_on_measuring(updatable, switch_on, tmp_path):
+    board, kind = updatable
+    (tmp_path / "served").write_bytes(IMAGE)
+    board.send(ch.NODE_UPDATE, signed_update(tmp_path, kind))
+    lines = board.run(60)
+    assert [line for line in lines if line.split()[0] in {"fetch", "flash", "write", "restart"}] == [
+        "fetch http://fog/n1.bin", "write /update.txt", "flash complete", "restart",
+    ]  # fmt: skip
+    assert (tmp_path / "flashed").read_bytes() == IMAGE
+    again = switch_on(board=kind)
+    again.run(5)
+    again.send(ch.NODE_UPDATE, signed_update(tmp_path, kind))  # retained: it comes again with each connection
+    assert not any(line.startswith("fetch") for line in again.run(60))
 
 
 @pytest.mark.parametrize(
-    ("macro", "header", "libraries"),
-    [("ESP8266", "bearssl/bearssl.h", ["-lbearssl"]), ("ESP32", "mbedtls/ecdsa.h", ["-lmbedcrypto"])],
+    ("change", "words"),
+    [
+        ({"number": 3}, "not signed by the key"),
+        ({"size": len(IMAGE) + 1}, "not signed by the key"),
+        ({"sha256": "ab" * 32}, "not signed by the key"),
+        ({"signature": "3006020101020101"}, "not signed by the key"),
+        ({"signature": "00" * 72}, "not signed by the key"),
+        ({"number": 1}, None),  # that of what runs
+    ],
 )
-def test_signature_by_openssl_is_good_for_the_boards_library_and_nothing_else_is(
-    firmware, compiler, tmp_path, macro, header, libraries
-):
-    if not Path("/usr/include", header).is_file() or shutil.which("openssl") is None:
-        pytest.skip(f"no {header} or no openssl: apt-get install libbearssl-dev libmbedtls-dev openssl")
-    main = tmp_path / "main.cpp"
-    main.write_text(SIGNATURES)
-    folders = ("include", "src", "lib/node_edge/src")
-    files = [main, firmware / "src" / "signature.cpp", firmware / "lib" / "node_edge" / "src" / "hexadecimal.cpp"]
-    includes = [f"-I{firmware / folder}" for folder in folders]
-    command = [compiler, f"-D{macro}", "-std=gnu++17", "-Wall", "-Wextra", "-Werror", *includes, *map(str, files)]
-    subprocess.run([*command, *libraries, "-o", str(tmp_path / "program")], check=True, capture_output=True)
+def test_update_that_differs_from_what_was_signed_is_refused(updatable, tmp_path, change, words):
+    board, kind = updatable
+    board.send(ch.NODE_UPDATE, signed_update(tmp_path, kind, **change))
+    lines = board.run(2)
+    problems = published(lines, ch.NODE_PROBLEM)
+    assert problems == [] if words is None else words in problems[0]
+    assert not any(line.startswith("fetch") for line in lines)
 
-    def openssl(*arguments, text=None):
-        done = subprocess.run(["openssl", *arguments], cwd=tmp_path, input=text, check=True, capture_output=True)
-        return done.stdout
 
-    openssl("ecparam", "-name", "prime256v1", "-genkey", "-noout", "-out", "key.pem")
-    key = openssl("ec", "-in", "key.pem", "-pubout", "-outform", "DER")[-65:].hex()
-    text = "fognav-firmware\nd1-mini\n6\n1000\nabcd\n"
-    signature = openssl("dgst", "-sha256", "-sign", "key.pem", text=text.encode()).hex()
+def test_update_signed_by_another_key_is_refused(updatable, tmp_path):
+    board, kind = updatable
+    make_key(tmp_path, "other.pem")
+    board.send(ch.NODE_UPDATE, signed_update(tmp_path, kind, key="other.pem"))
+    assert "not signed by the key" in published(board.run(2), ch.NODE_PROBLEM)[0]
 
-    def checked(*arguments):
-        return subprocess.run([tmp_path / "program", *arguments], check=True, capture_output=True, text=True).stdout
 
-    digest = openssl("dgst", "-sha256", "-hex", text=text.encode()).decode().split()[-1]
-    assert checked(key, signature, text) == f"{digest} 1\n"
-    assert checked(key, signature, text + " ").endswith(" 0\n")
-    flipped = f"{int(signature[20], 16) ^ 1:x}"
-    assert checked(key, signature[:20] + flipped + signature[21:], text).endswith(" 0\n")
-    assert checked(key, "", text).endswith(" 0\n")
-    other = openssl("ecparam", "-name", "prime256v1", "-genkey", "-noout", "-out", "other.pem")
-    assert other == b""
-    foreign = openssl("ec", "-in", "other.pem", "-pubout", "-outform", "DER")[-65:].hex()
-    assert checked(foreign, signature, text).endswith(" 0\n")
-    off_the_curve = "04" + "01" * 64
-    assert checked(off_the_curve, signature, text).endswith(" 0\n")
+@pytest.mark.parametrize(
+    ("served", "words"),
+    [(None, "does not answer"), (IMAGE[:-1], "does not answer"), (IMAGE[:-1] + b"x", "not what was signed")],
+)
+def test_image_that_differs_from_what_was_signed_is_not_started(updatable, tmp_path, served, words):
+    board, kind = updatable
+    if served is not None:
+        (tmp_path / "served").write_bytes(served)
+    board.send(ch.NODE_UPDATE, signed_update(tmp_path, kind))
+    lines = board.run(60)
+    assert words in published(lines, ch.NODE_PROBLEM)[0]
+    assert "flash complete" not in lines
+    assert not board.restarted
+    assert not (tmp_path / "update.txt").exists()

@@ -70,23 +70,6 @@ def test_libraries_compile_for_the_esp8266_with_its_c_library_alone(firmware, tm
     assert int(sizes[1]) + int(sizes[2]) == 0, "it has no variables of its own"
 
 
-@pytest.mark.parametrize("board", ["ESP8266", "ESP32"])
-def test_the_boards_part_compiles_against_stand_ins_for_arduino_and_the_mqtt_library(firmware, compiler, board):
-    options = (
-        f"-D{board}",
-        '-DFOGNAV_FIRMWARE="test"',
-        "-std=gnu++17",
-        "-fsyntax-only",
-        "-Wall",
-        "-Wextra",
-        "-Wshadow",
-        "-Werror",
-    )
-    stand_ins = [f"-I{firmware / 'host' / folder}" for folder in ("board", "board/crypto")]
-    files = [str(file) for file in sorted((firmware / "src").glob("*.cpp"))]
-    run(compiler, *options, *stand_ins, *includes(firmware), *files)
-
-
 def test_no_input_makes_the_node_fault(firmware, compiler, tmp_path):
     program, inputs = tmp_path / "fuzz", tmp_path / "inputs"
     sanitizers = (

@@ -37,7 +37,11 @@ BOARD_COMPILER: Final = Tool(
     "xtensa-lx106-elf-g++", ("xtensa-lx106-elf-g++",), "gcc-xtensa-lx106 picolibc-xtensa-lx106-elf",
     "compiling the firmware's core for the ESP8266", required=False,
 )  # fmt: skip
-TOOLS: Final = (MOSQUITTO, REDIS, CHROMIUM, COMPILER, BOARD_COMPILER)
+FIRMWARE_CHECKER: Final = Tool(
+    "cppcheck", ("cppcheck",), "cppcheck libbearssl-dev libmbedtls-dev",
+    "checking the firmware, and its signatures with the boards' own libraries", required=False,
+)  # fmt: skip
+TOOLS: Final = (MOSQUITTO, REDIS, CHROMIUM, COMPILER, BOARD_COMPILER, FIRMWARE_CHECKER)
 
 
 class MissingToolsError(RuntimeError):

@@ -1,6 +1,8 @@
 // A stand-in for the board's file system: a folder of the computer.
 #pragma once
 
+#include <memory>
+
 #include "Arduino.h"
 
 class File {
@@ -11,10 +13,10 @@ public:
     size_t size() const;
     String readString();
     size_t write(const uint8_t* data, size_t size);
-    void close();
+    void close() { file_.reset(); }
 
 private:
-    FILE* file_ = nullptr;
+    std::shared_ptr<FILE> file_;  // copies are of the same file, as on the board
 };
 
 struct FileSystem {

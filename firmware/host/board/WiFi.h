@@ -21,8 +21,14 @@ struct Radio {
 };
 extern Radio WiFi;
 
-struct WiFiClient {
-    int available() { return 0; }
-    uint8_t connected() { return 0; }
-    int read(uint8_t*, size_t) { return -1; }
+class WiFiClient {
+public:
+    int available();
+    uint8_t connected() { return body_ != nullptr ? 1 : 0; }
+    int read(uint8_t* buffer, size_t size);
+    void set_body(FILE* body) { body_ = body; }
+    FILE* body() { return body_; }
+
+private:
+    FILE* body_ = nullptr;  // of the answer
 };

@@ -8,6 +8,7 @@
 #include <vector>
 
 #include "DallasTemperature.h"
+#include "HTTPClient.h"
 #include "LittleFS.h"
 #include "Update.h"
 #include "VL53L1X.h"
@@ -152,27 +153,68 @@ void Radio::begin(const char* name, const char*) {
 wl_status_t Radio::status() { return joined && network ? WL_CONNECTED : WL_DISCONNECTED; }
 void Radio::softAP(const char* name) { printf("network %s\n", name); }
 
-File::File(const std::string& name, const char* mode) : file_(fopen(name.c_str(), mode)) {}
+File::File(const std::string& name, const char* mode) {
+    FILE* opened = fopen(name.c_str(), mode);
+    if (opened != nullptr) file_ = std::shared_ptr<FILE>(opened, fclose);
+}
 size_t File::size() const {
     struct stat found;
-    return fstat(fileno(file_), &found) == 0 ? static_cast<size_t>(found.st_size) : 0;
+    return fstat(fileno(file_.get()), &found) == 0 ? static_cast<size_t>(found.st_size) : 0;
 }
 String File::readString() {
     String text;
-    for (int character = fgetc(file_); character != EOF; character = fgetc(file_)) text.push_back(static_cast<char>(character));
+    for (int character = fgetc(file_.get()); character != EOF; character = fgetc(file_.get())) text.push_back(static_cast<char>(character));
     close();
     return text;
 }
-size_t File::write(const uint8_t* data, size_t size) { return fwrite(data, 1, size, file_); }
-void File::close() {
-    if (file_ != nullptr) fclose(file_);
-    file_ = nullptr;
-}
+size_t File::write(const uint8_t* data, size_t size) { return fwrite(data, 1, size, file_.get()); }
 bool FileSystem::begin() { return !folder().empty(); }
 File FileSystem::open(const char* name, const char* mode) { return File(folder() + name, mode); }
 bool FileSystem::rename(const char* from, const char* to) {
     printf("write %s\n", to);
     return ::rename((folder() + from).c_str(), (folder() + to).c_str()) == 0;
+}
+
+bool HTTPClient::begin(WiFiClient& client, const char* url) {
+    printf("fetch %s\n", url);
+    client_ = &client;
+    return true;
+}
+int HTTPClient::GET() {
+    client_->set_body(fopen((folder() + "/served").c_str(), "rb"));
+    return client_->connected() ? HTTP_CODE_OK : -1;
+}
+int HTTPClient::getSize() {
+    struct stat found;
+    return fstat(fileno(client_->body()), &found) == 0 ? static_cast<int>(found.st_size) : -1;
+}
+void HTTPClient::end() {
+    if (client_->connected()) fclose(client_->body());
+    client_->set_body(nullptr);
+}
+int WiFiClient::available() {
+    const int next = body_ != nullptr ? fgetc(body_) : EOF;
+    if (next == EOF) return 0;
+    ungetc(next, body_);
+    return 1460;
+}
+int WiFiClient::read(uint8_t* buffer, size_t size) { return static_cast<int>(fread(buffer, 1, size, body_)); }
+bool FlashWriter::begin(size_t size) {
+    if (image_ != nullptr) fclose(image_);
+    image_ = fopen((folder() + "/flashed").c_str(), "wb");
+    missing_ = size;
+    return image_ != nullptr;
+}
+size_t FlashWriter::write(uint8_t* data, size_t size) {
+    missing_ -= size;
+    return fwrite(data, 1, size, image_);
+}
+bool FlashWriter::end() {
+    const bool whole = image_ != nullptr && missing_ == 0;
+    if (image_ != nullptr) fclose(image_);
+    image_ = nullptr;
+    printf("flash %s\n", whole ? "complete" : "discarded");
+    return whole;
 }
 
 BearSSL::X509List::X509List(const char*) {}

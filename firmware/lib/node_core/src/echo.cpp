@@ -4,7 +4,7 @@ namespace fognav {
 
 int32_t range_mm(uint32_t flight_us, int16_t temperature_dc) {
     // The speed in tenths of a mm/s keeps the resolution of the temperature; half of the way, rounded.
-    const uint64_t speed = static_cast<uint64_t>(3313000 + 606 * static_cast<int32_t>(temperature_dc));
+    const uint64_t speed = static_cast<uint64_t>(3313000 + int64_t{606} * temperature_dc);
     return static_cast<int32_t>((flight_us * speed + 10000000) / 20000000);
 }
 

@@ -43,7 +43,8 @@ public:
     virtual int fetch(uint8_t* buffer, size_t size) = 0;
     virtual void close() = 0;
 
-    // Prepare the flash for so many bytes, write to it, and start from it at the next reset.
+    // Prepare the flash for so many bytes, write to it, and start from it at the next reset. What is abandoned was not
+    // written as a whole.
     virtual bool begin_flash(uint32_t size) = 0;
     virtual bool write_flash(const uint8_t* data, size_t size) = 0;
     virtual bool commit_flash() = 0;
@@ -86,6 +87,7 @@ private:
 
     const char* begin(uint32_t now_ms);
     const char* fetch(uint32_t now_ms);
+    bool hash_is_right();
     const char* finish();
     const char* fail(const char* problem, uint32_t now_ms);
 

@@ -1,3 +1,4 @@
+import itertools
 import math
 
 import numpy as np
@@ -10,6 +11,7 @@ from fog_contracts.geometry import (
     contains_point,
     distance_to_polygon,
     normalized_polygon,
+    sampled,
     signed_area,
 )
 from fog_contracts.grid import GridGeometry, Window
@@ -17,6 +19,19 @@ from fog_contracts.raster import rasterize
 
 SQUARE = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)]
 GRID = GridGeometry(40, 30, 0.1, -2.0, -1.0)
+
+
+@given(
+    st.lists(st.tuples(st.floats(-60, 60), st.floats(-60, 60)), min_size=1, max_size=6),
+    st.sampled_from([0.1, 0.7, 50.0]),
+)
+def test_samples_divide_each_line_evenly_and_contain_every_corner(corners, spacing):
+    expected = [corners[0]]
+    for (x0, y0), (x1, y1) in itertools.pairwise(corners):
+        count = max(1, math.ceil(math.hypot(x1 - x0, y1 - y0) / spacing))
+        expected += [(x0 + k / count * (x1 - x0), y0 + k / count * (y1 - y0)) for k in range(1, count)]
+        expected.append((x1, y1))
+    assert sampled(np.array(corners), spacing).tolist() == [list(point) for point in expected]
 
 
 @st.composite

@@ -22,6 +22,7 @@ from fog_kernels.astar import (
     Planner,
     line_cost,
     nearest_traversable,
+    polyline_cost,
     shortcut,
 )
 from fog_kernels.inflation import inflate, inflation_table
@@ -235,6 +236,18 @@ def test_line_cost_is_the_integral_of_the_weight() -> None:
         expected = np.rint(50 + 0.8 * costmap[rows, cols]).mean() * math.hypot(x1 - x0, y1 - y0)
         assert line_cost(costmap, x0, y0, x1, y1) == pytest.approx(expected, rel=2e-3)
         assert line_cost(costmap, x1, y1, x0, y0) == pytest.approx(line_cost(costmap, x0, y0, x1, y1), rel=1e-9)
+
+
+def test_polyline_costs_what_its_lines_cost_and_nothing_crosses_a_wall() -> None:
+    rng = np.random.default_rng(6)
+    costmap = rng.integers(0, 253, (30, 30)).astype(np.uint8)
+    points = rng.uniform(0, 29, (6, 2))
+    lines = [line_cost(costmap, *a, *b) for a, b in itertools.pairwise(points.tolist())]
+    assert polyline_cost(costmap, points) == sum(lines)
+    assert polyline_cost(costmap, points[:1]) == 0.0
+    assert polyline_cost(costmap, np.array([[0.0, 0.0], [3.0, 3.0], [50.0, 3.0]])) == math.inf
+    with pytest.raises(ValueError, match="points"):
+        polyline_cost(costmap, np.zeros((2, 3)))
 
 
 def test_line_between_two_diagonal_obstacles_is_blocked() -> None:

@@ -8,6 +8,7 @@ from typing import Any, cast
 import pytest
 
 from planner.query_queue import PER_ASKER, WAITING, BusyError, Kind, QueryQueue
+from planner.threads import Threads
 
 
 class Work:
@@ -81,6 +82,22 @@ async def test_query_whose_asker_has_gone_is_not_answered_and_makes_room() -> No
     await settle()
     assert work.begun == ["first"]
     assert await queue.run("plan", "a", work.named("next")) == "next"
+
+
+async def test_memory_is_released_when_all_have_been_answered_and_not_before() -> None:
+    threads, work = Threads(), Work()
+    loop, idle = asyncio.get_running_loop(), asyncio.Queue[list[str]]()
+    queue = QueryQueue(threads, on_idle=lambda: loop.call_soon_threadsafe(idle.put_nowait, list(work.begun)))
+    work.release.set()
+    try:
+        await asyncio.gather(*(ask(queue, "plan", "a", work.named(name)) for name in ("first", "second")))
+        assert await idle.get() == ["first", "second"]
+        assert await queue.run("plan", "a", work.named("third")) == "third"
+        assert await idle.get() == ["first", "second", "third"]
+    finally:
+        queue.close()
+        threads.close()
+    assert idle.empty()
 
 
 async def test_error_reaches_its_asker_alone() -> None:

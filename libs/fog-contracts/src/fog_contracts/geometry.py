@@ -1,6 +1,5 @@
 """Plane geometry of areas, zones and paths: polygons as sequences of (x, y), lines as arrays, metres, frame `map`."""
 
-import itertools
 import math
 from collections.abc import Sequence
 from typing import Final
@@ -24,12 +23,14 @@ class GeometryError(ValueError):
 
 def sampled(corners: _Floats, spacing: float) -> _Floats:
     """Return the polyline through the corners (n, 2) as points (m, 2) at most `spacing` apart, all corners included."""
-    parts: list[_Floats] = [corners[:1]]
-    for a, b in itertools.pairwise(corners):
-        count = max(1, math.ceil(math.hypot(*(b - a)) / spacing))
-        fraction = np.arange(1, count)[:, None] / count
-        parts += [a + fraction * (b - a), b[None, :]]
-    return np.concatenate(parts)
+    steps = np.diff(corners, axis=0)
+    counts = np.array([max(1, math.ceil(math.hypot(x, y) / spacing)) for x, y in steps.tolist()], np.int64)
+    line = np.repeat(np.arange(len(counts)), counts)
+    ends = np.cumsum(counts)
+    number = np.arange(1, len(line) + 1) - (ends - counts)[line]
+    points: _Floats = corners[line] + (number / counts[line])[:, None] * steps[line]
+    points[ends - 1] = corners[1:]
+    return np.concatenate((corners[:1], points))
 
 
 def signed_area(polygon: Polygon) -> float:

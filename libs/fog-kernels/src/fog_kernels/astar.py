@@ -577,6 +577,15 @@ def _line_cost(costmap: Any, weight: Any, x0: float, y0: float, x1: float, y1: f
             return math.inf
 
 
+@njit(float64(_arrays.U8_GRID, _arrays.I32_FLAT, _arrays.F64_GRID), cache=True, nogil=True)
+def _polyline_cost(costmap: Any, weight: Any, points: Any) -> float:
+    """Integrate the weight along the lines between points; infinite if one is blocked."""
+    total = 0.0
+    for i in range(points.shape[0] - 1):
+        total += _line_cost(costmap, weight, points[i, 0], points[i, 1], points[i + 1, 0], points[i + 1, 1], math.inf)
+    return total
+
+
 @njit(float64(_arrays.U8_GRID, _arrays.I32_FLAT, _arrays.I32_PAIRS, _arrays.F64_OUT), cache=True, nogil=True)
 def _cells_cost(costmap: Any, weight: Any, cells: Any, cumulated: Any) -> float:
     """Fill cumulated[i] with the cost from the first cell to cell i; infinite if a step isn't one of the grid's."""
@@ -931,6 +940,18 @@ def line_cost(
     costmap = _arrays.grid(costmap, "costmap")
     weight = _weights_of(neutral, factor)
     return float(_line_cost(costmap, weight, float(x0), float(y0), float(x1), float(y1), math.inf))
+
+
+def polyline_cost(costmap: NDArray[np.uint8], points: NDArray[np.float64]) -> float:
+    """Return the sum of `line_cost`, with the weights of the default, over the lines between points (float64 (n, 2)).
+
+    Raises TypeError or ValueError for arrays of another type or shape.
+    """
+    costmap = _arrays.grid(costmap, "costmap")
+    _arrays.exact(points, np.float64, 2, "points")
+    if points.shape[1] != 2:
+        raise ValueError(f"points must have shape (n, 2), not {points.shape}")
+    return float(_polyline_cost(costmap, _DEFAULT_WEIGHTS, points))
 
 
 def shortcut(

@@ -57,7 +57,9 @@ class _Entry:
 class QueryQueue:
     """Runs answers one after another, as tasks of the event loop on which it is used."""
 
-    def __init__(self, threads: Threads) -> None:
+    def __init__(self, threads: Threads, on_idle: Callable[[], object] | None = None) -> None:
+        """`on_idle` runs on the thread `query` whenever all have been answered."""
+        self._on_idle = on_idle
         self.threads = threads
         """Where the work runs: what is on `query` comes from this queue alone."""
         self._waiting: list[_Entry] = []
@@ -103,6 +105,12 @@ class QueryQueue:
         WAITING_NOW.labels(entry.kind).dec()
 
     async def _work(self) -> None:
+        while self._waiting:
+            await self._answer_all()
+            if self._on_idle is not None:
+                await self.threads.run("query", self._on_idle)
+
+    async def _answer_all(self) -> None:
         while self._waiting:
             entry = heapq.heappop(self._waiting)
             try:

@@ -1,6 +1,5 @@
 """A planned route as a polyline: its cost, progress along it, and changes near it. Metres in the frame `map`."""
 
-import itertools
 import math
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 from fog_contracts.geometry import sampled
 from fog_contracts.grid import GridGeometry, Window
 from fog_contracts.messages import PointXY
-from fog_kernels.astar import line_cost
+from fog_kernels.astar import polyline_cost
 
 Floats = NDArray[np.float64]
 Grid = NDArray[np.uint8]
@@ -77,13 +76,7 @@ class Route:
         Escape lines are left out, because they lead through impassable cells on purpose.
         """
         points = self.remaining(max(along, float(self._corner_along[self.escape_lines])))
-        cells = geometry.grid_coordinates(points)
-        total = 0.0
-        for (x0, y0), (x1, y1) in itertools.pairwise(cells):
-            total += line_cost(costmap, float(x0), float(y0), float(x1), float(y1))
-            if math.isinf(total):
-                return total
-        return total
+        return polyline_cost(costmap, geometry.grid_coordinates(points))
 
     def distance_to(self, mask: NDArray[np.bool_], window: Window, geometry: GridGeometry, along: float) -> float:
         """Return how far (m) beyond `along` the route first enters the cells of a mask over a window; else infinity."""

@@ -86,7 +86,7 @@ class Service:
         self._health = health
         self._wake = asyncio.Event()
         self._threads = Threads()
-        self._queue = QueryQueue(self._threads)
+        self._queue = QueryQueue(self._threads, on_idle=core.answerer.release)
         self._cycle = Cycle(core, zenoh)
         self._missions = MissionKeeper(core, store, clock, health, self._change_goal)
         self._map = MapKeeper(core, zenoh, clock, health, self._queue, on_loaded=self._wake.set)

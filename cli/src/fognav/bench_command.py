@@ -199,6 +199,38 @@ def dwa_command(
         console.print(f"{name:22} {value}", markup=False)
 
 
+@bench_app.command("pipeline", epilog="Example: fognav bench pipeline --nodes 500 --rate 20 --seconds 30 --json")
+def pipeline_command(
+    *,
+    nodes: Annotated[int, typer.Option("--nodes", metavar="N", min=1, max=2000, help="Nodes that publish.")] = 500,
+    rate: Annotated[float, typer.Option("--rate", metavar="HZ", min=1.0, max=50.0, help="Readings per second.")] = 20.0,
+    robots: Annotated[int, typer.Option("--robots", metavar="N", min=0, max=200, help="Robots with poses.")] = 50,
+    seconds: Annotated[float, typer.Option("--seconds", metavar="S", min=4.0, help="How long they publish.")] = 30.0,
+    json: Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")] = False,
+) -> None:
+    """Measure the way from readings to the map.
+
+    Broker, aggregator and map-service are real processes, and so is the generator of the load. Readings that the
+    aggregator did not get are lost; times are in ms, from the confirmation of a hazard to the map's delta.
+    """
+    from fognav.bench import machine, pipeline  # noqa: PLC0415  # keeps the other commands fast
+
+    kernels.warm_cache(lambda text: console.print(text, markup=False))
+    with exit_codes(), TemporaryDirectory(prefix="fognav-") as folder:
+        figures = asyncio.run(
+            pipeline.measure(
+                Path(folder), nodes=nodes, rate=rate, robots=robots, seconds=seconds,
+                on_phase=lambda text: console.print(text, markup=False),
+            )
+        )  # fmt: skip
+    asked = {"nodes": nodes, "rate": rate, "robots": robots, "seconds": seconds}
+    if json:
+        print_json({"bench": "pipeline", **asked, **figures, **machine.describe()})
+        return
+    for name, value in (asked | figures).items():
+        console.print(f"{name:28} {value}", markup=False)
+
+
 @bench_app.command("debounce", epilog="Example: fognav bench debounce --recordings DIR --png rules.png")
 def debounce_command(
     *,

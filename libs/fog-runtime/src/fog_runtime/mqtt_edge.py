@@ -21,7 +21,7 @@ from fog_contracts.messages import Message
 from fog_runtime import logs, metrics
 from fog_runtime.cancellation import raise_if_cancelled
 from fog_runtime.clock import Clock
-from fog_runtime.mqtt_broker import Broker
+from fog_runtime.mqtt_broker import Broker, Inbox
 from fog_runtime.mqtt_subscriptions import ForeignHandler, Ids, Subscriptions
 
 M = TypeVar("M", bound=Message)
@@ -184,11 +184,11 @@ class MqttEdge:
         """Connect and stay connected until cancelled; after a failure at the next broker."""
         failures = 0
         while True:
-            broker = self._brokers[0]
+            broker, inbox = self._brokers[0], Inbox(self._subscriptions.deliver)
             try:
-                async with broker.client(self._client_id, self._mqtt_will()) as client:
+                async with broker.client(self._client_id, self._mqtt_will(), inbox) as client:
                     failures = 0
-                    await self._serve(client, broker)
+                    await self._serve(client, broker, inbox)
             except aiomqtt.MqttError as error:
                 raise_if_cancelled()
                 reason = str(error) or type(error).__name__
@@ -215,7 +215,7 @@ class MqttEdge:
             self._topic(channel, will.ids), _encoded(channel, will.message), channel.qos, channel.retained
         )
 
-    async def _serve(self, client: aiomqtt.Client, broker: Broker) -> None:
+    async def _serve(self, client: aiomqtt.Client, broker: Broker, inbox: Inbox) -> None:
         if topics := self._subscriptions.qos_by_topic():
             await _subscribe(client, topics)
         self._client = client
@@ -225,8 +225,9 @@ class MqttEdge:
         _log.info("broker_connected", broker=str(broker), client=self._client_id)
         for callback in self._on_connect:
             self._spawn(callback(), "on_connect")
-        async for message in client.messages:
-            self._subscriptions.deliver(message)
+        inbox.open()
+        async for _ in client.messages:  # until the connection ends: the inbox delivers
+            pass
 
     def _on_disconnected(self) -> None:
         self._client = None

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import aiomqtt
 
@@ -24,12 +24,24 @@ FOREIGN: Final = "foreign"
 _log = logs.get("mqtt_edge")
 
 
+_ROUTES: Final = 10_000
+"""Topics whose handlers are remembered: thousands of messages a second come on the same few hundred topics."""
+
+
 @dataclass
 class _Subscription:
     channel: Channel
     handler: Callable[[Ids, Any], object]
     kind: type[Message] | None
     topics: list[str]
+
+
+class _Route(NamedTuple):
+    """Who gets the messages of one topic; `malformed` are the channels that it nearly belongs to."""
+
+    foreign: tuple[ForeignHandler, ...]
+    malformed: tuple[Channel, ...]
+    subscriptions: tuple[tuple[_Subscription, Ids], ...]
 
 
 class Subscriptions:
@@ -40,6 +52,7 @@ class Subscriptions:
         self._site = site
         self._subscriptions: list[_Subscription] = []
         self._foreign: dict[str, ForeignHandler] = {}
+        self._routes: dict[str, _Route] = {}
         self._limited = logs.RateLimited(_log)
 
     def add(
@@ -58,12 +71,14 @@ class Subscriptions:
         else:
             topics = [channel.pattern(**({"site": self._site} if "site" in channel.fields else {}))]
         self._subscriptions.append(_Subscription(channel, handler, kind, topics))
+        self._routes.clear()
 
     def add_topic(self, channel: Channel, topic: str) -> bool:
         """Give the channel's handlers one more topic; return whether any of them did not have it yet."""
         without = [one for one in self._subscriptions if one.channel == channel and topic not in one.topics]
         for subscription in without:
             subscription.topics.append(topic)
+        self._routes.clear()
         return bool(without)
 
     def set_foreign(self, topics: Iterable[str], handler: ForeignHandler) -> tuple[list[str], list[str]]:
@@ -72,6 +87,7 @@ class Subscriptions:
         Returns the topics to subscribe to and those to unsubscribe from.
         """
         old, self._foreign = self._foreign, dict.fromkeys(topics, handler)
+        self._routes.clear()
         kept = self.qos_by_topic().keys()
         return sorted(self._foreign.keys() - old.keys()), sorted(old.keys() - kept)
 
@@ -83,42 +99,54 @@ class Subscriptions:
     def deliver(self, message: aiomqtt.Message) -> None:
         """Pass a message to the handlers of its channel; count and log it when it breaks the channel's contract."""
         topic = message.topic.value
-        for handler in {self._foreign[pattern] for pattern in self._foreign if message.topic.matches(pattern)}:
+        route = self._routes.get(topic)
+        if route is None:
+            if len(self._routes) >= _ROUTES:
+                self._routes.clear()
+            route = self._routes[topic] = self._route(message.topic)
+        for handler in route.foreign:
             self._deliver_foreign(handler, message)
+        for channel in route.malformed:
+            self._refuse(channel, topic, "the ids in the topic are malformed")
+        for subscription, ids in route.subscriptions:
+            self._deliver_to(subscription, ids, topic, message)
+
+    def _route(self, topic: aiomqtt.Topic) -> _Route:
+        foreign = {self._foreign[pattern] for pattern in self._foreign if topic.matches(pattern)}
+        subscriptions: list[tuple[_Subscription, Ids]] = []
+        malformed: list[Channel] = []
         for subscription in self._subscriptions:
-            channel = subscription.channel
-            ids = channel.match(topic)
-            if ids is None:
-                if any(message.topic.matches(pattern) for pattern in subscription.topics):
-                    self._refuse(channel, topic, "the ids in the topic are malformed")
-                continue
-            ids.pop("site", None)  # always this process's own site
-            data = message.payload
-            if message.retain and not channel.retained:
-                # It may be years old; a stale reading must never be used as a fresh one.
-                self._refuse(
-                    channel, topic, "retained, but this channel's messages never are: delete it from the broker"
-                )
-                continue
-            if channel.retained and not data:
-                continue  # a retained message was deleted
-            try:
-                content = (
-                    decode_text(channel, data)
-                    if subscription.kind is None
-                    else decode(channel, data, subscription.kind)
-                )
-            except ContractError as error:
-                self._refuse(channel, topic, error.reason)
-                continue
-            metrics.RECEIVED.labels(channel.name).inc()
-            try:
-                subscription.handler(ids, content)
-            except RefusedMessageError as error:
-                self._refuse(channel, topic, str(error))
-            except Exception as error:  # noqa: BLE001  # one message must not end the process; the bug is logged
-                metrics.HANDLER_ERRORS.labels(channel.name).inc()
-                _log.error("handler_failed", error=error, channel=channel.name, topic=topic)
+            ids = subscription.channel.match(topic.value)
+            if ids is not None:
+                ids.pop("site", None)  # always this process's own site
+                subscriptions.append((subscription, ids))
+            elif any(topic.matches(pattern) for pattern in subscription.topics):
+                malformed.append(subscription.channel)
+        return _Route(tuple(foreign), tuple(malformed), tuple(subscriptions))
+
+    def _deliver_to(self, subscription: _Subscription, ids: Ids, topic: str, message: aiomqtt.Message) -> None:
+        channel, data = subscription.channel, message.payload
+        if message.retain and not channel.retained:
+            # It may be years old; a stale reading must never be used as a fresh one.
+            self._refuse(channel, topic, "retained, but this channel's messages never are: delete it from the broker")
+            return
+        if channel.retained and not data:
+            return  # a retained message was deleted
+        try:
+            content = (
+                decode_text(channel, data) if subscription.kind is None else decode(channel, data, subscription.kind)
+            )
+        except ContractError as error:
+            self._refuse(channel, topic, error.reason)
+            return
+        metrics.RECEIVED.labels(channel.name).inc()
+        try:
+            subscription.handler(dict(ids), content)
+        except RefusedMessageError as error:
+            self._refuse(channel, topic, str(error))
+        except Exception as error:  # noqa: BLE001  # one message must not end the process; the bug is logged
+            metrics.HANDLER_ERRORS.labels(channel.name).inc()
+            _log.error("handler_failed", error=error, channel=channel.name, topic=topic)
 
     def _deliver_foreign(self, handler: ForeignHandler, message: aiomqtt.Message) -> None:
         topic, data = message.topic.value, message.payload

@@ -150,8 +150,10 @@ class AreaFusion:
             self._reject(node_id, "implausible")
         changed: list[AreaHazard] = []
         for area, node in watched:
+            before = node.outcome
             node.apply(classification, taken.at, stamp, counts=taken.counts)
-            changed += self._evaluate(area, stamp)
+            if node.outcome != before:  # an area may have a hundred nodes, and nearly no reading changes anything
+                changed += self._evaluate(area, stamp)
         return changed
 
     def on_thesis_state(self, number: int, state: str, now: float, stamp: float) -> list[AreaHazard]:

@@ -42,6 +42,11 @@ class NodeState:
     flaps: FlapDetector = field(default_factory=lambda: FlapDetector(UnknownPolicy().max_changes))
 
     @property
+    def outcome(self) -> tuple[AreaState, str, str | None, bool]:
+        """All that an area's hazard depends on."""
+        return self.state, self.reason, self.explained_by, self.ever_received
+
+    @property
     def penalty(self) -> int | None:
         """The cost of the area while this one alone is blocked; None: the area is impassable then."""
         return None

@@ -1,0 +1,129 @@
+"""Publishes the readings of many nodes and the poses of many robots, as a process of its own: no other work delays it.
+
+`python -m fognav.bench.node_load SITE MQTT_URL ZENOH_ENDPOINT NODES RATE ROBOTS SECONDS`. One node at a time sees an
+obstacle for a while, in turn. At the end it writes what it has sent as one JSON object.
+"""
+
+from __future__ import annotations
+
+import secrets
+import socket
+import sys
+import threading
+import time
+from typing import Final
+from urllib.parse import urlsplit
+
+import msgspec
+import zenoh
+
+from fog_contracts import channels as ch
+from fog_contracts.codec import encode
+from fog_contracts.messages import NodeReading, RobotPose
+from fog_runtime.zenoh_edge import session_config
+
+BLOCKED_S: Final = 0.5
+"""How long a node sees its obstacle; after as long, another node sees the next one."""
+_STRIDE: Final = 0.618
+"""From one such node to the next, as a share of all nodes: they spread over the areas."""
+_POSE_HZ: Final = 10.0
+_BATCH: Final = 20
+"""Nodes whose readings are sent together."""
+
+
+def main() -> None:
+    """Publish as the command line says."""
+    site, url, endpoint = sys.argv[1:4]
+    nodes, robots, rate, seconds = int(sys.argv[4]), int(sys.argv[6]), float(sys.argv[5]), float(sys.argv[7])
+    stop = threading.Event()
+    with _connected(url) as broker, zenoh.open(session_config("client", connect=[endpoint])) as session:
+        poses = threading.Thread(target=_publish_poses, args=(session, site, robots, stop))
+        poses.start()
+        sent, late_s = _publish_readings(broker, site, nodes, rate, seconds)
+        stop.set()
+        poses.join()
+        broker.sendall(b"\xe0\x00")  # DISCONNECT
+        while broker.recv(4096):  # the broker closes once it has read everything
+            pass
+    sys.stdout.buffer.write(msgspec.json.encode({"sent": sent, "late_s": round(late_s, 3)}) + b"\n")
+
+
+def _connected(url: str) -> socket.socket:
+    """Return a connection that is an MQTT 3.1.1 session (section 3.1 of its standard).
+
+    A client library would queue what it can't send yet, and deliver it later than this process says.
+    """
+    parts = urlsplit(url)
+    broker = socket.create_connection((parts.hostname or "127.0.0.1", parts.port or 1883), timeout=30.0)
+    broker.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    name = b"fognav-bench"
+    variable = b"\x00\x04MQTT\x04\x02\x00\x00" + len(name).to_bytes(2, "big") + name
+    broker.sendall(b"\x10" + _length(len(variable)) + variable)
+    if (answer := broker.recv(4)) != b"\x20\x02\x00\x00":
+        raise SystemExit(f"the broker at {url} refuses the connection: {answer.hex()}")
+    return broker
+
+
+def _length(size: int) -> bytes:
+    """Encode a packet's remaining length: seven bits a byte, the low ones first."""
+    encoded = bytearray()
+    while True:
+        size, digit = divmod(size, 128)
+        encoded.append(digit | (0x80 if size else 0))
+        if not size:
+            return bytes(encoded)
+
+
+def _packet(topic: bytes, payload: bytes) -> bytes:
+    """Return a PUBLISH packet with quality of service 0."""
+    return b"\x30" + _length(2 + len(topic) + len(payload)) + len(topic).to_bytes(2, "big") + topic + payload
+
+
+def _publish_readings(broker: socket.socket, site: str, nodes: int, rate: float, seconds: float) -> tuple[int, float]:
+    """Publish every node's readings, spread over each period; return how many, and how late (s) they were at most."""
+    topics = [ch.NODE_READING.key(site=site, node=f"n{i}").encode() for i in range(nodes)]
+    boot = secrets.randbits(32)
+    begin, late_s, rounds = time.monotonic(), 0.0, round(seconds * rate)
+    for seq in range(rounds):
+        elapsed = seq / rate
+        seen = int(elapsed / (2.0 * BLOCKED_S)) * round(_STRIDE * nodes)
+        blocked = seen % nodes if elapsed % (2.0 * BLOCKED_S) < BLOCKED_S and elapsed > BLOCKED_S else -1
+        clear, near = _payload(boot, seq, elapsed, near=False), _payload(boot, seq, elapsed, near=True)
+        for first in range(0, nodes, _BATCH):
+            due = begin + elapsed + first / nodes / rate
+            late_s = max(late_s, time.monotonic() - due)
+            time.sleep(max(0.0, due - time.monotonic()))
+            batch = range(first, min(first + _BATCH, nodes))
+            broker.sendall(b"".join(_packet(topics[i], near if i == blocked else clear) for i in batch))
+    return rounds * nodes, late_s
+
+
+def _payload(boot: int, seq: int, elapsed: float, *, near: bool) -> bytes:
+    """Return a reading; its ranges differ from those before, as a sonar's do."""
+    measured = (0.8 if near else 2.9) + 0.001 * (seq % 7)
+    reading = NodeReading(
+        seq=seq,
+        boot=boot,
+        uptime_ms=round(1000 * elapsed),
+        range_m=[measured, 2.9],
+        status=["ok", "ok"],
+        state="blocked" if near else "clear",
+        rssi=-60,
+        fw="bench",
+    )
+    return encode(ch.NODE_READING, reading)
+
+
+def _publish_poses(session: zenoh.Session, site: str, robots: int, stop: threading.Event) -> None:
+    keys = [ch.ROBOT_POSE.key(site=site, robot=f"r{i}") for i in range(robots)]
+    while not stop.wait(1.0 / _POSE_HZ):
+        for index, key in enumerate(keys):
+            pose = RobotPose(
+                x=2.0 + index, y=3.0, theta=0.0, covariance=[0.01] * 9, v=0.2, w=0.0, radius=0.17, height=0.35,
+                stamp=time.time(),
+            )  # fmt: skip
+            session.put(key, encode(ch.ROBOT_POSE, pose))
+
+
+if __name__ == "__main__":
+    main()

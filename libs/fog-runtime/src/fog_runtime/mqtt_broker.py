@@ -73,8 +73,8 @@ class Broker:
     def __str__(self) -> str:
         return f"{self.host}:{self.port}"
 
-    def client(self, identifier: str, will: aiomqtt.Will | None, inbox: Inbox) -> aiomqtt.Client:
-        """Return a client of this broker that is not connected yet, whose messages go to `inbox`."""
+    def client(self, identifier: str, will: aiomqtt.Will | None, inbox: Inbox | None = None) -> aiomqtt.Client:
+        """Return a client of this broker that is not connected yet; its messages go to `inbox`, or into a queue of its own."""
         client = aiomqtt.Client(
             self.host,
             self.port,
@@ -86,7 +86,7 @@ class Broker:
             will=will,
             timeout=_TIMEOUT_S,
             keepalive=_KEEPALIVE_S,
-            queue_type=cast("type[asyncio.Queue[aiomqtt.Message]]", lambda maxsize: inbox),  # noqa: ARG005  # its keyword
+            queue_type=None if inbox is None else cast("type[asyncio.Queue[aiomqtt.Message]]", lambda **_: inbox),
             tls_context=ssl.create_default_context() if self.tls else None,
         )
         client.pending_calls_threshold = 1000

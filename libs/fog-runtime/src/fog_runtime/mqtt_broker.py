@@ -74,7 +74,7 @@ class Broker:
         return f"{self.host}:{self.port}"
 
     def client(self, identifier: str, will: aiomqtt.Will | None, inbox: Inbox | None = None) -> aiomqtt.Client:
-        """Return a client of this broker that is not connected yet; its messages go to `inbox`, or into a queue of its own."""
+        """Return a client of this broker that is not connected yet; its messages go to `inbox`, if one is given."""
         client = aiomqtt.Client(
             self.host,
             self.port,

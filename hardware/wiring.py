@@ -85,10 +85,10 @@ class Pins:
 
 
 PROFILES: Final = {
-    "default": (Pins(trigger="D5", echo="D1"), Pins(trigger="D6", echo="D2")),
+    "standard": (Pins(trigger="D5", echo="D1"), Pins(trigger="D6", echo="D2")),
     "thesis": (Pins(trigger="D0", echo="D1"), Pins(trigger="D3", echo="D6")),
 }
-"""The firmware's pin profiles for the D1 mini. The default leaves alone all pins that matter when the board boots."""
+"""The firmware's profiles of a D1 mini's pins. `standard` leaves alone all pins that matter when the board boots."""
 
 
 def node(profile: str) -> str:
@@ -180,7 +180,7 @@ def cut_off() -> str:
     return drawing.svg()
 
 
-FILES: Final = {"node-wiring.svg": node("default"), "node-wiring-thesis.svg": node("thesis"), "cut-off.svg": cut_off()}
+FILES: Final = {"node-wiring.svg": node("standard"), "node-wiring-thesis.svg": node("thesis"), "cut-off.svg": cut_off()}
 """The text of each file, by its name in `docs/images`."""
 
 

@@ -1,5 +1,7 @@
 """The page on hardware shows what its scripts compute, and the case can be computed with and without a power bank."""
 
+import re
+import runpy
 import shutil
 import subprocess
 import sys
@@ -17,6 +19,18 @@ def run(*command: str) -> subprocess.CompletedProcess[str]:
 def test_drawings_are_those_that_the_script_draws() -> None:
     checked = run("hardware/wiring.py", "--check")
     assert checked.returncode == 0, checked.stdout
+
+
+GPIO = {"D0": 16, "D1": 5, "D2": 4, "D3": 0, "D4": 2, "D5": 14, "D6": 12, "D7": 13, "D8": 15}
+
+
+def test_drawn_pins_are_those_of_the_firmware() -> None:
+    header = (ROOT / "firmware" / "lib" / "node_edge" / "src" / "board_pins.hpp").read_text("utf-8")
+    board = header.partition("kD1Mini = {")[2].partition("};")[0]
+    standard, thesis = re.findall(r"^    \{\{\{(\d+), (\d+)\}, \{(\d+), (\d+)\}\}\}", board, re.MULTILINE)
+    drawn = runpy.run_path(str(ROOT / "hardware" / "wiring.py"))["PROFILES"]
+    for pins, profile in ((standard, "standard"), (thesis, "thesis")):
+        assert [str(GPIO[name]) for sonar in drawn[profile] for name in (sonar.trigger, sonar.echo)] == list(pins)
 
 
 def test_page_contains_the_computed_currents() -> None:

@@ -47,9 +47,8 @@ PasswordsOption = Annotated[
     Path | None,
     typer.Option("--passwords", metavar="F", help="Mosquitto's password file, which gets the node's password."),
 ]
-WiringOption = Annotated[
-    Literal["d1_mini", "d1_mini-thesis"],
-    typer.Option("--wiring", help="Which pins: docs/hardware.md draws both."),
+ProfileOption = Annotated[
+    Literal["standard", "thesis"], typer.Option("--profile", help="How it is wired: docs/hardware.md draws both.")
 ]
 
 
@@ -70,7 +69,7 @@ def node_add(  # noqa: PLR0913  # each option is an argument
     fog_host: HostOption = "fog.local",
     tls: TlsOption = True,
     passwords: PasswordsOption = None,
-    wiring: WiringOption = "d1_mini",
+    profile: ProfileOption = "standard",
     out: OutOption = Path("firmware/data"),
     json: JsonOption = False,
 ) -> None:
@@ -90,7 +89,7 @@ def node_add(  # noqa: PLR0913  # each option is an argument
         _compiled()
         node = _placed(loaded, name, area, _pose(pose), height)
         access = provisioning.Access(wifi, wifi_password, fog_host, 8883 if tls else 1883, tls)
-        members = provisioning.settings(loaded.site.id, node, access, provisioning.new_password(), wiring)
+        members = provisioning.settings(loaded.site.id, node, access, provisioning.new_password(), profile)
         site_file.add(loaded, node)
         _provision(target, members, passwords)
         _tell_board(json, "added", node, target, passwords)
@@ -106,7 +105,7 @@ def node_replace(  # noqa: PLR0913  # each option is an argument
     fog_host: HostOption = "fog.local",
     tls: TlsOption = True,
     passwords: PasswordsOption = None,
-    wiring: WiringOption = "d1_mini",
+    profile: ProfileOption = "standard",
     out: OutOption = Path("firmware/data"),
     json: JsonOption = False,
 ) -> None:
@@ -118,7 +117,7 @@ def node_replace(  # noqa: PLR0913  # each option is an argument
         loaded = site_file.load(checkout.site_folder(site))
         node = site_file.node_of(loaded, name)
         access = provisioning.Access(wifi, wifi_password, fog_host, 8883 if tls else 1883, tls)
-        members = provisioning.settings(loaded.site.id, node, access, provisioning.new_password(), wiring)
+        members = provisioning.settings(loaded.site.id, node, access, provisioning.new_password(), profile)
         target = out / provisioning.SETTINGS_FILE
         _provision(target, members, passwords)
         _tell_board(json, "replaced", node, target, passwords)

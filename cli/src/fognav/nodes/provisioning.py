@@ -18,11 +18,6 @@ if TYPE_CHECKING:
     from fog_contracts.site import NodeSite
 
 SETTINGS_FILE: Final = "node.json"
-PINS: Final[dict[str, tuple[tuple[int, int], ...]]] = {
-    "d1_mini": ((14, 5), (12, 4)),
-    "d1_mini-thesis": ((16, 5), (0, 12)),
-}
-"""Trigger and echo pin (GPIO) of each sonar by wiring; docs/hardware.md draws both."""
 _ITERATIONS: Final = 20_000
 
 
@@ -42,11 +37,8 @@ def new_password() -> str:
     return secrets.token_urlsafe(15)
 
 
-def settings(site: str, node: NodeSite, access: Access, password: str, wiring: str) -> dict[str, Any]:
-    """Return the members of a board's `node.json`; raises `WrongUseError` for more sonars than the wiring has."""
-    pins = PINS[wiring]
-    if len(node.sonars) > len(pins):
-        raise WrongUseError(f"the wiring {wiring} has {len(pins)} sonars and node {node.id} has {len(node.sonars)}")
+def settings(site: str, node: NodeSite, access: Access, password: str, profile: str) -> dict[str, Any]:
+    """Return the members of a board's `node.json`, as firmware/README.md lists them; `profile` says which pins."""
     return {
         "site": site,
         "node": node.id,
@@ -57,14 +49,9 @@ def settings(site: str, node: NodeSite, access: Access, password: str, wiring: s
         "tls": access.tls,
         "user": node.id,
         "password": password,
+        "profile": profile,
         "sonars": [
-            {
-                "trigger": trigger,
-                "echo": echo,
-                "range_limit_m": sonar.range_limit,
-                "no_echo_is_clear": sonar.no_echo_is_clear,
-            }
-            for (trigger, echo), sonar in zip(pins, node.sonars, strict=False)
+            {"range_limit_m": sonar.range_limit, "no_echo_is_clear": sonar.no_echo_is_clear} for sonar in node.sonars
         ],
     }
 

@@ -189,6 +189,7 @@ def test_status_shows_addresses_token_and_processes(demo: Service, tmp_path: Pat
     assert (shown["kind"], shown["site"], shown["token_file"]) == ("demo", "here", str(tmp_path / "token"))
     assert shown["urls"]["planner"] == demo.url
     assert shown["pids"] == {}
+    assert shown["connected"] is None, "its router can't be reached"
 
 
 def test_status_of_a_fog_node_that_does_not_answer_fails() -> None:

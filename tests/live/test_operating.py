@@ -58,6 +58,9 @@ def wait_for(pattern: str, output: Path, demo: subprocess.Popen[bytes]) -> re.Ma
     return found
 
 
+SERVICES = ("map-service", "planner", "hazard-aggregator")
+
+
 def test_walk_through_a_running_demo_works_as_the_readme_says(tmp_path):
     start, commands = readme_commands()
     assert len(commands) > 8
@@ -86,6 +89,7 @@ def test_walk_through_a_running_demo_works_as_the_readme_says(tmp_path):
         status = json.loads((terminal.run("./fognav status --json")).stdout)
         (system,) = [system for system in status["systems"] if system["kind"] == "demo"]
         assert system["site"] == "estig"
+        assert set(system["connected"]) >= {f"{name}/estig" for name in SERVICES} | {"robot-agent/r1"}
         assert set(system["urls"]) >= {"map-service", "planner", "hazard-aggregator", "page"}
         assert Path(system["token_file"]).stat().st_mode & 0o777 == 0o600
         assert system["pids"]["demo"] == demo.pid

@@ -6,6 +6,7 @@ import msgspec
 
 from fognav.operate.fog import FOG, Fog, find_fog
 from fognav.operate.options import FogOption, JsonOption
+from fognav.operate.presence import connected
 from fognav.operate.registry import System
 from fognav.operate.systems import SERVICE_PORTS, find_systems
 from fognav.output import FailedError, exit_codes, fail, print_json, print_line
@@ -14,13 +15,13 @@ from fognav.output import FailedError, exit_codes, fail, print_json, print_line
 def status_command(*, fog: FogOption = None, json: JsonOption = False) -> None:
     """Show the systems that run on this machine.
 
-    These are demos, a fog node and robots. With --fog or FOGNAV_FOG, show that fog node instead. The exit code is 1 if
-    nothing runs.
+    These are demos, a fog node and robots, each with what is connected to its router from anywhere. With --fog or
+    FOGNAV_FOG, show that fog node instead. The exit code is 1 if nothing runs.
     """
     with exit_codes():
         systems = [_remote(find_fog(fog))] if fog or os.environ.get(FOG) else find_systems()
     if json:
-        print_json({"systems": [msgspec.to_builtins(system) for system in systems]})
+        print_json({"systems": [{**msgspec.to_builtins(system), "connected": connected(system)} for system in systems]})
     else:
         for system in systems:
             _show(system)
@@ -49,4 +50,6 @@ def _show(system: System) -> None:
         print_line(f"  {name:18} {url}")
     if system.token_file:
         print_line(f"  {'token':18} {system.token_file}")
+    if (present := connected(system)) is not None:
+        print_line(f"  {'connected':18} {', '.join(present) or 'nothing'}")
     print_line(f"  {'processes':18} {', '.join(f'{name} {pid}' for name, pid in system.pids.items()) or 'not visible'}")

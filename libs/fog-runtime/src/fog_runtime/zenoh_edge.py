@@ -425,19 +425,34 @@ class ZenohEdge:
         key = LIVE.key(site=self._site, role=role, id=id)
         self._declare(lambda session: session.liveliness().declare_token(key))
 
-    def subscribe_liveliness(self, handler: Callable[[str, str, bool], object]) -> None:
-        """Call `handler(role, id, alive)` for each process that is present, and whenever one appears or disappears.
+    async def present(self, timeout_s: float = 2.0) -> set[tuple[str, str]]:
+        """Return role and id of each process whose session is open now, as far as its router knows it.
 
-        When this process loses its own router, all others disappear.
+        Empty while this process has no router; waits for answers of other routers for `timeout_s` (real seconds).
         """
+        session = self._session
+        if session is None:
+            return set()
+        found: set[tuple[str, str]] = set()
+        done = asyncio.Event()
 
-        def on_sample(sample: zenoh.Sample) -> None:
-            ids = LIVE.match(str(sample.key_expr))
-            if ids is not None:
-                self.call(handler, ids["role"], ids["id"], sample.kind == zenoh.SampleKind.PUT)
+        def add(key: str) -> None:
+            if (ids := LIVE.match(key)) is not None:
+                found.add((ids["role"], ids["id"]))
 
-        pattern = LIVE.pattern(site=self._site)
-        self._declare(lambda session: session.liveliness().declare_subscriber(pattern, on_sample, history=True))
+        def on_reply(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                self.call(add, str(reply.ok.key_expr))
+
+        get = partial(
+            session.liveliness().get,
+            LIVE.pattern(site=self._site),
+            zenoh.handlers.Callback(on_reply, lambda: self.call(done.set)),
+            timeout=timeout_s,
+        )
+        await self.in_thread(get)
+        await done.wait()
+        return found
 
     # --- For the other classes of this module -----------------------------------------------------------------------
 

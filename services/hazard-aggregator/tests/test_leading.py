@@ -43,6 +43,8 @@ class Connection:
 
     publish_nowait = publish
 
+    async def listen_to_foreign(self, *_: object) -> None: ...
+
 
 async def test_stored_blockages_are_published_when_redis_confirms_a_provisional_epoch_under_its_number(tmp_path: Path):
     stored = AreaHazard(area="gate", state="blocked", severity=3, penalty=254, since=0, seq=7, epoch=1, cause="")

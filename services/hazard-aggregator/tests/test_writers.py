@@ -39,6 +39,8 @@ class Connection:
 
     publish_nowait = publish
 
+    async def listen_to_foreign(self, *_: object) -> None: ...
+
 
 class HangingStore(Store):
     """A store whose Redis hangs during the first write, and carries it out only just before the second one."""

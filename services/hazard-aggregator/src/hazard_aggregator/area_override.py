@@ -39,7 +39,12 @@ class AreaOverride(Message, frozen=True, kw_only=True):
 
 
 class Rest(Message, frozen=True, kw_only=True):
-    """The time (s) that was left of this version of an override when it was last stored."""
+    """The time (s) that was left of this version of an override when it was last stored.
+
+    `deadline` (s) is the same as a time of the clock of the boot `boot`, so that a restart within it prolongs nothing.
+    """
 
     version: Count
     rest_s: Seconds
+    boot: str = ""
+    deadline: Finite = 0.0

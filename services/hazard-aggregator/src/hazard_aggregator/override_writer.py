@@ -122,7 +122,7 @@ class OverrideWriter:
                     _log.warning("override_changed_elsewhere", area=override.area, reason=str(error))
             now = self._clock.now()
             if self._core.overrides.all() and now >= self._rests_stored_at + PERIOD_S:
-                await self._store.save_rests(self._core.overrides.rests(now))
+                await self._store.save_rests(self._core.overrides.rests(self._boot, now))
                 self._rests_stored_at = now
 
     async def _delete(self, override: AreaOverride, audit: Audit) -> None:

@@ -2,7 +2,7 @@
 
 An override ends by the monotonic clock. A restart within one boot of the machine changes nothing about that. After
 another boot, or on another machine, nobody knows how long nothing ran: a blocked area stays so for the time that was
-left when it was last stored, and an area that was declared clear is measured again.
+left when it was last stored, from the first start on, and an area that was declared clear is measured again.
 """
 
 from __future__ import annotations
@@ -73,9 +73,15 @@ class Overrides:
         entry = self._entries.get(area)
         return 0.0 if entry is None else max(0.0, entry.deadline - now)
 
-    def rests(self, now: float) -> dict[str, Rest]:
-        """Return what must be stored of the times of all stored overrides."""
-        return {o.area: Rest(version=o.version, rest_s=self.rest_s(o.area, now)) for o in self.all()}
+    def rests(self, boot: str, now: float) -> dict[str, Rest]:
+        """Return what must be stored of the times of all stored overrides; `boot` identifies this run of the clock."""
+        return {
+            name: Rest(
+                version=entry.override.version, rest_s=self.rest_s(name, now), boot=boot, deadline=entry.deadline
+            )
+            for name, entry in self._entries.items()
+            if entry.override.version > 0
+        }
 
     # --- Inputs -----------------------------------------------------------------------------------------------------
 
@@ -150,5 +156,6 @@ def _restored(override: AreaOverride, stored: StoredOverrides, now: float) -> _E
     if override.state == "clear":
         return _Entry(override, now)
     rest = stored.rests.get(override.area)
-    left = rest.rest_s if rest is not None and rest.version == override.version else override.ttl_s
-    return _Entry(override, now + left)
+    if rest is None or rest.version != override.version:
+        return _Entry(override, now + override.ttl_s)
+    return _Entry(override, rest.deadline if stored.boot and rest.boot == stored.boot else now + rest.rest_s)

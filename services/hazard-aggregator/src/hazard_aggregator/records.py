@@ -158,5 +158,5 @@ class Records:
             [definition for definition in self._core.definitions() if definition.version > 0],
             list(self._core.announced().values()),
             overrides.all(),
-            overrides.rests(self._clock.now()),
+            overrides.rests(self._boot, self._clock.now()),
         )

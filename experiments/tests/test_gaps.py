@@ -5,9 +5,11 @@ FOGNAV_GAP_SEEDS sets the number of drives at each place; `python -m fognav_expe
 
 import os
 
+import numpy as np
 import pytest
 
-from fognav_experiments.gaps import series
+from fognav_experiments.gaps import door_ajar, drive, series
+from robot_agent.agent.recoveries import Recoveries
 
 SEEDS = int(os.environ.get("FOGNAV_GAP_SEEDS", "2"))
 
@@ -28,3 +30,15 @@ def test_robot_does_not_touch_what_it_does_not_fit_through(kind, gap):
     assert not row.passable
     assert (row.contacts, row.passed) == (0, 0)
     assert row.clearance_min_m > 0.0
+
+
+def test_robot_that_is_stuck_in_a_gap_backs_up_and_passes(monkeypatch):
+    def outcome():
+        rng = np.random.default_rng((4, 430, 1))
+        return drive(door_ajar(0.43, rng), rng)
+
+    helped = outcome()
+    assert helped.passed
+    assert helped.clearance_m > 0.0
+    monkeypatch.setattr(Recoveries, "due", lambda *_: None)
+    assert not outcome().passed

@@ -18,6 +18,7 @@ import numpy as np
 
 from fog_contracts.costs import ROBOT_RADIUS
 from fog_contracts.grid import GridGeometry
+from robot_agent.agent.recoveries import Recoveries
 from robot_agent.agent.wheel_control import WheelControl
 from robot_agent.config import agent_config
 from robot_agent.footprint import Footprint
@@ -253,7 +254,7 @@ def drive(scene: Scene, rng: np.random.Generator, seconds: float = _TIME_S) -> O
     robot = _Robot(scene, rng)
     follower = PathFollower(scene.path, math.inf)
     free = np.zeros(_GRID.shape, np.uint8)
-    wheels = WheelControl(_AGENT)
+    wheels, recoveries = WheelControl(_AGENT), Recoveries()
     reversals, turning = 0, 0.0
     step = 0
     while step < round(seconds / _STEP_S) and robot.pose.x < _END_X - 0.15 and robot.clearance > 0.0:
@@ -264,13 +265,16 @@ def drive(scene: Scene, rng: np.random.Generator, seconds: float = _TIME_S) -> O
             follower.advance(robot.pose.x, robot.pose.y, now)
             if follower.stuck_for(now) > _CONFIG.stuck_after:
                 break
+            recovery = recoveries.due(follower, robot.pose, robot.pose, _CONFIG.limits.v_max, now)
             job = make_job(
                 follower, plan_id=1, planner_epoch=1, now=now, pose=robot.pose,
                 speeds=twist(*wheels.speeds, _CONFIG.limits.axle), goal_theta=None, cap=_CONFIG.limits.v_max, cost=free,
                 speed_limits=free, geometry=_GRID, lidar_points=robot.points,
-                footprint=Footprint.circle(ROBOT_RADIUS), config=_CONFIG,
+                footprint=Footprint.circle(ROBOT_RADIUS), config=_CONFIG, recovery=recovery,
             )  # fmt: skip
             wheels.decision = decision = None if job is None else decide(job)
+            if decision is not None:
+                recoveries.on_decision(decision)
             if decision is not None and abs(decision.w) > 0.05:
                 reversals += turning * decision.w < 0.0
                 turning = decision.w

@@ -161,6 +161,8 @@ class MotionConfig:
     """Speed (m/s) where there is hardly any."""
     lookahead_narrow: float = 0.35
     """Share of the lookahead that remains there."""
+    path_narrow: float = 4.0
+    """How many times more the distance from the path counts there: a curve must not be cut."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -10,6 +10,7 @@ from robot_agent.agent.mission import Mission
 from robot_agent.agent.path_monitor import PathMonitor
 from robot_agent.agent.path_traces import PathTraces
 from robot_agent.agent.progress_monitor import Hindrance, ProgressMonitor
+from robot_agent.agent.recoveries import Recoveries
 from robot_agent.agent.wheel_control import WheelControl
 from robot_agent.motion.local_planner import Decision, make_job, twist
 from robot_agent.motion.recent_scans import RecentScans
@@ -48,6 +49,7 @@ class PathDriving:
         self._monitor = PathMonitor()
         self._progress = ProgressMonitor(config.motion.stuck_after, config.radius)
         self._scans = RecentScans()
+        self._recoveries = Recoveries()
         self._arrived = False
         """Whether the last decision was made within the tolerance of the path's end."""
 
@@ -111,13 +113,17 @@ class PathDriving:
 
     def job(self, localizer: Localizer, replica: Replica, safety: SafetyOutputs, now: float) -> Job | None:
         """Return the inputs of the next decision; None while there is no goal or the robot must not drive."""
-        pose, mission = localizer.pose(now), self.mission
+        pose, odom, mission = localizer.pose(now), localizer.odom_at(now), self.mission
         follower, path = mission.follower, mission.path
-        if follower is None or path is None or pose is None or replica.geometry is None or not mission.active:
+        if follower is None or path is None or not mission.active:
+            return None
+        if pose is None or odom is None or replica.geometry is None:
             return None
         follower.advance(pose.x, pose.y, now)
         if not safety.mission_may_drive:
+            self._recoveries.reset()
             return None
+        recovery = None if self._arrived else self._recoveries.due(follower, pose, odom, safety.cap, now)
         scan, scan_pose = localizer.scan, localizer.scan_pose()
         points = np.zeros((0, 2))
         if scan is not None and scan_pose is not None:
@@ -139,6 +145,7 @@ class PathDriving:
             lidar_points=points,
             footprint=self._footprint,
             config=self._config,
+            recovery=recovery,
         )
 
     def accept(self, decision: Decision) -> None:
@@ -147,6 +154,7 @@ class PathDriving:
             return
         self.wheels.decision = decision
         self._arrived = decision.arrived
+        self._recoveries.on_decision(decision)
         if decision.at_goal:
             self.mission.reach()
             self._stop_following()

@@ -21,6 +21,7 @@ from robot_agent.localization.pose import Pose2, wrap
 from robot_agent.motion.band import distances, give_way
 from robot_agent.motion.detour import detour, local_costs
 from robot_agent.motion.path_follower import PathFollower
+from robot_agent.motion.recovery_moves import recovery_speeds
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from fog_contracts.grid import GridGeometry
     from robot_agent.config import MotionConfig
     from robot_agent.footprint import Footprint
+    from robot_agent.motion.recovery_moves import RecoveryMove
 
 _AHEAD_M: Final = 2.5
 """Length of the path in a decision: more than an arc can reach, so that a detour can be found."""
@@ -45,7 +47,7 @@ class Job:
     starting beside the robot. ends_here: whether its last point is the goal; goal_theta: heading wanted there; arrived:
     whether the robot has come to this point already.
     cap: the gate's limit on speed (m/s). cost: uint8 (h, w), the master costmap around the robot, geometry `window`.
-    lidar_points: (m, 2) m, points of the newest scan.
+    lidar_points: (m, 2) m, points of the newest scans. recovery: what to do instead of following the path.
     """
 
     plan_id: int
@@ -64,6 +66,7 @@ class Job:
     lidar_points: NDArray[np.float64]
     footprint: Footprint
     config: MotionConfig
+    recovery: RecoveryMove | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -115,6 +118,8 @@ def decide(job: Job) -> Decision:
         config.arcs,
         at_least=_LOOK_M,
     )
+    if job.recovery is not None:
+        return _recover(job, job.recovery, around, body)
     costs = local_costs(
         job.cost, window, job.lidar_points, config.inflation, around, body.inscribed + config.arcs.padding
     )
@@ -138,6 +143,7 @@ def decide(job: Job) -> Decision:
         replace(
             config.arcs,
             lookahead=config.arcs.lookahead * max(room, config.lookahead_narrow),
+            w_path=config.arcs.w_path * (config.path_narrow + (1.0 - config.path_narrow) * room),
             goal_tolerance=tolerance,
         ),
     )
@@ -158,6 +164,23 @@ def decide(job: Job) -> Decision:
         arrived=arrived,
         at_goal=job.ends_here and arrived and at_heading,
         blocked=blocked,
+    )
+
+
+def _recover(job: Job, move: RecoveryMove, around: Clearance, body: Body) -> Decision:
+    """Return the speeds of a recovery's move."""
+    chosen = recovery_speeds(move, job.pose, around, body, job.config.arcs.padding, job.cap)
+    v, w = chosen or (0.0, 0.0)
+    left, right = wheels(v, w, job.config.limits.axle)
+    return Decision(
+        plan_id=job.plan_id,
+        planner_epoch=job.planner_epoch,
+        made_at=job.made_at,
+        v=v,
+        w=w,
+        left=left,
+        right=right,
+        blocked=None if chosen else "there is no room to turn or back up",
     )
 
 
@@ -194,6 +217,7 @@ def make_job(  # noqa: PLR0913  # a job holds all that a decision rests on
     lidar_points: NDArray[np.float64],
     footprint: Footprint,
     config: MotionConfig,
+    recovery: RecoveryMove | None = None,
 ) -> Job | None:
     """Gather the inputs of a decision; None when the robot is off the map. `lidar_points`: (m, 2) m.
 
@@ -224,6 +248,7 @@ def make_job(  # noqa: PLR0913  # a job holds all that a decision rests on
         lidar_points=lidar_points[near],
         footprint=footprint,
         config=config,
+        recovery=recovery,
     )
 
 

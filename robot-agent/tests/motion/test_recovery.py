@@ -1,0 +1,187 @@
+"""Being stuck has an end: wait, turn, back up along the trail, try again, and after a few moves no more."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fog_contracts.costs import DEFAULT_INFLATION
+from fog_kernels.body import cover
+from fog_kernels.clearance import clearance
+from fog_kernels.dwa import DwaLimits, DwaSettings
+from robot_agent.footprint import Footprint
+from robot_agent.localization.pose import Pose2
+from robot_agent.motion.recovery import MOVE_MAX_S, PATIENCE_S, SERIES, Recovery, Situation, step
+from robot_agent.motion.recovery_moves import RecoveryMove, clearances, recovery_speeds
+from robot_agent.motion.trail import LENGTH_M, Trail
+
+ROUND = cover(Footprint.circle(0.17).polygon)
+LONG = cover(Footprint(((-0.3, -0.12), (0.15, -0.12), (0.15, 0.12), (-0.3, 0.12))).polygon)
+PADDING = DwaSettings().padding
+DT = 0.2
+STUCK = Situation(place=(0.0, 0.0), stuck_for=PATIENCE_S, error=0.5, trail=0.5)
+
+
+def around(points, body=ROUND, x=1.5, y=1.5):
+    return clearance(
+        np.zeros((60, 60), np.uint8), 0.05, 0.0, 0.0, np.array(points, dtype=np.float64).reshape(-1, 2), x, y, body,
+        DEFAULT_INFLATION, DwaLimits(axle=0.235, wheel_max=0.5), DwaSettings(), at_least=1.0,
+    )  # fmt: skip
+
+
+def distance(body, pose, points):
+    """Return the exact distance of points (n, 2) from a body at a pose; below 0 inside."""
+    if not len(body.discs):
+        return np.hypot(*(points - pose[:2]).T).min() - body.circumscribed
+    seen = pose.inverse_transform(points)
+    return (np.hypot(*(seen[:, None] - body.discs[None, :, :2]).transpose(2, 0, 1)) - body.discs[:, 2]).min()
+
+
+# --- the machine ---
+
+
+def exhausted(state):
+    return state.running is None and state.begun == len(SERIES)
+
+
+def test_robot_waits_before_it_moves_at_all():
+    assert step(Recovery(), STUCK._replace(stuck_for=PATIENCE_S - 0.1), 10.0) == Recovery()
+    assert step(Recovery(), STUCK, 10.0).running == SERIES[0]
+
+
+def test_robot_that_heads_along_its_path_backs_up_instead_of_turning():
+    assert step(Recovery(), STUCK._replace(error=0.1), 10.0).running.kind == "back"
+    assert exhausted(step(Recovery(), STUCK._replace(error=0.1, trail=0.02), 10.0))
+
+
+def test_turn_ends_at_the_path_and_backing_up_after_its_length():
+    turning = step(Recovery(), STUCK, 10.0)
+    assert step(turning, STUCK, 10.2).running
+    assert step(turning, STUCK._replace(error=-0.05), 10.4).running is None
+    backing = step(Recovery(), STUCK._replace(error=0.0), 10.0)
+    length = SERIES[1].length
+    assert step(backing, STUCK._replace(error=0.0, trail=0.5 - length + 0.02), 11.0).running
+    assert step(backing, STUCK._replace(error=0.0, trail=0.5 - length), 11.0).running is None
+
+
+@pytest.mark.parametrize(
+    ("later", "seen"), [(0.2, STUCK._replace(refused=True)), (MOVE_MAX_S, STUCK)], ids=["no room", "too long"]
+)
+def test_move_that_is_not_possible_is_given_up(later, seen):
+    assert step(step(Recovery(), STUCK, 10.0), seen, 10.0 + later).running is None
+
+
+@given(st.lists(st.tuples(st.floats(0.0, 30.0), st.floats(-3.0, 3.0), st.floats(0.0, 0.6), st.booleans())))
+def test_moves_at_one_place_have_an_end(seen):
+    state, begun, now = Recovery(), 0, 0.0
+    for stuck_for, error, trail, refused in seen:
+        before, now = state, now + DT
+        state = step(state, Situation((0.1, 0.2), stuck_for, error, trail, refused), now)
+        begun += state.running is not None and state.running != before.running
+        assert state.running is None or now - state.since <= MOVE_MAX_S
+    assert begun <= len(SERIES)
+
+
+def test_series_begins_anew_elsewhere_only():
+    done = Recovery(begun=len(SERIES), origin=(0.0, 0.0))
+    assert exhausted(step(done, STUCK._replace(place=(0.5, 0.0)), 10.0))
+    assert not exhausted(step(done, STUCK._replace(place=(0.7, 0.0)), 10.0))
+
+
+# --- the trail ---
+
+
+def test_trail_is_taken_up_on_the_way_back():
+    trail, x = Trail(), 0.0
+    for x in np.arange(0.0, 1.0, 0.013):
+        trail.add(Pose2(x, 0.0, 0.0))
+    assert trail.length == pytest.approx(LENGTH_M)
+    behind = trail.behind(Pose2(x, 0.0, 0.0))
+    assert behind[0] == pytest.approx((0.0, 0.0), abs=0.02)
+    assert behind[-1] == pytest.approx((-LENGTH_M, 0.0), abs=0.03)
+    for back in np.arange(0.0, 0.3, 0.013):
+        trail.add(Pose2(x - back, 0.003, 0.0))
+    assert trail.length == pytest.approx(LENGTH_M - 0.3, abs=0.05)
+    trail.clear()
+    assert trail.length == 0.0
+    assert len(trail.behind(Pose2(0.0, 0.0, 0.0))) == 0
+
+
+# --- the moves ---
+
+
+def drive(move_of, pose, points, body, seconds):
+    """Make a move in a closed loop; return the poses, the last one where it ended."""
+    poses = [pose]
+    for _ in range(round(seconds / DT)):
+        move = move_of(poses[-1])
+        chosen = None if move is None else recovery_speeds(
+            move, poses[-1], around(points, body, *poses[-1][:2]), body, PADDING, 0.3
+        )  # fmt: skip
+        if chosen is None:
+            break
+        x, y, theta = poses[-1]
+        v, w = chosen
+        poses.append(
+            Pose2(x + v * DT * math.cos(theta + w * DT / 2), y + v * DT * math.sin(theta + w * DT / 2), theta + w * DT)
+        )
+    return poses
+
+
+def test_turn_leads_to_the_path_where_there_is_room():
+    walls = [(1.5 + 0.19 * math.cos(a), 1.5 + 0.19 * math.sin(a)) for a in np.arange(0.0, 6.2, 0.1)]
+    poses = drive(lambda _: RecoveryMove(heading=2.0), Pose2(1.5, 1.5, -0.5), walls, ROUND, 8.0)
+    assert poses[-1].theta == pytest.approx(2.0, abs=0.05)
+    assert poses[-1][:2] == (1.5, 1.5)
+
+
+def test_long_body_does_not_turn_its_tail_into_a_wall():
+    wall = [(x, 1.5 - 0.16) for x in np.arange(1.0, 2.0, 0.02)]
+    poses = drive(lambda _: RecoveryMove(heading=1.5), Pose2(1.5, 1.5, 0.0), wall, LONG, 8.0)
+    assert poses[-1].theta < 0.5
+    assert min(distance(LONG, pose, np.array(wall)) for pose in poses) > 0.0
+
+
+def test_robot_backs_up_along_its_curved_trail():
+    trail = Trail()
+    for angle in np.arange(0.0, 1.0, 0.02):
+        trail.add(Pose2(1.5 + 0.6 * math.sin(angle), 1.5 + 0.6 * (1.0 - math.cos(angle)), angle))
+    end = Pose2(1.5 + 0.6 * math.sin(0.98), 1.5 + 0.6 * (1.0 - math.cos(0.98)), 0.98)
+
+    def move(pose):
+        trail.add(pose)
+        return RecoveryMove(trail=pose.transform(trail.behind(pose))) if trail.length > 0.25 else None
+
+    poses = drive(move, end, [], ROUND, 20.0)
+    off = [abs(math.dist(pose[:2], (1.5, 2.1)) - 0.6) for pose in poses]
+    assert max(off) < 0.02
+    assert math.dist(poses[-1][:2], end[:2]) > 0.25
+
+
+@given(
+    st.lists(st.tuples(st.floats(-0.6, 0.6), st.floats(-0.6, 0.6)), min_size=1, max_size=8),
+    st.floats(-3.1, 3.1),
+    st.floats(-1.5, 1.5),
+    st.sampled_from([ROUND, LONG]),
+    st.booleans(),
+)
+def test_no_move_brings_the_body_nearer_to_anything_than_its_padding(things, theta, bend, body, back):
+    pose = Pose2(1.5, 1.5, theta)
+    points = np.array([(1.5 + x, 1.5 + y) for x, y in things])
+    begin = distance(body, pose, points)
+    if begin < 0.0:
+        return
+    behind = np.array([(-s * math.cos(bend * s), -s * math.sin(bend * s)) for s in np.arange(0.02, 0.6, 0.02)])
+    move = RecoveryMove(trail=pose.transform(behind)) if back else RecoveryMove(heading=theta + 2.0 * bend)
+    poses = drive(lambda _: move, pose, points, body, 1.6)
+    for reached in poses:
+        assert distance(body, reached, points) >= min(begin, PADDING) - 0.006
+
+
+def test_unknown_places_are_not_free():
+    field = around([])
+    free, off = (np.array([value]) for value in (1.5, 9.0))
+    assert clearances(field, ROUND, (free, free, free))[0] > 0.3
+    assert clearances(field, ROUND, (off, free, free))[0] == 0.0

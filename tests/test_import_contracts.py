@@ -50,7 +50,7 @@ EDGES = {
     "planner.mission_keeper", "planner.robot_commands",
     "planner.query_queue", "planner.service", "planner.settings", "planner.store", "planner.threads",
     "robot_agent.__main__", "robot_agent.agent.guardian_client", "robot_agent.agent.input_writer",
-    "robot_agent.agent.lidar_edge", "robot_agent.agent.map_loader", "robot_agent.agent.power_metrics",
+    "robot_agent.agent.lidar_edge", "robot_agent.agent.map_loader", "robot_agent.agent.exporter",
     "robot_agent.agent.replay",
     "robot_agent.agent.service", "robot_agent.agent.settings", "robot_agent.agent.store",
     "robot_agent.guardian.__main__", "robot_agent.guardian.process", "robot_agent.guardian.protection",

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from fog_runtime import task_usage
 from fog_runtime.site import load_site
-from fognav.bench import cpu_quota, office, robot, robot_system, task_usage
+from fognav.bench import cpu_quota, office, robot, robot_system
 from fognav.output import WrongUseError
 
 

@@ -12,6 +12,8 @@ import os
 import secrets
 from functools import partial
 
+from prometheus_client import REGISTRY
+
 from fog_runtime import logs, process, signals
 from fog_runtime.clock import SystemClock
 from fog_runtime.health import Health, serve_health
@@ -78,6 +80,7 @@ async def main() -> None:
                 check=partial(LineCheck, port, robot.settings.lidar.driver, registry.signatures()),
             )
             agent.subscribe()
+            REGISTRY.register(agent.collector)
             zenoh.declare_liveliness("robot-agent", settings.robot)
             # What the start has made stays: no later collection of garbage looks at it, and delays a wheel command.
             release_startup_memory()
@@ -92,7 +95,7 @@ async def main() -> None:
                 tasks.create_task(agent.control_loop(), name="control")
                 tasks.create_task(map_loader.run(body), name="map")
                 tasks.create_task(agent.publish_loop(), name="publish")
-                tasks.create_task(agent.housekeeping_loop(lidar), name="housekeeping")
+                tasks.create_task(agent.housekeeping_loop(lidar, guardian), name="housekeeping")
 
 
 if __name__ == "__main__":

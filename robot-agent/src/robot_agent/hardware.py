@@ -290,6 +290,10 @@ class LidarDriver(Protocol):
         """Why there is no scan; empty while scans arrive."""
 
     @property
+    def corrupted(self) -> int:
+        """Number of damaged packets so far, and of places where the boundary of packets was lost."""
+
+    @property
     def stop_command(self) -> bytes:
         """Bytes that end the scan; empty for a lidar that takes no commands."""
 

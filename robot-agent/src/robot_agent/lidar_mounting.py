@@ -94,6 +94,11 @@ class MountedLidar:
         return self._driver.problem
 
     @property
+    def corrupted(self) -> int:
+        """Number of damaged packets."""
+        return self._driver.corrupted
+
+    @property
     def stop_command(self) -> bytes:
         """Bytes that end the scan."""
         return self._driver.stop_command

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import pytest
-from prometheus_client import REGISTRY
 
-from fog_contracts.messages import Power, RobotState
+from fog_contracts.messages import Power
 from fog_runtime.robot_file import default_robot
 from robot_agent.agent.power import power_warnings
-from robot_agent.agent.power_metrics import observe_power
 from robot_agent.bases.diffdrive.emulator import DiffDriveEmulator
 from robot_agent.bases.roomba600.driver import MEASURE_S
 from robot_agent.bases.roomba600.emulator import Battery, RoombaEmulator
@@ -89,21 +87,3 @@ def test_noise_of_the_measurements_sends_no_more_feedback():
 )
 def test_a_low_battery_and_a_charger_in_fault_are_reasons(status, warnings):
     assert power_warnings(status, 0.2) == warnings
-
-
-def test_metrics_show_the_last_state():
-    common = {
-        "mode": "NORMAL", "reasons": [], "enabled": True, "goal_id": None, "map_epoch": 1, "map_seq": 1,
-        "plan_id": None,
-    }  # fmt: skip
-    power = Power(voltage_v=15.5, current_a=-0.4, temperature_c=24.0, charging="trickle")
-    observe_power(RobotState(**common, battery=0.5, power=power, proximity=[3, 900]))
-    assert REGISTRY.get_sample_value("fognav_battery_charge_ratio") == 0.5
-    assert REGISTRY.get_sample_value("fognav_battery_volts") == 15.5
-    assert REGISTRY.get_sample_value("fognav_battery_amperes") == -0.4
-    assert REGISTRY.get_sample_value("fognav_battery_celsius") == 24.0
-    assert REGISTRY.get_sample_value("fognav_battery_charging", {"state": "trickle"}) == 1.0
-    assert REGISTRY.get_sample_value("fognav_proximity_strength", {"sensor": "1"}) == 900.0
-    observe_power(RobotState(**common, battery=None, power=Power(charging="no")))
-    assert REGISTRY.get_sample_value("fognav_battery_charging", {"state": "trickle"}) is None
-    assert REGISTRY.get_sample_value("fognav_battery_charging", {"state": "no"}) == 1.0

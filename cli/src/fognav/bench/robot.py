@@ -7,9 +7,9 @@ import time
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Final
 
+from fog_runtime.task_usage import ProcessUsage, memory_mb, sample, usage
 from fognav.bench.cpu_quota import cpu_quota
 from fognav.bench.robot_system import RobotSystem
-from fognav.bench.task_usage import ProcessUsage, memory_mb, sample, usage
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

@@ -14,6 +14,7 @@ Values and times go in, values come out. `now` is the robot's own monotonic cloc
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
@@ -309,6 +310,11 @@ class AgentCore:
     def encoder_faults(self) -> int:
         """Number of encoder readings that no motion of the wheels explains."""
         return self._odometry.faults
+
+    def map_age(self, now: float) -> float | None:
+        """Return the time (s) since the map was last confirmed to be the newest; None before the first time."""
+        age = self._map.age(now)
+        return None if math.isinf(age) else age
 
     @property
     def replica(self) -> Replica:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 import socket
+import struct
 from typing import TYPE_CHECKING, Final
 
 import msgspec
@@ -44,6 +45,8 @@ class GuardianClient:
         self._socket: socket.socket | None = None
         self._reset_until = -math.inf
         self._feedback_at = -math.inf
+        self.pid: int | None = None
+        """The guardian's process id; None without a link, or where it runs in a container of its own."""
         self._last_logged = ""
         self._limited = logs.RateLimited(_log)
 
@@ -76,11 +79,12 @@ class GuardianClient:
                     link.settimeout(0)
                     await asyncio.get_running_loop().sock_connect(link, str(self._path))
                     self._socket, self._feedback_at = link, self._clock.now()
+                    self.pid = _peer(link)
                     reason = await self._read(link)
             except OSError as error:
                 reason = f"{self._path}: {error.strerror or error}; does the watchdog run?"
             finally:
-                self._socket = None
+                self._socket = self.pid = None
             self._lost(reason)
             await self._clock.sleep(RETRY_S)
 
@@ -111,3 +115,8 @@ class GuardianClient:
             self._last_logged = reason
             _log.warning("base_lost", reason=reason)
         self._on_lost(self._clock.now(), reason)
+
+
+def _peer(link: socket.socket) -> int | None:
+    pid, _, _ = struct.unpack("3i", link.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i")))
+    return pid or None

@@ -122,6 +122,11 @@ class LidarEdge:
                 return problem
         return None
 
+    @property
+    def corrupted(self) -> int:
+        """Number of damaged packets of the lidar."""
+        return self._driver.corrupted
+
     def poll(self, now: float, *, on: bool = True) -> None:
         """Read what has arrived, and pass it on; nothing while the port is closed. Call it 20 times a second.
 

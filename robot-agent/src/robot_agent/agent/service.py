@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+import os
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Final
 
@@ -18,7 +19,7 @@ from fog_runtime.edges import Edges
 from fog_runtime.service_manager import ServiceManager
 from fog_runtime.suspension import SuspensionMonitor
 from robot_agent.agent.core import decide
-from robot_agent.agent.power_metrics import observe_power
+from robot_agent.agent.exporter import Observed, RobotCollector, parent
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -46,11 +47,6 @@ SCANS = Counter("fognav_lidar_scans_total", "Whole scans of the lidar")
 LATENESS = Gauge("fognav_loop_lateness_p99_seconds", "99th percentile of a loop's lateness", ["loop"])
 ENCODER_FAULTS = Counter("fognav_encoder_faults_total", "Readings of the wheel encoders that no motion explains")
 SUSPENSIONS = Counter("fognav_suspensions_total", "Times that the robot's computer was suspended and resumed")
-POSE_SIGMA = Gauge(
-    "fognav_pose_sigma_meters", "Standard deviation of the position, in its least and its most certain direction",
-    ["direction"],
-)  # fmt: skip
-MODE = Gauge("fognav_robot_mode", "1 for the mode that the robot is in", ["mode"])
 
 _log = logs.get("agent")
 
@@ -71,6 +67,9 @@ class Service:
         """The common phase of all loops: the process sleeps between their ticks."""
         self._stream = self._ticker(STREAM_S)
         self._control = self._ticker(CONTROL_S)
+        self.collector = RobotCollector()
+        self._state: RobotState | None = None
+        self._corrupted: dict[str, int] = {}
         self._mode = ""
         self._searching = False
         self._encoder_faults = 0
@@ -84,7 +83,7 @@ class Service:
 
     # --- Housekeeping -----------------------------------------------------------------------------------------------
 
-    async def housekeeping_loop(self, lidar: LidarEdge) -> None:
+    async def housekeeping_loop(self, lidar: LidarEdge, guardian: GuardianClient) -> None:
         """Once a second: store the pose if it changed, and report the health; more often until the robot is ready."""
         due = -math.inf
         self._manager.ready()
@@ -96,6 +95,7 @@ class Service:
                 self._core.on_loop_health(self._loop_health())
                 await self._store_pose(now)
                 self._report_health(self._clock.now(), lidar)
+                self._observe(self._clock.now(), lidar, guardian)
             elif not self._health.ready:
                 self._report_health(now, lidar)
 
@@ -120,18 +120,32 @@ class Service:
         health.set("base", base_ok, "" if base_ok else self._base_reason)
         ENCODER_FAULTS.inc(core.encoder_faults - self._encoder_faults)
         self._encoder_faults = core.encoder_faults
-        spread = core.localizer.uncertainty
-        POSE_SIGMA.labels("along").set(spread.along)
-        POSE_SIGMA.labels("across").set(spread.across)
         if core.localizer.searching and not self._searching:
             _log.info("global_search_started", reason=core.localizer.detail)
         self._searching = core.localizer.searching
+
+    def _observe(self, now: float, lidar: LidarEdge, guardian: GuardianClient) -> None:
+        """Leave what the metrics tell where the thread that serves them finds it."""
+        watchdog = guardian.pid and parent(guardian.pid)
+        pids = {"agent": os.getpid(), "guardian": guardian.pid, "watchdog": watchdog}
+        self.collector.pids = {name: pid for name, pid in pids.items() if pid}
+        if self._state is None:
+            return
+        core, localizer = self._core, self._core.localizer
+        self.collector.observed = Observed(
+            state=self._state,
+            map_age=core.map_age(now),
+            particles=localizer.particles,
+            uncertainty=None if localizer.pose(now) is None else localizer.uncertainty,
+            corrupted={**self._corrupted, "lidar": lidar.corrupted},
+        )
 
     # --- Base and lidar ---------------------------------------------------------------------------------------------
 
     def on_feedback(self, feedback: BaseFeedback, now: float) -> None:
         """Pass the guardian's feedback to the core."""
         self._last_feedback_at = now
+        self._corrupted["base"] = feedback.corrupted
         self._core.on_base(feedback, now)
 
     def on_base_lost(self, now: float, reason: str) -> None:
@@ -209,8 +223,8 @@ class Service:
     def _publish(self, publications: Sequence[Publication]) -> None:
         for publication in publications:
             if isinstance(state := publication.message, RobotState):
+                self._state = state
                 self._report_mode(state)
-                observe_power(state)
             self._edges.publish(publication)
 
     def _loop_health(self) -> LoopHealth:
@@ -223,7 +237,4 @@ class Service:
         if state.mode == self._mode:
             return
         _log.info("mode_changed", mode=state.mode, before=self._mode, reasons=state.reasons)
-        if self._mode:
-            MODE.labels(self._mode).set(0)
-        MODE.labels(state.mode).set(1)
         self._mode = state.mode

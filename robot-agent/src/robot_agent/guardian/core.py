@@ -288,7 +288,12 @@ class GuardianCore:
         elif self._fresh_command(now) is None:
             stopped = NO_FRESH_COMMAND
         return BaseFeedback(
-            seq=self._seq, status=reading.status, odometry=reading.odometry, fault=self._latched, stopped=stopped
+            seq=self._seq,
+            status=reading.status,
+            odometry=reading.odometry,
+            fault=self._latched,
+            stopped=stopped,
+            corrupted=self.corrupted,
         )
 
 

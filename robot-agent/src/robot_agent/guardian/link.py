@@ -36,7 +36,7 @@ class BaseFeedback(Struct, frozen=True, kw_only=True):
     """The newest reading of the base.
 
     `fault`: the guardian's latched fault (None: none). `stopped`: why the guardian keeps the wheels at zero
-    whatever the agent requests (None: it does not).
+    whatever the agent requests (None: it does not). `corrupted`: damaged frames of the base so far.
     """
 
     seq: Count
@@ -44,6 +44,7 @@ class BaseFeedback(Struct, frozen=True, kw_only=True):
     odometry: WheelOdometry
     fault: Sentence | None
     stopped: Sentence | None
+    corrupted: Count = 0
 
 
 encode = msgspec.msgpack.Encoder().encode

@@ -53,6 +53,11 @@ class RplidarA1Driver:
         """Number of scans that were discarded because nodes were missing."""
         return self._assembler.incomplete
 
+    @property
+    def corrupted(self) -> int:
+        """Number of damaged capsules, and of lost boundaries of nodes or capsules."""
+        return self._parser.corrupted + self._parser.resyncs
+
     def begin(self, now: float) -> bytes:
         """Begin (again), after the port was opened; return the bytes to send."""
         self._parser.reset()

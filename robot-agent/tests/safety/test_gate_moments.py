@@ -62,3 +62,47 @@ def test_silent_planner_is_one_finding_whatever_path_is_left() -> None:
 
     assert [finding.level for finding in findings(0.15)] == [Level.HOLD]
     assert [finding.level for finding in findings(0.1500001)] == [Level.DEGRADED]
+
+
+# --- durations, at their very moments ---
+
+
+def test_mode_is_relaxed_at_2_s_and_not_before() -> None:
+    late, relaxed = run((100.0, {"caution": "slow"}), (101.9375, {}), (102.0, {}))[1:]
+    assert (late.mode, relaxed.mode) == ("DEGRADED", "NORMAL")
+    assert late.reasons == ("over, waiting until healthy for 2 s: slow",)
+    assert relaxed.reasons == ()
+
+
+def test_hold_needs_an_operator_at_60_s_and_not_before() -> None:
+    blocked = {"path_problem": "blocked"}
+    before, at = run((100.0, blocked), (159.9375, blocked), (160.0, blocked))[1:]
+    assert before.reasons == ("blocked",)
+    assert at.reasons[1].startswith("stopped for more than 60 s, an operator must enable again (blocked)")
+
+
+@pytest.mark.parametrize(("third", "mode"), [(159.9375, "FAULT"), (160.0, "PROTECTIVE_STOP")])
+def test_protective_stop_counts_for_60_s_and_not_at_60_s(third: float, mode: str) -> None:
+    silent = {"lidar_age": 9.0}
+    steps = [(100.0, silent), (102.5, {}), (130.0, silent), (132.5, {}), (159.0, {}), (third, silent)]
+    assert run(*steps)[-1].mode == mode
+
+
+def test_reason_of_a_stop_is_told_on_after_a_lesser_one_came_and_went() -> None:
+    out = run((100.0, {"lidar_age": 0.5}), (100.5, {"caution": "slow"}), (101.0, {}))[-1]
+    assert out.mode == "PROTECTIVE_STOP"
+    assert out.reasons == ("over, waiting until healthy for 2 s: the lidar has been silent for 0.5 s",)
+
+
+def test_stop_in_a_zone_after_a_long_hold_stays_a_stop_and_is_enabled_without_either_cause() -> None:
+    blocked, inside = {"path_problem": "blocked"}, {"inside_blocked": "the zone x"}
+    steps = [(100.0, blocked), (160.0, blocked), (161.0, {**blocked, **inside}), (164.0, blocked)]
+    stopped, refused = run(*steps, (164.5, {**blocked, "request": "enable"}))[-2:]
+    assert stopped.mode == "PROTECTIVE_STOP"
+    assert refused.refusal == "the cause is still there: blocked"
+    assert run(*steps, (164.5, {"request": "enable"}))[-1].refusal is None
+
+
+def test_reset_changes_the_mode() -> None:
+    out = run((100.0, {"bumper": True}), (101.0, {"request": "reset"}), (102.0, {}))
+    assert [(each.mode, each.changed) for each in out] == [("FAULT", True), ("INIT", True), ("INIT", False)]

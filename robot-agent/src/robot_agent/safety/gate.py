@@ -89,7 +89,7 @@ def step(
     Modes and their conditions: the table of modes in docs/architecture.md, guided by ISO 3691-4 without claiming
     conformity.
     """
-    config = config or SafetyConfig()
+    config, before = config or SafetyConfig(), state.mode
     findings = collect_findings(inputs if state.maneuver is None else maneuver.relevant(inputs), config)
     map_held_at = state.map_held_at
     if any(finding.about_map for finding in findings):
@@ -104,8 +104,7 @@ def step(
     state = replace(state, last_demanded=last_demanded, map_held_at=map_held_at)
     state, refusal = _apply_request(state, inputs, findings, now, config)
 
-    mode = state.mode
-    if mode == "FAULT":
+    if state.mode == "FAULT":
         new = state
     elif state.maneuver is not None:
         new = _maneuver(state, state.maneuver, inputs, now, config)
@@ -122,7 +121,7 @@ def step(
     else:
         new = _advance(state, findings, demanded, now, config)
     new = replace(new, reasons=_reasons(new, findings))
-    return new, _outputs(new, mode, refusal, config)
+    return new, _outputs(new, before, refusal, config)
 
 
 def _apply_request(

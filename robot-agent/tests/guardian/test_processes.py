@@ -141,6 +141,25 @@ while not pathlib.Path(sys.argv[1]).exists():
 """
 
 
+FLOODING_AGENT = AGENT.replace("range(10_000)", "range(2**31)").replace("time.sleep(0.05)", "pass")
+
+
+def test_agent_that_floods_the_guardian_delays_no_stop(rig):
+    rig.drive()
+    guardian = rig.watchdog.guardian()
+    rig.agent.__exit__()
+    flooding = subprocess.Popen([sys.executable, "-c", FLOODING_AGENT, str(rig.watchdog.socket)])
+    try:
+        wait_for(lambda: rig.base.speeds == (0.2, 0.2), "the flooding agent drives")
+        rig.base.robot.world.bump_left = True
+        assert rig.base.stopped_within(time.monotonic()) < STOP_S
+        wait_for(lambda: rig.watchdog.count("fault_latched") == 1, "the fault is logged")
+        assert rig.watchdog.guardian() == guardian, "its heartbeats came in time"
+    finally:
+        flooding.kill()
+        flooding.wait()
+
+
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
 def test_wheels_stop_when_the_agent_is_killed_or_hangs(rig, number):
     rig.drive()

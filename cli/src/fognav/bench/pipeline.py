@@ -46,7 +46,7 @@ _READY_S: Final = 120.0
 async def measure(
     folder: Path, *, nodes: int, rate: float, robots: int, seconds: float, on_phase: Callable[[str], object]
 ) -> dict[str, Any]:
-    """Return the figures; times in ms. `folder` is empty. Raises `FailedError` when no hazard reached the map."""
+    """Return the figures; times in ms, None when no hazard reached the map. `folder` is empty."""
     write_nodes(folder, nodes)
     config = StackConfig(site_dir=folder, robot="none", extra={"HAZARDS_WAIT_S": "0"})
     async with Stack(config) as stack:
@@ -68,15 +68,14 @@ async def measure(
             cpu = {name: sum(process.cpu_times()[:2]) - before[name] for name, process in processes.items()}
             await asyncio.sleep(_SETTLE_S)
         received = await _received(stack) - warm_up
-        if not delays:
-            raise FailedError("no hazard reached the map: look at the aggregator's log")
-        p50, p99 = np.percentile(delays, [50, 99])
+        # On a machine that can't keep up, readings are too old to count, and no hazard may come of them.
+        p50, p99 = (round(1000 * float(np.percentile(delays, p)), 1) if delays else None for p in (50, 99))
         return {
             "sent": load["sent"],
             "lost": load["sent"] - received,
             "hazards": len(delays),
-            "confirmed_to_delta_p50_ms": round(1000 * float(p50), 1),
-            "confirmed_to_delta_p99_ms": round(1000 * float(p99), 1),
+            "confirmed_to_delta_p50_ms": p50,
+            "confirmed_to_delta_p99_ms": p99,
             "load_late_s": load["late_s"],
             "aggregator_cpu_percent": round(100 * cpu[AGGREGATOR] / seconds, 1),
             "aggregator_us_per_reading": round(1e6 * cpu[AGGREGATOR] / load["sent"], 1),

@@ -20,6 +20,7 @@ ROOT: Final = Path(__file__).parents[2]
 SIDES: Final = {
     "subscribe": "subscribers", "latest": "subscribers", "on": "subscribers",
     "query": "subscribers", "_query": "subscribers", "on_message": "subscribers",
+    "decode": "subscribers", "decode_text": "subscribers", "encode_text": "publishers",
     "publish": "publishers", "publish_nowait": "publishers", "Will": "publishers", "serve": "publishers",
 }  # fmt: skip
 """Which side of a channel's row a call belongs to, by the name of what is called."""
@@ -28,12 +29,8 @@ NOT_YET: Final[frozenset[tuple[Role, Channel]]] = frozenset(
     {
         ("hazard-aggregator", ch.NODE_VALUE),
         ("hazard-aggregator", ch.HOME_ASSISTANT),
-        ("console", ch.NODE_COMMAND),
-        ("console", ch.NODE_CALIBRATION),
         ("console", ch.NODE_UPDATE),
-        ("console", ch.NODE_PROBLEM),
         ("console", ch.PLANNER_PLAN),
-        ("console", ch.LIVE),
     }
 )
 """What the table allows and no program does so far; whoever makes it true removes it from here."""
@@ -68,9 +65,9 @@ def liveliness_declared(folder: str) -> set[str]:
     return {str(ast.literal_eval(call.args[0])) for call in declared}
 
 
-def liveliness_subscribed(folder: str) -> list[str]:
-    """Return where the sources below a folder subscribe to liveliness."""
-    return [place for place, call in _calls(folder) if _name(call) == "subscribe_liveliness"]
+def liveliness_read(folder: str) -> list[str]:
+    """Return where the sources below a folder ask who is present."""
+    return [place for place, call in _calls(folder) if _name(call) == "present"]
 
 
 def session_roles(folder: str) -> dict[str, str]:

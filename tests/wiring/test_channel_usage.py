@@ -55,7 +55,7 @@ def in_table(*roles: Role) -> set[tuple[str, str, Role]]:
         for row in ch.CHANNELS.values()
         for side in ("publishers", "subscribers")
         for role in getattr(row, side)
-        if role in roles and (role, row) not in usage.NOT_YET
+        if role in roles and row.kind != "liveliness" and (role, row) not in usage.NOT_YET
     }
 
 
@@ -71,12 +71,12 @@ def test_simulated_nodes_use_channels_that_the_table_gives_to_nodes():
     assert ("node_reading", "publishers", "node") in found
 
 
-def test_exactly_the_services_that_the_table_names_declare_and_watch_liveliness():
+def test_exactly_the_services_that_the_table_names_declare_liveliness_and_operators_read_it():
     declaring = {role for role, folder in SERVICES.items() if usage.liveliness_declared(folder) == {role}}
-    watching = {role for role, folder in SERVICES.items() if usage.liveliness_subscribed(folder)}
     assert declaring == set(ch.LIVE.publishers)
-    assert watching == {role for role in ch.LIVE.subscribers if (role, ch.LIVE) not in usage.NOT_YET}
-    assert not any(usage.liveliness_declared(tool) or usage.liveliness_subscribed(tool) for tool in TOOLS)
+    assert not any(usage.liveliness_declared(tool) for tool in TOOLS)
+    reading = {folder for folder in (*SERVICES.values(), *TOOLS) if usage.liveliness_read(folder)}
+    assert (reading, ch.LIVE.subscribers) == ({"cli/src"}, ("console",))
 
 
 def test_every_session_is_opened_in_the_role_of_its_program():
@@ -88,6 +88,7 @@ def test_every_session_is_opened_in_the_role_of_its_program():
         "cli/src/fognav/recording.py:play": "console",
         "cli/src/fognav/demo/attempt.py:_open": "console",
         "cli/src/fognav/operate/robots.py:connect": "console",
+        "cli/src/fognav/operate/presence.py:_connected": "console",
     }
     assert set(opened["sim/src"].values()) == {"console", "sim"}
 

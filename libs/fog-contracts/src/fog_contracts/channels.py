@@ -168,10 +168,10 @@ _live = partial(Channel, transport="zenoh", kind="liveliness", encoding="msgpack
 # fmt: off
 # Sensor nodes and areas: MQTT, JSON or text
 NODE_AVAILABILITY = _text( "node_availability", V1 + "nodes/{node}/availability",                       limit=16,
-    publishers=(NODE,),          subscribers=(AGGREGATOR,),       durability=LATEST,   qos=1,
+    publishers=(NODE,),          subscribers=(AGGREGATOR, CONSOLE), durability=LATEST,   qos=1,
     values=(ONLINE, OFFLINE), about="whether a node is connected; `offline` is its last will")
 NODE_READING      = _mqtt( "node_reading",      V1 + "nodes/{node}/reading",          m.NodeReading,    limit=KIB,
-    publishers=(NODE,),          subscribers=(AGGREGATOR,),       durability=VOLATILE, qos=0, rate_hz=10,
+    publishers=(NODE,),          subscribers=(AGGREGATOR, CONSOLE), durability=VOLATILE, qos=0, rate_hz=10,
     max_age_s=m.UnknownPolicy().silent_after_s)
 NODE_VALUE        = _mqtt( "node_value",        V1 + "nodes/{node}/value",            m.NodeValue,      limit=KIB,
     publishers=(NODE,),          subscribers=(AGGREGATOR,),       durability=VOLATILE, qos=0)

@@ -48,6 +48,14 @@ def test_points_are_forgotten_after_the_memory_and_beyond_the_reach_never_kept()
     assert len(near.seen_from(localizer, 1.6)) == 0
 
 
+def test_after_a_rest_only_what_was_seen_within_the_memory_counts_and_for_no_longer():
+    near, localizer = NearPoints(LocalizationConfig(), 1.0, 0.5), driven(0.0, 6.0)
+    for step in range(80):
+        near.add(samples((0.0, 0.5), at=1.0 + 0.05 * step))
+    assert len(near.seen_from(localizer, 4.98)) == 10
+    assert len(near.seen_from(localizer, 5.23)) == 5
+
+
 def test_lidar_off_the_centre_and_turned_is_placed_by_its_configuration():
     config = LocalizationConfig(lidar_x=0.1, lidar_y=-0.05, lidar_yaw=math.pi / 2)
     near, localizer = NearPoints(config, 1.0, 0.5), driven(0.0, 1.0)

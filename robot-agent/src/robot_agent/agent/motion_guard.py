@@ -44,6 +44,10 @@ class MotionGuard:
 
     def limit(self, wheels: Wheels, now: float) -> Wheels:
         """Return the wheel speeds (m/s) that may be commanded at `now` (s, monotonic) instead of these."""
+        if wheels == (0.0, 0.0):
+            # Nothing to limit; the points wait until they are needed.
+            self.reason, self.unseeing = None, False
+            return wheels
         points = self._points.seen_from(self._localizer, now)
         seen = self._field.limit(wheels, points)
         unseen = self._view.visibility.limit(seen.wheels, self._drive.twist(*seen.wheels))

@@ -47,21 +47,20 @@ class NearPoints:
         body = localizer.odom_at(now)
         if body is None:
             return np.zeros((0, 2))
-        self._place(localizer)
+        while self._pending:
+            samples = self._pending.popleft()
+            if samples.ended_at >= now - self._memory:  # else it came while nobody asked
+                self._place(samples, localizer)
         while self._batches and self._batches[0].times[-1] < now - self._memory:
             self._batches.popleft()
         if not self._batches:
             return np.zeros((0, 2))
         return body.inverse_transform(np.concatenate([batch.points for batch in self._batches]))
 
-    def _place(self, localizer: Localizer) -> None:
-        """Move the pending samples into `odom`, each by the odometry at its own time."""
-        if not self._pending:
-            return
-        angles = np.concatenate([samples.angles_rad for samples in self._pending]).astype(np.float64)
-        ranges = np.concatenate([samples.ranges_m for samples in self._pending]).astype(np.float64)
-        times = np.concatenate([np.linspace(s.started_at, s.ended_at, len(s.ranges_m)) for s in self._pending])
-        self._pending.clear()
+    def _place(self, samples: LidarSamples, localizer: Localizer) -> None:
+        """Move a batch into `odom`, each sample by the odometry at its own time."""
+        angles, ranges = samples.angles_rad.astype(np.float64), samples.ranges_m.astype(np.float64)
+        times = np.linspace(samples.started_at, samples.ended_at, len(ranges))
         near = ranges <= self._reach  # False for nan
         if not near.any():
             return

@@ -13,6 +13,9 @@ from fog_contracts import channels as ch
 from fog_contracts.codec import decode, encode
 from fog_contracts.messages import NodeCalibration, NodeConfig, NodeReading, NodeUpdate, NodeValue
 
+# Compiled once, not by each worker of a parallel run.
+pytestmark = pytest.mark.xdist_group("firmware-board")
+
 # Of the cryptographic library that each board's core brings along: a header, and how a program is linked with it.
 CRYPTOGRAPHY = {"esp8266": ("bearssl/bearssl.h", "-lbearssl"), "esp32": ("mbedtls/ecdsa.h", "-lmbedcrypto")}
 NO_CRYPTOGRAPHY = "no {}, or no openssl: apt-get install libbearssl-dev libmbedtls-dev openssl"
@@ -181,10 +184,12 @@ def test_board_restarts_after_ten_minutes_without_a_broker(switch_on):
     assert board.restarted
 
 
-def test_encrypted_node_trusts_its_authority_alone_and_asks_the_fog_for_the_time(switch_on):
+@pytest.mark.parametrize("kind", BOARDS)
+def test_encrypted_node_trusts_its_authority_alone_and_asks_the_fog_for_the_time(switch_on, kind):
     settings = {key: value for key, value in SETTINGS.items() if key not in {"tls", "port"}}
-    board = switch_on(settings, authority=PEM)
+    board = switch_on(settings, kind, PEM)
     assert board.started[:2] == ["trust", "server fog.local 8883"]
+    assert ("watchdog" in board.started) == (kind == "esp32")  # an ESP8266's watches by itself
     lines = board.run(5)
     assert "time from fog.local" in lines
     assert published(lines, ch.NODE_AVAILABILITY) == ["online"]

@@ -223,6 +223,34 @@ def test_calibration_is_reported_with_the_version_that_it_replaces(make_node, ru
     assert node.take_calibration() is None
 
 
+def test_sonar_that_does_not_answer_is_reported_and_keeps_its_limit(core, make_node, run):
+    node = make_node()
+    trigger = node._trigger
+    node._trigger = lambda world, at_us: trigger(world, at_us) if core.sonar(node._node) else None
+    report = calibrated(run, node, ch.CALIBRATE, (3.0, 3.0))
+    assert report.result == ["stuck", "done"]
+    assert report.range_limit_m == [2.0, pytest.approx(2.8, abs=0.02)]
+    assert b"check its supply" in core.describe_calibration(core.calibration(node._node, 0))
+
+
+def test_unsteady_echoes_are_reported_with_the_remedy(core, make_node, run):
+    node = make_node()
+    assert node.command(ch.CALIBRATE) is None
+    assert b"keep the way" in core.describe_calibration(core.calibration(node._node, 0))
+    for step in range(60):
+        run(node, (3.0 if step % 2 else 1.5, 3.0), 0.2)
+    assert node.take_calibration().result == ["unsteady", "done"]
+
+
+def test_pulses_of_different_width_are_no_sign_for_no_echo(make_node, run):
+    node = make_node()
+    assert node.command(ch.LEARN_NO_ECHO) is None
+    for step in range(60):
+        run(node, (0.4 if step % 2 else 0.5, 3.0), 0.2)
+    report = node.take_calibration()
+    assert (report.result[0], report.no_echo_us[0]) == ("unsteady", 0)
+
+
 def test_calibration_holds_until_another_version_comes_and_over_a_restart(core, make_node, run):
     config = NodeConfig(version=9, range_limit_m=[1.0, 1.0], no_echo_is_clear=[False, False])
     node = make_node()

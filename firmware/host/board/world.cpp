@@ -25,7 +25,7 @@ I2cBus Wire;
 namespace {
 
 constexpr double kUsPerMm = 2e6 / 343420.0;  // at 20 degrees
-constexpr unsigned kTurnUs = 500;            // of the loop
+constexpr unsigned kTurnUs = 1000;           // of the loop
 constexpr unsigned kBurstUs = 450;
 
 struct Interrupt {

@@ -71,9 +71,9 @@ def test_faults_are_tried_in_turn_until_each_has_its_trials(tmp_path: Path) -> N
 def test_page_has_a_table_for_each_kind_of_fault_with_its_limit() -> None:
     rows = [row(BY_NAME[name], [0.02, 0.03]) for name in ("agent killed", "cliff", "watchdog and guardian killed")]
     text = page.markdown(rows, "the command", "a machine", 2)
-    assert "| agent killed | 2 | 2 | 0.025 | 0.03 | 0.03 | 0.3 | 0.3 |" in text
-    assert "| cliff | 2 | 2 | 0.025 | 0.03 | 0.03 | 0.05 | one sensor frame: 0.05 |" in text
-    assert "| watchdog and guardian killed | 2 | 2 | 0.025 | 0.03 | 0.03 | none | none: needs hardware |" in text
+    assert "| agent killed | 2 | 2 | 0.025 | 0.03 | 0.03 | 0.3 | 0 | 0.3 |" in text
+    assert "| cliff | 2 | 2 | 0.025 | 0.03 | 0.03 | 0.05 | 0 | one sensor frame: 0.05 |" in text
+    assert "| watchdog and guardian killed | 2 | 2 | 0.025 | 0.03 | 0.03 | none | 0 | none: needs hardware |" in text
     assert "## Operator" not in text
 
 

@@ -75,3 +75,13 @@ def test_rate_at_which_the_base_answered_is_kept_and_all_begins_anew(count: int)
     assert tried.attempt(102.9) is None
     assert tried.attempt(103.0) is None, "there is no other rate"
     assert (tried.baud, tried.problem) == (answered, TWO_RATES)
+
+
+def test_attempts_on_a_base_that_fell_silent_again_are_counted_anew() -> None:
+    tried = revival(115_200, line=RTS)
+    attempts(tried, 3)
+    tried.on_answer()
+    assert attempts(tried, 1, 100.0) == [Attempt(line=RTS)]
+    assert tried.problem is None
+    assert attempts(tried, 1, 103.0) == [Attempt(line=RTS)]
+    assert tried.problem == ONE_RATE

@@ -85,5 +85,37 @@ PARTS: Final = (
             "guardian/test_revival.py",
         ),
         ("numpy", "hypothesis.strategies", "robot_agent.config"),
+        (
+            Equivalent(
+                "core",
+                "self._feedback_at = _NEVER",
+                "self._feedback_at = _NEVER -> pass",
+                "the first reading is reported whatever the time, and sets it",
+            ),
+            Equivalent(
+                "core",
+                "elapsed = 0.0 if self._stepped_at is None else max(0.0, min(now - self._stepped_at, STEP_S))",
+                "0.0 -> 1.0",
+                "the first of the two: a base that is awake has a time of its last step",
+            ),
+            Equivalent(
+                "core",
+                "if current * target < 0:",
+                "current * target < 0 -> current * target <= 0",
+                "with either of them zero, the current speed or the target is zero, and the result the same",
+            ),
+            Equivalent(
+                "core",
+                "if abs(target) <= abs(current):",
+                "abs(target) <= abs(current) -> abs(target) < abs(current)",
+                "a target that equals the current speed is returned by the next line, too",
+            ),
+            Equivalent(
+                "core",
+                "return min(target, current + gain) if target > 0 else max(target, current - gain)",
+                "target > 0 -> target >= 0",
+                "a target of zero is returned before",
+            ),
+        ),
     ),
 )

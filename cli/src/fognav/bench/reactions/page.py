@@ -27,9 +27,11 @@ watchdog is started again or goes on: see the limits in the [README](../README.m
 base. A watchdog that hangs alone is no fault: the wheels keep obeying guardian and agent.
 
 Measured on: {machine}, {robots} robots at once.
+Robots, emulated devices and whatever else ran shared its cores: a load above their
+number means that all of them waited for a processor, and the times beyond a limit include that.
 """
-_HEAD: Final = """| fault | trials | stopped | median, s | p99, s | longest, s | limit, s | parts of the limit, s |
-|---|---|---|---|---|---|---|---|
+_HEAD: Final = """| fault | trials | stopped | median, s | p99, s | longest, s | limit, s | beyond | its parts, s |
+|---|---|---|---|---|---|---|---|---|
 """
 _TITLES: Final = {
     "process": "Processes killed (`SIGKILL`) or stopped (`SIGSTOP`)",
@@ -52,4 +54,4 @@ def markdown(rows: Sequence[dict[str, object]], command: str, machine: str, robo
 def _line(each: dict[str, object]) -> str:
     limit = "none" if each["limit_s"] is None else each["limit_s"]
     figures = " | ".join(str(each[name]) for name in ("trials", "stopped", "median_s", "p99_s", "max_s"))
-    return f"| {each['fault']} | {figures} | {limit} | {each['design']} |"
+    return f"| {each['fault']} | {figures} | {limit} | {each['beyond_limit']} | {each['design']} |"

@@ -218,6 +218,8 @@ class Link:
     """A stand-in for the guardian and for the lidar's port."""
 
     problem = ""
+    pid = 0
+    corrupted = 0
 
     def __init__(self) -> None:
         self.sent: list[WheelCommand] = []
@@ -297,7 +299,7 @@ class LiveServices:
             "planner tick": self.planner.tick_loop(),
             "agent publish": self.agent.publish_loop(),
             "planner map": self.planner.snapshot_loop(),
-            "agent housekeeping": self.agent.housekeeping_loop(self.link),
+            "agent housekeeping": self.agent.housekeeping_loop(self.link, self.link),
         }
         for name, loop in loops.items():
             await self._begin(name, loop)

@@ -31,10 +31,10 @@ def site_coverage(
     png: Annotated[Path | None, typer.Option("--png", metavar="F", help="Draw it on the map.")] = None,
     json: JsonOption = False,
 ) -> None:
-    """Show what the sensor nodes see: of each area, and along each route between two places.
+    """Show what the sensor nodes see of areas and routes.
 
-    On a blind stretch no node notices a person. A lead is by how many seconds the fog may know of a hazard before the
-    robot's own lidar could.
+    Routes are those between any two places. On a blind stretch no node notices a person. A lead is by how many seconds
+    the fog may know of a hazard before the robot's own lidar could.
     """
     from fognav.coverage import coverage  # noqa: PLC0415  # keeps the other commands fast
 

@@ -12,7 +12,7 @@ from fog_contracts.messages import AreaDefinition, AreaHazard, NodeReading, Robo
 from fog_contracts.site import NodeSite, Sonar
 from hazard_aggregator.debounce import DebounceError, Observation, RuleFactory
 from hazard_aggregator.fusion import AreaFusion
-from hazard_aggregator.reading_order import ReadingOrder
+from hazard_aggregator.reading_order import FORGOTTEN_S, ReadingOrder
 from hazard_aggregator.registry import find_rule
 
 SQUARE = [(0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (0.0, 1.0)]
@@ -159,21 +159,32 @@ def test_reading_of_an_earlier_boot_is_ignored_until_the_node_is_silent():
     for seq in range(1, 5):
         read_from_boot(9, seq)
     assert rig.hazard.state == "blocked", "boots are random: one that was never heard is new, whatever its number"
-    rig.wait(3.5)
+    rig.wait(FORGOTTEN_S + 0.5)
     rig.read(3.0, 3.0, times=5)
     assert rig.hazard.state == "clear"
 
 
-def test_node_that_counts_from_zero_again_is_heard_after_three_seconds():
+def test_node_that_counts_from_zero_again_is_heard_after_thirty_seconds():
     rig = Rig(site("n1"))
     rig.seq = 6000
     rig.read(3.0, 3.0, times=5)
     rig.seq = -1
-    rig.read(0.8, 3.0, times=29)
+    rig.read(0.8, 3.0, times=299)
     assert rig.hazard.state == "clear"
     assert set(rig.core.pop_rejections()) == {("n1", "outdated")}
     rig.read(0.8, 3.0, times=7)
     assert rig.hazard.state == "blocked"
+
+
+@pytest.mark.parametrize("boot", [1, 2])
+def test_old_burst_in_any_order_is_not_fresh_after_a_silence(boot):
+    order = ReadingOrder()
+    for i in range(60):
+        order.place(measured(100 + i, uptime_ms=10_000 + 100 * i), 10.0 + i / 10)
+    if boot == 2:
+        order.place(msgspec.structs.replace(measured(0, uptime_ms=0), boot=2), 16.0)
+    late = [order.place(measured(100 + i, uptime_ms=10_000 + 100 * i), 26.0) for i in (3, 7, 4, 5, 6)]
+    assert set(late) == {"outdated" if boot == 1 else "earlier_boot"}
 
 
 def test_seq_of_32_bits_may_wrap():
@@ -447,6 +458,15 @@ def test_one_blocked_node_blocks_an_area_and_only_all_nodes_clear_it():
     rig.read(0.8, 3.0, node="n2", times=5)
     assert rig.hazard.state == "blocked"
     assert rig.hazard.nodes == {"n1": "clear", "n2": "blocked"}
+
+
+def test_second_silence_discards_the_readings_before_it_as_the_first_did():
+    rig = Rig(site("n1"))
+    rig.read(0.8, 3.0, times=5)
+    for _ in range(3):
+        rig.wait(3.5)
+        rig.read(3.0, 3.0, times=4)
+    assert (rig.hazard.state, rig.hazard.penalty) == ("unknown", 254)
 
 
 def test_silent_node_beside_a_clear_one_makes_the_area_unknown():

@@ -79,7 +79,8 @@ class NodeState:
         """Invalidate the state of a node that was silent, or confirmed nothing, for longer than `limit` (s)."""
         if self.silent_for(now) > limit:
             reason = f"it has been silent for more than {limit:g} s"
-            if self.state != "unknown" or self.reason != reason:
+            # A few readings since an earlier silence confirmed nothing, and do not count after this one.
+            if self.state != "unknown" or self.reason != reason or self.run_state is not None:
                 self.invalidate(reason)
         elif now - self.last_confirmed > limit and self.state != "unknown":
             self.invalidate("its readings contradict one another")

@@ -19,7 +19,9 @@ Rejection = Literal["duplicate", "outdated", "earlier_boot", "late", "too_soon",
 """Why a reading does not count."""
 
 SILENT_S: Final = NODE_READING.max_age_s
-"""A reading older than this does not count; after as long a silence, an outdated boot or seq does."""
+"""A reading older than this does not count."""
+FORGOTTEN_S: Final = 30.0
+"""After so long a silence an earlier boot, or an older seq, is a node that repeats its numbers, and no late reading."""
 MIN_PERIOD_S: Final = 0.04
 """Readings closer together are one: between two measurements a node pauses for 50 ms (`NodeConfig.pause_ms`)."""
 _BOOTS: Final = 8
@@ -47,12 +49,13 @@ class ReadingOrder:
     def place(self, reading: NodeReading, now: float) -> Taken | Rejection:
         """Return when a reading was taken that arrives `now` (s), or why it is no news.
 
-        Boots are random numbers: one that was never heard is new. An older boot, or an older seq of the same boot, is
-        accepted once the node has been silent for 3 s; a seq has 32 bits and may wrap.
+        Boots are random numbers: one that was never heard is new. An earlier boot, or an older seq of the same boot, is
+        accepted only once the node has been silent for 30 s: its clock would begin anew, and what the network held back
+        for long would count as fresh. A seq has 32 bits and may wrap.
         """
-        silent = self._accepted_at is None or now - self._accepted_at > SILENT_S
+        forgotten = self._accepted_at is None or now - self._accepted_at > FORGOTTEN_S
         same_boot = bool(self._boots) and self._boots[-1] == reading.boot
-        if not silent and (problem := self._problem(reading, same_boot=same_boot)) is not None:
+        if not forgotten and (problem := self._problem(reading, same_boot=same_boot)) is not None:
             return problem
         uptime_s = reading.uptime_ms / 1000
         if not same_boot or uptime_s < self._uptime_s:  # uptime begins anew, or its 32 bits have wrapped

@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from fog_contracts.messages import AreaDefinition, AreaHazard, NodeReading, RobotPose
     from hazard_aggregator.area_override import AreaOverride
     from hazard_aggregator.foreign_messages import ForeignMessage
-    from hazard_aggregator.fusion import AreaFusion, NodeReport
+    from hazard_aggregator.fusion import AreaFusion
+    from hazard_aggregator.node_report import NodeReport
     from hazard_aggregator.overrides import StoredOverrides
     from hazard_aggregator.reading_order import Rejection
 

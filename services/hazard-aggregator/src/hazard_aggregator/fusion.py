@@ -7,12 +7,12 @@ receiver's monotonic clock) and `stamp` (s since the epoch, for people and trace
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from fog_contracts.channels import BLOCKED, CLEAR
 from hazard_aggregator.debounce import DEFAULT_RULE
 from hazard_aggregator.members import THESIS_NODE, Members
+from hazard_aggregator.node_report import node_reports
 from hazard_aggregator.plausibility import Classification, classify_reading
 from hazard_aggregator.reading_order import ReadingOrder, Taken
 from hazard_aggregator.robot_poses import RobotPoses
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from fog_contracts.site import NodeSite
     from hazard_aggregator.area_override import AreaOverride
     from hazard_aggregator.debounce import Registry
+    from hazard_aggregator.node_report import NodeReport
     from hazard_aggregator.node_state import NodeState
     from hazard_aggregator.reading_order import Rejection
 
@@ -35,20 +36,6 @@ LATE_TICK_S: Final = 0.5
 THESIS_EXPIRY_S: Final = 60.0
 """A thesis node that has been silent for so long (s) is gone: no site lists it, and one stray message made it."""
 _MAX_REJECTIONS: Final = 10_000
-
-
-@dataclass(frozen=True)
-class NodeReport:
-    """Health of a node, for people: `age` is the time (s) since its last reading, None before the first one."""
-
-    id: str
-    area: str
-    state: AreaState
-    reason: str
-    online: bool | None
-    age: float | None
-    received: int
-    ignored: int
 
 
 class AreaFusion:
@@ -115,20 +102,7 @@ class AreaFusion:
 
     def node_reports(self, now: float) -> list[NodeReport]:
         """Return the health of every node of every area."""
-        return [
-            NodeReport(
-                id=node.id,
-                area=area.definition.id,
-                state=node.state,
-                reason=node.reason,
-                online=node.online,
-                age=node.silent_for(now) if node.ever_received else None,
-                received=node.received,
-                ignored=node.ignored,
-            )
-            for area in self._areas.values()
-            for node in area.nodes.values()
-        ]
+        return node_reports(self._areas.values(), now)
 
     # --- Inputs -----------------------------------------------------------------------------------------------------
 

@@ -75,7 +75,33 @@ def test_closed_corridor_is_its_own_shadow_and_is_left_by_its_ends_only() -> Non
     assert not shadow.contains((20, 1))
     columns, rows = shadow.border % 40, shadow.border // 40
     assert set(columns.tolist()) <= {1, 2, 3}
-    assert set(rows.tolist()) <= {2, 3, 4, 5, 6}
+    assert set(rows.tolist()) <= set(range(1, 8))
+
+
+def test_raised_goal_still_ends_the_shadow() -> None:
+    bound = np.zeros((8, 20), np.uint8)
+    closed = bound.copy()
+    closed[2:6, 12:18] = 30  # passable, around the goal
+    planner = Planner(20, 8)
+    field = planner.goal_field(bound, (15, 4), TilePatterns(10**6))
+    shadow = Shadow(closed, bound, field, [(2, 4)], planner)
+    assert not shadow.contains((15, 4))
+    assert shadow.border.tolist() == [4 * 20 + 15]
+    detour = shadow.detour(field.costs(shadow.border))
+    assert detour is not None
+    expected = planner.plan(closed, (2, 4), (15, 4)).cost * 2 * STRAIGHT
+    assert detour.costs[4, 2] == expected
+
+
+def test_step_that_a_closed_corner_cuts_off_is_in_the_shadow() -> None:
+    bound = np.full((5, 6), 254, np.uint8)
+    bound[1, 1:4] = bound[2:4, 3] = bound[3, 3:5] = 0
+    bound[2, 2] = 0  # where the cheapest path cuts the corner
+    closed = bound.copy()
+    closed[2, 2] = 254
+    planner = Planner(6, 5)
+    shadow = Shadow(closed, bound, planner.goal_field(bound, (4, 3), TilePatterns(10**6)), [(1, 1)], planner)
+    assert shadow.contains((1, 1))
 
 
 def test_detour_saves_the_flood_of_a_closed_room() -> None:

@@ -1,8 +1,8 @@
 """The way round a closed part of the floor: a lower bound that all searches behind the closure share.
 
-A goal field knows nothing of a hazard that came later. The cells whose cheapest path leads through the hazard are its
-*shadow*: a search guided by the field floods the whole of it before it turns round. For any set of cells A without the
-goal, a path from a cell of A enters the rest of the map through one of the few border cells b of A, so
+A goal field knows nothing of a hazard that came later. The cells from which a cheapest path leads through the hazard
+are its *shadow*: a search guided by the field floods the whole of it before it turns round. For any set of cells A
+without the goal, a path from a cell of A enters the rest of the map through one of the few border cells b of A, so
 
     cost(x, goal) >= min over b of (cost within A from x to b + level(b)) + min over b of (field(b) - level(b))
 
@@ -36,12 +36,11 @@ if TYPE_CHECKING:
     from fog_kernels.astar import Planner
     from fog_kernels.guides import GoalField
 
-_QUEUED = 1
+_LIT = 1
 _SHADOW = 2
-_LIT = 3
-_BORDER = 4
-_INSIDE = 5
-_START = 6
+_BORDER = 3
+_INSIDE = 4
+_START = 5
 
 _BUCKETS = 65536
 _UNSET = 2147483647
@@ -70,94 +69,89 @@ def _cost_to_goal(lowest: Any, columns: int, slots: Any, patterns: Any, x: Any, 
 
 @njit(
     int64(
-        _arrays.U8_FLAT, int64, _arrays.I32_FLAT, _arrays.I32_FLAT, int64, _arrays.I32_FLAT, _arrays.I32_FLAT,
-        _arrays.I32_FLAT, _U8_OUT, _arrays.I32_OUT, _arrays.I32_OUT, int64,
+        _arrays.U8_FLAT, _arrays.U8_FLAT, int64, _arrays.I32_FLAT, _arrays.I32_FLAT, int64, _arrays.I32_FLAT,
+        _arrays.I32_FLAT, _arrays.I32_FLAT, _U8_OUT, _arrays.I32_OUT,
     ),
     cache=True, nogil=True, error_model="numpy",
 )  # fmt: skip
 def _mark_shadow(
-    costmap: Any, width: int, weight: Any, lowest: Any, tile_columns: int, slots: Any, patterns: Any,
-    raised: Any, mark: Any, chain: Any, heads: Any, shift: int,
+    costmap: Any, bound: Any, width: int, weight: Any, lowest: Any, tile_columns: int, slots: Any, patterns: Any,
+    raised: Any, mark: Any, found: Any,
 ) -> int:  # fmt: skip
-    """Mark the cells whose cheapest path leads through raised cells, in the order of the field; return their number.
+    """Mark the cells that have a cheapest path over `bound` through raised cells; return their number.
 
-    A cell is lit, not in the shadow, when a step to a cell outside the shadow leads on at the cost that the field
-    gives. Each cell is queued once, so the queue is a chain through the cells themselves. A bucket is no wider than the
-    cheapest step, so the cells that one leads on to are marked before it.
+    They are found from the raised cells, against the direction of the paths, in no special order; `found` receives
+    them.
     """
     height = costmap.size // width
     columns, rows, steps, lengths = _steps(width)
-    heads[:] = -1
+    count = 0
     for i in range(raised.size):
         cell: Any = np.int64(raised[i])
-        y: Any = np.int64(np.uint32(cell) // np.uint32(width))
-        cost = _cost_to_goal(lowest, tile_columns, slots, patterns, cell - y * width, y)
-        if cost >= 0:
-            mark[np.uint64(cell)] = _QUEUED
-            chain[np.uint64(cell)] = heads[np.uint64(cost >> shift)]
-            heads[np.uint64(cost >> shift)] = cell
-    count = 0
-    around = np.empty(8, np.int64)
-    for bucket in range(heads.size):
-        while heads[np.uint64(bucket)] >= 0:
-            cell = np.int64(heads[np.uint64(bucket)])
-            heads[np.uint64(bucket)] = chain[np.uint64(cell)]
-            y = np.int64(np.uint32(cell) // np.uint32(width))
-            x = cell - y * width
-            own = np.int64(weight[costmap[np.uint64(cell)]])
-            cost = _cost_to_goal(lowest, tile_columns, slots, patterns, x, y)
-            lit = own > 0 and cost == 0
-            for k in range(8):
-                around[k] = -1
-                if lit or not (0 <= x + columns[k] < width and 0 <= y + rows[k] < height):
-                    continue
-                other = cell + steps[k]
-                known = mark[np.uint64(other)]
-                if known == _LIT and own == 0:
-                    continue
-                there = _cost_to_goal(lowest, tile_columns, slots, patterns, x + columns[k], y + rows[k])
-                if there > cost:
-                    if known == 0:
-                        around[k] = there
-                    continue
-                if there < 0 or known == _SHADOW or own == 0:
-                    continue
-                weight_there = np.int64(weight[costmap[np.uint64(other)]])
-                if weight_there == 0 or there + lengths[k] * (own + weight_there) > cost:
-                    continue
-                if columns[k] != 0 and rows[k] != 0:
-                    aside, along = np.uint64(cell + columns[k]), np.uint64(cell + steps[k] - columns[k])
-                    if weight[costmap[aside]] == 0 or weight[costmap[along]] == 0:
-                        continue
-                lit = True
-            if lit:
-                mark[np.uint64(cell)] = _LIT
-                continue
+        if mark[np.uint64(cell)] == 0:
             mark[np.uint64(cell)] = _SHADOW
+            found[np.uint64(count)] = cell
             count += 1
-            for k in range(8):
-                if around[k] >= 0:
-                    other = cell + steps[k]
-                    slot = np.uint64(around[k] >> shift)
-                    mark[np.uint64(other)] = _QUEUED
-                    chain[np.uint64(other)] = heads[slot]
-                    heads[slot] = other
+        if weight[costmap[np.uint64(cell)]] > 0:
+            continue
+        y: Any = np.int64(np.uint32(cell) // np.uint32(width))
+        x = cell - y * width
+        for k in range(4):  # a diagonal step between these two is cut off now, too
+            if not (0 <= x + columns[k] < width and 0 <= y + rows[k] < height):
+                continue
+            other = cell + steps[k]
+            if mark[np.uint64(other)] == 0:
+                mark[np.uint64(other)] = _SHADOW
+                found[np.uint64(count)] = other
+                count += 1
+    done = 0
+    while done < count:
+        cell = np.int64(found[np.uint64(done)])
+        done += 1
+        own = np.int64(weight[bound[np.uint64(cell)]])
+        if own == 0:
+            continue
+        y = np.int64(np.uint32(cell) // np.uint32(width))
+        x = cell - y * width
+        cost = _cost_to_goal(lowest, tile_columns, slots, patterns, x, y)
+        if cost < 0:
+            continue
+        within = 0 < x < width - 1 and 0 < y < height - 1
+        for k in range(8):
+            if not within and not (0 <= x + columns[k] < width and 0 <= y + rows[k] < height):
+                continue
+            other = cell + steps[k]
+            if mark[np.uint64(other)] != 0:
+                continue
+            weight_there = np.int64(weight[bound[np.uint64(other)]])
+            if weight_there == 0:
+                continue
+            there = _cost_to_goal(lowest, tile_columns, slots, patterns, x + columns[k], y + rows[k])
+            if there != cost + lengths[k] * (own + weight_there):
+                continue
+            if columns[k] != 0 and rows[k] != 0:
+                aside, along = np.uint64(cell + columns[k]), np.uint64(cell + steps[k] - columns[k])
+                if weight[bound[aside]] == 0 or weight[bound[along]] == 0:
+                    continue
+            mark[np.uint64(other)] = _SHADOW
+            found[np.uint64(count)] = other
+            count += 1
     return count
 
 
 @njit(
     void(
         _arrays.U8_FLAT, int64, _arrays.I32_FLAT, _arrays.I32_FLAT, _U8_OUT, _arrays.I32_OUT, _arrays.I32_OUT,
-        _arrays.I64_OUT,
+        _arrays.I32_OUT, _arrays.I64_OUT,
     ),
     cache=True, nogil=True, error_model="numpy",
 )  # fmt: skip
 def _enclose(
-    costmap: Any, width: int, weight: Any, starts: Any, mark: Any, inside: Any, border: Any, result: Any
+    costmap: Any, width: int, weight: Any, starts: Any, mark: Any, label: Any, inside: Any, border: Any, result: Any
 ) -> None:
     """List the cells of the shadow that are connected with a start, and the cells where one can leave them.
 
-    `result` receives the numbers of both.
+    `result` receives the numbers of both; the labels of the cells inside are unset.
     """
     height = costmap.size // width
     columns, rows, steps, _ = _steps(width)
@@ -167,6 +161,7 @@ def _enclose(
         cell: Any = np.int64(starts[i])
         if mark[np.uint64(cell)] == _SHADOW and weight[costmap[np.uint64(cell)]] > 0:
             mark[np.uint64(cell)] = _INSIDE
+            label[np.uint64(cell)] = _UNSET
             inside[count] = cell
             count += 1
     done = 0
@@ -175,8 +170,9 @@ def _enclose(
         done += 1
         y: Any = np.int64(np.uint32(cell) // np.uint32(width))
         x = cell - y * width
+        within = 0 < x < width - 1 and 0 < y < height - 1
         for k in range(8):
-            if not (0 <= x + columns[k] < width and 0 <= y + rows[k] < height):
+            if not within and not (0 <= x + columns[k] < width and 0 <= y + rows[k] < height):
                 continue
             other = cell + steps[k]
             if mark[np.uint64(other)] >= _BORDER:
@@ -190,6 +186,7 @@ def _enclose(
                     continue
             if mark[np.uint64(other)] == _SHADOW:
                 mark[np.uint64(other)] = _INSIDE
+                label[np.uint64(other)] = _UNSET
                 inside[np.uint64(count)] = other
                 count += 1
             else:
@@ -250,22 +247,22 @@ def _fill(
         y: Any = np.int64(np.uint32(cell) // np.uint32(width))
         x = cell - y * width
         own = np.int64(weight[costmap[np.uint64(cell)]])
+        within = 0 < x < width - 1 and 0 < y < height - 1
         for k in range(8):
-            if not (0 <= x + columns[k] < width and 0 <= y + rows[k] < height):
+            if not within and not (0 <= x + columns[k] < width and 0 <= y + rows[k] < height):
                 continue
             other = cell + steps[k]
-            if mark[np.uint64(other)] < _INSIDE:
-                continue
+            known = np.int64(label[np.uint64(other)])
+            if known <= here:
+                continue  # final, or outside
             there = np.int64(weight[costmap[np.uint64(other)]])
-            if there == 0:
+            reached = here + lengths[k] * (own + there)
+            if reached >= known or there == 0:
                 continue
             if columns[k] != 0 and rows[k] != 0:
                 aside, along = np.uint64(cell + columns[k]), np.uint64(cell + steps[k] - columns[k])
                 if weight[costmap[aside]] == 0 or weight[costmap[along]] == 0:
                     continue
-            reached = here + lengths[k] * (own + there)
-            if reached >= np.int64(label[np.uint64(other)]):
-                continue
             slot = reached >> shift
             if slot >= heads.size:
                 return -1
@@ -284,7 +281,10 @@ def _fill(
 
 
 class Shadow:
-    """The part of the floor that the starts share and whose cheapest paths to a goal lead through raised cells."""
+    """The part of the floor around the starts from which a cheapest path to a goal led through raised cells.
+
+    Where several paths cost the same, one of them is enough: so its cells are found from the raised ones, in any order.
+    """
 
     def __init__(
         self,
@@ -296,29 +296,30 @@ class Shadow:
     ) -> None:
         """Find it on a uint8 (h, w) costmap; `field` is an exact one over the costmap `bound`.
 
-        Takes some 50 ns for each of its cells. Raises ValueError for a field that is not exact.
+        Takes some 25 ns for each of its cells. Raises ValueError for a field that is not exact.
         """
         if not field.exact:
             raise ValueError(f"the field of goal {field.goal} has one cost for several cells: pass an exact one")
         self._costmap = _arrays.grid(costmap, "costmap")
         self._planner = planner
-        self._mark = np.zeros(costmap.size, np.uint8)
+        size = costmap.size
+        self._mark = np.zeros(size, np.uint8)
+        self._label, self._memory = np.zeros(size, np.int32), np.empty((2, size), np.int32)
+        cells, border = self._memory  # later those of the search's queue
+        bound = _arrays.grid(bound, "bound")
         raised = np.flatnonzero((costmap > bound).ravel()).astype(np.int32)
-        memory = np.empty(costmap.size, np.int32)
-        heads = np.empty(_BUCKETS, np.int32)
         flat, width, weight = costmap.ravel(), planner.width, planner.weight
-        count = int(
-            _mark_shadow(
-                flat, width, weight, field.lowest.ravel(), field.lowest.shape[1], field.slots.ravel(),
-                field.patterns.ravel(), raised, self._mark, memory, heads, planner.bucket_shift,
-            )
+        goal = field.goal[1] * width + field.goal[0]
+        if weight[flat[goal]] > 0:
+            self._mark[goal] = _LIT  # raised or not, nothing lies behind it
+        _mark_shadow(
+            flat, bound.ravel(), width, weight, field.lowest.ravel(), field.lowest.shape[1], field.slots.ravel(),
+            field.patterns.ravel(), raised, self._mark, cells,
         )  # fmt: skip
         first = np.array([row * width + column for column, row in starts], np.int32)
-        inside, border = np.empty(count, np.int32), np.empty(costmap.size, np.int32)
         result = np.empty(2, np.int64)
-        _enclose(flat, width, weight, first, self._mark, inside, border, result)
-        number, leaving = result.tolist()
-        self._inside = inside[:number]
+        _enclose(flat, width, weight, first, self._mark, self._label, cells, border, result)
+        leaving = int(result[1])
         self._starts = np.unique(first[self._mark[first] == _INSIDE])
         self.border = border[:leaving].copy()
         """The flat indexes of the cells through which every path leaves it."""
@@ -330,14 +331,13 @@ class Shadow:
     def detour(self, levels: NDArray[np.int64]) -> Detour | None:
         """Return the bound that begins with a level at each border cell, in full for cells as near to it as the starts.
 
-        None when nothing leads out of the shadow, or when costs exceed 32 bits. Takes some 50 ns for each cell.
+        Call it once: the bound takes over the memory. None when nothing leads out of the shadow, or when costs exceed
+        32 bits. Takes some 50 ns for each cell.
         """
         if len(self.border) == 0:
             return None
-        size, planner = self._costmap.size, self._planner
+        planner, label, memory = self._planner, self._label, self._memory
         levels = levels - levels.min()
-        label, memory = np.zeros(size, np.int32), np.empty((2, size), np.int32)
-        label[self._inside] = _UNSET
         self._mark[self._starts] = _START
         heads = np.empty(_BUCKETS, np.int32)
         highest = int(

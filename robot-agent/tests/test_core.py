@@ -464,6 +464,14 @@ def test_cancel_stops_the_robot_and_lasts_while_the_planner_repeats_the_goal(dri
     assert not driving.command("cancel").accepted or driving.state().goal_id == "g1"
 
 
+def test_trail_for_backing_up_is_forgotten_at_the_end_of_a_mission_since_people_may_move_the_robot(driving):
+    trail = driving.agent._driving._recoveries._trail
+    assert trail.length > 0.1
+    assert driving.command("cancel").accepted
+    driving.run(0.3)
+    assert trail.length == 0.0
+
+
 def test_the_first_command_on_a_new_path_closes_its_trace_once(driving):
     driving.drive_to([(driving.x, driving.y), *L_PATH[1:]], plan_id=2, traces=[trace()])
     driving.run(1.0)

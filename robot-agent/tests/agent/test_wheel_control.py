@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import math
+
 import pytest
 
 from robot_agent.agent.wheel_control import WheelControl
@@ -70,6 +72,21 @@ def test_hold_and_stale_decision_ramp_the_wheels_to_rest(driving, stale, stop):
         now += DT
         driving.command(outputs(stop), free, now)
     assert now <= 20 * DT + CONFIG.safety.ramp
+
+
+@pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_decision_whose_speed_is_no_number_never_moves_a_wheel(driving, side, wrong):
+    standing, useless = WheelControl(CONFIG), decision(1.0, **{side: wrong})
+    for step in range(10):
+        standing.decision = driving.decision = useless
+        before, now = driving.speeds, 1.0 + step * DT
+        assert standing.command(outputs(), free, now).right == 0.0
+        driving.command(outputs(), free, now)
+        assert driving.speeds[1] < before[1] or driving.at_rest
+        assert not driving.following
+    assert standing.at_rest
+    assert driving.at_rest
 
 
 def test_protective_stop_sets_zero_speed_immediately(driving):

@@ -115,13 +115,14 @@ class PathDriving:
         """Return the inputs of the next decision; None while there is no goal or the robot must not drive."""
         pose, odom, mission = localizer.pose(now), localizer.odom_at(now), self.mission
         follower, path = mission.follower, mission.path
+        if not (safety.mission_may_drive and mission.active):
+            self._recoveries.reset()
         if follower is None or path is None or not mission.active:
             return None
         if pose is None or odom is None or replica.geometry is None:
             return None
         follower.advance(pose.x, pose.y, now)
         if not safety.mission_may_drive:
-            self._recoveries.reset()
             return None
         recovery = None if self._arrived else self._recoveries.due(follower, pose, odom, safety.cap, now)
         scan, scan_pose = localizer.scan, localizer.scan_pose()

@@ -58,10 +58,7 @@ class WheelControl:
         dt = 0.0 if self._streamed_at is None else min(max(now - self._streamed_at, 0.0), _STEP_MAX_S)
         self._streamed_at = now
         limits, safety, last = self._config.motion.limits, self._config.safety, self.speeds
-        # A decision is as old as its inputs, so a hung control loop stops the robot too.
-        decision = self.decision
-        if decision is not None and now - decision.made_at > self._config.decision_max_age:
-            decision = None
+        decision = self._usable_decision(now)
         wanted = last
         if outputs.stop == "none" and decision is None:
             self.speeds = ramp_down(last, dt, limits.wheel_max / safety.ramp)
@@ -84,6 +81,14 @@ class WheelControl:
         self._seq += 1
         reset, self._reset_pending = self._reset_pending, False
         return WheelCommand(seq=self._seq, left=self.speeds[0], right=self.speeds[1], reset=reset)
+
+    def _usable_decision(self, now: float) -> Decision | None:
+        """Return the newest decision; None when it is too old, or one of its speeds is no number."""
+        decision = self.decision
+        if decision is None or not (math.isfinite(decision.left) and math.isfinite(decision.right)):
+            return None
+        # A decision is as old as its inputs, so a hung control loop stops the robot too.
+        return None if now - decision.made_at > self._config.decision_max_age else decision
 
     def _smoothed(self, requested: Wheels, cap: float, dt: float) -> Wheels:
         """Return the wheel speeds (m/s) on the way to those requested, within acceleration and jerk."""

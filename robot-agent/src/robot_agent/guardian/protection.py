@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
@@ -23,7 +24,8 @@ def run_in_real_time(priority: int) -> str:
         return "not requested"
     try:
         for thread in Path("/proc/self/task").iterdir():
-            os.sched_setscheduler(int(thread.name), os.SCHED_RR, os.sched_param(priority))
+            with suppress(ProcessLookupError):  # it has just ended
+                os.sched_setscheduler(int(thread.name), os.SCHED_RR, os.sched_param(priority))
     except OSError:
         return "refused: grant CAP_SYS_NICE or an rtprio limit"
     return f"SCHED_RR {priority}"

@@ -65,7 +65,6 @@ class BadSettings(Exception):  # noqa: N818  # an end, too
 
 def log_event(event: str, **fields: object) -> None:
     """Write one line of JSON to standard error."""
-    """Write one line of JSON to standard error."""
     line = {"ts": time.time(), "process": "watchdog", "event": event, **fields}
     # A log without a reader must not end the process that stops the wheels.
     with suppress(OSError):

@@ -2,6 +2,7 @@
 
 import ctypes
 import json
+import os
 import shutil
 import stat
 import subprocess
@@ -15,12 +16,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from paho.mqtt.enums import CallbackAPIVersion
+from typer.testing import CliRunner
 
+from fog_contracts.messages import NodeCalibration
 from fog_contracts.site import NodeSite, Sonar
 from fog_runtime.site import load_site
 from fog_supervisor.servers import start_mosquitto
+from fognav.node_command import node_app
 from fognav.nodes import on_broker, provisioning, site_file
-from fognav.output import FailedError
+from fognav.output import FailedError, WrongUseError
 from fognav_sim.firmware import Core, FirmwareError, build_library, find_compiler
 
 ROOT = Path(__file__).parents[2]
@@ -109,6 +113,57 @@ def test_replaced_board_has_a_new_password_and_the_same_place(floor: Path, tmp_p
     assert {**first, "password": ""} == {**second, "password": ""}
     assert passwords.read_text().count("n1:") == 1
     assert run("replace", "n99", *words).returncode == 2
+
+
+def test_new_board_never_takes_the_file_of_another_node(floor: Path, tmp_path: Path) -> None:
+    """Its password is nowhere else: the broker has its hash only."""
+    file = tmp_path / "node.json"
+    for text, says in (('{"node": "n2"}', "that of node n2"), ("[]", "no node's settings")):
+        file.write_text(text)
+        done = run("replace", "n1", "--wifi", "Lab", "--site", str(floor), "--out", str(tmp_path))
+        assert done.returncode == 2
+        assert says in " ".join(done.stderr.split())
+        assert file.read_text() == text
+
+
+def test_password_file_keeps_its_owner_and_permissions(tmp_path: Path) -> None:
+    """The broker, which reads it, is another user than who adds a node."""
+    file = tmp_path / "passwords"
+    provisioning.set_password(file, "n1", "first")
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+    owner = (1883, 1883) if os.geteuid() == 0 else (os.geteuid(), os.getegid())
+    os.chown(file, *owner)
+    file.chmod(0o640)
+    provisioning.set_password(file, "n2", "second")
+    found = file.stat()
+    assert (stat.S_IMODE(found.st_mode), found.st_uid, found.st_gid) == (0o640, *owner)
+
+
+def test_password_file_of_another_user_is_left_to_him(tmp_path: Path, monkeypatch) -> None:
+    file = tmp_path / "passwords"
+    provisioning.set_password(file, "n1", "first")
+    before = file.read_bytes()
+    monkeypatch.setattr(os, "geteuid", lambda: file.stat().st_uid + 1)
+    with pytest.raises(WrongUseError, match="belongs to another user"):
+        provisioning.set_password(file, "n2", "second")
+    assert file.read_bytes() == before
+
+
+def test_board_with_another_number_of_sonars_is_told_and_not_written(monkeypatch, floor: Path) -> None:
+    learned = NodeCalibration(
+        boot=1, config_version=1, result=["done"], range_limit_m=[1.5], no_echo_is_clear=[False], no_echo_us=[0]
+    )
+
+    async def learn(*_: object) -> NodeCalibration:
+        return learned
+
+    monkeypatch.setattr(on_broker, "learn", learn)
+    before = (floor / "site.toml").read_bytes()
+    words = ["calibrate", "n1", "--site", str(floor), "--broker", "mqtt://127.0.0.1:1"]
+    done = CliRunner().invoke(node_app, words)
+    assert done.exit_code == 1
+    assert "1 limits, and has 2 sonars" in " ".join(done.stderr.split())
+    assert (floor / "site.toml").read_bytes() == before
 
 
 @pytest.mark.live

@@ -391,6 +391,19 @@ def test_update_that_fails_is_tried_three_times_and_starts_nothing(board, fault,
     assert board.busy
 
 
+def test_update_that_was_refused_does_not_count_as_tried_once_it_is_signed_well(board):
+    """After another one that failed: a forged offer must not keep the true one of its number away."""
+    board.reachable = False
+    assert board.offer() is None
+    assert len(board.run(1100)) == 3
+    board.reachable, board.good = True, False
+    assert "not signed by the key" in board.offer(number=7)
+    board.good = True
+    assert board.offer(number=7) is None
+    assert board.run(10) == []
+    assert board.remembered == 7
+
+
 def test_update_that_fails_once_succeeds_five_minutes_later(board):
     board.reachable = False
     assert board.offer() is None

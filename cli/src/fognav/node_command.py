@@ -116,9 +116,11 @@ def node_replace(  # noqa: PLR0913  # each option is an argument
     with exit_codes():
         loaded = site_file.load(checkout.site_folder(site))
         node = site_file.node_of(loaded, name)
+        target = out / provisioning.SETTINGS_FILE
+        if (other := provisioning.node_in(target)) not in (None, name):
+            raise WrongUseError(f"{target} is that of node {other}: move it, or name a folder with --out")
         access = provisioning.Access(wifi, wifi_password, fog_host, 8883 if tls else 1883, tls)
         members = provisioning.settings(loaded.site.id, node, access, provisioning.new_password(), profile)
-        target = out / provisioning.SETTINGS_FILE
         _provision(target, members, passwords)
         _tell_board(json, "replaced", node, target, passwords)
 
@@ -345,6 +347,11 @@ def _tell_board(json: bool, verb: str, node: NodeSite, target: Path, passwords: 
 
 
 def _with_limits(node: NodeSite, learned: NodeCalibration) -> NodeSite:
+    if len(node.sonars) != len(learned.range_limit_m):
+        raise FailedError(
+            f"node {node.id} has learned {len(learned.range_limit_m)} limits, and has {len(node.sonars)} sonars in the "
+            "site: make site.toml and the board's settings agree"
+        )
     sonars = [
         msgspec.structs.replace(sonar, range_limit=min(4.0, limit), no_echo_is_clear=silent)
         for sonar, limit, silent in zip(node.sonars, learned.range_limit_m, learned.no_echo_is_clear, strict=True)

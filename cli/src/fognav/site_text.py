@@ -26,7 +26,7 @@ def to_toml(site: Site) -> str:
     )
     about_areas = (
         "# A watched area: `number` is its number in the topics of the thesis's nodes. Optional tables:",
-        "# `debounce` (default: 5 readings for a change) and `unknown` (cost while its nodes are silent).",
+        "# `debounce` (default: the rule `evidence`) and `unknown` (cost while its nodes are silent).",
     )
     about_nodes = (
         "# A sensor node on a wall: `range_limit` is the calibrated distance below which an echo means an",

@@ -5,11 +5,13 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import os
 import secrets
+import stat
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from fog_runtime.files import atomic_write
+from fog_runtime.files import PRIVATE, atomic_write
 from fognav.output import WrongUseError
 
 if TYPE_CHECKING:
@@ -56,19 +58,34 @@ def settings(site: str, node: NodeSite, access: Access, password: str, profile: 
     }
 
 
+def node_in(file: Path) -> str | None:
+    """Return the id of the node that a `node.json` is for, or None without a file; raises `WrongUseError`."""
+    try:
+        return str(json.loads(file.read_bytes())["node"]) if file.exists() else None
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise WrongUseError(f"{file} is no node's settings, or can't be read: move it away") from error
+
+
 def write_settings(file: Path, members: dict[str, Any]) -> None:
     """Write `node.json`, readable for its owner only; raises `WrongUseError`."""
     _write(file, (json.dumps(members, indent=2) + "\n").encode())
 
 
 def set_password(file: Path, user: str, password: str) -> None:
-    """Set a user's password in a Mosquitto password file, which is created if it is missing; raises `WrongUseError`."""
+    """Set a user's password in a Mosquitto password file; raises `WrongUseError`.
+
+    A missing one is created for its owner only. Another one keeps its owner and permissions: the broker reads it, and
+    mostly as a user of its own.
+    """
     try:
         lines = file.read_text("utf-8").splitlines() if file.exists() else []
     except (OSError, UnicodeDecodeError) as error:
         raise WrongUseError(f"the broker's password file {file} can't be read: {error}") from error
+    owner = file.stat() if file.exists() else None
+    if owner is not None and os.geteuid() not in (0, owner.st_uid):
+        raise WrongUseError(f"the broker's password file {file} belongs to another user: run this as that user or root")
     kept = [line for line in lines if line.partition(":")[0] != user]
-    _write(file, ("\n".join([*kept, f"{user}:{_hashed(password)}"]) + "\n").encode())
+    _write(file, ("\n".join([*kept, f"{user}:{_hashed(password)}"]) + "\n").encode(), owner)
 
 
 def _hashed(password: str) -> str:
@@ -78,9 +95,12 @@ def _hashed(password: str) -> str:
     return f"$7${_ITERATIONS}${base64.b64encode(salt).decode()}${base64.b64encode(key).decode()}"
 
 
-def _write(file: Path, data: bytes) -> None:
+def _write(file: Path, data: bytes, like: os.stat_result | None = None) -> None:
+    """Write a file with the owner, group and permissions of `like`; None: for the caller only."""
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        atomic_write(file, data)
+        atomic_write(file, data, mode=PRIVATE if like is None else stat.S_IMODE(like.st_mode))
+        if like is not None:
+            os.chown(file, like.st_uid, like.st_gid)
     except OSError as error:
         raise WrongUseError(f"{file} can't be written: {error.strerror}") from error

@@ -9,6 +9,7 @@ from fog_contracts.messages import CommandKind, Pose
 from fognav.operate.fog import Fog, RefusedError
 from fognav.operate.outcome import Outcome
 from fognav.operate.systems import PLANNER
+from fognav.output import FailedError
 
 
 def command(fog: Fog, robot: str, kind: CommandKind, pose: Pose | None = None) -> Outcome:
@@ -46,5 +47,8 @@ def _outcome(fog: Fog, robot: str, path: str, body: object) -> Outcome:
 def _mode(fog: Fog, robot: str) -> Any:  # noqa: ANN401  # a mode, or None without a token that may read it
     if fog.token is None:
         return None
-    state = fog.get(PLANNER, f"/api/v1/robots/{robot}")["state"]
+    try:
+        state = fog.get(PLANNER, f"/api/v1/robots/{robot}")["state"]
+    except FailedError:  # the robot has obeyed: a token that may not read changes nothing about that
+        return None
     return state and state["mode"]

@@ -91,19 +91,19 @@ size_t signed_text(const UpdateOffer& offer, char* buffer, size_t size) {
 const char* Updater::offer(const char* text, size_t size, uint32_t now_ms) {
     // What is under way goes on.
     if (busy()) return nullptr;
-    const uint32_t tried = attempts_ > 0 ? offer_.number : 0;
     const char* problem = read_update(text, size, offer_);
     if (problem != nullptr) return problem;
     if (offer_.number == number_) return nullptr;
     if (offer_.number < number_) return "the update is older than what runs: sign one with a higher number";
     if (strcmp(offer_.board, board_) != 0) return "the update is for another board";
     // The broker delivers it again with each connection.
-    if (offer_.number == tried) return nullptr;
+    if (offer_.number == tried_) return nullptr;
     char signed_lines[kSignedTextSize];
     const size_t length = signed_text(offer_, signed_lines, sizeof signed_lines);
     if (!port_.signature_is_good(signed_lines, length, offer_.signature, offer_.signature_size)) {
         return "the update is not signed by the key in update_key of node.json";
     }
+    tried_ = offer_.number;
     attempts_ = 0;
     wait_ms_ = 0;
     since_ms_ = now_ms;

@@ -95,6 +95,7 @@ private:
     const char* board_;
     uint32_t number_;
     UpdateOffer offer_;
+    uint32_t tried_ = 0;  // number of the last offer that was fetched: one that is refused does not count as tried
     Phase phase_ = Phase::idle;
     uint32_t since_ms_ = 0;  // of the last byte, or of the failure
     uint32_t wait_ms_ = 0;

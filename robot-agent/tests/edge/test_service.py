@@ -129,6 +129,32 @@ def test_every_query_of_the_core_is_served_and_commands_are_logged(rig, monkeypa
     ]
 
 
+async def test_storage_that_hangs_does_not_make_the_service_manager_restart_the_agent(rig, monkeypatch):
+    begun, released, signs = threading.Event(), threading.Event(), []
+
+    def hang(_pose):
+        begun.set()
+        released.wait(DEADLINE_S)
+
+    monkeypatch.setattr(rig.service._manager, "alive", signs.append)
+    monkeypatch.setattr(rig.service._store, "put_pose", hang)
+    monkeypatch.setattr(rig.core, "pose_to_store", lambda _now: "a pose")
+    loops = [
+        rig.service.housekeeping_loop(FakeLidar(), FakeGuardian()),
+        rig.service.stream_loop(FakeGuardian(), FakeLidar()),
+    ]
+    tasks = [asyncio.create_task(loop) for loop in loops]
+    try:
+        await rig.until(begun.is_set)
+        before = len(signs)
+        await rig.until(lambda: len(signs) > before + 2)
+    finally:
+        for task in tasks:
+            task.cancel()
+        released.set()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
 async def test_deltas_of_an_older_map_service_do_not_affect_the_new_map(mapping):
     await mapping.until(lambda: mapping.fog.requests == 1)
     mapping.deliver(mapping.change())

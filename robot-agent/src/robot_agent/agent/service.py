@@ -89,8 +89,6 @@ class Service:
         self._manager.ready()
         async for now in self._ticker(PUBLISH_S):
             if now >= due:
-                missing = self._health.missing
-                self._manager.alive(f"waiting for {', '.join(missing)}" if missing else "ready")
                 due = now + HOUSEKEEPING_S - PUBLISH_S / 2
                 self._core.on_loop_health(self._loop_health())
                 await self._store_pose(now)
@@ -169,6 +167,9 @@ class Service:
                 self._core.on_suspension(seconds)
             lidar.poll(now, on=self._core.lidar_on)
             guardian.send(self._core.stream(now, self._clock.stamp()))
+            # Here, because the housekeeping waits for the storage, which may hang while the robot drives well.
+            missing = self._health.missing
+            self._manager.alive(f"waiting for {', '.join(missing)}" if missing else "ready")
 
     async def control_loop(self) -> None:
         """Decide at 5 Hz on a separate thread, so that a decision that hangs can't block the stream."""

@@ -15,6 +15,7 @@ from fog_contracts.messages import (
     Source,
     UnknownPolicy,
 )
+from fog_contracts.site import NodeSite, Sonar
 from hazard_aggregator.area_size import AreaError
 from hazard_aggregator.flapping import FlapDetector
 from hazard_aggregator.fusion import AreaFusion
@@ -374,3 +375,22 @@ def test_weights_count_as_evidence():
     assert fuse({"camera": "blocked", "pir": "clear"}, policy) == "blocked"
     assert fuse({"camera": "clear", "pir": "blocked"}, policy) == "clear"
     assert fuse({"camera": "unknown", "pir": "clear"}, policy) == "unknown"
+
+
+def test_source_never_has_the_id_of_a_node_whose_readings_would_count_for_it():
+    node = NodeSite(id="n1", area="yard", x=0.0, y=0.0, theta=0.0, sonars=[Sonar(range_limit=1.0)])
+    source = Source(id="n1", topic="door", blocked=["shut"], clear=["open"], period_s=5.0)
+    with pytest.raises(AreaError, match=r"sources\.n1.*a node of the site has this id"):
+        AreaFusion([AreaDefinition(id="hall", polygon=SQUARE, sources=[source])], [node], 1, registry=find_rule)
+
+
+def test_policy_that_the_only_thesis_node_could_never_reach_is_refused():
+    quorum = AreaDefinition(id="hall", polygon=SQUARE, number=5, fusion=FusionPolicy(rule="quorum", at_least=2.0))
+    with pytest.raises(AreaError, match="more than all nodes and sources have"):
+        AreaFusion([quorum], [], 1, registry=find_rule)
+
+
+def test_pointer_to_a_digit_that_is_no_index_makes_its_source_unknown():
+    rig = Rig(Source(id="s", topic="t", pointer="/\u00b2", blocked=["on"], clear=["off"], period_s=5.0))
+    assert rig.send("t", ["on", "off", "on"]) == "unknown"
+    assert "its format has changed" in rig.hazard.cause

@@ -41,8 +41,12 @@ class Members:
             if names.count(source.id) > 1:
                 problem = "another node or source of the area has this id"
                 raise SourceError(definition.id, f"sources.{source.id}", problem)
+            if source.id in self._sites:
+                problem = "a node of the site has this id, and its readings would count as the source's: choose another"
+                raise SourceError(definition.id, f"sources.{source.id}", problem)
             self._new_source(definition, source)
-        check_fusion(definition)
+        number = definition.number
+        check_fusion(definition, None if number is None else THESIS_NODE.format(number=number))
 
     def new_rule(self, definition: AreaDefinition) -> Rule:
         """Return a fresh debounce rule for a node of an area; raises `DebounceError` for invalid settings."""

@@ -83,7 +83,7 @@ def _value(payload: bytes, pointer: str | None) -> Any:  # noqa: ANN401  # any J
         key = part.replace("~1", "/").replace("~0", "~")
         if isinstance(found, dict) and key in found:
             found = found[key]
-        elif isinstance(found, list) and key.isdigit() and int(key) < len(found):
+        elif isinstance(found, list) and key.isdecimal() and int(key) < len(found):
             found = found[int(key)]
         else:
             raise _FormatError(f"there is no {pointer} in it")

@@ -31,10 +31,15 @@ def fuse(states: Mapping[str, AreaState], policy: FusionPolicy) -> AreaState:
     return "unknown" if blocked + unknown >= threshold - _ROUNDING else "clear"
 
 
-def check_fusion(definition: AreaDefinition) -> None:
-    """Raise `AreaError` for a policy by which the area could never be blocked."""
+def check_fusion(definition: AreaDefinition, thesis_node: str | None) -> None:
+    """Raise `AreaError` for a policy by which the area could never be blocked.
+
+    `thesis_node` is the id of the node that may report by the area's number, alone where nothing else watches it.
+    """
     policy = definition.fusion
     members = [*definition.nodes, *(source.id for source in definition.sources if source.penalty is None)]
+    if not members and thesis_node is not None:
+        members = [thesis_node]
     if policy.rule in ("any", "all") or not members:
         return
     reachable = sum(_weight(name, policy) for name in members)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
 from fog_supervisor import net
 
@@ -15,7 +15,9 @@ if TYPE_CHECKING:
     from xdist.scheduler import LoadScopeScheduling
 
 # In CI the examples are the same in every run; on a developer's machine each run tries new ones.
-settings.register_profile("repeatable", derandomize=True)
+settings.register_profile("default", suppress_health_check=[HealthCheck.too_slow])  # a busy machine is no defect
+settings.register_profile("repeatable", parent=settings.get_profile("default"), derandomize=True)
+settings.load_profile("default")
 if os.environ.get("CI", "").lower() in {"1", "true"}:
     settings.load_profile("repeatable")
 

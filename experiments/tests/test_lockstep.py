@@ -77,7 +77,7 @@ def test_hazard_reaches_the_wheels_within_a_second_and_every_stage_is_stamped(wa
     assert set(stages) == {"debounce", "costmap", "plan", "deliver", "command", "total"}
     assert stages["total"] == pytest.approx(sum(v for k, v in stages.items() if k != "total"), abs=0.5)
     # Five readings at 8 to 10 a second, then the next decision and wheel command.
-    assert 380.0 < stages["debounce"] < 600.0
+    assert 30.0 < stages["debounce"] < 350.0  # two clear echoes of one sonar
     assert stages["total"] < 1000.0
 
 

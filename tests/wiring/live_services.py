@@ -155,6 +155,9 @@ class BusEdge:
     def on_connect(self, callback: Callable[[], Awaitable[None]]) -> None:
         """The broker never connects again."""
 
+    def on_connection_lost(self, callback: Callable[[], object]) -> None:
+        """The connection is never lost."""
+
 
 class MemoryStore:
     """A store without delay that is empty at the start."""

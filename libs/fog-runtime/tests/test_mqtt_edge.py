@@ -155,6 +155,8 @@ async def test_subscriptions_and_publishing_resume_after_a_restart_of_the_broker
         )
 
     a.on_connect(publish_on_connect)
+    lost = []
+    a.on_connection_lost(lambda: lost.append(a.connected))
     async with running(a, b):
         await a.publish(ch.NODE_READING, reading(1), node="n1")
         await until(lambda: seen == [1] and on_connect_results == [True], "no message before the crash")
@@ -166,6 +168,7 @@ async def test_subscriptions_and_publishing_resume_after_a_restart_of_the_broker
         assert counter("fognav_dropped_messages_total", ch.NODE_READING) == before + 1
         broker.start()
         await until(lambda: a.connected and b.connected and on_connect_results == [True, True], "no reconnection")
+        assert lost == [False]
         assert await a.publish(ch.NODE_READING, reading(3), node="n1")
         await until(lambda: seen == [1, 3], f"no message after the restart: {seen}")
 

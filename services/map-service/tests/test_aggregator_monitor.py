@@ -272,8 +272,12 @@ def test_area_that_the_aggregator_does_not_list_vanishes_from_the_map():
     with pytest.raises(RefusedMessageError, match="no area nowhere"):
         fog.layer.hazard("nowhere")
     fog.deliver(ch.AREA_DEFINITION, definition("gate"), area="gate")
-    fog.hear(GATE)
+    fog.hear(GATE)  # late, of the removed area
     fog.run(0.4, CLEAR, GATE)
+    assert fog.state("gate") == ("unknown", 200)
+    again = structs.replace(GATE, seq=GATE.seq + 1)
+    fog.hear(again)
+    fog.run(0.4, CLEAR, again)
     assert fog.state("gate") == ("blocked", 254)
 
 

@@ -73,6 +73,7 @@ class MqttEdge:
         self._will = will
         self._subscriptions = Subscriptions(clock, site=site)
         self._on_connect: list[Callable[[], Awaitable[None]]] = []
+        self._on_connection_lost: list[Callable[[], object]] = []
         self._client: aiomqtt.Client | None = None
         self._changed = asyncio.Event()
         self._tasks: set[asyncio.Future[Any]] = set()
@@ -156,6 +157,10 @@ class MqttEdge:
         """Run `callback` after every connection, once all subscriptions are made."""
         self._on_connect.append(callback)
 
+    def on_connection_lost(self, callback: Callable[[], object]) -> None:
+        """Run `callback` when a connection has ended, before the next one delivers anything."""
+        self._on_connection_lost.append(callback)
+
     async def publish(self, channel: Channel, message: Message | str, *, wait: bool = False, **ids: str) -> bool:
         """Publish; True when it was passed to the connection or, with `wait`, acknowledged by the broker (QoS 1).
 
@@ -230,10 +235,12 @@ class MqttEdge:
             pass
 
     def _on_disconnected(self) -> None:
-        self._client = None
+        was_connected, self._client = self._client is not None, None
         metrics.CONNECTED.labels("mqtt").set(0)
         for task in list(self._tasks):
             task.cancel()
+        for callback in self._on_connection_lost if was_connected else ():
+            callback()
 
     def _spawn(self, work: Awaitable[T], name: str) -> asyncio.Future[T]:
         task = asyncio.ensure_future(work)

@@ -126,6 +126,10 @@ class Aggregator:
         """Handle a message on one of the `source_topics`: they are the sensors' own, no channels of Fognav."""
         return self._announce(self._fusion.on_source(topic, payload, at.now, at.stamp, retained=retained))
 
+    def on_connection_lost(self, at: Moment) -> list[Publication]:
+        """Handle the loss of the connection to the broker: what changed meanwhile may never be told."""
+        return self._announce(self._fusion.on_connection_lost(at.stamp))
+
     def tick(self, at: Moment) -> list[Publication]:
         """End overrides, detect silent and flapping nodes, publish the heartbeat if it is due; call it at 10 Hz."""
         publications = self._announce([*self.overrides.tick(at), *self._fusion.tick(at.now, at.stamp)])

@@ -155,6 +155,12 @@ class AreaFusion:
             changed += self._evaluate(area, stamp)
         return changed
 
+    def on_connection_lost(self, stamp: float) -> list[AreaHazard]:
+        """Make unknown what sources said that publish on change only: their changes may be lost."""
+        return [
+            hazard for name in self._sources.on_connection_lost() for hazard in self._evaluate(self._areas[name], stamp)
+        ]
+
     def on_availability(self, node_id: str, online: bool, now: float, stamp: float) -> list[AreaHazard]:  # noqa: FBT001  # the topic's payload
         """Apply a node's availability message or last will; an offline node is unknown until its next readings."""
         changed: list[AreaHazard] = []

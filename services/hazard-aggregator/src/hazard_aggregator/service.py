@@ -81,6 +81,7 @@ class Service:
         self._edges.subscribe(self.core.handlers(), self._publisher.announce, numbers=self.core.thesis_numbers())
         self._edges.serve(self.core.query_handlers())
         self._mqtt.on_connect(self._publisher.republish_all)
+        self._mqtt.on_connection_lost(lambda: self._publisher.announce(self.core.on_connection_lost(self._edges.now())))
 
     async def tick_loop(self) -> None:
         """Tick the core, and report the broker connection's health."""

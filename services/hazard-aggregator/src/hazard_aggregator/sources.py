@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from itertools import chain
 from typing import TYPE_CHECKING, NamedTuple
 
 from hazard_aggregator.node_state import SourceState
@@ -58,6 +59,21 @@ class Sources:
             else Applied(area, source, _apply_value(area, source, payload, now, stamp, retained=retained))
             for area, source, availability in found
         ]
+
+    def on_connection_lost(self) -> set[str]:
+        """Forget what sources said that publish on change only; return the ids of their areas.
+
+        Their changes are lost while there is no connection, and a message that the broker kept comes again.
+        """
+        areas = set()
+        for area, source, _ in [*chain.from_iterable(self._exact.values()), *(one for _, one in self._wildcards)]:
+            if source.silent_after(area.definition.unknown) == math.inf:
+                source.pending = None
+                if source.source is not None and source.source.availability is not None:
+                    source.online = None
+                source.invalidate("the connection to the broker was lost, and it tells only changes")
+                areas.add(area.definition.id)
+        return areas
 
     def _add(self, topic: str | None, listener: _Listener) -> None:
         if topic is None:

@@ -29,7 +29,8 @@ def test_robot_arrives_within_its_tolerances_and_drives_smoothly(seed):
     assert done.acceleration_m_s2 <= 1.38
     assert done.jerk_m_s3 <= 5.1
     assert done.lateral_m_s2 <= 0.4
-    assert done.reversals_per_m < 2.0
+    # Most of them while it turns at its goal; a robot that wavers on its way has dozens.
+    assert round(done.reversals_per_m * done.distance_m) <= 6
 
 
 def test_reversals_are_changes_of_sign_without_what_is_no_intent_to_turn():

@@ -44,6 +44,7 @@ def _warm_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
         ["store", "restore"],
         ["store", "accept"],
         ["area", "override"],
+        ["area", "history"],
         *(["token", name] for name in ("create", "list", "revoke")),
         *(["zone", name] for name in ("add", "list", "show", "remove")),
         *(

@@ -284,6 +284,23 @@ def test_areas_are_listed_with_their_state(demo: Service) -> None:
     assert json.loads(run("area", "list", "--json"))["areas"] == areas
 
 
+def test_history_of_an_area_is_listed_with_how_long_each_state_lasted(demo: Service) -> None:
+    path = "/api/v1/areas/hall/history?limit="
+    period = {"began": 1_700_000_000.0, "state": "clear", "penalty": 0, "cause": "n1 sees nothing", "overridden": False}
+    blocked = {**period, "state": "blocked", "cause": "something at 0.62 m"}
+    periods = [
+        {"period": period, "ended": None, "lasted_s": 61.0},
+        {"period": blocked, "ended": 1_700_000_000.0, "lasted_s": 7260.0},
+    ]
+    demo.answers["GET", path + "20"] = (200, periods)
+    printed = run("area", "history", "hall")
+    assert ": clear until now, for 1 min 1 s, n1 sees nothing" in printed
+    assert ": blocked for 2 h 1 min, something at 0.62 m" in printed
+    assert json.loads(run("area", "history", "hall", "--json"))["periods"] == periods
+    demo.answers["GET", path + "1"] = (200, [])
+    assert run("area", "history", "hall", "--limit", "1") == "area hall has no history yet"
+
+
 def test_source_is_added_to_an_area_listed_and_removed(demo: Service) -> None:
     definition = {"id": "hall", "polygon": [[0, 0], [1, 0], [1, 1]], "nodes": ["n1"], "version": 3}
     demo.answers["GET", "/api/v1/areas/hall"] = (200, {"definition": definition})

@@ -1,6 +1,7 @@
 """`fognav area`: the watched areas of a running system."""
 
 from collections.abc import Mapping
+from datetime import UTC, datetime
 from typing import Annotated, Any, Literal
 
 import typer
@@ -10,7 +11,7 @@ from fognav.operate.options import FogOption, JsonOption, duration
 from fognav.operate.systems import AGGREGATOR
 from fognav.output import WrongUseError, exit_codes, print_json, print_line
 
-area_app = typer.Typer(help="List the watched areas, and override one.", no_args_is_help=True)
+area_app = typer.Typer(help="List the watched areas and their history, and override one.", no_args_is_help=True)
 
 
 @area_app.command("list", epilog="Example: fognav area list --json")
@@ -64,6 +65,29 @@ def area_override(  # noqa: PLR0913  # each option is an argument
             print_json({"area": area, "override": override})
         else:
             print_line(line)
+
+
+@area_app.command("history", epilog="Example: fognav area history z1 --limit 20")
+def area_history(
+    area: Annotated[str, typer.Argument(metavar="AREA", help="The area's id, as fognav area list shows it.")],
+    *,
+    limit: Annotated[int, typer.Option("--limit", min=1, max=1000, help="How many periods.")] = 20,
+    fog: FogOption = None,
+    json: JsonOption = False,
+) -> None:
+    """List the latest states of an area, newest first, and how long each lasted, restarts included."""
+    with exit_codes():
+        periods = find_fog(fog).get(AGGREGATOR, f"/api/v1/areas/{area}/history?limit={limit}")
+        if json:
+            print_json({"area": area, "periods": periods})
+            return
+        for view in periods:
+            period = view["period"]
+            began = datetime.fromtimestamp(period["began"], UTC).astimezone().isoformat(" ", "seconds")
+            lasted = ("for " if view["ended"] is not None else "until now, for ") + _length(view["lasted_s"])
+            print_line(f"{began}: {period['state']} {lasted}, {period['cause']}")
+        if not periods:
+            print_line(f"area {area} has no history yet")
 
 
 def _line(area: Mapping[str, Any]) -> str:

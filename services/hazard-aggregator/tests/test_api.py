@@ -37,6 +37,32 @@ async def test_areas_are_changed_by_version_and_survive_a_kill(fog, client, toke
     assert (kept["polygon"], kept["debounce"]["to_blocked"], kept["version"]) == (POLYGON, 3, 1)
 
 
+async def test_history_continues_over_a_kill(fog, client, tokens):
+    override = {"state": "blocked", "reason": "wet floor", "ttl_s": 600}
+    put = await client.put("/api/v1/areas/hall/override", json=override, headers=tokens["operator"])
+    assert put.status_code == 200, put.text
+
+    async def blocked(client: httpx.AsyncClient) -> dict:
+        answer = await client.get("/api/v1/areas/hall/history?limit=1")
+        async with asyncio.timeout(60):
+            while [view["period"]["state"] for view in answer.json()] != ["blocked"]:
+                await asyncio.sleep(0.05)
+                answer = await client.get("/api/v1/areas/hall/history?limit=1")
+        return answer.json()[0]
+
+    before = await blocked(client)
+    older = await client.get("/api/v1/areas/hall/history")
+    assert [view["period"]["state"] for view in older.json()] == ["blocked", "unknown"]
+    fog.kill("hazard_aggregator")
+    fog.start("hazard_aggregator")
+    async with httpx.AsyncClient(base_url=await fog.ready("hazard_aggregator")) as again:
+        after = await blocked(again)
+        assert (await again.get("/api/v1/areas/nowhere/history")).status_code == 404
+        assert (await again.get("/api/v1/areas/hall/history?cursor=x")).status_code == 422
+    assert (after["period"], after["ended"]) == (before["period"], None)
+    assert after["lasted_s"] > before["lasted_s"]
+
+
 async def test_one_of_eight_concurrent_changes_to_a_version_succeeds(fog, client, tokens):
     async def put(number: int) -> httpx.Response:
         body = {"polygon": POLYGON, "nodes": ["n1"], "label": f"by writer {number}"}

@@ -88,6 +88,32 @@ async def test_restarted_aggregator_restores_the_blocked_area(fog, until):
         assert node.hazards[-1].penalty == 254
 
 
+async def test_blocked_period_lasts_from_its_first_announcement_whenever_the_aggregator_is_killed(fog, until):
+    fog.start("hazard_aggregator")
+    await fog.ready("hazard_aggregator")
+    async with connected_node(fog) as (node, _):
+        await node.read(0.8, 5)
+        await until(lambda: node.state == "blocked", "blocked")
+        since = node.hazards[-1].since
+        for _ in range(2):  # the first time before Redis has the period
+            epoch = node.hazards[-1].epoch
+            fog.kill("hazard_aggregator")
+            fog.start("hazard_aggregator")
+            await until(lambda epoch=epoch: node.hazards[-1].epoch > epoch, "restarted")
+        url = await fog.ready("hazard_aggregator")
+        await until(lambda: node.state == "unknown", "unknown because its node is silent")
+        ended = node.hazards[-1].since
+        async with httpx.AsyncClient() as client, asyncio.timeout(60):
+            blocked = []
+            while not blocked or blocked[0]["ended"] is None:
+                views = (await client.get(f"{url}/api/v1/areas/hall/history")).json()
+                blocked = [view for view in views if view["period"]["state"] == "blocked"]
+                await asyncio.sleep(0.05)
+    assert len(blocked) == 1
+    assert blocked[0]["period"]["began"] == pytest.approx(since, abs=0.2)
+    assert blocked[0]["lasted_s"] == pytest.approx(ended - since, abs=0.4)
+
+
 async def test_broker_that_lost_its_data_gets_everything_again(fog, until):
     fog.start("hazard_aggregator")
     await fog.ready("hazard_aggregator")

@@ -3,11 +3,14 @@
 import asyncio
 from pathlib import Path
 
+import msgspec
 import pytest
 from redis.asyncio import Redis
 
 from fog_contracts.messages import AreaDefinition, AreaHazard
+from fog_runtime.audit import CursorError
 from fog_supervisor.servers import Server, start_redis
+from hazard_aggregator.area_history import period_of
 from hazard_aggregator.debounce import make_rule
 from hazard_aggregator.registry import find_rule
 from hazard_aggregator.store import Audit, Store, StoreError, usable_areas
@@ -43,6 +46,35 @@ async def test_stored_hazards_and_areas_survive_kills_of_redis(redis: Server):
         await asyncio.to_thread(redis.kill)
         with pytest.raises(StoreError):
             await store.save_hazards([hazard(9)])
+
+
+async def test_period_of_an_area_is_written_once_continues_over_restarts_and_is_forgotten_after_90_days(redis: Server):
+    day = 86_400.0
+    blocked, clear = hazard(1), msgspec.structs.replace(hazard(2), state="clear", penalty=0)
+    again = msgspec.structs.replace(blocked, epoch=2)
+    relief, last = msgspec.structs.replace(clear, epoch=2), msgspec.structs.replace(blocked, epoch=2, seq=3)
+    written = [(blocked, 0.0), (clear, 10.0), (blocked, 10.0), (clear, 11.0), (again, 20.0)]
+    async with Store(redis.url, "test", timeout_s=5.0) as store:
+        for announced, stamp in written:
+            await store.begin_period(announced, period_of(announced, stamp))
+    async with Store(redis.url, "test", timeout_s=5.0) as store:
+        restarted = msgspec.structs.replace(again, epoch=3)
+        await store.begin_period(restarted, period_of(restarted, 50.0))
+        first = await store.history("hall", cursor=None, limit=2, now=60.0)
+        rest = await store.history("hall", cursor=first.next, limit=2, now=60.0)
+        assert [(v.period.state, v.period.began, v.ended, v.lasted_s) for v in [*first.periods, *rest.periods]] == [
+            ("blocked", 20.0, None, 40.0), ("clear", 10.0, 20.0, 10.0), ("blocked", 0.0, 10.0, 10.0),
+        ]  # fmt: skip
+        assert rest.next is None
+        for announced, stamp in ((relief, 80 * day), (last, 100 * day)):
+            later = msgspec.structs.replace(announced, epoch=4)
+            await store.begin_period(later, period_of(later, stamp))
+        kept = await store.history("hall", cursor=None, limit=9, now=101 * day)
+        assert [v.period.began for v in kept.periods] == [100 * day, 80 * day, 20.0], "the third ended 20 days ago"
+        gone = await store.history("hall", cursor=first.next, limit=9, now=101 * day)
+        assert gone.periods == []
+        with pytest.raises(CursorError):
+            await store.history("hall", cursor="1", limit=9, now=0.0)
 
 
 async def test_unreadable_record_is_left_out_and_the_others_are_loaded(redis: Server):

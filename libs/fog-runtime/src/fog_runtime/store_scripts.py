@@ -87,3 +87,33 @@ key.
 A deleted record leaves its version as the table's floor, above which every new record's version must be, so that a
 version never names two states. It is idempotent: a record that is already stored is left unchanged.
 """
+
+PERIOD: Final = f"""{_GUARD}
+local function field(entry, name)
+  for i = 1, #entry[2], 2 do if entry[2][i] == name then return entry[2][i + 1] end end
+end
+
+local last = redis.call('XREVRANGE', KEYS[3], '+', '-', 'COUNT', 1)[1]
+if last then
+  local epoch, seq = string.match(last[1], '(%d+)-(%d+)')
+  epoch, seq = tonumber(epoch), tonumber(seq)
+  if request.id_epoch < epoch or (request.id_epoch == epoch and request.id_seq <= seq)
+      or field(last, 'same') == request.same then
+    return {{'exists', writes, ''}}
+  end
+end
+redis.call('XADD', KEYS[3], 'MAXLEN', '~', request.entries,
+  string.format('%.0f-%.0f', request.id_epoch, request.id_seq), 'at', request.at, 'same', request.same,
+  'data', ARGV[2])
+while true do
+  local oldest = redis.call('XRANGE', KEYS[3], '-', '+', 'COUNT', 2)
+  if not oldest[2] or tonumber(field(oldest[2], 'at')) >= request.oldest then break end
+  redis.call('XDEL', KEYS[3], oldest[1][1])
+end
+return {{'ok', redis.call('HINCRBY', KEYS[2], request.table, 1), ''}}
+"""
+"""Begin a period in a history, unless it is known or the last one has the same text `same`; forget what ended long ago.
+
+Keys: `generation`, `writes`, history (a stream), epoch. `id_epoch` and `id_seq` order the periods; a period that is not
+newer than the last one is known.
+"""

@@ -42,6 +42,7 @@ from fog_runtime.http import (
 from fog_runtime.idempotency import IdempotencyError
 from hazard_aggregator.area_size import AreaError, check_size
 from hazard_aggregator.area_writer import ConflictError
+from hazard_aggregator.history_api import add_history
 from hazard_aggregator.override_api import OverrideView, add_overrides, override_view
 from hazard_aggregator.service import Service
 from hazard_aggregator.store import StoreError
@@ -99,7 +100,9 @@ def make_api(
     While `standby` returns a reason, nothing can be written.
     """
     app = make_app("Fognav hazard-aggregator", health, tokens, standby=standby)
-    _add_areas(Routes(app, "areas"), service, geometry, clock)
+    areas = Routes(app, "areas")
+    _add_areas(areas, service, geometry, clock)
+    add_history(areas, service, clock)
     _add_nodes(Routes(app, "nodes"), service, clock)
     recovery = Routes(app, "store")
     add_store_errors(recovery)

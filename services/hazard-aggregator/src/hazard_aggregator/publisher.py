@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from fog_contracts.handlers import Publication
     from fog_runtime.edges import Edges
     from hazard_aggregator.core import Aggregator
+    from hazard_aggregator.history_keeper import HistoryKeeper
 
 AREA_STATES: Final[tuple[str, ...]] = get_args(AreaState)
 
@@ -31,10 +32,11 @@ _log = logs.get("aggregator")
 class Publisher:
     """The way of the core's publications to the edges; `write_pending` is set while hazards must be stored."""
 
-    def __init__(self, core: Aggregator, edges: Edges) -> None:
+    def __init__(self, core: Aggregator, edges: Edges, history: HistoryKeeper) -> None:
         self.write_pending = asyncio.Event()
         self._core = core
         self._edges = edges
+        self._history = history
         self._logged: dict[str, int] = {}  # the seq of each area's last hazard in the log
 
     def announce(self, publications: Sequence[Publication]) -> None:
@@ -55,6 +57,8 @@ class Publisher:
         for publication in publications:
             _count(publication)
             self._edges.publish(publication)
+            if isinstance(hazard := publication.message, AreaHazard):
+                self._history.add(hazard, self._edges.now().stamp)
         WITHHELD.set(len(self._core.withheld()))
         UNSTORED.set(len(self._core.to_store()))
         if self._core.to_store():

@@ -11,6 +11,7 @@ from fog_runtime import logs
 from fog_runtime.clock import ticker
 from fog_runtime.edges import Edges
 from hazard_aggregator.area_writer import AreaWriter
+from hazard_aggregator.history_keeper import HistoryKeeper
 from hazard_aggregator.override_writer import OverrideWriter
 from hazard_aggregator.publisher import Publisher
 from hazard_aggregator.records import Records
@@ -69,11 +70,12 @@ class Service:
         self._clock = clock
         self._health = health
         self._edges = Edges(clock, mqtt=mqtt, zenoh=zenoh, gate=gate)
-        self._publisher = Publisher(core, self._edges)
+        self._leading = asyncio.Event()
+        self.history = HistoryKeeper(core, store, self._leading)
+        self._publisher = Publisher(core, self._edges, self.history)
         self.records = Records(core, store, self._publisher, mqtt, self._edges, clock, health, boot)
         self.areas = AreaWriter(core, store, self.records, self._publisher, self._edges, clock)
         self.overrides = OverrideWriter(core, store, self.records, self._publisher, self._edges, clock, boot)
-        self._leading = asyncio.Event()
         self._limited = logs.RateLimited(_log)
 
     def subscribe(self) -> None:

@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, NamedTuple
+import re
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
+import msgspec
 from msgspec import structs
 
 from fog_contracts.messages import AreaDefinition, AreaHazard, Message
-from fog_runtime import logs
+from fog_runtime import logs, store_scripts
+from fog_runtime.audit import CursorError
 from fog_runtime.redis_store import Audit, Outcome, RecoveryError, RedisStore, StoreError, StoreLostError, Table
+from hazard_aggregator.area_history import (
+    MAX_PERIODS,
+    RETENTION_S,
+    HistoryPage,
+    Period,
+    page_of,
+    sameness,
+)
 from hazard_aggregator.area_override import AreaOverride, Rest
 from hazard_aggregator.area_size import AreaError, check_size
 
@@ -34,6 +45,8 @@ _HAZARDS: Final = "hazards"
 _OVERRIDES: Final = Table("overrides", "override")
 _RESTS: Final = "override_rests"
 _ALL: Final = "all"
+_HISTORY: Final = "history"
+_CURSOR: Final = re.compile(r"[0-9]{1,15}-[0-9]{1,15}")
 
 _log = logs.get("store")
 
@@ -109,6 +122,28 @@ class Store(RedisStore):
         """Replace the stored rests of all overrides."""
         await self._write_records(_RESTS, {_ALL: _AllRests(overrides=rests)})
 
+    async def begin_period(self, hazard: AreaHazard, period: Period) -> None:
+        """Begin a period of an area's history durably, unless Redis has it, or it only continues the last one."""
+        keys = [self._key(name) for name in ("generation", "writes", f"{_HISTORY}:{hazard.area}", self._epoch_key)]
+        arguments = {
+            "id_epoch": hazard.epoch,
+            "id_seq": hazard.seq,
+            "at": f"{period.began:.3f}",
+            "same": sameness(period),
+            "oldest": period.began - RETENTION_S,
+            "entries": MAX_PERIODS,
+        }
+        await self._run(store_scripts.PERIOD, keys, _HISTORY, arguments, msgspec.json.encode(period))
+
+    async def history(self, area: str, *, cursor: str | None, limit: int, now: float) -> HistoryPage:
+        """Return a page of an area's history at `now` (s since the epoch); raises `CursorError` and `StoreError`."""
+        if cursor is not None and _CURSOR.fullmatch(cursor) is None:
+            raise CursorError(f"{cursor!r} is no cursor: take the address of the next page from the Link header")
+        key = self._key(f"{_HISTORY}:{area}")
+        reply = await self._redis.read("XREVRANGE", key, cursor or "+", "-", "COUNT", limit + 2)
+        found = [(entry_id.decode(), fields) for entry_id, fields in reply]
+        return page_of([(name, _data(fields)) for name, fields in found], cursor=cursor, limit=limit, now=now)
+
     async def earlier_override(self, attempt: Attempt | None) -> AreaOverride | None:
         """Return the override that an earlier attempt with the same idempotency key stored."""
         return await self.recall(attempt, AreaOverride)
@@ -126,6 +161,11 @@ class Store(RedisStore):
             _RESTS: {_ALL: _AllRests(overrides=known.rests)},
         }
         await self._adopt(tables, audit)
+
+
+def _data(fields: Any) -> bytes:  # noqa: ANN401  # as redis gives them
+    pairs = fields if isinstance(fields, dict) else dict(zip(fields[::2], fields[1::2], strict=True))
+    return bytes(pairs[b"data"])
 
 
 async def load_at_start(store: Store) -> tuple[Stored, bool]:

@@ -8,11 +8,10 @@ import io
 import secrets
 from collections.abc import Callable
 from typing import Annotated, Final, Literal
-from urllib.parse import urlencode
 
 import msgspec
 import numpy as np
-from fastapi import Depends, FastAPI, Query, Response
+from fastapi import FastAPI, Response
 from PIL import Image
 
 from fog_contracts.messages import (
@@ -42,6 +41,7 @@ from fog_runtime.http import (
     IfMatch,
     IfNoneMatch,
     Operator,
+    PageSize,
     ProblemError,
     Routes,
     Tokens,
@@ -53,6 +53,7 @@ from fog_runtime.http import (
     expected_version,
     make_app,
     must_be_new,
+    next_page,
 )
 from fog_runtime.http.routes import InvalidBodyError
 from fog_runtime.idempotency import Attempt, IdempotencyError
@@ -65,16 +66,6 @@ from map_service.zone_validation import ZoneError
 from map_service.zone_writer import ConflictError
 
 AuditKind = Literal["area", "mission", "override", "robot", "store", "zone"]
-
-
-def _page_size(
-    limit: Annotated[int, Query(description="The most entries of a page: at least 1 and at most 1000 count")] = 100,
-) -> int:
-    return max(1, min(limit, 1000))
-
-
-PageSize = Annotated[int, Depends(_page_size)]
-"""The parameter `limit`, brought into its bounds before it is passed on."""
 
 Image.preinit()  # the first picture would load PIL's formats, while the map is served
 
@@ -225,9 +216,7 @@ def _add_audit(routes: Routes, service: Service) -> None:
     ) -> Answer[list[AuditEntry]]:
         """Return the audit trail of all services, newest first; the Link header has the next page's address."""
         page = await service.audit(KINDS if kind is None else (kind,), cursor, limit)
-        query = {"kind": kind, "cursor": page.next, "limit": limit}
-        address = urlencode({name: value for name, value in query.items() if value is not None})
-        return Answer(page.entries, {"Link": f'</api/v1/audit?{address}>; rel="next"'} if page.next else {})
+        return Answer(page.entries, next_page("/api/v1/audit", page.next, limit, kind=kind))
 
 
 def _add_errors(routes: Routes) -> None:

@@ -2,6 +2,7 @@
 
 from fog_runtime.http.app import make_app
 from fog_runtime.http.front import Front, FrontError, unused
+from fog_runtime.http.paging import PageSize, next_page
 from fog_runtime.http.problems import RETRY_AFTER, ProblemError
 from fog_runtime.http.routes import Answer, Body, ClientHost, Encoded, IfMatch, Routes, etag, expected_version
 from fog_runtime.http.store_routes import (
@@ -29,6 +30,7 @@ __all__ = [
     "IfMatch",
     "IfNoneMatch",
     "Operator",
+    "PageSize",
     "ProblemError",
     "Routes",
     "Tokens",
@@ -42,6 +44,7 @@ __all__ = [
     "load_tokens",
     "make_app",
     "must_be_new",
+    "next_page",
     "token_hash",
     "unused",
 ]

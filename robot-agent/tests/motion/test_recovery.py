@@ -180,6 +180,18 @@ def test_no_move_brings_the_body_nearer_to_anything_than_its_padding(things, the
         assert distance(body, reached, points) >= min(begin, PADDING) - 0.006
 
 
+@pytest.mark.parametrize("theta", [0.0, 3.1])
+def test_trail_that_ends_where_the_robot_stands_gives_no_move(theta):
+    pose = Pose2(1.5, 1.5, theta)
+    for here in ([(1.5, 1.5)], [(1.503, 1.5)], np.zeros((0, 2))):
+        move = RecoveryMove(trail=np.array(here, dtype=np.float64).reshape(-1, 2))
+        assert recovery_speeds(move, pose, around([]), ROUND, PADDING, 0.3) == (0.0, 0.0)
+    # The sign of a zero decides what the arc's formula divides by.
+    there = Pose2(0.0, 0.0, math.pi)
+    move = RecoveryMove(trail=np.array([(0.0, 0.0)]))
+    assert recovery_speeds(move, there, around([], x=0.0, y=0.0), ROUND, PADDING, 0.3) == (0.0, 0.0)
+
+
 def test_unknown_places_are_not_free():
     field = around([])
     free, off = (np.array([value]) for value in (1.5, 9.0))

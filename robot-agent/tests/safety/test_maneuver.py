@@ -103,6 +103,35 @@ def test_fault_during_an_egress_is_latched(fault):
     assert gate.run(request="reset").mode == "INIT"
 
 
+def test_reset_of_a_base_fault_that_comes_in_the_same_step_ends_the_egress_in_init():
+    gate = Gate().leaving()
+    out = gate.run(request="reset", base_fault="the bumper is pressed (left)")
+    assert (out.refusal, out.mode, out.stop) == (None, "INIT", "immediate")
+    assert "the egress ended: base: the bumper is pressed (left)" in out.reasons
+    assert gate.run(5.0).mode == "INIT"
+
+
+RESTING = {"resting": "waking up: its lidar starts", "lidar_age": 700.0, "scan_age": 700.0}
+
+
+def test_egress_of_a_resting_robot_waits_for_its_lidar_and_counts_from_then():
+    gate = Gate()
+    out = gate.run(request="egress", **RESTING)
+    assert (out.refusal, out.mode, out.stop) == (None, "INIT", "immediate")
+    assert out.reasons[-1] == "leaves the blocked area as soon as its lidar runs"
+    assert gate.run(70.0, **RESTING).stop == "immediate"
+    assert gate.run().mode == "EGRESS"
+    assert gate.run(9.8).mode == "EGRESS"
+    assert gate.run(0.4).mode == "INIT"
+
+
+def test_lidar_that_does_not_start_ends_an_egress_that_waits_for_it():
+    gate = Gate()
+    gate.run(request="egress", **RESTING)
+    assert "the lidar has been silent" in "; ".join(gate.run(lidar_age=700.0, scan_age=700.0).reasons)
+    assert gate.run(5.0).mode == "INIT"
+
+
 def test_egress_is_refused_outside_and_an_enable_during_one():
     assert "nothing to leave" in Gate().run(request="egress", inside_blocked=None).refusal
     gate = Gate().leaving()

@@ -27,6 +27,8 @@ _SLOWEST_RAD_S: Final = 1e-3
 _GAIN_PER_S: Final = 2.0
 _AIM_M: Final = 0.15
 """The robot aims at the point of its trail this far behind it."""
+_HERE_M: Final = 0.005
+"""A point of the trail that is nearer than this is where the robot stands."""
 _ASIDE_RAD: Final = 0.3
 """If its trail leads farther to a side than this, the robot first turns its back on it."""
 _LOOK_M: Final = 0.1
@@ -85,7 +87,10 @@ def _wanted(move: RecoveryMove, pose: Pose2, cap: float) -> tuple[float, float]:
     behind = pose.inverse_transform(move.trail)
     along = np.hypot(behind[:, 0], behind[:, 1])
     far = np.flatnonzero(along >= _AIM_M)
-    x, y = (float(value) for value in behind[far[0] if len(far) else -1])
+    point = far[0] if len(far) else -1
+    if along[point] < _HERE_M:
+        return 0.0, 0.0  # no direction leads to where the robot is
+    x, y = (float(value) for value in behind[point])
     aside = math.atan2(-y, -x)
     if abs(aside) > _ASIDE_RAD:
         return 0.0, _turn(aside)

@@ -147,7 +147,10 @@ def _reset(state: SafetyState, inputs: SafetyInputs, config: SafetyConfig) -> tu
     present = [finding.reason for finding in causes if finding.level == Level.FAULT]
     if present:
         return state, f"the cause is still there: {'; '.join(present)}"
-    return replace(state, mode="INIT", enabled=False, latched=(), stops=()), None
+    reset = replace(state, mode="INIT", enabled=False, latched=(), stops=(), maneuver=None)
+    if state.maneuver is not None:
+        reset = replace(reset, maneuver_end=f"the egress ended: base: {inputs.base_fault}")
+    return reset, None
 
 
 def _begin_egress(
@@ -184,11 +187,12 @@ def _enable(state: SafetyState, inputs: SafetyInputs, findings: list[Finding]) -
 def _maneuver(
     state: SafetyState, running: Maneuver, inputs: SafetyInputs, now: float, config: SafetyConfig
 ) -> SafetyState:
-    """Go on with a maneuver, or end it: in FAULT, or waiting to be enabled."""
+    """Go on with a maneuver, or end it: in FAULT, or waiting to be enabled. While the lidar is woken it waits."""
     findings = collect_findings(maneuver.relevant(inputs), config)
     result = maneuver.proceed(running, inputs, findings, now, config)
     if isinstance(result, Maneuver):
-        return replace(state, mode="EGRESS", stops=(), stopped_since=math.inf, maneuver=result)
+        mode: Mode = "EGRESS" if inputs.resting is None else "INIT"
+        return replace(state, mode=mode, stops=(), stopped_since=math.inf, maneuver=result)
     ended = replace(state, mode="INIT", maneuver=None, maneuver_end=f"the egress ended: {result}")
     faults = tuple(finding for finding in findings if finding.level == Level.FAULT)
     if not faults:
@@ -275,6 +279,8 @@ def _reasons(state: SafetyState, findings: list[Finding]) -> tuple[str, ...]:
     if state.mode == "FAULT":
         latched = [finding.reason for finding in state.latched]
         return (*latched, *(reason for reason in current if reason not in latched))
+    if state.maneuver is not None and state.mode == "INIT":
+        return (*current, "leaves the blocked area as soon as its lidar runs")
     if state.mode == "INIT":
         ended = (state.maneuver_end,) if state.maneuver_end else ()
         return (*current, *ended, "waiting for an operator to enable")

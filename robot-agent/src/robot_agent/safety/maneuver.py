@@ -37,7 +37,8 @@ def begin(inputs: SafetyInputs, now: float, config: SafetyConfig) -> Maneuver | 
     """Return an egress that begins at `now` (s, monotonic), or why there can't be one."""
     if inputs.inside_blocked is None:
         return "the robot is in no blocked area or zone: there is nothing to leave"
-    causes = [finding.reason for finding in collect_findings(relevant(inputs), config) if finding.level >= Level.HOLD]
+    findings = collect_findings(relevant(inputs), config)
+    causes = [finding.reason for finding in findings if finding.level >= Level.HOLD and not finding.rest]
     if causes:
         return f"the robot must not move: {'; '.join(causes)}"
     return Maneuver(now, math.inf, now)
@@ -48,11 +49,14 @@ def proceed(
 ) -> Maneuver | str:
     """Return the egress as it goes on at `now` (s, monotonic), or why it ends.
 
-    findings: those of the `relevant` inputs. The distance to the end of the way out must shrink steadily.
+    findings: those of the `relevant` inputs. The distance to the end of the way out must shrink steadily. The time
+    counts from when the lidar runs.
     """
-    stops = [finding.reason for finding in findings if finding.level >= Level.HOLD]
+    stops = [finding.reason for finding in findings if finding.level >= Level.HOLD and not finding.rest]
     if stops:
         return "; ".join(stops)
+    if inputs.resting is not None:
+        return replace(maneuver, since=now, shrank_at=now)
     if inputs.egress_remaining <= config.egress_end:
         still = inputs.inside_blocked
         return "the robot is out" if still is None else f"the way out ends, and the robot is still in {still}"

@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import itertools
 import json
+import threading
 import time
 from collections import Counter
 
@@ -363,6 +364,19 @@ async def test_processes_are_present_for_as_long_as_their_sessions_are_open(rout
                 await until_present(observer, {("planner", "p1"), ("robot-agent", "r1")})
             await until_present(observer, {("planner", "p1")})
         await until_present(observer, set())
+
+
+async def test_question_for_the_present_processes_ends_though_the_link_lets_nothing_be_asked(router):
+    freed = threading.Event()
+    async with edge(router.endpoint) as observer:
+        # As when queries block because a connection is congested: no thread is left to ask with.
+        blocked = [asyncio.ensure_future(observer.in_thread(freed.wait)) for _ in range(4)]
+        try:
+            async with asyncio.timeout(60):
+                assert await observer.present(0.05) == set()
+        finally:
+            freed.set()
+        await asyncio.gather(*blocked)
 
 
 async def test_wrong_channel_ids_or_message_type_raises(router):

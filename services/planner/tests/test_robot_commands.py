@@ -6,6 +6,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
 import httpx
+import msgspec
 import pytest
 
 from fog_contracts import channels as ch
@@ -42,6 +43,7 @@ class Robot:
         self.clock = ManualClock(100.0)
         self.received: list[RobotCommand] = []
         self.records: list[tuple[str, str, bytes]] = []
+        self.stops: list[tuple[str, str, dict[str, Any]]] = []
         self.answers = True
         self.refusal = ""
         self.store_error: Exception | None = None
@@ -63,6 +65,11 @@ class Robot:
         if self.store_error:
             raise self.store_error
         self.records.append((robot, audit.who, command))
+
+    async def record_stop(self, robot: str, stop: bytes, audit: Any) -> None:
+        if self.store_error:
+            raise self.store_error
+        self.stops.append((robot, audit.who, msgspec.json.decode(stop)))
 
     def state(self, mode: Any = "INIT") -> None:
         state = RobotState(
@@ -148,6 +155,31 @@ async def test_anybody_stops_a_robot_whatever_else_is_missing(rig: Rig) -> None:
     assert rig.robot.received[0].operator.startswith("stop from ")
     rig.robot.clock.advance(60.0)
     assert (await rig.client.post("/api/v1/robots/r1/stop")).status_code == 200
+
+
+async def test_flood_of_stops_without_a_token_stops_each_time_and_fills_no_audit_trail(rig: Rig) -> None:
+    for _ in range(300):
+        assert (await rig.client.post("/api/v1/robots/r1/stop")).status_code == 200
+    assert len(rig.robot.received) == 300
+    assert rig.robot.records == [], "operators' commands have a trail of their own"
+    assert [stop[2] for stop in rig.robot.stops] == [{"kind": "disable"}]
+    rig.robot.clock.advance(600.0)
+    rig.robot.store_error = StoreError("Redis is away")
+    await rig.operator.record_repeated_stops()
+    rig.robot.store_error = None
+    await rig.operator.record_repeated_stops()
+    await rig.operator.record_repeated_stops()
+    sender = rig.robot.received[0].operator
+    assert rig.robot.stops[1:] == [("r1", sender, {"kind": "disable", "repeats": {sender: 299}, "period_s": 600.0})]
+
+
+async def test_stop_that_could_not_be_recorded_is_told_of_later(rig: Rig) -> None:
+    rig.robot.store_error = StoreError("Redis is away")
+    assert (await rig.client.post("/api/v1/robots/r1/stop")).status_code == 200
+    rig.robot.store_error = None
+    rig.robot.clock.advance(600.0)
+    await rig.operator.record_repeated_stops()
+    assert [stop[2]["repeats"] for stop in rig.robot.stops] == [{rig.robot.received[0].operator: 1}]
 
 
 async def test_command_that_can_not_be_recorded_or_is_not_the_leaders_is_not_sent(rig: Rig) -> None:

@@ -6,6 +6,7 @@ session can't be opened while no router is up; what was declared before is decla
 """
 
 import asyncio
+import contextlib
 import inspect
 import json
 import random
@@ -45,6 +46,8 @@ _QUEUE: Final = 4096
 _PENDING_QUERIES: Final = 64
 _PENDING_OF_ONE: Final = 16
 """How many queries on one key may wait for their answers: of all askers, and of one session."""
+PRESENCE_GRACE_S: Final = 0.5
+"""How much longer than asked for a question for the present processes may take (real seconds)."""
 ASKER: Final[ContextVar[str]] = ContextVar("asker", default="")
 """The session that asks, by its id, in the handler of a query; empty if it did not say."""
 _RETRY_S: Final = (0.2, 1.0)
@@ -428,7 +431,8 @@ class ZenohEdge:
     async def present(self, timeout_s: float = 2.0) -> set[tuple[str, str]]:
         """Return role and id of each process whose session is open now, as far as its router knows it.
 
-        Empty while this process has no router; waits for answers of other routers for `timeout_s` (real seconds).
+        Empty while this process has no router. Waits for answers of other routers for `timeout_s` (real seconds), and
+        for nothing longer than `PRESENCE_GRACE_S` more: on a congested link, even asking may block.
         """
         session = self._session
         if session is None:
@@ -450,8 +454,10 @@ class ZenohEdge:
             zenoh.handlers.Callback(on_reply, lambda: self.call(done.set)),
             timeout=timeout_s,
         )
-        await self.in_thread(get)
-        await done.wait()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(timeout_s + PRESENCE_GRACE_S):
+                await self.in_thread(get)
+                await done.wait()
         return found
 
     # --- For the other classes of this module -----------------------------------------------------------------------

@@ -57,6 +57,7 @@ async def main() -> None:
             async with asyncio.TaskGroup() as tasks:
                 tasks.create_task(leadership.run(service), name="lease")
                 tasks.create_task(service.store_loop(), name="store")
+                tasks.create_task(service.operator.record_loop(), name="stops")
                 tasks.create_task(service.snapshot_loop(), name="snapshot")
                 tasks.create_task(service.tick_loop(), name="tick")
                 tasks.create_task(service.plan_loop(), name="plan")

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from fog_contracts.messages import CommandKind, Id, Message, Metres, Mode, Pose, Radians
+from fog_contracts.messages import CommandKind, CommandReply, Id, Message, Metres, Mode, Pose, Radians
 from fog_contracts.site import Site
 from fog_runtime.http import Body, ClientHost, Operator, ProblemError, Routes
 from planner.robot_commands import CommandError, RobotOperator
@@ -48,9 +48,7 @@ def add_commands(
         lambda error: ProblemError(504, str(error)),
     )
 
-    async def send(robot: str, kind: CommandKind, who: str, pose: Pose | None = None) -> CommandOutcome:
-        check(robot)
-        reply = await operator.send(kind, robot, who, pose)
+    def outcome(robot: str, reply: CommandReply) -> CommandOutcome:
         if not reply.accepted:
             raise ProblemError(409, reply.reason, mode=mode(robot))
         return CommandOutcome(accepted=True, reason=reply.reason, mode=mode(robot))
@@ -62,7 +60,8 @@ def add_commands(
     )
     async def post_command(robot: str, body: Body[CommandBody], caller: Operator) -> CommandOutcome:
         """Command a robot; the robot itself accepts or refuses."""
-        return await send(robot, body.kind, caller.name, _pose(body, site))
+        check(robot)
+        return outcome(robot, await operator.send(body.kind, robot, caller.name, _pose(body, site)))
 
     @routes.post(
         "/api/v1/robots/{robot}/stop",
@@ -71,7 +70,8 @@ def add_commands(
     )
     async def stop(robot: str, client: ClientHost) -> CommandOutcome:
         """Stop a robot at once. Anybody may: this needs no token. An operator must enable it again."""
-        return await send(robot, "disable", f"stop from {client or 'an unknown address'}")
+        check(robot)
+        return outcome(robot, await operator.stop(robot, f"stop from {client or 'an unknown address'}"))
 
 
 def _pose(body: CommandBody, site: Site) -> Pose | None:

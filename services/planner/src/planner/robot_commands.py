@@ -14,7 +14,9 @@ import msgspec
 from fog_contracts.codec import ContractError
 from fog_contracts.commands import STOPS
 from fog_runtime import logs
+from fog_runtime.clock import ticker
 from fog_runtime.robot_commands import REPLY_TIMEOUT_S, RobotCommands
+from planner.stop_records import PERIOD_S, StopRecords
 from planner.store import Audit, StoreError
 
 if TYPE_CHECKING:
@@ -25,6 +27,8 @@ if TYPE_CHECKING:
 
 STATE_MAX_AGE_S: Final = 3.0
 """A command names the robot's clock by its latest state, which comes once a second."""
+
+_RECORDS_PERIOD_S: Final = 10.0
 
 _log = logs.get("planner")
 
@@ -43,6 +47,7 @@ class RobotOperator:
         self._key = key
         self._states: dict[str, tuple[RobotState, float]] = {}
         self._changed: dict[str, asyncio.Event] = {}
+        self._stops = StopRecords()
 
     def on_state(self, robot: str, state: RobotState, now: float) -> None:
         """Record a robot's state, which arrived at `now` (s, monotonic)."""
@@ -69,17 +74,50 @@ class RobotOperator:
         It is recorded in the audit trail first, a stop afterwards. Raises `CommandError`, and `StoreError` for a
         command that could not be recorded and was not sent.
         """
-        state = None if kind in STOPS else self._fresh_state(robot)
-        if kind not in STOPS:
-            await self._record(kind, robot, who, pose)
+        if kind in STOPS:
+            try:
+                return await self._deliver(kind, robot, who)
+            finally:
+                await self._record_stop(robot, {"kind": kind}, who, kind)
+        state = self._fresh_state(robot)
+        detail = {"kind": kind, **({} if pose is None else {"pose": pose})}
+        await self._store.record_command(robot, msgspec.json.encode(detail), Audit(self._clock.stamp(), who, kind))
+        return await self._deliver(kind, robot, who, state, pose)
+
+    async def stop(self, robot: str, sender: str) -> CommandReply:
+        """Stop a robot for somebody without a token; return its reply. Repetitions are recorded together.
+
+        Raises `CommandError`.
+        """
+        try:
+            return await self._deliver("disable", robot, sender)
+        finally:
+            alone = self._stops.count(robot, sender, self._clock.now())
+            if alone and not await self._record_stop(robot, {"kind": "disable"}, sender, "stop", anybody=True):
+                self._stops.unrecorded(robot, sender)
+
+    async def record_loop(self) -> None:
+        """Record, from time to time, how often stops without a token were repeated."""
+        async for _ in ticker(self._clock, _RECORDS_PERIOD_S):
+            await self.record_repeated_stops()
+
+    async def record_repeated_stops(self) -> None:
+        """Record how often stops without a token were repeated, for the robots for which that is due."""
+        for robot, repeats in self._stops.due(self._clock.now()).items():
+            detail = {"kind": "disable", "repeats": repeats, "period_s": PERIOD_S}
+            most = max(repeats, key=repeats.__getitem__)
+            if await self._record_stop(robot, detail, most, "stop", anybody=True):
+                self._stops.recorded(robot, repeats, self._clock.now())
+
+    async def _deliver(
+        self, kind: CommandKind, robot: str, who: str, state: RobotState | None = None, pose: Pose | None = None
+    ) -> CommandReply:
+        """Send a command, which needs a state unless it is a stop; raises `CommandError`."""
         commands = RobotCommands(self._zenoh, operator=who, key=self._key)
         try:
             reply = await commands.send(kind, robot, state, pose, REPLY_TIMEOUT_S * max(1.0, self._clock.speed))
         except ContractError as error:
             raise CommandError(f"robot {robot} gave an invalid reply: {error}. Check that versions match") from error
-        finally:
-            if kind in STOPS:
-                await self._record_stop(kind, robot, who)
         if reply is None:
             raise CommandError(
                 f"robot {robot} did not answer within {REPLY_TIMEOUT_S:.0f} s: check that its agent runs and is"
@@ -102,16 +140,15 @@ class RobotOperator:
     def _age(self, received_at: float) -> float:
         return self._clock.now() - received_at
 
-    async def _record(self, kind: CommandKind, robot: str, who: str, pose: Pose | None) -> None:
-        detail = msgspec.json.encode({"kind": kind, **({} if pose is None else {"pose": pose})})
-        await self._store.record_command(robot, detail, Audit(self._clock.stamp(), who, kind))
-
-    async def _record_stop(self, kind: CommandKind, robot: str, who: str) -> None:
-        """Record a stop once it was sent: it must reach the robot whatever the store does."""
+    async def _record_stop(self, robot: str, detail: object, who: str, action: str, *, anybody: bool = False) -> bool:
+        """Record a stop once it was sent: it must reach the robot whatever the store does. Return whether it could."""
+        record = self._store.record_stop if anybody else self._store.record_command
         try:
-            await self._record(kind, robot, who, None)
+            await record(robot, msgspec.json.encode(detail), Audit(self._clock.stamp(), who, action))
         except StoreError as error:
             _log.error("stop_not_recorded", robot=robot, who=who, reason=str(error))
+            return False
+        return True
 
 
 def _silent(robot: str) -> str:

@@ -48,6 +48,10 @@ class Store(RedisStore):
         """Record an operator's command to a robot (JSON) in the audit trail."""
         await self._record("robot", robot, command, audit)
 
+    async def record_stop(self, robot: str, stop: bytes, audit: Audit) -> None:
+        """Record a stop without a token (JSON), apart from what operators command: anybody may send any number."""
+        await self._record("stop", robot, stop, audit)
+
     async def earlier_result(self, attempt: Attempt | None) -> StoredGoal | None:
         """Return the mission that an earlier attempt with the same idempotency key stored."""
         return await self.recall(attempt, StoredGoal)

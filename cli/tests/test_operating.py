@@ -337,6 +337,8 @@ def test_source_may_be_given_as_json_and_wrong_ones_are_refused_before_anything_
     assert (added["source"]["pointer"], added["source"]["penalty"]) == ("/gas", 120)
     asked = len(demo.requests)
     assert "--source is no JSON object" in run("source", "add", "gas", "--area", "hall", "--source", "[", code=2)
+    aimless = run("source", "add", "gas", "--area", "hall", "--source", text, "--hysteresis", "2", code=2)
+    assert "--hysteresis needs the limit that it is of" in aimless
     assert "source gas: Expected" in run("source", "add", "gas", "--area", "hall", "--source", '{"topic": 7}', code=2)
     assert len(demo.requests) == asked
     assert "zigbee2mqtt-contact: zigbee2mqtt/{device}" in run("source", "profiles")

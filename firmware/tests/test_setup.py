@@ -415,6 +415,30 @@ def test_update_that_fails_once_succeeds_five_minutes_later(board):
     assert board.started
 
 
+def test_offer_with_a_corrected_address_is_taken_between_the_attempts_of_the_wrong_one(board):
+    board.reachable = False
+    assert board.offer(url="http://fog.local/misspelt.bin") is None
+    assert len(board.run(1)) == 1
+    board.reachable = True
+    assert board.offer() is None
+    assert board.run(10) == []
+    assert (board.started, board.remembered) == (True, 6)
+
+
+def test_newer_offer_ends_the_fetch_of_an_older_one_and_a_refused_one_does_not(board):
+    board.stalls_at = 600
+    assert board.offer() is None
+    assert board.run(1) == []
+    assert "older" in board.offer(number=4)
+    assert board.offer() is None
+    assert board.calls == [("open", "http://fog.local/n1.bin", len(IMAGE))], "what is under way goes on"
+    board.stalls_at = 10**9
+    assert board.offer(number=7) is None
+    assert board.calls[1:] == [("close",), ("abandon",)]
+    assert board.run(10) == []
+    assert (board.started, board.remembered) == (True, 7)
+
+
 def test_update_that_the_board_itself_refuses_is_not_tried_again(board):
     board.accepts = False
     assert board.offer() is None

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
     from fog_contracts.channels import Channel, Role
     from fog_contracts.messages import Message
+    from fog_runtime.mqtt_subscriptions import ForeignHandler
     from fog_runtime.site import LoadedSite
     from robot_agent.config import AgentConfig
     from robot_agent.guardian.link import WheelCommand
@@ -150,7 +151,9 @@ class BusEdge:
 
     async def add_number(self, channel: Channel, number: str | int) -> None: ...
 
-    async def listen_to_foreign(self, topics: Iterable[str], handler: Callable[[str, bytes, bool], object]) -> None: ...
+    async def listen_to_foreign(
+        self, topics: Iterable[str], handler: ForeignHandler, again: Iterable[str] = ()
+    ) -> None: ...
 
     def on_connect(self, callback: Callable[[], Awaitable[None]]) -> None:
         """The broker never connects again."""

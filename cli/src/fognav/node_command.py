@@ -90,8 +90,9 @@ def node_add(  # noqa: PLR0913  # each option is an argument
         node = _placed(loaded, name, area, _pose(pose), height)
         access = provisioning.Access(wifi, wifi_password, fog_host, 8883 if tls else 1883, tls)
         members = provisioning.settings(loaded.site.id, node, access, provisioning.new_password(), profile)
-        site_file.add(loaded, node)
-        _provision(target, members, passwords)
+        text = site_file.with_node(loaded, node)
+        provisioning.provision(target, members, passwords)
+        site_file.write(loaded, text)
         _tell_board(json, "added", node, target, passwords)
 
 
@@ -121,7 +122,7 @@ def node_replace(  # noqa: PLR0913  # each option is an argument
             raise WrongUseError(f"{target} is that of node {other}: move it, or name a folder with --out")
         access = provisioning.Access(wifi, wifi_password, fog_host, 8883 if tls else 1883, tls)
         members = provisioning.settings(loaded.site.id, node, access, provisioning.new_password(), profile)
-        _provision(target, members, passwords)
+        provisioning.provision(target, members, passwords)
         _tell_board(json, "replaced", node, target, passwords)
 
 
@@ -327,12 +328,6 @@ def _placed(loaded: LoadedSite, name: str, area: str, pose: tuple[float, float, 
     except (PlacingError, msgspec.ValidationError) as error:
         raise WrongUseError(f"node {name}: {error}") from error
     return node
-
-
-def _provision(target: Path, members: dict[str, Any], passwords: Path | None) -> None:
-    provisioning.write_settings(target, members)
-    if passwords is not None:
-        provisioning.set_password(passwords, members["user"], members["password"])
 
 
 def _tell_board(json: bool, verb: str, node: NodeSite, target: Path, passwords: Path | None) -> None:  # noqa: FBT001  # a flag of each command

@@ -32,7 +32,9 @@ def source_add(  # noqa: PLR0913  # each option is an argument
     device: Annotated[str, typer.Option("--device", help="The name that fills the profile's topics.")] = "",
     above: Annotated[float | None, typer.Option("--above", help="Blocked above this number.")] = None,
     below: Annotated[float | None, typer.Option("--below", help="Blocked below this number.")] = None,
-    hysteresis: Annotated[float, typer.Option("--hysteresis", min=0, help="Clear when it is back by so much.")] = 0.0,
+    hysteresis: Annotated[
+        float | None, typer.Option("--hysteresis", min=0, help="Clear when it is back by so much.")
+    ] = None,
     penalty: Annotated[
         int | None, typer.Option("--penalty", min=1, max=253, help="Costly (1 to 253) instead of impassable.")
     ] = None,
@@ -48,7 +50,9 @@ def source_add(  # noqa: PLR0913  # each option is an argument
         options = {"id": name, "profile": profile, "device": device or None, "penalty": penalty}
         given |= {key: value for key, value in options.items() if value is not None}
         if above is not None or below is not None:
-            given["number"] = Limits(above=above, below=below, hysteresis=hysteresis)
+            given["number"] = Limits(above=above, below=below, hysteresis=hysteresis or 0.0)
+        elif hysteresis is not None:
+            raise WrongUseError("--hysteresis needs the limit that it is of: --above or --below")
         try:
             source = msgspec.convert(msgspec.to_builtins(given), Source)
         except msgspec.ValidationError as error:

@@ -2,6 +2,7 @@
 
 import json
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -12,6 +13,7 @@ from fog_contracts.messages import (
     Availability,
     FusionPolicy,
     Limits,
+    NodeReading,
     Source,
     UnknownPolicy,
 )
@@ -24,6 +26,7 @@ from hazard_aggregator.source_profiles import PROFILES
 from hazard_aggregator.voting import fuse
 
 SQUARE = [(0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (0.0, 1.0)]
+TOO_LONG = object()
 ABOVE_40 = Limits(above=40.0, hysteresis=2.0, minimum=-40.0, maximum=120.0)
 
 
@@ -37,11 +40,13 @@ class Rig:
     def __init__(self, *sources: Source, **fields) -> None:
         definition = AreaDefinition(id="hall", polygon=SQUARE, sources=list(sources), **fields)
         self.fusion = AreaFusion([definition], [], 1, registry=find_rule)
+        self.hazards: list[AreaHazard] = []
         self.now = 100.0
         self.wait(0.0)
 
     def send(self, topic: str, value: object, *, retained: bool = False) -> str:
-        self.fusion.on_source(topic, text(value), self.now, self.now, retained=retained)
+        payload = None if value is TOO_LONG else text(value)
+        self.hazards += self.fusion.on_source(topic, payload, self.now, self.now, retained=retained)
         return self.hazard.state
 
     def wait(self, seconds: float) -> str:
@@ -161,6 +166,51 @@ def test_changed_format_is_unknown_with_the_reason_and_back_with_the_old_format(
     assert reason in rig.hazard.cause
     assert rig.fusion.pop_rejections() == [("s1", "implausible")]
     assert rig.send("zigbee2mqtt/m", {"occupancy": False}) == "clear"
+
+
+@pytest.mark.parametrize("retained", [False, True])
+def test_message_that_is_too_long_makes_its_source_unknown_at_once(retained):
+    rig = Rig(Source(id="s1", profile="shelly-door-gen2", device="d"))
+    rig.send("d/online", "true")
+    assert rig.send("d/status/input:0", {"state": False}) == "clear"
+    assert rig.send("d/status/input:0", TOO_LONG, retained=retained) == "unknown"
+    assert "its message is too long" in rig.hazard.cause
+    rig.send("d/online", TOO_LONG)
+    assert rig.send("d/status/input:0", {"state": False}) == "clear"
+
+
+@pytest.mark.parametrize("noise", [[900.0 + i for i in range(50)], [f"E{i}" for i in range(50)], [{"x": 1}, TOO_LONG]])
+def test_wrong_values_that_change_are_one_hazard_with_the_first_reason(noise):
+    rig = Rig(Source(id="s1", topic="t", pointer="/t", number=ABOVE_40, period_s=10.0))
+    rig.send("t", {"t": 20})
+    rig.hazards.clear()
+    for value in noise:
+        assert rig.send("t", value if value is TOO_LONG else {"t": value}) == "unknown"
+    assert len(rig.hazards) == 1
+    assert rig.send("t", {"t": 20}) == "clear"
+    assert rig.send("t", {"t": 121}) == "unknown"
+    assert "121 is implausible: it should be at least -40, at most 120" in rig.hazard.cause
+
+
+def test_changed_source_asks_for_what_the_broker_retains_and_an_unchanged_one_does_not():
+    door = Source(id="door", profile="shelly-door-gen2", device="d")
+    rig = Rig(door, Source(id="other", topic="o", blocked=["1"], clear=["0"], period_s=10.0))
+    assert rig.fusion.pop_new_source_topics() == {"d/online", "d/status/input:0", "o"}
+    turned = msgspec.structs.replace(door, blocked=[False], clear=[True])
+    sources = [turned, *rig.fusion.definitions()[0].sources[1:]]
+    rig.fusion.put_area(AreaDefinition(id="hall", polygon=SQUARE, sources=sources), rig.now)
+    assert rig.fusion.pop_new_source_topics() == {"d/online", "d/status/input:0"}
+    assert rig.fusion.pop_new_source_topics() == set()
+
+
+def test_reading_under_the_id_of_a_source_does_not_count_for_it():
+    rig = Rig(Source(id="s1", topic="t", blocked=["1"], clear=["0"], period_s=60.0))
+    rig.send("t", "1")
+    for seq in range(20):
+        reading = NodeReading(seq=seq, boot=1, uptime_ms=100 * seq, range_m=[3.0], status=["ok"], state="clear")
+        rig.now += 0.1
+        rig.fusion.on_reading("s1", reading, rig.now, rig.now)
+    assert rig.hazard.state == "blocked"
 
 
 def test_source_with_a_period_is_unknown_after_three_of_them():

@@ -61,6 +61,27 @@ async def test_sources_of_the_site_and_over_rest_decide_their_areas_and_survive_
         await wait_for(client, "yard", lambda hazard: hazard["state"] == "clear")
 
 
+async def test_changed_source_is_given_what_the_broker_retains_and_a_long_message_makes_it_unknown(fog, tokens):
+    fog.start("hazard_aggregator")
+    url = await fog.ready("hazard_aggregator")
+    door = {"id": "door", "profile": "esphome-binary", "device": "gate/binary_sensor/beam"}
+    async with httpx.AsyncClient(base_url=url, timeout=15) as client, broker(fog) as mqtt:
+        await mqtt.publish("gate/status", "online", retain=True, qos=1)
+        await mqtt.publish("gate/binary_sensor/beam/state", "OFF", retain=True, qos=1)
+
+        async def put(**fields) -> None:
+            body = {"polygon": POLYGON, "sources": [{**door, **fields}]}
+            assert (await client.put("/api/v1/areas/yard", json=body, headers=tokens["operator"])).status_code == 200
+
+        await put()
+        await wait_for(client, "yard", lambda hazard: hazard["state"] == "clear")
+        await put(blocked=["OFF"], clear=["ON"])
+        await wait_for(client, "yard", lambda hazard: hazard["state"] == "blocked")
+        await mqtt.publish("gate/binary_sensor/beam/state", b" " * 20_000 + b"OFF")
+        unknown = await wait_for(client, "yard", lambda hazard: hazard["state"] == "unknown")
+        assert "its message is too long" in unknown["cause"]
+
+
 async def test_invalid_source_is_refused_with_the_field(fog, tokens):
     fog.start("hazard_aggregator")
     async with httpx.AsyncClient(base_url=await fog.ready("hazard_aggregator"), timeout=15) as client:

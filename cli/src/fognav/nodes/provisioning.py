@@ -66,9 +66,22 @@ def node_in(file: Path) -> str | None:
         raise WrongUseError(f"{file} is no node's settings, or can't be read: move it away") from error
 
 
-def write_settings(file: Path, members: dict[str, Any]) -> None:
-    """Write `node.json`, readable for its owner only; raises `WrongUseError`."""
+def provision(file: Path, members: dict[str, Any], passwords: Path | None) -> None:
+    """Write `node.json`, readable for its owner only, and the password in it into the broker's file, if one is given.
+
+    Raises `WrongUseError`, and leaves both as they were: a board with a password that no broker knows is of no use.
+    """
+    before = file.read_bytes() if file.exists() else None
     _write(file, (json.dumps(members, indent=2) + "\n").encode())
+    try:
+        if passwords is not None:
+            set_password(passwords, members["user"], members["password"])
+    except WrongUseError:
+        if before is None:
+            file.unlink()
+        else:
+            _write(file, before)
+        raise
 
 
 def set_password(file: Path, user: str, password: str) -> None:

@@ -37,13 +37,11 @@ def node_of(loaded: LoadedSite, name: str) -> NodeSite:
     raise WrongUseError(f"{loaded.directory / SITE_FILE} has no node {name!r}: it has {names}")
 
 
-def add(loaded: LoadedSite, node: NodeSite) -> None:
-    """Append a node to the site's file; the file stays as it was if that makes the site invalid.
-
-    Raises `WrongUseError` with the reason.
-    """
-    text = _read(loaded.directory)
-    _write(loaded.directory, text, text.rstrip("\n") + "\n\n" + "\n".join(node_lines(node)))
+def with_node(loaded: LoadedSite, node: NodeSite) -> str:
+    """Return the text of the site's file with one more node; raises `WrongUseError` if that makes the site invalid."""
+    text = _read(loaded.directory).rstrip("\n") + "\n\n" + "\n".join(node_lines(node))
+    _check(loaded.directory, text)
+    return text
 
 
 def replace(loaded: LoadedSite, node: NodeSite) -> None:
@@ -58,7 +56,8 @@ def replace(loaded: LoadedSite, node: NodeSite) -> None:
         raise FailedError(
             f"the table of node {node.id} was not found in {loaded.directory / SITE_FILE}: replace it by\n{block}"
         )
-    _write(loaded.directory, text, new)
+    _check(loaded.directory, new)
+    write(loaded, new)
 
 
 def replaced(text: str, node: NodeSite) -> str | None:
@@ -97,14 +96,18 @@ def _read(folder: Path) -> str:
         raise WrongUseError(f"{folder / SITE_FILE} can't be read: {error.strerror}") from error
 
 
-def _write(folder: Path, old: str, new: str) -> None:
-    file = folder / SITE_FILE
+def _check(folder: Path, text: str) -> None:
+    """Raise `WrongUseError` for an invalid text before it replaces the file: a service may read that at any time."""
     try:
-        atomic_write(file, new.encode(), mode=SHARED)
-        try:
-            load_site(folder)
-        except SiteError as error:
-            atomic_write(file, old.encode(), mode=SHARED)
-            raise WrongUseError(f"{error} (nothing was changed)") from error
+        load_site(folder, text)
+    except SiteError as error:
+        raise WrongUseError(f"{error} (nothing was changed)") from error
+
+
+def write(loaded: LoadedSite, text: str) -> None:
+    """Replace the site's file by a text that was found valid; raises `WrongUseError`."""
+    file = loaded.directory / SITE_FILE
+    try:
+        atomic_write(file, text.encode(), mode=SHARED)
     except OSError as error:
         raise WrongUseError(f"{file} can't be written: {error.strerror}") from error

@@ -73,6 +73,10 @@ private:
     bool has_hash_ = false;
 };
 
+bool is_same(const UpdateOffer& a, const UpdateOffer& b) {
+    return a.number == b.number && a.size == b.size && memcmp(a.hash, b.hash, kHashSize) == 0 && strcmp(a.url, b.url) == 0;
+}
+
 }  // namespace
 
 const char* read_update(const char* text, size_t size, UpdateOffer& offer) {
@@ -89,21 +93,24 @@ size_t signed_text(const UpdateOffer& offer, char* buffer, size_t size) {
 }
 
 const char* Updater::offer(const char* text, size_t size, uint32_t now_ms) {
-    // What is under way goes on.
-    if (busy()) return nullptr;
-    const char* problem = read_update(text, size, offer_);
+    UpdateOffer found;
+    const char* problem = read_update(text, size, found);
     if (problem != nullptr) return problem;
-    if (offer_.number == number_) return nullptr;
-    if (offer_.number < number_) return "the update is older than what runs: sign one with a higher number";
-    if (strcmp(offer_.board, board_) != 0) return "the update is for another board";
-    // The broker delivers it again with each connection.
-    if (offer_.number == tried_) return nullptr;
+    if (found.number == number_) return nullptr;
+    if (found.number < number_) return "the update is older than what runs: sign one with a higher number";
+    if (strcmp(found.board, board_) != 0) return "the update is for another board";
+    // The broker delivers it again with each connection: what is under way goes on, and what has failed is not tried anew.
+    if (is_same(found, offer_)) return nullptr;
     char signed_lines[kSignedTextSize];
-    const size_t length = signed_text(offer_, signed_lines, sizeof signed_lines);
-    if (!port_.signature_is_good(signed_lines, length, offer_.signature, offer_.signature_size)) {
+    const size_t length = signed_text(found, signed_lines, sizeof signed_lines);
+    if (!port_.signature_is_good(signed_lines, length, found.signature, found.signature_size)) {
         return "the update is not signed by the key in update_key of node.json";
     }
-    tried_ = offer_.number;
+    if (phase_ == Phase::fetching) {
+        port_.close();
+        port_.abandon_flash();
+    }
+    offer_ = found;
     attempts_ = 0;
     wait_ms_ = 0;
     since_ms_ = now_ms;

@@ -74,7 +74,8 @@ public:
     Updater(UpdateBoard& port, const char* board, uint32_t number, uint32_t remembered)
         : port_(port), board_(board), number_(number > remembered ? number : remembered) {}
 
-    // Take an offer (JSON); return nullptr, or why it is refused. An offer of what runs already is neither.
+    // Take an offer (JSON); return nullptr, or why it is refused. An offer of what runs already is neither, nor is the
+    // offer again that was taken last; another one replaces that, even while it is fetched.
     const char* offer(const char* text, size_t size, uint32_t now_ms);
 
     // Go on; call it in every turn of the loop (millis(), 32 bits that wrap). Return nullptr, or why the update failed.
@@ -94,8 +95,7 @@ private:
     UpdateBoard& port_;
     const char* board_;
     uint32_t number_;
-    UpdateOffer offer_;
-    uint32_t tried_ = 0;  // number of the last offer that was fetched: one that is refused does not count as tried
+    UpdateOffer offer_;  // the last one taken: one that is refused does not count
     Phase phase_ = Phase::idle;
     uint32_t since_ms_ = 0;  // of the last byte, or of the failure
     uint32_t wait_ms_ = 0;

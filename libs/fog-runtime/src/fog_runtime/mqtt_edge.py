@@ -136,12 +136,15 @@ class MqttEdge:
         except aiomqtt.MqttError as error:
             self._limited.warning("subscription_failed", topic, self._clock.now(), topic=topic, reason=str(error))
 
-    async def listen_to_foreign(self, topics: Iterable[str], handler: ForeignHandler) -> None:
+    async def listen_to_foreign(
+        self, topics: Iterable[str], handler: ForeignHandler, again: Iterable[str] = ()
+    ) -> None:
         """Call `handler(topic, payload, retained)` for each message of these topics, which are no channel's.
 
-        They replace those of the call before, now and after every connection.
+        They replace those of the call before, now and after every connection. The broker delivers the retained messages
+        of those in `again` once more, though they were subscribed to before.
         """
-        added, dropped = self._subscriptions.set_foreign(topics, handler)
+        added, dropped = self._subscriptions.set_foreign(topics, handler, again)
         client = self._client
         if client is None:
             return

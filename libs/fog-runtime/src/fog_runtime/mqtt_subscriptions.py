@@ -14,8 +14,8 @@ from fog_runtime import logs, metrics
 from fog_runtime.clock import Clock
 
 Ids = dict[str, str]
-ForeignHandler = Callable[[str, bytes, bool], object]
-"""Handles a message of a topic that is no channel's: the topic, the payload, and whether it was retained."""
+ForeignHandler = Callable[[str, bytes | None, bool], object]
+"""Handles a message of a topic that is no channel's: topic, payload (None: too long), and whether it was retained."""
 FOREIGN_LIMIT: Final = 16 * 1024
 """Bytes of the longest payload of such a topic."""
 FOREIGN: Final = "foreign"
@@ -81,15 +81,18 @@ class Subscriptions:
         self._routes.clear()
         return bool(without)
 
-    def set_foreign(self, topics: Iterable[str], handler: ForeignHandler) -> tuple[list[str], list[str]]:
+    def set_foreign(
+        self, topics: Iterable[str], handler: ForeignHandler, again: Iterable[str] = ()
+    ) -> tuple[list[str], list[str]]:
         """Pass the messages of these topics, which are no channel's, to a handler, and those of others no more.
 
-        Returns the topics to subscribe to and those to unsubscribe from.
+        Returns the topics to subscribe to, those of them that `again` names included, and those to unsubscribe from.
         """
         old, self._foreign = self._foreign, dict.fromkeys(topics, handler)
         self._routes.clear()
         kept = self.qos_by_topic().keys()
-        return sorted(self._foreign.keys() - old.keys()), sorted(old.keys() - kept)
+        added = self._foreign.keys() - (old.keys() - set(again))
+        return sorted(added), sorted(old.keys() - kept)
 
     def qos_by_topic(self) -> dict[str, int]:
         """Return every topic to subscribe to, with its quality of service."""
@@ -154,10 +157,10 @@ class Subscriptions:
             metrics.REFUSED.labels(FOREIGN).inc()
             reason = f"{len(data)} bytes are over the limit of {FOREIGN_LIMIT}"
             self._limited.warning("message_refused", topic, self._clock.now(), topic=topic, reason=reason)
-            return
-        metrics.RECEIVED.labels(FOREIGN).inc()
+        else:
+            metrics.RECEIVED.labels(FOREIGN).inc()
         try:
-            handler(topic, data, message.retain)
+            handler(topic, data if len(data) <= FOREIGN_LIMIT else None, message.retain)
         except Exception as error:  # noqa: BLE001  # one message must not end the process; the bug is logged
             metrics.HANDLER_ERRORS.labels(FOREIGN).inc()
             _log.error("handler_failed", error=error, channel=FOREIGN, topic=topic)

@@ -43,14 +43,14 @@ class LoadedSite:
     directory: Path
 
 
-def load_site(directory: Path) -> LoadedSite:
-    """Read and validate a site's folder; raises `SiteError`.
+def load_site(directory: Path, text: str | None = None) -> LoadedSite:
+    """Read and validate a site's folder, or what it would be with this `text` in its file; raises `SiteError`.
 
     Ids are unique and every referenced id exists; areas are simple polygons on the map (counter-clockwise in the
     result), nodes lie on the map, places and start poses on free cells.
     """
     file = directory / SITE_FILE
-    site = _read(file)
+    site = _read(file, text)
     _check_ids(file, site)
     try:
         static = load_map(directory / site.map)
@@ -66,9 +66,9 @@ def load_site(directory: Path) -> LoadedSite:
     return LoadedSite(msgspec.structs.replace(site, areas=areas), static, directory)
 
 
-def _read(file: Path) -> Site:
+def _read(file: Path, text: str | None) -> Site:
     try:
-        data = tomllib.loads(file.read_text("utf-8"))
+        data = tomllib.loads(file.read_text("utf-8") if text is None else text)
     except OSError as error:
         remedy = "A site is a folder with site.toml and its map; check the path"
         raise SiteError(file, "file", f"can't be read ({error.strerror})", remedy) from error

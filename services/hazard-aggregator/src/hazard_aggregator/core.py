@@ -80,6 +80,10 @@ class Aggregator:
         """Return the topics of all areas' sources, which may contain wildcards."""
         return self._fusion.source_topics()
 
+    def pop_new_source_topics(self) -> set[str]:
+        """Return the topics of sources that are new or have changed: the broker has to deliver what it retains."""
+        return self._fusion.pop_new_source_topics()
+
     def node_reports(self, now: float) -> list[NodeReport]:
         """Return the health of every node of every area."""
         return self._fusion.node_reports(now)
@@ -122,8 +126,8 @@ class Aggregator:
         """Return the handler of every query: the aggregator answers none."""
         return {}
 
-    def on_source(self, topic: str, payload: bytes, at: Moment, *, retained: bool) -> list[Publication]:
-        """Handle a message on one of the `source_topics`: they are the sensors' own, no channels of Fognav."""
+    def on_source(self, topic: str, payload: bytes | None, at: Moment, *, retained: bool) -> list[Publication]:
+        """Handle a message (None: one that is too long) on one of the `source_topics`, which are the sensors' own."""
         return self._announce(self._fusion.on_source(topic, payload, at.now, at.stamp, retained=retained))
 
     def on_connection_lost(self, at: Moment) -> list[Publication]:

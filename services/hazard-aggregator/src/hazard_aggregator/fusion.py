@@ -13,6 +13,7 @@ from fog_contracts.channels import BLOCKED, CLEAR
 from hazard_aggregator.debounce import DEFAULT_RULE
 from hazard_aggregator.members import THESIS_NODE, Members
 from hazard_aggregator.node_report import node_reports
+from hazard_aggregator.node_state import SourceState
 from hazard_aggregator.plausibility import Classification, classify_reading
 from hazard_aggregator.reading_order import ReadingOrder, Taken
 from hazard_aggregator.robot_poses import RobotPoses
@@ -96,6 +97,10 @@ class AreaFusion:
         """Return the topics of all sources, which may contain wildcards."""
         return self._sources.topics
 
+    def pop_new_source_topics(self) -> set[str]:
+        """Return the topics of sources that are new, or have changed, since the last call."""
+        return self._sources.pop_new_topics()
+
     def is_removed(self, area: str) -> bool:
         """Whether there was an area of this id, and is none now."""
         return area in self._tombstones
@@ -146,8 +151,10 @@ class AreaFusion:
             changed += self._evaluate(area, stamp)
         return changed
 
-    def on_source(self, topic: str, payload: bytes, now: float, stamp: float, *, retained: bool) -> list[AreaHazard]:
-        """Apply a message of the sensors that areas name as sources."""
+    def on_source(
+        self, topic: str, payload: bytes | None, now: float, stamp: float, *, retained: bool
+    ) -> list[AreaHazard]:
+        """Apply a message of the sensors that areas name as sources; None: one that is too long."""
         changed: list[AreaHazard] = []
         for area, source, understood in self._sources.apply(topic, payload, now, stamp, retained=retained):
             if not understood:
@@ -255,7 +262,8 @@ class AreaFusion:
         self._by_node = {}
         for area in self._areas.values():
             for node in area.nodes.values():
-                self._by_node.setdefault(node.id, []).append((area, node))
+                if not isinstance(node, SourceState):
+                    self._by_node.setdefault(node.id, []).append((area, node))
         self._sources = Sources(self._areas.values())
 
     @staticmethod

@@ -128,11 +128,16 @@ class NodeState:
 
 @dataclass
 class SourceState(NodeState):
-    """One source of one area, with its profile filled in; `pending` is a retained message of unknown age."""
+    """One source of one area, with its profile filled in; `pending` is a retained message of unknown age.
+
+    `misread`: its last message was not understood. `new`: its topics are not subscribed to yet, for this source.
+    """
 
     source: Source | None = None
     reader: SourceReader | None = None
     pending: bytes | None = None
+    misread: bool = False
+    new: bool = True
 
     @property
     def penalty(self) -> int | None:
@@ -146,5 +151,6 @@ class SourceState(NodeState):
     def invalidate(self, reason: str) -> None:
         """Set the state to unknown until messages confirm another one."""
         super().invalidate(reason)
+        self.misread = False
         if self.reader is not None:
             self.reader.reset()

@@ -115,11 +115,12 @@ class Records:
 
     async def subscribe(self) -> None:
         """Subscribe to the thesis's topics of all areas, and to their sources' own."""
-        await self._mqtt.listen_to_foreign(self._core.source_topics(), self._on_source)
+        topics, again = self._core.source_topics(), self._core.pop_new_source_topics()
+        await self._mqtt.listen_to_foreign(topics, self._on_source, again)
         for number in self._core.thesis_numbers():
             await self._mqtt.add_number(ch.THESIS_AREA, number)
 
-    def _on_source(self, topic: str, payload: bytes, retained: bool) -> None:  # noqa: FBT001  # as the edge calls it
+    def _on_source(self, topic: str, payload: bytes | None, retained: bool) -> None:  # noqa: FBT001  # as the edge calls it
         self._publisher.announce(self._core.on_source(topic, payload, self._edges.now(), retained=retained))
 
     async def store_status(self) -> StoreStatus:

@@ -30,9 +30,11 @@ class SourceReader:
         """Forget on which side of its limits the number was."""
         self._exceeded = None
 
-    def classify(self, payload: bytes) -> Classification:
-        """Return what a message says; a payload that does not have the source's format is `unknown`."""
+    def classify(self, payload: bytes | None) -> Classification:
+        """Return what a message says; one that is too long, or not in its format, is `unknown`."""
         source = self._source
+        if payload is None:
+            return Classification("unknown", "its message is too long")
         try:
             value = _value(payload, source.pointer)
             if source.number is not None:
@@ -47,7 +49,8 @@ class SourceReader:
     def _classify_number(self, value: float, limits: Limits) -> Classification:
         if not _within(value, limits.minimum, limits.maximum):
             self._exceeded = None
-            return Classification("unknown", f"{value:g} is implausible")
+            bounds = f"{_bound(limits.minimum, 'at least')}{_bound(limits.maximum, 'at most')}".removesuffix(", ")
+            return Classification("unknown", f"{value:g} is implausible: it should be {bounds}")
         # Within the hysteresis a number stays on its side; one that has none yet counts as a danger.
         margin = 0.0 if self._exceeded is False else limits.hysteresis
         above = limits.above is not None and value > limits.above - margin
@@ -60,8 +63,10 @@ class SourceReader:
         return Classification("clear", f"{value:g} is within its limits")
 
 
-def is_online(availability: Availability, payload: bytes) -> bool | None:
+def is_online(availability: Availability, payload: bytes | None) -> bool | None:
     """Return whether a source's sensor is connected; None if the message does not say so."""
+    if payload is None:
+        return None
     try:
         value = _value(payload, availability.pointer)
     except _FormatError:
@@ -105,6 +110,10 @@ def _is_one_of(value: Any, meaning: list[str | bool | float]) -> bool:  # noqa: 
     if isinstance(value, str):
         return any(isinstance(other, str) and value.casefold() == other.casefold() for other in meaning)
     return any(isinstance(value, bool) == isinstance(other, bool) and value == other for other in meaning)
+
+
+def _bound(value: float | None, words: str) -> str:
+    return "" if value is None else f"{words} {value:g}, "
 
 
 def _within(value: float, minimum: float | None, maximum: float | None) -> bool:

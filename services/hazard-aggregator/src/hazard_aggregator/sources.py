@@ -39,15 +39,17 @@ class Sources:
         self._exact: dict[str, list[_Listener]] = {}
         self._wildcards: list[tuple[re.Pattern[str], _Listener]] = []
         self.topics: set[str] = set()
+        self._members: list[SourceState] = []
         for area in areas:
             for member in area.nodes.values():
                 if isinstance(member, SourceState) and member.source is not None:
+                    self._members.append(member)
                     self._add(member.source.topic, _Listener(area, member, availability=False))
                     if member.source.availability is not None:
                         self._add(member.source.availability.topic, _Listener(area, member, availability=True))
 
-    def apply(self, topic: str, payload: bytes, now: float, stamp: float, *, retained: bool) -> list[Applied]:
-        """Apply a message to the sources that it concerns, and return them.
+    def apply(self, topic: str, payload: bytes | None, now: float, stamp: float, *, retained: bool) -> list[Applied]:
+        """Apply a message (None: one that is too long) to the sources that it concerns, and return them.
 
         A `retained` one has an unknown age: it counts only for a source that publishes on change, and once its sensor
         is known to be connected.
@@ -75,6 +77,16 @@ class Sources:
                 areas.add(area.definition.id)
         return areas
 
+    def pop_new_topics(self) -> set[str]:
+        """Return the topics of sources that are new since the last call: a subscription delivers what is retained."""
+        topics: set[str | None] = set()
+        for member in self._members:
+            if member.new and member.source is not None:
+                member.new = False
+                availability = member.source.availability
+                topics |= {member.source.topic, None if availability is None else availability.topic}
+        return {topic for topic in topics if topic is not None}
+
     def _add(self, topic: str | None, listener: _Listener) -> None:
         if topic is None:
             return
@@ -92,19 +104,19 @@ def _pattern(topic: str) -> re.Pattern[str]:
 
 
 def _apply_value(
-    area: WatchedArea, source: SourceState, payload: bytes, now: float, stamp: float, *, retained: bool
+    area: WatchedArea, source: SourceState, payload: bytes | None, now: float, stamp: float, *, retained: bool
 ) -> bool:
     if not retained:
         source.pending = None
         return _read(source, payload, now, stamp)
     if source.silent_after(area.definition.unknown) == math.inf:
-        if source.online:
+        if source.online or payload is None:
             return _read(source, payload, now, stamp)
         source.pending = payload
     return True
 
 
-def _apply_availability(source: SourceState, payload: bytes, now: float, stamp: float) -> bool:
+def _apply_availability(source: SourceState, payload: bytes | None, now: float, stamp: float) -> bool:
     availability = None if source.source is None else source.source.availability
     online = None if availability is None else is_online(availability, payload)
     if online is None:
@@ -118,14 +130,20 @@ def _apply_availability(source: SourceState, payload: bytes, now: float, stamp: 
     return True
 
 
-def _read(source: SourceState, payload: bytes, now: float, stamp: float) -> bool:
-    """Apply a value; one that is not understood makes the source unknown at once. Return whether it was."""
+def _read(source: SourceState, payload: bytes | None, now: float, stamp: float) -> bool:
+    """Apply a value; one that is not understood makes the source unknown at once. Return whether it was.
+
+    Further ones leave the reason: the hazard would change with each of them.
+    """
     if source.reader is None:
         return False
     classification = source.reader.classify(payload)
     if classification.state == "unknown":
         source.receive(now)
-        source.invalidate(classification.reason)
+        if not source.misread:
+            source.invalidate(classification.reason)
+            source.misread = True
         return False
+    source.misread = False
     source.apply(classification, now, stamp)
     return True

@@ -44,6 +44,21 @@ class PlainBase:
         return f"{left_m_s:.4f},{right_m_s:.4f};".encode()
 
 
+class DockingBase(PlainBase):
+    """One that finds its dock by itself; `ready` to leave it again."""
+
+    ready = True
+
+    def seek_dock(self) -> bytes:
+        return b"seek;"
+
+    def leave_dock(self) -> bytes:
+        return b"full;" if self.ready else b""
+
+    def take_control(self, *, charging: bool) -> bytes:
+        return b"start;" if charging else b"take;"
+
+
 class Rig:
     """A guardian on a plain base that is woken at `begin`, and awake since 0.1 s later."""
 
@@ -67,8 +82,9 @@ class Rig:
         self.base.frames.append(BaseReading(msgspec.convert(status, BaseStatus), odometry))
         return self.core.on_bytes(b"", now)
 
-    def command(self, now: float, left: float = 0.1, right: float = 0.1, *, reset: bool = False):
-        return self.core.on_command(WheelCommand(seq=1, left=left, right=right, reset=reset), now)
+    def command(self, now: float, left: float = 0.1, right: float = 0.1, *, reset: bool = False, maneuver=None):
+        command = WheelCommand(seq=1, left=left, right=right, reset=reset, maneuver=maneuver)
+        return self.core.on_command(command, now)
 
     def wheels(self, output) -> tuple[float, float] | None:
         words = [word for word in output.data.decode().split(";") if "," in word]

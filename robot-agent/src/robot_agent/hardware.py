@@ -12,7 +12,7 @@ import hashlib
 import math
 from collections import deque
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Final, Generic, Literal, NamedTuple, Protocol, TypeVar
+from typing import TYPE_CHECKING, Annotated, Final, Generic, Literal, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import msgspec
 from msgspec import Meta
@@ -31,6 +31,9 @@ _REMEMBERED_SCANS: Final = 64
 
 NO_FRESH_COMMAND: Final = "no fresh command from the agent"
 """Why the guardian keeps the wheels at zero when the agent is silent or late."""
+
+ON_CHARGER: Final = "the base is on its charger, where it does not drive"
+"""Why the guardian keeps the wheels at zero while a charger is connected."""
 
 Options = TypeVar("Options", bound=msgspec.Struct)
 """A driver's own options: a frozen struct whose fields name their units and that refuses unknown fields."""
@@ -61,9 +64,9 @@ class BaseStatus(msgspec.Struct, frozen=True, kw_only=True):
     """State that a base reports. A missing sensor is False, a missing number None.
 
     `overcurrent`: a wheel motor draws too much current. `battery`: charged fraction. `charging`: a charger is
-    connected. `power`: what it measures of battery and charger. `proximity`: strengths of its light sensors from the
-    left to the right, in its own unit. `mode_problem`: why the base does not obey wheel commands (None: it is in its
-    driving mode).
+    connected. `docked`: it is that of the dock, and no cable is plugged in. `power`: what it measures of battery and
+    charger. `proximity`: strengths of its light sensors from the left to the right, in its own unit. `mode_problem`:
+    why the base does not obey wheel commands (None: it is in its driving mode).
     """
 
     bumper_left: bool = False
@@ -73,6 +76,7 @@ class BaseStatus(msgspec.Struct, frozen=True, kw_only=True):
     overcurrent: bool = False
     battery: Annotated[float, Meta(ge=0.0, le=1.0)] | None = None
     charging: bool = False
+    docked: bool = False
     power: Power | None = None
     proximity: tuple[Strength, ...] = ()
     mode_problem: Sentence | None = None
@@ -238,6 +242,23 @@ class BaseDriver(Protocol):
 
     def drive(self, left_m_s: float, right_m_s: float) -> bytes:
         """Return the command that turns the wheels at these speeds until the next one; zeros stop them at once."""
+
+
+@runtime_checkable
+class DockingDriver(Protocol):
+    """What the driver of a base adds if the base finds and enters its dock by itself.
+
+    Between `seek_dock` or `leave_dock` and `take_control` the modes that belong to it are no `mode_problem`.
+    """
+
+    def seek_dock(self) -> bytes:
+        """Return the bytes that let the base's own program drive it into its dock."""
+
+    def leave_dock(self) -> bytes:
+        """Return the bytes after which it obeys wheel commands on its dock, too; empty while it is not ready."""
+
+    def take_control(self, *, charging: bool) -> bytes:
+        """Return the bytes that stop it at once, and bring it into its driving mode again; a charging one charges."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

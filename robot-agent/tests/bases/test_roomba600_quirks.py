@@ -201,7 +201,7 @@ def test_a_robot_on_its_dock_is_left_in_passive_mode_and_comes_up_when_it_is_tak
     line.base.world.home_base = True
     line.run(3.0)
     assert line.base.mode == PASSIVE
-    assert line.feedback[-1].stopped == "the base is on its charger"
+    assert line.feedback[-1].stopped == "the base is on its charger, where it does not drive"
     line.base.world.home_base = False
     line.wheels = (0.3, 0.25)
     line.run(2.0)

@@ -315,7 +315,7 @@ def test_charging_base_is_not_woken_until_it_leaves_the_charger():
     rig.run(1.0)
     later = b"".join(rig.core.tick(rig.now + 0.02 * n).data for n in range(12))
     assert {opcode for opcode, _ in commands(later)} <= {145}
-    assert rig.feedback[-1].stopped == "the base is on its charger"
+    assert rig.feedback[-1].stopped == "the base is on its charger, where it does not drive"
     assert rig.feedback[-1].status.charging
     rig.base.world.charger = False
     rig.run(1.5)

@@ -112,7 +112,7 @@ def test_charging_base_that_is_awake_stands_and_says_why() -> None:
     rig = Rig()
     rig.drive(0.1, 1.0)
     output = rig.frame(1.01, charging=True)
-    assert output.feedback[-1].stopped == "the base is on its charger, where it does not drive: take it off first"
+    assert output.feedback[-1].stopped == "the base is on its charger, where it does not drive"
     assert rig.wheels(rig.command(1.02)) == (0.0, 0.0)
 
 

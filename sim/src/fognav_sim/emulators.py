@@ -6,7 +6,7 @@ Emulators come with their drivers and know nothing of the simulator: they implem
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
     import numpy as np
@@ -54,6 +54,18 @@ class BaseEmulator(SerialEmulator, Protocol):
 
     def tick(self, now: float, dt: float) -> None:
         """Let dt seconds pass up to `now`."""
+
+
+@runtime_checkable
+class DockingBase(Protocol):
+    """What the emulator of a base adds if the base drives into its dock by itself."""
+
+    def set_dock(self, ahead_m: float, aside_m: float, heading_rad: float) -> None:
+        """Set where the base is, seen from where it stands on its dock.
+
+        ahead_m: how far it has still to go along the dock's middle line. aside_m: how far it is to the left of that
+        line. heading_rad: its heading, counter-clockwise from that line's direction.
+        """
 
 
 class LidarEmulator(SerialEmulator, Protocol):

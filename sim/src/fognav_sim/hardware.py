@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Final
 
+from fognav_sim.emulators import DockingBase
+
 if TYPE_CHECKING:
+    from fog_contracts.messages import Pose
     from fognav_sim.emulators import BaseEmulator, LidarEmulator
     from fognav_sim.world import World
 
@@ -79,8 +83,18 @@ class Hardware:
         self.now += dt
         bump_left, bump_right = world.bumpers
         base.set_sensors(bump_left=bump_left, bump_right=bump_right, cliff=False)
+        if world.robot.dock is not None and isinstance(base, DockingBase):
+            base.set_dock(*seen_from_dock(world.pose, world.robot.dock))
         base.tick(self.now, dt)
         return (
             self._base_line.send(base.outgoing(self.now), dt),
             self._lidar_line.send(self.lidar.outgoing(self.now), dt),
         )
+
+
+def seen_from_dock(pose: tuple[float, float, float], dock: Pose) -> tuple[float, float, float]:
+    """Return how far (m) a robot at `pose` has to go to its pose on the dock, how far aside, and its heading (rad)."""
+    x, y, theta = pose
+    cos, sin = math.cos(dock.theta), math.sin(dock.theta)
+    dx, dy = x - dock.x, y - dock.y
+    return -(dx * cos + dy * sin), dy * cos - dx * sin, math.remainder(theta - dock.theta, math.tau)

@@ -77,7 +77,14 @@ PARTS: Final = (
     ),
     Part(
         "guardian",
-        ("guardian.core", "guardian.link", "guardian.revival"),
+        (
+            "guardian.core",
+            "guardian.base_faults",
+            "guardian.feedback",
+            "guardian.link",
+            "guardian.maneuvers",
+            "guardian.revival",
+        ),
         (
             "guardian/test_guardian_core.py",
             "guardian/test_guardian_limits.py",

@@ -77,10 +77,14 @@ class SourceSite(Source, frozen=True, kw_only=True):
 
 
 class RobotSite(Message, frozen=True, kw_only=True):
-    """A robot of this site: its start pose, and the radius and height of its body."""
+    """A robot of this site: its start pose, and the radius and height of its body.
+
+    `dock`: its pose while it stands on its dock, facing it; None if it has none here.
+    """
 
     id: Id
     start: Pose
+    dock: Pose | None = None
     radius: Annotated[float, Meta(gt=0.0, le=2.0)] = ROBOT_RADIUS
     height: Annotated[float, Meta(gt=0.0, le=3.0)] = 0.35
 

@@ -15,26 +15,21 @@ import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-import msgspec
-
 from fog_contracts.messages import SENTENCE_MAX
+from robot_agent.guardian.base_faults import fault_of, is_bump
+from robot_agent.guardian.feedback import FeedbackPolicy
 from robot_agent.guardian.link import WHEEL_SPEED_MAX_M_S, BaseFeedback, WheelCommand
+from robot_agent.guardian.maneuvers import Maneuvers, Situation
 from robot_agent.guardian.revival import Attempt, Revival
-from robot_agent.hardware import NO_FRESH_COMMAND
+from robot_agent.hardware import NO_FRESH_COMMAND, ON_CHARGER, DockingDriver
 
 if TYPE_CHECKING:
-    from robot_agent.hardware import BaseDriver, BaseReading, BaseStatus, WheelOdometry
+    from robot_agent.hardware import BaseDriver, BaseReading, BaseStatus
 
 COMMAND_FRESH_S: Final = 0.2
 """A command older than this does not move a wheel."""
-OVERCURRENT_S: Final = 0.3
-"""A motor that starts on a carpet draws a high current for a moment; a blocked one keeps drawing it."""
 REPEAT_S: Final = 0.05
 """Period of repeating an unchanged wheel command: a byte may have been lost."""
-FEEDBACK_S: Final = 0.045
-"""The agent gets every third sensor frame while the wheels turn, and every change immediately."""
-FEEDBACK_AT_REST_S: Final = 0.09
-"""And every seventh while they do not: an idle robot shall cost little."""
 _NEVER: Final = -math.inf
 STEP_S: Final = 0.06
 """Longest time step of acceleration: after a pause the guardian must not catch up in one step."""
@@ -66,6 +61,8 @@ class _Base:
     awake: bool = False
     woken_at: float | None = None
     overcurrent_since: float | None = None
+    restrained: bool = False
+    """Whether it drove by itself, or without its own protection, and has not reported its driving mode since."""
 
 
 @dataclass
@@ -82,16 +79,14 @@ class GuardianCore:
         self._command: WheelCommand | None = None
         self._command_at = _NEVER
         self._latched: str | None = None
+        self._bumped = False
+        """Whether the latched fault is a pressed bumper."""
+        self._maneuvers = Maneuvers(self.driver)
         self._wheels = (0.0, 0.0)
         self._sent: tuple[float, float] | None = None
         self._sent_at = _NEVER
         self._stepped_at: float | None = None
-        self._feedback_at = _NEVER
-        self._feedback_key: object = None
-        self._told_status: BaseStatus | None = None
-        self._told_alarms: BaseStatus | None = None
-        self._feedback_odometry: WheelOdometry | None = None
-        self._seq = 0
+        self._feedback = FeedbackPolicy()
 
     @property
     def latched(self) -> str | None:
@@ -100,8 +95,8 @@ class GuardianCore:
 
     @property
     def moving(self) -> bool:
-        """Whether a wheel is told to turn."""
-        return self._wheels != (0.0, 0.0)
+        """Whether a wheel is told to turn, or the base may turn one by itself."""
+        return self._wheels != (0.0, 0.0) or self._maneuvers.running is not None
 
     @property
     def unanswered(self) -> str | None:
@@ -122,9 +117,9 @@ class GuardianCore:
             self._base.reading, self._base.reading_at = reading, now
             self._revival.on_answer()
             stop += self._check(reading.status, now)
-            feedback = self._feedback(reading, now)
-            if feedback is not None:
-                feedbacks.append(feedback)
+            state = (self._latched, self._base.awake, self._maneuvers.running, self._maneuvers.problem)
+            if self._feedback.is_due(reading, state, now, moving=self._wheels != (0.0, 0.0)):
+                feedbacks.append(self._report(reading, now))
         if not self._base.awake:
             stop += self.driver.respond()
         return Output(stop, tuple(feedbacks))
@@ -133,7 +128,8 @@ class GuardianCore:
         """Handle the agent's command; with `reset` also clear a latched fault and wake the base again."""
         self._command, self._command_at = command, now
         if command.reset and self._latched is not None:
-            self._latched = None
+            self._latched, self._bumped = None, False
+            self._maneuvers.end()
             self._base.awake = False
             return Output(self._wake(now))
         return self._drive(now)
@@ -153,7 +149,7 @@ class GuardianCore:
                 return Output(self._wake(now), self._reminder(now), self._attempt(now))
             # The wake command may have been lost, and the base may still roll at an old speed.
             repeat = now - self._sent_at >= REPEAT_S
-            return Output(self._send((0.0, 0.0), now) if repeat else b"", self._reminder(now))
+            return Output(self._restrain(now) if repeat else b"", self._reminder(now))
         silent = now - base.reading_at
         if silent > timing.frame_timeout:
             data = self._latch(f"the base has sent no valid frame for {silent:.1f} s: check cable and power", now)
@@ -162,7 +158,10 @@ class GuardianCore:
 
     def stop_command(self) -> bytes:
         """Return the bytes that stop the wheels at an orderly end of the guardian; the base stays awake."""
-        return self.driver.drive(0.0, 0.0)
+        if self._maneuvers.running is None or not isinstance(self.driver, DockingDriver):
+            return self.driver.drive(0.0, 0.0)
+        charging = self._base.reading is not None and self._base.reading.status.charging
+        return self.driver.take_control(charging=charging)
 
     def _attempt(self, now: float) -> Attempt | None:
         """Return what to try on a base from which nothing has come since it was woken last."""
@@ -180,7 +179,7 @@ class GuardianCore:
         return base.reading is not None and fresh and base.reading.status.charging
 
     def _wake(self, now: float) -> bytes:
-        self._base.woken_at = now
+        self._base.woken_at, self._base.restrained = now, False
         self._wheels, self._sent, self._sent_at = (0.0, 0.0), (0.0, 0.0), now
         return self.driver.wake()
 
@@ -190,46 +189,72 @@ class GuardianCore:
             current = base.woken_at is not None and now - base.woken_at >= self.driver.timing.ignored_after_wake
             if not current or status.mode_problem is not None:
                 return b""
-            base.awake, base.overcurrent_since, self._stepped_at = True, None, now
-        if self._latched is not None:
+            base.awake, base.restrained, base.overcurrent_since, self._stepped_at = True, False, None, now
+        backing = self._maneuvers.is_running("back_off")
+        if self._latched is not None and not backing:
             return b""
         if not status.overcurrent:
             base.overcurrent_since = None
         elif base.overcurrent_since is None:
             base.overcurrent_since = now
-        fault = self._fault(status, now)
-        return b"" if fault is None else self._latch(fault, now)
-
-    def _fault(self, status: BaseStatus, now: float) -> str | None:
-        """Return the fault that an awake base reports and that must stop the wheels; None without one."""
-        # A base may leave its driving mode by itself on cliff or wheel drop, which are the more precise reason.
-        if status.cliff:
-            return "a cliff sensor sees no floor"
-        if status.wheel_drop:
-            return "a wheel has dropped: the robot was lifted or hangs over an edge"
-        if status.bumper:
-            both = status.bumper_left and status.bumper_right
-            side = "both sides" if both else "left" if status.bumper_left else "right"
-            return f"the bumper is pressed ({side})"
-        since = self._base.overcurrent_since
-        if since is not None and now - since >= OVERCURRENT_S:
-            return "a wheel motor draws too much current: it is blocked"
-        if status.mode_problem is not None:
-            return f"the base left its driving mode: {status.mode_problem}"
-        return None
+        blocked_for = 0.0 if base.overcurrent_since is None else now - base.overcurrent_since
+        fault = fault_of(status, blocked_for, bumper=not self._maneuvers.expects_bumper(status))
+        if fault is None:
+            return b""
+        if backing:
+            self._latched = None  # the new fault is no bump
+        return self._latch(fault, now)
 
     def _latch(self, reason: str, now: float) -> bytes:
         first = self._latched is None
         if first:
             self._latched = reason[:SENTENCE_MAX]  # a driver's own words may fill the whole field
+            self._bumped = is_bump(reason)
+        if self._maneuvers.running is not None:
+            return self._end_maneuver(now)
         self._wheels, self._stepped_at = (0.0, 0.0), now
         if not first and self._sent == self._wheels and now - self._sent_at < REPEAT_S:
             return b""
         return self._send(self._wheels, now)
 
+    def _maneuver(self, now: float) -> bytes:
+        """Begin or end the maneuver that the agent asks for, or no longer does; return the bytes for it."""
+        base, maneuvers, command = self._base, self._maneuvers, self._fresh_command(now)
+        asked = None if command is None else command.maneuver
+        if base.reading is None:
+            return b""
+        if maneuvers.running is not None:
+            return self._end_maneuver(now) if maneuvers.is_over(asked, base.reading, now) else b""
+        moving = self._wheels != (0.0, 0.0)
+        data = maneuvers.begin(
+            asked, base.reading, Situation(base.awake, moving, self._latched is not None, self._bumped), now
+        )
+        if maneuvers.is_running("leave_dock"):
+            # Its own protection is off from now on, so every frame counts.
+            base.awake, base.overcurrent_since, self._stepped_at = True, None, now
+        return data
+
+    def _end_maneuver(self, now: float) -> bytes:
+        """End the maneuver with the wheels at rest."""
+        own_drive = not self._maneuvers.is_running("back_off")
+        self._maneuvers.end()
+        self._wheels, self._stepped_at = (0.0, 0.0), now
+        if not own_drive:
+            return self._send(self._wheels, now)
+        self._base.awake, self._base.woken_at, self._base.restrained = False, now, True
+        return self._restrain(now)
+
+    def _restrain(self, now: float) -> bytes:
+        """Return the bytes that keep the wheels at rest of a base that is not in its driving mode yet."""
+        if not (self._base.restrained and isinstance(self.driver, DockingDriver)):
+            return self._send((0.0, 0.0), now)
+        self._sent, self._sent_at = (0.0, 0.0), now
+        return self.driver.take_control(charging=self._charging(now))
+
     def _drive(self, now: float) -> Output:
-        if not self._base.awake:
-            return Output()
+        begun = self._maneuver(now)
+        if not self._base.awake or self._maneuvers.is_running("seek_dock"):
+            return Output(begun)
         elapsed = 0.0 if self._stepped_at is None else max(0.0, min(now - self._stepped_at, STEP_S))
         self._stepped_at = now
         target = self._target(now)
@@ -238,11 +263,13 @@ class GuardianCore:
         right = _slew(self._wheels[1], target[1], gain)
         self._wheels = (left, right)
         if self._wheels == self._sent and now - self._sent_at < REPEAT_S:
-            return Output()
-        return Output(self._send(self._wheels, now))
+            return Output(begun)
+        return Output(begun + self._send(self._wheels, now))
 
     def _target(self, now: float) -> tuple[float, float]:
         command = self._fresh_command(now)
+        if command is not None and self._maneuvers.running is not None:
+            return self._maneuvers.wheels(command.left, command.right)
         if command is None or self._latched is not None or self._charging(now):
             return 0.0, 0.0
         left, right = command.left, command.right
@@ -259,42 +286,33 @@ class GuardianCore:
         self._sent, self._sent_at = wheels, now
         return self.driver.drive(*wheels)
 
-    def _feedback(self, reading: BaseReading, now: float) -> BaseFeedback | None:
-        if reading.status is not self._told_status:
-            self._told_status = reading.status
-            # Any change counts but that of measurements, which change all the time.
-            self._told_alarms = msgspec.structs.replace(reading.status, battery=None, power=None, proximity=())
-        key = (self._told_alarms, self._latched, self._base.awake)
-        rests = reading.odometry == self._feedback_odometry and self._wheels == (0.0, 0.0)
-        period = FEEDBACK_AT_REST_S if rests else FEEDBACK_S
-        if key == self._feedback_key and now - self._feedback_at < period:
-            return None
-        self._feedback_key = key
-        return self._report(reading, now)
-
     def _reminder(self, now: float) -> tuple[BaseFeedback, ...]:
         """Repeat the last frame while the base is silent, so that the agent gets the reason."""
         reading = self._base.reading
-        return () if reading is None or now - self._feedback_at < FEEDBACK_S else (self._report(reading, now),)
+        return () if reading is None or not self._feedback.is_overdue(now) else (self._report(reading, now),)
 
     def _report(self, reading: BaseReading, now: float) -> BaseFeedback:
-        self._seq += 1
-        self._feedback_at, self._feedback_odometry = now, reading.odometry
-        stopped = None
-        if not self._base.awake:
-            stopped = "the base is on its charger" if self._charging(now) else "the base is not ready to drive yet"
-        elif self._charging(now):
-            stopped = "the base is on its charger, where it does not drive: take it off first"
-        elif self._fresh_command(now) is None:
-            stopped = NO_FRESH_COMMAND
         return BaseFeedback(
-            seq=self._seq,
+            seq=self._feedback.on_report(reading, now),
             status=reading.status,
             odometry=reading.odometry,
             fault=self._latched,
-            stopped=stopped,
+            stopped=self._stopped(now),
             corrupted=self.corrupted,
+            bumped=self._bumped,
         )
+
+    def _stopped(self, now: float) -> str | None:
+        """Return why the wheels are kept at zero whatever the agent requests; None: they are not."""
+        if self._fresh_command(now) is not None and self._maneuvers.running is not None:
+            return None
+        if self._maneuvers.problem is not None:
+            return self._maneuvers.problem
+        if self._charging(now):
+            return ON_CHARGER
+        if not self._base.awake:
+            return "the base is not ready to drive yet"
+        return NO_FRESH_COMMAND if self._fresh_command(now) is None else None
 
 
 def _slew(current: float, target: float, gain: float) -> float:

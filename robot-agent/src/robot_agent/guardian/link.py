@@ -3,7 +3,7 @@
 To an agent that it refuses the guardian sends one sentence, the reason, and closes the link.
 """
 
-from typing import Annotated, Final
+from typing import Annotated, Final, Literal
 
 import msgspec
 from msgspec import Meta, Struct
@@ -20,23 +20,30 @@ WHEEL_SPEED_MAX_M_S: Final = 0.5
 WheelSpeed = Annotated[float, Meta(ge=-WHEEL_SPEED_MAX_M_S, le=WHEEL_SPEED_MAX_M_S)]
 
 
+Maneuver = Literal["seek_dock", "leave_dock", "back_off"]
+"""A movement beyond ordinary driving, which the guardian allows within limits of its own (`guardian.maneuvers`)."""
+
+
 class WheelCommand(Struct, frozen=True, kw_only=True):
     """Wheel speeds that the agent requests (m/s), 20 times a second; `seq` grows by one with each.
 
     `reset` passes on an operator's authenticated reset: the guardian clears a latched fault and wakes the base again.
+    `maneuver` goes on as long as it is asked for.
     """
 
     seq: Count
     left: WheelSpeed
     right: WheelSpeed
     reset: bool = False
+    maneuver: Maneuver | None = None
 
 
 class BaseFeedback(Struct, frozen=True, kw_only=True):
     """The newest reading of the base.
 
     `fault`: the guardian's latched fault (None: none). `stopped`: why the guardian keeps the wheels at zero
-    whatever the agent requests (None: it does not). `corrupted`: damaged frames of the base so far.
+    whatever the agent requests (None: it does not). `corrupted`: damaged frames of the base so far. `bumped`: the fault
+    is a pressed bumper, from which the robot may back off.
     """
 
     seq: Count
@@ -45,6 +52,7 @@ class BaseFeedback(Struct, frozen=True, kw_only=True):
     fault: Sentence | None
     stopped: Sentence | None
     corrupted: Count = 0
+    bumped: bool = False
 
 
 encode = msgspec.msgpack.Encoder().encode

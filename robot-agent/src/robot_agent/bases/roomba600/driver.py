@@ -1,7 +1,8 @@
 """Driver of the Roomba 600: Open Interface in Safe mode, with its safety sensors streamed every 15 ms.
 
 A Roomba keeps its last velocity while the host is silent. Safe mode falls back to Passive by itself on cliff, wheel
-drop and charger, and stops the wheels then; the bumper is left to the host.
+drop and charger, and stops the wheels then; the bumper is left to the host. Its own program drives it into its dock in
+Passive mode; off the dock it drives in Full mode only.
 """
 
 from __future__ import annotations
@@ -44,6 +45,10 @@ _REMEDY: Final = (
 _REMEDY_BRC: Final = "it was pulsed awake without success: check the cable, its BRC wire, and the battery"
 _CHANGING: Final = frozenset((*range(21, 27), 35, 41, 42, 43, 44, *oi.LIGHT_BUMPER))
 """Packets that change all the time, and the mode, which the monitor follows."""
+_DRIVING: Final = frozenset({oi.Mode.SAFE})
+_SEEKING: Final = frozenset({oi.Mode.PASSIVE, oi.Mode.SAFE})
+"""Frames of before Seek Dock may still arrive."""
+_LEAVING: Final = frozenset({oi.Mode.PASSIVE, oi.Mode.FULL})
 MEASURE_S: Final = 0.5
 """Period of looking at battery and light bumper: they hurry nobody."""
 _CHARGING: Final[dict[int, Charging]] = {
@@ -89,6 +94,7 @@ class Roomba600Driver:
         self._corrupted_before = 0
         self._mode = ModeMonitor()
         self._safe_sent = False
+        self._modes = _DRIVING
         self._on_charger = False
         self._received_at = 0.0
         other = 19200 if options.baud == 115200 else 115200
@@ -133,6 +139,7 @@ class Roomba600Driver:
         # of a wheel command takes up to four bytes as the missing ones.
         self._mode.restart()
         self._safe_sent = False
+        self._modes = _DRIVING
         return 5 * oi.start() + oi.stream(self._stream)
 
     def respond(self) -> bytes:
@@ -141,6 +148,24 @@ class Roomba600Driver:
             return b""
         self._safe_sent = True
         return oi.safe() + 2 * oi.drive_direct(0, 0)
+
+    def seek_dock(self) -> bytes:
+        """Return Seek Dock; it leads into Passive mode."""
+        self._modes = _SEEKING
+        return oi.seek_dock()
+
+    def leave_dock(self) -> bytes:
+        """Return Full, which moves the wheels on the dock; empty while the offset of the mode is not known."""
+        if self._mode.offset is None:
+            return b""
+        self._modes = _LEAVING
+        return oi.full()
+
+    def take_control(self, *, charging: bool) -> bytes:
+        """Return Start, which stops the wheels; and without a charger Safe and zero speed; each twice."""
+        self._modes = _DRIVING
+        self._safe_sent = not charging
+        return 2 * oi.start() if charging else 2 * (oi.start() + oi.safe() + oi.drive_direct(0, 0))
 
     def use_baud(self, baud: int) -> None:
         """Ask for the stream that fits into this rate."""
@@ -157,10 +182,10 @@ class Roomba600Driver:
         """Return the status; that of the last frame as long as no packet has changed that it is made of."""
         if self._received_at - self._measured_at >= MEASURE_S:
             self._measured, self._measured_at = _measure(frame), self._received_at
-        made_of = (self._mode.mode, self._measured, self._status_packets(frame.packets))
+        made_of = (self._mode.mode, self._modes, self._measured, self._status_packets(frame.packets))
         if made_of != self._status_made_of:
             self._status_made_of = made_of
-            self._last_status = _status(frame, self._mode.mode, self._measured)
+            self._last_status = _status(frame, self._mode.mode, self._modes, self._measured)
         return self._last_status
 
     def _odometry(self, frame: oi.Frame) -> WheelOdometry:
@@ -196,7 +221,7 @@ def _measure(frame: oi.Frame) -> _Measured:
     return _Measured(min(1.0, max(0.0, charge)) if math.isfinite(charge) else None, power, proximity)
 
 
-def _status(frame: oi.Frame, mode: oi.Mode | int | None, measured: _Measured) -> BaseStatus:
+def _status(frame: oi.Frame, mode: oi.Mode | int | None, modes: frozenset[oi.Mode], measured: _Measured) -> BaseStatus:
     return BaseStatus(
         bumper_left=frame.bump_left,
         bumper_right=frame.bump_right,
@@ -205,15 +230,14 @@ def _status(frame: oi.Frame, mode: oi.Mode | int | None, measured: _Measured) ->
         overcurrent=frame.wheel_overcurrent,
         battery=measured.battery,
         charging=frame.on_charger,
+        docked=frame.docked,
         power=measured.power,
         proximity=measured.proximity,
-        mode_problem=_mode_problem(frame, mode),
+        mode_problem=None if mode in modes else _mode_problem(frame, mode),
     )
 
 
-def _mode_problem(frame: oi.Frame, mode: oi.Mode | int | None) -> str | None:
-    if mode == oi.Mode.SAFE:
-        return None
+def _mode_problem(frame: oi.Frame, mode: oi.Mode | int | None) -> str:
     if mode is None:
         return "its Open Interface is being started"
     name = mode.name.capitalize() if isinstance(mode, oi.Mode) else f"number {mode}"

@@ -3,8 +3,8 @@
 Nothing here touches a port or a clock: bytes and arrival times go in, values come out.
 Source: iRobot Create 2 Open Interface specification based on the Roomba 600 (2018).
 
-Full mode has no builder on purpose: the robot is driven in Safe mode only, so that its own cliff, wheel drop and
-charger protection stays on.
+The robot is driven in Safe mode, so that its own cliff, wheel drop and charger protection stays on. Full mode is for
+leaving the dock only, where Safe mode does not move the wheels.
 """
 
 from __future__ import annotations
@@ -206,6 +206,11 @@ def safe() -> bytes:
     return b"\x83"
 
 
+def full() -> bytes:
+    """Take control without the robot's own protection (132): -> Full. It drives on its charger, and stops charging."""
+    return b"\x84"
+
+
 def power() -> bytes:
     """Switch the robot off (133)."""
     return b"\x85"
@@ -403,6 +408,11 @@ class Frame:
     def on_charger(self) -> bool:
         """Home Base or charger has contact (packet 34)."""
         return bool(self[34] & 3)
+
+    @property
+    def docked(self) -> bool:
+        """Home Base has contact, and no charger is plugged in (packet 34)."""
+        return self[34] & 3 == 2
 
     @property
     def mode(self) -> Mode | int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from robot_agent.bases.roomba600.emulator.body import AXLE_MM, Battery, Wheels, World
+from robot_agent.bases.roomba600.emulator.docking import Dock, Search
 from robot_agent.bases.roomba600.emulator.quirks import LineNoise, Quirks
 from robot_agent.bases.roomba600.emulator.sensors import Sensors, Stream
 
@@ -72,12 +73,18 @@ class RoombaEmulator:
         self.world = World()
         self.battery = battery or Battery()
         self.mode = OFF
-        self.seeking_dock = False
+        self._search: Search | None = None
+        self._dock: Dock | None = None
         self._wheels = Wheels(left_encoder, right_encoder)
         self._commands = CommandParser()
         self._stream = Stream()
         self._sensors = Sensors(self.world, self.battery, self._wheels, self._stream, lambda: self.mode)
         self._outgoing = bytearray()
+
+    @property
+    def seeking_dock(self) -> bool:
+        """Whether its firmware drives it to its dock."""
+        return self._search is not None
 
     @property
     def baud(self) -> int:
@@ -101,6 +108,11 @@ class RoombaEmulator:
         self.world.cliff_left = self.world.cliff_right = cliff
         self.world.cliff_front_left = self.world.cliff_front_right = cliff
 
+    def set_dock(self, ahead_m: float, aside_m: float, heading_rad: float) -> None:
+        """Set where the robot is, seen from where it stands on its dock; see `docking.Dock`."""
+        self._dock = Dock(ahead_m, aside_m, heading_rad)
+        self.world.home_base = self._dock.has_contact
+
     @property
     def wheel_speeds_m_s(self) -> tuple[float, float]:
         """(left, right) speeds at which the motors are driven now, m/s."""
@@ -120,8 +132,10 @@ class RoombaEmulator:
     def tick(self, now: float, dt: float) -> None:
         """Advance time by dt (s) to `now`: protection, battery and the stream."""
         self._protect()
+        self._drive_to_dock(dt)
         moving = sum(abs(speed) for speed in self.wheel_speeds_m_s)
-        self.battery.tick(dt, powered=self.world.powered, wheels_m_s=moving)
+        # Safe and Full mode end the charging.
+        self.battery.tick(dt, powered=self.world.powered and self.mode in {OFF, PASSIVE}, wheels_m_s=moving)
         if self.battery.charge_mah <= 0.0:
             self._leave(OFF)
         self._send_stream(now)
@@ -166,12 +180,12 @@ class RoombaEmulator:
         elif opcode == 133:
             self._leave(PASSIVE)
         elif opcode in {130, 131, 132}:
-            self.seeking_dock = False
+            self._stop_search()
             self.mode = FULL if opcode == 132 else SAFE
             self._protect()
         elif opcode in {134, 135, 136, 143}:
             self._leave(PASSIVE, keep_stream=True)
-            self.seeking_dock = opcode == 143
+            self._search = Search() if opcode == 143 else None
         elif opcode in {142, 148, 149, 150}:
             self._report(opcode, arguments, now)
         elif opcode in {137, 145, 146} and self.mode in {SAFE, FULL}:
@@ -196,9 +210,25 @@ class RoombaEmulator:
         """Stop the motors and enter a mode in which the host does not drive."""
         self.mode = mode
         self._wheels.stop()
-        self.seeking_dock = False
+        self._search = None
         if not keep_stream:
             self._stream.pause()
+
+    def _drive_to_dock(self, dt: float) -> None:
+        """Let the firmware drive: blind to everything but the dock's beams, wheel drop and cliff."""
+        if self._search is None:
+            return
+        wheels = None if self.world.wheel_drop or self.world.cliff else self._search.wheels(self._dock, dt)
+        if wheels is None:
+            self._stop_search()
+        else:
+            left, right = wheels
+            self._wheels.drive_direct(right, left)
+
+    def _stop_search(self) -> None:
+        if self._search is not None:
+            self._search = None
+            self._wheels.stop()
 
     def _protect(self) -> None:
         """Safe mode's own protection: cliff while moving forward, wheel drop, charger; not bumper."""

@@ -1,0 +1,51 @@
+"""When the agent gets a reading of the base: every change at once, the rest at a steady rate. Pure."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+import msgspec
+
+if TYPE_CHECKING:
+    from robot_agent.hardware import BaseReading, BaseStatus, WheelOdometry
+
+FEEDBACK_S: Final = 0.045
+"""The agent gets every third sensor frame while the wheels turn, and every change immediately."""
+FEEDBACK_AT_REST_S: Final = 0.09
+"""And every seventh while they do not: an idle robot shall cost little."""
+
+
+class FeedbackPolicy:
+    """What was reported last; `now` is s of a monotonic clock."""
+
+    def __init__(self) -> None:
+        self._at = -math.inf
+        self._key: object = None
+        self._status: BaseStatus | None = None
+        self._alarms: BaseStatus | None = None
+        self._odometry: WheelOdometry | None = None
+        self.seq = 0
+
+    def is_due(self, reading: BaseReading, state: object, now: float, *, moving: bool) -> bool:
+        """Return whether to report a new reading; `state`: what else is reported at once when it changes."""
+        if reading.status is not self._status:
+            self._status = reading.status
+            # Any change counts but that of measurements, which change all the time.
+            self._alarms = msgspec.structs.replace(reading.status, battery=None, power=None, proximity=())
+        key = (self._alarms, state)
+        rests = reading.odometry == self._odometry and not moving
+        if key == self._key and now - self._at < (FEEDBACK_AT_REST_S if rests else FEEDBACK_S):
+            return False
+        self._key = key
+        return True
+
+    def is_overdue(self, now: float) -> bool:
+        """Return whether to repeat the last reading of a base that is silent."""
+        return now - self._at >= FEEDBACK_S
+
+    def on_report(self, reading: BaseReading, now: float) -> int:
+        """Record that a reading is reported; return the report's number."""
+        self.seq += 1
+        self._at, self._odometry = now, reading.odometry
+        return self.seq

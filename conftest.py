@@ -24,6 +24,11 @@ if os.environ.get("CI", "").lower() in {"1", "true"}:
 WORKER: Final = os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw")
 WORKERS: Final = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
 ROOT: Final = Path(__file__).parent
+LONGER: Final = (
+    "FOGNAV_FLAPS", "FOGNAV_FUZZ_INPUTS", "FOGNAV_GAP_SEEDS", "FOGNAV_HISTORIES", "FOGNAV_KILLS",
+    "FOGNAV_PERMUTED_READINGS", "FOGNAV_RIDE_SEEDS", "FOGNAV_STORE_EXAMPLES", "FOGNAV_TEST_STOP_FIELD_SEEDS",
+)  # fmt: skip
+"""Variables that set how much some tests try, which may take hours then (CONTRIBUTING.md)."""
 REACTION, COMPUTING, SYSTEM, LIVE, COMPOSE = range(5)
 """Kinds of test modules, in the order in which they are started."""
 
@@ -79,7 +84,11 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> "LoadScop
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Start with the tests that take longest, if several workers share them."""
+    """Start with the tests that take longest, if several workers share them; no test that was made longer times out."""
+    if any(os.environ.get(name) for name in LONGER):
+        for item in items:
+            if item.get_closest_marker("timeout") is None:
+                item.add_marker(pytest.mark.timeout(0))
     if "PYTEST_XDIST_WORKER" in os.environ:
         items.sort(key=lambda item: group_of(module_of(item.nodeid)))
 

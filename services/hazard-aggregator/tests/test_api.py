@@ -40,7 +40,7 @@ async def test_areas_are_changed_by_version_and_survive_a_kill(fog, client, toke
 async def test_history_continues_over_a_kill(fog, client, tokens):
     override = {"state": "blocked", "reason": "wet floor", "ttl_s": 600}
     put = await client.put("/api/v1/areas/hall/override", json=override, headers=tokens["operator"])
-    assert put.status_code == 200, put.text
+    assert put.status_code == 201, put.text
 
     async def blocked(client: httpx.AsyncClient) -> dict:
         answer = await client.get("/api/v1/areas/hall/history?limit=1")
@@ -129,8 +129,9 @@ async def test_repeated_put_returns_the_first_result_and_emptied_redis_is_restor
     other = await client.put("/api/v1/areas/hall", json={"polygon": POLYGON}, headers=headers)
     assert (other.status_code, other.json()["errors"][0]["field"]) == (422, "header.Idempotency-Key")
     new = {**tokens["operator"], "If-None-Match": "*"}
-    assert (await client.put("/api/v1/areas/hall", json=body, headers=new)).status_code == 412
-    assert (await client.put("/api/v1/areas/gate", json=body, headers=new)).status_code == 200
+    refused = await client.put("/api/v1/areas/hall", json=body, headers=new)
+    assert (refused.status_code, "exists already" in refused.json()["detail"]) == (412, True)
+    assert (await client.put("/api/v1/areas/gate", json=body, headers=new)).status_code == 201
     async with Redis.from_url(fog.redis.url) as raw:
         await raw.flushall()
         refused = await client.put("/api/v1/areas/hall", json=body, headers=tokens["operator"])
@@ -173,7 +174,7 @@ async def test_override_counts_at_once_survives_a_kill_and_ends_with_an_entry_in
     body = {"state": "blocked", "reason": "wet floor", "ttl_s": 3600}
     assert (await client.put(path, json=body)).status_code == 401
     put = await client.put(path, json=body, headers={**tokens["operator"], "Idempotency-Key": "k1"})
-    assert (put.status_code, put.headers["etag"], put.json()["author"]) == (200, '"1"', "anna"), put.text
+    assert (put.status_code, put.headers["etag"], put.json()["author"]) == (201, '"1"', "anna"), put.text
     again = await client.put(path, json=body, headers={**tokens["operator"], "Idempotency-Key": "k1"})
     assert again.headers["etag"] == '"1"', "the same attempt"
     fog.kill("hazard_aggregator")
@@ -215,6 +216,14 @@ async def test_only_an_admin_declares_an_area_clear_and_for_a_quarter_of_an_hour
     unreasoned = await client.put(path, json={**body, "reason": ""}, headers=tokens["admin"])
     assert unreasoned.status_code == 422
     assert (await client.put(path.replace("hall", "nix"), json=body, headers=tokens["admin"])).status_code == 404
+    missing = await client.get(path)
+    assert (missing.status_code, "has no override" in missing.json()["detail"]) == (404, True)
+    assert (await client.put(path, json=body, headers=tokens["admin"])).status_code == 201
+    read = await client.get(path)
+    assert (read.json()["author"], read.headers["etag"]) == ("ada", '"1"')
     assert (await client.put(path, json=body, headers=tokens["admin"])).status_code == 200
-    assert (await client.delete(path, headers=tokens["operator"])).status_code == 204
+    stale = await client.delete(path, headers={**tokens["operator"], "If-Match": '"1"'})
+    assert (stale.status_code, "has another override by now" in stale.json()["detail"]) == (412, True)
+    assert (await client.delete(path, headers={**tokens["operator"], "If-Match": '"2"'})).status_code == 204
+    assert (await client.delete(path, headers={**tokens["operator"], "If-Match": '"2"'})).status_code == 404
     assert (await client.get("/api/v1/areas/hall")).json()["override"] is None

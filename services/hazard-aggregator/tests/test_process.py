@@ -197,7 +197,7 @@ async def test_thesis_node_of_an_area_added_at_run_time_is_subscribed_without_a_
     async with connected_node(fog) as (node, _), httpx.AsyncClient() as client:
         body = {"polygon": [[1.0, 1.0], [2.0, 1.0], [2.0, 2.0]], "number": 8}
         put = await client.put(f"{url}/api/v1/areas/gate", json=body, headers=tokens["operator"])
-        assert put.status_code == 200, put.text
+        assert put.status_code == 201, put.text
         for _ in range(5):
             assert await node.mqtt.publish(ch.THESIS_AREA, "blocked", wait=True, number="8")
         await until(

@@ -45,7 +45,7 @@ async def test_sources_of_the_site_and_over_rest_decide_their_areas_and_survive_
         assert offline["cause"] == "source gate: it went offline"
         body = {"polygon": POLYGON, "sources": [DOOR]}
         put = await client.put("/api/v1/areas/yard", json=body, headers=tokens["operator"])
-        assert put.status_code == 200, put.text
+        assert put.status_code == 201, put.text
         await mqtt.publish("zigbee2mqtt/fire_door", '{"contact": true, "battery": 100}')
         blocked = await wait_for(client, "yard", lambda hazard: hazard["state"] == "blocked")
         assert blocked["nodes"] == {"door": "blocked"}
@@ -71,7 +71,7 @@ async def test_changed_source_is_given_what_the_broker_retains_and_a_long_messag
 
         async def put(**fields) -> None:
             body = {"polygon": POLYGON, "sources": [{**door, **fields}]}
-            assert (await client.put("/api/v1/areas/yard", json=body, headers=tokens["operator"])).status_code == 200
+            assert (await client.put("/api/v1/areas/yard", json=body, headers=tokens["operator"])).is_success
 
         await put()
         await wait_for(client, "yard", lambda hazard: hazard["state"] == "clear")

@@ -236,11 +236,11 @@ async def test_operator_without_a_key_enables_a_robot_through_the_planner_and_th
             stopped = await client.post("/api/v1/robots/r1/stop")
             assert stopped.json()["reason"] == "stop from 127.0.0.1 may disable"
         redis = RedisConnection(env.redis.url)
-        trail = await redis.read("XRANGE", "fog:test:audit:robot", "-", "+")
+        trails = [await redis.read("XRANGE", f"fog:test:audit:{kind}", "-", "+") for kind in ("robot", "stop")]
         await redis.aclose()
-        entries = [fields for _, fields in trail]
-        assert [(e[b"who"], e[b"action"], e[b"id"]) for e in entries[-2:]] == [
-            (b"operator", b"enable", b"r1"), (b"stop from 127.0.0.1", b"disable", b"r1"),
+        last = [trail[-1][1] for trail in trails]
+        assert [(e[b"who"], e[b"action"], e[b"id"]) for e in last] == [
+            (b"operator", b"enable", b"r1"), (b"stop from 127.0.0.1", b"stop", b"r1"),
         ]  # fmt: skip
 
 
@@ -254,7 +254,7 @@ async def test_mission_is_replanned_around_a_hazard_survives_a_kill_and_ends_whe
     async with running_planner(tmp_path) as env:
         async with env.ready() as client:
             answer = await client.put("/api/v1/robots/r1/goal", json={"place": "right"}, headers=OPERATOR)
-            assert answer.status_code == 200
+            assert answer.status_code == 201
             goal_id = answer.json()["goal_id"]
             await env.until(lambda: env.paths and env.goals)
             assert (env.paths[-1].goal_id, env.goals[-1].goal_id) == (goal_id, goal_id)
@@ -315,10 +315,46 @@ async def test_invalid_goals_are_refused_with_a_reason_and_all_goals_without_the
         assert "retry-after" in unstored.headers
         assert (await client.get(url, headers=OPERATOR)).status_code == 404
         env.redis.start()
-        assert (await put({"place": "right"})).status_code == 200
+        assert (await put({"place": "right"})).status_code == 201
         await env.until(lambda: env.paths)
         assert (await client.delete(url, headers=OPERATOR)).status_code == 204
         await env.until(lambda: env.goals[-1].pose is None)
+
+
+async def test_mission_is_replaced_or_cancelled_only_if_it_is_the_one_that_was_read(tmp_path: Path) -> None:
+    async with running_planner(tmp_path) as env, env.ready() as client:
+        url = "/api/v1/robots/r1/goal"
+
+        async def put(place: str, **condition: str) -> httpx.Response:
+            headers = {**OPERATOR, **{name.replace("_", "-"): value for name, value in condition.items()}}
+            return await client.put(url, json={"place": place}, headers=headers)
+
+        first = await put("right", if_none_match="*")
+        assert first.status_code == 201
+        tag = first.headers["etag"]
+        assert tag == f'"{first.json()["goal_id"]}"' == (await client.get(url, headers=OPERATOR)).headers["etag"]
+        refused = await put("right", if_none_match="*")
+        assert (refused.status_code, refused.headers["content-type"]) == (412, "application/problem+json")
+        assert f"has the mission {first.json()['goal_id']}" in refused.json()["detail"]
+        for wrong in ('"other"', "no tag", '""'):
+            assert (await put("right", if_match=wrong)).status_code == 412
+            assert (await client.delete(url, headers={**OPERATOR, "If-Match": wrong})).status_code == 412
+        second = await put("right", if_match=tag)
+        assert second.status_code == 200
+        assert (await put("right", if_match=tag)).status_code == 412, "it is not that mission any more"
+        keyed = {"if_match": second.headers["etag"], "idempotency_key": "k1"}
+        third = await put("right", **keyed)
+        assert (await put("right", **keyed)).json() == third.json(), "a repeated request is no new order"
+        # A reached mission may still be stored for a while.
+        goal_id = third.json()["goal_id"]
+        await env.until(lambda: env.goals and env.goals[-1].goal_id == goal_id)
+        env.report_reached(goal_id)
+        await env.until(lambda: env.goals[-1].pose is None)
+        assert (await put("right", if_match=third.headers["etag"])).status_code == 412
+        assert (await put("right", if_none_match="*")).status_code == 201
+        current = (await client.get(url, headers=OPERATOR)).headers["etag"]
+        assert (await client.delete(url, headers={**OPERATOR, "If-Match": current})).status_code == 204
+        assert (await client.delete(url, headers={**OPERATOR, "If-Match": current})).status_code == 404
 
 
 async def test_queries_are_answered_over_zenoh_and_http_without_side_effects(tmp_path: Path) -> None:

@@ -186,7 +186,7 @@ async def sent(planners: Planners, tokens, leader: str) -> str:
             break
         await asyncio.sleep(0.05)
         answer = await planners.call("PUT", tokens, leader, json=GOAL)
-    assert answer.status_code == 200, answer.text
+    assert answer.status_code == 201, answer.text
     return answer.json()["goal_id"]
 
 

@@ -43,7 +43,7 @@ from fog_runtime.idempotency import IdempotencyError
 from hazard_aggregator.area_size import AreaError, check_size
 from hazard_aggregator.area_writer import ConflictError
 from hazard_aggregator.history_api import add_history
-from hazard_aggregator.override_api import OverrideView, add_overrides, override_view
+from hazard_aggregator.override_api import OverrideView, add_overrides, no_such_area, override_view
 from hazard_aggregator.service import Service
 from hazard_aggregator.store import StoreError
 
@@ -115,7 +115,7 @@ def _add_areas(routes: Routes, service: Service, geometry: GridGeometry, clock: 
     routes.raises(
         ConflictError,
         {412: "Somebody else changed the area"},
-        lambda error: ProblemError(412, f"{error}: read it again, then retry"),
+        lambda error: ProblemError(412, str(error)),
     )
 
     def area_views() -> dict[str, AreaView]:
@@ -141,10 +141,10 @@ def _add_areas(routes: Routes, service: Service, geometry: GridGeometry, clock: 
         """Return one area with its ETag."""
         view = area_views().get(area_id)
         if view is None:
-            raise ProblemError(404, f"there is no area {area_id}")
+            raise no_such_area(area_id)
         return Answer(view, etag(view.definition.version))
 
-    @routes.put("/api/v1/areas/{area_id}", raises=[ConflictError, IdempotencyError, StoreError])
+    @routes.put("/api/v1/areas/{area_id}", status=(200, 201), raises=[ConflictError, IdempotencyError, StoreError])
     async def put_area(
         area_id: str,
         body: Body[AreaBody],
@@ -157,6 +157,7 @@ def _add_areas(routes: Routes, service: Service, geometry: GridGeometry, clock: 
 
         With If-Match, only if it is unchanged; with `If-None-Match: *`, only if there is none.
         """
+        new = area_id not in area_views()
         definition = await service.areas.put_area(
             _validated(area_id, body, service, geometry),
             caller.name,
@@ -164,7 +165,7 @@ def _add_areas(routes: Routes, service: Service, geometry: GridGeometry, clock: 
             must_be_new=must_be_new(if_none_match),
             attempt=attempt_of(idempotency_key, caller, f"PUT /api/v1/areas/{area_id}", body),
         )
-        return Answer(definition, etag(definition.version))
+        return Answer(definition, etag(definition.version), status=201 if new else 200)
 
     add_overrides(routes, service, clock)
 

@@ -30,10 +30,10 @@ class _Earlier(NamedTuple):
 
 
 class ConflictError(Exception):
-    """An area has another version than the writer expected."""
+    """An area or its override has another version than the writer expected; the message names the remedy."""
 
-    def __init__(self, area: str) -> None:
-        super().__init__(f"area {area} was changed by somebody else")
+    def __init__(self, area: str, what: str = "was changed by somebody else: read it again, then retry") -> None:
+        super().__init__(f"area {area} {what}")
 
 
 class AreaWriter:
@@ -71,7 +71,7 @@ class AreaWriter:
                     stored = old.definition
                     break
                 if must_be_new and old is not None and not old.removed:
-                    raise ConflictError(definition.id)
+                    raise ConflictError(definition.id, "exists already: PUT it with If-Match, or choose another id")
                 if expected is not None and (old is None or old.version != expected):
                     raise ConflictError(definition.id)
                 stored = structs.replace(definition, version=1 if old is None else old.version + 1)

@@ -54,8 +54,18 @@ def override_view(service: Service, area: str, now: float) -> OverrideView | Non
 def add_overrides(routes: Routes, service: Service, clock: Clock) -> None:
     """Add the routes that set and remove overrides; `routes` knows the errors of areas and of the store."""
 
+    @routes.get("/api/v1/areas/{area_id}/override", problems={404: "No area has this id, or it has no override"})
+    async def get_override(area_id: str) -> Answer[OverrideView]:
+        """Return an area's override with its ETag."""
+        _require_area(service, area_id)
+        view = override_view(service, area_id, clock.now())
+        if view is None:
+            raise _without_override(area_id)
+        return Answer(view, etag(view.version))
+
     @routes.put(
         "/api/v1/areas/{area_id}/override",
+        status=(200, 201),
         raises=[ConflictError, IdempotencyError, StoreError],
         problems={404: "No area has this id"},
     )
@@ -72,6 +82,7 @@ def add_overrides(routes: Routes, service: Service, clock: Clock) -> None:
         """
         _require_area(service, area_id)
         _require_allowed(body, caller)
+        new = service.core.overrides.get(area_id) is None
         override = await service.overrides.put(
             area_id,
             body.state,
@@ -82,22 +93,31 @@ def add_overrides(routes: Routes, service: Service, clock: Clock) -> None:
             attempt=attempt_of(idempotency_key, caller, f"PUT /api/v1/areas/{area_id}/override", body),
         )
         rest_s = max(0.0, override.deadline - clock.now())
-        return Answer(_view(override, rest_s), etag(override.version))
+        return Answer(_view(override, rest_s), etag(override.version), status=201 if new else 200)
 
     @routes.delete(
         "/api/v1/areas/{area_id}/override",
         raises=[ConflictError, StoreError],
-        problems={404: "The area has no override"},
+        problems={404: "No area has this id, or it has no override"},
     )
-    async def delete_override(area_id: str, caller: Operator) -> None:
-        """End an area's override: its nodes count again."""
-        if not await service.overrides.remove(area_id, caller.name):
-            raise ProblemError(404, f"area {area_id} has no override")
+    async def delete_override(area_id: str, caller: Operator, if_match: IfMatch = None) -> None:
+        """End an area's override, with If-Match only if it is unchanged: its nodes count again."""
+        if not await service.overrides.remove(area_id, caller.name, expected_version(if_match)):
+            raise _without_override(area_id)
+
+
+def no_such_area(area: str) -> ProblemError:
+    """Return the problem of a request about an area that does not exist."""
+    return ProblemError(404, f"there is no area {area}: GET /api/v1/areas lists those that there are")
+
+
+def _without_override(area: str) -> ProblemError:
+    return ProblemError(404, f"area {area} has no override: its nodes and sources decide; PUT one first")
 
 
 def _require_area(service: Service, area: str) -> None:
     if not any(known.id == area and not known.removed for known in service.core.definitions()):
-        raise ProblemError(404, f"there is no area {area}")
+        raise no_such_area(area)
 
 
 def _require_allowed(body: OverrideBody, caller: Caller) -> None:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from hazard_aggregator.records import Records
     from hazard_aggregator.store import Store
 
+OVERRIDE_CHANGED: Final = "has another override by now, or none: read it again, then retry"
 PERIOD_S: Final = 10.0
 """How often the remaining times are stored: after a boot, an override may last longer by up to this time."""
 
@@ -73,7 +74,7 @@ class OverrideWriter:
                         return earlier
                 old = self._core.overrides.known(area)
                 if expected is not None and (old is None or old.version != expected):
-                    raise ConflictError(area)
+                    raise ConflictError(area, OVERRIDE_CHANGED)
                 override = AreaOverride(
                     area=area,
                     state=state,
@@ -92,12 +93,12 @@ class OverrideWriter:
                     self._publisher.announce(self._core.put_override(override, self._edges.now()))
                     return override
                 self._records.request_reload()
-        raise ConflictError(area)
+        raise ConflictError(area, OVERRIDE_CHANGED)
 
-    async def remove(self, area: str, who: str) -> bool:
+    async def remove(self, area: str, who: str, expected: int | None = None) -> bool:
         """Delete an area's override, and let its nodes count again; return whether there was one.
 
-        Raises `ConflictError` and `StoreError`.
+        With `expected`, only this version. Raises `ConflictError` and `StoreError`.
         """
         async with self._records.lock:
             with self._records.uncertain_write():
@@ -106,6 +107,8 @@ class OverrideWriter:
             override = self._core.overrides.get(area)
             if override is None:
                 return False
+            if expected not in (None, override.version):
+                raise ConflictError(area, OVERRIDE_CHANGED)
             await self._delete(override, Audit(self._clock.stamp(), who, "remove"))
         return True
 

@@ -243,7 +243,7 @@ def _conflict(error: ConflictError) -> ProblemError:
     if error.outcome == "exists":
         return ProblemError(409, f"zone {error.zone} exists already: choose another id, or PUT it")
     if error.outcome == "missing":
-        return ProblemError(404, f"there is no zone {error.zone} any more")
+        return ProblemError(404, f"there is no zone {error.zone} any more: POST it to add it again")
     return ProblemError(412, f"zone {error.zone} was changed by somebody else: read it again, then retry")
 
 
@@ -369,7 +369,7 @@ def _find_zone(service: Service, zone_id: str) -> Zone:
     _require_zones(service)
     entry = service.core.zones.get(zone_id)
     if entry is None:
-        raise ProblemError(404, f"there is no zone {zone_id}")
+        raise ProblemError(404, f"there is no zone {zone_id}: GET /api/v1/zones lists those that there are")
     return entry.zone
 
 

@@ -22,9 +22,12 @@ from fog_contracts.messages import (
 from fog_contracts.site import Site
 from fog_runtime.health import Health
 from fog_runtime.http import (
+    Answer,
     Body,
     ClientHost,
     IdempotencyKey,
+    IfMatch,
+    IfNoneMatch,
     Operator,
     ProblemError,
     Routes,
@@ -33,10 +36,14 @@ from fog_runtime.http import (
     add_recovery,
     add_store_errors,
     attempt_of,
+    etag,
+    expected_tag,
     make_app,
+    must_be_new,
 )
 from fog_runtime.idempotency import IdempotencyError
 from planner.command_api import add_commands
+from planner.mission_keeper import NO_MISSION, MissionConflictError, Order
 from planner.query_queue import BusyError
 from planner.robot_commands import CommandError
 from planner.service import Service
@@ -102,6 +109,14 @@ def _goal_view(robot: str, stored: StoredGoal) -> GoalView:
         any_heading=stored.any_heading,
         stamp=goal.stamp,
     )
+
+
+def _goal_answer(robot: str, stored: StoredGoal, status: int = 200) -> Answer[GoalView]:
+    return Answer(_goal_view(robot, stored), etag(stored.goal.goal_id), status=status)
+
+
+def _without_mission(robot: str) -> ProblemError:
+    return ProblemError(404, f"robot {robot} has no mission: PUT one first")
 
 
 def _plan_view(path: RobotPath) -> PlanView:
@@ -177,7 +192,7 @@ def make_api(service: Service, site: Site, health: Health, tokens: Tokens, stand
     _add_plan(Routes(app, "plan"), service)
     recovery = Routes(app, "store")
     add_store_errors(recovery)
-    add_recovery(recovery, service)
+    add_recovery(recovery, service.missions)
     return app
 
 
@@ -201,54 +216,75 @@ def _add_views(routes: Routes, service: Service, robots: _Robots) -> None:
         return robots.view(robot)
 
     @routes.get("/api/v1/robots/{robot}/goal", problems={404: "No robot has this id, or it has no mission"})
-    async def get_goal(robot: str, _caller: Viewer) -> GoalView:
-        """Return a robot's mission."""
+    async def get_goal(robot: str, _caller: Viewer) -> Answer[GoalView]:
+        """Return a robot's mission with its ETag."""
         robots.check(robot)
         stored = service.goals.get(robot)
         if stored is None:
-            raise ProblemError(404, f"robot {robot} has no mission")
-        return _goal_view(robot, stored)
+            raise _without_mission(robot)
+        return _goal_answer(robot, stored)
 
 
 def _add_orders(routes: Routes, service: Service, robots: _Robots, site: Site) -> None:
     """Add the routes that send and stop robots."""
+    routes.raises(
+        MissionConflictError,
+        {412: "The robot has another mission than the request expects, or has one"},
+        lambda error: ProblemError(412, str(error)),
+    )
 
     @routes.put(
         "/api/v1/robots/{robot}/goal",
-        raises=[IdempotencyError, StoreError],
+        status=(200, 201),
+        raises=[IdempotencyError, MissionConflictError, StoreError],
         problems={
             404: "No robot has this id",
             422: "The body is invalid, or the goal can never be reached: then with Nav2's `code` and `name`, and the"
             " `nearest` reachable point",
         },
     )
-    async def put_goal(
-        robot: str, body: Body[GoalBody], caller: Operator, idempotency_key: IdempotencyKey = None
-    ) -> GoalView:
-        """Send a robot to a place or pose."""
+    async def put_goal(  # headers are parameters
+        robot: str,
+        body: Body[GoalBody],
+        caller: Operator,
+        if_match: IfMatch = None,
+        if_none_match: IfNoneMatch = None,
+        idempotency_key: IdempotencyKey = None,
+    ) -> Answer[GoalView]:
+        """Send a robot to a place or pose, instead of its mission.
+
+        With If-Match, only if it still has the mission that was read; with `If-None-Match: *`, only if it has none.
+        """
         robots.check(robot)
         pose, any_heading = _goal_pose(body, site)
-        attempt = attempt_of(idempotency_key, caller, f"PUT /api/v1/robots/{robot}/goal", body)
-        answer = await service.send(
-            robot, pose, caller.name, place=body.place, any_heading=any_heading, attempt=attempt
+        order = Order(
+            robot,
+            pose,
+            caller.name,
+            place=body.place,
+            any_heading=any_heading,
+            attempt=attempt_of(idempotency_key, caller, f"PUT /api/v1/robots/{robot}/goal", body),
+            expected=NO_MISSION if must_be_new(if_none_match) else expected_tag(if_match),
         )
+        new = robot not in service.goals
+        answer = await service.send(order)
         if isinstance(answer, Refusal):
             field = "body.place" if body.place else "body.pose"
             raise ProblemError(
                 422, answer.reason, field=field, code=answer.code, name=answer.name, nearest=answer.nearest
             )
-        return _goal_view(robot, answer)
+        return _goal_answer(robot, answer, status=201 if new else 200)
 
     @routes.delete(
         "/api/v1/robots/{robot}/goal",
-        raises=[StoreError],
+        raises=[MissionConflictError, StoreError],
         problems={404: "No robot has this id, or it has no mission"},
     )
-    async def delete_goal(robot: str, caller: Operator) -> None:
-        """Cancel a robot's mission."""
+    async def delete_goal(robot: str, caller: Operator, if_match: IfMatch = None) -> None:
+        """Cancel a robot's mission; with If-Match, only if it is the one that was read."""
         robots.check(robot)
-        if not await service.cancel(robot, caller.name):
-            raise ProblemError(404, f"robot {robot} has no mission")
+        if not await service.missions.cancel(robot, caller.name, expected_tag(if_match)):
+            raise _without_mission(robot)
 
 
 def _add_plan(routes: Routes, service: Service) -> None:

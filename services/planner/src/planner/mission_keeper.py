@@ -6,12 +6,12 @@ import asyncio
 import secrets
 from contextlib import contextmanager
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from fog_contracts.messages import RobotGoal
 from fog_runtime import logs
 from fog_runtime.redis_connection import StoreRefusedError
-from planner.store import Audit, RecoveryError, StoredGoal, StoreError, StoreLostError
+from planner.store import ANY, Audit, RecoveryError, StoredGoal, StoreError, StoreLostError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -26,8 +26,36 @@ if TYPE_CHECKING:
     from planner.store import Store
 
 STORE_PERIOD_S = 0.5
+NO_MISSION: Final = ""
+"""Instead of a mission's id: expect that a robot has none."""
+_ATTEMPTS: Final = 2
+"""How often a conditional write is tried: what is stored may differ from what this process knows, once."""
 
 _log = logs.get("planner")
+
+
+class Order(NamedTuple):
+    """A mission as an operator orders it, and the conditions of the order.
+
+    `any_heading`: ignore the pose's theta. `expected` is the id of the mission that it replaces, or `NO_MISSION`; None
+    replaces any.
+    """
+
+    robot: str
+    pose: Pose
+    who: str
+    place: str | None = None
+    any_heading: bool = False
+    attempt: Attempt | None = None
+    expected: str | None = None
+
+
+class MissionConflictError(Exception):
+    """A robot has another mission than the writer expected; the message names it."""
+
+    def __init__(self, robot: str, stored: StoredGoal | None) -> None:
+        has = "no mission" if stored is None else f"the mission {stored.goal.goal_id}"
+        super().__init__(f"robot {robot} has {has}, and not the one that was expected: read it again, then retry")
 
 
 class MissionKeeper:
@@ -61,7 +89,8 @@ class MissionKeeper:
         """
         self._store.epoch = epoch
         try:
-            await self._load()
+            async with self._lock:
+                await self._load()
         except StoreError as error:
             if confirmed and not isinstance(error, StoreLostError):
                 raise
@@ -87,35 +116,39 @@ class MissionKeeper:
         with self._uncertain_write():
             earlier = await self._store.earlier_result(attempt)
             if earlier is not None and self._reload:
-                await self._load()
+                async with self._lock:
+                    await self._load()
             return earlier
 
-    async def send(
-        self, robot: str, pose: Pose, who: str, *, place: str | None, any_heading: bool, attempt: Attempt | None
-    ) -> StoredGoal:
-        """Give a robot a mission. Raises `StoreError`, after which the mission may or may not be stored."""
+    async def send(self, order: Order) -> StoredGoal:
+        """Give a robot a mission.
+
+        Raises `MissionConflictError`, and `StoreError`, after which the mission may or may not be stored.
+        """
         async with self._lock:
-            stamp = self._clock.stamp()
+            stamp, place, pose = self._clock.stamp(), order.place, order.pose
             goal = RobotGoal(goal_id=secrets.token_hex(8), pose=pose, place=place, stamp=stamp)
-            stored = StoredGoal(goal=goal, any_heading=any_heading)
-            with self._uncertain_write():
-                outcome = await self._store.put(robot, stored, Audit(stamp, who, "goal", attempt))
-            if outcome != "ok":
-                raise StoreError("another request with this Idempotency-Key is in progress: repeat it")
-            self._begin(robot, stored)
-        _log.info("goal_accepted", robot=robot, goal=goal.goal_id, x=pose.x, y=pose.y, place=place, who=who)
+            stored = StoredGoal(goal=goal, any_heading=order.any_heading)
+            await self._store_mission(order, stored, Audit(stamp, order.who, "goal", order.attempt))
+            self._begin(order.robot, stored)
+        _log.info("goal_accepted", robot=order.robot, goal=goal.goal_id, x=pose.x, y=pose.y, place=place, who=order.who)
         return stored
 
-    async def cancel(self, robot: str, who: str) -> bool:
-        """End a robot's mission; False when it has none. Raises `StoreError`."""
-        with self._uncertain_write():
-            if self._reload:
-                # It may have one that was stored although its request failed: "none" would be wrong.
-                await self._load()
+    async def cancel(self, robot: str, who: str, expected: str | None = None) -> bool:
+        """End a robot's mission; False when it has none. With `expected`, only the mission of that id.
+
+        Raises `MissionConflictError` and `StoreError`.
+        """
         async with self._lock:
+            with self._uncertain_write():
+                if self._reload:
+                    # It may have one that was stored although its request failed: "none" would be wrong.
+                    await self._load()
             stored = self.goals.get(robot)
             if stored is None:
                 return False
+            if expected not in (None, stored.goal.goal_id):
+                raise MissionConflictError(robot, stored)
             with self._uncertain_write():
                 await self._store.delete(robot, stored.goal.goal_id, Audit(self._clock.stamp(), who, "cancel"))
             self._cancel(robot)
@@ -157,7 +190,8 @@ class MissionKeeper:
         while True:
             try:
                 if self._leading and self._reload:
-                    await self._load()
+                    async with self._lock:
+                        await self._load()
                     self._change_core(partial(self._core.lead, self._store.epoch, knows_missions=True))
                 for robot, goal_id in list(self._reached.items()):
                     await self._store.delete(robot, goal_id, Audit(self._clock.stamp(), robot, "reached"))
@@ -185,17 +219,45 @@ class MissionKeeper:
             self._health.set("store", ok=False, detail=str(error))
             raise
 
+    async def _store_mission(self, order: Order, stored: StoredGoal, audit: Audit) -> None:
+        """Store a mission if the robot's mission is the expected one; raises `MissionConflictError`, `StoreError`."""
+        robot, expected = order.robot, order.expected
+        for _ in range(_ATTEMPTS):
+            if expected is not None:
+                await self._require(expected, robot)
+            # One that is reached may still be stored.
+            before = ANY if expected is None else expected or self._reached.get(robot, "0")
+            with self._uncertain_write():
+                outcome = await self._store.put(robot, stored, audit, expected=before)
+            if outcome == "ok":
+                return
+            if expected is None:
+                raise StoreError("another request with this Idempotency-Key is in progress: repeat it")
+            self._reload = True
+        raise MissionConflictError(robot, self.goals.get(robot))
+
+    async def _require(self, expected: str, robot: str) -> None:
+        """Raise `MissionConflictError` unless the robot's mission is the expected one; raises `StoreError`, too."""
+        with self._uncertain_write():
+            if self._reload:
+                await self._load()
+        known = self.goals.get(robot)
+        if expected != (NO_MISSION if known is None else known.goal.goal_id):
+            raise MissionConflictError(robot, known)
+
     async def _load(self) -> None:
-        """Put the stored missions into force, and end those that are not stored; raises `StoreError`."""
-        async with self._lock:
-            stored = await self._store.goals()
-            for robot in [robot for robot in self.goals if robot not in stored]:
-                self._cancel(robot)
-            for robot, mission in stored.items():
-                # One that is reached may still be stored, until its deletion succeeds.
-                if mission != self.goals.get(robot) and mission.goal.goal_id != self._reached.get(robot):
-                    self._begin(robot, mission)
-            self._reload = False
+        """Put the stored missions into force, and end those that are not stored; hold the lock.
+
+        Raises `StoreError`.
+        """
+        stored = await self._store.goals()
+        for robot in [robot for robot in self.goals if robot not in stored]:
+            self._cancel(robot)
+        for robot, mission in stored.items():
+            # One that is reached may still be stored, until its deletion succeeds.
+            if mission != self.goals.get(robot) and mission.goal.goal_id != self._reached.get(robot):
+                self._begin(robot, mission)
+        self._reload = False
         self._loaded.set()
         self._health.set("goals", ok=True, detail=f"{len(self.goals)} loaded")
 

@@ -30,17 +30,15 @@ from planner.threads import Threads
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
-    from typing import Literal
 
     from fog_contracts.handlers import Handler, Ids, Moment, Publication
-    from fog_contracts.messages import EgressRequest, Message, PlanRequest, Pose, Refusal
+    from fog_contracts.messages import EgressRequest, Message, PlanRequest, Refusal
     from fog_runtime.clock import Clock
     from fog_runtime.edges import Gate
     from fog_runtime.health import Health
-    from fog_runtime.idempotency import Attempt
-    from fog_runtime.redis_store import StoreStatus
     from fog_runtime.zenoh_edge import ZenohEdge
     from planner.core import Job, PlannerCore
+    from planner.mission_keeper import Order
     from planner.store import Store, StoredGoal
 
 TICK_S: Final = 0.1
@@ -88,7 +86,7 @@ class Service:
         self._threads = Threads()
         self._queue = QueryQueue(self._threads, on_idle=core.answerer.release)
         self._cycle = Cycle(core, zenoh)
-        self._missions = MissionKeeper(core, store, clock, health, self._change_goal)
+        self.missions = MissionKeeper(core, store, clock, health, self._change_goal)
         self._map = MapKeeper(core, zenoh, clock, health, self._queue, on_loaded=self._wake.set)
         self.operator = RobotOperator(zenoh, store, clock, key)
         self._jobs: set[asyncio.Task[None]] = set()
@@ -102,43 +100,24 @@ class Service:
     @property
     def goals(self) -> dict[str, StoredGoal]:
         """The missions by robot."""
-        return self._missions.goals
+        return self.missions.goals
 
     def path(self, robot: str) -> RobotPath | None:
         """Return the last published path or refusal for the robot's current goal, as last released."""
         path, stored = self._paths.get(robot), self.goals.get(robot)
         return path if path and stored and path.goal_id == stored.goal.goal_id else None
 
-    async def send(
-        self, robot: str, pose: Pose, who: str, *, place: str | None, any_heading: bool, attempt: Attempt | None = None
-    ) -> StoredGoal | Refusal:
+    async def send(self, order: Order) -> StoredGoal | Refusal:
         """Give a robot a mission; returns a refusal for an unreachable goal.
 
-        An `attempt` that succeeded before returns its mission again and changes nothing. Raises `IdempotencyError` for
-        another request's attempt, and `StoreError`, after which the mission may or may not be stored.
+        An attempt that succeeded before returns its mission again and changes nothing. Raises `IdempotencyError` for
+        another request's attempt, and as `MissionKeeper.send`.
         """
-        earlier = await self._missions.earlier_result(attempt)
+        earlier = await self.missions.earlier_result(order.attempt)
         if earlier is not None:
             return earlier
-        refusal = await self._threads.run("core", lambda: self._core.check_goal(pose.x, pose.y))
-        if refusal is not None:
-            return refusal
-        return await self._missions.send(robot, pose, who, place=place, any_heading=any_heading, attempt=attempt)
-
-    async def cancel(self, robot: str, who: str) -> bool:
-        """End a robot's mission; False when it has none. Raises `StoreError`."""
-        return await self._missions.cancel(robot, who)
-
-    async def store_status(self) -> StoreStatus:
-        """Return what Redis and this process have; raises `StoreError`."""
-        return await self._missions.store_status()
-
-    async def recover_store(self, action: Literal["restore", "accept"], who: str) -> None:
-        """Restore the missions from memory, or accept those in Redis, after Redis lost records.
-
-        Raises `RecoveryError` and `StoreError`.
-        """
-        await self._missions.recover_store(action, who)
+        refusal = await self._threads.run("core", lambda: self._core.check_goal(order.pose.x, order.pose.y))
+        return refusal if refusal is not None else await self.missions.send(order)
 
     async def preview(self, request: PlanRequest, asker: str) -> PlanReply:
         """Plan a path without side effects; raises `BusyError` when too many queries are waiting, or of this asker.
@@ -206,17 +185,17 @@ class Service:
 
     async def lead(self, epoch: int, *, confirmed: bool) -> None:
         """Load the stored missions and continue with this epoch; raises `StoreError`."""
-        await self._missions.lead(epoch, confirmed=confirmed)
+        await self.missions.lead(epoch, confirmed=confirmed)
 
     def stand_by(self) -> None:
         """Follow all inputs, without missions."""
-        self._missions.stand_by()
+        self.missions.stand_by()
 
     # --- Loops ------------------------------------------------------------------------------------------------------
 
     async def store_loop(self) -> None:
         """Load the missions, then keep the store up to date."""
-        await self._missions.store_loop()
+        await self.missions.store_loop()
 
     async def snapshot_loop(self) -> None:
         """Fetch a snapshot of the map whenever the core needs one."""
@@ -242,7 +221,7 @@ class Service:
             if result.unfinished:
                 self._wake.set()
             for robot, goal_id in result.reached:
-                self._missions.end(robot, goal_id)
+                self.missions.end(robot, goal_id)
             for job in result.jobs:
                 self._start(job)
             if result.wants_snapshot:

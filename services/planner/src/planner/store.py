@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
     from fog_runtime.idempotency import Attempt
 
-__all__ = ["Audit", "RecoveryError", "Store", "StoreError", "StoreLostError", "StoredGoal"]
+__all__ = ["ANY", "Audit", "RecoveryError", "Store", "StoreError", "StoreLostError", "StoredGoal"]
 
 _GOALS: Final = Table("goals", "mission", version="goal.goal_id")
 
@@ -36,9 +36,12 @@ class Store(RedisStore):
         """
         return await self._readable_records(_GOALS.name, StoredGoal)
 
-    async def put(self, robot: str, goal: StoredGoal, audit: Audit) -> Outcome:
-        """Write a mission durably, with its audit entry; `exists` if another process used the same idempotency key."""
-        return await self._swap(_GOALS, robot, goal, ANY, audit)
+    async def put(self, robot: str, goal: StoredGoal, audit: Audit, *, expected: str = ANY) -> Outcome:
+        """Write a mission durably, with its audit entry, if the stored one's id is `expected` (`0`: none is stored).
+
+        `exists` also if another process used the same idempotency key.
+        """
+        return await self._swap(_GOALS, robot, goal, expected, audit)
 
     async def delete(self, robot: str, goal_id: str, audit: Audit) -> None:
         """Delete a mission durably if it is still this one: a newer one stays."""

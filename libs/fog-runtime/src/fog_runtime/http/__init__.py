@@ -4,7 +4,17 @@ from fog_runtime.http.app import make_app
 from fog_runtime.http.front import Front, FrontError, unused
 from fog_runtime.http.paging import PageSize, next_page
 from fog_runtime.http.problems import RETRY_AFTER, ProblemError
-from fog_runtime.http.routes import Answer, Body, ClientHost, Encoded, IfMatch, Routes, etag, expected_version
+from fog_runtime.http.routes import (
+    Answer,
+    Body,
+    ClientHost,
+    Encoded,
+    IfMatch,
+    Routes,
+    etag,
+    expected_tag,
+    expected_version,
+)
 from fog_runtime.http.store_routes import (
     IdempotencyKey,
     IfNoneMatch,
@@ -40,6 +50,7 @@ __all__ = [
     "add_store_errors",
     "attempt_of",
     "etag",
+    "expected_tag",
     "expected_version",
     "load_tokens",
     "make_app",

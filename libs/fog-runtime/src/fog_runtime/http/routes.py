@@ -86,17 +86,28 @@ class Encoded(Generic[T]):
     data: bytes
 
 
-def etag(version: int) -> dict[str, str]:
-    """Return the header with a record's version."""
+def etag(version: int | str) -> dict[str, str]:
+    """Return the header with a record's version, or with what else names its state."""
     return {"ETag": f'"{version}"'}
+
+
+def expected_tag(if_match: str | None) -> str | None:
+    """Return the tag in an If-Match header without its quotes: None when any is accepted.
+
+    An invalid header gives what is no record's tag.
+    """
+    if if_match is None or if_match.strip() == "*":
+        return None
+    tag = re.fullmatch(r'"([\x21\x23-\x7e]+)"', if_match.strip())
+    return tag[1] if tag else '"'
 
 
 def expected_version(if_match: str | None) -> int | None:
     """Return the version in an If-Match header: None when any version is accepted, -1 for an invalid one."""
-    if if_match is None or if_match.strip() == "*":
+    tag = expected_tag(if_match)
+    if tag is None:
         return None
-    tag = re.fullmatch(r'"([0-9]{1,16})"', if_match.strip())
-    return int(tag[1]) if tag else -1
+    return int(tag) if re.fullmatch(r"[0-9]{1,16}", tag) else -1
 
 
 class Routes:

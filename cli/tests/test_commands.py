@@ -49,7 +49,19 @@ def _warm_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
         *(["zone", name] for name in ("add", "list", "show", "remove")),
         *(
             ["robot", name]
-            for name in ("enable", "disable", "reset", "egress", "stop", "pose", "goal", "cancel", "status", "watch")
+            for name in (
+                "enable",
+                "disable",
+                "reset",
+                "egress",
+                "profile",
+                "stop",
+                "pose",
+                "goal",
+                "cancel",
+                "status",
+                "watch",
+            )
         ),
     ],
 )

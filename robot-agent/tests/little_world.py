@@ -234,8 +234,8 @@ class LittleWorld:
             self.send(ch.MAP_HEARTBEAT, self.master.heartbeat(self.stamp - self.link_delay))
         if self.path is not None and self.path_on and self.steps % 50 == 0:
             self._publish_as_planner()
-        if self.decide_on and self.steps % 20 == 0 and (job := self.agent.control_job(self.now)) is not None:
-            self.agent.accept(decide(job))
+        if self.decide_on and self.steps % round(self.agent.profile.control_period / DT) == 0:
+            self._control()
         if self.steps % 5 == 0:
             command = self.agent.stream(self.now, self.stamp)
             self.resets += command.reset
@@ -249,6 +249,12 @@ class LittleWorld:
             self.published.extend(self.agent.tick(self.moment))
             if self.agent.egress_request(self.now) is not None:
                 self.agent.on_egress_reply(PlanReply(points=self.way_out), self.now)
+
+    def _control(self):
+        if (search := self.agent.search(self.now)) is not None:
+            self.agent.on_found(search.run(), self.moment)
+        if (job := self.agent.control_job(self.now)) is not None:
+            self.agent.accept(decide(job))
 
     def _publish_as_planner(self):
         """Publish goal and release, and the path while the robot does not name it."""

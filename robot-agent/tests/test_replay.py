@@ -86,6 +86,15 @@ def drive_through_most_situations(world):
     assert world.state().mode == "EGRESS"
 
 
+def plan_on_the_robot(world):
+    """Let the robot search a path itself."""
+    assert world.command("disable").accepted
+    world.run(1.0)
+    assert world.command("profile_default").accepted
+    world.drive_to([(world.x, world.y), (world.x, world.y - 1.0)], goal_id="g3", plan_id=3)
+    world.run(0.5)
+
+
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory):
     """A logged drive: where its log is, and the world at its end."""
@@ -93,6 +102,7 @@ def drive(tmp_path_factory):
     entries = []
     world = LittleWorld(seed=4, start_agent=lambda config, seed: log.LoggedAgent(config, seed, entries.append))
     drive_through_most_situations(world)
+    plan_on_the_robot(world)
     write(path, entries)
     return path, world
 
@@ -103,7 +113,7 @@ def test_a_replay_repeats_every_command_mode_publication_and_answer(drive):
     assert result.differences == []
     assert result.outputs["WheelsCommanded"] == len(world.commands)
     assert result.outputs["Published"] == len(world.published)
-    assert result.outputs["Answered"] == result.inputs["QueryReceived"] == 8
+    assert result.outputs["Answered"] == result.inputs["QueryReceived"] == 10
     assert result.inputs["DecisionMade"] > 50
     assert {"INIT", "NORMAL", "HOLD", "FAULT"} <= set(result.modes)
     assert set(result.inputs) == {kind.__name__ for kind in log.TOPIC_OF_ENTRY if issubclass(kind, log.Input)} - {
@@ -131,6 +141,7 @@ def test_replays_in_other_processes_with_other_hash_seeds_give_the_same_outputs(
 def test_logging_changes_no_decision(drive):
     plain = LittleWorld(seed=4)
     drive_through_most_situations(plain)
+    plan_on_the_robot(plain)
     assert plain.commands == drive[1].commands
     assert plain.published == drive[1].published
 
@@ -186,7 +197,10 @@ def test_a_log_holds_no_operators_key_and_none_of_its_signatures(drive):
     assert AGENT.operator_key == KEY
     commands = [entry for entry in entries_of(path) if isinstance(entry, log.QueryReceived)]
     kinds = [entry.request["kind"] for entry in commands]
-    assert kinds == ["initial_pose", "enable", "enable", "enable", "reset", "enable", "cancel", "egress"]
+    assert kinds == [
+        *("initial_pose", "enable", "enable", "enable", "reset", "enable", "cancel", "egress"),
+        *("disable", "profile_default"),
+    ]
     for entry in commands:
         command = msgspec.convert(entry.request, RobotCommand)
         assert command.signature in {b"", sign(command, log.LOG_KEY).signature}

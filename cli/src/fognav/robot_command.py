@@ -11,8 +11,8 @@ from typing import Annotated, Any
 import msgspec
 import typer
 
-from fog_contracts.commands import STOPS
-from fog_contracts.messages import CommandKind, Pose
+from fog_contracts.commands import PROFILE_OF, STOPS
+from fog_contracts.messages import CommandKind, Pose, ProfileName
 from fog_runtime import logs
 from fognav.operate import rest_commands
 from fognav.operate.fog import Fog, RefusedError, find_fog
@@ -86,6 +86,23 @@ def robot_pose(pose: Start, *, robot: RobotOption = None, fog: FogOption = None,
             x, y, theta = place["x"], place["y"], place["theta"]
         outcome = _send(found, found.robot(robot), "initial_pose", Pose(x=x, y=y, theta=theta))
         _report(outcome, json=json)
+
+
+@robot_app.command("profile", epilog="Example: fognav robot profile fog")
+def robot_profile(
+    profile: Annotated[ProfileName, typer.Argument(help="Who plans: the robot on its own, or the fog.")],
+    *,
+    robot: RobotOption = None,
+    fog: FogOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Let a robot navigate by another profile; it must be at rest.
+
+    fog: by the fog's map and paths, as usual. default: on its own, as without Fognav, knowing no hazard, area or zone.
+    full: on its own, but with the fog's hazards. An agent that restarts is in the profile fog again.
+    """
+    kind = next(kind for kind, name in PROFILE_OF.items() if name == profile)
+    _run_command(kind, robot, fog, json=json)
 
 
 @robot_app.command("goal", context_settings=NUMBERS, epilog="Example: fognav robot goal b")

@@ -142,7 +142,9 @@ class AgentProcess:
                 self.core.load(snapshot, at.now)
 
     def control(self, at: Moment) -> None:
-        """Run the local planner; call it 5 times a second."""
+        """Run the robot's own global planner, if its profile has one, and its local planner, as often as this says."""
+        if (search := self.core.search(at.now)) is not None:
+            self.core.on_found(search.run(), at)
         job = self.core.control_job(at.now)
         if job is not None:
             self.core.accept(decide(job))

@@ -56,7 +56,6 @@ _LIDAR_STEPS: Final = 2
 _STREAM_STEPS: Final = 5
 TICK_STEPS: Final = 10
 """Steps of 10 ms between two ticks of the cores."""
-_CONTROL_STEPS: Final = 20
 
 
 def moment(now: float) -> Moment:
@@ -121,7 +120,7 @@ class RobotRig:
         at, step = moment(self.now), self._steps - 1
         if step % _STREAM_STEPS == 0:
             self.process.fetch_map(at)
-        if step % _CONTROL_STEPS == 0:
+        if step % round(self.agent.profile.control_period / STEP_S) == 0:
             self.process.control(at)
         if step % _STREAM_STEPS == 0:
             command = link.decode_command(link.encode(self.process.stream(at)))

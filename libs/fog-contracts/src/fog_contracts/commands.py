@@ -4,17 +4,22 @@ A command that only stops a robot needs no signature: whoever reaches the robot 
 """
 
 import hmac
+from collections.abc import Mapping
 from typing import Final
 
 import msgspec
 
-from fog_contracts.messages import CommandKind, Pose, RobotCommand
+from fog_contracts.messages import CommandKind, Pose, ProfileName, RobotCommand
 
 VALID_S: Final = 5.0
 """Seconds of the robot's clock after `issued_at` during which a command is valid."""
 KEY_BYTES: Final = 32
 STOPS: Final[frozenset[CommandKind]] = frozenset({"disable", "cancel"})
 """Commands that pass unsigned, at any age and repeatedly: a refused stop is worse than an unwanted one."""
+PROFILE_OF: Final[Mapping[CommandKind, ProfileName]] = {
+    "profile_default": "default", "profile_full": "full", "profile_fog": "fog",
+}  # fmt: skip
+"""The profile of navigation that a command selects."""
 
 
 def _signature(command: RobotCommand, key: bytes) -> bytes:

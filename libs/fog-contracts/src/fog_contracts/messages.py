@@ -543,10 +543,14 @@ class PlanReply(Message, frozen=True, kw_only=True):
 
 
 class RobotGoal(Message, frozen=True, kw_only=True):
-    """The mission of a robot; `pose` is null when it has none (cancelled or reached)."""
+    """The mission of a robot; `pose` is null when it has none (cancelled or reached).
+
+    `any_heading`: the robot may arrive with any heading, that of `pose` does not count.
+    """
 
     goal_id: Annotated[str, Meta(max_length=64)]
     pose: Pose | None
+    any_heading: bool = False
     place: Id | None = None
     stamp: Stamp = 0.0
     planner_epoch: Count = 0
@@ -653,6 +657,10 @@ class Power(Message, frozen=True, kw_only=True):
 Strength = Annotated[int, Meta(ge=0, le=4095)]
 
 
+ProfileName = Literal["default", "full", "fog"]
+"""How a robot navigates: on its own; on its own with the fog's hazards; or by the fog's map and paths."""
+
+
 class RobotState(Message, frozen=True, kw_only=True):
     """A robot's mode with its reasons, the map version and plan that it follows, and the epochs that it received.
 
@@ -679,6 +687,7 @@ class RobotState(Message, frozen=True, kw_only=True):
     clock: Seconds = 0.0
     power: Power | None = None
     proximity: Annotated[list[Strength], Meta(max_length=16)] = []
+    profile: ProfileName = "fog"
 
 
 VIEW_SECTORS: Final = 180
@@ -713,7 +722,9 @@ class RobotObstacles(Message, frozen=True, kw_only=True):
     view: View | None = None
 
 
-CommandKind = Literal["enable", "disable", "cancel", "egress", "reset", "initial_pose"]
+CommandKind = Literal[
+    "enable", "disable", "cancel", "egress", "reset", "initial_pose", "profile_default", "profile_full", "profile_fog"
+]
 
 
 class RobotCommand(Message, frozen=True, kw_only=True):

@@ -9,13 +9,16 @@ import numpy as np
 from fog_contracts import channels as ch
 from fog_contracts.costs import LETHAL
 from fog_contracts.geometry import contains_point
-from fog_contracts.shapes import shape_contains
+from fog_contracts.messages import PolygonShape
+from fog_contracts.shapes import shape_contains, shape_spans
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
+    from fog_contracts.grid import GridGeometry
     from fog_contracts.handlers import Handler, Ids, Moment, Publication
-    from fog_contracts.messages import HazardArea, Zone, ZoneSet
+    from fog_contracts.messages import HazardArea, Shape, Zone, ZoneSet
+    from fog_contracts.raster import Spans
     from fog_contracts.replica import Replica
     from robot_agent.agent.obstacle_reporter import ObstacleReporter
     from robot_agent.localization.pose import Pose2
@@ -27,6 +30,8 @@ class BlockedPlaces:
     def __init__(self) -> None:
         self._hazards: dict[str, HazardArea] = {}
         self._zones: list[Zone] = []
+        self._spans: dict[str, Spans] = {}
+        """Cells of what was closed last: outlines are rasterized once."""
 
     def handlers(self) -> Mapping[ch.Channel, Handler]:
         """Return the handlers of the channels that carry areas and zones."""
@@ -53,6 +58,27 @@ class BlockedPlaces:
         if named is None and not reporter.is_self_reported(np.array([[pose.x, pose.y]]), now)[0]:
             return "a blocked part of the map"
         return named
+
+    def named(self, pose: Pose2, replica: Replica) -> str | None:
+        """Return the name of the area or zone that blocks where the robot's centre is (m, frame `map`), if one does."""
+        return self._named(pose) if _is_blocked(replica, pose) else None
+
+    def closed(self, geometry: GridGeometry) -> dict[str, Spans]:
+        """Return the cells of each blocked area and no-go zone, by a name that changes with them."""
+        closed: dict[str, Spans] = {}
+        for name, outline in self._outlines():
+            if name not in self._spans:
+                self._spans[name] = shape_spans(outline, geometry)
+            closed[name] = self._spans[name]
+        self._spans = dict(closed)
+        return closed
+
+    def _outlines(self) -> Iterator[tuple[str, Shape]]:
+        for area in self._hazards.values():
+            if area.hazard.penalty >= LETHAL:
+                yield f"area {area.hazard.area} {area.polygon}", PolygonShape(points=area.polygon)
+        for zone in self._zones:
+            yield f"zone {zone.id} {zone.shape}", zone.shape
 
     def _named(self, pose: Pose2) -> str | None:
         for hazard in self._hazards.values():

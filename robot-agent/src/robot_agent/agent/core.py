@@ -4,7 +4,8 @@ Values and times go in, values come out. `now` is the robot's own monotonic cloc
 `stamp` is the wall clock (s) and only dates messages and traces. Whoever runs the core
 - passes it every message of `handlers()`, every query of `query_handlers()`, and the input from base and lidar;
 - calls `stream` 20 times a second and sends the wheel command to the guardian;
-- runs `decide(control_job(now))` 5 times a second, on any thread, and passes the decision to `accept`;
+- runs `search(now).run()`, if there is a search, on any thread, and passes the result to `on_found`; then
+  `decide(control_job(now))`, on any thread, and passes the decision to `accept`; every `profile.control_period`;
 - calls `tick` 10 times a second and publishes what it returns;
 - sends the query of `egress_request` to the planner, and passes the reply to `on_egress_reply`;
 - lets the lidar's motor turn while `lidar_on`;
@@ -26,6 +27,7 @@ from robot_agent.agent.blocked_places import BlockedPlaces
 from robot_agent.agent.egress import Egress
 from robot_agent.agent.fog_inputs import FogInputs
 from robot_agent.agent.motion_guard import MotionGuard
+from robot_agent.agent.navigation import Navigation
 from robot_agent.agent.obstacle_reporter import ObstacleReporter
 from robot_agent.agent.operator_commands import OperatorCommands, initial_pose_refusal
 from robot_agent.agent.path_driving import PathDriving
@@ -50,6 +52,7 @@ if TYPE_CHECKING:
         MapSnapshot,
         PlanReply,
         Pose,
+        ProfileName,
         RobotCommand,
         RobotObstacles,
         RobotPose,
@@ -61,6 +64,8 @@ if TYPE_CHECKING:
     from robot_agent.guardian.link import BaseFeedback, WheelCommand
     from robot_agent.hardware import LaserScan, LidarSamples
     from robot_agent.localization.absolute import AbsoluteObservation
+    from robot_agent.onboard.search import Found, Search
+    from robot_agent.profiles import Profile
     from robot_agent.safety.conditions import Request
     from robot_agent.safety.gate import SafetyOutputs
 
@@ -84,7 +89,8 @@ class AgentCore:
         self._map = MapFollower()
         self._places = BlockedPlaces()
         self._driving = PathDriving(config)
-        self._fog = FogInputs(self._map, self._places, self._driving, self._localizer)
+        self._navigation = Navigation(config, self._map, self._places, self._driving, self._localizer)
+        self._fog = FogInputs(self._navigation, self._places, self._driving, self._localizer)
         self._egress = Egress(config)
         self._guard = MotionGuard(config, self._localizer)
         self._safety = SafetySupervisor(config.safety)
@@ -116,7 +122,7 @@ class AgentCore:
 
     def wants_snapshot(self, now: float) -> bool:
         """Return whether the replica of the map needs a snapshot from the map-service."""
-        return self._map.wants_snapshot(now)
+        return self._navigation.wants_snapshot(now)
 
     def prepare_map(self, snapshot: MapSnapshot) -> PreparedMap:
         """Do what takes long when a snapshot is loaded, on any thread; raises `MapError` when it is invalid."""
@@ -128,7 +134,7 @@ class AgentCore:
         self._map.on_snapshot(prepared.decoded, now)
         self._fence.raise_to(ch.MAP, prepared.snapshot.epoch)
         self._pose_keeper.load_map(prepared.snapshot.site, prepared.fields)
-        self._driving.check_path(self.replica, now)
+        self._navigation.on_map_loaded(now)
 
     # --- base and lidar ---
 
@@ -194,6 +200,14 @@ class AgentCore:
         """Handle the planner's reply to an `egress_request`; None when it did not answer."""
         self._egress.on_reply(reply, self._localizer.pose(now), now)
 
+    def search(self, now: float) -> Search | None:
+        """Return the search for a path that is due; None in the profile `fog`. Call it before each `control_job`."""
+        return self._navigation.search(now)
+
+    def on_found(self, found: Found, at: Moment) -> None:
+        """Handle what a search found."""
+        self._navigation.on_found(found, at)
+
     def control_job(self, now: float) -> Job | None:
         """Return the inputs of the next decision; None while there is no goal or the robot must not drive."""
         return self._driving.job(self._localizer, self.replica, self.safety, now)
@@ -209,13 +223,13 @@ class AgentCore:
         inputs = safety_inputs(
             self._base,
             self._lidar,
-            self._map,
+            self._navigation,
             self._localizer,
             self._driving.mission,
             path_problem=self._driving.path_problem(self.replica, self._guard, self.safety, now),
-            inside_blocked=self._places.containing(trusted, self.replica, self._reporter, now) if trusted else None,
+            inside_blocked=self._navigation.inside_blocked(trusted, self._reporter, now) if trusted else None,
             egress=(self._egress.remaining, self._egress.problem(self._guard.reason)),
-            caution=self._places.caution(pose) if pose else None,
+            caution=self._navigation.caution(pose, now) if pose else None,
             resting=self._rest.reason,
             now=now,
         )
@@ -247,6 +261,11 @@ class AgentCore:
             self._localizer.initial_pose(pose.x, pose.y, pose.theta)
         return refusal
 
+    def switch_profile(self, name: ProfileName, now: float) -> str | None:
+        """Navigate by another profile; return why not, None when it is done."""
+        self._rest.wake()
+        return self._navigation.switch(name, now, at_rest=self._driving.wheels.at_rest)
+
     # --- publications ---
 
     def tick(self, at: Moment) -> Sequence[Publication]:
@@ -255,6 +274,8 @@ class AgentCore:
         return self._publishing.due(self.pose(at), self.state(at), partial(self._report_obstacles, at), at.now)
 
     def _report_obstacles(self, at: Moment) -> RobotObstacles | None:
+        if self.profile.onboard:
+            return None  # such a robot keeps what it sees on its own costmap
         scan_age, impassable = self._lidar.scan_age(at.now), self._driving.impassable(at.now)
         return self._reporter.report(self._localizer, self.replica, scan_age, at, impassable)
 
@@ -277,6 +298,7 @@ class AgentCore:
             loop=self._loop_health,
             epochs=self._fence.epochs,
             boot=self._config.boot,
+            profile=self.profile.name,
             at=at,
         )
 
@@ -313,13 +335,18 @@ class AgentCore:
 
     def map_age(self, now: float) -> float | None:
         """Return the time (s) since the map was last confirmed to be the newest; None before the first time."""
-        age = self._map.age(now)
+        age = self._navigation.age(now)
         return None if math.isinf(age) else age
 
     @property
     def replica(self) -> Replica:
-        """The replica of the master costmap."""
-        return self._map.replica
+        """The costmap that the robot drives by: the replica of the fog's, or its own."""
+        return self._navigation.replica
+
+    @property
+    def profile(self) -> Profile:
+        """How the robot navigates; its control loop runs at the period that this says."""
+        return self._navigation.profile
 
     @property
     def safety(self) -> SafetyOutputs:

@@ -9,10 +9,10 @@ from fog_contracts import channels as ch
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from fog_contracts.follower import MapFollower
     from fog_contracts.handlers import Handler, Ids, Moment, Publication
     from fog_contracts.messages import MapDelta, MapHeartbeat, RobotGoal, RobotPath, RobotRelease
     from robot_agent.agent.blocked_places import BlockedPlaces
+    from robot_agent.agent.navigation import Navigation
     from robot_agent.agent.path_driving import PathDriving
     from robot_agent.localization.localizer import Localizer
 
@@ -21,9 +21,9 @@ class FogInputs:
     """Passes each message to the part of the agent that it concerns."""
 
     def __init__(
-        self, map_follower: MapFollower, places: BlockedPlaces, driving: PathDriving, localizer: Localizer
+        self, navigation: Navigation, places: BlockedPlaces, driving: PathDriving, localizer: Localizer
     ) -> None:
-        self._map = map_follower
+        self._navigation = navigation
         self._places = places
         self._driving = driving
         self._localizer = localizer
@@ -40,22 +40,21 @@ class FogInputs:
         }
 
     def _on_delta(self, _ids: Ids, delta: MapDelta, at: Moment) -> Sequence[Publication]:
-        if self._map.on_delta(delta, at.now) is not None:
-            self._driving.check_path(self._map.replica, at.now)
+        self._navigation.on_delta(delta, at.now)
         return ()
 
     def _on_heartbeat(self, _ids: Ids, heartbeat: MapHeartbeat, at: Moment) -> Sequence[Publication]:
-        self._map.on_heartbeat(heartbeat, at.now)
+        self._navigation.on_heartbeat(heartbeat, at.now)
         return ()
 
     def _on_goal(self, _ids: Ids, goal: RobotGoal, at: Moment) -> Sequence[Publication]:
-        self._driving.on_goal(goal, self._localizer.pose(at.now), self._map.replica, at)
+        self._driving.on_goal(goal, self._localizer.pose(at.now), self._navigation.replica, at)
         return ()
 
     def _on_path(self, _ids: Ids, path: RobotPath, at: Moment) -> Sequence[Publication]:
-        self._driving.on_path(path, self._localizer.pose(at.now), self._map.replica, at)
+        self._navigation.on_path(path, at)
         return ()
 
     def _on_release(self, _ids: Ids, release: RobotRelease, at: Moment) -> Sequence[Publication]:
-        self._driving.on_release(release, self._map.replica, at.now)
+        self._navigation.on_release(release, at.now)
         return ()

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from fog_contracts.handlers import Handler, Ids, Moment, Publication, QueryHandler
     from fog_contracts.messages import Message
     from robot_agent.motion.local_planner import Job
+    from robot_agent.onboard.search import Found, Search
 
 LOG_KEY: Final = b"known to all: signs commands in logs only"
 """Replaces the operators' key in a log."""
@@ -207,6 +208,19 @@ class LoopHealthReceived(Input, frozen=True, kw_only=True):
     health: LoopHealth
 
 
+class SearchCycle(Input, frozen=True, kw_only=True):
+    """The control loop asked for a search of a path, in profiles in which the robot plans for itself."""
+
+    now: float
+
+
+class SearchEnded(Input, frozen=True, kw_only=True):
+    """The last search ended. What it found depends on it alone, so a replay searches again."""
+
+    now: float
+    stamp: float
+
+
 class ControlCycle(Input, frozen=True, kw_only=True):
     """The control loop requested a job."""
 
@@ -274,8 +288,9 @@ class EntriesLost(Entry, frozen=True, kw_only=True):
 
 _KINDS: Final[tuple[type[Entry], ...]] = (
     Started, PoseRestored, SnapshotLoaded, MessageReceived, QueryReceived, BaseReceived, BaseLost, SuspensionNoticed,
-    PoseObserved, LidarSamplesReceived, ScanReceived, LoopHealthReceived, ControlCycle, DecisionMade, StreamCycle, Tick,
-    StorageCheck, EgressReplied, WheelsCommanded, Published, Answered, PoseStored, EntriesLost,
+    PoseObserved, LidarSamplesReceived, ScanReceived, LoopHealthReceived, SearchCycle, SearchEnded, ControlCycle,
+    DecisionMade, StreamCycle, Tick, StorageCheck, EgressReplied, WheelsCommanded, Published, Answered, PoseStored,
+    EntriesLost,
 )  # fmt: skip
 ENTRY_OF_TOPIC: Final[Mapping[str, type[Entry]]] = {f"agent/{kind.__name__}": kind for kind in _KINDS}
 TOPIC_OF_ENTRY: Final[Mapping[type[Entry], str]] = {kind: topic for topic, kind in ENTRY_OF_TOPIC.items()}
@@ -373,6 +388,17 @@ class LoggedAgent(AgentCore):
         """Log the loops' health and record it."""
         self._write(LoopHealthReceived(health=health))
         super().on_loop_health(health)
+
+    def search(self, now: float) -> Search | None:
+        """Log the cycle, if the robot plans for itself, and return the search."""
+        if self.profile.onboard:
+            self._write(SearchCycle(now=now))
+        return super().search(now)
+
+    def on_found(self, found: Found, at: Moment) -> None:
+        """Log the end of the search and handle what it found."""
+        self._write(SearchEnded(now=at.now, stamp=at.stamp))
+        super().on_found(found, at)
 
     def control_job(self, now: float) -> Job | None:
         """Log the control cycle and return its job."""

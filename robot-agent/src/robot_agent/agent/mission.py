@@ -121,6 +121,10 @@ class Mission:
         if self.follower is not None:
             self.follower.release(release.released_length)
 
+    def confirm(self, now: float) -> None:
+        """Record that the robot's own planner confirms goal and path."""
+        self._path_at = now
+
     def reach(self) -> None:
         """Record that the robot has reached its goal."""
         self._reached = self.goal_id

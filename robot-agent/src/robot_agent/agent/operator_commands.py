@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final, Protocol
 
-from fog_contracts.commands import CommandGate
+from fog_contracts.commands import PROFILE_OF, CommandGate
 from fog_contracts.costs import LETHAL
 from fog_contracts.messages import CommandReply
 
 if TYPE_CHECKING:
     from fog_contracts.handlers import Moment
-    from fog_contracts.messages import Pose, RobotCommand
+    from fog_contracts.messages import Pose, ProfileName, RobotCommand
     from fog_contracts.replica import Replica
     from robot_agent.config import AgentConfig
     from robot_agent.safety.conditions import Request
@@ -30,6 +30,9 @@ class CommandTarget(Protocol):
 
     def set_initial_pose(self, pose: Pose | None) -> str | None:
         """Start localization at a pose in `map`; return why the pose is refused, None when it is accepted."""
+
+    def switch_profile(self, name: ProfileName, now: float) -> str | None:
+        """Navigate by another profile; return why not, None when it is done."""
 
 
 class OperatorCommands:
@@ -51,6 +54,8 @@ class OperatorCommands:
                 return self._cancel()
             case "initial_pose":
                 return self._start_localization(command.pose)
+            case "profile_default" | "profile_full" | "profile_fog":
+                return self._switch(PROFILE_OF[command.kind], at.now)
 
     def _cancel(self) -> CommandReply:
         goal = self._robot.cancel_goal()
@@ -63,6 +68,12 @@ class OperatorCommands:
         if refusal is not None:
             return _refused(refusal)
         return CommandReply(accepted=True, reason="accepted; the next lidar scans verify it")
+
+    def _switch(self, profile: ProfileName, now: float) -> CommandReply:
+        refusal = self._robot.switch_profile(profile, now)
+        if refusal is not None:
+            return _refused(refusal)
+        return CommandReply(accepted=True, reason=f"the robot navigates by the profile {profile} from now on")
 
     def _request(self, request: Request, now: float) -> CommandReply:
         outputs = self._robot.request(request, now)

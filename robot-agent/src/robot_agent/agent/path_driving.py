@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from fog_contracts.messages import RobotGoal, RobotPath, RobotRelease
     from fog_contracts.replica import Replica
     from robot_agent.agent.motion_guard import MotionGuard
-    from robot_agent.config import AgentConfig
+    from robot_agent.config import AgentConfig, MotionConfig
     from robot_agent.guardian.link import WheelCommand
     from robot_agent.localization.localizer import Localizer
     from robot_agent.localization.pose import Pose2
@@ -52,6 +52,12 @@ class PathDriving:
         self._recoveries = Recoveries()
         self._arrived = False
         """Whether the last decision was made within the tolerance of the path's end."""
+
+    def configure(self, config: MotionConfig) -> None:
+        """Follow paths by another configuration from now on, and drop the present path."""
+        self._config = config
+        self.mission.drop_path()
+        self._stop_following()
 
     # --- goal and path ---
 

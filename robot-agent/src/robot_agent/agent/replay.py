@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from robot_agent.motion.local_planner import Job
+    from robot_agent.onboard.search import Found
 
 _LISTED_MAX: Final = 20
 """Differences that are listed; further ones are only counted."""
@@ -107,6 +108,7 @@ class _Run:
         self._digest = hashlib.blake2b(digest_size=16)
         self._produced: list[bytes] = []
         self._job: Job | None = None
+        self._found: Found | None = None
         self._agent = log.LoggedAgent(started.config, started.seed, self._on_entry)
 
     def _on_entry(self, entry: log.Entry) -> None:
@@ -155,6 +157,8 @@ class _Run:
                 self._agent.on_absolute_observation(entry.observation())
             case log.EgressReplied() | log.LoopHealthReceived():
                 self._from_process(entry)
+            case log.SearchCycle() | log.SearchEnded():
+                self._search(entry)
             case log.ControlCycle() | log.DecisionMade() | log.StreamCycle() | log.Tick() | log.StorageCheck():
                 self._cycle(entry)
             case _:
@@ -195,6 +199,16 @@ class _Run:
                 self._agent.on_lidar_samples(entry.samples(), entry.now)
             case log.ScanReceived():
                 self._agent.on_scan(entry.scan(), entry.now)
+
+    def _search(self, entry: log.SearchCycle | log.SearchEnded) -> None:
+        match entry:
+            case log.SearchCycle():
+                search = self._agent.search(entry.now)
+                self._found = None if search is None else search.run()
+            case log.SearchEnded():
+                if self._found is None:
+                    raise ReplayError(f"input {self.count}: a search ended that the replay has not begun")
+                self._agent.on_found(self._found, Moment(entry.now, entry.stamp))
 
     def _cycle(
         self, entry: log.ControlCycle | log.DecisionMade | log.StreamCycle | log.Tick | log.StorageCheck

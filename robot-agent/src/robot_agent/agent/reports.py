@@ -12,7 +12,7 @@ from robot_agent.agent.power import power_warnings
 
 if TYPE_CHECKING:
     from fog_contracts.handlers import Moment
-    from fog_contracts.messages import Trace
+    from fog_contracts.messages import ProfileName, Trace
     from fog_contracts.replica import Version
     from robot_agent.agent.mission import Mission
     from robot_agent.config import AgentConfig
@@ -59,6 +59,7 @@ def robot_state(  # noqa: PLR0913  # a message gathers from all parts of the age
     loop: LoopHealth,
     epochs: dict[str, int],
     boot: str,
+    profile: ProfileName,
     at: Moment,
 ) -> RobotState:
     """Return mode, reasons, goal, path, map version and the `epochs` received of each service.
@@ -85,6 +86,7 @@ def robot_state(  # noqa: PLR0913  # a message gathers from all parts of the age
         stamp=at.stamp,
         epochs=epochs,
         boot=boot,
+        profile=profile,
         clock=at.now,
         power=feedback.status.power if feedback else None,
         proximity=list(feedback.status.proximity) if feedback else [],

@@ -10,8 +10,8 @@ from robot_agent.safety.conditions import SafetyInputs
 from robot_agent.safety.gate import SafetyState, step
 
 if TYPE_CHECKING:
-    from fog_contracts.follower import MapFollower
     from robot_agent.agent.mission import Mission
+    from robot_agent.agent.navigation import Navigation
     from robot_agent.agent.sensors import BaseSource, LidarSource
     from robot_agent.config import SafetyConfig
     from robot_agent.localization.localizer import Localizer
@@ -43,7 +43,7 @@ class SafetySupervisor:
 def safety_inputs(  # noqa: PLR0913  # the gate weighs every source of the agent
     base: BaseSource,
     lidar: LidarSource,
-    map_follower: MapFollower,
+    navigation: Navigation,
     localizer: Localizer,
     mission: Mission,
     *,
@@ -60,9 +60,9 @@ def safety_inputs(  # noqa: PLR0913  # the gate weighs every source of the agent
     """
     feedback, follower = base.feedback, mission.follower
     return SafetyInputs(
-        map_loaded=map_follower.version is not None,
-        map_age=map_follower.age(now),
-        map_gap=map_follower.gap(now),
+        map_loaded=navigation.version is not None,
+        map_age=navigation.age(now),
+        map_gap=navigation.gap(now),
         localization=localizer.status,
         localization_detail=localizer.detail,
         lidar_age=lidar.samples_age(now),

@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from robot_agent.hardware import LaserScan
 
 STREAM_S: Final = 0.05
-CONTROL_S: Final = 0.2
 PUBLISH_S: Final = 0.1
 HOUSEKEEPING_S: Final = 1.0
 EGRESS_TIMEOUT_S: Final = 3.0
@@ -66,7 +65,7 @@ class Service:
         self.phase = Phase()
         """The common phase of all loops: the process sleeps between their ticks."""
         self._stream = self._ticker(STREAM_S)
-        self._control = self._ticker(CONTROL_S)
+        self._control = self._ticker(core.profile.control_period)
         self.collector = RobotCollector()
         self._state: RobotState | None = None
         self._corrupted: dict[str, int] = {}
@@ -172,11 +171,15 @@ class Service:
             self._manager.alive(f"waiting for {', '.join(missing)}" if missing else "ready")
 
     async def control_loop(self) -> None:
-        """Decide at 5 Hz on a separate thread, so that a decision that hangs can't block the stream."""
+        """Plan and decide, 5 times a second in the profile `fog`, on a thread: what hangs can't block the stream."""
         loop = asyncio.get_running_loop()
         thread = ThreadPoolExecutor(1, thread_name_prefix="decide")
         try:
             async for now in self._control:
+                self._control.period = self._core.profile.control_period
+                if (search := self._core.search(now)) is not None:
+                    found = await loop.run_in_executor(thread, search.run)
+                    self._core.on_found(found, self._edges.now())
                 job = self._core.control_job(now)
                 if job is not None:
                     self._core.accept(await loop.run_in_executor(thread, decide, job))

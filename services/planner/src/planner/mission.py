@@ -165,7 +165,7 @@ class Mission:
         if self.goal is None or at.now < self.goal_due:
             return None
         self.goal_due = at.now + config.goal_republish_s
-        return structs.replace(self.goal, stamp=at.stamp, planner_epoch=epoch)
+        return structs.replace(self.goal, any_heading=self.any_heading, stamp=at.stamp, planner_epoch=epoch)
 
     def due_path(self, at: Moment, config: PlannerConfig, epoch: int, version: Version) -> RobotPath | None:
         """Return the path or refusal when it is new, has changed, or its robot has not received it for a while.

@@ -1,0 +1,164 @@
+"""The map and the planner that the robot drives by: the fog's, or its own, as its profile says.
+
+The safety gate judges a robot by the sources that its profile uses, and by no other: one that plans for itself waits
+for no message of the fog's planner.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from robot_agent.profiles import FOG, PROFILES
+
+if TYPE_CHECKING:
+    from fog_contracts.follower import MapFollower
+    from fog_contracts.handlers import Moment
+    from fog_contracts.messages import MapDelta, MapHeartbeat, ProfileName, RobotPath, RobotRelease
+    from fog_contracts.raster import Spans
+    from fog_contracts.replica import Replica, Version
+    from robot_agent.agent.blocked_places import BlockedPlaces
+    from robot_agent.agent.obstacle_reporter import ObstacleReporter
+    from robot_agent.agent.path_driving import PathDriving
+    from robot_agent.config import AgentConfig
+    from robot_agent.localization.localizer import Localizer
+    from robot_agent.localization.pose import Pose2
+    from robot_agent.onboard.navigator import OnboardNavigator
+    from robot_agent.onboard.search import Found, Search
+    from robot_agent.profiles import Profile
+
+
+class Navigation:
+    """Selects between the fog's map and paths, and those of the robot itself. `now` is s of its monotonic clock."""
+
+    def __init__(
+        self,
+        config: AgentConfig,
+        map_follower: MapFollower,
+        places: BlockedPlaces,
+        driving: PathDriving,
+        localizer: Localizer,
+    ) -> None:
+        self._config = config
+        self._fog = map_follower
+        self._places = places
+        self._driving = driving
+        self._localizer = localizer
+        self._onboard: OnboardNavigator | None = None
+        self._fog_heard_at = 0.0
+        self.profile: Profile = FOG
+        """How the robot navigates."""
+
+    # --- the map ---
+
+    @property
+    def replica(self) -> Replica:
+        """The costmap to drive by."""
+        return self._fog.replica if self._onboard is None else self._onboard.replica
+
+    @property
+    def version(self) -> Version | None:
+        """Version of this costmap; None before the first one."""
+        return self.replica.version
+
+    def age(self, now: float) -> float:
+        """Return the time (s) since the costmap was confirmed to be up to date."""
+        return self._fog.age(now) if self._onboard is None else self._onboard.age(now)
+
+    def gap(self, now: float) -> float:
+        """Return for how long (s) the costmap has lacked changes that are known to exist."""
+        return self._fog.gap(now) if self._onboard is None else 0.0
+
+    def wants_snapshot(self, now: float) -> bool:
+        """Return whether a snapshot of the fog's map is needed: of a robot that plans for itself, only the first."""
+        return self._fog.wants_snapshot(now) if not self.profile.onboard else self._fog.version is None
+
+    def on_map_loaded(self, now: float) -> None:
+        """Take over a snapshot that the follower of the fog's map has loaded."""
+        self._begin_onboard(now)
+        self._driving.check_path(self.replica, now)
+
+    def on_delta(self, delta: MapDelta, now: float) -> None:
+        """Apply a change of the fog's map, if the robot drives by it."""
+        if not self.profile.onboard and self._fog.on_delta(delta, now) is not None:
+            self._driving.check_path(self.replica, now)
+
+    def on_heartbeat(self, heartbeat: MapHeartbeat, now: float) -> None:
+        """Record that the fog's map-service lives, and which version it has."""
+        self._fog_heard_at = now
+        if not self.profile.onboard:
+            self._fog.on_heartbeat(heartbeat, now)
+
+    # --- paths ---
+
+    def on_path(self, path: RobotPath, at: Moment) -> None:
+        """Follow a path of the fog's planner, if the robot drives by its paths."""
+        if not self.profile.onboard:
+            self._driving.on_path(path, self._localizer.pose(at.now), self.replica, at)
+
+    def on_release(self, release: RobotRelease, now: float) -> None:
+        """Extend such a path."""
+        if not self.profile.onboard:
+            self._driving.on_release(release, self.replica, now)
+
+    def search(self, now: float) -> Search | None:
+        """Update the robot's own costmap, and return the search for a path, each if due; None without a search."""
+        onboard, mission = self._onboard, self._driving.mission
+        if onboard is None:
+            return None
+        if onboard.update(self._localizer, self._closed(onboard.replica), now):
+            self._driving.check_path(onboard.replica, now)
+        pose, goal = self._localizer.pose(now), mission.goal
+        mission.confirm(now)
+        if pose is None or goal is None or not mission.active:
+            return None
+        return onboard.search(goal, pose, mission.follower, now)
+
+    def on_found(self, found: Found, at: Moment) -> None:
+        """Follow the path that a search found, unless the present one is as good; one to another goal is dropped."""
+        onboard, mission = self._onboard, self._driving.mission
+        if onboard is None or found.goal != mission.goal or not mission.active:
+            return
+        path = onboard.path(found, mission.follower, at)
+        if path is not None:
+            self._driving.on_path(path, self._localizer.pose(at.now), self.replica, at)
+
+    def _closed(self, replica: Replica) -> dict[str, Spans]:
+        return self._places.closed(replica.geometry) if self.profile.hazards and replica.geometry is not None else {}
+
+    # --- what the fog says of places ---
+
+    def inside_blocked(self, pose: Pose2, reporter: ObstacleReporter, now: float) -> str | None:
+        """Return the name of the blocked place that the robot is in, of those that its profile knows."""
+        if self._onboard is None:
+            return self._places.containing(pose, self.replica, reporter, now)
+        return self._places.named(pose, self.replica) if self.profile.hazards else None
+
+    def caution(self, pose: Pose2, now: float) -> str | None:
+        """Return why the robot must drive slowly where it is; None when it need not."""
+        if not self.profile.hazards:
+            return None
+        silent = now - self._fog_heard_at
+        if self.profile.onboard and silent > self._config.safety.map_late:
+            return f"the fog's hazards are {silent:.1f} s old"
+        return self._places.caution(pose)
+
+    # --- profiles ---
+
+    def switch(self, name: ProfileName, now: float, *, at_rest: bool) -> str | None:
+        """Navigate by another profile; return why not, None when it is done. The present path is dropped."""
+        if not at_rest:
+            return "the robot is driving: disable it first"
+        self.profile = PROFILES[name]
+        self._driving.configure(self.profile.motion(self._config.motion))
+        self._onboard = None
+        self._begin_onboard(now)
+        return None
+
+    def _begin_onboard(self, now: float) -> None:
+        if not self.profile.onboard or self._fog.version is None:
+            return
+        # Only now: a robot that drives by the fog's map has no planner of its own in its memory.
+        from robot_agent.onboard.navigator import OnboardNavigator  # noqa: PLC0415  # see above
+
+        radius = self._config.footprint.inscribed_radius
+        self._onboard = OnboardNavigator(self.profile, self._fog.replica, radius, now)

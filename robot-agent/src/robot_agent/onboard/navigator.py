@@ -1,0 +1,123 @@
+"""When the robot's own costmap is updated, and when a path is searched on it."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+from fog_contracts.messages import RobotPath
+from fog_kernels.astar import Planner
+from robot_agent.motion.path_follower import first_blocked
+from robot_agent.onboard.costmap import OnboardCostmap
+from robot_agent.onboard.search import Search
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from fog_contracts.handlers import Moment
+    from fog_contracts.messages import RobotGoal
+    from fog_contracts.raster import Spans
+    from fog_contracts.replica import Replica
+    from robot_agent.localization.localizer import Localizer
+    from robot_agent.localization.pose import Pose2
+    from robot_agent.motion.path_follower import PathFollower
+    from robot_agent.onboard.search import Found
+    from robot_agent.profiles import Profile
+
+_EXPLAINED_M: Final = 0.25
+"""A lidar point this near to a wall of the floor plan is explained by it."""
+_TURN_RATE: Final = 0.5
+"""Above this turning rate (rad/s) nothing is marked: the residual skew would smear it."""
+_SHORTER_M: Final = 0.3
+"""A free path is kept unless a new one is this much shorter, so that the robot does not waver between equal ones."""
+_REFUSED_RETRY_S: Final = 1.0
+"""A search that found no path is repeated after this long, although nothing has changed."""
+_EARLY_S: Final = 1e-6
+"""Rounding of a clock must not put off what is due."""
+
+
+class OnboardNavigator:
+    """Keeps the robot's own costmap up to date and says when to search. Times are s of the robot's monotonic clock."""
+
+    def __init__(self, profile: Profile, floor: Replica, inscribed_radius: float, now: float) -> None:
+        self._profile = profile
+        self._costmap = OnboardCostmap(floor, inscribed_radius)
+        geometry = self._costmap.geometry
+        self._planner = Planner(geometry.width, geometry.height)
+        self._updated_at = now
+        self._searched_at = -math.inf
+        self._searched_goal: RobotGoal | None = None
+        self._refused = False
+        self._plan_id = 0
+
+    @property
+    def replica(self) -> Replica:
+        """The robot's own costmap, in the form of the fog's."""
+        return self._costmap.replica
+
+    def age(self, now: float) -> float:
+        """Return the time (s) since the costmap was last up to date."""
+        return now - self._updated_at
+
+    def update(self, localizer: Localizer, closed: Mapping[str, Spans], now: float) -> bool:
+        """Update the layers if that is due; return whether it was. `closed`: the places that the fog closes."""
+        if now - self._updated_at < self._profile.layers_period - _EARLY_S:
+            return False
+        self._updated_at = now
+        self._costmap.close(closed)
+        points, seen_from = localizer.points_in_map(), localizer.scan_pose()
+        trusted = localizer.status == "good" and abs(localizer.twist()[1]) <= _TURN_RATE
+        if points is not None and seen_from is not None and trusted:
+            self._costmap.observe(seen_from, points, localizer.wall_distance(points) > _EXPLAINED_M)
+        return True
+
+    def search(self, goal: RobotGoal, pose: Pose2, follower: PathFollower | None, now: float) -> Search | None:
+        """Return the search for a path from the robot's pose to its goal if one is due, else None."""
+        if not self._is_due(goal, follower, now):
+            return None
+        self._searched_at, self._searched_goal = now, goal
+        return Search(
+            planner=self._planner,
+            cost=self.replica.cost,
+            geometry=self._costmap.geometry,
+            start=(pose.x, pose.y),
+            goal=goal,
+        )
+
+    def path(self, found: Found, follower: PathFollower | None, at: Moment) -> RobotPath | None:
+        """Return the path to follow from now on, or the refusal; None if the present path is kept."""
+        self._refused = found.refusal is not None
+        version = self.replica.version
+        assert version is not None
+        assert found.goal.pose is not None
+        if follower is not None and found.refusal is None and self._is_as_good(follower, found):
+            return None
+        self._plan_id += 1
+        return RobotPath(
+            plan_id=self._plan_id,
+            planner_epoch=0,
+            goal_id=found.goal.goal_id,
+            points=found.points,
+            map_epoch=version.epoch,
+            map_seq=version.seq,
+            released_length=found.length,
+            goal_theta=None if found.goal.any_heading else found.goal.pose.theta,
+            refusal=found.refusal,
+            stamp=at.stamp,
+        )
+
+    def _is_due(self, goal: RobotGoal, follower: PathFollower | None, now: float) -> bool:
+        period = self._profile.planning_period
+        if period is not None:
+            return now - self._searched_at >= period - _EARLY_S
+        if self._refused:
+            return now - self._searched_at >= _REFUSED_RETRY_S
+        other_goal = self._searched_goal is None or self._searched_goal.goal_id != goal.goal_id
+        return other_goal or follower is None or self._is_blocked(follower)
+
+    def _is_as_good(self, follower: PathFollower, found: Found) -> bool:
+        return follower.remaining <= found.length + _SHORTER_M and not self._is_blocked(follower)
+
+    def _is_blocked(self, follower: PathFollower) -> bool:
+        ahead = first_blocked(self.replica.cost, self._costmap.geometry, follower, known_to_planner=True)
+        return ahead is not None

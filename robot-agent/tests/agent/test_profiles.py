@@ -1,0 +1,154 @@
+"""Profiles of navigation: what each of them plans by, waits for, and ignores."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import msgspec
+import pytest
+from little_world import L_PATH, LittleWorld
+
+from fog_contracts import channels as ch
+from fog_contracts.messages import AreaHazard, HazardArea, PolygonShape, Zone, ZoneSet
+from robot_agent.profiles import PROFILES
+
+RING = [(1, 1, 9, 2.4), (1, 5, 9, 6.4), (1, 1, 2.4, 6.4), (7.6, 1, 9, 6.4), (4.0, 2.4, 4.8, 3.0), (5.6, 6.4, 6.8, 7.0)]
+"""Corridors around a block, with niches: from the lower left to the lower right there are two ways."""
+ACROSS = (5.0, 1.0, 5.4, 2.4)
+
+
+def polygon(left, bottom, right, top):
+    return [(left, bottom), (right, bottom), (right, top), (left, top)]
+
+
+def ring(profile):
+    world = LittleWorld(rooms=RING, size=(10.0, 8.0), pose=(2.0, 1.7, 0.0)).ready()
+    return switched(world, profile)
+
+
+def switched(world, profile):
+    assert world.command("disable").accepted
+    world.run(0.6)
+    reply = world.command(f"profile_{profile}")
+    assert reply.accepted, reply
+    assert world.command("enable").accepted
+    world.run(0.6)
+    assert world.state().profile == profile
+    return world
+
+
+def send_goal(world, goal):
+    """Give the robot a goal, and paths that lead nowhere: only a robot that drives by the fog follows them."""
+    world.drive_to([(2.0, 1.7), (2.0, 1.8)], goal_id="g")
+    world.goal = msgspec.structs.replace(
+        world.goal, pose=msgspec.structs.replace(world.goal.pose, x=goal[0], y=goal[1]), any_heading=True
+    )
+    world.send(ch.ROBOT_GOAL, world.goal)
+
+
+def hazard(state, penalty, seq=1):
+    area = AreaHazard(area="z1", state=state, severity=1, penalty=penalty, since=0.0, seq=seq, epoch=1, cause="t")
+    return HazardArea(hazard=area, polygon=polygon(*ACROSS), epoch=7)
+
+
+@pytest.mark.parametrize("profile", ["default", "full"])
+def test_a_robot_that_plans_for_itself_reaches_its_goal_without_the_planner(profile):
+    world = ring(profile)
+    world.path_on = False
+    send_goal(world, (8.0, 1.7))
+    assert world.run(40.0, lambda w: w.state().goal_reached), world.state().reasons
+    assert not world.collided
+    assert 5.5 < world.travelled < 7.0
+
+
+def test_default_drives_up_to_what_its_lidar_sees_and_turns_back():
+    world = ring("default")
+    world.block(*ACROSS, solid=True, publish=False)
+    world.send(ch.HAZARD, hazard("blocked", 254))
+    send_goal(world, (8.0, 1.7))
+    assert world.run(90.0, lambda w: w.state().goal_reached), world.state().reasons
+    assert world.travelled > 12.0
+    assert not world.collided
+
+
+def test_full_avoids_a_hazard_that_only_the_fog_knows_and_default_does_not():
+    lengths = {}
+    for profile in ("default", "full"):
+        world = ring(profile)
+        world.send(ch.HAZARD, hazard("blocked", 254))
+        send_goal(world, (8.0, 1.7))
+        assert world.run(90.0, lambda w: w.state().goal_reached), world.state().reasons
+        lengths[profile] = world.travelled
+    assert lengths["default"] < 7.0
+    assert lengths["full"] > 12.0
+
+
+def test_full_avoids_a_no_go_zone_and_forgets_one_that_is_lifted():
+    world = ring("full")
+    zone = Zone(id="wet", kind="BLOCKED", shape=PolygonShape(points=polygon(*ACROSS)))
+    world.send(ch.ZONES, ZoneSet(epoch=7, seq=1, zones=[zone], active=["wet"]))
+    send_goal(world, (8.0, 1.7))
+    world.run(1.0)
+    assert world.state().goal_distance > 11.0
+    world.send(ch.ZONES, ZoneSet(epoch=7, seq=2, zones=[zone], active=[]))
+    world.command("cancel")
+    world.run(1.0)
+    send_goal(world, (8.0, 1.7))
+    world.goal = msgspec.structs.replace(world.goal, goal_id="g2")
+    world.send(ch.ROBOT_GOAL, world.goal)
+    world.run(1.0)
+    assert world.state().goal_distance < 7.0
+
+
+def test_a_profile_is_judged_by_the_sources_that_it_uses():
+    modes = {}
+    for profile in PROFILES:
+        world = ring(profile)
+        world.heartbeats_on = world.path_on = False
+        send_goal(world, (8.0, 1.7))
+        world.run(6.0)
+        modes[profile] = world.state().mode
+    assert modes == {"default": "NORMAL", "full": "DEGRADED", "fog": "HOLD"}
+
+
+def test_no_way_left_is_refused_and_tried_again():
+    world = ring("full")
+    world.send(ch.HAZARD, hazard("blocked", 254))
+    zone = Zone(id="wet", kind="BLOCKED", shape=PolygonShape(points=polygon(5.0, 5.0, 5.4, 6.4)))
+    world.send(ch.ZONES, ZoneSet(epoch=7, seq=1, zones=[zone], active=["wet"]))
+    send_goal(world, (8.0, 1.7))
+    world.run(2.0)
+    assert world.state().mode == "HOLD"
+    assert any("no path leads to the goal" in reason for reason in world.state().reasons)
+    world.send(ch.ZONES, ZoneSet(epoch=7, seq=2, zones=[], active=[]))
+    assert world.run(90.0, lambda w: w.state().goal_reached), world.state().reasons
+
+
+def test_a_profile_is_switched_at_rest_only():
+    world = LittleWorld().ready()
+    world.drive_to(L_PATH)
+    world.run(3.0)
+    reply = world.command("profile_default")
+    assert not reply.accepted
+    assert "disable it first" in reply.reason
+    assert world.state().profile == "fog"
+
+
+def test_a_robot_that_returns_to_the_fog_waits_for_the_newest_map_and_drives_by_it():
+    world = ring("default")
+    world.block(*ACROSS, publish=True)
+    world.run(1.0)
+    switched(world, "fog")
+    assert world.run(3.0, lambda w: w.state().mode == "HOLD"), world.state().reasons
+    assert world.agent.wants_snapshot(world.now)
+    world.agent.load(world.master.snapshot(), world.now)
+    world.run(3.0)
+    assert world.state().mode == "NORMAL"
+    assert world.agent.replica.version == world.master.version
+
+
+def test_a_robot_that_drives_by_the_fog_loads_no_planner_of_its_own():
+    program = "import sys, robot_agent.__main__; print([name for name in sys.modules if 'onboard' in name])"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

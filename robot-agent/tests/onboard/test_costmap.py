@@ -1,0 +1,107 @@
+"""The robot's own costmap is what its layers are, whatever order they changed in."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fog_contracts.costs import DEFAULT_INFLATION, LETHAL
+from fog_contracts.grid import GridGeometry
+from fog_contracts.raster import polygon_spans
+from fog_contracts.replica import MasterMap, Replica
+from fog_kernels.inflation import inflate, inflation_table
+from fog_kernels.raycast import cast
+from robot_agent.localization.pose import Pose2
+from robot_agent.onboard.costmap import OnboardCostmap
+
+GEOMETRY = GridGeometry(120, 100, 0.05, 0.0, 0.0)
+TABLE = inflation_table(0.05, DEFAULT_INFLATION)
+PLACES = {
+    "box": polygon_spans([(1.0, 1.0), (2.0, 1.0), (2.0, 2.0), (1.0, 2.0)], GEOMETRY),
+    "strip": polygon_spans([(0.5, 3.0), (5.5, 3.0), (5.5, 3.2), (0.5, 3.2)], GEOMETRY),
+}
+
+
+def floor():
+    """A room of 6 x 5 m with a pillar."""
+    static = np.zeros(GEOMETRY.shape, np.uint8)
+    static[[0, -1], :] = static[:, [0, -1]] = LETHAL
+    static[40:50, 70:80] = LETHAL
+    replica = Replica()
+    replica.load(MasterMap("lab", GEOMETRY, static, static, epoch=3).snapshot())
+    return replica
+
+
+def scan(solid, pose):
+    """What a lidar without noise sees from a pose: points, and which of them the floor plan does not explain."""
+    angles = np.linspace(-math.pi, math.pi, 720, endpoint=False)
+    ranges = cast(solid, 0.05, 0.0, 0.0, pose.x, pose.y, angles, 12.0)
+    # The cell that was hit lies just behind the place where the beam ends.
+    points = np.column_stack((pose.x + (ranges + 0.01) * np.cos(angles), pose.y + (ranges + 0.01) * np.sin(angles)))
+    points = points[np.isfinite(ranges)]
+    return points, GEOMETRY.sample(floor().static, points, LETHAL) != LETHAL
+
+
+def with_obstacle(*boxes):
+    solid = floor().static.copy()
+    for left, bottom, right, top in boxes:
+        solid[round(bottom / 0.05) : round(top / 0.05), round(left / 0.05) : round(right / 0.05)] = LETHAL
+    return solid
+
+
+STEPS = st.lists(
+    st.one_of(
+        st.sets(st.sampled_from(sorted(PLACES))).map(lambda names: ("close", names)),
+        st.tuples(
+            st.just("observe"),
+            st.tuples(st.floats(0.5, 5.5), st.floats(0.5, 4.5)),
+            st.sampled_from([(), ((2.5, 1.0, 2.8, 1.4),), ((4.4, 3.4, 4.9, 4.0), (1.2, 3.9, 1.5, 4.2))]),
+        ),
+    ),
+    max_size=8,
+)
+
+
+@settings(max_examples=40, deadline=None)
+@given(STEPS)
+def test_costs_are_those_of_a_costmap_inflated_from_scratch(steps):
+    costmap = OnboardCostmap(floor(), 0.17)
+    for step in steps:
+        before, cost = costmap.replica.version, costmap.replica.cost.copy()
+        if step[0] == "close":
+            costmap.close({name: PLACES[name] for name in step[1]})
+        else:
+            pose = Pose2(*step[1], 0.0)
+            costmap.observe(pose, *scan(with_obstacle(*step[2]), pose))
+        raw = floor().static.copy()
+        for spans in costmap._closed.values():
+            window, mask = spans.to_mask()
+            raw[window.rows, window.columns][mask] = LETHAL
+        raw[costmap._marked[:, 1], costmap._marked[:, 0]] = LETHAL
+        assert np.array_equal(costmap.replica.cost, inflate(raw, TABLE))
+        assert (costmap.replica.version != before) >= (not np.array_equal(cost, costmap.replica.cost))
+
+
+def test_an_obstacle_is_marked_when_it_is_seen_and_freed_when_it_is_seen_to_be_gone():
+    costmap, pose = OnboardCostmap(floor(), 0.17), Pose2(1.0, 1.2, 0.0)
+    middle = GEOMETRY.cell(2.6, 1.2)[::-1]
+    costmap.observe(pose, *scan(with_obstacle((2.5, 1.0, 2.8, 1.4)), pose))
+    assert costmap.replica.cost[middle] >= 253
+    # From behind the pillar nothing tells that it is gone.
+    hidden = Pose2(4.5, 2.25, 0.0)
+    costmap.observe(hidden, *scan(with_obstacle((3.0, 0.5, 3.2, 4.5)), hidden))
+    assert costmap.replica.cost[middle] >= 253
+    costmap.observe(pose, *scan(floor().static, pose))
+    assert costmap.replica.cost[middle] == 0
+
+
+def test_the_fog_s_own_copy_of_the_map_is_left_alone():
+    fog = floor()
+    costmap, pose = OnboardCostmap(fog, 0.17), Pose2(1.0, 1.2, 0.0)
+    costmap.close(PLACES)
+    costmap.observe(pose, *scan(with_obstacle((2.5, 1.0, 2.8, 1.4)), pose))
+    assert np.array_equal(fog.static, floor().static)
+    assert np.array_equal(fog.cost, floor().cost)

@@ -244,11 +244,15 @@ class AgentProcess:
             self.process.kill()
             self.process.wait()
 
+    @property
+    def port(self) -> int:
+        """The port of the agent's health server."""
+        return int(self._port_file.read_text())
+
     def get(self, path: str) -> tuple[int, str]:
         """GET from the agent's health server; status 0 while it is not there."""
         try:
-            port = int(self._port_file.read_text())
-            with urllib.request.urlopen(f"http://127.0.0.1:{port}{path}", timeout=2.0) as answer:
+            with urllib.request.urlopen(f"http://127.0.0.1:{self.port}{path}", timeout=2.0) as answer:
                 return answer.status, answer.read().decode()
         except urllib.error.HTTPError as error:
             with error:

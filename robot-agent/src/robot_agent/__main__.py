@@ -18,6 +18,7 @@ from fog_runtime import logs, process, signals
 from fog_runtime.clock import SystemClock
 from fog_runtime.health import Health, serve_health
 from fog_runtime.memory import release_startup_memory
+from fog_runtime.own_address import reachable_address
 from fog_runtime.robot_file import describe_robot, load_robot
 from fog_runtime.settings import describe, load
 from fog_runtime.zenoh_edge import ZenohEdge
@@ -65,10 +66,11 @@ async def main() -> None:
     ) as zenoh:
         with (
             open_core(config, settings.seed, settings.input_log) as core,
-            serve_health(health, settings.http_host, settings.http_port, settings.port_file),
+            serve_health(health, settings.http_host, settings.http_port, settings.port_file) as server,
         ):
             store = Store(settings.data_dir)
-            agent = Service(core, zenoh, store, clock, health)
+            address = partial(reachable_address, settings.http_host, server.port, settings.zenoh_endpoints)
+            agent = Service(core, zenoh, store, clock, health, address)
             map_loader = MapLoader(core, zenoh, store, clock, site=site, phase=agent.phase)
             guardian = GuardianClient(settings.guardian_socket, clock, agent.on_feedback, agent.on_base_lost)
             lidar = LidarEdge(

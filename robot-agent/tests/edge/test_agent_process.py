@@ -62,6 +62,8 @@ async def test_agent_localizes_refuses_a_wrong_key_and_drives_a_path(robot):
     assert robot.error() < 0.2
     state = robot.fog.state
     assert (state.goal_id, state.plan_id, state.map_epoch, state.mode) == ("g1", 1, 7, "NORMAL")
+    await until(lambda: robot.fog.state.metrics, "it says where its metrics are")
+    assert robot.fog.state.metrics == f"127.0.0.1:{robot.agent.port}"
     status, text = robot.agent.get("/metrics")
     assert status == 200
     assert "fognav_lidar_scans_total" in text

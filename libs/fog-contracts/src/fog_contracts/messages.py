@@ -666,6 +666,7 @@ class RobotState(Message, frozen=True, kw_only=True):
 
     `boot` is the id of this run of its agent, `clock` the agent's own monotonic clock: a command names both.
     `proximity` has the strength of each of the base's light sensors, from the left to the right; empty without any.
+    `metrics` is the address (host:port) at which Prometheus reaches the robot's metrics; empty if it can't.
     """
 
     mode: Mode
@@ -688,6 +689,7 @@ class RobotState(Message, frozen=True, kw_only=True):
     power: Power | None = None
     proximity: Annotated[list[Strength], Meta(max_length=16)] = []
     profile: ProfileName = "fog"
+    metrics: Annotated[str, Meta(max_length=128)] = ""
 
 
 VIEW_SECTORS: Final = 180

@@ -21,6 +21,8 @@ class Health:
     def __init__(self, *needed: str) -> None:
         """Start with the `needed` conditions unmet, so that the process is not ready before all are set."""
         self._lock = threading.Lock()
+        for name in needed:
+            metrics.CONDITION.labels(name).set(0)
         self._conditions: dict[str, tuple[bool, str]] = dict.fromkeys(needed, (False, "not started"))
 
     def set(self, name: str, ok: bool, detail: str = "") -> None:  # noqa: FBT001  # set("redis", True) reads well
@@ -28,6 +30,7 @@ class Health:
         with self._lock:
             before = self._conditions.get(name)
             self._conditions[name] = (ok, detail)
+        metrics.CONDITION.labels(name).set(ok)
         if before is None or before[0] != ok:
             _log.info("readiness_changed", condition=name, ok=ok, detail=detail)
 

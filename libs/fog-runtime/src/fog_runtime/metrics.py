@@ -1,6 +1,9 @@
 """Prometheus metrics common to all processes; CPU and memory come from prometheus-client's process collector."""
 
+import math
+import shutil
 from collections.abc import Collection
+from pathlib import Path
 from typing import Final, Literal
 
 from prometheus_client import (
@@ -59,6 +62,11 @@ HANDLER_ERRORS: Final = Counter(
 )
 BUILD: Final = Info("fognav_build", "Which code runs: its version, and its revision if that is known")
 BUILD.info({"version": VERSION, "revision": REVISION})
+CONDITION: Final = Gauge(
+    "fognav_condition", "Whether a condition of readiness is met (1) or not (0), as /readyz describes it", ["condition"]
+)
+DISK_FREE: Final = Gauge("fognav_disk_free_bytes", "Free space of the disk that holds this folder", ["folder"])
+DISK_SIZE: Final = Gauge("fognav_disk_size_bytes", "Size of the disk that holds this folder", ["folder"])
 CONNECTED: Final = Gauge("fognav_connected", "Whether the connection is up (1) or down (0)", ["transport"])
 CONNECTIONS: Final = Counter("fognav_connections_total", "Connections established", ["transport"])
 
@@ -66,6 +74,21 @@ CONNECTIONS: Final = Counter("fognav_connections_total", "Connections establishe
 def count_bytes(channel: str, direction: Literal["sent", "received"], size: int) -> None:
     """Count the bytes of a payload."""
     BYTES.labels(channel, direction).inc(size)
+
+
+def watch_disk(folder: Path) -> None:
+    """Export size and free space of the disk that holds the folder, as they are when Prometheus asks."""
+    DISK_FREE.labels(str(folder)).set_function(lambda: _disk(folder)[1])
+    DISK_SIZE.labels(str(folder)).set_function(lambda: _disk(folder)[0])
+
+
+def _disk(folder: Path) -> tuple[float, float]:
+    """Return size and free space (bytes); not-a-number, which no rule takes for a value, while it can't be asked."""
+    try:
+        usage = shutil.disk_usage(folder)
+    except OSError:
+        return math.nan, math.nan
+    return float(usage.total), float(usage.free)
 
 
 def observe_trace(trace: Trace, stages: Collection[str] = tuple(SPANS)) -> None:

@@ -6,11 +6,13 @@ how a loss of acknowledged records is noticed: docs/adr/0013-store-that-notices-
 
 from __future__ import annotations
 
+import math
 import secrets
 import time
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, NamedTuple, Self, TypeVar, cast
 
 import msgspec
+from prometheus_client import Gauge
 
 from fog_contracts.messages import Message
 from fog_runtime import logs, store_scripts
@@ -39,6 +41,11 @@ __all__ = [
 ]
 
 M = TypeVar("M", bound=Message)
+
+DURABLE: Final = Gauge(
+    "fognav_store_durable", "Whether Redis writes to its disk before it acknowledges; not a number until it tells"
+)
+DURABLE.set(math.nan)
 
 Outcome = Literal["ok", "exists", "missing", "stale"]
 """Result of a write: done (now or before), or refused because a record exists, is missing, or has another version."""
@@ -135,7 +142,9 @@ class RedisStore:
         except StoreError:
             return ""
         values = {_text(name): _text(value) for name, value in _items(config)}
-        if values.get("appendonly") != "yes" or values.get("appendfsync") != "always":
+        durable = values.get("appendonly") == "yes" and values.get("appendfsync") == "always"
+        DURABLE.set(durable)
+        if not durable:
             return "run Redis with `appendonly yes` and `appendfsync always`: it may lose acknowledged writes"
         return ""
 

@@ -6,8 +6,10 @@ import asyncio
 import math
 import os
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
+from msgspec import structs
 from prometheus_client import Counter, Gauge
 
 from fog_contracts import channels as ch
@@ -22,7 +24,7 @@ from robot_agent.agent.core import decide
 from robot_agent.agent.exporter import Observed, RobotCollector, parent
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from fog_contracts.handlers import Publication
     from fog_contracts.messages import EgressRequest, Message
@@ -53,7 +55,16 @@ _log = logs.get("agent")
 class Service:
     """The running agent; its loops are tasks of the process. The core is used on the loop's thread only."""
 
-    def __init__(self, core: AgentCore, zenoh: ZenohEdge, store: Store, clock: Clock, health: Health) -> None:
+    def __init__(
+        self,
+        core: AgentCore,
+        zenoh: ZenohEdge,
+        store: Store,
+        clock: Clock,
+        health: Health,
+        metrics_address: Callable[[], str] = str,
+    ) -> None:
+        """Prepare; `metrics_address` returns where the fog node reaches this process's metrics, and may block."""
         self._core = core
         self._zenoh = zenoh
         self._edges = Edges(clock, zenoh=zenoh)
@@ -76,6 +87,9 @@ class Service:
         self._last_scan_at = -math.inf
         self._base_reason = "the guardian is not connected yet"
         self._manager = ServiceManager()
+        self._find_metrics_address = metrics_address
+        self._metrics_address = ""
+        self._was_connected = False
 
     def _ticker(self, period: float) -> Ticker:
         return Ticker(self._clock, period, self.phase)
@@ -91,6 +105,7 @@ class Service:
                 due = now + HOUSEKEEPING_S - PUBLISH_S / 2
                 self._core.on_loop_health(self._loop_health())
                 await self._store_pose(now)
+                await self._announce_metrics()
                 self._report_health(self._clock.now(), lidar)
                 self._observe(self._clock.now(), lidar, guardian)
             elif not self._health.ready:
@@ -103,6 +118,12 @@ class Service:
                 await asyncio.to_thread(self._store.put_pose, pose)
             except OSError as error:
                 _log.error("pose_not_stored", reason=str(error))
+
+    async def _announce_metrics(self) -> None:
+        """Look up this computer's address after each connection: a network gives it another one now and then."""
+        if self._zenoh.connected and not self._was_connected:
+            self._metrics_address = await asyncio.to_thread(self._find_metrics_address)
+        self._was_connected = self._zenoh.connected
 
     def _report_health(self, now: float, lidar: LidarEdge) -> None:
         core, health = self._core, self._health
@@ -227,6 +248,8 @@ class Service:
     def _publish(self, publications: Sequence[Publication]) -> None:
         for publication in publications:
             if isinstance(state := publication.message, RobotState):
+                state = structs.replace(state, metrics=self._metrics_address)
+                publication = replace(publication, message=state)  # noqa: PLW2901  # the same one, completed
                 self._state = state
                 self._report_mode(state)
             self._edges.publish(publication)

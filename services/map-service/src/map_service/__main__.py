@@ -6,7 +6,7 @@ import asyncio
 import os
 
 from fog_contracts import channels as ch
-from fog_runtime import logs, process
+from fog_runtime import logs, metrics, process
 from fog_runtime.clock import SystemClock, WallClock, boot_id
 from fog_runtime.health import Health
 from fog_runtime.http import Front, load_tokens, unused
@@ -35,6 +35,7 @@ async def main() -> None:
     site = settings.site or loaded.site.id
     clock = SystemClock(settings.speed)
     health = Health("store", "zones", "mqtt", "map")
+    metrics.watch_disk(settings.data_dir)
     tokens = load_tokens(settings.tokens_file)
     front = Front.fork(
         lambda: make_api(unused(), loaded.site, clock, health, tokens), settings.http_host, settings.http_port

@@ -60,6 +60,7 @@ from fog_runtime.idempotency import Attempt, IdempotencyError
 from fog_runtime.work import BusyError, Worker
 from map_service.costmap import LayeredCostmap
 from map_service.layers.base import Grid
+from map_service.robot_directory import ScrapeTarget
 from map_service.service import Service
 from map_service.store import StoreError
 from map_service.zone_validation import ZoneError
@@ -129,6 +130,7 @@ def make_api(  # the process's parts
     _add_zone_writes(zones, service, clock)
     _add_audit(zones, service)
     _add_views(Routes(app, "map"), service, site)
+    _add_scrape_targets(Routes(app, "robots"), service, clock)
     recovery = Routes(app, "store")
     add_store_errors(recovery)
     add_recovery(recovery, service.zones)
@@ -341,6 +343,13 @@ def _add_views(routes: Routes, service: Service, site: Site) -> None:
         """Return the master costmap; a pixel's palette index is the cell's cost."""
         _require_zones(service)
         return await pictures.response("cost", costmap.cost, _COSTS)
+
+
+def _add_scrape_targets(routes: Routes, service: Service, clock: Clock) -> None:
+    @routes.get("/api/v1/prometheus/robots")
+    async def scrape_targets() -> list[ScrapeTarget]:
+        """Return where Prometheus finds the metrics of the robots that are alive, for its HTTP service discovery."""
+        return service.core.robots.targets(clock.now())
 
 
 def _require_zones(service: Service) -> None:

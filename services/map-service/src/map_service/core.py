@@ -19,6 +19,7 @@ from fog_contracts.messages import HazardArea, ZoneSet
 from map_service.costmap import LayeredCostmap
 from map_service.layers.hazards import HazardsLayer
 from map_service.layers.zones import ZonesLayer
+from map_service.robot_directory import RobotDirectory
 from map_service.zone_times import StoredState
 
 if TYPE_CHECKING:
@@ -71,6 +72,7 @@ class MapCore:
         for definition in definitions:
             self._hazards.define(definition, Moment(0.0, 0.0))
         self.costmap = LayeredCostmap(site, static, layers, inflation, epoch)
+        self.robots = RobotDirectory()
         self._zones_loaded = False
         self._hazards_wait_s = hazards_wait_s
         self._serving = False
@@ -197,8 +199,9 @@ class MapCore:
 
         return handle
 
-    def _on_state(self, _ids: Ids, _state: RobotState, _at: Moment) -> list[Publication]:
-        """Do nothing: of a robot's state only the epochs that it received matter, which the edges pass on."""
+    def _on_state(self, ids: Ids, state: RobotState, at: Moment) -> list[Publication]:
+        """Note that the robot is alive; the epochs that it received are passed on by the edges."""
+        self.robots.heard(ids["robot"], state, at.now)
         return []
 
     def _commit(self, publications: list[Publication], at: Moment) -> list[Publication]:

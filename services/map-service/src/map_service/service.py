@@ -44,6 +44,7 @@ AREAS_UNCONFIRMED = Gauge("fognav_areas_unconfirmed", "Areas whose hazard no liv
 OBSTACLES_REFUSED = Counter(
     "fognav_obstacles_refused_total", "Obstacle cells that are not on the map because it holds as many as it may"
 )
+CLOCK_SYNCHRONIZED = Gauge("fognav_clock_synchronized", "Whether something keeps the time of day synchronized")
 CLOCK_UNKNOWN = (
     "nothing keeps the time of day synchronized: zones with a start, an end or a schedule are in force until it is"
     " known (FOGNAV_WALL_CLOCK=trusted if the machine's clock is right)"
@@ -106,6 +107,7 @@ class Service:
             self.publisher.publish(publications)
             self._observe_aggregator(at.now)
             self._observe_layers()
+            CLOCK_SYNCHRONIZED.set(at.synchronized)
             self._health.set("clock", ok=True, detail="" if at.synchronized else CLOCK_UNKNOWN)
             self._health.set("map", ok=self.core.serving, detail=self.core.missing())
             self._health.set("mqtt", ok=connected, detail="" if connected else "not connected to the broker")

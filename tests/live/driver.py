@@ -248,7 +248,7 @@ class LiveSystem:
     async def drive_to(self, x: float, y: float, timeout_s: float = 30) -> None:
         """Send the robot to a position, and wait until it drives in NORMAL mode."""
         answer = await self.send_goal(x, y)
-        assert answer.status == 200, answer
+        assert answer.status in (200, 201), answer
         await self.wait_driving(timeout_s)
 
     async def wait_driving(self, timeout_s: float = 30) -> None:

@@ -41,7 +41,8 @@ FIRMWARE_CHECKER: Final = Tool(
     "cppcheck", ("cppcheck",), "cppcheck libbearssl-dev libmbedtls-dev",
     "checking the firmware, and its signatures with the boards' own libraries", required=False,
 )  # fmt: skip
-TOOLS: Final = (MOSQUITTO, REDIS, CHROMIUM, COMPILER, BOARD_COMPILER, FIRMWARE_CHECKER)
+PROMETHEUS: Final = Tool("prometheus", ("prometheus",), "prometheus", "tests of alerts and dashboards", required=False)
+TOOLS: Final = (MOSQUITTO, REDIS, CHROMIUM, COMPILER, BOARD_COMPILER, FIRMWARE_CHECKER, PROMETHEUS)
 
 
 class MissingToolsError(RuntimeError):

@@ -1,0 +1,174 @@
+"""A real Prometheus, configured as on a fog node, beside the running system: each panel and each rule has its data."""
+
+from __future__ import annotations
+
+import asyncio
+import importlib.util
+import json
+import shutil
+import subprocess
+import time
+import urllib.error
+import urllib.parse
+import urllib.request
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+import pytest_asyncio
+import yaml
+from driver import LiveSystem
+
+from fog_contracts.messages import SimCommand, SimObstacle
+from fog_supervisor import net
+from fognav.stack import AGENT, MAP_SERVICE, SERVICES
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Iterator
+
+ROOT = Path(__file__).parents[2]
+DEPLOYED = ROOT / "deploy"
+GOAL = (58.0, 28.4)
+BARRIER = SimObstacle(id="barrier", polygon=[(39.6, 26.9), (40.4, 26.9), (40.4, 29.8), (39.6, 29.8)], height=1.0)
+"""Across the middle corridor, in the beam of the node of area z1."""
+
+pytestmark = [
+    pytest.mark.live,
+    pytest.mark.asyncio(loop_scope="module"),
+    pytest.mark.timeout(240),
+    pytest.mark.skipif(shutil.which("prometheus") is None, reason="prometheus is not installed"),
+]
+
+
+class Prometheus:
+    """A Prometheus on a loopback port that scrapes a running system with the deployed configuration."""
+
+    def __init__(self, folder: Path, system: LiveSystem) -> None:
+        self.port = net.free_port()
+        ports = {name: system.stack.port(name) for name in SERVICES}
+        config = yaml.safe_load((DEPLOYED / "prometheus" / "prometheus.yml").read_text("utf-8"))
+        config["global"] |= {"scrape_interval": "1s", "evaluation_interval": "1s"}
+        config["rule_files"] = [str(DEPLOYED / "prometheus" / "rules" / "*.yml")]
+        fog, robots = config["scrape_configs"]
+        # One machine instead of one host name per service.
+        assert [target.split(":")[0] for target in fog["static_configs"][0]["targets"]] == list(SERVICES)
+        del fog["relabel_configs"]
+        fog["static_configs"] = [
+            {"targets": [f"127.0.0.1:{port}"], "labels": {"process": name}} for name, port in ports.items()
+        ]
+        (discovery,) = robots["http_sd_configs"]
+        discovery["url"] = discovery["url"].replace("map-service:8000", f"127.0.0.1:{ports[MAP_SERVICE]}")
+        discovery["refresh_interval"] = "1s"
+        file = folder / "prometheus.yml"
+        file.write_text(yaml.safe_dump(config))
+        self.log = folder / "prometheus.log"
+        with self.log.open("wb") as log:
+            self.process = subprocess.Popen(
+                ["prometheus", f"--config.file={file}", f"--storage.tsdb.path={folder / 'data'}",
+                 f"--web.listen-address=127.0.0.1:{self.port}"], stdout=log, stderr=log,
+            )  # fmt: skip
+
+    def close(self) -> None:
+        self.process.terminate()
+        self.process.wait(30)
+
+    def ask(self, path: str, **parameters: str) -> Any:
+        """GET from its API; raises `urllib.error.URLError` while it starts, AssertionError for a wrong query."""
+        url = f"http://127.0.0.1:{self.port}/api/v1/{path}?{urllib.parse.urlencode(parameters)}"
+        try:
+            with urllib.request.urlopen(url, timeout=5.0) as answer:
+                return json.load(answer)["data"]
+        except urllib.error.HTTPError as error:
+            with error:
+                raise AssertionError(f"{parameters}: {error.read().decode()}") from error
+
+    def series(self, expression: str) -> list[Any]:
+        return list(self.ask("query", query=expression)["result"])
+
+
+@pytest_asyncio.fixture(scope="module", loop_scope="module")
+async def system(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[LiveSystem]:
+    async with LiveSystem(tmp_path_factory.mktemp("live")) as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def prometheus(tmp_path_factory: pytest.TempPathFactory, system: LiveSystem) -> Iterator[Prometheus]:
+    running = Prometheus(tmp_path_factory.mktemp("prometheus"), system)
+    yield running
+    running.close()
+
+
+def panels() -> list[tuple[str, str, str]]:
+    """Return the page, the panel and the query of each panel that must have data."""
+    spec = importlib.util.spec_from_file_location("panels", DEPLOYED / "grafana" / "panels.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return [
+        (page.title, panel.title, query)
+        for page in module.DASHBOARDS
+        for _, row in page.rows
+        for panel in row
+        for query, _ in panel.queries
+        if not panel.needs or panel.title.startswith("Stages")
+    ]
+
+
+def as_grafana_asks(query: str) -> str:
+    return query.replace("$__rate_interval", "15s").replace("$robot", ".*")
+
+
+async def test_every_panel_has_data_and_every_rule_works_while_a_robot_drives_and_a_hazard_appears(
+    system: LiveSystem, prometheus: Prometheus
+) -> None:
+    await system.drive_to(*GOAL)
+    await system.simulate(SimCommand(place=[BARRIER]))
+    await system.until(lambda: system.hazard("z1") == "blocked", 20, "the barrier is seen")
+    missing = [(page, panel, as_grafana_asks(query)) for page, panel, query in panels()]
+    assert len(missing) > 30
+    deadline = time.monotonic() + 90.0
+    while missing:
+        assert time.monotonic() < deadline, f"no data: {missing}"
+        try:
+            missing = [entry for entry in missing if not await asyncio.to_thread(prometheus.series, entry[2])]
+        except urllib.error.URLError:
+            assert prometheus.process.poll() is None, prometheus.log.read_text()
+        await asyncio.sleep(0.5)
+    groups = prometheus.ask("rules")["groups"]
+    rules = [rule for group in groups for rule in group["rules"]]
+    assert len(rules) > 25
+    assert [(rule["name"], rule["lastError"]) for rule in rules if rule["health"] == "err"] == []
+    targets = prometheus.ask("targets")["activeTargets"]
+    assert sorted(target["labels"].get("robot", target["labels"].get("process")) for target in targets) == sorted(
+        [*SERVICES, "r1"]
+    )
+    (robot,) = [target for target in targets if target["labels"]["job"] == "robots"]
+    assert robot["scrapeUrl"] == f"http://127.0.0.1:{system.stack.port(AGENT)}/metrics"
+    firing = {
+        alert["labels"]["alertname"] for alert in prometheus.ask("alerts")["alerts"] if alert["state"] == "firing"
+    }
+    assert firing & {"ServiceDown", "NotOneLeader", "BrokerDown", "StoreDown", "StoreLost", "StoreNotDurable"} == set()
+
+
+async def test_robot_that_is_gone_is_no_target_any_more(system: LiveSystem, prometheus: Prometheus) -> None:
+    def robots() -> list[str]:
+        found = prometheus.ask("targets")["activeTargets"]
+        return [target["labels"]["robot"] for target in found if target["labels"]["job"] == "robots"]
+
+    async def wait(expected: list[str], timeout_s: float) -> None:
+        deadline = time.monotonic() + timeout_s
+        while True:
+            try:
+                if await asyncio.to_thread(robots) == expected:
+                    return
+            except urllib.error.URLError:
+                assert prometheus.process.poll() is None, prometheus.log.read_text()
+            assert time.monotonic() < deadline, f"robots are not {expected}"
+            await asyncio.sleep(0.2)
+
+    await wait(["r1"], 60.0)
+    await system.stop_operator()
+    await system.stack.supervisor.stop(AGENT)
+    await wait([], 60.0)

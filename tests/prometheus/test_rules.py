@@ -1,0 +1,45 @@
+"""The rules of Prometheus, checked by its own tool, and what operators are told about each alert."""
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).parents[2]
+DEPLOYED = ROOT / "deploy" / "prometheus"
+TESTS = Path(__file__).parent / "alerts.test.yml"
+ALERTS = [
+    rule["alert"]
+    for group in yaml.safe_load((DEPLOYED / "rules" / "alerts.yml").read_text("utf-8"))["groups"]
+    for rule in group["rules"]
+]
+
+needs_promtool = pytest.mark.skipif(shutil.which("promtool") is None, reason="promtool is not installed")
+
+
+def promtool(*arguments: str) -> str:
+    done = subprocess.run(["promtool", *arguments], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@needs_promtool
+def test_configuration_is_valid_and_names_files_that_exist() -> None:
+    assert "2 rule files found" in promtool("check", "config", str(DEPLOYED / "prometheus.yml"))
+
+
+@needs_promtool
+def test_each_alert_fires_when_it_must_and_not_before() -> None:
+    assert "SUCCESS" in promtool("test", "rules", str(TESTS))
+
+
+@pytest.mark.parametrize("alert", ALERTS)
+def test_alert_has_a_test_and_tells_operators_what_to_do(alert: str) -> None:
+    cases = yaml.safe_load(TESTS.read_text("utf-8"))["tests"]
+    expected = [case for test in cases for case in test.get("alert_rule_test", []) if case["alertname"] == alert]
+    assert any(case["exp_alerts"] for case in expected), "no test in which it fires"
+    operations = (ROOT / "docs" / "operations.md").read_text("utf-8")
+    assert re.search(rf"^\*\*{alert}\.\*\* \S", operations, re.MULTILINE), "say in docs/operations.md what to do"

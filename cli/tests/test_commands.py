@@ -45,6 +45,8 @@ def _warm_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
         ["store", "accept"],
         ["area", "override"],
         ["area", "history"],
+        ["alert", "list"],
+        ["alert", "acknowledge"],
         *(["token", name] for name in ("create", "list", "revoke")),
         *(["zone", name] for name in ("add", "list", "show", "remove")),
         *(

@@ -301,6 +301,23 @@ def test_history_of_an_area_is_listed_with_how_long_each_state_lasted(demo: Serv
     assert run("area", "history", "hall", "--limit", "1") == "area hall has no history yet"
 
 
+def test_alerts_are_listed_and_acknowledged(demo: Service) -> None:
+    alert = {
+        "id": "node-unknown.hall.n1", "kind": "node-unknown", "area": "hall", "node": "n1", "reason": "it went offline",
+        "since": 1_700_000_000.0, "raised": 1_700_000_120.0, "acknowledged_by": None, "acknowledged_at": None,
+    }  # fmt: skip
+    demo.answers["GET", "/api/v1/alerts"] = (200, [alert])
+    assert run("alert", "list").startswith("node-unknown.hall.n1: since 2023-11-1")
+    seen = {**alert, "acknowledged_by": "ann"}
+    demo.answers["PUT", "/api/v1/alerts/node-unknown.hall.n1/acknowledgement"] = (200, seen)
+    assert run("alert", "acknowledge", "node-unknown.hall.n1") == "node-unknown.hall.n1 is acknowledged by ann"
+    demo.answers["GET", "/api/v1/alerts"] = (200, [seen])
+    assert run("alert", "list").endswith("it went offline [ann looks after it]")
+    assert json.loads(run("alert", "list", "--json"))["alerts"] == [seen]
+    demo.answers["GET", "/api/v1/alerts"] = (200, [])
+    assert run("alert", "list") == "no alerts"
+
+
 def test_source_is_added_to_an_area_listed_and_removed(demo: Service) -> None:
     definition = {"id": "hall", "polygon": [[0, 0], [1, 0], [1, 1]], "nodes": ["n1"], "version": 3}
     demo.answers["GET", "/api/v1/areas/hall"] = (200, {"definition": definition})

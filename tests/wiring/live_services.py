@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 AGENT_LOOPS: Final = ("agent map", "agent control", "agent stream")
 TICKS: Final = ("aggregator tick", "map tick", "planner tick", "agent publish")
-OTHERS: Final = ("planner map", "agent housekeeping")
+OTHERS: Final = ("aggregator alerts", "planner map", "agent housekeeping")
 _EARLY_S: Final = 1e-6
 """Sums of periods are not exact multiples of a step: a task that is due within this time is due now."""
 
@@ -188,6 +188,15 @@ class MemoryStore:
     async def goals(self) -> dict[str, Any]:
         return {}
 
+    async def alerts(self) -> list[Any]:
+        return []
+
+    async def save_alerts(self, alerts: list[Any]) -> None:
+        self.writes.append(tuple(alerts))
+
+    async def record_alert(self, *args: Any) -> None:
+        self.writes.append(args)
+
     async def save_hazards(self, hazards: Any) -> None:
         self.writes.append(tuple(hazards))
 
@@ -301,6 +310,7 @@ class LiveServices:
             "agent control": self.agent.control_loop(),
             "agent stream": self.agent.stream_loop(self.link, self.link),
             "aggregator tick": self.aggregator.tick_loop(),
+            "aggregator alerts": self.aggregator.alerts.run(),
             "map tick": self.map.tick_loop(),
             "planner tick": self.planner.tick_loop(),
             "agent publish": self.agent.publish_loop(),

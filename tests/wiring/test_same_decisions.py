@@ -139,10 +139,13 @@ class Run:
         return [p for at, p in self.bus.published if at == step and is_external(p)]
 
     def decisions(self) -> dict[str, list[Any]]:
-        """Return what the system published by itself, by channel: step, ids and content."""
+        """Return what the system published by itself, by channel: step, ids and content.
+
+        Without alerts: they tell people, and the service makes them of what the core has decided.
+        """
         found: dict[str, list[Any]] = {}
         for step, publication in self.bus.published:
-            if not is_external(publication):
+            if not is_external(publication) and publication.channel is not ch.AGGREGATOR_ALERTS:
                 entry = step, dict(publication.ids), comparable(publication.message)
                 found.setdefault(publication.channel.name, []).append(entry)
         return found

@@ -13,6 +13,7 @@ from rich.table import Table
 
 from fog_runtime import parts
 from fognav import __version__, checkout, doctor, kernels, system
+from fognav.alert_command import alert_app
 from fognav.area_command import area_app
 from fognav.bench_command import bench_app
 from fognav.channels_command import channels_command
@@ -54,6 +55,7 @@ site_app = typer.Typer(help="Create and check sites.", no_args_is_help=True)
 app.add_typer(site_app, name="site")
 app.add_typer(zone_app, name="zone")
 app.add_typer(area_app, name="area")
+app.add_typer(alert_app, name="alert")
 app.add_typer(source_app, name="source")
 app.add_typer(node_app, name="node")
 app.add_typer(robot_app, name="robot")

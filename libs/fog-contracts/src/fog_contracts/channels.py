@@ -195,6 +195,8 @@ AGGREGATOR_HEARTBEAT = _mqtt("aggregator_heartbeat", V1 + "aggregator/heartbeat"
     limit=64 * KIB,
     publishers=(AGGREGATOR,),    subscribers=(AGGREGATOR, MAP),   durability=VOLATILE, qos=0, rate_hz=5,
     max_age_s=1.5, epoch="epoch")
+AGGREGATOR_ALERTS = _mqtt( "aggregator_alerts", V1 + "aggregator/alerts",             m.AlertList,      limit=64 * KIB,
+    publishers=(AGGREGATOR,),    subscribers=("home-assistant",), durability=LATEST,   qos=1, epoch="epoch")
 AGGREGATOR_REQUEST = _text("aggregator_request", V1 + "aggregator/request",                             limit=16,
     publishers=(MAP,),           subscribers=(AGGREGATOR,),       durability=VOLATILE, qos=0,
     values=(REPUBLISH,), about="asks the aggregator to publish all areas again: a subscriber has missed some")

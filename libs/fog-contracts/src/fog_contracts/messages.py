@@ -222,6 +222,14 @@ class UnknownPolicy(Message, frozen=True, kw_only=True):
     max_changes: Annotated[int, Meta(ge=1, le=1000)] = 30
 
 
+class AlertPolicy(Message, frozen=True, kw_only=True):
+    """After how long (s) people are told that an area is unknown or blocked, or a node or source unknown; 0: never."""
+
+    unknown_after_s: Seconds = 300.0
+    blocked_after_s: Seconds = 3600.0
+    node_after_s: Seconds = 120.0
+
+
 Topic = Annotated[str, Meta(min_length=1, max_length=200)]
 Pointer = Annotated[str, Meta(max_length=200, pattern=r"^(/([^/~]|~[01])*)*$(?!\n)")]
 """A JSON pointer (RFC 6901); the empty one is the whole document."""
@@ -303,9 +311,43 @@ class AreaDefinition(Message, frozen=True, kw_only=True):
     debounce: dict[str, Any] = {}
     fusion: FusionPolicy = FusionPolicy()
     unknown: UnknownPolicy = UnknownPolicy()
+    alerts: AlertPolicy = AlertPolicy()
     version: Count = 0
     removed: bool = False
     epoch: Count = 0
+
+
+AlertKind = Literal["area-unknown", "area-blocked", "node-unknown"]
+
+
+class Alert(Message, frozen=True, kw_only=True):
+    """A condition of an area, or of a node or source in it, that has lasted for as long as the area's policy allows.
+
+    It lasts since `since` and was raised at `raised`, or acknowledged by an operator at `acknowledged_at`. `reason` is
+    the newest one.
+    """
+
+    id: Annotated[str, Meta(max_length=100)]
+    kind: AlertKind
+    area: Id
+    node: Id | None = None
+    reason: Annotated[str, Meta(max_length=200)]
+    since: Stamp
+    raised: Stamp
+    acknowledged_by: Author | None = None
+    acknowledged_at: Stamp | None = None
+
+
+class AlertList(Message, frozen=True, kw_only=True):
+    """The present alerts, those that nobody has acknowledged first: the first of very many only.
+
+    `total` counts all of them, `unseen` those that nobody has acknowledged.
+    """
+
+    epoch: Count
+    total: Count
+    unseen: Count
+    alerts: list[Alert]
 
 
 MAX_CELLS: Final = 100_000_000

@@ -7,6 +7,7 @@ from msgspec.structs import asdict
 
 from fog_contracts.costs import ROBOT_RADIUS
 from fog_contracts.messages import (
+    AlertPolicy,
     AreaDefinition,
     FusionPolicy,
     Id,
@@ -63,6 +64,7 @@ class AreaSite(Message, frozen=True, kw_only=True):
     debounce: dict[str, Any] = field(default_factory=dict)
     fusion: FusionPolicy = FusionPolicy()
     unknown: UnknownPolicy = UnknownPolicy()
+    alerts: AlertPolicy = AlertPolicy()
 
 
 class SourceSite(Source, frozen=True, kw_only=True):
@@ -128,6 +130,7 @@ class Site(Message, frozen=True, kw_only=True):
                 debounce=area.debounce,
                 fusion=area.fusion,
                 unknown=area.unknown,
+                alerts=area.alerts,
             )
             for area in self.areas
         ]

@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
     from fog_runtime.redis_connection import RedisConnection
 
-KINDS: Final = ("area", "mission", "override", "robot", "stop", "store", "zone")
+KINDS: Final = ("alert", "area", "mission", "override", "robot", "stop", "store", "zone")
 """The kinds of records that have an audit trail.
 
-`store`: what an administrator decided after a loss; `robot`: operators' commands to robots; `stop`: stops without a
-token, of which anybody may send any number.
+`alert`: alerts that began, ended or were acknowledged; `store`: what an administrator decided after a loss; `robot`:
+operators' commands to robots; `stop`: stops without a token, of which anybody may send any number.
 """
 
 _CURSOR: Final = re.compile(r"([0-9]{1,16})-([0-9]{1,16})\.([a-z]+)")

@@ -83,6 +83,7 @@ async def main() -> None:
                 tasks.create_task(service.write_loop(), name="write")
                 tasks.create_task(service.store_loop(), name="store")
                 tasks.create_task(service.history.run(), name="history")
+                tasks.create_task(service.alerts.run(), name="alerts")
                 tasks.create_task(front.serve(app, settings.port_file), name="http")
 
 

@@ -9,6 +9,7 @@ from fastapi import FastAPI
 from fog_contracts.geometry import GeometryError, normalized_polygon
 from fog_contracts.grid import GridGeometry
 from fog_contracts.messages import (
+    AlertPolicy,
     AreaDefinition,
     AreaHazard,
     AreaState,
@@ -40,6 +41,7 @@ from fog_runtime.http import (
     must_be_new,
 )
 from fog_runtime.idempotency import IdempotencyError
+from hazard_aggregator.alert_api import add_alerts
 from hazard_aggregator.area_size import AreaError, check_size
 from hazard_aggregator.area_writer import ConflictError
 from hazard_aggregator.history_api import add_history
@@ -59,6 +61,7 @@ class AreaBody(Message, frozen=True, kw_only=True):
     debounce: dict[str, Any] = msgspec.field(default_factory=dict)
     fusion: FusionPolicy = FusionPolicy()
     unknown: UnknownPolicy = UnknownPolicy()
+    alerts: AlertPolicy = AlertPolicy()
     removed: bool = False
 
 
@@ -104,6 +107,7 @@ def make_api(
     _add_areas(areas, service, geometry, clock)
     add_history(areas, service, clock)
     _add_nodes(Routes(app, "nodes"), service, clock)
+    add_alerts(Routes(app, "alerts"), service)
     recovery = Routes(app, "store")
     add_store_errors(recovery)
     add_recovery(recovery, service.records)

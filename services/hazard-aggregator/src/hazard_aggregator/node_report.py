@@ -14,7 +14,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class NodeReport:
-    """Health of a node; `age` is the time (s) since its last reading, None before the first one."""
+    """Health of a node; `age` is the time (s) since its last reading, None before the first one.
+
+    `penalty` is the area's cost while this node or source alone is blocked; None: the area is impassable then.
+    """
 
     id: str
     area: str
@@ -24,6 +27,7 @@ class NodeReport:
     age: float | None
     received: int
     ignored: int
+    penalty: int | None = None
 
 
 def node_reports(areas: Iterable[WatchedArea], now: float) -> list[NodeReport]:
@@ -38,6 +42,7 @@ def node_reports(areas: Iterable[WatchedArea], now: float) -> list[NodeReport]:
             age=node.silent_for(now) if node.ever_received else None,
             received=node.received,
             ignored=node.ignored,
+            penalty=node.penalty,
         )
         for area in areas
         for node in area.nodes.values()

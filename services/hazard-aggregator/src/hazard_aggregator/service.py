@@ -10,6 +10,7 @@ from prometheus_client import Counter, Gauge
 from fog_runtime import logs
 from fog_runtime.clock import ticker
 from fog_runtime.edges import Edges
+from hazard_aggregator.alert_keeper import AlertKeeper
 from hazard_aggregator.area_writer import AreaWriter
 from hazard_aggregator.history_keeper import HistoryKeeper
 from hazard_aggregator.override_writer import OverrideWriter
@@ -72,6 +73,7 @@ class Service:
         self._edges = Edges(clock, mqtt=mqtt, zenoh=zenoh, gate=gate)
         self._leading = asyncio.Event()
         self.history = HistoryKeeper(core, store, self._leading)
+        self.alerts = AlertKeeper(core, store, self._edges, clock, self._leading)
         self._publisher = Publisher(core, self._edges, self.history)
         self.records = Records(core, store, self._publisher, mqtt, self._edges, clock, health, boot)
         self.areas = AreaWriter(core, store, self.records, self._publisher, self._edges, clock)
@@ -83,6 +85,7 @@ class Service:
         self._edges.subscribe(self.core.handlers(), self._publisher.announce, numbers=self.core.thesis_numbers())
         self._edges.serve(self.core.query_handlers())
         self._mqtt.on_connect(self._publisher.republish_all)
+        self._mqtt.on_connect(self.alerts.publish)
         self._mqtt.on_connection_lost(lambda: self._publisher.announce(self.core.on_connection_lost(self._edges.now())))
 
     async def tick_loop(self) -> None:

@@ -12,6 +12,7 @@ from fog_contracts.messages import AreaDefinition, AreaHazard, Message
 from fog_runtime import logs, store_scripts
 from fog_runtime.audit import CursorError
 from fog_runtime.redis_store import Audit, Outcome, RecoveryError, RedisStore, StoreError, StoreLostError, Table
+from hazard_aggregator.alerts import StoredAlerts
 from hazard_aggregator.area_history import (
     MAX_PERIODS,
     RETENTION_S,
@@ -26,7 +27,9 @@ from hazard_aggregator.area_size import AreaError, check_size
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
+    from fog_contracts.messages import Alert
     from fog_runtime.idempotency import Attempt
+    from hazard_aggregator.alerts import AlertEvent
 
 __all__ = [
     "Audit",
@@ -44,6 +47,7 @@ _AREAS: Final = Table("areas", "area")
 _HAZARDS: Final = "hazards"
 _OVERRIDES: Final = Table("overrides", "override")
 _RESTS: Final = "override_rests"
+_ALERTS: Final = "alerts"
 _ALL: Final = "all"
 _HISTORY: Final = "history"
 _CURSOR: Final = re.compile(r"[0-9]{1,15}-[0-9]{1,15}")
@@ -143,6 +147,20 @@ class Store(RedisStore):
         reply = await self._redis.read("XREVRANGE", key, cursor or "+", "-", "COUNT", limit + 2)
         found = [(entry_id.decode(), fields) for entry_id, fields in reply]
         return page_of([(name, _data(fields)) for name, fields in found], cursor=cursor, limit=limit, now=now)
+
+    async def alerts(self) -> list[Alert]:
+        """Return the stored alerts."""
+        found = (await self._readable_records(_ALERTS, StoredAlerts)).get(_ALL)
+        return [] if found is None else found.alerts
+
+    async def save_alerts(self, alerts: list[Alert]) -> None:
+        """Replace the stored alerts."""
+        await self._write_records(_ALERTS, {_ALL: StoredAlerts(alerts=alerts)})
+
+    async def record_alert(self, event: AlertEvent, stamp: float) -> None:
+        """Add what became of an alert at `stamp` (s since the epoch) to the audit trail."""
+        audit = Audit(at=stamp, who=event.who, action=event.action)
+        await self._record("alert", event.alert.id, msgspec.json.encode(event.alert), audit)
 
     async def earlier_override(self, attempt: Attempt | None) -> AreaOverride | None:
         """Return the override that an earlier attempt with the same idempotency key stored."""

@@ -1,0 +1,134 @@
+"""Keeps the alerts: evaluates them once a second, publishes them, and stores them with their history."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import TYPE_CHECKING, Final, get_args
+
+from prometheus_client import Gauge
+
+from fog_contracts import channels as ch
+from fog_contracts.handlers import Publication
+from fog_contracts.messages import AlertKind
+from fog_runtime import logs
+from fog_runtime.clock import ticker
+from fog_runtime.redis_connection import StoreRefusedError
+from hazard_aggregator.alerts import AlertEvent, Alerts
+from hazard_aggregator.store import StoreError
+
+if TYPE_CHECKING:
+    import asyncio
+
+    from fog_contracts.messages import Alert
+    from fog_runtime.clock import Clock
+    from fog_runtime.edges import Edges
+    from hazard_aggregator.core import Aggregator
+    from hazard_aggregator.store import Store
+
+_PERIOD_S: Final = 1.0
+_QUEUE: Final = 10_000
+"""Events that wait while Redis is away; beyond them the oldest are missing in the history."""
+
+ALERTS = Gauge("fognav_alerts", "Alerts of areas and nodes that an operator has acknowledged, or not", ["kind", "seen"])
+
+_log = logs.get("alerts")
+
+
+class AlertKeeper:
+    """The alerts of the aggregator that leads; one that stands by has none."""
+
+    def __init__(self, core: Aggregator, store: Store, edges: Edges, clock: Clock, leading: asyncio.Event) -> None:
+        self._core = core
+        self._clock = clock
+        self._store = store
+        self._edges = edges
+        self._leading = leading
+        self._alerts = Alerts()
+        self._events: deque[AlertEvent] = deque(maxlen=_QUEUE)
+        self._loaded = False
+        self._epoch = -1
+
+    def active(self) -> list[Alert]:
+        """Return the active alerts, oldest first."""
+        return self._alerts.active()
+
+    async def run(self) -> None:
+        """Evaluate, publish and store alerts, while this process leads."""
+        async for _ in ticker(self._clock, _PERIOD_S):
+            if self._leading.is_set():
+                await self._load()
+                self._evaluate()
+                await self._write()
+            else:
+                self._forget()
+
+    async def publish(self) -> None:
+        """Publish the alerts; call it after every connection too, since the broker may have lost them."""
+        if self._leading.is_set():
+            self._epoch = self._core.epoch
+            self._edges.publish(Publication(ch.AGGREGATOR_ALERTS, self._alerts.message(self._epoch)))
+
+    async def acknowledge(self, name: str, who: str) -> Alert:
+        """Record that an operator has seen an alert, and store that durably; raises `AlertError` and `StoreError`."""
+        if not self._loaded:
+            raise StoreRefusedError("the stored alerts are not loaded yet: /readyz says why")
+        event = self._alerts.acknowledge(name, who, self._edges.now().stamp)
+        self._events.append(event)
+        self._edges.publish(Publication(ch.AGGREGATOR_ALERTS, self._alerts.message(self._core.epoch)))
+        self._count()
+        await self._store_events()
+        return event.alert
+
+    def _forget(self) -> None:
+        """Stand by: the leader's alerts are its own."""
+        self._alerts, self._loaded, self._epoch = Alerts(), False, -1
+        self._events.clear()
+        ALERTS.clear()
+
+    async def _load(self) -> None:
+        if self._loaded:
+            return
+        try:
+            self._alerts.restore(await self._store.alerts())
+        except StoreError as error:
+            # The store's own loop reports the state of Redis in the process's health.
+            _log.debug("alerts_not_loaded", reason=str(error))
+        else:
+            self._loaded = True
+
+    def _evaluate(self) -> None:
+        at, before = self._edges.now(), self._alerts.active()
+        events = self._alerts.update(
+            self._core.definitions(), self._core.announced(), self._core.node_reports(at.now), at
+        )
+        for event in events:
+            _log.info(f"alert_{event.action}", alert=event.alert.id, reason=event.alert.reason)
+        self._events += events
+        if self._alerts.active() != before or self._epoch != self._core.epoch:
+            self._epoch = self._core.epoch
+            self._edges.publish(Publication(ch.AGGREGATOR_ALERTS, self._alerts.message(self._epoch)))
+        self._count()
+
+    def _count(self) -> None:
+        active = self._alerts.active()
+        for kind in get_args(AlertKind):
+            for seen in (True, False):
+                count = sum(alert.kind == kind and (alert.acknowledged_by is not None) == seen for alert in active)
+                ALERTS.labels(kind, str(seen).lower()).set(count)
+
+    async def _write(self) -> None:
+        try:
+            await self._store_events()
+        except StoreError as error:
+            _log.debug("alerts_wait", reason=str(error), queued=len(self._events))
+
+    async def _store_events(self) -> None:
+        """Store the history and then the active alerts: killed in between, an alert is in the history twice."""
+        if not self._events or not self._loaded:
+            return
+        while self._events:
+            event = self._events[0]
+            await self._store.record_alert(event, event.alert.acknowledged_at or self._edges.now().stamp)
+            if self._events and self._events[0] is event:
+                self._events.popleft()
+        await self._store.save_alerts(self._alerts.active())

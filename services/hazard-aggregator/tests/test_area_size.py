@@ -5,8 +5,9 @@ import pytest
 from fog_contracts import channels as ch
 from fog_contracts.codec import encode
 from fog_contracts.messages import AreaDefinition, AreaHazard
+from fog_runtime.health import Health
 from hazard_aggregator.area_size import AreaError, check_size
-from hazard_aggregator.store import usable_areas
+from hazard_aggregator.unusable_areas import UnusableAreas
 
 POLYGON = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0)]
 
@@ -24,7 +25,8 @@ def test_area_with_more_nodes_than_a_hazard_can_name_is_refused_with_the_remedy(
 
 
 def test_hazard_of_an_accepted_area_fits_whatever_its_cause_says():
-    accepted = [definition for definition in map(area, range(150)) if usable_areas([definition], lambda _: None)]
+    unusable = UnusableAreas(lambda _: None, Health())
+    accepted = [d for d in map(area, range(150)) if unusable.made_usable([d], {}) == [d]]
     assert len(accepted) > 60
     states = dict.fromkeys(accepted[-1].nodes, "unknown")
     hazard = AreaHazard(

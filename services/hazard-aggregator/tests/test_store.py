@@ -9,11 +9,13 @@ from redis.asyncio import Redis
 
 from fog_contracts.messages import AreaDefinition, AreaHazard
 from fog_runtime.audit import CursorError
+from fog_runtime.health import Health
 from fog_supervisor.servers import Server, start_redis
 from hazard_aggregator.area_history import period_of
 from hazard_aggregator.debounce import make_rule
 from hazard_aggregator.registry import find_rule
-from hazard_aggregator.store import Audit, Store, StoreError, usable_areas
+from hazard_aggregator.store import Audit, Store, StoreError
+from hazard_aggregator.unusable_areas import UnusableAreas
 
 pytestmark = pytest.mark.live
 AUDIT = Audit(at=1.0, who="anna", action="put")
@@ -84,12 +86,30 @@ async def test_unreadable_record_is_left_out_and_the_others_are_loaded(redis: Se
         assert (await store.load()).hazards == [hazard(1)]
 
 
-def test_stored_area_with_an_unknown_rule_is_left_out_and_logged(caplog):
+def test_stored_area_with_an_unknown_rule_stays_on_the_map_unwatched_and_is_named(caplog):
+    polygon = [(0, 0), (1, 0), (1, 1)]
     areas = [
-        AreaDefinition(id="hall", polygon=[(0, 0), (1, 0), (1, 1)], debounce={"rule": "of-a-removed-package"}),
-        AreaDefinition(id="foyer", polygon=[(0, 0), (1, 0), (1, 1)], debounce={"to_blocked": 3}),
+        AreaDefinition(id="hall", polygon=polygon, nodes=["n1"], debounce={"rule": "of-a-removed-package"}, version=3),
+        AreaDefinition(id="foyer", polygon=polygon, debounce={"to_blocked": 3}),
+        AreaDefinition(id="gone", polygon=polygon, debounce={"rule": "of-a-removed-package"}, removed=True),
     ]
-    usable = usable_areas(areas, lambda area: make_rule(area.id, area.debounce, find_rule))
-    assert [area.id for area in usable] == ["foyer"]
+    health = Health()
+    unusable = UnusableAreas(lambda area: make_rule(area.id, area.debounce, find_rule), health)
+    usable = unusable.made_usable(areas, {})
+    assert usable == [AreaDefinition(id="hall", polygon=polygon, version=3), *areas[1:]]
     (record,) = [record for record in caplog.records if record.message == "stored_area_unusable"]
     assert record.levelname == "ERROR"
+    assert "hall (area hall: debounce" in health.report()["parts"]["areas"]["detail"]
+    assert unusable.made_usable(areas[1:], {}) == areas[1:]
+    assert health.report()["parts"]["areas"] == {"ok": True, "detail": ""}
+
+
+async def test_area_whose_record_can_be_read_in_part_only_keeps_its_place(redis: Server):
+    polygon = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0)]
+    record = {"id": "hall", "polygon": polygon, "nodes": "of another version", "version": 4}
+    async with Store(redis.url, "test") as store, Redis.from_url(redis.url) as raw:
+        await raw.hset("fog:test:areas", "hall", msgspec.json.encode(record))
+        await raw.hset("fog:test:areas", "gate", b"nonsense")
+        areas, unreadable = await store.areas()
+    assert areas == [AreaDefinition(id="hall", polygon=polygon, version=4)]
+    assert set(unreadable) == {"hall", "gate"}

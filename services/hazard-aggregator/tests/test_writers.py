@@ -122,4 +122,4 @@ async def test_unconditional_area_replaces_a_stored_one_that_this_process_does_n
         assert await other.put_area(stored, expected=0, audit=AUDIT) == "ok"
         done = await service.areas.put_area(HALL, "ann")
         assert (done.label, done.version) == ("", 2)
-        assert service.core.definitions() == [done] == await store.areas()
+        assert (service.core.definitions(), await store.areas()) == ([done], ([done], {}))

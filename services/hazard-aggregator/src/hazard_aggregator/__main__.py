@@ -24,7 +24,8 @@ from hazard_aggregator.overrides import StoredOverrides
 from hazard_aggregator.registry import find_rule
 from hazard_aggregator.service import Service
 from hazard_aggregator.settings import Settings
-from hazard_aggregator.store import Store, load_at_start, usable_areas
+from hazard_aggregator.store import Store, load_at_start
+from hazard_aggregator.unusable_areas import UnusableAreas
 
 _log = logs.get("aggregator")
 
@@ -50,7 +51,8 @@ async def main() -> None:
     ):
         stored, loaded_from_store = await load_at_start(store)
         nodes = {node.id: node for node in loaded.site.nodes}
-        usable = usable_areas(stored.definitions, Members(nodes, find_rule, settings.debounce).check)
+        unusable = UnusableAreas(Members(nodes, find_rule, settings.debounce).check, health)
+        usable = unusable.made_usable(stored.definitions, stored.unreadable)
         definitions = {d.id: d for d in [*loaded.site.definitions(), *usable]}
         fusion = AreaFusion(
             definitions.values(), loaded.site.nodes, 0, stored.hazards,

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 from fog_contracts import channels as ch
 from fog_runtime.redis_connection import StoreRefusedError
 from hazard_aggregator.overrides import StoredOverrides
-from hazard_aggregator.store import Audit, RecoveryError, Stored, StoreError, usable_areas
+from hazard_aggregator.store import Audit, RecoveryError, Stored, StoreError
+from hazard_aggregator.unusable_areas import UnusableAreas
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -53,6 +54,7 @@ class Records:
         self._clock = clock
         self._health = health
         self._boot = boot
+        self._unusable = UnusableAreas(core.check, health)
         self._reload_due = False
 
     def mark_loaded(self) -> None:
@@ -81,7 +83,7 @@ class Records:
         """Put the stored records into force; return everything, to be published. Raises `StoreError`."""
         async with self.lock:
             stored = await self._store.load()
-            usable = usable_areas(stored.definitions, self._core.check)
+            usable = self._unusable.made_usable(stored.definitions, stored.unreadable)
             overrides = StoredOverrides(stored.overrides, stored.rests, self._boot)
             changed = self._core.load_overrides(overrides, self._edges.now())
             publications = [*changed, *self._core.restore(usable, stored.hazards, self._edges.now())]
@@ -101,7 +103,7 @@ class Records:
         if not self._reload_due:
             return
         known = {definition.id: definition for definition in self._core.definitions()}
-        for definition in usable_areas(await self._store.areas(), self._core.check):
+        for definition in self._unusable.made_usable(*await self._store.areas()):
             if definition != known.get(definition.id):
                 self._publisher.announce(self._core.put_area(definition, self._edges.now()))
         overrides = StoredOverrides(*await self._store.overrides(), self._boot)
@@ -160,4 +162,5 @@ class Records:
             list(self._core.announced().values()),
             overrides.all(),
             overrides.rests(self._boot, self._clock.now()),
+            {},
         )

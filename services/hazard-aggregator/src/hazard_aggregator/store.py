@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import msgspec
 from msgspec import structs
 
-from fog_contracts.messages import AreaDefinition, AreaHazard, Message
+from fog_contracts.messages import AreaDefinition, AreaHazard, Count, Id, Message, Ring
 from fog_runtime import logs, store_scripts
 from fog_runtime.audit import CursorError
 from fog_runtime.redis_store import Audit, Outcome, RecoveryError, RedisStore, StoreError, StoreLostError, Table
@@ -22,10 +22,9 @@ from hazard_aggregator.area_history import (
     sameness,
 )
 from hazard_aggregator.area_override import AreaOverride, Rest
-from hazard_aggregator.area_size import AreaError, check_size
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Iterable
 
     from fog_contracts.messages import Alert
     from fog_runtime.idempotency import Attempt
@@ -40,7 +39,6 @@ __all__ = [
     "StoreLostError",
     "Stored",
     "load_at_start",
-    "usable_areas",
 ]
 
 _AREAS: Final = Table("areas", "area")
@@ -59,13 +57,29 @@ class _AllRests(Message, frozen=True, kw_only=True):
     overrides: dict[str, Rest]
 
 
+class _Outline(Message, frozen=True, kw_only=True):
+    """The part of an area's record that says where it is."""
+
+    id: Id
+    polygon: Ring
+    version: Count = 0
+    removed: bool = False
+
+    def area(self) -> AreaDefinition:
+        return AreaDefinition(id=self.id, polygon=self.polygon, version=self.version, removed=self.removed)
+
+
 class Stored(NamedTuple):
-    """What an aggregator loads when it starts, and when it begins to lead; `rests` are those of the overrides."""
+    """What an aggregator loads when it starts, and when it begins to lead; `rests` are those of the overrides.
+
+    `unreadable`: by area, why its definition could be read in part only, or not at all.
+    """
 
     definitions: list[AreaDefinition]
     hazards: list[AreaHazard]
     overrides: list[AreaOverride]
     rests: dict[str, Rest]
+    unreadable: dict[str, str]
 
 
 class Store(RedisStore):
@@ -76,11 +90,20 @@ class Store(RedisStore):
     async def load(self) -> Stored:
         """Return all readable records."""
         hazards = await self._readable_records(_HAZARDS, AreaHazard)
-        return Stored(await self.areas(), list(hazards.values()), *await self.overrides())
+        definitions, unreadable = await self.areas()
+        return Stored(definitions, list(hazards.values()), *await self.overrides(), unreadable)
 
-    async def areas(self) -> list[AreaDefinition]:
-        """Return the stored areas; an unreadable one is left out, so the site's definition of it stays in force."""
-        return list((await self._readable_records(_AREAS.name, AreaDefinition)).values())
+    async def areas(self) -> tuple[list[AreaDefinition], dict[str, str]]:
+        """Return the stored areas, and, by id, why others are unreadable.
+
+        An unreadable one whose place can be read is returned without anything that watches it: it is unknown then. One
+        that were left out would count as clear.
+        """
+        areas, unreadable = await self._decoded(_AREAS.name, AreaDefinition)
+        if unreadable:
+            outlines, _ = await self._decoded(_AREAS.name, _Outline)
+            areas |= {name: outlines[name].area() for name in unreadable if name in outlines}
+        return list(areas.values()), unreadable
 
     async def save_hazards(self, hazards: Iterable[AreaHazard]) -> None:
         """Write hazards durably (Redis answers after its fsync: `appendfsync always`)."""
@@ -192,24 +215,4 @@ async def load_at_start(store: Store) -> tuple[Stored, bool]:
         return await store.load(), True
     except StoreError as error:
         _log.warning("started_without_store", reason=str(error))
-        return Stored([], [], [], {}), False
-
-
-def usable_areas(
-    definitions: Iterable[AreaDefinition], check: Callable[[AreaDefinition], object]
-) -> list[AreaDefinition]:
-    """Return the stored areas that `check` accepts; one that is invalid or too large is logged and left out.
-
-    Its rule may have gone with the package that provided it. Whatever is in force without the record stays in force,
-    and the REST API stays there to repair it.
-    """
-    usable = []
-    for definition in definitions:
-        try:
-            check_size(definition)
-            check(definition)
-        except AreaError as error:
-            _log.error("stored_area_unusable", area=definition.id, reason=str(error), remedy="PUT the area again")
-        else:
-            usable.append(definition)
-    return usable
+        return Stored([], [], [], {}, {}), False

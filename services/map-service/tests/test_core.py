@@ -43,6 +43,8 @@ from fog_contracts.shapes import ShapeError
 from map_service.aggregator_monitor import TRUSTED_AFTER_S
 from map_service.core import MapCore
 from map_service.layers.base import CostLayer, write_cost
+from map_service.layers.obstacles import MAX_OF_ROBOT
+from map_service.layers.view_reach import CELL_HALF_WIDTH_M, MARGIN_M, RANGE_M
 from map_service.pending import merge_overlapping
 from map_service.registry import LayersError, make_layers
 from map_service.zone_validation import ZoneError, list_size, prepare_zone
@@ -324,6 +326,28 @@ def test_no_area_is_clear_while_the_aggregator_is_lost():
     ]
     rig.on_aggregator(present=True, stamp=4.0)
     assert cost_and_speed(rig, 0.75, 0.75) == (0, 0)
+
+
+def test_aggregator_that_knows_all_areas_has_the_last_word_on_them_though_its_versions_begin_anew():
+    # Redis lost the areas, an administrator accepted that, and the aggregator started again.
+    rig = make_rig()
+    rig.on_definition(definition(version=5, epoch=1), 0.0)
+    rig.aggregator.announce(hazard("blocked", epoch=1), 1.0)
+    rig.on_hazard(hazard("blocked", epoch=1), 1.0)
+    moved = definition(x=1.5, version=1, epoch=2)
+    rig.on_definition(moved, 2.0)
+    rig.on_hazard(hazard("blocked", epoch=2), 2.0)
+    successor = LivingAggregator(rig.core, epoch=2)
+    successor.announced["hall"] = hazard("blocked", epoch=2)
+    successor.beat(3.0)
+    assert cost_and_speed(rig, 1.75, 0.75)[0] < LETHAL, "it may have started without Redis, and know the site's only"
+    for now in (4.0, 4.1):
+        successor.send(successor.heartbeat(now, complete=True), now)
+    assert cost_and_speed(rig, 1.75, 0.75)[0] == LETHAL
+    assert cost_and_speed(rig, 0.75, 0.75)[0] < LETHAL
+    rig.on_definition(definition(version=0, epoch=2), 4.2)
+    successor.send(successor.heartbeat(4.3, complete=True), 4.3)
+    assert cost_and_speed(rig, 1.75, 0.75)[0] == LETHAL, "of one aggregator the higher version counts"
 
 
 def test_area_whose_polygon_crosses_itself_is_refused_and_the_known_one_stays():
@@ -622,6 +646,64 @@ def test_obstacle_that_is_seen_between_two_views_beyond_it_stays():
         points = [(1.0, 1.0)] if now % 2 == 0 else []
         rig.on_obstacles("r1", obstacles(*points, ttl=600.0, view=view_from(0.4, 1.0, 1.2)), float(now), float(now))
     assert cost_and_speed(rig, 1.0, 1.0)[0] == LETHAL
+
+
+def test_robot_with_a_broken_lidar_takes_no_other_robots_room():
+    rig = make_rig(floor_plan(600, 300))
+    wall = [(0.025 + 0.05 * (i % 500), 0.025 + 0.05 * (i // 500)) for i in range(25_000)]
+    for start in range(0, 25_000, 2_000):
+        rig.on_obstacles("r1", obstacles(*wall[start : start + 2_000], ttl=600.0), 1.0, 1.0)
+    assert rig.core.refused_cells == 25_000 - MAX_OF_ROBOT
+    rig.on_obstacles("r2", obstacles((10.0, 10.0), ttl=600.0), 2.0, 2.0)
+    assert cost_and_speed(rig, 10.0, 10.0)[0] == LETHAL
+    for now in (3.0, 4.0):
+        rig.on_obstacles("r2", obstacles((10.0, 10.0), ttl=600.0, view=view_from(5.0, -0.3, 12.0)), now, now)
+    rig.on_obstacles("r1", obstacles((20.0, 10.0), ttl=600.0), 5.0, 5.0)
+    assert cost_and_speed(rig, 20.0, 10.0)[0] == LETHAL, "what was cleared made room"
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    reports=st.lists(
+        st.tuples(
+            st.sampled_from(["r1", "r2"]),
+            st.lists(st.tuples(st.integers(-25, 70), st.integers(-15, 55)), max_size=12),
+            st.one_of(st.none(), st.tuples(st.integers(0, 50), st.integers(0, 45), st.sampled_from([10, 30, 255]))),
+            st.sampled_from([0.3, 2.0, 600.0]),
+        ),
+        max_size=12,
+    )
+)
+def test_obstacles_on_the_map_are_those_that_were_seen_and_neither_cleared_nor_expired(reports):
+    rig, known = make_rig(), {}
+    free = rig.cost.copy()
+    for step, (robot, cells, view, ttl) in enumerate(reports):
+        now = 1.0 + step
+        # In the middle of cells; a view is none of a cell's, so that no bearing is between two sectors.
+        points = [(0.05 * x + 0.025, 0.05 * y + 0.025) for x, y in cells]
+        seen = (
+            None
+            if view is None
+            else View(x=0.05 * view[0] + 0.01, y=0.05 * view[1] + 0.02, reach=bytes([view[2]]) * VIEW_SECTORS)
+        )
+        for point in points:
+            if rig.geometry.contains(*point):
+                known[point] = [max(now + ttl, known.get(point, (0.0,))[0]), 0]
+        if seen is not None:
+            for point, state in known.items():
+                distance = math.dist(point, (seen.x, seen.y))
+                if point in points or not 2 * CELL_HALF_WIDTH_M < distance <= RANGE_M:
+                    continue
+                state[1] = state[1] + 1 if REACH_UNIT_M * view[2] > distance + MARGIN_M else 0
+        known = {point: state for point, state in known.items() if state[1] < 2}
+        rig.on_obstacles(robot, obstacles(*points, ttl=ttl, view=seen), now, now)
+        rig.tick(now + 0.5, now + 0.5)
+        known = {point: state for point, state in known.items() if state[0] > now + 0.5}
+        check = make_rig()
+        check.on_obstacles("r9", obstacles(*known, ttl=600.0), 0.0, 0.0)
+        assert np.array_equal(rig.cost, check.cost)
+    rig.tick(1e4, 1e4)
+    assert np.array_equal(rig.cost, free)
 
 
 def test_expired_obstacle_restores_the_zone_beneath():

@@ -52,6 +52,8 @@ class _Area:
     """When the operator did so whose word was accepted last (`set_at`)."""
     declared_until: float = -math.inf
     """How long that word may count while no aggregator lives that would end it (s, monotonic)."""
+    defined_by: int = 0
+    """The highest epoch of an aggregator that announced this definition."""
 
 
 class HazardsLayer(CostLayer):
@@ -65,6 +67,8 @@ class HazardsLayer(CostLayer):
         self._removed: dict[str, HazardArea] = {}
         self._last_of_removed: dict[str, tuple[int, int]] = {}
         """Epoch and seq of the last hazard of each removed area: neither it nor one before it is another area's."""
+        self._lower: dict[str, AreaDefinition] = {}
+        """Definitions by newer aggregators with versions below the known ones: they count if the sender is complete."""
         self._fence = Fence()
         self.aggregator = AggregatorMonitor()
 
@@ -88,19 +92,34 @@ class HazardsLayer(CostLayer):
         return [Publication(ch.AGGREGATOR_REQUEST, ch.REPUBLISH)] if due else []
 
     def _on_definition(self, _ids: Ids, definition: AreaDefinition, at: Moment) -> list[Publication]:
+        """Receive an area's definition; one with a lower version than the known one waits for its sender's heartbeat.
+
+        It is outdated, unless a newer aggregator has the stored areas and no higher version among them: then Redis lost
+        some, and versions began anew.
+        """
+        known = self._areas.get(definition.id)
         try:
-            # Who publishes it does not change an area.
-            return self.define(structs.replace(definition, epoch=0), at)
+            if known is not None and definition.version < known.definition.version:
+                normalized_polygon(definition.polygon)
+                if definition.epoch > known.defined_by:
+                    self._lower[definition.id] = definition
+                return []
+            return self._announced(definition, at)
         except GeometryError as error:
             raise RefusedMessageError(f"area {definition.id}: {error}") from error
 
-    def define(self, definition: AreaDefinition, at: Moment) -> list[Publication]:
-        """Add, change or remove an area; raises `GeometryError` when its polygon is invalid.
+    def _announced(self, definition: AreaDefinition, at: Moment) -> list[Publication]:
+        """Define an area as an aggregator announced it: who publishes it does not change it."""
+        self._lower.pop(definition.id, None)
+        publications = self.define(structs.replace(definition, epoch=0), at)
+        if (area := self._areas.get(definition.id)) is not None:
+            area.defined_by = max(area.defined_by, definition.epoch)
+        return publications
 
-        A version older than the known one is ignored.
-        """
+    def define(self, definition: AreaDefinition, at: Moment) -> list[Publication]:
+        """Add, change or remove an area; raises `GeometryError` when its polygon is invalid."""
         old = self._areas.get(definition.id)
-        if old is not None and (definition == old.definition or definition.version < old.definition.version):
+        if old is not None and definition == old.definition:
             return []
         if definition.removed:
             return self._remove(definition.id)
@@ -142,11 +161,13 @@ class HazardsLayer(CostLayer):
     def _on_heartbeat(self, _ids: Ids, heartbeat: AggregatorHeartbeat, at: Moment) -> list[Publication]:
         self.aggregator.on_heartbeat(heartbeat, self._received, self._areas.keys(), at.now)
         self._fence.raise_to(_AGGREGATOR, self.aggregator.epoch or 0)
-        removed: list[Publication] = []
+        changed: list[Publication] = []
         if (listed := self.aggregator.areas(at.now)) is not None:
-            removed = [p for area in list(self._areas) if area not in listed for p in self._remove(area)]
+            changed = [p for area in list(self._areas) if area not in listed for p in self._remove(area)]
+            own = [d for d in self._lower.values() if d.epoch == self.aggregator.epoch]
+            changed += [p for definition in own for p in self._announced(definition, at)]
             self._received = {area: hazard for area, hazard in self._received.items() if area in listed}
-        return [*removed, *self._refresh_all(at)]
+        return [*changed, *self._refresh_all(at)]
 
     # --- State ------------------------------------------------------------------------------------------------------
 
@@ -184,6 +205,7 @@ class HazardsLayer(CostLayer):
 
     def _remove(self, name: str) -> list[Publication]:
         area = self._areas.pop(name, None)
+        self._lower.pop(name, None)
         if area is None:
             return []
         self.mark_updated(area.mask.window, Cause(kind="hazard", id=name, state="removed"))

@@ -71,6 +71,23 @@ async def test_loops_of_one_phase_share_their_ticks_whenever_they_begin():
     assert times[0.2] == times[0.1][::2]
 
 
+@pytest.mark.parametrize("first", [0.0, 0.025])
+async def test_a_loop_with_an_offset_ticks_that_much_after_those_of_its_phase(first):
+    clock, phase = ManualClock(50.0), Phase()
+    assert phase.next_tick(50.0, 0.1, first) == 50.0
+    begin = 50.0 - first
+    assert phase.next_tick(50.13, 0.1) == pytest.approx(begin + 0.2)
+    clock.advance(0.13)
+    ticks = aiter(Ticker(clock, 0.2, phase, 0.025))
+    for due in (begin + 0.225, begin + 0.425):
+        tick = asyncio.ensure_future(anext(ticks))
+        while not tick.done():
+            clock.advance(0.01)
+            await asyncio.sleep(0)
+            await asyncio.sleep(0)
+        assert await tick == pytest.approx(due, abs=0.035)
+
+
 async def test_p99_of_few_ticks_is_the_largest_lateness():
     clock = ManualClock()
     loop_ticker = ticker(clock, 1.0)

@@ -21,7 +21,7 @@ from fog_runtime.memory import release_startup_memory
 from fog_runtime.own_address import reachable_address
 from fog_runtime.robot_file import describe_robot, load_robot
 from fog_runtime.settings import describe, load
-from fog_runtime.zenoh_edge import ZenohEdge
+from fog_runtime.zenoh_edge import ZenohEdge, use_one_thread
 from robot_agent import registry
 from robot_agent.agent.guardian_client import GuardianClient
 from robot_agent.agent.input_writer import open_core
@@ -59,6 +59,7 @@ async def main() -> None:
         settings=robot.settings,
     )
     port = read_port(robot)
+    use_one_thread()
     clock = SystemClock(settings.speed)
     health = Health("map", "pose", "lidar", "base")
     async with ZenohEdge.open(

@@ -23,6 +23,10 @@ class FakeLocalizer:
         self.searches = 0
         self.restored = []
         self.trusted = POSE
+        self.moving = (0.0, 0.0)
+
+    def twist(self):
+        return self.moving
 
     def pose(self, _now):
         return self.known
@@ -108,6 +112,20 @@ def test_only_a_pose_that_differs_is_stored(keeper, localizer, change, stored):
     assert keeper.to_store("lab", 1.0) is None
     localizer.trusted = msgspec.structs.replace(POSE, **change)
     assert (keeper.to_store("lab", 2.0) is not None) == stored
+
+
+@pytest.mark.parametrize("moving", [(0.3, 0.0), (0.0, 0.5)])
+@pytest.mark.parametrize(
+    ("change", "stored"),
+    [({"x": 1.4}, False), ({"x": 1.51}, True), ({"theta": 3.45}, False), ({"theta": 3.52}, True)],
+)
+def test_while_it_moves_a_pose_is_stored_less_often_and_again_at_rest(keeper, localizer, moving, change, stored):
+    assert keeper.to_store("lab", 0.0) == POSE
+    localizer.moving = moving
+    localizer.trusted = msgspec.structs.replace(POSE, **change)
+    assert (keeper.to_store("lab", 1.0) is not None) == stored
+    localizer.moving = (0.0, 0.0)
+    assert (keeper.to_store("lab", 2.0) is None) == stored
 
 
 def test_a_pose_that_is_not_trusted_or_of_no_site_is_not_stored(keeper, localizer):

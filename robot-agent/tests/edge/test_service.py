@@ -61,6 +61,16 @@ class FakeLidar:
         self.polled.append(now)
 
 
+class _Ticks:
+    def __init__(self, times):
+        self._times = times
+
+    async def __aiter__(self):
+        for now in self._times:
+            await asyncio.sleep(0)
+            yield float(now)
+
+
 class Rig:
     def __init__(self, tmp_path):
         self.world = LittleWorld()
@@ -127,6 +137,21 @@ def test_every_query_of_the_core_is_served_and_commands_are_logged(rig, monkeypa
     assert logged == [
         ("command", {"kind": "enable", "operator": "ann", "accepted": False, "reason": reply.reason}),
     ]
+
+
+@pytest.mark.parametrize(("idle", "least", "most"), [(True, 0.09, 0.5), (False, 0.0, 0.075)])
+async def test_the_stream_runs_at_half_its_rate_while_the_robot_has_nothing_to_do(rig, monkeypatch, idle, least, most):
+    monkeypatch.setattr(AgentCore, "idle", property(lambda _core: idle))
+    guardian, lidar, now = FakeGuardian(), FakeLidar(), iter(np.arange(0.0, 100.0, 0.05))
+    monkeypatch.setattr(rig.service, "_stream", _Ticks(now))
+    task = asyncio.create_task(rig.service.stream_loop(guardian, lidar))
+    await rig.until(lambda: len(lidar.polled) >= 6)
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+    periods = np.diff(lidar.polled)
+    assert least < periods.min()
+    assert periods.max() < most
+    assert len(guardian.sent) == len(lidar.polled)
 
 
 async def test_storage_that_hangs_does_not_make_the_service_manager_restart_the_agent(rig, monkeypatch):

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import pytest
+from msgspec.structs import replace
 
 from robot_agent.safety.conditions import SafetyInputs
 from robot_agent.safety.gate import SafetyState, step

@@ -173,27 +173,30 @@ class Phase:
     def __init__(self) -> None:
         self._origin: float | None = None
 
-    def next_tick(self, now: float, period: float) -> float:
-        """Return the first multiple of the period after the common beginning that is not before `now` (s)."""
+    def next_tick(self, now: float, period: float, offset: float = 0.0) -> float:
+        """Return the first multiple of the period, `offset` s after the common beginning, that is not before `now`."""
         if self._origin is None:
-            self._origin = now
-        return self._origin + math.ceil((now - self._origin) / period) * period
+            self._origin = now - offset
+        begin = self._origin + offset
+        return begin + math.ceil((now - begin) / period) * period
 
 
 class Ticker:
     """A periodic loop without drift: `async for now in Ticker(clock, period): ...`.
 
     Ticks lie at multiples of the period after the first. Loops of one `phase` share their ticks, so that the process is
-    woken once for all of them. A tick that was missed because the body took too long is skipped: a burst of control
-    cycles would act several times on the same state of the world.
+    woken once for all of them; one with an `offset` (s) ticks that much later than the others, for work on a thread of
+    its own that would compete with them for the interpreter. A tick that was missed because the body took too long is
+    skipped: a burst of control cycles would act several times on the same state of the world.
     """
 
-    def __init__(self, clock: Clock, period: float, phase: Phase | None = None) -> None:
+    def __init__(self, clock: Clock, period: float, phase: Phase | None = None, offset: float = 0.0) -> None:
         if period <= 0.0:
             raise ValueError(f"a period must be positive, not {period} s")
         self.clock = clock
         self.period = period
         self._phase = phase or Phase()
+        self._offset = offset
         self.ticks = 0
         self.late = 0
         """Ticks that were skipped, or came more than half a period after they were due."""
@@ -209,7 +212,7 @@ class Ticker:
 
     async def __aiter__(self) -> AsyncIterator[float]:
         """Yield `clock.now()` at every tick, the first at once, or when the phase's next one is due."""
-        due = self._phase.next_tick(self.clock.now(), self.period)
+        due = self._phase.next_tick(self.clock.now(), self.period, self._offset)
         while True:
             wait = due - self.clock.now()
             if wait > 0.0:

@@ -9,6 +9,7 @@ import asyncio
 import contextlib
 import inspect
 import json
+import os
 import random
 import threading
 from collections import Counter, deque
@@ -53,6 +54,15 @@ ASKER: Final[ContextVar[str]] = ContextVar("asker", default="")
 _RETRY_S: Final = (0.2, 1.0)
 
 _log = logs.get("zenoh")
+
+
+def use_one_thread() -> None:
+    """Let zenoh work on one thread of this process; call it before the first session is opened.
+
+    Its usual four or five wake one another for each message. One is enough for a process of few and small messages,
+    and costs a small computer less. A variable ZENOH_RUNTIME that is set already has priority.
+    """
+    os.environ.setdefault("ZENOH_RUNTIME", "(rx: (handover: app), tx: (handover: app), net: (handover: app))")
 
 
 def session_config(

@@ -48,6 +48,8 @@ class GuardianClient:
         self.pid: int | None = None
         """The guardian's process id; None without a link, or where it runs in a container of its own."""
         self._last_logged = ""
+        self._accepted = False
+        """Whether the guardian has sent feedback on this link."""
         self._limited = logs.RateLimited(_log)
 
     def send(self, command: WheelCommand) -> bool:
@@ -91,24 +93,47 @@ class GuardianClient:
     async def _read(self, link: socket.socket) -> str:
         """Pass feedback on until the link breaks; return the reason."""
         loop = asyncio.get_running_loop()
-        accepted = False
-        while True:
-            data = await loop.sock_recv(link, PACKET_LIMIT + 1)
-            if not data:
-                return "the guardian closed the link"
-            now = self._clock.now()
-            try:
-                feedback = decode_reply(data)
-            except (msgspec.DecodeError, UnicodeDecodeError) as error:
-                self._limited.warning("feedback_refused", "feedback_refused", now, reason=str(error))
-                continue
-            if isinstance(feedback, str):
-                return f"the guardian refuses this agent: {feedback}"
-            if not accepted:
-                accepted = True
-                _log.info("guardian_connected", socket=str(self._path))
-            self._feedback_at, self._last_logged = now, ""
-            self._on_feedback(feedback, now)
+        end: asyncio.Future[str] = loop.create_future()
+        self._accepted = False
+        # One registration for all packets: it costs less than one for each.
+        loop.add_reader(link, self._receive, link, end)
+        try:
+            return await end
+        finally:
+            loop.remove_reader(link)
+
+    def _receive(self, link: socket.socket, end: asyncio.Future[str]) -> None:
+        """Pass one packet on; set `end` when the link is over, or to what went wrong."""
+        if end.done():
+            return  # what waits for it has not run yet
+        try:
+            reason = self._on_packet(link.recv(PACKET_LIMIT + 1))
+        except BlockingIOError:
+            return
+        except Exception as error:  # noqa: BLE001  # who awaits `end` raises it
+            end.set_exception(error)
+            return
+        if reason is not None:
+            end.set_result(reason)
+
+    def _on_packet(self, data: bytes) -> str | None:
+        """Pass a packet of the guardian on; return why the link ends with it, None if it does not."""
+        if not data:
+            return "the guardian closed the link"
+        now = self._clock.now()
+        try:
+            feedback = decode_reply(data)
+        except (msgspec.DecodeError, UnicodeDecodeError) as error:
+            self._limited.warning("feedback_refused", "feedback_refused", now, reason=str(error))
+            return None
+        if isinstance(feedback, str):
+            return f"the guardian refuses this agent: {feedback}"
+        if not self._accepted:
+            self._accepted = True
+            _log.info("guardian_connected", socket=str(self._path))
+        self._feedback_at, self._last_logged = now, ""
+        self._on_feedback(feedback, now)
+        return None
 
     def _lost(self, reason: str) -> None:
         if reason != self._last_logged:

@@ -59,12 +59,13 @@ class NearPoints:
 
     def _place(self, samples: LidarSamples, localizer: Localizer) -> None:
         """Move a batch into `odom`, each sample by the odometry at its own time."""
-        angles, ranges = samples.angles_rad.astype(np.float64), samples.ranges_m.astype(np.float64)
-        times = np.linspace(samples.started_at, samples.ended_at, len(ranges))
-        near = ranges <= self._reach  # False for nan
-        if not near.any():
+        near = (samples.ranges_m <= self._reach).nonzero()[0]  # False for nan
+        if not len(near):
             return
-        angles, ranges, times = angles[near] + self._lidar.lidar_yaw, ranges[near], times[near]
+        ranges = samples.ranges_m[near].astype(np.float64)
+        angles = samples.angles_rad[near].astype(np.float64) + self._lidar.lidar_yaw
+        period = (samples.ended_at - samples.started_at) / max(len(samples.ranges_m) - 1, 1)
+        times = samples.started_at + np.float64(period) * near
         x, y, theta = localizer.odom_poses(times)
         cos, sin = np.cos(theta), np.sin(theta)
         base_x = self._lidar.lidar_x + ranges * np.cos(angles)

@@ -17,6 +17,9 @@ SEARCH_AGAIN_S: Final = 15.0
 """Least time between the beginnings of two global searches."""
 _MOVED_M: Final = 0.02
 _TURNED_RAD: Final = 0.03
+_MOVED_DRIVING_M: Final = 0.5
+_TURNED_DRIVING_RAD: Final = 0.4
+"""Of a robot that moves only a pose this far from the stored one is stored: a restart finds it from there."""
 _SIGMA_CHANGED: Final = 0.05
 _START_SIGMA_M: Final = 0.25
 _START_SIGMA_RAD: Final = 0.15
@@ -65,7 +68,8 @@ class PoseKeeper:
         Storage of a small computer wears out, so a pose that hardly differs is not written.
         """
         pose = self._localizer.save(site, now) if site else None
-        if pose is None or (self._stored is not None and not _differs(pose, self._stored)):
+        moves = self._localizer.twist() != (0.0, 0.0)
+        if pose is None or (self._stored is not None and not _differs(pose, self._stored, moves=moves)):
             return None
         self._stored = pose
         return pose
@@ -79,10 +83,10 @@ def start_pose(site: str, robot: RobotSite) -> SavedPose:
     )
 
 
-def _differs(new: SavedPose, old: SavedPose) -> bool:
+def _differs(new: SavedPose, old: SavedPose, *, moves: bool) -> bool:
     return (
-        math.hypot(new.x - old.x, new.y - old.y) > _MOVED_M
-        or abs(math.remainder(new.theta - old.theta, math.tau)) > _TURNED_RAD
+        math.hypot(new.x - old.x, new.y - old.y) > (_MOVED_DRIVING_M if moves else _MOVED_M)
+        or abs(math.remainder(new.theta - old.theta, math.tau)) > (_TURNED_DRIVING_RAD if moves else _TURNED_RAD)
         or abs(new.sigma_xy - old.sigma_xy) > _SIGMA_CHANGED
         or abs(new.sigma_theta - old.sigma_theta) > _SIGMA_CHANGED
     )

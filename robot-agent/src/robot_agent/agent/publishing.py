@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
 from fog_contracts import channels as ch
@@ -63,5 +64,10 @@ def _content(state: RobotState) -> object:
         state.map_epoch,
         state.map_seq,
         len(state.traces),
-        tuple(_NUMBER.sub("", reason) for reason in state.reasons),
+        tuple(map(_without_numbers, state.reasons)),
     )
+
+
+@lru_cache(maxsize=64)
+def _without_numbers(reason: str) -> str:
+    return _NUMBER.sub("", reason)

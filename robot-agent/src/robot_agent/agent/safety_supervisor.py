@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import TYPE_CHECKING
+
+from msgspec.structs import replace
 
 from robot_agent.safety.conditions import SafetyInputs
 from robot_agent.safety.gate import SafetyState, step

@@ -39,6 +39,9 @@ if TYPE_CHECKING:
     from robot_agent.hardware import LaserScan
 
 STREAM_S: Final = 0.05
+CONTROL_AFTER_S: Final = 0.025
+"""Decisions begin this long after a tick of the stream: at the same moment, their thread and the loop's would take the
+interpreter from one another some hundred times a second. They end before the next tick, which sends their speeds."""
 PUBLISH_S: Final = 0.1
 HOUSEKEEPING_S: Final = 1.0
 EGRESS_TIMEOUT_S: Final = 3.0
@@ -76,7 +79,7 @@ class Service:
         self.phase = Phase()
         """The common phase of all loops: the process sleeps between their ticks."""
         self._stream = self._ticker(STREAM_S)
-        self._control = self._ticker(core.profile.control_period)
+        self._control = self._ticker(core.profile.control_period, CONTROL_AFTER_S)
         self.collector = RobotCollector()
         self._state: RobotState | None = None
         self._corrupted: dict[str, int] = {}
@@ -91,8 +94,8 @@ class Service:
         self._metrics_address = ""
         self._was_connected = False
 
-    def _ticker(self, period: float) -> Ticker:
-        return Ticker(self._clock, period, self.phase)
+    def _ticker(self, period: float, offset: float = 0.0) -> Ticker:
+        return Ticker(self._clock, period, self.phase, offset)
 
     # --- Housekeeping -----------------------------------------------------------------------------------------------
 
@@ -178,13 +181,17 @@ class Service:
         self._core.on_scan(scan, now)
 
     async def stream_loop(self, guardian: GuardianClient, lidar: LidarEdge) -> None:
-        """Stream wheel commands at 20 Hz, each on the newest samples of the lidar."""
-        suspension = SuspensionMonitor()
+        """Stream wheel commands at 20 Hz, at rest at 10 Hz, each on the newest samples of the lidar."""
+        suspension, skip = SuspensionMonitor(), False
         async for now in self._stream:
             if seconds := suspension.suspended():
                 SUSPENSIONS.inc()
                 _log.warning("computer_was_suspended", seconds=round(seconds, 1))
                 self._core.on_suspension(seconds)
+            # A robot at rest with nothing to do needs every other tick only.
+            skip = self._core.idle and not skip
+            if skip:
+                continue
             lidar.poll(now, on=self._core.lidar_on)
             guardian.send(self._core.stream(now, self._clock.stamp()))
             # Here, because the housekeeping waits for the storage, which may hang while the robot drives well.

@@ -69,9 +69,12 @@ class ScanBuilder:
     def take_samples(self) -> LidarSamples | None:
         """Return all samples since the last call, be their scan whole or not; None without any."""
         newest, self._newest = self._newest, []
-        if not sum(len(times) for _, _, times in newest):
+        if not any(len(times) for _, _, times in newest):
             return None
-        clockwise, ranges, times = (np.concatenate(fields) for fields in zip(*newest, strict=True))
+        if len(newest) == 1:
+            clockwise, ranges, times = newest[0]
+        else:
+            clockwise, ranges, times = (np.concatenate(fields) for fields in zip(*newest, strict=True))
         return LidarSamples(
             angles_rad=_counter_clockwise(clockwise).astype(np.float32),
             ranges_m=ranges.astype(np.float32),

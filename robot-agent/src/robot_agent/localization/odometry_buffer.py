@@ -58,7 +58,7 @@ class OdometryBuffer:
 
     def poses(self, times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Return x, y (m) and theta (rad) at times (n; s), as `pose` does; there must be a pose."""
-        known = np.array(self._history)
+        known = np.array(self._since(float(times.min(initial=math.inf))))
         x, y, theta = (np.interp(times, known[:, 0], known[:, i]) for i in (1, 2, 3))
         late = np.clip(times - known[-1, 0], 0.0, _EXTRAPOLATION_S)
         if late.any():
@@ -66,6 +66,16 @@ class OdometryBuffer:
             heading = known[-1, 3] + 0.5 * w * late
             x, y, theta = x + v * late * np.cos(heading), y + v * late * np.sin(heading), theta + w * late
         return x, y, theta
+
+    def _since(self, timestamp: float) -> list[tuple[float, float, float, float]]:
+        """Return the poses from the last one at or before this time (s) on; of times before the first, all."""
+        since: list[tuple[float, float, float, float]] = []
+        for entry in reversed(self._history):
+            since.append(entry)
+            if entry[0] <= timestamp:
+                break
+        since.reverse()
+        return since
 
     def _extrapolated(self, late: float) -> Pose2:
         """Return the pose `late` seconds after the newest, at the measured twist."""

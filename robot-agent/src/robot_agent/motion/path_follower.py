@@ -27,8 +27,9 @@ class PathFollower:
 
     def __init__(self, points: NDArray[np.float64], released_length: float) -> None:
         self.points = points
-        steps = np.hypot(*np.diff(points, axis=0).T) if len(points) > 1 else np.zeros(0)
-        self.along = np.concatenate(([0.0], np.cumsum(steps)))
+        self._deltas = points[1:] - points[:-1]
+        self._squares = (self._deltas**2).sum(axis=1)
+        self.along = np.concatenate(([0.0], np.cumsum(np.sqrt(self._squares))))
         """Metres from the path's start to each point."""
         self.released = 0.0
         self.release(released_length)
@@ -98,18 +99,21 @@ class PathFollower:
         return np.array([np.interp(along, self.along, self.points[:, i]) for i in (0, 1)])
 
     def _nearest(self, x: float, y: float, low: float, high: float) -> tuple[float, float]:
-        here = np.array([x, y])
         if len(self.points) == 1:
-            return 0.0, float(np.hypot(*(self.points[0] - here)))
-        steps = np.diff(self.along)
-        usable = (self.along[:-1] <= high) & (self.along[1:] >= low) & (steps > 0.0)
-        if not usable.any():
+            return 0.0, math.hypot(self.points[0, 0] - x, self.points[0, 1] - y)
+        first = max(int(self.along.searchsorted(low)) - 1, 0)
+        last = min(int(self.along.searchsorted(high, "right")), len(self._deltas))
+        delta, square = self._deltas[first:last], self._squares[first:last]
+        behind = np.array((x, y)) - self.points[first:last]
+        with np.errstate(invalid="ignore"):  # a step of no length is nan: it is no part of the path
+            part = np.clip((behind * delta).sum(axis=1) / square, 0.0, 1.0)
+        gaps = behind - part[:, None] * delta
+        squares = (gaps * gaps).sum(axis=1)
+        if np.isnan(squares).all():
             return self.progress, math.inf
-        start, delta, length = self.points[:-1][usable], np.diff(self.points, axis=0)[usable], steps[usable]
-        part = np.clip(((here - start) * delta).sum(axis=1) / length**2, 0.0, 1.0)
-        offsets = np.hypot(*(start + part[:, None] * delta - here).T)
-        best = int(offsets.argmin())
-        return float(self.along[:-1][usable][best] + part[best] * length[best]), float(offsets[best])
+        best = int(np.nanargmin(squares))
+        progress = self.along[first + best] + part[best] * math.sqrt(square[best])
+        return float(progress), math.sqrt(squares[best])
 
 
 def first_blocked(

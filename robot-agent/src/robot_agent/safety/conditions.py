@@ -6,9 +6,10 @@ Pure: values in, values out. The gate (`robot_agent.safety.gate`) turns the find
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from enum import IntEnum
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple
+
+import msgspec
 
 from robot_agent.hardware import NO_FRESH_COMMAND
 
@@ -31,8 +32,7 @@ class Level(IntEnum):
     FAULT = 4
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SafetyInputs:
+class SafetyInputs(msgspec.Struct, frozen=True, kw_only=True):
     """Inputs of one step; ages in s by the robot's own monotonic clock, infinite for what was never received.
 
     map_age: since the map copy was last confirmed to be the newest version. map_gap: for how long deltas have been

@@ -9,16 +9,17 @@ or stop the robot but not speed it up.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Final, Literal
+from dataclasses import dataclass
+from typing import Final, Literal
 
+import msgspec
+from msgspec.structs import replace
+
+from fog_contracts.messages import Mode
 from robot_agent.config import SafetyConfig
 from robot_agent.safety import maneuver
 from robot_agent.safety.conditions import Finding, Level, SafetyInputs, collect_findings
 from robot_agent.safety.maneuver import Maneuver
-
-if TYPE_CHECKING:
-    from fog_contracts.messages import Mode
 
 MODE_OF: Final[dict[Level, Mode]] = {
     Level.NORMAL: "NORMAL",
@@ -34,8 +35,7 @@ MANEUVERS: Final[frozenset[Mode]] = frozenset({"EGRESS", "DOCK"})
 _NEVER: Final = -math.inf
 
 
-@dataclass(frozen=True, slots=True)
-class SafetyState:
+class SafetyState(msgspec.Struct, frozen=True):
     """State that the gate keeps from step to step; the default is that of a robot that was just switched on."""
 
     mode: Mode = "INIT"
@@ -53,7 +53,7 @@ class SafetyState:
     """Whether the last protective stop is one of these, so far."""
     latched: tuple[Finding, ...] = ()
     """Findings that stay until an operator acts: faults until a reset, the others until an enable."""
-    reasons: tuple[str, ...] = field(default=("just started",))
+    reasons: tuple[str, ...] = ("just started",)
     last_reasons: tuple[str, ...] = ()
     """Reasons of the last escalation, reported during the 2 s before the mode is relaxed."""
     maneuver: Maneuver | None = None

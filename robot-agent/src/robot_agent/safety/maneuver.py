@@ -7,8 +7,10 @@ and ends for good with anything else that would stop the robot. Afterwards the r
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
+
+import msgspec
+from msgspec.structs import replace
 
 from robot_agent.safety.conditions import Level, collect_findings
 
@@ -19,8 +21,7 @@ if TYPE_CHECKING:
     from robot_agent.safety.conditions import Finding, SafetyInputs
 
 
-@dataclass(frozen=True, slots=True)
-class Maneuver:
+class Maneuver(msgspec.Struct, frozen=True):
     """A maneuver that runs: since when (s), the smallest distance to go so far (m), and when it last shrank (s)."""
 
     since: float

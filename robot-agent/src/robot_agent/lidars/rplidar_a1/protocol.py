@@ -156,6 +156,7 @@ _DESCRIPTORS: Final = {
     b"\xa5\x5a\x05\x00\x00\x40\x81": Descriptor(Answer.NODES, 5, repeats=True),
     b"\xa5\x5a\x54\x00\x00\x40\x82": Descriptor(Answer.CAPSULES, 84, repeats=True),
 }
+_DESCRIPTOR_START: Final = b"\xa5\x5a"
 _DESCRIPTOR_SIZE: Final = 7
 _ANY_DESCRIPTOR: Final = re.compile(b"|".join(re.escape(pattern) for pattern in _DESCRIPTORS), re.DOTALL)
 
@@ -189,7 +190,8 @@ class Parser:
         """Parse received bytes, in pieces of any size."""
         buffer = self._held + data
         begin = 0
-        for match in _ANY_DESCRIPTOR.finditer(buffer):
+        # Nearly all that a lidar ever sends is measurements: a descriptor is looked for where one may begin.
+        for match in _ANY_DESCRIPTOR.finditer(buffer) if _DESCRIPTOR_START in buffer else ():
             self._pass_on(buffer[begin : match.start()], last=True)
             begin = match.end()
             descriptor = _DESCRIPTORS[match.group()]
@@ -225,6 +227,8 @@ class Parser:
 
 def _partial_descriptor_size(buffer: bytes, begin: int) -> int:
     """Return how many bytes at the end of the buffer could begin a descriptor."""
+    if buffer.find(_DESCRIPTOR_START[:1], max(begin, len(buffer) - _DESCRIPTOR_SIZE + 1)) < 0:
+        return 0
     for size in range(min(_DESCRIPTOR_SIZE - 1, len(buffer) - begin), 0, -1):
         tail = buffer[-size:]
         if any(pattern.startswith(tail) for pattern in _DESCRIPTORS):
@@ -268,7 +272,9 @@ def _health_status(value: int) -> HealthStatus | int:
         return value
 
 
-_NODE_SIZE: Final = 5
+_NODE: Final = np.dtype([("first", "u1"), ("angle", "<u2"), ("distance", "<u2")])
+"""Lowest bit of `first`: start flag, the next one: its inverse; lowest bit of `angle`: always 1."""
+_NODE_SIZE: Final = _NODE.itemsize
 # To find the node boundary again, this many nodes in a row must have right check bits and angles that advance like a
 # rotating head's. Check bits alone are not enough: without returns, the zeros and the even steps of the angle look like
 # nodes two bytes aside for whole seconds.
@@ -301,15 +307,16 @@ class _NodeDecoder:
         count = len(self._buffer) // _NODE_SIZE
         if not count:
             return False
-        raw = np.frombuffer(self._buffer, np.uint8, count * _NODE_SIZE).reshape(count, _NODE_SIZE)
-        angle = _angles_q6(raw[:, 1], raw[:, 2])
-        valid = _is_node(raw[:, 0], raw[:, 1], angle)
-        good = count if valid.all() else int(np.argmin(valid))
+        nodes = np.frombuffer(self._buffer, _NODE, count)
+        first, second = nodes["first"], nodes["angle"]
+        angle = second >> np.uint16(1)
+        valid = ((first ^ (first >> 1)) & second & 1).astype(np.bool_) & (angle < _FULL_CIRCLE_Q6)
+        good = count if valid.all() else int(valid.argmin())
         if good:
-            raw = raw[:good]
-            first = raw[:, 0]
-            distance = _u16(raw[:, 3]) | _u16(raw[:, 4]) << np.uint16(8)
-            events.append(Nodes((first & 1).astype(np.bool_), first >> np.uint8(2), angle[:good], distance))
+            first = first[:good]
+            events.append(
+                Nodes((first & 1).view(np.bool_), first >> np.uint8(2), angle[:good], nodes["distance"][:good])
+            )
         self._buffer = self._buffer[good * _NODE_SIZE :]
         if good == count:
             return False
@@ -457,6 +464,14 @@ def decode_capsule(capsule: bytes, next_start: int) -> Nodes:
 _START_WINDOW_Q6: Final = 45 * 64
 
 
+_RAD_PER_Q6: Final = np.float64(np.pi / (180.0 * 64.0))
+_M_PER_Q2: Final = np.float64(0.00025)
+
+
+def _is_near_zero(angle_q6: int) -> bool:
+    return angle_q6 < _START_WINDOW_Q6 or angle_q6 >= _FULL_CIRCLE_Q6 - _START_WINDOW_Q6
+
+
 class ScanAssembler:
     """Nodes -> whole scans, each from one start flag to the next."""
 
@@ -471,10 +486,9 @@ class ScanAssembler:
     def feed(self, nodes: Nodes, now: float) -> list[LaserScan]:
         """Add a batch that arrived at `now` (s, monotonic); return the scans that it completes."""
         angle = nodes.angle_q6
-        near_zero = (angle < _START_WINDOW_Q6) | (angle >= _FULL_CIRCLE_Q6 - _START_WINDOW_Q6)
-        boundaries = [int(index) for index in np.flatnonzero(nodes.start & near_zero)]
-        clockwise = angle.astype(np.float64) * (np.pi / (180.0 * 64.0))
-        ranges = nodes.distance_q2.astype(np.float64) * 0.00025
+        boundaries = [index for index in nodes.start.nonzero()[0].tolist() if _is_near_zero(int(angle[index]))]
+        clockwise = angle * _RAD_PER_Q6
+        ranges = nodes.distance_q2 * _M_PER_Q2
         ranges[nodes.distance_q2 == 0] = np.nan
         return self._builder.feed(Samples(clockwise, ranges, nodes.quality), boundaries, now)
 

@@ -16,6 +16,7 @@ import pytest
 
 from fog_contracts.grid import GridGeometry, StaticMap
 from fog_runtime.clock import SystemClock
+from fog_runtime.locks.site_locks import SiteLocks
 from fog_runtime.maps import save_map
 from fog_runtime.mqtt_edge import MqttEdge
 from fog_runtime.zenoh_edge import ZenohEdge
@@ -50,11 +51,12 @@ DEADLINE_S = 60.0
 class Fog:
     """The servers, a site, and processes that can be started and killed."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, locks: SiteLocks | None = None) -> None:
         self.folder = folder
-        self.mosquitto: Server = start_mosquitto(folder / "mosquitto")
-        self.redis: Server = start_redis(folder / "redis")
-        self.router: Server = start_router(folder / "router")
+        self.locks = locks
+        self.mosquitto: Server = start_mosquitto(folder / "mosquitto", locks=locks and locks.folder("mosquitto"))
+        self.redis: Server = start_redis(folder / "redis", locks=locks and locks.folder("redis"))
+        self.router: Server = start_router(folder / "router", locks=locks and locks.folder("zenoh"))
         self.site = folder / "site"
         self.site.mkdir()
         (self.site / "site.toml").write_text(SITE)
@@ -89,7 +91,12 @@ class Fog:
         name = name or module
         port_file = self.folder / f"{name}.port"
         port_file.unlink(missing_ok=True)
-        environment = {**self.environment, "FOGNAV_PORT_FILE": str(port_file), **environment}
+        own = (
+            {}
+            if self.locks is None
+            else {"FOGNAV_CREDENTIALS_FILE": str(self.locks.credentials(module.replace("_", "-")))}
+        )
+        environment = {**self.environment, "FOGNAV_PORT_FILE": str(port_file), **own, **environment}
         self.processes[name] = programs.start(module, environment, self.folder / f"{name}.log")
 
     def kill(self, module: str) -> None:
@@ -244,6 +251,18 @@ async def proxy(fog: Fog) -> AsyncIterator[Proxy]:
 @pytest.fixture
 def fog(tmp_path: Path) -> Iterator[Fog]:
     running = Fog(tmp_path)
+    try:
+        yield running
+    finally:
+        running.close()
+
+
+@pytest.fixture
+def locked_fog(tmp_path: Path) -> Iterator[Fog]:
+    """Yield a fog whose servers encrypt, and admit only users with a password."""
+    locks = SiteLocks(tmp_path / "locks", "test")
+    locks.make(["127.0.0.1"])
+    running = Fog(tmp_path, locks)
     try:
         yield running
     finally:

@@ -16,6 +16,7 @@ from fognav import __version__, checkout, doctor, kernels, system
 from fognav.alert_command import alert_app
 from fognav.area_command import area_app
 from fognav.bench_command import bench_app
+from fognav.ca_command import ca_app
 from fognav.channels_command import channels_command
 from fognav.coverage_command import site_coverage
 from fognav.localize_command import localize_command
@@ -35,7 +36,7 @@ from fognav.output import (
     write_report,
 )
 from fognav.robot_command import robot_app, robot_goal
-from fognav.robot_file_command import robot_check, robot_new
+from fognav.robot_file_command import robot_add, robot_check, robot_new
 from fognav.source_command import source_app
 from fognav.status_command import status_command
 from fognav.store_command import store_app
@@ -60,6 +61,7 @@ app.add_typer(source_app, name="source")
 app.add_typer(node_app, name="node")
 app.add_typer(robot_app, name="robot")
 app.add_typer(token_app, name="token")
+app.add_typer(ca_app, name="ca")
 app.add_typer(map_app, name="map")
 app.add_typer(store_app, name="store")
 app.add_typer(bench_app, name="bench")
@@ -68,6 +70,7 @@ app.command("localize", epilog="Example: fognav localize --map floor.yaml --log 
 )
 app.command("status", epilog="Example: fognav status --json")(status_command)
 app.command("goal", context_settings=NUMBERS, epilog="Example: fognav goal b")(robot_goal)
+robot_app.command("add", epilog="Example: fognav robot add r2 --locks locks")(robot_add)
 robot_app.command("new", epilog="Example: fognav robot new --base roomba600 --lidar rplidar-a1 --out robot.toml")(
     robot_new
 )

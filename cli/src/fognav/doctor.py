@@ -1,5 +1,6 @@
 """Checks whether this machine has what Fognav needs, with the remedy for what is missing."""
 
+import datetime as dt
 import os
 import platform
 import re
@@ -15,6 +16,9 @@ from typing import Final, Literal
 import psutil
 
 from fognav import checkout, kernels, system
+from fognav.locking import VARIABLE as LOCKS_VARIABLE
+from fognav.locking import locks_errors, locks_folder, open_locks
+from fognav.output import FailedError
 
 State = Literal["ok", "missing", "optional"]
 
@@ -94,6 +98,24 @@ def check_kernels() -> Check:
     return Check("kernel cache", "optional", "not compiled yet", "./fognav test and demo compile them at their start")
 
 
+def check_certificates() -> Check | None:
+    """Check until when the certificates are valid of the locks that FOGNAV_LOCKS_DIR names; None without any."""
+    folder = locks_folder(None)
+    if folder is None:
+        return None
+    try:
+        with locks_errors():
+            locks = open_locks(folder)
+            expiring, first = locks.expiring(), min(locks.expiries().values())
+    except FailedError as error:
+        return Check("certificates", "missing", str(error), f"correct {LOCKS_VARIABLE}, or restore a backup")
+    found = f"the first expires on {first:%Y-%m-%d} ({folder})"
+    if not expiring:
+        return Check("certificates", "ok", found)
+    remedy = "fognav ca rotate" if "authority" in expiring else "fognav ca issue"
+    return Check("certificates", "missing" if first < dt.datetime.now(dt.UTC) else "optional", found, remedy)
+
+
 def check_ports() -> Check:
     """Check whether a server can listen on the loopback address."""
     try:
@@ -133,6 +155,8 @@ def checks() -> Iterator[Check]:
         yield check_tool(tool)
     for check in (check_kernels, check_ports, check_ptys, check_machine):
         yield check()
+    if (certificates := check_certificates()) is not None:
+        yield certificates
 
 
 def as_json(found: list[Check]) -> dict[str, object]:

@@ -13,8 +13,10 @@ import typer
 from fog_contracts import channels as ch
 from fog_contracts.messages import Id, NodeCalibration, NodeReading
 from fog_contracts.site import NodeSite
+from fog_runtime.credentials import Credentials
 from fog_runtime.site import LoadedSite
 from fognav import checkout, kernels
+from fognav.locking import LocksOption, locks_errors, locks_folder, open_locks, own_credentials
 from fognav.nodes import on_broker, provisioning, site_file
 from fognav.operate.fog import Fog, find_fog
 from fognav.operate.options import NUMBERS, FogOption, JsonOption
@@ -69,6 +71,7 @@ def node_add(  # noqa: PLR0913  # each option is an argument
     fog_host: HostOption = "fog.local",
     tls: TlsOption = True,
     passwords: PasswordsOption = None,
+    locks: LocksOption = None,
     profile: ProfileOption = "standard",
     out: OutOption = Path("firmware/data"),
     json: JsonOption = False,
@@ -91,7 +94,7 @@ def node_add(  # noqa: PLR0913  # each option is an argument
         access = provisioning.Access(wifi, wifi_password, fog_host, 8883 if tls else 1883, tls)
         members = provisioning.settings(loaded.site.id, node, access, provisioning.new_password(), profile)
         text = site_file.with_node(loaded, node)
-        provisioning.provision(target, members, passwords)
+        provisioning.provision(target, _let_in(members, target, locks), passwords)
         site_file.write(loaded, text)
         _tell_board(json, "added", node, target, passwords)
 
@@ -106,6 +109,7 @@ def node_replace(  # noqa: PLR0913  # each option is an argument
     fog_host: HostOption = "fog.local",
     tls: TlsOption = True,
     passwords: PasswordsOption = None,
+    locks: LocksOption = None,
     profile: ProfileOption = "standard",
     out: OutOption = Path("firmware/data"),
     json: JsonOption = False,
@@ -122,7 +126,7 @@ def node_replace(  # noqa: PLR0913  # each option is an argument
             raise WrongUseError(f"{target} is that of node {other}: move it, or name a folder with --out")
         access = provisioning.Access(wifi, wifi_password, fog_host, 8883 if tls else 1883, tls)
         members = provisioning.settings(loaded.site.id, node, access, provisioning.new_password(), profile)
-        provisioning.provision(target, members, passwords)
+        provisioning.provision(target, _let_in(members, target, locks), passwords)
         _tell_board(json, "replaced", node, target, passwords)
 
 
@@ -180,9 +184,9 @@ def node_calibrate(  # noqa: PLR0913  # each option is an argument
     with exit_codes():
         loaded = None if folder is None else site_file.load(checkout.site_folder(folder))
         node = None if loaded is None else site_file.node_of(loaded, name)
-        url, site_id = _on(fog, broker, site if loaded is None else loaded.site.id)
+        url, site_id, own = _on(fog, broker, site if loaded is None else loaded.site.id)
         command = ch.LEARN_NO_ECHO if no_echo else ch.CALIBRATE
-        learned = _run(on_broker.learn(url, site_id, _checked(name), command))
+        learned = _run(on_broker.learn(url, site_id, _checked(name), command, own))
         failed = [
             f"sonar {index + 1} {_RESULTS[result]}" for index, result in enumerate(learned.result) if result != "done"
         ]
@@ -223,7 +227,7 @@ def node_sim(
         loaded = site_file.load(checkout.site_folder(site))
         node = site_file.node_of(loaded, name)
         persons = [_numbers("--person", text, 2) for text in person or ()]
-        url, _ = _on(fog, broker, loaded.site.id)
+        url, _, _ = _on(fog, broker, loaded.site.id)
         _compiled()
         _run(_bounded(simulated.run(loaded, node, url, [(x, y) for x, y in persons]), seconds))
 
@@ -236,9 +240,10 @@ _RESULTS: Final = {
 }
 
 
-async def _watch(on: tuple[str, str], name: str, count: int | None, *, json: bool) -> None:
+async def _watch(on: tuple[str, str, Credentials], name: str, count: int | None, *, json: bool) -> None:
     seen = 0
-    async for reading in on_broker.readings(*on, name):
+    url, site, own = on
+    async for reading in on_broker.readings(url, site, name, own):
         if json:
             values = {"state": reading} if isinstance(reading, str) else msgspec.to_builtins(reading)
             typer.echo(msgspec.json.encode(values).decode())
@@ -271,17 +276,20 @@ def _run(work: Coroutine[Any, Any, T]) -> T:
         raise typer.Exit(0) from None
 
 
-def _on(fog: str | None, broker: str | None, site: str | None) -> tuple[str, str]:
-    """Return the broker's address and the site's id: those that are given, else those of the running system."""
+def _on(fog: str | None, broker: str | None, site: str | None) -> tuple[str, str, Credentials]:
+    """Return the broker's address, the site's id and the caller's credentials.
+
+    They are those that are given, else those of the running system.
+    """
     if broker is not None and site is not None:
-        return broker, site
+        return broker, site, own_credentials()
     found: Fog = find_fog(fog)
     url = broker or found.system.urls.get(BROKER)
     if url is None:
         raise WrongUseError(
             f"the broker of {found.system.name} is not known: name it with --broker mqtts://USER:PASSWORD@HOST"
         )
-    return url, site or found.site
+    return url, site or found.site, found.credentials
 
 
 def _checked(name: str) -> str:
@@ -328,6 +336,16 @@ def _placed(loaded: LoadedSite, name: str, area: str, pose: tuple[float, float, 
     except (PlacingError, msgspec.ValidationError) as error:
         raise WrongUseError(f"node {name}: {error}") from error
     return node
+
+
+def _let_in(members: dict[str, Any], target: Path, locks: Path | None) -> dict[str, Any]:
+    """Return a board's settings with the password that a site's locks give it, and write beside them whom it trusts."""
+    if (folder := locks_folder(locks)) is None:
+        return members
+    with locks_errors():
+        password, authority = provisioning.let_in(open_locks(folder), members["user"])
+    provisioning.write_authority(target.with_name(provisioning.AUTHORITY_FILE), authority)
+    return {**members, "password": password}
 
 
 def _tell_board(json: bool, verb: str, node: NodeSite, target: Path, passwords: Path | None) -> None:  # noqa: FBT001  # a flag of each command

@@ -11,9 +11,11 @@ from typing import Final
 from fog_contracts.channels import Channel
 from fog_contracts.messages import Message
 from fog_runtime.clock import Clock, SystemClock
+from fog_runtime.credentials import NOBODY, Credentials
 from fog_runtime.mqtt_edge import MqttEdge
 from fog_runtime.record import Recorder, RecordError, bytes_lost, read, record_all, replay
 from fog_runtime.zenoh_edge import ZenohEdge
+from fognav.locking import own_credentials
 from fognav.output import WrongUseError
 
 _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
@@ -23,13 +25,19 @@ _POLL_S: Final = 0.05
 
 @contextlib.asynccontextmanager
 async def recording(
-    path: Path, *, mqtt_url: str, zenoh: ZenohEdge, clock: Clock, numbers: Sequence[int] = ()
+    path: Path,
+    *,
+    mqtt_url: str,
+    zenoh: ZenohEdge,
+    clock: Clock,
+    numbers: Sequence[int] = (),
+    credentials: Credentials = NOBODY,
 ) -> AsyncIterator[None]:
     """Record every channel while the context is open, which begins when the broker is connected.
 
     Raises `WrongUseError` if the file can't be written or the broker can't be reached.
     """
-    mqtt = _mqtt(mqtt_url, "fognav-record", clock, zenoh.site)
+    mqtt = _mqtt(mqtt_url, "fognav-record", clock, zenoh.site, credentials)
     try:
         recorder = Recorder(path, site=zenoh.site)
     except OSError as error:
@@ -50,14 +58,16 @@ async def record(path: Path, *, mqtt_url: str, zenoh_endpoint: str, site: str, s
 
     Raises `WrongUseError` without broker or router; an existing file then stays unchanged.
     """
-    clock = SystemClock()
-    opened = ZenohEdge.open(connect=[zenoh_endpoint], clock=clock, role="recorder", id="record", site=site)
+    clock, credentials = SystemClock(), own_credentials()
+    opened = ZenohEdge.open(
+        connect=[zenoh_endpoint], clock=clock, role="recorder", id="record", site=site, credentials=credentials
+    )
     async with opened as zenoh:
-        await _check_reachable(zenoh, zenoh_endpoint, mqtt_url, clock)
+        await _check_reachable(zenoh, zenoh_endpoint, mqtt_url, clock, credentials)
         stop = asyncio.Event()
         for number in _SIGNALS:
             asyncio.get_running_loop().add_signal_handler(number, stop.set)
-        async with recording(path, mqtt_url=mqtt_url, zenoh=zenoh, clock=clock):
+        async with recording(path, mqtt_url=mqtt_url, zenoh=zenoh, clock=clock, credentials=credentials):
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(stop.wait(), seconds or None)
     return summary(path)
@@ -94,9 +104,11 @@ async def play(path: Path, *, mqtt_url: str, zenoh_endpoint: str, site: str, spe
     contents = summary(path)
     if not contents["messages"]:
         raise WrongUseError(f"{path} contains no complete message. Record it again")
-    clock = SystemClock(speed)
-    mqtt = _mqtt(mqtt_url, "fognav-replay", clock, site)
-    opened = ZenohEdge.open(connect=[zenoh_endpoint], clock=clock, role="console", id="replay", site=site)
+    clock, credentials = SystemClock(speed), own_credentials()
+    mqtt = _mqtt(mqtt_url, "fognav-replay", clock, site, credentials)
+    opened = ZenohEdge.open(
+        connect=[zenoh_endpoint], clock=clock, role="console", id="replay", site=site, credentials=credentials
+    )
     async with opened as zenoh:
         await _wait_for_router(zenoh, zenoh_endpoint)
 
@@ -115,16 +127,18 @@ async def play(path: Path, *, mqtt_url: str, zenoh_endpoint: str, site: str, spe
             await asyncio.gather(task, return_exceptions=True)
 
 
-def _mqtt(url: str, client: str, clock: Clock, site: str) -> MqttEdge:
+def _mqtt(url: str, client: str, clock: Clock, site: str, credentials: Credentials) -> MqttEdge:
     try:
-        return MqttEdge(url, client, clock, site=site)
+        return MqttEdge(url, client, clock, site=site, credentials=credentials)
     except ValueError as error:
         raise WrongUseError(f"{url!r} is not a broker's URL ({error}). Correct --mqtt") from error
 
 
-async def _check_reachable(zenoh: ZenohEdge, zenoh_endpoint: str, mqtt_url: str, clock: Clock) -> None:
+async def _check_reachable(
+    zenoh: ZenohEdge, zenoh_endpoint: str, mqtt_url: str, clock: Clock, credentials: Credentials
+) -> None:
     """Check that broker and router can be reached, before a file is overwritten; raises `WrongUseError`."""
-    mqtt = _mqtt(mqtt_url, "fognav-check", clock, zenoh.site)
+    mqtt = _mqtt(mqtt_url, "fognav-check", clock, zenoh.site, credentials)
     connection = asyncio.create_task(mqtt.run())
     try:
         await _wait_for_broker(mqtt, mqtt_url)

@@ -1,17 +1,49 @@
-"""`fognav robot new` and `check`: write a commented robot file, and show the settings that one gives."""
+"""`fognav robot add`, `new` and `check`: a robot's credentials, and its commented file and the settings it gives."""
 
 import os
 from pathlib import Path
 from typing import Annotated
 
+import msgspec
 import typer
 
+from fog_contracts.messages import Id
 from fog_runtime.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fog_runtime.files import SHARED, atomic_write
 from fog_runtime.robot_file import ROBOT_FILE, RobotFile, default_robot, describe_robot, load_robot
 from fog_runtime.settings import SettingsError
+from fognav.locking import LocksOption, locks_errors, open_locks
 from fognav.operate.options import JsonOption
 from fognav.output import NOT_TRUE, WrongUseError, exit_codes, fail, print_json, print_line
+
+
+def robot_add(
+    robot: Annotated[str, typer.Argument(metavar="ROBOT", help="The robot's id: a to z, 0 to 9 and -.")],
+    *,
+    locks: LocksOption = None,
+    remove: Annotated[bool, typer.Option("--remove", help="Let it in no longer.")] = False,
+    json: JsonOption = False,
+) -> None:
+    """Let a robot into a site's fog, with a file of credentials.
+
+    The robot needs it as FOGNAV_CREDENTIALS_FILE.
+    For a robot that is known already they are new ones, and those of before are worth nothing any more.
+    """
+    with exit_codes(), locks_errors():
+        opened = open_locks(locks)
+        try:
+            msgspec.convert(robot, Id)
+        except msgspec.ValidationError as error:
+            raise WrongUseError(f"{robot!r}: an id has only a to z, 0 to 9 and -, at most 32") from error
+        file = None if remove else opened.add_robot(robot)
+        if remove and not opened.remove(robot):
+            raise WrongUseError(f"there is no robot {robot}. Known are: {', '.join(sorted(opened.users()))}")
+        if json:
+            print_json({"robot": robot, "credentials": None if file is None else str(file)})
+        elif file is None:
+            print_line(f"the router refuses {robot} from now on")
+        else:
+            print_line(f"wrote {file}: copy it to the robot, for its owner only, and delete it here")
 
 
 def robot_new(

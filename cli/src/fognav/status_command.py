@@ -4,6 +4,7 @@ import os
 
 import msgspec
 
+from fognav.locking import own_credentials
 from fognav.operate.fog import FOG, Fog, find_fog
 from fognav.operate.options import FogOption, JsonOption
 from fognav.operate.presence import connected
@@ -20,11 +21,13 @@ def status_command(*, fog: FogOption = None, json: JsonOption = False) -> None:
     """
     with exit_codes():
         systems = [_remote(find_fog(fog))] if fog or os.environ.get(FOG) else find_systems()
+        present = [connected(system, own_credentials(system.credentials_file)) for system in systems]
     if json:
-        print_json({"systems": [{**msgspec.to_builtins(system), "connected": connected(system)} for system in systems]})
+        shown = zip(systems, present, strict=True)
+        print_json({"systems": [{**msgspec.to_builtins(system), "connected": names} for system, names in shown]})
     else:
-        for system in systems:
-            _show(system)
+        for system, names in zip(systems, present, strict=True):
+            _show(system, names)
     if not systems:
         fail("nothing runs on this machine. Start a demo: fognav demo --keep-running")
 
@@ -44,12 +47,12 @@ def _remote(fog: Fog) -> System:
     return msgspec.structs.replace(fog.system, site=fog.site, urls=urls)
 
 
-def _show(system: System) -> None:
+def _show(system: System, present: list[str] | None) -> None:
     print_line(f"{system.name}: {system.kind}" + (f", site {system.site}" if system.site else ""))
     for name, url in system.urls.items():
         print_line(f"  {name:18} {url}")
     if system.token_file:
         print_line(f"  {'token':18} {system.token_file}")
-    if (present := connected(system)) is not None:
+    if present is not None:
         print_line(f"  {'connected':18} {', '.join(present) or 'nothing'}")
     print_line(f"  {'processes':18} {', '.join(f'{name} {pid}' for name, pid in system.pids.items()) or 'not visible'}")

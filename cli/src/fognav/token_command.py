@@ -6,7 +6,10 @@ from typing import Annotated, Final
 
 import typer
 
+from fog_runtime.credentials import to_toml
+from fog_runtime.files import atomic_write
 from fog_runtime.token_file import Role, TokensError, create_token, read_tokens, revoke_token
+from fognav.locking import LocksOption, locks_errors, locks_folder, open_locks
 from fognav.operate.fog import find_fog
 from fognav.operate.options import JsonOption
 from fognav.output import FailedError, WrongUseError, exit_codes, print_json, print_line
@@ -33,18 +36,33 @@ def token_create(
         Role, typer.Option("--role", help="viewer reads, operator writes, admin also recovers.")
     ] = "viewer",
     file: FileOption = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="FILE", help="Write it there, as credentials (FOGNAV_CREDENTIALS_FILE)."),
+    ] = None,
+    locks: LocksOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Create a token and print it.
+    """Create a token and print it, or write it to a file.
 
     Only its hash is stored: it can't be shown again. The running services accept it at once.
     """
-    with exit_codes():
+    with exit_codes(), locks_errors():
+        if out is not None and out.exists():
+            raise WrongUseError(f"{out} already exists: name another file with --out, or remove it")
+        authority = open_locks(locks).authority.trusted if locks_folder(locks) is not None else ""
         try:
             token = create_token(_file(file), name, role)
         except TokensError as error:
             raise FailedError(str(error)) from error
-        if json:
+        if out is not None:
+            text = to_toml(name, authority=authority, passwords={}, token=token)
+            atomic_write(out, text.encode())
+            if json:
+                print_json({"name": name, "role": role, "credentials": str(out)})
+            else:
+                print_line(f"wrote {out}: give it to {name}, who names it in FOGNAV_CREDENTIALS_FILE")
+        elif json:
             print_json({"name": name, "role": role, "token": token})
         else:
             typer.echo(token)

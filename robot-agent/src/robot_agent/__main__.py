@@ -63,8 +63,9 @@ async def main() -> None:
     clock = SystemClock(settings.speed)
     health = Health("map", "pose", "lidar", "base")
     async with ZenohEdge.open(
-        connect=settings.zenoh_endpoints, clock=clock, role="robot-agent", id=settings.robot, site=site
-    ) as zenoh:
+        connect=settings.zenoh_endpoints, clock=clock, role="robot-agent", id=settings.robot, site=site,
+        credentials=settings.credentials(),
+    ) as zenoh:  # fmt: skip
         with (
             open_core(config, settings.seed, settings.input_log) as core,
             serve_health(health, settings.http_host, settings.http_port, settings.port_file) as server,

@@ -62,15 +62,21 @@ async def main() -> None:
     with LiveWorld(hardware, clock, settings.run_dir, settings.truth_log) as live_world:
         health.set("devices", ok=True)
         async with ZenohEdge.open(
-            connect=settings.zenoh_endpoints, clock=clock, role="sim", id=robot.id, site=site
-        ) as edge:
+            connect=settings.zenoh_endpoints, clock=clock, role="sim", id=robot.id, site=site,
+            credentials=settings.credentials(),
+        ) as edge:  # fmt: skip
             live_world.serve(edge, robot.id)
             with serve_health(health, settings.http_host, settings.http_port, settings.port_file):
                 async with asyncio.TaskGroup() as tasks:
                     tasks.create_task(live_world.run(), name="world")
                     tasks.create_task(live_world.publish_truth(edge, robot.id), name="truth")
                     sonars = make_nodes(loaded.site.nodes, boot, clock.now(), settings.nodes)
-                    nodes = [VirtualNode(each, live_world, settings.mqtt_url, clock, site) for each in sonars]
+                    nodes = [
+                        VirtualNode(
+                            each, live_world, settings.mqtt_url, clock, site, settings.credentials_of(each.node.id)
+                        )
+                        for each in sonars
+                    ]
                     tasks.create_task(run_nodes(nodes, clock), name="nodes")
                     while True:
                         connected = edge.connected

@@ -16,6 +16,7 @@ from fog_contracts.geometry import GeometryError
 from fog_contracts.messages import CommandReply, NodeConfig, SimCommand
 from fog_runtime import logs
 from fog_runtime.clock import Ticker
+from fog_runtime.credentials import NOBODY, Credentials
 from fog_runtime.mqtt_edge import MqttEdge, Will
 from fognav_sim.hardware import STEP_S
 from fognav_sim.pty_port import PtyPort
@@ -186,13 +187,21 @@ class MeasuredFloor(Protocol):
 class VirtualNode:
     """A simulated sensor node with its own MQTT connection, as a real one has."""
 
-    def __init__(self, sonars: SensorNode, floor: MeasuredFloor, url: str, clock: Clock, site: str) -> None:
+    def __init__(  # what it is, where it is, and how it reaches its broker
+        self,
+        sonars: SensorNode,
+        floor: MeasuredFloor,
+        url: str,
+        clock: Clock,
+        site: str,
+        credentials: Credentials = NOBODY,
+    ) -> None:
         self._sonars = sonars
         self._world = floor
         self._clock = clock
         self._id = sonars.node.id
         will = Will(ch.NODE_AVAILABILITY, ch.OFFLINE, {"node": self._id})
-        self._mqtt = MqttEdge(url, f"node-{self._id}", clock, site=site, will=will)
+        self._mqtt = MqttEdge(url, f"node-{self._id}", clock, site=site, will=will, credentials=credentials)
         self._mqtt.on(ch.NODE_CONFIG, self._on_config, NodeConfig)
         self._mqtt.on(ch.NODE_COMMAND, self._on_command)
         self._problem: str | None = None

@@ -154,6 +154,7 @@ async def main() -> None:
             role="console",
             id=robot,
             site=settings.site or site.id,
+            credentials=settings.credentials(),
         ) as edge,
         Supervisor(_log_program_event) as supervisor,
     ):

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Literal
 
+from fog_runtime.credentials import NOBODY, Credentials
 from fog_runtime.settings import CommonSettings
 
 
@@ -20,3 +21,10 @@ class Settings(CommonSettings, frozen=True, kw_only=True):
     `auto`: the firmware where its sources and a C++ compiler are."""
     seed: int = 1
     truth_log: Path | None = None
+    node_credentials_dir: Path | None = None
+    """Folder with the credentials of each sensor node, `NODE.toml`; without it the nodes are nobody."""
+
+    def credentials_of(self, node: str) -> Credentials:
+        """Read the credentials of a sensor node; raises `CredentialsError`."""
+        folder = self.node_credentials_dir
+        return NOBODY if folder is None else Credentials.read(folder / f"{node}.toml")

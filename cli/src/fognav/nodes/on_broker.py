@@ -13,6 +13,7 @@ from paho.mqtt.subscribeoptions import SubscribeOptions
 from fog_contracts import channels as ch
 from fog_contracts.codec import ContractError, decode, decode_text, encode_text
 from fog_contracts.messages import NodeCalibration, NodeReading
+from fog_runtime.credentials import NOBODY, Credentials
 from fog_runtime.mqtt_broker import Broker
 from fognav.output import FailedError, WrongUseError
 
@@ -26,9 +27,9 @@ CALIBRATION_S: Final = 60.0
 
 
 @asynccontextmanager
-async def _connected(url: str, topics: dict[str, int]) -> AsyncIterator[aiomqtt.Client]:
+async def _connected(url: str, topics: dict[str, int], credentials: Credentials) -> AsyncIterator[aiomqtt.Client]:
     try:
-        broker = Broker.of(url)
+        broker = Broker.of(url, credentials)
     except ValueError as error:
         raise WrongUseError(f"--broker {url}: {error}") from error
     try:
@@ -41,13 +42,15 @@ async def _connected(url: str, topics: dict[str, int]) -> AsyncIterator[aiomqtt.
         ) from error
 
 
-async def readings(url: str, site: str, node: str) -> AsyncIterator[NodeReading | str]:
+async def readings(
+    url: str, site: str, node: str, credentials: Credentials = NOBODY
+) -> AsyncIterator[NodeReading | str]:
     """Yield what a node publishes, until cancelled: readings, and `online` or `offline`.
 
     Raises `FailedError` for a broker that can't be used, or when the connection ends.
     """
     reading, availability = (channel.key(site=site, node=node) for channel in (ch.NODE_READING, ch.NODE_AVAILABILITY))
-    async with _connected(url, {reading: 0, availability: 1}) as client:
+    async with _connected(url, {reading: 0, availability: 1}, credentials) as client:
         async for message in client.messages:
             data = _bytes(message)
             try:
@@ -59,14 +62,17 @@ async def readings(url: str, site: str, node: str) -> AsyncIterator[NodeReading 
                 yield f"not understood: {error}"
 
 
-async def learn(url: str, site: str, node: str, command: str) -> NodeCalibration:
+async def learn(url: str, site: str, node: str, command: str, credentials: Credentials = NOBODY) -> NodeCalibration:
     """Let a node learn its limits (`CALIBRATE`) or its board's "no echo" (`LEARN_NO_ECHO`), and return what it learned.
 
     Raises `FailedError` with the node's own words if it refused, or if it does not answer within 60 s.
     """
     keys = {channel: channel.key(site=site, node=node) for channel in (ch.NODE_CALIBRATION, ch.NODE_PROBLEM)}
     try:
-        async with asyncio.timeout(CALIBRATION_S), _connected(url, dict.fromkeys(keys.values(), 1)) as client:
+        async with (
+            asyncio.timeout(CALIBRATION_S),
+            _connected(url, dict.fromkeys(keys.values(), 1), credentials) as client,
+        ):
             await client.publish(
                 ch.NODE_COMMAND.key(site=site, node=node),
                 encode_text(ch.NODE_COMMAND, command),

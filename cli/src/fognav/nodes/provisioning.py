@@ -11,6 +11,7 @@ import stat
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
+from fog_runtime.credentials import Credentials
 from fog_runtime.files import PRIVATE, atomic_write
 from fognav.output import WrongUseError
 
@@ -18,8 +19,10 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from fog_contracts.site import NodeSite
+    from fog_runtime.locks.site_locks import SiteLocks
 
 SETTINGS_FILE: Final = "node.json"
+AUTHORITY_FILE: Final = "ca.pem"
 _ITERATIONS: Final = 20_000
 
 
@@ -82,6 +85,22 @@ def provision(file: Path, members: dict[str, Any], passwords: Path | None) -> No
         else:
             _write(file, before)
         raise
+
+
+def let_in(locks: SiteLocks, node: str) -> tuple[str, str]:
+    """Let a node in by a site's locks; return its new password, and the authorities that its board shall trust (PEM).
+
+    Raises `LocksError` or `AuthorityError`.
+    """
+    file = locks.add_node(node)
+    credentials = Credentials.read(file)
+    file.unlink()  # the board has it: nobody else needs it
+    return credentials.passwords["mqtt"], credentials.authority
+
+
+def write_authority(file: Path, authority: str) -> None:
+    """Write the certificates that a board trusts beside its settings; raises `WrongUseError`."""
+    _write(file, authority.encode())
 
 
 def set_password(file: Path, user: str, password: str) -> None:

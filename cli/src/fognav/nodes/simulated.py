@@ -13,6 +13,7 @@ from fog_contracts.geometry import GeometryError
 from fog_contracts.messages import Pose, SimObstacle
 from fog_contracts.site import RobotSite
 from fog_runtime.clock import SystemClock
+from fognav.locking import own_credentials
 from fognav.output import WrongUseError
 from fognav_sim.floor import Floor
 from fognav_sim.live import VirtualNode, run_nodes
@@ -63,4 +64,4 @@ async def run(loaded: LoadedSite, node: NodeSite, broker: str, persons: Sequence
     clock = SystemClock(1.0)
     floor = StillFloor(loaded, persons, clock)
     (sonars,) = make_nodes([node], int(time.time()), clock.now())
-    await run_nodes([VirtualNode(sonars, floor, broker, clock, loaded.site.id)], clock)
+    await run_nodes([VirtualNode(sonars, floor, broker, clock, loaded.site.id, own_credentials())], clock)

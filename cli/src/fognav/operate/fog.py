@@ -13,8 +13,10 @@ from urllib.parse import quote, urlsplit
 import msgspec
 
 from fog_contracts.messages import Id
+from fog_runtime.credentials import Credentials
 from fog_runtime.operator_key import OperatorKeyError, read_operator_key
 from fog_supervisor import net
+from fognav.locking import own_credentials
 from fognav.operate.registry import System, registered
 from fognav.operate.systems import FOG_NODE, MAP_SERVICE, PLANNER, ROUTER, addresses, find_systems
 from fognav.output import FailedError, WrongUseError
@@ -58,11 +60,16 @@ class Fog:
             return token
         file = os.environ.get(TOKEN_FILE) or self.system.token_file
         if file is None:
-            return None
+            return self.credentials.token or None
         try:
             return Path(file).read_text("ascii").strip()
         except (OSError, UnicodeDecodeError) as error:
             raise WrongUseError(f"the token file {file} can't be read: {error}. {_GIVE_TOKEN}") from error
+
+    @cached_property
+    def credentials(self) -> Credentials:
+        """The caller's credentials, or nobody's; raises `WrongUseError` for a file that can't be used."""
+        return own_credentials(self.system.credentials_file)
 
     @property
     def commands_by_rest(self) -> bool:
@@ -116,6 +123,7 @@ class Fog:
                 token=self.token,
                 headers=headers,
                 host=parts.hostname or net.LOOPBACK,
+                tls=self.credentials.tls_context() if parts.scheme == "https" else None,
             )
         except (OSError, http.client.HTTPException) as error:
             raise FailedError(
@@ -156,7 +164,9 @@ def _fog_node(name: str) -> System:
             "docker-compose.yml; set FOGNAV_PLANNER_PORT, … if they were changed"
         )
     host = net.LOOPBACK if name == FOG_NODE else name
-    return System(name=name, kind="fog node", site="", urls=addresses(host), pids={})
+    return System(
+        name=name, kind="fog node", site="", urls=addresses(host, locked=bool(own_credentials().authority)), pids={}
+    )
 
 
 def router(fog: Fog) -> str:

@@ -38,6 +38,7 @@ class System(msgspec.Struct, frozen=True, kw_only=True):
     pids: dict[str, int]
     token_file: str | None = None
     key_file: str | None = None
+    credentials_file: str | None = None
     robots: list[str] = []
     speed: float = 1.0
 

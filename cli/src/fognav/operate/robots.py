@@ -83,7 +83,9 @@ class Robot:
 async def connect(fog: Fog, robot: str) -> AsyncIterator[Robot]:
     """Connect to a robot; raises `FailedError` when the router can't be reached."""
     clock = SystemClock(fog.system.speed)
-    async with ZenohEdge.open(connect=[router(fog)], clock=clock, role="console", id=robot, site=fog.site) as edge:
+    async with ZenohEdge.open(
+        connect=[router(fog)], clock=clock, role="console", id=robot, site=fog.site, credentials=fog.credentials
+    ) as edge:
         if not edge.connected:
             raise FailedError(f"the zenoh router {router(fog)} can't be reached: check that it runs (fognav status)")
         yield Robot(edge, fog, robot, clock)

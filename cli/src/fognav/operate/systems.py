@@ -28,6 +28,7 @@ SERVICE_PORTS: Final = {
 """The ports of a fog node's REST APIs: the variables that docker-compose.yml reads, and its defaults."""
 ZENOH_PORT: Final = ("FOGNAV_ZENOH_PORT", 7447)
 MQTT_PORT: Final = ("FOGNAV_MQTT_PORT", 1883)
+MQTTS_PORT: Final = ("FOGNAV_MQTT_PORT", 8883)
 
 _FOG_MODULES: Final = {"hazard_aggregator": AGGREGATOR, "map_service": MAP_SERVICE, "planner": PLANNER}
 _ROBOT_MODULES: Final = {
@@ -51,11 +52,17 @@ def port(setting: tuple[str, int]) -> int:
     return int(os.environ.get(variable) or default)
 
 
-def addresses(host: str) -> dict[str, str]:
-    """Return the addresses of a fog node's REST APIs, router and broker on a host."""
+def addresses(host: str, *, locked: bool = False) -> dict[str, str]:
+    """Return the addresses of a fog node's REST APIs, router and broker on a host; those of a locked one encrypt."""
     shown = f"[{host}]" if ":" in host else host  # IPv6
-    urls = {name: f"http://{shown}:{port(setting)}" for name, setting in SERVICE_PORTS.items()}
-    return {**urls, ROUTER: f"tcp/{shown}:{port(ZENOH_PORT)}", BROKER: f"mqtt://{shown}:{port(MQTT_PORT)}"}
+    http_scheme, zenoh_scheme, mqtt_scheme = ("https", "tls", "mqtts") if locked else ("http", "tcp", "mqtt")
+    urls = {name: f"{http_scheme}://{shown}:{port(setting)}" for name, setting in SERVICE_PORTS.items()}
+    mqtt_port = port(MQTTS_PORT if locked else MQTT_PORT)
+    return {
+        **urls,
+        ROUTER: f"{zenoh_scheme}/{shown}:{port(ZENOH_PORT)}",
+        BROKER: f"{mqtt_scheme}://{shown}:{mqtt_port}",
+    }
 
 
 def _module(process: psutil.Process) -> str:

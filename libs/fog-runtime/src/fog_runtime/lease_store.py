@@ -6,10 +6,12 @@ import asyncio
 import time
 from typing import TYPE_CHECKING, Any, Final, Self
 
+from fog_runtime.credentials import NOBODY
 from fog_runtime.lease import ATTEMPT_S, LEASE_S, Granted, Held, Reply, Request
 from fog_runtime.redis_connection import RedisConnection, StoreError
 
 if TYPE_CHECKING:
+    from fog_runtime.credentials import Credentials
     from fog_runtime.redis_connection import Command
 
 # The lease is "EPOCH HOLDER" and expires; the epoch stays. An epoch that Redis has granted is renewed as long as nobody
@@ -49,8 +51,8 @@ return 0
 class LeaseStore:
     """The lease of one service of a site; none of its calls raises for a Redis that does not answer."""
 
-    def __init__(self, url: str, site: str, service: str) -> None:
-        self._redis = RedisConnection(url, timeout_s=ATTEMPT_S)
+    def __init__(self, url: str, site: str, service: str, *, credentials: Credentials = NOBODY) -> None:
+        self._redis = RedisConnection(url, timeout_s=ATTEMPT_S, credentials=credentials)
         self._lease, self._epoch, self._floor = (f"fog:{site}:{service}:{name}" for name in ("lease", "epoch", "floor"))
 
     async def __aenter__(self) -> Self:

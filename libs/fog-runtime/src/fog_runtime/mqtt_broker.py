@@ -1,13 +1,14 @@
 """The broker that a process connects to: its address, and the options of a connection."""
 
 import asyncio
-import ssl
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, Self, cast
 from urllib.parse import unquote, urlsplit
 
 import aiomqtt
+
+from fog_runtime.credentials import NOBODY, Credentials
 
 _KEEPALIVE_S: Final = 10
 """A connection without traffic for 1.5 times as long is considered lost by both sides."""
@@ -49,26 +50,35 @@ class Broker:
     user: str | None
     password: str | None
     tls: bool
+    credentials: Credentials = NOBODY
 
     @classmethod
-    def of(cls, url: str) -> Self:
-        """Read an address; raises `ValueError` for an invalid one."""
+    def of(cls, url: str, credentials: Credentials = NOBODY) -> Self:
+        """Read an address, whose user and password, if it has any, replace those of `credentials`.
+
+        Raises `ValueError` for an invalid one, and `CredentialsError` if it would reveal the password.
+        """
         parts = urlsplit(url)
         if parts.scheme not in {"mqtt", "mqtts"} or not parts.hostname:
             raise ValueError("the broker's address must look like mqtt://host:1883 or mqtts://user:password@host:8883")
         tls = parts.scheme == "mqtts"
+        user = unquote(parts.username) if parts.username else None
+        password = unquote(parts.password) if parts.password else None
+        if user is None and (login := credentials.login("mqtt", url, parts.hostname, encrypted=tls)) is not None:
+            user, password = login
         return cls(
             host=parts.hostname,
             port=parts.port or (8883 if tls else 1883),
-            user=unquote(parts.username) if parts.username else None,
-            password=unquote(parts.password) if parts.password else None,
+            user=user,
+            password=password,
             tls=tls,
+            credentials=credentials,
         )
 
     @classmethod
-    def listed(cls, urls: str) -> list[Self]:
-        """Read comma separated addresses of bridged brokers; raises `ValueError` for an invalid one."""
-        return [cls.of(url.strip()) for url in urls.split(",")]
+    def listed(cls, urls: str, credentials: Credentials = NOBODY) -> list[Self]:
+        """Read comma separated addresses of bridged brokers; raises as `of`."""
+        return [cls.of(url.strip(), credentials) for url in urls.split(",")]
 
     def __str__(self) -> str:
         return f"{self.host}:{self.port}"
@@ -87,7 +97,7 @@ class Broker:
             timeout=_TIMEOUT_S,
             keepalive=_KEEPALIVE_S,
             queue_type=None if inbox is None else cast("type[asyncio.Queue[aiomqtt.Message]]", lambda **_: inbox),
-            tls_context=ssl.create_default_context() if self.tls else None,
+            tls_context=self.credentials.tls_context() if self.tls else None,
         )
         client.pending_calls_threshold = 1000
         return client

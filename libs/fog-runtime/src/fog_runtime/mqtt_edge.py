@@ -21,6 +21,7 @@ from fog_contracts.messages import Message
 from fog_runtime import logs, metrics
 from fog_runtime.cancellation import raise_if_cancelled
 from fog_runtime.clock import Clock
+from fog_runtime.credentials import NOBODY, Credentials
 from fog_runtime.mqtt_broker import Broker, Inbox
 from fog_runtime.mqtt_subscriptions import ForeignHandler, Ids, Subscriptions
 
@@ -60,13 +61,22 @@ async def _subscribe(client: aiomqtt.Client, qos_by_topic: Mapping[str, int]) ->
 class MqttEdge:
     """One process's connection to the broker. All handlers run on the event loop's thread."""
 
-    def __init__(self, url: str, client_id: str, clock: Clock, *, site: str, will: Will | None = None) -> None:
+    def __init__(  # what a connection is
+        self,
+        url: str,
+        client_id: str,
+        clock: Clock,
+        *,
+        site: str,
+        will: Will | None = None,
+        credentials: Credentials = NOBODY,
+    ) -> None:
         """Prepare a connection that `run` opens. `site` is filled into every topic that contains one.
 
         `url` may list several brokers, comma separated, that are bridged: each failure moves on to the next one. Raises
-        `ValueError` for an invalid address.
+        `ValueError` for an invalid address, or one over which the password in `credentials` could be read.
         """
-        self._brokers = deque(Broker.listed(url))
+        self._brokers = deque(Broker.listed(url, credentials))
         self._client_id = client_id
         self._clock = clock
         self._site = site

@@ -1,6 +1,6 @@
 """A connection to Redis, or through Sentinels to the primary of several, with errors that name cause and remedy.
 
-    redis://[user:password@]host:port/db[?wait=N]
+    redis://[user:password@]host:port/db[?wait=N]       (rediss:// over TLS)
     redis+sentinel://[user:password@]host:port,host:port,.../name[/db][?wait=N]
 
 `name` is the name under which the Sentinels monitor the primary. With `wait`, a write is acknowledged once N replicas
@@ -21,6 +21,7 @@ from redis.exceptions import BusyLoadingError, OutOfMemoryError, ReadOnlyError, 
 from redis.exceptions import TimeoutError as RedisTimeoutError
 
 from fog_runtime.cancellation import raise_if_cancelled
+from fog_runtime.credentials import NOBODY, Credentials
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -96,10 +97,10 @@ class RedisConnection:
     connection of the pool. So every command must be one that may be repeated.
     """
 
-    def __init__(self, url: str, *, timeout_s: float = 1.0) -> None:
-        self._address = parse_address(url)
+    def __init__(self, url: str, *, timeout_s: float = 1.0, credentials: Credentials = NOBODY) -> None:
+        self._address = _with_login(parse_address(url), credentials)
         self._timeout_s = timeout_s
-        self._client, self._sentinel = _connect(self._address, timeout_s)
+        self._client, self._sentinel = _connect(self._address, timeout_s, credentials)
 
     async def aclose(self) -> None:
         """Close the connections."""
@@ -189,7 +190,18 @@ def _host(text: str, default_port: int) -> tuple[str, int]:
     return parts.hostname, parts.port or default_port
 
 
-def _connect(address: RedisAddress, timeout_s: float) -> tuple[Redis, Sentinel | None]:
+def _with_login(address: RedisAddress, credentials: Credentials) -> RedisAddress:
+    """Return an address with a user and password: its own, else those in the credentials for Redis."""
+    if address.username is not None or address.password is not None:
+        return address
+    for host, port in address.hosts:
+        login = credentials.login("redis", f"Redis at {host}:{port}", host, encrypted=address.tls)
+        if login is not None:
+            address = address._replace(username=login[0], password=login[1])
+    return address
+
+
+def _connect(address: RedisAddress, timeout_s: float, credentials: Credentials) -> tuple[Redis, Sentinel | None]:
     timeouts: dict[str, Any] = {"socket_timeout": timeout_s, "socket_connect_timeout": timeout_s}
     options = {
         **timeouts,
@@ -200,7 +212,8 @@ def _connect(address: RedisAddress, timeout_s: float) -> tuple[Redis, Sentinel |
     }
     if not address.sentinel_name:
         ((host, port),) = address.hosts
-        return Redis(host=host, port=port, ssl=address.tls, **options), None
+        tls: dict[str, Any] = {"ssl": True, "ssl_ca_data": credentials.authority or None} if address.tls else {}
+        return Redis(host=host, port=port, **tls, **options), None
     sentinels: Sequence[tuple[str, int]] = address.hosts
     once = {**timeouts, "retry": Retry(NoBackoff(), 0)}
     sentinel = _Sentinels(sentinels, sentinel_kwargs=once, **options)

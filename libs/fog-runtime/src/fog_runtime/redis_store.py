@@ -17,6 +17,7 @@ from prometheus_client import Gauge
 from fog_contracts.messages import Message
 from fog_runtime import logs, store_scripts
 from fog_runtime.audit import KINDS, AuditPage, read_page
+from fog_runtime.credentials import NOBODY
 from fog_runtime.idempotency import LIFETIME_S, IdempotencyError
 from fog_runtime.redis_connection import RedisConnection, StoreError, StoreRefusedError
 from fog_runtime.store_identity import StoreIdentity, StoreLostError
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
+    from fog_runtime.credentials import Credentials
     from fog_runtime.idempotency import Attempt
 
 __all__ = [
@@ -107,10 +109,17 @@ class RedisStore:
     tables: ClassVar[Sequence[str]] = ()
     """The names of the service's tables, for people."""
 
-    def __init__(
-        self, url: str, site: str, *, service: str = "service", data_dir: Path | None = None, timeout_s: float = 1.0
+    def __init__(  # what a store is
+        self,
+        url: str,
+        site: str,
+        *,
+        service: str = "service",
+        data_dir: Path | None = None,
+        timeout_s: float = 1.0,
+        credentials: Credentials = NOBODY,
     ) -> None:
-        self._redis = RedisConnection(url, timeout_s=timeout_s)
+        self._redis = RedisConnection(url, timeout_s=timeout_s, credentials=credentials)
         self._site = site
         self._service = service
         self._identity = StoreIdentity(None if data_dir is None else data_dir / f"{service}.{site}.store")

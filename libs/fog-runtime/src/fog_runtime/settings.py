@@ -9,7 +9,9 @@ from typing import Any, Final, Literal, TypeVar
 import msgspec
 
 from fog_contracts.costs import DEFAULT_INFLATION, Inflation
+from fog_runtime.credentials import Credentials
 from fog_runtime.logs import Level
+from fog_runtime.server_certificate import ServerCertificate
 
 S = TypeVar("S", bound=msgspec.Struct)
 
@@ -63,16 +65,29 @@ class CommonSettings(msgspec.Struct, frozen=True, kw_only=True):
     http_host: str = "127.0.0.1"
     http_port: int = 0
     """0: any free port; the chosen one is logged (`listening`) and written to `port_file`."""
+    http_certificate_file: Path | None = None
+    http_key_file: Path | None = None
+    """Certificate and private key (PEM) with which the REST API is served by HTTPS; without them by HTTP."""
     port_file: Path | None = None
     log_level: Level = "info"
     log_format: Literal["json", "text"] = "json"
     tokens_file: Path | None = None
+    credentials_file: Path | None = None
+    """Who this process is, and whom it trusts (`fog_runtime.credentials`); without one it is nobody."""
     operator_key_file: Path | None = None
 
     @property
     def zenoh_endpoints(self) -> list[str]:
         """The endpoints in `zenoh_connect`."""
         return [part.strip() for part in self.zenoh_connect.split(",") if part.strip()]
+
+    def credentials(self) -> Credentials:
+        """Read the process's credentials; raises `CredentialsError`."""
+        return Credentials.read(self.credentials_file)
+
+    def http_certificate(self) -> ServerCertificate | None:
+        """Read the certificate of the REST API; None without one. Raises `CertificateError`."""
+        return ServerCertificate.of(self.http_certificate_file, self.http_key_file)
 
 
 class InflationSettings(CommonSettings, frozen=True, kw_only=True):

@@ -6,6 +6,7 @@ session can't be opened while no router is up; what was declared before is decla
 """
 
 import asyncio
+import base64
 import contextlib
 import inspect
 import json
@@ -19,6 +20,7 @@ from contextlib import asynccontextmanager
 from contextvars import ContextVar
 from functools import partial
 from typing import Any, Final, Generic, Literal, TypeVar
+from urllib.parse import urlsplit
 
 import zenoh
 from zenoh import ext
@@ -29,6 +31,7 @@ from fog_contracts.handlers import RefusedMessageError
 from fog_contracts.messages import Message
 from fog_runtime import logs, metrics
 from fog_runtime.clock import Clock
+from fog_runtime.credentials import NOBODY, Credentials
 from fog_runtime.reply_parts import GONE, PART, PART_BYTES, REPLY, LargeReplies
 from fog_runtime.slots import Slot
 from fog_runtime.zenoh_query import ask
@@ -52,6 +55,7 @@ PRESENCE_GRACE_S: Final = 0.5
 ASKER: Final[ContextVar[str]] = ContextVar("asker", default="")
 """The session that asks, by its id, in the handler of a query; empty if it did not say."""
 _RETRY_S: Final = (0.2, 1.0)
+_ENCRYPTED: Final = ("tls/", "quic/")
 
 _log = logs.get("zenoh")
 
@@ -66,9 +70,17 @@ def use_one_thread() -> None:
 
 
 def session_config(
-    mode: Literal["client", "router", "peer"], *, connect: Sequence[str] = (), listen: Sequence[str] = ()
+    mode: Literal["client", "router", "peer"],
+    *,
+    connect: Sequence[str] = (),
+    listen: Sequence[str] = (),
+    credentials: Credentials = NOBODY,
 ) -> zenoh.Config:
-    """Build a configuration without scouting and shared memory: a session connects only to the given endpoints."""
+    """Build a configuration without scouting and shared memory: a session connects only to the given endpoints.
+
+    Endpoints are `tcp/host:port`, or `tls/host:port` for encrypted connections. `credentials` prove who this session is
+    to what it connects to. Raises `CredentialsError` if an endpoint would reveal the password in them.
+    """
     config = zenoh.Config()
     values: dict[str, object] = {
         "mode": mode,
@@ -80,9 +92,21 @@ def session_config(
         "transport/shared_memory/enabled": False,
         "timestamping/enabled": True,
     }
+    for endpoint in connect:
+        login = credentials.login("zenoh", endpoint, _host(endpoint), encrypted=endpoint.startswith(_ENCRYPTED))
+        if login is not None:
+            values["transport/auth/usrpwd"] = {"user": login[0], "password": login[1]}
+    if credentials.authority:
+        authority = base64.b64encode(credentials.authority.encode()).decode()
+        values["transport/link/tls/root_ca_certificate_base64"] = authority
     for key, value in values.items():
         config.insert_json5(key, json.dumps(value))
     return config
+
+
+def _host(endpoint: str) -> str:
+    """Return the host of an endpoint such as `tcp/[::1]:7447?option=value`."""
+    return urlsplit("//" + endpoint.partition("/")[2]).hostname or ""
 
 
 def _finish(query: Any) -> None:  # noqa: ANN401  # `drop` has no types in zenoh's stubs
@@ -327,8 +351,13 @@ class _Queryable:
 class ZenohEdge:
     """The zenoh session of a process. All handlers run on the thread of the event loop that opened it."""
 
-    def __init__(self, clock: Clock, *, site: str, role: Role, name: str) -> None:
+    def __init__(
+        self, clock: Clock, *, site: str, role: Role, name: str, connect: Sequence[str], credentials: Credentials
+    ) -> None:
         """Prepare a session; use `ZenohEdge.open`."""
+        self._connect = connect
+        self._credentials = credentials
+        self._config()  # raises now, not whenever a router is up
         self._clock = clock
         self._site = site
         self._client_name = f"{role}/{name}"
@@ -353,16 +382,18 @@ class ZenohEdge:
         role: Role,
         id: str,  # noqa: A002  # as in the channel `live`
         site: str,
+        credentials: Credentials = NOBODY,
     ) -> AsyncIterator["ZenohEdge"]:
         """Open a session as a client of one of the routers `connect`; while none is reachable it keeps trying.
 
-        `role` and `id` identify the process in logs; `site` is filled into every key.
+        `role` and `id` identify the process in logs; `site` is filled into every key. Raises
+        `CredentialsError` if an endpoint would reveal the password in the `credentials`.
         """
-        edge = cls(clock, site=site, role=role, name=id)
+        edge = cls(clock, site=site, role=role, name=id, connect=connect, credentials=credentials)
         connecting: asyncio.Task[None] | None = None
         try:
-            if not await edge._try_connect(connect):
-                connecting = asyncio.create_task(edge._connect_when_possible(connect), name="zenoh connect")
+            if not await edge._try_connect():
+                connecting = asyncio.create_task(edge._connect_when_possible(), name="zenoh connect")
             yield edge
         finally:
             if connecting is not None:
@@ -523,13 +554,18 @@ class ZenohEdge:
             # zenoh undeclares what is no longer referenced.
             self._declared.append(declare(self._session))
 
-    async def _try_connect(self, connect: Sequence[str]) -> bool:
+    def _config(self) -> zenoh.Config:
+        return session_config("client", connect=self._connect, credentials=self._credentials)
+
+    async def _try_connect(self) -> bool:
         try:
-            session = await asyncio.to_thread(zenoh.open, session_config("client", connect=connect))
+            session = await asyncio.to_thread(zenoh.open, self._config())
         except zenoh.ZError as error:
+            # zenoh does not say whether nobody listens, or refuses these credentials, or is not to be trusted.
             self._limited.warning(
-                "router_unreachable", "router_unreachable", self._clock.now(), connect=list(connect), reason=str(error)
-            )
+                "router_unreachable", "router_unreachable", self._clock.now(), connect=list(self._connect),
+                reason=str(error), credentials=self._credentials.origin,
+            )  # fmt: skip
             return False
         self._session = session
         metrics.CONNECTED.labels("zenoh").set_function(lambda: float(self.connected))
@@ -537,13 +573,13 @@ class ZenohEdge:
         pending, self._undeclared = self._undeclared, []
         for declare in pending:
             self._declared.append(declare(session))
-        _log.info("router_connected", client=self._client_name, connect=list(connect), zid=str(session.zid()))
+        _log.info("router_connected", client=self._client_name, connect=list(self._connect), zid=str(session.zid()))
         return True
 
-    async def _connect_when_possible(self, connect: Sequence[str]) -> None:
+    async def _connect_when_possible(self) -> None:
         while True:
             await asyncio.sleep(random.uniform(*_RETRY_S))  # noqa: S311  # spreads attempts in time, no secret
-            if await self._try_connect(connect):
+            if await self._try_connect():
                 return
 
     async def _close(self) -> None:

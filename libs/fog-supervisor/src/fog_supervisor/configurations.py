@@ -25,8 +25,7 @@ _MOSQUITTO: Final = f"""\
 # The broker of the sensor nodes. The aggregator publishes all retained messages again after each reconnect, so a lost
 # database does no harm.
 listener {{listener}}
-allow_anonymous true
-persistence true
+{{doors}}persistence true
 persistence_location {{data}}/
 autosave_interval 30
 # Larger than any message of the contracts, small enough not to exhaust the memory.
@@ -39,13 +38,19 @@ log_type warning
 log_type notice
 connection_messages false
 """
+_MOSQUITTO_LOCKED: Final = """\
+certfile {locks}/server.pem
+keyfile {locks}/server.key
+allow_anonymous false
+password_file {locks}/users
+acl_file {locks}/access
+"""
 _REDIS: Final = f"""\
 {_NOTE}
 # Stores zones, areas, missions and the audit log. With `always` no acknowledged write was lost over hundreds of kills,
 # with `everysec` some were.
 bind {{bind}}
-port {{port}}
-protected-mode no
+{{doors}}protected-mode no
 appendonly yes
 appendfsync always
 save ""
@@ -54,26 +59,46 @@ maxmemory-policy noeviction
 """
 
 
-def mosquitto(listener: str, data: str, *, extra: Sequence[str] = ()) -> str:
+_REDIS_LOCKED: Final = """\
+port 0
+tls-port {port}
+tls-cert-file {locks}/server.pem
+tls-key-file {locks}/server.key
+tls-auth-clients no
+aclfile {locks}/users
+"""
+
+
+def mosquitto(listener: str, data: str, *, locks: str | None = None, extra: Sequence[str] = ()) -> str:
     """Return a `mosquitto.conf`.
 
-    `listener` is a port, or a port and an address; `data` the folder of the broker's database; the `extra` lines are
-    appended.
+    `listener` is a port, or a port and an address; `data` the folder of the broker's database; `locks` that with its
+    certificate, users and access list (`fog_runtime.locks`), without which it admits everybody, unencrypted; the
+    `extra` lines are appended.
     """
-    return _MOSQUITTO.format(listener=listener, data=data) + "".join(f"{line}\n" for line in extra)
+    doors = "allow_anonymous true\n" if locks is None else _MOSQUITTO_LOCKED.format(locks=locks)
+    return _MOSQUITTO.format(listener=listener, data=data, doors=doors) + "".join(f"{line}\n" for line in extra)
 
 
-def redis(bind: str, data: str, *, port: int = REDIS_PORT) -> str:
+def redis(bind: str, data: str, *, port: int = REDIS_PORT, locks: str | None = None) -> str:
     """Return a `redis.conf` of a server whose acknowledged writes survive a crash.
 
-    `bind` is the address on which it listens, `data` the folder of its append-only file.
+    `bind` is the address on which it listens, `data` the folder of its append-only file; `locks` as for `mosquitto`.
     """
-    return _REDIS.format(bind=bind, port=port, data=data)
+    doors = f"port {port}\n" if locks is None else _REDIS_LOCKED.format(port=port, locks=locks)
+    return _REDIS.format(bind=bind, data=data, doors=doors)
 
 
-def router_arguments(endpoint: str) -> list[str]:
-    """Return the arguments with which `python -m fog_runtime.router` listens on a zenoh endpoint."""
-    return ["--listen", endpoint]
+def router_arguments(endpoint: str, *, locks: str | None = None) -> list[str]:
+    """Return the arguments with which `python -m fog_runtime.router` listens on a zenoh endpoint.
+
+    `locks` as for `mosquitto`.
+    """
+    files = {"certificate": "server.pem", "key": "server.key", "users": "users", "access": "access.json5"}
+    options = (
+        [] if locks is None else [text for name, file in files.items() for text in (f"--{name}", f"{locks}/{file}")]
+    )
+    return ["--listen", endpoint, *options]
 
 
 def deployed() -> dict[str, str]:

@@ -6,6 +6,7 @@ import http.client
 import json
 import random
 import socket
+import ssl
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -68,8 +69,12 @@ def request(  # noqa: PLR0913  # the parts of a request
     token: str | None = None,
     headers: Mapping[str, str] | None = None,
     host: str = LOOPBACK,
+    tls: ssl.SSLContext | None = None,
 ) -> Response:
-    """Send a request to a server on the loopback address or a `host`; raises `OSError` or `HTTPException`."""
+    """Send a request to a server on the loopback address or a `host`, by HTTPS with `tls`.
+
+    Raises `OSError` or `HTTPException`.
+    """
     sent_headers = {"Accept": "application/json", **(headers or {})}
     data = None
     if body is not None:
@@ -77,7 +82,10 @@ def request(  # noqa: PLR0913  # the parts of a request
         sent_headers["Content-Type"] = "application/json"
     if token is not None:
         sent_headers["Authorization"] = f"Bearer {token}"
-    connection = http.client.HTTPConnection(host, port, timeout=HTTP_TIMEOUT_S)
+    if tls is None:
+        connection = http.client.HTTPConnection(host, port, timeout=HTTP_TIMEOUT_S)
+    else:
+        connection = http.client.HTTPSConnection(host, port, timeout=HTTP_TIMEOUT_S, context=tls)
     try:
         connection.request(method, path, body=data, headers=sent_headers)
         response = connection.getresponse()
@@ -108,10 +116,24 @@ async def readiness(port_file: Path) -> str | None:
     return response.reason
 
 
-async def server_problem(port: int, probe: bytes = b"", expected: bytes = b"") -> str | None:
-    """Return None when a server accepts connections on the port and answers `probe` as expected, else what is wrong."""
+def unverified() -> ssl.SSLContext:
+    """Return what a connection needs whose server need not prove its name: one to this computer, without secrets."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname = False
+    context.verify_mode = ssl.CERT_NONE
+    return context
+
+
+async def server_problem(
+    port: int, probe: bytes = b"", expected: bytes = b"", *, encrypted: bool = False
+) -> str | None:
+    """Return None when a server accepts connections on the port and answers `probe` as expected, else what is wrong.
+
+    `encrypted`: by TLS.
+    """
     try:
-        reader, writer = await asyncio.wait_for(asyncio.open_connection(LOOPBACK, port), HTTP_TIMEOUT_S)
+        opened = asyncio.open_connection(LOOPBACK, port, ssl=unverified() if encrypted else None)
+        reader, writer = await asyncio.wait_for(opened, HTTP_TIMEOUT_S)
     except (OSError, TimeoutError) as error:
         return f"no server listens on port {port}: {error}"
     try:

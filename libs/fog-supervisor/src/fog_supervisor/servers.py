@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import IO, Final, Self
 
 from fog_supervisor import configurations
-from fog_supervisor.net import LOOPBACK, free_port
+from fog_supervisor.net import LOOPBACK, free_port, unverified
 
 _READY_S: Final = 60.0
 """Long, because a server that can't start ends at once, and a busy machine may be ten times slower."""
@@ -48,6 +48,8 @@ class ServerProgram:
     command: tuple[str, ...]
     probe: bytes = b""
     reply: bytes = b""
+    encrypted: bool = False
+    """Whether the probe is sent, and the reply comes, by TLS."""
 
     def ready(self) -> bool:
         """Whether it accepts connections and sends the expected reply."""
@@ -55,10 +57,16 @@ class ServerProgram:
             with socket.create_connection((LOOPBACK, self.port), timeout=0.5) as connection:
                 if not self.probe:
                     return True
-                connection.sendall(self.probe)
-                return connection.recv(64).startswith(self.reply)
+                if not self.encrypted:
+                    return self._replies(connection)
+                with unverified().wrap_socket(connection) as encrypted:
+                    return self._replies(encrypted)
         except OSError:
             return False
+
+    def _replies(self, connection: socket.socket) -> bool:
+        connection.sendall(self.probe)
+        return connection.recv(64).startswith(self.reply)
 
 
 def _installed(name: str, package: str) -> str:
@@ -68,41 +76,55 @@ def _installed(name: str, package: str) -> str:
     return str(path)
 
 
-def mosquitto_program(folder: Path, port: int, *, extra: str = "") -> ServerProgram:
-    """Return an MQTT broker for anonymous clients, configured in `folder`; `extra` is appended to its configuration.
+def mosquitto_program(folder: Path, port: int, *, locks: Path | None = None, extra: str = "") -> ServerProgram:
+    """Return an MQTT broker, configured in `folder`; `extra` is appended to its configuration.
 
+    With the folder of its `locks` (`fog_runtime.locks`) it encrypts and admits only the users there, else everybody.
     Raises `ServerError` when it is not installed.
     """
     program = _installed("mosquitto", "mosquitto")
     # As root, Mosquitto switches to another user, who may have no access to a private folder.
     lines = [*(["user root"] if os.geteuid() == 0 else []), *extra.splitlines()]
     file = folder / "mosquitto.conf"
-    file.write_text(configurations.mosquitto(f"{port} {LOOPBACK}", str(folder), extra=lines), "utf-8")
+    text = configurations.mosquitto(f"{port} {LOOPBACK}", str(folder), locks=_text(locks), extra=lines)
+    file.write_text(text, "utf-8")
+    scheme = "mqtt" if locks is None else "mqtts"
     return ServerProgram(
-        name="mosquitto", port=port, url=f"mqtt://{LOOPBACK}:{port}", command=(program, "-c", str(file))
+        name="mosquitto", port=port, url=f"{scheme}://{LOOPBACK}:{port}", command=(program, "-c", str(file))
     )
 
 
-def redis_program(folder: Path, port: int) -> ServerProgram:
-    """Return a Redis with durable writes, configured in `folder`; raises `ServerError` when it is not installed."""
+def redis_program(folder: Path, port: int, *, locks: Path | None = None) -> ServerProgram:
+    """Return a Redis with durable writes, configured in `folder`; `locks` as for `mosquitto_program`.
+
+    Raises `ServerError` when it is not installed.
+    """
     program = _installed("redis-server", "redis-server")
     file = folder / "redis.conf"
-    file.write_text(configurations.redis(LOOPBACK, str(folder), port=port), "utf-8")
+    file.write_text(configurations.redis(LOOPBACK, str(folder), port=port, locks=_text(locks)), "utf-8")
+    command = (program, str(file))
+    locked = locks is not None
     return ServerProgram(
         name="redis",
         port=port,
-        url=f"redis://{LOOPBACK}:{port}/0",
-        command=(program, str(file)),
+        url=f"{'rediss' if locked else 'redis'}://{LOOPBACK}:{port}/0",
+        command=command,
         probe=b"PING\r\n",
-        reply=b"+PONG",
+        reply=b"-NOAUTH" if locked else b"+PONG",
+        encrypted=locked,
     )
 
 
-def router_program(port: int) -> ServerProgram:
-    """Return a zenoh router."""
-    endpoint = f"tcp/{LOOPBACK}:{port}"
-    command = (sys.executable, "-m", "fog_runtime.router", *configurations.router_arguments(endpoint))
+def router_program(port: int, *, locks: Path | None = None) -> ServerProgram:
+    """Return a zenoh router; `locks` as for `mosquitto_program`."""
+    endpoint = f"{'tcp' if locks is None else 'tls'}/{LOOPBACK}:{port}"
+    arguments = configurations.router_arguments(endpoint, locks=_text(locks))
+    command = (sys.executable, "-m", "fog_runtime.router", *arguments)
     return ServerProgram(name="zenoh-router", port=port, url=endpoint, command=command)
+
+
+def _text(path: Path | None) -> str | None:
+    return None if path is None else str(path)
 
 
 class Server:
@@ -221,16 +243,16 @@ def _start(folder: Path, port: int, program: Callable[[Path, int], ServerProgram
     return Server(program(folder, free_port(taken)), folder)
 
 
-def start_mosquitto(folder: Path, port: int = 0, *, extra: str = "") -> Server:
-    """Start an MQTT broker for anonymous clients; `extra` is appended to its configuration. Port 0: any free port."""
-    return _start(folder, port, lambda folder, port: mosquitto_program(folder, port, extra=extra))
+def start_mosquitto(folder: Path, port: int = 0, *, locks: Path | None = None, extra: str = "") -> Server:
+    """Start an MQTT broker; `locks` and `extra` as for `mosquitto_program`. Port 0: any free port."""
+    return _start(folder, port, lambda folder, port: mosquitto_program(folder, port, locks=locks, extra=extra))
 
 
-def start_redis(folder: Path, port: int = 0) -> Server:
-    """Start a Redis whose acknowledged writes survive a crash. Port 0: any free port."""
-    return _start(folder, port, redis_program)
+def start_redis(folder: Path, port: int = 0, *, locks: Path | None = None) -> Server:
+    """Start a Redis whose acknowledged writes survive a crash; `locks` as above. Port 0: any free port."""
+    return _start(folder, port, lambda folder, port: redis_program(folder, port, locks=locks))
 
 
-def start_router(folder: Path, port: int = 0) -> Server:
-    """Start a zenoh router (`python -m fog_runtime.router`). Port 0: any free port."""
-    return _start(folder, port, lambda _, port: router_program(port))
+def start_router(folder: Path, port: int = 0, *, locks: Path | None = None) -> Server:
+    """Start a zenoh router (`python -m fog_runtime.router`); `locks` as above. Port 0: any free port."""
+    return _start(folder, port, lambda _, port: router_program(port, locks=locks))

@@ -40,14 +40,16 @@ async def main() -> None:
     clock = SystemClock(settings.speed)
     health = Health("store", "mqtt")
     tokens = load_tokens(settings.tokens_file)
+    own = settings.credentials()
     front = Front.fork(
         lambda: make_api(unused(), loaded.map.geometry, clock, health, tokens),
-        settings.http_host,
-        settings.http_port,
-    )
+        settings.http_host, settings.http_port, settings.http_certificate(),
+    )  # fmt: skip
     async with (
-        Store(settings.redis_url, site, service="hazard-aggregator", data_dir=settings.data_dir) as store,
-        LeaseStore(settings.redis_url, site, "hazard-aggregator") as keeper,
+        Store(
+            settings.redis_url, site, service="hazard-aggregator", data_dir=settings.data_dir, credentials=own
+        ) as store,
+        LeaseStore(settings.redis_url, site, "hazard-aggregator", credentials=own) as keeper,
     ):
         stored, loaded_from_store = await load_at_start(store)
         nodes = {node.id: node for node in loaded.site.nodes}
@@ -58,9 +60,9 @@ async def main() -> None:
             definitions.values(), loaded.site.nodes, 0, stored.hazards,
             registry=find_rule, default_rule=settings.debounce,
         )  # fmt: skip
-        mqtt = MqttEdge(settings.mqtt_url, process_id("hazard-aggregator"), clock, site=site)
+        mqtt = MqttEdge(settings.mqtt_url, process_id("hazard-aggregator"), clock, site=site, credentials=own)
         async with ZenohEdge.open(
-            connect=settings.zenoh_endpoints, clock=clock, role="hazard-aggregator", id=site, site=site
+            connect=settings.zenoh_endpoints, clock=clock, role="hazard-aggregator", id=site, site=site, credentials=own
         ) as zenoh:
             leadership = Leadership(
                 "hazard-aggregator", keeper, zenoh, health, connected=lambda: zenoh.connected or mqtt.connected

@@ -37,12 +37,14 @@ async def main() -> None:
     health = Health("store", "zones", "mqtt", "map")
     metrics.watch_disk(settings.data_dir)
     tokens = load_tokens(settings.tokens_file)
+    own = settings.credentials()
     front = Front.fork(
-        lambda: make_api(unused(), loaded.site, clock, health, tokens), settings.http_host, settings.http_port
-    )
+        lambda: make_api(unused(), loaded.site, clock, health, tokens),
+        settings.http_host, settings.http_port, settings.http_certificate(),
+    )  # fmt: skip
     async with (
-        Store(settings.redis_url, site, service="map-service", data_dir=settings.data_dir) as store,
-        LeaseStore(settings.redis_url, site, "map-service") as keeper,
+        Store(settings.redis_url, site, service="map-service", data_dir=settings.data_dir, credentials=own) as store,
+        LeaseStore(settings.redis_url, site, "map-service", credentials=own) as keeper,
     ):
         core = MapCore(
             site,
@@ -52,9 +54,9 @@ async def main() -> None:
             definitions=loaded.site.definitions(),
             hazards_wait_s=settings.hazards_wait_s,
         )
-        mqtt = MqttEdge(settings.mqtt_url, process_id("map-service"), clock, site=site)
+        mqtt = MqttEdge(settings.mqtt_url, process_id("map-service"), clock, site=site, credentials=own)
         async with ZenohEdge.open(
-            connect=settings.zenoh_endpoints, clock=clock, role="map-service", id=site, site=site
+            connect=settings.zenoh_endpoints, clock=clock, role="map-service", id=site, site=site, credentials=own
         ) as zenoh:
             leadership = Leadership(
                 "map-service", keeper, zenoh, health,

@@ -37,12 +37,18 @@ async def main() -> None:
     health = Health("store", "goals", "map", "zenoh")
     tokens = load_tokens(settings.tokens_file)
     key = read_key(settings.operator_key_file)
-    front = Front.fork(lambda: make_api(unused(), loaded.site, health, tokens), settings.http_host, settings.http_port)
+    own = settings.credentials()
+    front = Front.fork(
+        lambda: make_api(unused(), loaded.site, health, tokens),
+        settings.http_host, settings.http_port, settings.http_certificate(),
+    )  # fmt: skip
     config = PlannerConfig(inflation=settings.inflation, release_length=settings.release_m)
     async with (
-        Store(settings.redis_url, site, service="planner", data_dir=settings.data_dir) as store,
-        LeaseStore(settings.redis_url, site, "planner") as keeper,
-        ZenohEdge.open(connect=settings.zenoh_endpoints, clock=clock, role="planner", id=site, site=site) as zenoh,
+        Store(settings.redis_url, site, service="planner", data_dir=settings.data_dir, credentials=own) as store,
+        LeaseStore(settings.redis_url, site, "planner", credentials=own) as keeper,
+        ZenohEdge.open(
+            connect=settings.zenoh_endpoints, clock=clock, role="planner", id=site, site=site, credentials=own
+        ) as zenoh,
     ):
         core = PlannerCore(config=config)
         leadership = Leadership(

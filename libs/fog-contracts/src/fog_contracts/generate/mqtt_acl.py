@@ -6,10 +6,13 @@ Topics that no line allows are denied. A node's user name is the node's id (`%u`
 from __future__ import annotations
 
 import re
-from typing import Final, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 from fog_contracts.channels import CHANNELS, NODE, ROLES, Channel, Role
 from fog_contracts.generate import NOTE
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 Access = Literal["read", "write"]
 
@@ -23,10 +26,14 @@ _HEAD: Final = f"""\
 """
 
 
-def mqtt_acl(site: str = "+") -> str:
-    """Return the list for one site, or, without a site's id, for all sites that share the broker."""
+def mqtt_acl(site: str = "+", *, unrestricted: Sequence[str] = ()) -> str:
+    """Return the list for one site, or, without a site's id, for all sites that share the broker.
+
+    The users named in `unrestricted` may publish and receive everything.
+    """
     sections = [_HEAD]
     sections += [_section(role, site) for role in ROLES if role != NODE and _lines(role, site)]
+    sections += [f"user {user}\ntopic readwrite #\ntopic read $SYS/#\n" for user in unrestricted]
     sections.append(_nodes(site))
     return "\n".join(sections)
 

@@ -33,6 +33,18 @@ _ROLES_ONLY: Final = (
 _ROBOTS: Final = "The name is the role, for a robot its id; a robot may publish only as itself."
 
 
+_EVERYTHING: Final[dict[str, object]] = {
+    "id": "everything",
+    "permission": "allow",
+    "flows": ["ingress", "egress"],
+    "messages": [
+        "put", "delete", "declare_subscriber", "query", "declare_queryable", "reply", "liveliness_token",
+        "liveliness_query", "declare_liveliness_subscriber",
+    ],
+    "key_exprs": ["**"],
+}  # fmt: skip
+
+
 @dataclass
 class _Rights:
     """Key expressions by flow and kind of message, for one subject."""
@@ -61,8 +73,11 @@ class _Rights:
         ]
 
 
-def zenoh_acl(site: str = "*", robots: Sequence[str] = ()) -> str:
-    """Return the router's `access_control` as JSON5: for one site and its robots by id, or for all sites by role."""
+def zenoh_acl(site: str = "*", robots: Sequence[str] = (), *, unrestricted: Sequence[str] = ()) -> str:
+    """Return the router's `access_control` as JSON5: for one site and its robots by id, or for all sites by role.
+
+    The users named in `unrestricted` may do everything.
+    """
     clients: list[tuple[str, Role]] = []
     for role in ROLES:
         names = robots if role == ROBOT and robots else (role,)
@@ -70,6 +85,10 @@ def zenoh_acl(site: str = "*", robots: Sequence[str] = ()) -> str:
     rules: list[dict[str, object]] = []
     subjects: list[dict[str, object]] = []
     policies: list[dict[str, object]] = []
+    if unrestricted:
+        rules.append(_EVERYTHING)
+        subjects.append({"id": "unrestricted", "usernames": list(unrestricted)})
+        policies.append({"subjects": ["unrestricted"], "rules": [_EVERYTHING["id"]]})
     for name, role in clients:
         robot = name if role == ROBOT and robots else "*"
         client_rules = _rights(role, site, robot).rules(name)

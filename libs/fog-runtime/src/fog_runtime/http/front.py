@@ -23,6 +23,7 @@ from fog_runtime import logs, signals
 from fog_runtime.files import write_port_file
 from fog_runtime.http.link import CoreLink, FrontLink
 from fog_runtime.http.routes import answer_call
+from fog_runtime.server_certificate import ServerCertificate
 
 NICENESS: Final = 5
 """The front gets a third of the processor time of a core that wants some, too."""
@@ -51,19 +52,27 @@ class FrontError(Exception):
 class Front:
     """The front as the core's process sees it."""
 
-    def __init__(self, pid: int, link: socket.socket, host: str, port: int) -> None:
+    def __init__(self, pid: int, link: socket.socket, scheme: str, host: str, port: int) -> None:
         """Use `Front.fork`."""
         self._pid = pid
         self._link = link
+        self._scheme = scheme
         self._host = host
         self._port = port
 
     @classmethod
-    def fork(cls, make_app: Callable[[], FastAPI], host: str = "127.0.0.1", port: int = 0) -> Self:
+    def fork(
+        cls,
+        make_app: Callable[[], FastAPI],
+        host: str = "127.0.0.1",
+        port: int = 0,
+        certificate: ServerCertificate | None = None,
+    ) -> Self:
         """Fork the front, which accepts connections once `serve` runs; raises `OSError` when the port is taken.
 
-        `make_app` is called there: the handlers of its routes are never called, and need nothing behind them. Fork
-        before this process has threads and connections. The front ends with this process.
+        `make_app` is called there: the handlers of its routes are never called, and need nothing behind them. With a
+        `certificate` it speaks HTTPS. Fork before this process has threads and connections. The front ends with this
+        process.
         """
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         with socket.create_server((host, port), family=family, backlog=128) as listener:
@@ -71,8 +80,9 @@ class Front:
             with theirs:
                 pid = os.fork()
                 if pid == 0:
-                    _become_front(make_app, listener, theirs)
-            return cls(pid, ours, host, int(listener.getsockname()[1]))
+                    _become_front(make_app, listener, theirs, certificate)
+            scheme = "http" if certificate is None else "https"
+            return cls(pid, ours, scheme, host, int(listener.getsockname()[1]))
 
     async def serve(self, app: FastAPI, port_file: Path | None = None) -> None:
         """Answer what the front passes on with the routes of `app`, until cancelled.
@@ -84,7 +94,7 @@ class Front:
         answering = asyncio.ensure_future(link.answer_calls(lambda route, data: answer_call(app, route, data)))
         try:
             await link.start()
-            _log.info("listening", url=f"http://{self._host}:{self._port}", port=self._port)
+            _log.info("listening", url=f"{self._scheme}://{self._host}:{self._port}", port=self._port)
             write_port_file(port_file, self._port)
             await asyncio.shield(answering)
             raise FrontError("the process that receives requests has ended; its own log says why")
@@ -104,7 +114,12 @@ class _Server(uvicorn.Server):
         yield
 
 
-def _become_front(make_app: Callable[[], FastAPI], listener: socket.socket, link: socket.socket) -> NoReturn:
+def _become_front(
+    make_app: Callable[[], FastAPI],
+    listener: socket.socket,
+    link: socket.socket,
+    certificate: ServerCertificate | None,
+) -> NoReturn:
     """Run the front in a forked child, and end the process."""
     status = 1
     try:
@@ -114,7 +129,7 @@ def _become_front(make_app: Callable[[], FastAPI], listener: socket.socket, link
         _leave_files({listener.fileno(), link.fileno()})
         gc.freeze()  # shared with the parent until one of them writes
         os.nice(NICENESS)
-        asyncio.run(_receive(make_app(), listener, link))
+        asyncio.run(_receive(make_app(), listener, link, certificate))
         status = 0
     except Exception as error:  # noqa: BLE001  # the last place that can log why the front ends
         _log.error("front_crashed", error=error)
@@ -133,7 +148,9 @@ def _leave_files(kept: Collection[int]) -> None:
                 os.dup2(null, number)
 
 
-async def _receive(app: FastAPI, listener: socket.socket, end: socket.socket) -> None:
+async def _receive(
+    app: FastAPI, listener: socket.socket, end: socket.socket, certificate: ServerCertificate | None
+) -> None:
     """Serve, once started, until the core's process stops this or ends."""
     link = await CoreLink.over(end)
     if not await link.started():
@@ -141,7 +158,14 @@ async def _receive(app: FastAPI, listener: socket.socket, end: socket.socket) ->
     app.state.core = link
     server = _Server(
         uvicorn.Config(
-            app, log_config=None, access_log=False, lifespan="off", timeout_graceful_shutdown=2, server_header=False
+            app,
+            log_config=None,
+            access_log=False,
+            lifespan="off",
+            timeout_graceful_shutdown=2,
+            server_header=False,
+            ssl_certfile=None if certificate is None else certificate.file,
+            ssl_keyfile=None if certificate is None else certificate.key,
         )
     )
 

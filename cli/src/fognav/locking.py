@@ -1,0 +1,72 @@
+"""The locks of a site's servers as the commands use them: their folder, and their errors in a user's words."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+
+from fog_runtime.credentials import VARIABLE as CREDENTIALS_VARIABLE
+from fog_runtime.credentials import Credentials, CredentialsError
+from fognav.output import FailedError, WrongUseError
+
+if TYPE_CHECKING:
+    from fog_runtime.locks.site_locks import SiteLocks
+
+VARIABLE: Final = "FOGNAV_LOCKS_DIR"
+LocksOption = Annotated[
+    Path | None,
+    typer.Option("--locks", metavar="DIR", help=f"Folder of the site's certificates and users; default: {VARIABLE}."),
+]
+
+
+def locks_folder(given: Path | None) -> Path | None:
+    """Return the folder that an option or the environment names, or None."""
+    named = os.environ.get(VARIABLE)
+    return given or (Path(named) if named else None)
+
+
+def named_folder(given: Path | None) -> Path:
+    """Return the folder that an option or the environment names; raises `WrongUseError` without one."""
+    folder = locks_folder(given)
+    if folder is None:
+        raise WrongUseError(f"name the folder of the site's locks with --locks or {VARIABLE}")
+    return folder
+
+
+def open_locks(given: Path | None) -> "SiteLocks":
+    """Open the locks in the folder that an option or the environment names.
+
+    Raises `WrongUseError` without one, and `LocksError`.
+    """
+    from fog_runtime.locks.site_locks import SiteLocks  # noqa: PLC0415  # keeps the other commands fast
+
+    return SiteLocks.open(named_folder(given))
+
+
+def own_credentials(default: str | None = None) -> Credentials:
+    """Return the credentials that the environment names, or those in the `default` file, or nobody's.
+
+    Raises `WrongUseError` for a file that can't be used.
+    """
+    file = os.environ.get(CREDENTIALS_VARIABLE) or default
+    try:
+        return Credentials.read(Path(file) if file else None)
+    except CredentialsError as error:
+        raise WrongUseError(str(error)) from error
+
+
+@contextmanager
+def locks_errors() -> Iterator[None]:
+    """Turn errors of locks into those of commands."""
+    from fog_runtime.locks.authority import AuthorityError  # noqa: PLC0415  # keeps the other commands fast
+    from fog_runtime.locks.site_locks import LocksError  # noqa: PLC0415  # same
+
+    try:
+        yield
+    except (AuthorityError, LocksError) as error:
+        raise FailedError(str(error)) from error
+    except OSError as error:
+        raise FailedError(f"{error.filename} can't be used: {error.strerror}. Run this as its owner") from error

@@ -1,0 +1,116 @@
+"""Certificates, users and credentials by commands: a file for each, and what can't work is refused with the reason."""
+
+import datetime as dt
+import json
+import shutil
+import stat
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from fog_runtime.credentials import Credentials
+from fog_runtime.locks.site_locks import SiteLocks
+from fog_runtime.token_file import create_token
+from fognav import doctor
+from fognav.__main__ import app
+from fognav.locking import VARIABLE
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture
+def locks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SiteLocks:
+    monkeypatch.setenv(VARIABLE, str(tmp_path / "locks"))
+    done = run("ca", "create", "--site", "estig", "--host", "fog.local", "--host", "127.0.0.1", "--json")
+    assert set(done["credentials"]) >= {"map-service", "planner", "hazard-aggregator", "console", "r1", "n1"}
+    return SiteLocks.open(tmp_path / "locks")
+
+
+def invoke(*words: str):
+    return CliRunner().invoke(app, words)
+
+
+def run(*words: str) -> dict:
+    done = invoke(*words)
+    assert done.exit_code == 0, done.output
+    return json.loads(done.stdout)
+
+
+def test_authority_is_shown_rotated_and_finished_by_commands(locks: SiteLocks) -> None:
+    assert run("ca", "show", "--json")["rotating"] is False
+    before = Credentials.read(locks.credentials("r1")).authority
+    assert run("ca", "rotate", "--json")["rotating"] is True
+    overlap = Credentials.read(locks.credentials("r1")).authority
+    assert before.strip() in overlap
+    assert "not finished" in invoke("ca", "rotate").output.replace("\n", " ")
+    assert run("ca", "rotate", "--finish", "--json")["rotating"] is False
+    assert before.strip() not in Credentials.read(locks.credentials("r1")).authority
+    assert "nothing to finish" in invoke("ca", "rotate", "--finish").output.replace("\n", " ")
+
+
+def test_certificates_that_expire_soon_are_named_by_show_and_doctor(locks: SiteLocks) -> None:
+    check = doctor.check_certificates()
+    assert check is not None
+    assert check.state == "ok"
+    soon = locks.authority.issue("redis", ["fog"], now=dt.datetime.now(dt.UTC), days=5)
+    (locks.folder("redis") / "server.pem").write_bytes(soon.chain)
+    shown = invoke("ca", "show", "--json")
+    assert shown.exit_code == 1
+    assert json.loads(shown.stdout)["expiring"] == ["redis"]
+    check = doctor.check_certificates()
+    assert check is not None
+    assert (check.state, check.remedy) == ("optional", "fognav ca issue")
+    run("ca", "issue", "--json")
+    assert run("ca", "show", "--json")["expiring"] == []
+
+
+def test_doctor_names_locks_that_can_not_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(VARIABLE, raising=False)
+    assert doctor.check_certificates() is None
+    monkeypatch.setenv(VARIABLE, str(tmp_path / "nowhere"))
+    check = doctor.check_certificates()
+    assert check is not None
+    assert check.state == "missing"
+    assert "fognav ca create" in check.found
+
+
+def test_added_robot_gets_one_file_and_a_removed_one_is_unknown(locks: SiteLocks) -> None:
+    file = Path(run("robot", "add", "r9", "--json")["credentials"])
+    assert Credentials.read(file).user == "r9"
+    assert set(Credentials.read(file).passwords) == {"zenoh"}
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+    assert "r9" in locks.users()
+    run("robot", "add", "r9", "--remove", "--json")
+    assert "r9" not in locks.users()
+    for words, reason in (
+        (("r9", "--remove"), "there is no robot r9"), (("R 9",), "an id has only"), (("planner",), "name of a part"),
+    ):  # fmt: skip
+        done = invoke("robot", "add", *words)
+        assert done.exit_code != 0
+        assert reason in done.output.replace("\n", " ")
+
+
+def test_added_node_s_board_gets_the_password_and_the_authority(locks: SiteLocks, tmp_path: Path) -> None:
+    floor = Path(shutil.copytree(ROOT / "sites" / "estig", tmp_path / "floor"))
+    words = ("--area", "z4", "--pose", "33.20,38.15,1.5708", "--wifi", "Lab", "--site", str(floor))
+    run("node", "add", "n8", *words, "--out", str(tmp_path / "board"), "--json")
+    board = json.loads((tmp_path / "board" / "node.json").read_text())
+    assert (board["user"], board["tls"]) == ("n8", True)
+    assert (tmp_path / "board" / "ca.pem").read_text().strip() == locks.authority.trusted.strip()
+    assert "n8" in locks.users()
+    assert not locks.credentials("n8").exists()
+
+
+def test_token_is_handed_out_as_one_file_with_the_authority(locks: SiteLocks, tmp_path: Path) -> None:
+    tokens = tmp_path / "tokens.toml"
+    tokens.write_text("")
+    create_token(tokens, "first", "admin")
+    out = tmp_path / "anna.toml"
+    run("token", "create", "anna", "--role", "operator", "--file", str(tokens), "--out", str(out), "--json")
+    credentials = Credentials.read(out)
+    assert (credentials.user, len(credentials.token) > 30, credentials.passwords) == ("anna", True, {})
+    assert credentials.authority.strip() == locks.authority.trusted.strip()
+    assert credentials.token not in tokens.read_text()
+    again = invoke("token", "create", "bob", "--file", str(tokens), "--out", str(out))
+    assert "already exists" in again.output.replace("\n", " ")

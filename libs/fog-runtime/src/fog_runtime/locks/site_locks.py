@@ -1,0 +1,251 @@
+"""The locks of a site in one folder: an authority, a certificate and lists for each server, credentials for each user.
+
+    locks.json                                    for which site and hosts they were made
+    authority.pem                                 stays on the fog node, and is read by nothing that runs
+    mosquitto/  server.pem server.key passwords access
+    redis/      server.pem server.key users
+    zenoh/      server.pem server.key users access.json5
+    http/       server.pem server.key             of the REST APIs and the gateway
+    credentials/NAME.toml                         one file for each user (`fog_runtime.credentials`)
+
+Each server reads its own folder, each service its own credentials, so that none has another's secrets. Whoever adds a
+user hands out its file; here it may be removed then.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+import stat
+from typing import TYPE_CHECKING, Final, Self
+
+import msgspec
+
+from fog_contracts.channels import ROLES
+from fog_contracts.generate.mqtt_acl import mqtt_acl
+from fog_contracts.generate.zenoh_acl import zenoh_acl
+from fog_runtime.credentials import Credentials, Server, to_toml
+from fog_runtime.files import PRIVATE, atomic_write
+from fog_runtime.locks import users
+from fog_runtime.locks.authority import SERVER_DAYS, Authority, expiry
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+_PLAN: Final = "locks.json"
+AUTHORITY: Final = "authority.pem"
+CREDENTIALS: Final = "credentials"
+PROGRAMS: Final = ("mosquitto", "redis", "zenoh", "http")
+"""The folders of what has a certificate."""
+CERTIFICATE, KEY, USERS, ACCESS = "server.pem", "server.key", "users", "access"
+REDIS_ADMINISTRATOR: Final = "administrator"
+_RENEW_BEFORE: Final = dt.timedelta(days=SERVER_DAYS // 3)
+_PROGRAM_OF: Final[Mapping[Server, str]] = {"mqtt": "mosquitto", "zenoh": "zenoh", "redis": "redis"}
+
+
+class _Plan(msgspec.Struct, frozen=True):
+    site: str
+    hosts: list[str] = []
+    unrestricted: list[str] = []
+    mode: int = PRIVATE
+
+
+class LocksError(ValueError):
+    """Locks can't be made or changed so; the message names the file and the remedy."""
+
+
+class SiteLocks:
+    """The locks in a folder. Its methods may be repeated: what is there already stays."""
+
+    def __init__(self, folder: Path, site: str, *, unrestricted: Sequence[str] = (), mode: int = PRIVATE) -> None:
+        """Take a folder, which `make` fills; `mode` are the permissions of what the servers read.
+
+        The users named in `unrestricted` may do everything on broker and router (replaying, tests).
+        """
+        self._folder = folder
+        self._plan = _Plan(site=site, unrestricted=list(unrestricted), mode=mode)
+
+    @classmethod
+    def open(cls, folder: Path) -> Self:
+        """Open the locks that `make` has made in a folder; raises `LocksError`."""
+        try:
+            opened = cls(folder, "")
+            opened._plan = _read_plan(folder)
+        except OSError as error:
+            raise LocksError(
+                f"{folder} has no locks of a site ({error.strerror}). Create them (fognav ca create --locks {folder})"
+            ) from error
+        except msgspec.DecodeError as error:
+            raise LocksError(f"{folder / _PLAN}: {error}. Restore it from a backup") from error
+        return opened
+
+    def make(self, hosts: Sequence[str], *, robots: Sequence[str] = (), nodes: Sequence[str] = ()) -> None:
+        """Create what is missing: the authority, servers' certificates, the services' and tools' users, these robots'.
+
+        `hosts` are the names and addresses by which clients reach the servers. Certificates that expire soon, or name
+        other hosts, are renewed. Raises `LocksError` or `AuthorityError`.
+        """
+        known_hosts = _read_plan(self._folder).hosts if (self._folder / _PLAN).exists() else []
+        self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if not (self._folder / AUTHORITY).exists():
+            Authority.create(self._folder / AUTHORITY, f"Fognav {self._plan.site}", now=_now())
+        self.renew(hosts, only_due=set(hosts) <= set(known_hosts))
+        own: dict[str, Sequence[Server]] = {**users.SERVICES, **users.TOOLS, REDIS_ADMINISTRATOR: ("redis",)}
+        own |= dict.fromkeys(self._plan.unrestricted, ("mqtt", "zenoh"))
+        missing = {user: servers for user, servers in own.items() if not self.credentials(user).exists()}
+        # The credentials of robots and nodes need not stay here.
+        handed_out: dict[str, Sequence[Server]] = dict.fromkeys(robots, ("zenoh",))
+        handed_out |= dict.fromkeys(nodes, ("mqtt",))
+        known = self.users()
+        self._set_users(missing | {user: servers for user, servers in handed_out.items() if user not in known})
+        self._write_access()
+
+    @property
+    def directory(self) -> Path:
+        """The folder."""
+        return self._folder
+
+    def users(self) -> set[str]:
+        """Return everybody whom a server admits."""
+        return {_user(line) for program in _PROGRAM_OF.values() for line in self._lines(program)} - {"default"}
+
+    def credentials(self, user: str) -> Path:
+        """Return the file of a user's credentials."""
+        return self._folder / CREDENTIALS / f"{user}.toml"
+
+    def folder(self, program: str) -> Path:
+        """Return the folder of one of `PROGRAMS`."""
+        return self._folder / program
+
+    @property
+    def authority(self) -> Authority:
+        """The certificate authority; raises `AuthorityError`."""
+        return Authority.open(self._folder / AUTHORITY)
+
+    def add_robot(self, robot: str) -> Path:
+        """Let a robot in, or give it a new password; return its credentials. Raises `LocksError`."""
+        return self._add(robot, ("zenoh",))
+
+    def add_node(self, node: str) -> Path:
+        """Let a sensor node in, or give it a new password; return its credentials. Raises `LocksError`."""
+        return self._add(node, ("mqtt",))
+
+    def remove(self, user: str) -> bool:
+        """Refuse a user from now on, once the servers have read their lists again; return whether there was one."""
+        found = False
+        for program in _PROGRAM_OF.values():
+            kept = [line for line in self._lines(program) if _user(line) != user]
+            found |= len(kept) < len(self._lines(program))
+            self._write(program, USERS, "".join(f"{line}\n" for line in kept))
+        self.credentials(user).unlink(missing_ok=True)
+        self._write_access()
+        return found
+
+    def renew(self, hosts: Sequence[str] | None = None, *, only_due: bool) -> list[str]:
+        """Issue new certificates for the servers, all or those that expire soon; return whose.
+
+        `hosts`: those of before, if none are given. Raises `AuthorityError`.
+        """
+        authority, renewed = self.authority, []
+        hosts = self._plan.hosts if hosts is None else hosts
+        for program in PROGRAMS:
+            file = self.folder(program) / CERTIFICATE
+            if only_due and file.exists() and expiry(file) - _now() > _RENEW_BEFORE:
+                continue
+            issued = authority.issue(program, hosts, now=_now())
+            self._write(program, KEY, issued.key.decode())
+            self._write(program, CERTIFICATE, issued.chain.decode())
+            renewed.append(program)
+        self._plan = msgspec.structs.replace(self._plan, hosts=list(hosts))
+        atomic_write(self._folder / _PLAN, msgspec.json.format(msgspec.json.encode(self._plan)), mode=PRIVATE)
+        return renewed
+
+    def expiries(self) -> dict[str, dt.datetime]:
+        """Return when the authority and each server's certificate expire; raises `AuthorityError`."""
+        found = {"authority": self.authority.expires}
+        return found | {program: expiry(self.folder(program) / CERTIFICATE) for program in PROGRAMS}
+
+    def expiring(self) -> list[str]:
+        """Return which of `expiries` are to be renewed. Raises as `expiries`."""
+        soon = _now() + _RENEW_BEFORE
+        return [name for name, until in self.expiries().items() if until < soon]
+
+    def trust_again(self) -> list[Path]:
+        """Write into all credentials here which authorities to trust now; return the files. Raises as `make`."""
+        changed = []
+        for file in sorted((self._folder / CREDENTIALS).glob("*.toml")):
+            known = Credentials.read(file)
+            text = to_toml(
+                known.user, authority=self.authority.trusted, passwords=known.passwords, token=known.token
+            )  # fmt: skip
+            atomic_write(file, text.encode(), mode=stat.S_IMODE(file.stat().st_mode))
+            changed.append(file)
+        return changed
+
+    def _add(self, user: str, servers: Sequence[Server]) -> Path:
+        if user in ROLES or user in self._plan.unrestricted or user == REDIS_ADMINISTRATOR:
+            raise LocksError(f"{user} is the name of a part of Fognav: give the robot or node another id")
+        self._set_users({user: servers})
+        self._write_access()
+        return self.credentials(user)
+
+    def _set_users(self, added: Mapping[str, Sequence[Server]]) -> None:
+        """Give each of these users new passwords for these servers."""
+        trusted = self.authority.trusted
+        passwords: dict[str, dict[Server, str]] = {
+            user: {server: users.new_password() for server in servers} for user, servers in added.items()
+        }
+        for server, program in _PROGRAM_OF.items():
+            new = [self._line(server, user, own[server]) for user, own in passwords.items() if server in own]
+            kept = [line for line in self._lines(program) if _user(line) not in {_user(each) for each in new}]
+            if new:
+                self._write(program, USERS, "".join(f"{line}\n" for line in [*kept, *new]))
+        # Last: whatever is cut short before is done again by the next `make`.
+        for user, own in passwords.items():
+            self._private(CREDENTIALS, f"{user}.toml", to_toml(user, authority=trusted, passwords=own))
+
+    def _line(self, server: Server, user: str, password: str) -> str:
+        if server == "mqtt":
+            return users.mqtt_line(user, password)
+        if server == "zenoh":
+            return users.zenoh_line(user, password)
+        if user == REDIS_ADMINISTRATOR:
+            return users.redis_administrator_line(user, password)
+        return users.redis_line(user, password, self._plan.site)
+
+    def _lines(self, program: str) -> list[str]:
+        file = self.folder(program) / USERS
+        if file.exists():
+            return file.read_text("utf-8").splitlines()
+        return [users.REDIS_NOBODY] if program == "redis" else []
+
+    def _write_access(self) -> None:
+        """Write what each user may do; robots are the router's users who have no role."""
+        known = (_user(line) for line in self._lines("zenoh"))
+        robots = [user for user in known if user not in ROLES and user not in self._plan.unrestricted]
+        self._write("mosquitto", ACCESS, mqtt_acl(self._plan.site, unrestricted=self._plan.unrestricted))
+        access = zenoh_acl(self._plan.site, robots, unrestricted=self._plan.unrestricted)
+        self._write("zenoh", f"{ACCESS}.json5", access)
+
+    def _write(self, program: str, name: str, text: str) -> None:
+        file = self.folder(program) / name
+        file.parent.mkdir(mode=0o755 if self._plan.mode & 0o077 else 0o700, parents=True, exist_ok=True)
+        atomic_write(file, text.encode(), mode=self._plan.mode)
+
+    def _private(self, folder: str, name: str, text: str) -> None:
+        file = self._folder / folder / name
+        file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        atomic_write(file, text.encode(), mode=PRIVATE)
+
+
+def _read_plan(folder: Path) -> _Plan:
+    return msgspec.json.decode((folder / _PLAN).read_bytes(), type=_Plan)
+
+
+def _user(line: str) -> str:
+    """Return whose line it is, in any of the lists: `name:…`, or Redis's `user name …`."""
+    return line.split()[1] if line.startswith("user ") else line.partition(":")[0]
+
+
+def _now() -> dt.datetime:
+    return dt.datetime.now(dt.UTC)

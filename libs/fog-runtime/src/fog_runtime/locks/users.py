@@ -1,0 +1,89 @@
+"""The users of a site's servers, each in the form in which its server reads them.
+
+A password is random and long, so that the cheapest hash is enough; the router needs it as it is.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import secrets
+from typing import TYPE_CHECKING, Final
+
+from fog_runtime.credentials import SERVERS, Server
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+PASSWORD_BYTES: Final = 24
+_ITERATIONS: Final = 20_000
+"""Of MQTT's passwords, some of which people choose themselves."""
+
+SERVICES: Final[Mapping[str, Sequence[Server]]] = {
+    "hazard-aggregator": SERVERS,
+    "map-service": SERVERS,
+    "planner": ("zenoh", "redis"),
+}
+"""Which servers each service uses."""
+TOOLS: Final[Mapping[str, Sequence[Server]]] = {
+    "console": ("mqtt", "zenoh"),
+    "recorder": ("mqtt", "zenoh"),
+    "sim": ("zenoh",),
+}
+"""The same for the tools of the fog node's administrator, and for a simulated world."""
+_OWN_TABLES: Final[Mapping[str, Sequence[str]]] = {
+    "hazard-aggregator": ("areas", "hazards", "overrides", "override_rests"),
+    "map-service": ("zones", "zone_times"),
+    "planner": ("goals",),
+}
+_AUDITED: Final[Mapping[str, Sequence[str]]] = {
+    "hazard-aggregator": ("area", "override", "store"),
+    "map-service": ("zone", "store"),
+    "planner": ("mission", "robot", "store"),
+}
+_BOOKKEEPING: Final = ("probe", "generation", "writes", "floors", "no-attempt", "idempotency:*")
+"""Keys that every service of a site writes: by which they notice that Redis lost something."""
+_COMMANDS: Final = (
+    "+get +set +setrange +del +hget +hset +hdel +hgetall +hlen +hincrby +xadd +xrevrange +pttl +eval +multi +exec +wait"
+    " +ping +config|get +client|setname +client|id +hello +auth +select"
+)
+
+
+def new_password() -> str:
+    """Return a password that nobody has to type: 192 bits."""
+    return secrets.token_urlsafe(PASSWORD_BYTES)
+
+
+def mqtt_line(user: str, password: str) -> str:
+    """Return a line of Mosquitto's password file: `$7$`, PBKDF2 with SHA-512 (mosquitto_passwd(1))."""
+    salt = secrets.token_bytes(12)
+    key = hashlib.pbkdf2_hmac("sha512", password.encode(), salt, _ITERATIONS)
+    return f"{user}:$7${_ITERATIONS}${base64.b64encode(salt).decode()}${base64.b64encode(key).decode()}"
+
+
+def zenoh_line(user: str, password: str) -> str:
+    """Return a line of the router's dictionary of users."""
+    return f"{user}:{password}"
+
+
+def redis_line(user: str, password: str, site: str) -> str:
+    """Return a line of Redis's `aclfile` for a service: its own tables, the audit trail of what it may do, its lease.
+
+    It may read the whole audit trail. Raises `KeyError` for a user that is no service.
+    """
+    own = [*_OWN_TABLES[user], *_BOOKKEEPING, *(f"audit:{kind}" for kind in _AUDITED[user]), f"{user}:*"]
+    keys = " ".join([*(f"~fog:{site}:{name}" for name in own), f"%R~fog:{site}:audit:*"])
+    return f"user {user} on {_redis_secret(password)} resetchannels -@all {_COMMANDS} {keys}"
+
+
+def redis_administrator_line(user: str, password: str) -> str:
+    """Return a line of Redis's `aclfile` for somebody who may do everything, such as a backup."""
+    return f"user {user} on {_redis_secret(password)} ~* &* +@all"
+
+
+REDIS_NOBODY: Final = "user default off"
+"""The line that refuses who gives no name."""
+
+
+def _redis_secret(password: str) -> str:
+    return "#" + hashlib.sha256(password.encode()).hexdigest()

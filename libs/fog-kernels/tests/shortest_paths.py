@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from hypothesis import strategies as st
 
-from fog_kernels.astar import DIAGONAL, STRAIGHT
+from fog_kernels.steps import DIAGONAL, STRAIGHT
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

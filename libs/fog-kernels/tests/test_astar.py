@@ -16,16 +16,10 @@ from hypothesis import strategies as st
 from shortest_paths import Cell, cell_of, costmaps, dijkstra
 
 from fog_contracts.costs import DEFAULT_INFLATION
-from fog_kernels.astar import (
-    DIAGONAL,
-    STRAIGHT,
-    Planner,
-    line_cost,
-    nearest_traversable,
-    polyline_cost,
-    shortcut,
-)
+from fog_kernels.astar import Planner, nearest_traversable
 from fog_kernels.inflation import inflate, inflation_table
+from fog_kernels.lines import line_cost, polyline_cost, shortcut
+from fog_kernels.steps import DIAGONAL, STRAIGHT
 from fog_kernels.tiles import TilePatterns
 
 if TYPE_CHECKING:

@@ -12,8 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shortest_paths import cell_of, costmaps, dijkstra
 
-from fog_kernels.astar import STRAIGHT, Planner
+from fog_kernels.astar import Planner
 from fog_kernels.detour import Shadow
+from fog_kernels.steps import STRAIGHT
 from fog_kernels.tiles import TilePatterns
 
 if TYPE_CHECKING:
@@ -58,6 +59,27 @@ def test_searches_guided_by_field_and_detour_equal_full_searches(bound: NDArray[
             if expected is not None and offset is not None:
                 assert min(int(detour.costs[start[1], start[0]]), detour.highest) + offset <= expected
                 assert detour.covers(start)
+
+
+@settings(max_examples=examples(60), deadline=None)
+@given(costmaps(), st.data())
+def test_what_earlier_searches_left_in_memory_changes_nothing(bound: NDArray[np.uint8], data: st.DataObject) -> None:
+    height, width = bound.shape
+    goal, starts = cell_of(data, bound), [cell_of(data, bound) for _ in range(3)]
+    closed = raise_somewhere(raise_somewhere(bound, data), data)
+    found = []
+    for left in (0, 7, -5, (1 << 30) + 3):
+        planner, patterns = Planner(width, height), TilePatterns(10**6)
+        reference = planner.goal_field(bound, goal, patterns)
+        for memory in planner.scratch:
+            memory.fill(left)
+        shadow = Shadow(closed, bound, reference, starts, planner)
+        inside = [(x, y) for y in range(height) for x in range(width) if shadow.contains((x, y))]
+        levels = np.maximum(reference.costs(shadow.border), 0)
+        detour = shadow.detour(levels)
+        assert inside == [(x, y) for y in range(height) for x in range(width) if shadow.contains((x, y))]
+        found.append((inside, shadow.border.tolist(), None if detour is None else detour.costs.tolist()))
+    assert all(other == found[0] for other in found)
 
 
 def test_closed_corridor_is_its_own_shadow_and_is_left_by_its_ends_only() -> None:

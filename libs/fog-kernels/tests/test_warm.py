@@ -19,7 +19,7 @@ from fog_contracts.costs import DEFAULT_INFLATION
 from fog_kernels import warm
 warm.warm()
 from fog_kernels import amcl, astar, body, clearance, components, distance, dwa, dwa_settings, inflation, likelihood
-from fog_kernels import raycast, tiles
+from fog_kernels import lines, raycast, tiles
 raw = np.zeros((60, 60), np.uint8)
 raw[0] = 254
 shut = raw.copy()
@@ -40,7 +40,8 @@ for source in (raw, shut):
     planner.exit_path(cost, cost, (20, 20)), astar.nearest_traversable(cost, (0, 0), 20)
     found = components.Components(cost)
     found.nearest(found.of(20, 20), (0, 0)), found.labels(0, 0, 5, 5)
-    astar.line_cost(cost, 20, 20, 30, 30), astar.polyline_cost(cost, np.full((2, 2), 20.0))
+    lines.line_cost(cost, 20, 20, 30, 30), lines.polyline_cost(cost, np.full((2, 2), 20.0))
+    lines.leaves(np.zeros((2, 2)), np.ones((2, 2)), 0.5, 0.1)
     limits = dwa.DwaLimits(axle=0.235, wheel_max=0.5)
     shape, how = body.cover([(0.2, -0.1), (0.2, 0.1), (-0.2, 0.1), (-0.2, -0.1)]), dwa_settings.DEFAULT_SETTINGS
     around = clearance.clearance(cost, 0.05, 0, 0, [(1, 2)], 1, 1, shape, DEFAULT_INFLATION, limits, how)

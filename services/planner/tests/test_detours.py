@@ -25,7 +25,7 @@ class Fleet:
 
     def __init__(self, robots: int, detour_searches: int = 3) -> None:
         self.map = RingMap(walls=WALLS)
-        self.core = PlannerCore(1, PlannerConfig(detour_expansions=200, detour_searches=detour_searches))
+        self.core = PlannerCore(1, PlannerConfig(quick_expansions=200, detour_searches=detour_searches))
         self.core.load(self.map.master.snapshot(), 0.0)
         for number in range(robots):
             robot = f"r{number}"

@@ -22,11 +22,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numba import int64, njit, types, void
+from numba import int64, njit, types
 
 from fog_kernels import _arrays
-from fog_kernels.astar import DIAGONAL, STRAIGHT
-from fog_kernels.guides import TILE, TILE_BITS, Detour
+from fog_kernels.guides import NO_PATH, TILE, TILE_BITS, Detour
+from fog_kernels.steps import DIAGONAL, STRAIGHT
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -36,16 +36,13 @@ if TYPE_CHECKING:
     from fog_kernels.astar import Planner
     from fog_kernels.guides import GoalField
 
-_LIT = 1
-_SHADOW = 2
-_BORDER = 3
-_INSIDE = 4
-_START = 5
+_SHADOW = 1 << 30
+"""Labels from here on belong to cells of the shadow without a cost; what is added is the number of their group."""
+_CANDIDATE = 1
+"""The label of a cell beside the shadow."""
+_MOST_GROUPS = 24
+"""How many groups one raised cell can begin at most: it, its 8 neighbours, and steps that it cuts off."""
 
-_BUCKETS = 65536
-_UNSET = 2147483647
-
-_U8_OUT = types.Array(types.uint8, 1, "C")
 _I64_FLAT = types.Array(types.int64, 1, "C", readonly=True)
 
 
@@ -64,32 +61,59 @@ def _cost_to_goal(lowest: Any, columns: int, slots: Any, patterns: Any, x: Any, 
     last = TILE - 1
     place = (np.int64(slots[tile]) << (2 * TILE_BITS)) + ((y & last) << TILE_BITS) + (x & last)
     rise = np.int64(patterns[np.uint64(place)])
-    return rise if rise < 0 or lowest[tile] < 0 else rise + np.int64(lowest[tile])
+    least = np.int64(lowest[tile])
+    return least + rise if least >= 0 and rise >= 0 else np.int64(NO_PATH)
 
 
-@njit(
-    int64(
-        _arrays.U8_FLAT, _arrays.U8_FLAT, int64, _arrays.I32_FLAT, _arrays.I32_FLAT, int64, _arrays.I32_FLAT,
-        _arrays.I32_FLAT, _arrays.I32_FLAT, _U8_OUT, _arrays.I32_OUT,
-    ),
-    cache=True, nogil=True, error_model="numpy",
+@njit(inline="always")
+def _may_step(costmap: Any, weight: Any, cell: Any, column: Any, step: Any) -> bool:
+    """Whether a step between two cells that are traversable themselves cuts no corner."""
+    row = step - column
+    if column == 0 or row == 0:
+        return True
+    return bool(weight[costmap[np.uint64(cell + column)]] > 0 and weight[costmap[np.uint64(cell + row)]] > 0)
+
+
+@njit(inline="always")
+def _root(groups: Any, number: Any) -> Any:
+    """Return the group to which a group was joined, and shorten the way there."""
+    while groups[np.uint64(number)] != number:
+        above = np.int64(groups[np.uint64(number)])
+        groups[np.uint64(number)] = groups[np.uint64(above)]
+        number = above
+    return number
+
+
+_mark_signature = types.UniTuple(int64, 2)(  # type: ignore[no-untyped-call]  # numba has no types
+    _arrays.U8_FLAT, _arrays.U8_FLAT, int64, int64, _arrays.I32_FLAT, _arrays.I32_FLAT, int64, _arrays.I32_FLAT,
+    _arrays.I32_FLAT, _arrays.I32_FLAT, _arrays.I32_OUT, _arrays.I32_OUT, _arrays.I32_OUT, _arrays.I32_OUT,
 )  # fmt: skip
+
+
+@njit(_mark_signature, cache=True, nogil=True, error_model="numpy")
 def _mark_shadow(
-    costmap: Any, bound: Any, width: int, weight: Any, lowest: Any, tile_columns: int, slots: Any, patterns: Any,
-    raised: Any, mark: Any, found: Any,
-) -> int:  # fmt: skip
-    """Mark the cells that have a cheapest path over `bound` through raised cells; return their number.
+    costmap: Any, bound: Any, width: int, goal: int, weight: Any, lowest: Any, tile_columns: int, slots: Any,
+    patterns: Any, raised: Any, label: Any, found: Any, beside: Any, groups: Any,
+) -> tuple[int, int]:  # fmt: skip
+    """Label the cells that have a cheapest path over `bound` through raised cells; return their number.
 
     They are found from the raised cells, against the direction of the paths, in no special order; `found` receives
-    them.
+    them, `beside` the cells next to them, whose number is returned, too. Cells that a step on `costmap` joins get the
+    same group, as `_root` tells it. `goal` is never labelled.
     """
     height = costmap.size // width
     columns, rows, steps, lengths = _steps(width)
     count = 0
+    n_beside = 0
+    n_groups: Any = np.int64(0)
     for i in range(raised.size):
         cell: Any = np.int64(raised[i])
-        if mark[np.uint64(cell)] == 0:
-            mark[np.uint64(cell)] = _SHADOW
+        if cell == goal:
+            continue
+        if label[np.uint64(cell)] < _SHADOW:
+            label[np.uint64(cell)] = _SHADOW + n_groups
+            groups[np.uint64(n_groups)] = n_groups
+            n_groups += 1
             found[np.uint64(count)] = cell
             count += 1
         if weight[costmap[np.uint64(cell)]] > 0:
@@ -100,14 +124,17 @@ def _mark_shadow(
             if not (0 <= x + columns[k] < width and 0 <= y + rows[k] < height):
                 continue
             other = cell + steps[k]
-            if mark[np.uint64(other)] == 0:
-                mark[np.uint64(other)] = _SHADOW
+            if label[np.uint64(other)] < _SHADOW and other != goal:
+                label[np.uint64(other)] = _SHADOW + n_groups
+                groups[np.uint64(n_groups)] = n_groups
+                n_groups += 1
                 found[np.uint64(count)] = other
                 count += 1
     done = 0
     while done < count:
         cell = np.int64(found[np.uint64(done)])
         done += 1
+        own_label = np.int64(label[np.uint64(cell)])
         own = np.int64(weight[bound[np.uint64(cell)]])
         if own == 0:
             continue
@@ -116,110 +143,115 @@ def _mark_shadow(
         cost = _cost_to_goal(lowest, tile_columns, slots, patterns, x, y)
         if cost < 0:
             continue
+        passable = weight[costmap[np.uint64(cell)]] > 0
         within = 0 < x < width - 1 and 0 < y < height - 1
         for k in range(8):
             if not within and not (0 <= x + columns[k] < width and 0 <= y + rows[k] < height):
                 continue
             other = cell + steps[k]
-            if mark[np.uint64(other)] != 0:
+            known = np.int64(label[np.uint64(other)])
+            if known == own_label:
                 continue
-            weight_there = np.int64(weight[bound[np.uint64(other)]])
-            if weight_there == 0:
+            if known >= _SHADOW:
+                if not passable or weight[costmap[np.uint64(other)]] == 0:
+                    continue
+                first, second = _root(groups, own_label - _SHADOW), _root(groups, known - _SHADOW)
+                if first != second and _may_step(costmap, weight, cell, columns[k], steps[k]):
+                    groups[np.uint64(max(first, second))] = min(first, second)
                 continue
             there = _cost_to_goal(lowest, tile_columns, slots, patterns, x + columns[k], y + rows[k])
-            if there != cost + lengths[k] * (own + weight_there):
+            if there < 0:
                 continue
-            if columns[k] != 0 and rows[k] != 0:
-                aside, along = np.uint64(cell + columns[k]), np.uint64(cell + steps[k] - columns[k])
-                if weight[bound[aside]] == 0 or weight[bound[along]] == 0:
+            if there > cost:
+                there_weight = np.int64(weight[bound[np.uint64(other)]])
+                if there == cost + lengths[k] * (own + there_weight) and _may_step(
+                    bound, weight, cell, columns[k], steps[k]
+                ):
+                    if passable and _may_step(costmap, weight, cell, columns[k], steps[k]):
+                        label[np.uint64(other)] = own_label
+                    else:
+                        label[np.uint64(other)] = _SHADOW + n_groups
+                        groups[np.uint64(n_groups)] = n_groups
+                        n_groups += 1
+                    found[np.uint64(count)] = other
+                    count += 1
                     continue
-            mark[np.uint64(other)] = _SHADOW
-            found[np.uint64(count)] = other
-            count += 1
-    return count
-
-
-@njit(
-    void(
-        _arrays.U8_FLAT, int64, _arrays.I32_FLAT, _arrays.I32_FLAT, _U8_OUT, _arrays.I32_OUT, _arrays.I32_OUT,
-        _arrays.I32_OUT, _arrays.I64_OUT,
-    ),
-    cache=True, nogil=True, error_model="numpy",
-)  # fmt: skip
-def _enclose(
-    costmap: Any, width: int, weight: Any, starts: Any, mark: Any, label: Any, inside: Any, border: Any, result: Any
-) -> None:
-    """List the cells of the shadow that are connected with a start, and the cells where one can leave them.
-
-    `result` receives the numbers of both; the labels of the cells inside are unset.
-    """
-    height = costmap.size // width
-    columns, rows, steps, _ = _steps(width)
-    count = 0
-    leaving = 0
-    for i in range(starts.size):
-        cell: Any = np.int64(starts[i])
-        if mark[np.uint64(cell)] == _SHADOW and weight[costmap[np.uint64(cell)]] > 0:
-            mark[np.uint64(cell)] = _INSIDE
-            label[np.uint64(cell)] = _UNSET
-            inside[count] = cell
-            count += 1
-    done = 0
-    while done < count:
-        cell = np.int64(inside[np.uint64(done)])
-        done += 1
-        y: Any = np.int64(np.uint32(cell) // np.uint32(width))
-        x = cell - y * width
-        within = 0 < x < width - 1 and 0 < y < height - 1
-        for k in range(8):
-            if not within and not (0 <= x + columns[k] < width and 0 <= y + rows[k] < height):
-                continue
-            other = cell + steps[k]
-            if mark[np.uint64(other)] >= _BORDER:
-                continue
-            there = np.int64(weight[costmap[np.uint64(other)]])
-            if there == 0:
-                continue
-            if columns[k] != 0 and rows[k] != 0:
-                aside, along = np.uint64(cell + columns[k]), np.uint64(cell + steps[k] - columns[k])
-                if weight[costmap[aside]] == 0 or weight[costmap[along]] == 0:
-                    continue
-            if mark[np.uint64(other)] == _SHADOW:
-                mark[np.uint64(other)] = _INSIDE
-                label[np.uint64(other)] = _UNSET
-                inside[np.uint64(count)] = other
-                count += 1
-            else:
-                mark[np.uint64(other)] = _BORDER
-                border[np.uint64(leaving)] = other
-                leaving += 1
-    result[0] = count
-    result[1] = leaving
+            if known != _CANDIDATE:
+                label[np.uint64(other)] = _CANDIDATE
+                beside[np.uint64(n_beside)] = other
+                n_beside += 1
+    return count, n_beside
 
 
 @njit(
     int64(
-        _arrays.U8_FLAT, int64, _arrays.I32_FLAT, _arrays.I32_FLAT, _I64_FLAT, int64, _U8_OUT, _arrays.I32_OUT,
+        _arrays.U8_FLAT, int64, _arrays.I32_FLAT, _arrays.I32_FLAT, _arrays.I32_FLAT, _arrays.I32_FLAT,
+        _arrays.I32_OUT, _arrays.I32_OUT, _arrays.I32_OUT,
+    ),
+    cache=True, nogil=True, error_model="numpy",
+)  # fmt: skip
+def _enclose(
+    costmap: Any, width: int, weight: Any, starts: Any, found: Any, beside: Any, label: Any, groups: Any, border: Any
+) -> int:
+    """Unlabel what is not connected with a start; list where one can leave the rest, and return the number of cells."""
+    height = costmap.size // width
+    columns, rows, steps, _ = _steps(width)
+    behind = np.zeros(groups.size, np.bool_)
+    for i in range(starts.size):
+        known = np.int64(label[np.uint64(starts[i])])
+        if known >= _SHADOW and weight[costmap[np.uint64(starts[i])]] > 0:
+            behind[np.uint64(_root(groups, known - _SHADOW))] = True
+    for i in range(found.size):
+        cell: Any = np.uint64(found[i])
+        if not behind[np.uint64(_root(groups, np.int64(label[cell]) - _SHADOW))]:
+            label[cell] = 0
+    leaving = 0
+    for i in range(beside.size):
+        cell = np.int64(beside[i])
+        if label[np.uint64(cell)] != _CANDIDATE:
+            continue
+        label[np.uint64(cell)] = 0
+        if weight[costmap[np.uint64(cell)]] == 0:
+            continue
+        y: Any = np.int64(np.uint32(cell) // np.uint32(width))
+        x = cell - y * width
+        for k in range(8):
+            if not (0 <= x + columns[k] < width and 0 <= y + rows[k] < height):
+                continue
+            other = cell + steps[k]
+            if label[np.uint64(other)] < _SHADOW or weight[costmap[np.uint64(other)]] == 0:
+                continue
+            if _may_step(costmap, weight, cell, columns[k], steps[k]):
+                border[np.uint64(leaving)] = cell
+                leaving += 1
+                break
+    return leaving
+
+
+@njit(
+    int64(
+        _arrays.U8_FLAT, int64, _arrays.I32_FLAT, _arrays.I32_FLAT, _I64_FLAT, _arrays.I32_FLAT, _arrays.I32_OUT,
         _arrays.I32_OUT, _arrays.I32_OUT, _arrays.I32_OUT, int64,
     ),
     cache=True, nogil=True, error_model="numpy",
 )  # fmt: skip
 def _fill(
-    costmap: Any, width: int, weight: Any, border: Any, levels: Any, starts: int, mark: Any, label: Any,
+    costmap: Any, width: int, weight: Any, border: Any, levels: Any, starts: Any, label: Any,
     queue_cell: Any, queue_next: Any, heads: Any, shift: int,
 ) -> int:  # fmt: skip
-    """Write the lowest cost from cells inside to a border cell, plus that cell's level, until all starts have theirs.
+    """Write the lowest cost from labelled cells to a border cell, plus that cell's level, until all starts have theirs.
 
     Return below which costs they are final; costs that are not lower are not lower in truth, either. -1 when the costs
     or the queue exceed their limits.
     """
     height = costmap.size // width
-    columns, rows, steps, lengths = _steps(width)
+    _, _, steps, lengths = _steps(width)
+    around = np.empty(8, np.int64)
     heads[:] = -1
     free: Any = np.int64(-1)
     used: Any = np.int64(0)
     bucket: Any = np.int64(-1)  # the border's cells come first
-    ended: Any = np.int64(-1)  # the bucket in which the last start was
+    waiting = starts.size
     i: Any = np.int64(0)
     while True:
         if i < border.size:
@@ -227,11 +259,14 @@ def _fill(
             here = np.int64(levels[np.uint64(i)])
             i += 1
         else:
-            bucket = max(bucket, 0)
-            while bucket < heads.size and heads[np.uint64(bucket)] < 0:
-                bucket += 1
-            if bucket == heads.size or (starts == 0 and bucket > ended):
-                return int(bucket << shift)
+            if bucket < 0 or heads[np.uint64(bucket)] < 0:
+                bucket = max(bucket, 0)
+                while bucket < heads.size and heads[np.uint64(bucket)] < 0:
+                    bucket += 1
+                while waiting > 0 and np.int64(label[np.uint64(starts[waiting - 1])]) < bucket << shift:
+                    waiting -= 1
+                if bucket == heads.size or (waiting == 0 and starts.size > 0):
+                    return int(bucket << shift)
             entry: Any = np.int64(heads[np.uint64(bucket)])
             heads[np.uint64(bucket)] = queue_next[np.uint64(entry)]
             queue_next[np.uint64(entry)] = free
@@ -240,29 +275,29 @@ def _fill(
             here = np.int64(label[np.uint64(cell)])
             if here >> shift != bucket:
                 continue  # a stale entry: the cell was expanded from a lower bucket
-            if mark[np.uint64(cell)] == _START:
-                mark[np.uint64(cell)] = _INSIDE
-                starts -= 1
-                ended = bucket
         y: Any = np.int64(np.uint32(cell) // np.uint32(width))
         x = cell - y * width
         own = np.int64(weight[costmap[np.uint64(cell)]])
-        within = 0 < x < width - 1 and 0 < y < height - 1
+        w_right = np.int64(weight[costmap[np.uint64(cell + 1)]]) if x + 1 < width else np.int64(0)
+        w_left = np.int64(weight[costmap[np.uint64(cell - 1)]]) if x > 0 else np.int64(0)
+        w_up = np.int64(weight[costmap[np.uint64(cell + width)]]) if y + 1 < height else np.int64(0)
+        w_down = np.int64(weight[costmap[np.uint64(cell - width)]]) if y > 0 else np.int64(0)
+        around[0] = w_right
+        around[1] = w_left
+        around[2] = w_up
+        around[3] = w_down
+        around[4] = weight[costmap[np.uint64(cell + width + 1)]] if w_right > 0 and w_up > 0 else 0
+        around[5] = weight[costmap[np.uint64(cell + width - 1)]] if w_left > 0 and w_up > 0 else 0
+        around[6] = weight[costmap[np.uint64(cell - width + 1)]] if w_right > 0 and w_down > 0 else 0
+        around[7] = weight[costmap[np.uint64(cell - width - 1)]] if w_left > 0 and w_down > 0 else 0
         for k in range(8):
-            if not within and not (0 <= x + columns[k] < width and 0 <= y + rows[k] < height):
+            there = around[k]
+            if there == 0:
                 continue
             other = cell + steps[k]
-            known = np.int64(label[np.uint64(other)])
-            if known <= here:
-                continue  # final, or outside
-            there = np.int64(weight[costmap[np.uint64(other)]])
             reached = here + lengths[k] * (own + there)
-            if reached >= known or there == 0:
-                continue
-            if columns[k] != 0 and rows[k] != 0:
-                aside, along = np.uint64(cell + columns[k]), np.uint64(cell + steps[k] - columns[k])
-                if weight[costmap[aside]] == 0 or weight[costmap[along]] == 0:
-                    continue
+            if reached >= label[np.uint64(other)]:
+                continue  # no better; or outside, where labels are 0
             slot = reached >> shift
             if slot >= heads.size:
                 return -1
@@ -296,54 +331,55 @@ class Shadow:
     ) -> None:
         """Find it on a uint8 (h, w) costmap; `field` is an exact one over the costmap `bound`.
 
-        Takes some 25 ns for each of its cells. Raises ValueError for a field that is not exact.
+        Takes some 15 ns for each of its cells, in the planner's memory. Raises ValueError for a field that is not
+        exact.
         """
         if not field.exact:
             raise ValueError(f"the field of goal {field.goal} has one cost for several cells: pass an exact one")
         self._costmap = _arrays.grid(costmap, "costmap")
         self._planner = planner
-        size = costmap.size
-        self._mark = np.zeros(size, np.uint8)
-        self._label, self._memory = np.zeros(size, np.int32), np.empty((2, size), np.int32)
-        cells, border = self._memory  # later those of the search's queue
         bound = _arrays.grid(bound, "bound")
         raised = np.flatnonzero((costmap > bound).ravel()).astype(np.int32)
         flat, width, weight = costmap.ravel(), planner.width, planner.weight
         goal = field.goal[1] * width + field.goal[0]
-        if weight[flat[goal]] > 0:
-            self._mark[goal] = _LIT  # raised or not, nothing lies behind it
-        _mark_shadow(
-            flat, bound.ravel(), width, weight, field.lowest.ravel(), field.lowest.shape[1], field.slots.ravel(),
-            field.patterns.ravel(), raised, self._mark, cells,
+        self._label = np.zeros(costmap.size, np.int32)
+        found, beside = planner.scratch
+        groups = np.empty(min(costmap.size, _MOST_GROUPS * (len(raised) + 1)), np.int32)
+        count, candidates = _mark_shadow(
+            flat, bound.ravel(), width, goal if weight[flat[goal]] > 0 else -1, weight, field.lowest.ravel(),
+            field.lowest.shape[1], field.slots.ravel(), field.patterns.ravel(), raised, self._label, found, beside,
+            groups,
         )  # fmt: skip
-        first = np.array([row * width + column for column, row in starts], np.int32)
-        result = np.empty(2, np.int64)
-        _enclose(flat, width, weight, first, self._mark, self._label, cells, border, result)
-        leaving = int(result[1])
-        self._starts = np.unique(first[self._mark[first] == _INSIDE])
+        first = np.unique(np.array([row * width + column for column, row in starts], np.int32))
+        border = np.empty(candidates, np.int32)
+        leaving = int(
+            _enclose(flat, width, weight, first, found[:count], beside[:candidates], self._label, groups, border)
+        )
+        self._starts = first[(self._label[first] >= _SHADOW) & (weight[flat[first]] > 0)]
         self.border = border[:leaving].copy()
         """The flat indexes of the cells through which every path leaves it."""
 
     def contains(self, cell: tuple[int, int]) -> bool:
         """Whether a cell (column, row) is part of it."""
-        return bool(self._mark[cell[1] * self._planner.width + cell[0]] >= _INSIDE)
+        index = cell[1] * self._planner.width + cell[0]
+        return bool(self._label[index] > 0 and self._planner.weight[self._costmap.ravel()[index]] > 0)
 
     def detour(self, levels: NDArray[np.int64]) -> Detour | None:
         """Return the bound that begins with a level at each border cell, in full for cells as near to it as the starts.
 
-        Call it once: the bound takes over the memory. None when nothing leads out of the shadow, or when costs exceed
-        32 bits. Takes some 50 ns for each cell.
+        Call it once: the bound takes over the labels. None when nothing leads out of the shadow, or when costs exceed
+        30 bits. Takes some 30 ns for each cell.
         """
         if len(self.border) == 0:
             return None
-        planner, label, memory = self._planner, self._label, self._memory
+        planner, label = self._planner, self._label
         levels = levels - levels.min()
-        self._mark[self._starts] = _START
-        heads = np.empty(_BUCKETS, np.int32)
+        queue_cell, queue_next = planner.scratch
+        heads = np.empty(_SHADOW >> planner.bucket_shift, np.int32)
         highest = int(
             _fill(
-                self._costmap.ravel(), planner.width, planner.weight, self.border, levels, len(self._starts),
-                self._mark, label, memory[0], memory[1], heads, planner.bucket_shift,
+                self._costmap.ravel(), planner.width, planner.weight, self.border, levels, self._starts, label,
+                queue_cell, queue_next, heads, planner.bucket_shift,
             )
         )  # fmt: skip
         return None if highest < 0 else Detour(label.reshape(self._costmap.shape), highest, self.border, levels)

@@ -1,11 +1,17 @@
 """What guides a search besides the distance to its goal: lower bounds of the cost to go, computed beforehand."""
 
+# The kernel takes arrays and scalars, typed by its compiled signature.
+# ruff: noqa: ANN401, PLR0913
+
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+from numba import int64, njit, void
+
+from fog_kernels import _arrays
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -17,6 +23,33 @@ NO_PATH: Final = -1
 """In a field: no path leads from here to the goal."""
 _NO_SLOTS: Final[NDArray[np.int32]] = np.empty((0, 0), np.int32)
 _NO_PATTERNS: Final[NDArray[np.int32]] = np.empty((0, TILE * TILE), np.int32)
+
+
+@njit(
+    void(
+        _arrays.I32_FLAT, int64, int64, int64, _arrays.I32_FLAT, _arrays.I32_FLAT, int64, _arrays.I32_FLAT,
+        _arrays.I64_OUT,
+    ),
+    cache=True, nogil=True, error_model="numpy",
+)  # fmt: skip
+def _write_costs(
+    lowest: Any, columns: int, bits: int, unit: int, slots: Any, patterns: Any, width: int, cells: Any, costs: Any
+) -> None:
+    """Write the cost of each cell, given by its flat index, in a field (see `GoalField`); -1 without a path."""
+    last = TILE - 1
+    for i in range(cells.size):
+        y = cells[i] // width
+        x = cells[i] - y * width
+        block = np.uint64((y >> bits) * columns + (x >> bits))
+        costs[i] = NO_PATH
+        if lowest[block] < 0:
+            continue
+        rise = np.int64(0)
+        if slots.size > 0:
+            place = (np.int64(slots[block]) << (2 * TILE_BITS)) + ((y & last) << TILE_BITS) + (x & last)
+            rise = np.int64(patterns[np.uint64(place)])
+        if rise >= 0:
+            costs[i] = np.int64(lowest[block]) * unit + rise
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,13 +101,13 @@ class GoalField:
 
     def costs(self, cells: NDArray[np.integer]) -> NDArray[np.int64]:
         """Return the costs at cells given by flat indexes, int64 of their shape; -1 where no path leads to the goal."""
-        rows, columns = np.divmod(cells, self.width)
-        block = rows >> self.bits, columns >> self.bits
-        costs = self.lowest[block].astype(np.int64) * self.unit
-        if self.slots.size > 0:
-            rises = self.patterns[self.slots[block], (rows % TILE) * TILE + columns % TILE]
-            return np.where((costs < 0) | (rises < 0), NO_PATH, costs + rises)
-        return np.where(costs < 0, NO_PATH, costs)
+        flat = np.ascontiguousarray(cells, np.int32)
+        costs = np.empty(flat.shape, np.int64)
+        _write_costs(
+            self.lowest.ravel(), self.lowest.shape[1], self.bits, self.unit, self.slots.ravel(),
+            self.patterns.ravel(), self.width, flat.ravel(), costs.ravel(),
+        )  # fmt: skip
+        return costs
 
 
 @dataclass(frozen=True, slots=True)

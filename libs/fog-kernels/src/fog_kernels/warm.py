@@ -21,8 +21,21 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 PROFILES: dict[str, tuple[str, ...]] = {
-    "robot": ("amcl", "astar", "clearance", "distance", "dwa", "inflation", "likelihood", "raycast", "sweep"),
-    "planner": ("astar", "components", "detour", "distance", "inflation", "tiles"),
+    "robot": (
+        "amcl",
+        "astar",
+        "clearance",
+        "distance",
+        "dwa",
+        "flood",
+        "guides",
+        "inflation",
+        "likelihood",
+        "lines",
+        "raycast",
+        "sweep",
+    ),
+    "planner": ("astar", "components", "detour", "distance", "flood", "guides", "inflation", "lines", "tiles"),
     "map": ("distance", "inflation", "spans"),
     "sim": ("distance", "raycast"),
     "all": (
@@ -33,8 +46,11 @@ PROFILES: dict[str, tuple[str, ...]] = {
         "detour",
         "distance",
         "dwa",
+        "flood",
+        "guides",
         "inflation",
         "likelihood",
+        "lines",
         "raycast",
         "spans",
         "sweep",

@@ -10,7 +10,8 @@ import numpy as np
 
 from fog_contracts.costs import INSCRIBED
 from fog_contracts.messages import Refusal
-from fog_kernels.astar import Planner, line_cost, nearest_traversable
+from fog_kernels.astar import Planner, nearest_traversable
+from fog_kernels.lines import line_cost
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

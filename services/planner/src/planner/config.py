@@ -40,11 +40,9 @@ class PlannerConfig:
     """How long a heartbeat may be ahead of the deltas before a snapshot is fetched."""
     max_expansions: int = 50_000_000
     quick_expansions: int = 40_000
-    """After so many expanded cells (1 ms) a search first asks whether the goal can be reached at all."""
-    detour_expansions: int = 30_000
-    """After a search of so many expanded cells, a bound of the way round is computed for those that are left ..."""
+    """After so many expanded cells (1 ms) a search first asks whether the goal can be reached at all ..."""
     detour_searches: int = 3
-    """... if at least so many are."""
+    """... and, if at least so many others wait, has a bound of the way round computed for all of them."""
     standing_s: float = 60.0
     """What has stayed on the map for so long, zones above all, is in the distance fields, too."""
     goal_fields_bytes: int = 40_000_000

@@ -1,8 +1,8 @@
 """Bounds of the ways round closed parts of the floor: computed once, for all robots that search a path behind them.
 
 When a shared corridor closes, the goal fields of all robots lead into it, and every search floods the same part of the
-floor before it turns round. The first such search pays for it; then one more search of that part gives a bound that
-guides all the others (`fog_kernels.detour`).
+floor before it turns round. So the first search that takes long is interrupted, and one search of that part gives a
+bound that guides it and all the others (`fog_kernels.detour`).
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from fog_contracts.costs import NEUTRAL_WEIGHT
-from fog_kernels.astar import STRAIGHT
 from fog_kernels.detour import Shadow
+from fog_kernels.steps import STRAIGHT
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -59,26 +59,26 @@ class Detours:
         """Return the bound for a search; None without one."""
         return next((known for known in self._known if known.covers(start) and not known.covers(goal)), None)
 
-    def compute(
-        self, planning_map: PlanningMap, planner: Planner, cells: NDArray[np.int32], trips: Sequence[Trip]
-    ) -> None:
-        """Compute the bound for the searches that are due, unless there have been enough for this version of the map.
-
-        `planner` gives the weights; `cells` is the path of the search before them, whose way out the others should
-        share. Takes some 60 ns for each cell of the closed part.
-        """
+    def may_add(self, planning_map: PlanningMap) -> bool:
+        """Whether another bound may be computed for this version of the map."""
         if self._version != planning_map.version:
             self._version, self._attempts = planning_map.version, 0
-        exact = self._fields.exact
-        start, goal = _cell(cells[0]), _cell(cells[-1])
-        reference = next((exact[known] for known in (self._reference_goal, goal, *exact) if known in exact), None)
-        if self._attempts >= _ATTEMPTS or reference is None:
+        return self._attempts < _ATTEMPTS
+
+    def compute(self, planning_map: PlanningMap, planner: Planner, trips: Sequence[Trip]) -> None:
+        """Compute the bound for the searches that are due, if it may be added; the first of them needs it most.
+
+        `planner` gives the weights, and lends its memory. Takes some 40 ns for each cell of the closed part.
+        """
+        exact, first = self._fields.exact, trips[0][1]
+        reference = next((exact[known] for known in (self._reference_goal, first, *exact) if known in exact), None)
+        if not self.may_add(planning_map) or reference is None:
             return
         self._attempts += 1
-        starts = [start, *(other for other, _ in trips)]
+        starts = [start for start, _ in trips]
         shadow = Shadow(planning_map.cost, self._fields.bound, reference, starts, planner)
-        others = [other for begin, other in trips if shadow.contains(begin) and not shadow.contains(other)]
-        better = _better([reference, *(exact[known] for known in (goal, *others) if known in exact)], shadow.border)
+        goals = [goal for start, goal in trips if shadow.contains(start) and not shadow.contains(goal)]
+        better = _better([reference, *(exact[goal] for goal in (first, *goals) if goal in exact)], shadow.border)
         if better is not None:
             reference = better
             shadow = Shadow(planning_map.cost, self._fields.bound, reference, starts, planner)
@@ -87,10 +87,6 @@ class Detours:
             self._reference_goal = reference.goal
             self._known = [detour, *self._known][:_KEPT]
             self.computed += 1
-
-
-def _cell(cell: NDArray[np.int32]) -> Cell:
-    return int(cell[0]), int(cell[1])
 
 
 def _better(fields: Sequence[GoalField], border: NDArray[np.int32]) -> GoalField | None:

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from fog_contracts.costs import FREE, INSCRIBED, LETHAL
-from fog_kernels.astar import Planner, line_cost, nearest_traversable
+from fog_kernels.astar import Planner, nearest_traversable
+from fog_kernels.lines import line_cost
 from planner.refusals import (
     goal_occupied,
     goal_out_of_reach,
@@ -55,8 +56,6 @@ class SearchResult:
     refusal: Refusal | None
     question: Question | None = None
     searched: bool = True
-    found: PlanResult | None = None
-    """The path by cells that the route straightens."""
 
 
 def refused(refusal: Refusal, question: Question | None = None, *, searched: bool = False) -> SearchResult:
@@ -68,6 +67,10 @@ Covers = Callable[[float, float, float], bool]
 """Whether a point (m, frame `map`) lies in a blocked hazard or zone, or within a margin (m) of it."""
 
 
+Share = Callable[["Cell", "Cell"], "Detour | None"]
+"""Returns a bound for a search between two cells that others can use, too; None without one."""
+
+
 class PathSearch:
     """Searches paths on maps of one geometry; owns the memory that A* needs."""
 
@@ -76,7 +79,7 @@ class PathSearch:
         self.geometry = geometry
         self.planner = Planner(geometry.width, geometry.height)
 
-    def find(
+    def find(  # noqa: PLR0913  # what guides a search
         self,
         planning_map: PlanningMap,
         covers: Covers,
@@ -84,11 +87,13 @@ class PathSearch:
         goal: PointXY,
         field: GoalField | None = None,
         detour: Detour | None = None,
+        share: Share | None = None,
     ) -> SearchResult:
         """Return the cheapest path between two points (m, frame `map`), or why there is none.
 
-        `field` is that of the goal's cell, if there is one, `detour` a bound that holds for start and goal. Refusals
-        name no hazard and no zone: the `question` can be answered later.
+        `field` is that of the goal's cell, if there is one, `detour` a bound that holds for start and goal; without
+        one, `share` is asked for it when the search is long. Refusals name no hazard and no zone: the `question` can be
+        answered later.
         """
         geometry = self.geometry
         first, last = geometry.cell(*start), geometry.cell(*goal)
@@ -102,13 +107,13 @@ class PathSearch:
         if planning_map.cost[last[1], last[0]] >= INSCRIBED:
             nearest = nearest_reachable(planning_map, free, last)
             return refused(goal_occupied(goal, nearest), Question("goal", start, goal, free, last))
-        found = self._search(planning_map, free, last, field, detour)
+        found = self._search(planning_map, free, last, field, detour, share)
         if found is None or found.timed_out:
             return self._without_path(planning_map, Question("path", start, goal, free, last), found)
         corners = self.planner.shortcut(planning_map.cost, found.cells)
         points = self._points(planning_map.cost, corners, start, goal, escaping=free != first)
         route = Route(points, self._config.point_spacing, escape_lines=int(free != first))
-        return SearchResult(route, route.cost(planning_map.cost, geometry), None, found=found)
+        return SearchResult(route, route.cost(planning_map.cost, geometry), None)
 
     def _without_path(self, planning_map: PlanningMap, question: Question, found: PlanResult | None) -> SearchResult:
         if found is not None:
@@ -117,21 +122,29 @@ class PathSearch:
         return refused(no_path(nearest_reachable(planning_map, question.start_cell, question.goal_cell)), question)
 
     def _search(
-        self, planning_map: PlanningMap, start: Cell, goal: Cell, field: GoalField | None, detour: Detour | None
+        self,
+        planning_map: PlanningMap,
+        start: Cell,
+        goal: Cell,
+        field: GoalField | None,
+        detour: Detour | None,
+        share: Share | None,
     ) -> PlanResult | None:
         """Search a path between two traversable cells; None if they are not connected.
 
-        Most searches are short, so a few cells are expanded first; then it is worth to ask whether there is a path.
+        Most searches are short, so a few cells are expanded first; then it is worth to ask whether there is a path, and
+        for a bound.
         """
         if planning_map.has_components and not planning_map.reachable(start, goal):
             return None
-        most = self._config.max_expansions
-        if not planning_map.has_components and self._config.quick_expansions < most:
-            found = self.planner.plan(planning_map.cost, start, goal, self._config.quick_expansions, field, detour)
+        most, quick = self._config.max_expansions, self._config.quick_expansions
+        if quick < most and (share is not None or not planning_map.has_components):
+            found = self.planner.plan(planning_map.cost, start, goal, quick, field, detour)
             if not found.timed_out:
                 return found if found.found else None
             if not planning_map.reachable(start, goal):
                 return None
+            detour = share(start, goal) if share is not None else detour
         found = self.planner.plan(planning_map.cost, start, goal, most, field, detour)
         return found if found.found or found.timed_out else None
 

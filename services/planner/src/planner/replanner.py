@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Literal
 
 from planner.detours import Detours
@@ -14,12 +15,14 @@ if TYPE_CHECKING:
 
     from fog_contracts.grid import GridGeometry
     from fog_contracts.messages import PlanCode
+    from fog_kernels.astar import Planner
+    from fog_kernels.guides import Detour
     from planner.config import PlannerConfig
     from planner.detours import Trip
     from planner.goal_fields import GoalFields
     from planner.mission import Mission, ReplanReason
     from planner.path_search import Covers, SearchResult
-    from planner.planning_map import PlanningMap
+    from planner.planning_map import Cell, PlanningMap
 
 AvoidReason = Literal["far_from_path", "no_cost_fell", "unreachable"]
 """Why no search was needed: a change is far from the path, none lowered a cost, or the goal can't be reached."""
@@ -97,15 +100,24 @@ class Replanner:
         goal = geometry.cell(target.x, target.y)
         trip = _trip(mission, geometry)
         detour = None if trip is None else self.detours.guide(*trip)
-        found = self._search.find(
-            planning_map, covers, (pose.x, pose.y), (target.x, target.y), self._fields.guide(goal), detour
+        shared = detour is None and len(waiting) >= self._config.detour_searches and self.detours.may_add(planning_map)
+        return self._search.find(
+            planning_map,
+            covers,
+            (pose.x, pose.y),
+            (target.x, target.y),
+            self._fields.guide(goal),
+            detour,
+            partial(self._share, planning_map, self._search.planner, waiting) if shared else None,
         )
-        first = found.found
-        if detour is None and first is not None and first.expansions >= self._config.detour_expansions:
-            trips = [trip for other in waiting if (trip := _trip(other, geometry)) is not None]
-            if len(trips) >= self._config.detour_searches:
-                self.detours.compute(planning_map, self._search.planner, first.cells, trips)
-        return found
+
+    def _share(
+        self, planning_map: PlanningMap, planner: Planner, waiting: Sequence[Mission], start: Cell, goal: Cell
+    ) -> Detour | None:
+        """Return a bound for the search from start to goal, computed for the waiting missions, too."""
+        trips = [trip for other in waiting if (trip := _trip(other, planning_map.geometry)) is not None]
+        self.detours.compute(planning_map, planner, [(start, goal), *trips])
+        return self.detours.guide(start, goal)
 
 
 def _trip(mission: Mission, geometry: GridGeometry) -> Trip | None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fog_contracts.geometry import sampled
 from fog_contracts.grid import GridGeometry, Window
 from fog_contracts.messages import PointXY
-from fog_kernels.astar import polyline_cost
+from fog_kernels.lines import leaves, polyline_cost
 
 Floats = NDArray[np.float64]
 Grid = NDArray[np.uint8]
@@ -44,7 +44,7 @@ class Route:
     @property
     def length(self) -> float:
         """Length in m."""
-        return float(self.along[-1])
+        return float(self._corner_along[-1])
 
     def nearest(self, x: float, y: float, after: float = 0.0, window: float = math.inf) -> tuple[float, float]:
         """Return how far along (m) the point nearest to (x, y) is, and its distance.
@@ -66,9 +66,13 @@ class Route:
 
     def remaining(self, along: float) -> Floats:
         """Return the polyline from `along` (m) to the end: a point there, then the corners that follow."""
-        corners = self.corners[np.searchsorted(self._corner_along, along, side="right") :]
-        first = np.array([[np.interp(along, self._corner_along, self.corners[:, k]) for k in (0, 1)]])
-        return np.concatenate((first, corners))
+        lengths = self._corner_along
+        after = int(np.searchsorted(lengths, along, side="right"))
+        if after == 0 or after == len(lengths):
+            return self.corners[max(0, after - 1) :]
+        before, behind = self.corners[after - 1], self.corners[after]
+        share = (along - lengths[after - 1]) / (lengths[after] - lengths[after - 1])
+        return np.concatenate(((before + share * (behind - before))[None, :], self.corners[after:]))
 
     def cost(self, costmap: Grid, geometry: GridGeometry, along: float = 0.0) -> float:
         """Return the cost of the route from `along` on, as the kernels integrate it; infinite when it is impassable.
@@ -99,11 +103,4 @@ class Route:
 
     def differs_from(self, other: "Route", along: float, reach: float) -> bool:
         """Whether this route leaves the rest of another, from `along` (m) on, by more than `reach` (m) somewhere."""
-        every = max(1, round(0.5 * reach / self.spacing))
-        rest = other.points[other.along >= along][::every]
-        if len(rest) == 0:
-            return True
-        own = self.points[:: 2 * every]
-        # |a - b|^2 as |a|^2 - 2ab + |b|^2: one product of matrices instead of a subtraction for every pair.
-        squares = np.sum(own * own, axis=1)[:, None] - 2.0 * own @ rest.T + np.sum(rest * rest, axis=1)[None, :]
-        return bool(np.any(squares.min(axis=1) > reach * reach))
+        return leaves(self.corners, other.remaining(along), reach, max(reach, self.spacing))

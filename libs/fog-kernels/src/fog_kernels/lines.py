@@ -1,0 +1,290 @@
+"""Costs along straight lines, and paths made of them: integrals of the weight, shortcuts, and how far lines part.
+
+Costs are integrated along lines of sight cell by cell (Amanatides and Woo 1987).
+"""
+
+# Kernels take arrays and scalars, typed by their compiled signatures.
+# ruff: noqa: ANN401, PLR0913
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numba import boolean, float64, int64, njit
+
+from fog_contracts.costs import COST_WEIGHT, NEUTRAL_WEIGHT
+from fog_kernels import _arrays
+from fog_kernels.steps import DEFAULT_WEIGHTS, DIAGONAL, STRAIGHT, weights_of
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+@njit(float64(_arrays.U8_GRID, _arrays.I32_FLAT, float64, float64, float64, float64, float64), cache=True, nogil=True)
+def _line_cost(costmap: Any, weight: Any, x0: float, y0: float, x1: float, y1: float, limit: float) -> float:
+    """Integrate the weight along a line in cell coordinates; infinite if blocked, or as soon as it exceeds limit."""
+    height, width = costmap.shape
+    x = math.floor(x0 + 0.5)
+    y = math.floor(y0 + 0.5)
+    last_x = math.floor(x1 + 0.5)
+    last_y = math.floor(y1 + 0.5)
+    if min(x, last_x) < 0 or max(x, last_x) >= width or min(y, last_y) < 0 or max(y, last_y) >= height:
+        return math.inf
+    dx = x1 - x0
+    dy = y1 - y0
+    length = math.sqrt(dx * dx + dy * dy)
+    step_x = 1 if dx > 0.0 else -1
+    step_y = 1 if dy > 0.0 else -1
+    next_x = (x + 0.5 * step_x - x0) / dx if dx != 0.0 else math.inf
+    next_y = (y + 0.5 * step_y - y0) / dy if dy != 0.0 else math.inf
+    delta_x = abs(1.0 / dx) if dx != 0.0 else math.inf
+    delta_y = abs(1.0 / dy) if dy != 0.0 else math.inf
+    done = 0.0
+    total = 0.0
+    # Cells are counted instead of comparing parameters, so that rounding can't miss the last cell.
+    left_x = abs(last_x - x)
+    left_y = abs(last_y - y)
+    while True:
+        own = np.int64(weight[costmap[y, x]])
+        if own == 0:
+            return math.inf
+        if left_x == 0 and left_y == 0:
+            return total + max(1.0 - done, 0.0) * length * own
+        corner = left_x > 0 and left_y > 0 and abs(next_x - next_y) < 1e-9
+        if corner:
+            # A corner may be crossed only where a diagonal step is allowed.
+            if weight[costmap[y, x + step_x]] == 0 or weight[costmap[y + step_y, x]] == 0:
+                return math.inf
+            until = next_x
+            x += step_x
+            y += step_y
+            next_x += delta_x
+            next_y += delta_y
+            left_x -= 1
+            left_y -= 1
+        elif left_y == 0 or (left_x > 0 and next_x < next_y):
+            until = next_x
+            x += step_x
+            next_x += delta_x
+            left_x -= 1
+        else:
+            until = next_y
+            y += step_y
+            next_y += delta_y
+            left_y -= 1
+        until = min(until, 1.0)
+        total += (until - done) * length * own
+        done = until
+        if total > limit:
+            return math.inf
+
+
+@njit(float64(_arrays.U8_GRID, _arrays.I32_FLAT, _arrays.F64_GRID), cache=True, nogil=True)
+def _polyline_cost(costmap: Any, weight: Any, points: Any) -> float:
+    """Integrate the weight along the lines between points; infinite if one is blocked."""
+    total = 0.0
+    for i in range(points.shape[0] - 1):
+        total += _line_cost(costmap, weight, points[i, 0], points[i, 1], points[i + 1, 0], points[i + 1, 1], math.inf)
+    return total
+
+
+@njit(float64(_arrays.U8_GRID, _arrays.I32_FLAT, _arrays.I32_PAIRS, _arrays.F64_OUT), cache=True, nogil=True)
+def _cells_cost(costmap: Any, weight: Any, cells: Any, cumulated: Any) -> float:
+    """Fill cumulated[i] with the cost from the first cell to cell i; infinite if a step isn't one of the grid's."""
+    height, width = costmap.shape
+    total = 0.0
+    for i in range(cells.shape[0]):
+        x = np.int64(cells[i, 0])
+        y = np.int64(cells[i, 1])
+        if x < 0 or x >= width or y < 0 or y >= height or weight[costmap[y, x]] == 0:
+            return math.inf
+        if i > 0:
+            last_x = np.int64(cells[i - 1, 0])
+            last_y = np.int64(cells[i - 1, 1])
+            if abs(x - last_x) > 1 or abs(y - last_y) > 1:
+                return math.inf
+            if x != last_x and y != last_y:
+                if weight[costmap[last_y, x]] == 0 or weight[costmap[y, last_x]] == 0:
+                    return math.inf
+                length = float(DIAGONAL)
+            elif x != last_x or y != last_y:
+                length = float(STRAIGHT)
+            else:
+                length = 0.0
+            total += length * (np.int64(weight[costmap[y, x]]) + np.int64(weight[costmap[last_y, last_x]]))
+        cumulated[i] = total / (2.0 * STRAIGHT)
+    return total / (2.0 * STRAIGHT)
+
+
+@njit(
+    int64(_arrays.U8_GRID, _arrays.I32_FLAT, _arrays.I32_PAIRS, _arrays.F64_FLAT, float64, _arrays.I64_OUT),
+    cache=True,
+    nogil=True,
+)
+def _shortcut(costmap: Any, weight: Any, cells: Any, cumulated: Any, slack: float, kept: Any) -> int:
+    """Keep cells between which straight lines cost no more than the path: exponential, then binary search."""
+    last = cells.shape[0] - 1
+    kept[0] = 0
+    count = 1
+    anchor = 0
+    while anchor < last:
+        good = anchor + 1
+        stride = 2
+        bad = last + 1
+        while anchor + stride <= last or good < last:
+            probe = min(anchor + stride, last)
+            allowed = (cumulated[probe] - cumulated[anchor]) * (1.0 + slack) + 1e-9
+            cost = _line_cost(
+                costmap,
+                weight,
+                float(cells[anchor, 0]),
+                float(cells[anchor, 1]),
+                float(cells[probe, 0]),
+                float(cells[probe, 1]),
+                allowed,
+            )
+            if cost > allowed:
+                bad = probe
+                break
+            good = probe
+            if probe == last:
+                break
+            stride *= 2
+        while bad - good > 1 and bad <= last:
+            probe = (good + bad) // 2
+            allowed = (cumulated[probe] - cumulated[anchor]) * (1.0 + slack) + 1e-9
+            cost = _line_cost(
+                costmap,
+                weight,
+                float(cells[anchor, 0]),
+                float(cells[anchor, 1]),
+                float(cells[probe, 0]),
+                float(cells[probe, 1]),
+                allowed,
+            )
+            if cost > allowed:
+                bad = probe
+            else:
+                good = probe
+        kept[count] = good
+        count += 1
+        anchor = good
+    return count
+
+
+@njit(boolean(_arrays.F64_GRID, _arrays.F64_GRID, float64, float64), cache=True, nogil=True, error_model="numpy")
+def _leaves(line: Any, other: Any, reach: float, spacing: float) -> bool:
+    """Whether a point of a line, sampled at most `spacing` apart, is farther than `reach` from another line."""
+    nearest = 0
+    last = max(other.shape[0] - 2, 0)
+    for i in range(max(line.shape[0] - 1, 1)):
+        end = min(i + 1, line.shape[0] - 1)
+        dx = line[end, 0] - line[i, 0]
+        dy = line[end, 1] - line[i, 1]
+        samples = max(1, math.ceil(math.sqrt(dx * dx + dy * dy) / spacing))
+        for k in range(samples + 1):
+            x = line[i, 0] + dx * k / samples
+            y = line[i, 1] + dy * k / samples
+            found = False
+            # The part that was near the last sample is looked at first.
+            for turn in range(last + 1):
+                j = (nearest + turn) % (last + 1)
+                ahead = min(j + 1, other.shape[0] - 1)
+                ex = other[ahead, 0] - other[j, 0]
+                ey = other[ahead, 1] - other[j, 1]
+                square = ex * ex + ey * ey
+                along = 0.0
+                if square > 0.0:
+                    along = ((x - other[j, 0]) * ex + (y - other[j, 1]) * ey) / square
+                along = min(max(along, 0.0), 1.0)
+                off_x = x - other[j, 0] - along * ex
+                off_y = y - other[j, 1] - along * ey
+                if off_x * off_x + off_y * off_y <= reach * reach:
+                    nearest = j
+                    found = True
+                    break
+            if not found:
+                return True
+    return False
+
+
+def _cells_array(cells: NDArray[np.int32]) -> NDArray[np.int32]:
+    _arrays.exact(cells, np.int32, 2, "cells")
+    if cells.shape[0] == 0 or cells.shape[1] != 2:
+        raise ValueError(f"cells must have shape (n, 2) with n >= 1, not {cells.shape}")
+    return cells
+
+
+def line_cost(
+    costmap: NDArray[np.uint8],
+    x0: float,
+    y0: float,
+    x1: float,
+    y1: float,
+    neutral: int = NEUTRAL_WEIGHT,
+    factor: float = COST_WEIGHT,
+) -> float:
+    """Return the integral of the weight along a straight line, in cells times weight.
+
+    Coordinates are columns and rows, whole numbers being the centres of cells. Infinite when the line crosses a cell
+    that isn't traversable, cuts a corner that a diagonal step may not cut, or leaves the grid.
+    Raises TypeError or ValueError for a costmap of another type or shape.
+    """
+    costmap = _arrays.grid(costmap, "costmap")
+    weight = weights_of(neutral, factor)
+    return float(_line_cost(costmap, weight, float(x0), float(y0), float(x1), float(y1), math.inf))
+
+
+def polyline_cost(costmap: NDArray[np.uint8], points: NDArray[np.float64]) -> float:
+    """Return the sum of `line_cost`, with the weights of the default, over the lines between points (float64 (n, 2)).
+
+    Raises TypeError or ValueError for arrays of another type or shape.
+    """
+    costmap = _arrays.grid(costmap, "costmap")
+    _arrays.exact(points, np.float64, 2, "points")
+    if points.shape[1] != 2:
+        raise ValueError(f"points must have shape (n, 2), not {points.shape}")
+    return float(_polyline_cost(costmap, DEFAULT_WEIGHTS, points))
+
+
+def shortcut(
+    costmap: NDArray[np.uint8],
+    cells: NDArray[np.int32],
+    neutral: int = NEUTRAL_WEIGHT,
+    factor: float = COST_WEIGHT,
+    slack: float = 0.01,
+) -> NDArray[np.float64]:
+    """Straighten a path along lines of sight that cost at most `1 + slack` times the section that they replace.
+
+    `cells` is int32 (n, 2) as (column, row), a path of `Planner.plan` on this costmap. Returns float64 (m, 2) in the
+    same coordinates, the first and last cell kept: corners to be joined by straight lines, none of which crosses a
+    cell that isn't traversable. Raises ValueError if the path itself crosses one or isn't connected, TypeError or
+    ValueError for wrong types or shapes.
+    """
+    costmap = _arrays.grid(costmap, "costmap")
+    cells = _cells_array(cells)
+    if slack < 0.0:
+        raise ValueError(f"slack must not be negative, not {slack}")
+    weight = weights_of(neutral, factor)
+    cumulated = np.empty(len(cells))
+    if not math.isfinite(_cells_cost(costmap, weight, cells, cumulated)):
+        raise ValueError("cells aren't a path on this costmap: plan again before straightening")
+    kept = np.empty(len(cells), np.int64)
+    count = int(_shortcut(costmap, weight, cells, cumulated, slack, kept))
+    return cells[kept[:count]].astype(np.float64)
+
+
+def leaves(line: NDArray[np.float64], other: NDArray[np.float64], reach: float, spacing: float) -> bool:
+    """Return whether a line leaves another one by more than `reach` somewhere.
+
+    Both are float64 (n, 2), n >= 1, points joined by straight lines, in one unit with `reach` and `spacing`. The line's
+    corners are looked at, and points between them at most `spacing` apart. Raises TypeError or ValueError for arrays of
+    another type or shape.
+    """
+    for points, name in ((line, "line"), (other, "other")):
+        _arrays.exact(points, np.float64, 2, name)
+        if len(points) == 0 or points.shape[1] != 2:
+            raise ValueError(f"{name} must have shape (n, 2) with n >= 1, not {points.shape}")
+    return bool(_leaves(line, other, reach, _arrays.positive(spacing, "spacing")))

@@ -57,6 +57,34 @@ def robot_egress(*, robot: RobotOption = None, fog: FogOption = None, json: Json
     _run_command("egress", robot, fog, json=json)
 
 
+@robot_app.command("dock", epilog="Example: fognav robot dock && fognav robot watch --seconds 60")
+def robot_dock(*, robot: RobotOption = None, fog: FogOption = None, json: JsonOption = False) -> None:
+    """Send an enabled robot to its dock.
+
+    It drives to the front of the dock like to any goal; then its base drives into the dock by itself, for 60 s at most.
+    Watch it there: the base does not know of zones.
+    """
+    _run_command("dock", robot, fog, json=json)
+
+
+@robot_app.command("undock", epilog="Example: fognav robot undock")
+def robot_undock(*, robot: RobotOption = None, fog: FogOption = None, json: JsonOption = False) -> None:
+    """Let a robot leave its dock, 0.3 m straight back.
+
+    A goal does the same for an enabled robot.
+    """
+    _run_command("undock", robot, fog, json=json)
+
+
+@robot_app.command("back-off", epilog="Example: fognav robot back-off && fognav robot reset")
+def robot_back_off(*, robot: RobotOption = None, fog: FogOption = None, json: JsonOption = False) -> None:
+    """Let a robot back off from what it has bumped into, 10 cm at most.
+
+    Its fault stays until it is reset. Look behind it first: only its lidar does otherwise.
+    """
+    _run_command("back_off", robot, fog, json=json)
+
+
 @robot_app.command("stop", epilog="Example: fognav robot stop")
 def robot_stop(*, robot: RobotOption = None, fog: FogOption = None, json: JsonOption = False) -> None:
     """Stop a robot at once and end its mission."""

@@ -9,15 +9,16 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from fog_contracts import channels as ch
-from fog_contracts.messages import MapSnapshot, PlanReply
+from fog_contracts.messages import MapSnapshot, PlanReply, RobotGoal, RobotState
+from planner.dock_goals import DockGoals
 from robot_agent.agent.core import decide
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from fog_contracts.bus import Bus
     from fog_contracts.handlers import Handler, Ids, Moment, Publication
-    from fog_contracts.messages import Message, RobotGoal, Zone
+    from fog_contracts.messages import Message, Pose, Zone
     from hazard_aggregator.core import Aggregator
     from map_service.core import MapCore
     from planner.core import PlannerCore
@@ -81,9 +82,11 @@ class MapProcess:
 class PlannerProcess:
     """The planner: messages wait for its next tick; urgent ones trigger it at once."""
 
-    def __init__(self, core: PlannerCore, bus: Bus) -> None:
+    def __init__(self, core: PlannerCore, bus: Bus, staging: Mapping[str, Pose] | None = None) -> None:
+        """`staging`: by robot, the pose in front of its dock."""
         self.core = core
         self._bus = bus
+        self._docks = DockGoals(staging or {})
         self.due = False
         """Whether `tick` is due before its regular time."""
         bus.subscribe({channel: self._with_wake_up(channel, handler) for channel, handler in core.handlers().items()})
@@ -118,9 +121,16 @@ class PlannerProcess:
             self.tick(at)
             self._bus.deliver(at)
 
+    def _send_to_dock(self, robot: str, state: RobotState, at: Moment) -> None:
+        pose = self._docks.due(robot, state, self.core.missions.goal(robot), at.now)
+        if pose is not None:
+            self.set_goal(robot, RobotGoal(goal_id=f"dock-{at.now:.2f}", pose=pose, stamp=at.stamp))
+
     def _with_wake_up(self, channel: ch.Channel, handler: Handler) -> Handler:
         def handle(ids: Ids, message: Message, at: Moment) -> Sequence[Publication]:
             self.due = self.due or channel in self.core.URGENT
+            if isinstance(message, RobotState):
+                self._send_to_dock(ids["robot"], message, at)
             return handler(ids, message, at)
 
         return handle
@@ -163,10 +173,18 @@ class AgentProcess:
 class Fog:
     """Aggregator, map-service and planner together."""
 
-    def __init__(self, aggregator: Aggregator, map_: MapCore, planner: PlannerCore, bus: Bus) -> None:
+    def __init__(
+        self,
+        aggregator: Aggregator,
+        map_: MapCore,
+        planner: PlannerCore,
+        bus: Bus,
+        staging: Mapping[str, Pose] | None = None,
+    ) -> None:
+        """`staging`: by robot, the pose in front of its dock."""
         self.aggregator = AggregatorProcess(aggregator, bus)
         self.map = MapProcess(map_, bus)
-        self.planner = PlannerProcess(planner, bus)
+        self.planner = PlannerProcess(planner, bus, staging)
 
     def start(self, at: Moment) -> None:
         """Connect everything, with no zones stored."""

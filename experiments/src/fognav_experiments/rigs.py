@@ -32,6 +32,7 @@ from robot_agent.agent.pose_keeper import start_pose
 from robot_agent.config import agent_config
 from robot_agent.guardian import link
 from robot_agent.guardian.core import GuardianCore
+from robot_agent.hardware import DockingDriver
 from robot_agent.registry import make_base, make_lidar
 
 if TYPE_CHECKING:
@@ -90,7 +91,15 @@ class RobotRig:
             world, base_emulator, lidar_emulator, start, initial_wheel_travel_m=_INITIAL_WHEEL_TRAVEL_M
         )
         self.guardian = GuardianCore(driver)
-        config = agent_config(robot.id, OPERATOR_KEY, driver.drive_train, self._lidar_driver.traits, robot, boot=BOOT)
+        config = agent_config(
+            robot.id,
+            OPERATOR_KEY,
+            driver.drive_train,
+            self._lidar_driver.traits,
+            robot,
+            boot=BOOT,
+            finds_dock=isinstance(driver, DockingDriver),
+        )
         self.agent = make_agent(config, seed)
         self.agent.restore(start_pose(site.site.id, robot))
         self.process = AgentProcess(self.agent, robot.id, bus)
@@ -188,6 +197,7 @@ class FogRig(Fog):
             ),
             PlannerCore(epoch=1),
             bus,
+            site.site.staging,
         )
         self._bus = bus
         self._world = world

@@ -33,6 +33,7 @@ from robot_agent.agent.store import Store
 from robot_agent.config import agent_config
 from robot_agent.device_signature import LineCheck
 from robot_agent.guardian.protection import run_in_real_time
+from robot_agent.hardware import DockingDriver
 
 _log = logs.get("agent")
 
@@ -57,6 +58,7 @@ async def main() -> None:
         obstacle_ttl=settings.obstacle_memory_s,
         footprint=read_footprint(robot),
         settings=robot.settings,
+        finds_dock=isinstance(base, DockingDriver),
     )
     port = read_port(robot)
     use_one_thread()

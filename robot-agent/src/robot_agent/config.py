@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from fog_contracts.channels import MAP_HEARTBEAT, ROBOT_RELEASE
 from fog_contracts.costs import DEFAULT_INFLATION, DEGRADED_SPEED, ROBOT_RADIUS, Inflation
+from fog_contracts.messages import Pose  # noqa: TC001  # read at run time, when a configuration is decoded
 from fog_contracts.robot import MotionSettings
 from fog_kernels.dwa import DwaLimits, DwaSettings
 from robot_agent.footprint import Footprint
@@ -41,6 +42,7 @@ class SafetyConfig:
     speed_normal: float = 0.30
     speed_degraded: float = DEGRADED_SPEED / 100
     speed_egress: float = 0.10
+    speed_back_off: float = 0.05
     relax_after: float = 2.0
     map_late: float = MAP_HEARTBEAT.max_age_s
     map_lost: float = 3.0
@@ -69,6 +71,11 @@ class SafetyConfig:
     """By how much (m) the way out may become longer again: the pose's noise."""
     egress_end: float = 0.05
     """The way out is driven to within this (m) of its end."""
+    dock_max: float = 60.0
+    dock_settled: float = 1.0
+    """For how long (s) the dock must have contact until the base has found it."""
+    undock_max: float = 15.0
+    back_off_max: float = 5.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -187,6 +194,14 @@ class AgentConfig:
     """How long (s) an idle robot waits before it rests, with its lidar's motor at a standstill; 0: it never does."""
     battery_low: float = 0.2
     """Charge (of 1) below which the robot announces a low battery."""
+    dock_below: float = 0.0
+    """Charge (of 1) below which an enabled robot without a mission goes to its dock by itself; 0: never."""
+    finds_dock: bool = False
+    """Whether the base drives into its dock by itself."""
+    dock: Pose | None = None
+    """The robot's pose (frame `map`) on its dock; None if its site gives none."""
+    staging: Pose | None = None
+    """Where it goes before the base looks for the dock."""
     safety: SafetyConfig = field(default_factory=SafetyConfig)
     stop_field: StopFieldConfig = field(default_factory=StopFieldConfig)
     visibility: VisibilityConfig = field(default_factory=VisibilityConfig)
@@ -204,6 +219,7 @@ def agent_config(  # noqa: PLR0913  # what the process knows about its robot
     obstacle_ttl: float | None = None,
     footprint: Footprint | None = None,
     settings: RobotSettings | None = None,
+    finds_dock: bool = False,
 ) -> AgentConfig:
     """Return the configuration of a robot with this id, base and lidar, and the radius and height that its site gives.
 
@@ -211,6 +227,7 @@ def agent_config(  # noqa: PLR0913  # what the process knows about its robot
     obstacle_ttl: how long (s) a reported obstacle counts while no lidar looks there again; None for the default.
     footprint: outline of the body; None for the circle of the site's radius.
     settings: the robot's own settings; None for the defaults.
+    finds_dock: whether the base drives into its dock by itself.
     """
     limits = DwaLimits(axle=drive_train.axle_m, wheel_max=min(_WHEEL_SPEED_MAX, drive_train.wheel_speed_max_m_s))
     scan_lost = max(SafetyConfig().scan_lost, _LOST_AFTER_REVOLUTIONS * lidar.scan_period_s)
@@ -226,7 +243,7 @@ def agent_config(  # noqa: PLR0913  # what the process knows about its robot
     if obstacle_ttl is not None:
         config = replace(config, obstacle_ttl=obstacle_ttl)
     if body is not None:
-        config = replace(config, height=body.height)
+        config = replace(config, height=body.height, dock=body.dock, staging=body.staging, finds_dock=finds_dock)
     if footprint is not None:
         radius, inscribed = footprint.circumscribed_radius, footprint.inscribed_radius
     else:
@@ -268,4 +285,10 @@ def _with_settings(config: AgentConfig, settings: RobotSettings, *, can_rest: bo
         lidar_y=lidar.y_m,
         lidar_yaw=lidar.yaw_rad,
     )
-    return replace(config, localization=localization, battery_low=settings.power.low_fraction, rest_after=rest_after)
+    return replace(
+        config,
+        localization=localization,
+        battery_low=settings.power.low_fraction,
+        dock_below=settings.power.dock_below,
+        rest_after=rest_after,
+    )

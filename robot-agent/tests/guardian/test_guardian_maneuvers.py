@@ -203,12 +203,19 @@ def test_base_has_0_4_m_to_leave_its_dock(travel):
     assert "0.40 m" in rig.core._stopped(rig.now)
 
 
-@pytest.mark.parametrize("status", [{"bumper_left": True}, {"cliff": True}, {"wheel_drop": True}])
+@pytest.mark.parametrize("status", [{"cliff": True}, {"wheel_drop": True}])
 def test_each_fault_ends_leaving_within_its_frame_although_the_base_protects_itself_no_more(status):
     rig = leaving()
     rig.steps(0.2)
     assert rig.step(**status).startswith(b"start;")
     assert rig.core.latched is not None
+
+
+def test_dock_that_presses_the_bumper_does_not_keep_the_base():
+    rig = leaving()
+    rig.steps(0.5, bumper_left=True)
+    assert rig.core.moving
+    assert rig.core.latched is None
 
 
 def test_base_with_a_cable_in_it_stays_where_it_is():

@@ -67,6 +67,23 @@ ROWS = [
         "alone",
         "the guardian holds the wheels: no fresh command",
     ),
+    Row("on its dock", {"docked_for": 0.0, "mission": False}, {}, "HOLD", "alone", "the robot is on its dock"),
+    Row(
+        "on its dock, charging",
+        {"docked_for": 5.0, "base_stopped": "the base is on its charger, where it does not drive", "mission": False},
+        {},
+        "HOLD",
+        "alone",
+        "the robot is on its dock",
+    ),
+    Row(
+        "wheels held on the dock",
+        {"docked_for": 5.0, "base_stopped": "not ready"},
+        {},
+        "PROTECTIVE_STOP",
+        "alone",
+        "the guardian holds the wheels: not ready",
+    ),
     Row(
         "lidar silent",
         {"lidar_age": 0.301},

@@ -32,7 +32,7 @@ class Gate:
         for _ in range(max(1, round(seconds / DT))):
             self.now += DT
             self.remaining = max(0.0, self.remaining - speed * DT)
-            values = {"egress_remaining": self.remaining, **given}
+            values = {"maneuver_remaining": self.remaining, **given}
             self.state, self.out = step(self.state, SafetyInputs(**values, request=request), self.now)
             request = None
         return self.out
@@ -62,7 +62,7 @@ def test_egress_ignores_only_the_blocked_area_drives_slowly_and_ends_outside_in_
 
 def test_egress_that_ends_inside_says_so():
     gate = Gate().leaving()
-    out = gate.run(egress_remaining=0.05)
+    out = gate.run(maneuver_remaining=0.05)
     assert out.mode == "INIT"
     assert "the egress ended: the way out ends, and the robot is still in the no-go zone wet" in out.reasons
 
@@ -118,7 +118,7 @@ def test_egress_of_a_resting_robot_waits_for_its_lidar_and_counts_from_then():
     gate = Gate()
     out = gate.run(request="egress", **RESTING)
     assert (out.refusal, out.mode, out.stop) == (None, "INIT", "immediate")
-    assert out.reasons[-1] == "leaves the blocked area as soon as its lidar runs"
+    assert out.reasons[-1] == "as soon as its lidar runs: leaving a blocked area on an operator's command"
     assert gate.run(70.0, **RESTING).stop == "immediate"
     assert gate.run().mode == "EGRESS"
     assert gate.run(9.8).mode == "EGRESS"
@@ -148,7 +148,7 @@ def test_disable_ends_an_egress_at_once():
 def test_distance_to_the_edge_must_shrink():
     gate = Gate().leaving()
     assert gate.run(9.0).mode == "EGRESS"
-    out = gate.run(1.5, egress_problem="an obstacle ahead")
+    out = gate.run(1.5, maneuver_problem="an obstacle ahead")
     assert out.mode == "INIT"
     assert "no nearer to its end for 10 s: an obstacle ahead" in "; ".join(out.reasons)
     gate = Gate().leaving()
@@ -162,7 +162,7 @@ def test_egress_without_a_way_out_ends_after_ten_seconds():
     gate = Gate()
     gate.run(request="egress")
     assert gate.run(9.8).mode == "EGRESS"
-    assert "no nearer" in "; ".join(gate.run(0.3, egress_problem="the planner does not answer").reasons)
+    assert "no nearer" in "; ".join(gate.run(0.3, maneuver_problem="the planner does not answer").reasons)
 
 
 def test_egress_ends_after_sixty_seconds():
@@ -175,4 +175,4 @@ def test_egress_ends_after_sixty_seconds():
 
 @pytest.mark.parametrize("remaining", [math.nan, -math.inf])
 def test_impossible_distance_ends_an_egress(remaining):
-    assert Gate().leaving().run(egress_remaining=remaining).mode == "INIT"
+    assert Gate().leaving().run(maneuver_remaining=remaining).mode == "INIT"

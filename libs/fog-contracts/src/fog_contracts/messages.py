@@ -709,6 +709,7 @@ class RobotState(Message, frozen=True, kw_only=True):
     `boot` is the id of this run of its agent, `clock` the agent's own monotonic clock: a command names both.
     `proximity` has the strength of each of the base's light sensors, from the left to the right; empty without any.
     `metrics` is the address (host:port) at which Prometheus reaches the robot's metrics; empty if it can't.
+    `docked`: it stands on its dock. `wants_dock`: it asks the planner for the goal in front of its dock.
     """
 
     mode: Mode
@@ -732,6 +733,8 @@ class RobotState(Message, frozen=True, kw_only=True):
     proximity: Annotated[list[Strength], Meta(max_length=16)] = []
     profile: ProfileName = "fog"
     metrics: Annotated[str, Meta(max_length=128)] = ""
+    docked: bool = False
+    wants_dock: bool = False
 
 
 VIEW_SECTORS: Final = 180
@@ -767,7 +770,18 @@ class RobotObstacles(Message, frozen=True, kw_only=True):
 
 
 CommandKind = Literal[
-    "enable", "disable", "cancel", "egress", "reset", "initial_pose", "profile_default", "profile_full", "profile_fog"
+    "enable",
+    "disable",
+    "cancel",
+    "egress",
+    "dock",
+    "undock",
+    "back_off",
+    "reset",
+    "initial_pose",
+    "profile_default",
+    "profile_full",
+    "profile_fog",
 ]
 
 

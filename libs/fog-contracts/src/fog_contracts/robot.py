@@ -128,6 +128,13 @@ class PowerSettings(_Table, frozen=True, kw_only=True):
         Annotated[float, Meta(ge=0.0, le=0.9)],
         Meta(description="charge, of 1, below which its state says so; 0: never"),
     ] = 0.2
+    dock_below: Annotated[
+        Annotated[float, Meta(ge=0.0, le=0.9)],
+        Meta(
+            description="charge, of 1, below which an enabled robot without a mission drives to its dock by itself; "
+            "0: never"
+        ),
+    ] = 0.0
     rest_after_s: Annotated[
         Annotated[float, Meta(ge=0.0, le=86_400.0)],
         Meta(

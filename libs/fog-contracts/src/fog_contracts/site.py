@@ -1,6 +1,7 @@
 """A site as `site.toml` describes it: map, places, areas, nodes and robots; lengths in m, angles in rad."""
 
-from typing import Annotated, Any
+import math
+from typing import Annotated, Any, Final
 
 from msgspec import Meta, field
 from msgspec.structs import asdict
@@ -19,6 +20,9 @@ from fog_contracts.messages import (
     Source,
     UnknownPolicy,
 )
+
+STAGING_M: Final = 0.7
+"""A robot looks for its dock from this far in front of its pose on the dock."""
 
 
 class Place(Message, frozen=True, kw_only=True):
@@ -90,6 +94,14 @@ class RobotSite(Message, frozen=True, kw_only=True):
     radius: Annotated[float, Meta(gt=0.0, le=2.0)] = ROBOT_RADIUS
     height: Annotated[float, Meta(gt=0.0, le=3.0)] = 0.35
 
+    @property
+    def staging(self) -> Pose | None:
+        """The pose in front of the dock, facing it, from which the base finds it by itself; None without a dock."""
+        if self.dock is None:
+            return None
+        x, y, theta = self.dock.x, self.dock.y, self.dock.theta
+        return Pose(x=x - STAGING_M * math.cos(theta), y=y - STAGING_M * math.sin(theta), theta=theta)
+
 
 class DemoPlan(Message, frozen=True, kw_only=True):
     """The drive that the demo shows here: from one place to another, and the areas that may become blocked."""
@@ -116,6 +128,11 @@ class Site(Message, frozen=True, kw_only=True):
     robots: list[RobotSite] = field(default_factory=list)
     layers: list[str | dict[str, Any]] = field(default_factory=list)
     demo: DemoPlan | None = None
+
+    @property
+    def staging(self) -> dict[str, Pose]:
+        """By robot, the pose in front of its dock; robots without a dock are left out."""
+        return {robot.id: pose for robot in self.robots if (pose := robot.staging) is not None}
 
     def definitions(self) -> list[AreaDefinition]:
         """Return the areas as the aggregator publishes them, each with the nodes that watch it."""

@@ -24,8 +24,8 @@ from fog_contracts.fencing import Fence
 from fog_contracts.follower import MapFollower
 from fog_contracts.messages import LoopHealth
 from robot_agent.agent.blocked_places import BlockedPlaces
-from robot_agent.agent.egress import Egress
 from robot_agent.agent.fog_inputs import FogInputs
+from robot_agent.agent.maneuvers import Maneuvers
 from robot_agent.agent.motion_guard import MotionGuard
 from robot_agent.agent.navigation import Navigation
 from robot_agent.agent.obstacle_reporter import ObstacleReporter
@@ -91,8 +91,8 @@ class AgentCore:
         self._driving = PathDriving(config)
         self._navigation = Navigation(config, self._map, self._places, self._driving, self._localizer)
         self._fog = FogInputs(self._navigation, self._places, self._driving, self._localizer)
-        self._egress = Egress(config)
         self._guard = MotionGuard(config, self._localizer)
+        self._maneuvers = Maneuvers(config, self._localizer, self._guard)
         self._safety = SafetySupervisor(config.safety)
         self._rest = RestPolicy(config.rest_after)
         self._reporter = ObstacleReporter(config.obstacle_ttl, config.obstacle_limit)
@@ -147,6 +147,8 @@ class AgentCore:
         self._localizer.on_odometry(now, motion.x, motion.y, motion.theta)
         if motion.skipped is not None:
             self._localizer.on_unmeasured_motion(*possible_motion(motion.skipped, self._config.drive_train))
+        if (seen := self._maneuvers.docking.observation(self._base.docked_for(now), now)) is not None:
+            self._localizer.on_absolute_observation(seen)
 
     def on_suspension(self, seconds: float) -> None:
         """Record that the computer was suspended: the robot may have been pushed or carried since."""
@@ -186,18 +188,19 @@ class AgentCore:
         """Evaluate safety and return the wheel speeds to send now; call it 20 times a second."""
         self._rest.update(busy=not self.idle, goal_id=self._driving.mission.goal_id, now=now)
         safety = self._evaluate_safety(now)
-        if safety.mode == "EGRESS":
-            wheels = self._egress.wheels(self._localizer.pose(now))
-            return self._driving.command_directly(wheels, safety, self._guard.limit, now)
-        return self._driving.command(safety, self._guard.limit, now, stamp)
+        if self._maneuvers.may_seek_dock(self._safety.state, self._base.feedback, self._driving, now):
+            safety = self._evaluate_safety(now, "dock")
+            self._maneuvers.docking.on_begun(safety.refusal)
+        maneuver = self._maneuvers.command(self._safety.state, safety, self._driving, now)
+        return maneuver or self._driving.command(safety, self._guard.limit, now, stamp)
 
     def egress_request(self, now: float) -> EgressRequest | None:
         """Return the query for a way out of a blocked area that is due; pass its reply to `on_egress_reply`."""
-        return self._egress.request(self._localizer.pose(now), self.safety, now)
+        return self._maneuvers.egress.request(self._localizer.pose(now), self.safety, now)
 
     def on_egress_reply(self, reply: PlanReply | None, now: float) -> None:
         """Handle the planner's reply to an `egress_request`; None when it did not answer."""
-        self._egress.on_reply(reply, self._localizer.pose(now), now)
+        self._maneuvers.egress.on_reply(reply, self._localizer.pose(now), now)
 
     def search(self, now: float) -> Search | None:
         """Return the search for a path that is due; None in the profile `fog`. Call it before each `control_job`."""
@@ -218,7 +221,6 @@ class AgentCore:
     def _evaluate_safety(self, now: float, request: Request | None = None) -> SafetyOutputs:
         pose = self._localizer.pose(now)
         trusted = pose if self._localizer.status in {"good", "weak"} else None
-        self._egress.advance(trusted, now)
         inputs = safety_inputs(
             self._base,
             self._lidar,
@@ -227,7 +229,7 @@ class AgentCore:
             self._driving.mission,
             path_problem=self._driving.path_problem(self.replica, self._guard, self.safety, now),
             inside_blocked=self._navigation.inside_blocked(trusted, self._reporter, now) if trusted else None,
-            egress=(self._egress.remaining, self._egress.problem(self._guard.reason)),
+            maneuver=self._maneuvers.inputs(self._safety.state, self.replica, trusted, now),
             caution=self._navigation.caution(pose, now) if pose else None,
             resting=self._rest.reason,
             now=now,
@@ -241,15 +243,21 @@ class AgentCore:
     def request(self, request: Request, now: float) -> SafetyOutputs:
         """Pass an operator's request to the safety gate; the outputs carry its refusal."""
         self._rest.on_request(request)
-        if request == "egress" and self.safety.mode != "EGRESS":
-            self._egress.begin()
+        self._maneuvers.on_request(request, self._safety.state)
         outputs = self._evaluate_safety(now, request)
         if request == "reset" and outputs.refusal is None:
             self._driving.wheels.pass_reset()
         return outputs
 
+    def order_dock(self, now: float) -> str | None:
+        """Let the robot go to its dock; return why it does not, None if it does."""
+        self._rest.wake()
+        docked = self._base.docked_for(now) is not None
+        return self._maneuvers.docking.order(self._safety.state, self._driving.mission, docked=docked, now=now)
+
     def cancel_goal(self) -> str | None:
         """Cancel the goal; return its id, None without one."""
+        self._maneuvers.docking.give_up("its goal was cancelled")
         return self._driving.cancel_goal()
 
     def set_initial_pose(self, pose: Pose | None) -> str | None:
@@ -298,6 +306,7 @@ class AgentCore:
             epochs=self._fence.epochs,
             boot=self._config.boot,
             profile=self.profile.name,
+            docking=self._maneuvers.docking,
             at=at,
         )
 

@@ -9,6 +9,11 @@ from robot_agent.agent.near_points import NearPoints
 from robot_agent.safety.stop_field import StopField
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import numpy as np
+    from numpy.typing import NDArray
+
     from fog_contracts.replica import Replica
     from robot_agent.config import AgentConfig
     from robot_agent.hardware import LaserScan, LidarSamples
@@ -59,3 +64,17 @@ class MotionGuard:
         left = self._field.limit(unseen.wheels, points)
         self.reason = self.reason or left.reason
         return left.wheels
+
+    def hazard(
+        self, wheels: Wheels, keep: Callable[[NDArray[np.float64]], NDArray[np.float64]], now: float
+    ) -> str | None:
+        """Return why a robot that nobody slows down must not go on at these wheel speeds (m/s); None when it may.
+
+        keep: returns those of the points (n, 2; m) in `base` that count.
+        """
+        points = keep(self._points.seen_from(self._localizer, now))
+        if self._field.limit(wheels, points).zone != "free":
+            return "the lidar sees an obstacle near the robot's way"
+        if self._view.visibility.limit(wheels, self._drive.twist(*wheels)).zone == "free":
+            return None
+        return "the lidar does not see enough of the robot's way"

@@ -9,6 +9,8 @@ from fog_contracts.costs import LETHAL
 from fog_contracts.messages import CommandReply
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from fog_contracts.handlers import Moment
     from fog_contracts.messages import Pose, ProfileName, RobotCommand
     from fog_contracts.replica import Replica
@@ -17,6 +19,12 @@ if TYPE_CHECKING:
     from robot_agent.safety.gate import SafetyOutputs
 
 _REASON_LIMIT: Final = 500
+_ACCEPTED: Final[Mapping[Request, str]] = {
+    "reset": "the fault is reset; enable the robot to let it drive",
+    "egress": "the robot leaves the blocked area slowly; watch it",
+    "undock": "the robot leaves its dock, straight back; watch it",
+    "back_off": "the robot backs off by at most 10 cm; then reset its fault",
+}
 
 
 class CommandTarget(Protocol):
@@ -24,6 +32,9 @@ class CommandTarget(Protocol):
 
     def request(self, request: Request, now: float) -> SafetyOutputs:
         """Pass a request to the safety gate; the outputs carry its refusal."""
+
+    def order_dock(self, now: float) -> str | None:
+        """Let the robot go to its dock; return why it does not, None if it does."""
 
     def cancel_goal(self) -> str | None:
         """Cancel the goal; return its id, None without one."""
@@ -48,8 +59,10 @@ class OperatorCommands:
         if refusal is not None:
             return _refused(refusal)
         match command.kind:
-            case "enable" | "disable" | "reset" | "egress":
+            case "enable" | "disable" | "reset" | "egress" | "undock" | "back_off":
                 return self._request(command.kind, at.now)
+            case "dock":
+                return self._send_to_dock(at.now)
             case "cancel":
                 return self._cancel()
             case "initial_pose":
@@ -62,6 +75,12 @@ class OperatorCommands:
         if goal is None:
             return _refused("there is no goal to cancel")
         return CommandReply(accepted=True, reason=f"the goal {goal} is cancelled on the robot")
+
+    def _send_to_dock(self, now: float) -> CommandReply:
+        refusal = self._robot.order_dock(now)
+        if refusal is not None:
+            return _refused(refusal)
+        return CommandReply(accepted=True, reason="the robot goes to its dock; watch it while it drives into it")
 
     def _start_localization(self, pose: Pose | None) -> CommandReply:
         refusal = self._robot.set_initial_pose(pose)
@@ -79,11 +98,7 @@ class OperatorCommands:
         outputs = self._robot.request(request, now)
         if outputs.refusal is not None:
             return _refused(outputs.refusal)
-        if request == "reset":
-            return CommandReply(accepted=True, reason="the fault is reset; enable the robot to let it drive")
-        if request == "egress":
-            return CommandReply(accepted=True, reason="the robot leaves the blocked area slowly; watch it")
-        return CommandReply(accepted=True, reason=f"{request}d; the mode is {outputs.mode}")
+        return CommandReply(accepted=True, reason=_ACCEPTED.get(request, f"{request}d; the mode is {outputs.mode}"))
 
 
 def initial_pose_refusal(pose: Pose | None, replica: Replica, *, at_rest: bool) -> str | None:

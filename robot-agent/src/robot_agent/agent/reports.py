@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from fog_contracts.handlers import Moment
     from fog_contracts.messages import ProfileName, Trace
     from fog_contracts.replica import Version
+    from robot_agent.agent.docking import Docking
     from robot_agent.agent.mission import Mission
     from robot_agent.config import AgentConfig
     from robot_agent.guardian.link import BaseFeedback
@@ -60,15 +61,20 @@ def robot_state(  # noqa: PLR0913  # a message gathers from all parts of the age
     epochs: dict[str, int],
     boot: str,
     profile: ProfileName,
+    docking: Docking,
     at: Moment,
 ) -> RobotState:
     """Return mode, reasons, goal, path, map version and the `epochs` received of each service.
 
     `hindrances` are reasons besides the safety gate's, and so is a charge below `battery_low` (of 1); `boot` is the id
-    of this run of the agent.
+    of this run of the agent, `docking` its wish for the dock.
     """
     path = mission.path
     warnings = power_warnings(feedback.status if feedback else None, battery_low)
+    if docking.ordered:
+        warnings.append("on its way to its dock")
+    elif docking.given_up:
+        warnings.append(f"docking given up: {docking.given_up}")
     return RobotState(
         mode=safety.mode,
         reasons=[reason[:_REASON_LIMIT] for reason in (*safety.reasons, *hindrances, *warnings)],
@@ -90,6 +96,8 @@ def robot_state(  # noqa: PLR0913  # a message gathers from all parts of the age
         clock=at.now,
         power=feedback.status.power if feedback else None,
         proximity=list(feedback.status.proximity) if feedback else [],
+        docked=feedback is not None and feedback.status.docked,
+        wants_dock=docking.wants_goal(mission),
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from msgspec.structs import replace
 
@@ -18,6 +18,14 @@ if TYPE_CHECKING:
     from robot_agent.localization.localizer import Localizer
     from robot_agent.safety.conditions import Request
     from robot_agent.safety.gate import SafetyOutputs
+
+
+class ManeuverInputs(NamedTuple):
+    """How the maneuver goes: m to its end, what keeps the robot from it, and why the base must not seek its dock."""
+
+    remaining: float = math.inf
+    problem: str | None = None
+    dock_problem: str | None = None
 
 
 class SafetySupervisor:
@@ -50,15 +58,12 @@ def safety_inputs(  # noqa: PLR0913  # the gate weighs every source of the agent
     *,
     path_problem: str | None,
     inside_blocked: str | None,
-    egress: tuple[float, str | None],
+    maneuver: ManeuverInputs,
     caution: str | None,
     resting: str | None,
     now: float,
 ) -> SafetyInputs:
-    """Gather age, value and fault of every source at `now` (s, monotonic).
-
-    egress: m to the end of the way out of a blocked area, and what keeps the robot from taking it.
-    """
+    """Gather age, value and fault of every source at `now` (s, monotonic)."""
     feedback, follower = base.feedback, mission.follower
     return SafetyInputs(
         map_loaded=navigation.version is not None,
@@ -73,6 +78,8 @@ def safety_inputs(  # noqa: PLR0913  # the gate weighs every source of the agent
         guardian_lost=base.lost,
         base_fault=feedback.fault if feedback else None,
         base_stopped=feedback.stopped if feedback else None,
+        bumped=feedback is not None and feedback.bumped,
+        docked_for=base.docked_for(now),
         bumper=feedback is not None and feedback.status.bumper,
         cliff=feedback is not None and feedback.status.cliff,
         wheel_drop=feedback is not None and feedback.status.wheel_drop,
@@ -81,8 +88,9 @@ def safety_inputs(  # noqa: PLR0913  # the gate weighs every source of the agent
         released_remaining=follower.released_remaining if follower else 0.0,
         path_problem=path_problem,
         inside_blocked=inside_blocked,
-        egress_remaining=egress[0],
-        egress_problem=egress[1],
+        maneuver_remaining=maneuver.remaining,
+        maneuver_problem=maneuver.problem,
+        dock_problem=maneuver.dock_problem,
         caution=caution,
         resting=resting,
     )

@@ -19,10 +19,15 @@ class BaseSource:
         self.lost: str | None = None
         """Why the link to the guardian is broken; None while it is connected."""
         self._feedback_at = _NEVER
+        self._docked_at: float | None = None
 
     def on_feedback(self, feedback: BaseFeedback, now: float) -> None:
         """Store feedback that arrived at `now`."""
         self.feedback, self._feedback_at, self.lost = feedback, now, None
+        if not feedback.status.docked:
+            self._docked_at = None
+        elif self._docked_at is None:
+            self._docked_at = now
 
     def on_lost(self, reason: str) -> None:
         """Record that the link broke."""
@@ -31,6 +36,10 @@ class BaseSource:
     def age(self, now: float) -> float:
         """Return the age (s) of the feedback; infinite without any."""
         return now - self._feedback_at
+
+    def docked_for(self, now: float) -> float | None:
+        """Return for how long (s) the robot has been on its dock; None off it."""
+        return None if self._docked_at is None else now - self._docked_at
 
 
 class LidarSource:

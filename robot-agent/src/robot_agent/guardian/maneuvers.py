@@ -117,7 +117,7 @@ class Maneuvers:
 
     def expects_bumper(self, status: BaseStatus) -> bool:
         """Return whether a pressed bumper is no fault now: what the robot backs off from, or the dock that it is on."""
-        return self.is_running("back_off") or (self.is_running("seek_dock") and status.charging)
+        return self.is_running("back_off") or (self.running is not None and status.charging)
 
     def _travel(self, odometry: WheelOdometry) -> float:
         before = self._begun_at

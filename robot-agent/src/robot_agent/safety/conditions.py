@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 import msgspec
 
-from robot_agent.hardware import NO_FRESH_COMMAND
+from robot_agent.hardware import NO_FRESH_COMMAND, ON_CHARGER
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from robot_agent.config import SafetyConfig
 
 Localization = Literal["good", "weak", "lost", "none"]
-Request = Literal["enable", "disable", "reset", "egress"]
+Request = Literal["enable", "disable", "reset", "egress", "dock", "undock", "back_off"]
 
 
 class Level(IntEnum):
@@ -38,9 +38,11 @@ class SafetyInputs(msgspec.Struct, frozen=True, kw_only=True):
     map_age: since the map copy was last confirmed to be the newest version. map_gap: for how long deltas have been
     missing, 0 when none are. plan_age: since the planner's last message about the goal. released_remaining: m of
     released path ahead. path_problem: why the path must not be driven. inside_blocked: the blocked area or zone that
-    the robot is in. egress_remaining: m to the end of the way out of it, infinite while none is known. egress_problem:
-    what keeps the robot from taking it. caution: a reason to drive slowly here. guardian_lost: why there is no link to
-    the guardian. base_stopped: why the guardian keeps the wheels at zero. late_age: since this computer last ran the
+    the robot is in. maneuver_remaining: m to the end of the maneuver that runs, infinite while that is not known.
+    maneuver_problem: what keeps the robot from getting there. dock_problem: why the base must not drive into its dock
+    by itself. caution: a reason to drive slowly here. guardian_lost: why there is no link to the guardian.
+    base_stopped: why the guardian keeps the wheels at zero. bumped: the fault that it has latched is a bump.
+    docked_for: s for which the robot has been on its dock, None off it. late_age: since this computer last ran the
     agent too late, by `late_by`. resting: why the lidar stands still on purpose, or is being started.
     """
 
@@ -56,6 +58,8 @@ class SafetyInputs(msgspec.Struct, frozen=True, kw_only=True):
     guardian_lost: str | None = None
     base_fault: str | None = None
     base_stopped: str | None = None
+    bumped: bool = False
+    docked_for: float | None = None
     bumper: bool = False
     cliff: bool = False
     wheel_drop: bool = False
@@ -64,8 +68,9 @@ class SafetyInputs(msgspec.Struct, frozen=True, kw_only=True):
     released_remaining: float = 0.0
     path_problem: str | None = None
     inside_blocked: str | None = None
-    egress_remaining: float = math.inf
-    egress_problem: str | None = None
+    maneuver_remaining: float = math.inf
+    maneuver_problem: str | None = None
+    dock_problem: str | None = None
     caution: str | None = None
     resting: str | None = None
     late_age: float = math.inf
@@ -130,6 +135,10 @@ def _guardian_heard(inputs: SafetyInputs, config: SafetyConfig) -> bool:
     return inputs.guardian_lost is None and inputs.base_age <= config.base_lost
 
 
+def _rests_on_dock(inputs: SafetyInputs) -> bool:
+    return inputs.docked_for is not None and inputs.base_stopped in {None, ON_CHARGER}
+
+
 CONDITIONS: Final[tuple[Condition, ...]] = (
     # --- base and guardian ---
     Condition(Level.FAULT, lambda i, _: i.base_fault is not None, lambda i: f"base: {i.base_fault}"),
@@ -149,9 +158,15 @@ CONDITIONS: Final[tuple[Condition, ...]] = (
     ),
     Condition(
         Level.PROTECTIVE_STOP,
-        lambda i, c: _guardian_heard(i, c) and i.base_stopped is not None,
+        lambda i, c: _guardian_heard(i, c) and i.base_stopped is not None and not _rests_on_dock(i),
         lambda i: f"the guardian holds the wheels: {i.base_stopped}",
         by_delay=lambda i: i.base_stopped == NO_FRESH_COMMAND,
+    ),
+    Condition(
+        Level.HOLD,
+        lambda i, _: _rests_on_dock(i),
+        lambda _: "the robot is on its dock: a goal or `fognav robot undock` takes it off",
+        rest=True,
     ),
     # --- lidar ---
     Condition(

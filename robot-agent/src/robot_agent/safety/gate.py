@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 import msgspec
 from msgspec.structs import replace
@@ -20,6 +20,10 @@ from robot_agent.config import SafetyConfig
 from robot_agent.safety import maneuver
 from robot_agent.safety.conditions import Finding, Level, SafetyInputs, collect_findings
 from robot_agent.safety.maneuver import Maneuver
+from robot_agent.safety.maneuver_rules import RULES
+
+if TYPE_CHECKING:
+    from robot_agent.safety.maneuver_rules import ManeuverKind
 
 MODE_OF: Final[dict[Level, Mode]] = {
     Level.NORMAL: "NORMAL",
@@ -90,7 +94,7 @@ def step(
     conformity.
     """
     config, before = config or SafetyConfig(), state.mode
-    findings = collect_findings(inputs if state.maneuver is None else maneuver.relevant(inputs), config)
+    findings = collect_findings(_relevant(state, inputs), config)
     map_held_at = state.map_held_at
     if any(finding.about_map for finding in findings):
         map_held_at = now
@@ -118,10 +122,31 @@ def step(
             stopped_since=math.inf,
             last_reasons=worst or state.last_reasons,
         )
+    elif _may_undock(state, inputs, findings, now, config):
+        new = replace(state, mode="DOCK", maneuver=Maneuver(now, math.inf, now, "undock"))
     else:
         new = _advance(state, findings, demanded, now, config)
     new = replace(new, reasons=_reasons(new, findings))
     return new, _outputs(new, before, refusal, config)
+
+
+def _relevant(state: SafetyState, inputs: SafetyInputs) -> SafetyInputs:
+    """Return the inputs that count: all of them, unless a maneuver runs."""
+    return inputs if state.maneuver is None else RULES[state.maneuver.kind].relevant(inputs)
+
+
+def _may_undock(
+    state: SafetyState, inputs: SafetyInputs, findings: list[Finding], now: float, config: SafetyConfig
+) -> bool:
+    """Return whether an enabled robot leaves its dock for its mission: it would drive, were it not on its dock."""
+    if inputs.docked_for is None or inputs.resting is not None or not inputs.mission or state.latched:
+        return False
+    if _is_recent(Level.PROTECTIVE_STOP, state.last_demanded[Level.PROTECTIVE_STOP], now, config):
+        return False
+    stops = [finding for finding in findings if finding.level >= Level.HOLD and not finding.rest]
+    if stops or not inputs.released_remaining > config.released_end:
+        return False
+    return isinstance(maneuver.begin("undock", inputs, now, config), Maneuver)
 
 
 def _apply_request(
@@ -131,11 +156,11 @@ def _apply_request(
         case None:
             return state, None
         case "disable":
-            return replace(state, enabled=False, maneuver=None), None
+            return _interrupted(replace(state, enabled=False)), None
         case "reset":
             return _reset(state, inputs, config)
-        case "egress":
-            return _begin_egress(state, inputs, now, config)
+        case "egress" | "dock" | "undock" | "back_off" as kind:
+            return _begin(kind, state, inputs, now, config)
     return _enable(state, inputs, findings)
 
 
@@ -149,21 +174,37 @@ def _reset(state: SafetyState, inputs: SafetyInputs, config: SafetyConfig) -> tu
         return state, f"the cause is still there: {'; '.join(present)}"
     reset = replace(state, mode="INIT", enabled=False, latched=(), stops=(), maneuver=None)
     if state.maneuver is not None:
-        reset = replace(reset, maneuver_end=f"the egress ended: base: {inputs.base_fault}")
+        name = RULES[state.maneuver.kind].name
+        reset = replace(reset, maneuver_end=f"{name} ended: base: {inputs.base_fault}")
     return reset, None
 
 
-def _begin_egress(
-    state: SafetyState, inputs: SafetyInputs, now: float, config: SafetyConfig
+def _begin(
+    kind: ManeuverKind, state: SafetyState, inputs: SafetyInputs, now: float, config: SafetyConfig
 ) -> tuple[SafetyState, str | None]:
-    if state.mode == "FAULT":
+    rules = RULES[kind]
+    if state.mode == "FAULT" and kind != "back_off":
         return state, _latched_fault(state)
     if state.maneuver is not None:
-        return state, "the robot is leaving the blocked area already"
-    begun = maneuver.begin(inputs, now, config)
+        return state, f"the robot makes a maneuver already: {RULES[state.maneuver.kind].doing}"
+    if rules.needs_enable and not state.enabled:
+        return state, "the robot must be enabled for that"
+    begun = maneuver.begin(kind, inputs, now, config)
     if isinstance(begun, str):
         return state, begun
-    return replace(state, enabled=False, latched=(), maneuver=begun), None
+    # The bump stays latched while the robot backs off from it.
+    latched = state.latched if kind == "back_off" else ()
+    return replace(
+        state, mode=rules.mode, enabled=state.enabled and rules.stays_enabled, latched=latched, maneuver=begun
+    ), None
+
+
+def _interrupted(state: SafetyState) -> SafetyState:
+    """Return the state without its maneuver: a robot that backed off has its fault still."""
+    if state.maneuver is None:
+        return state
+    faults = tuple(finding for finding in state.latched if finding.level == Level.FAULT)
+    return replace(state, mode="FAULT" if faults else "INIT", maneuver=None, latched=faults)
 
 
 def _latched_fault(state: SafetyState) -> str:
@@ -174,7 +215,7 @@ def _enable(state: SafetyState, inputs: SafetyInputs, findings: list[Finding]) -
     if state.mode == "FAULT":
         return state, _latched_fault(state)
     if state.maneuver is not None:
-        return state, "the robot is leaving a blocked area: wait until it is out, or disable it"
+        return state, f"wait, or disable the robot: {RULES[state.maneuver.kind].doing}"
     limit = min((finding.level for finding in state.latched), default=Level.PROTECTIVE_STOP)
     if not inputs.map_loaded:
         limit = Level.HOLD
@@ -187,17 +228,20 @@ def _enable(state: SafetyState, inputs: SafetyInputs, findings: list[Finding]) -
 def _maneuver(
     state: SafetyState, running: Maneuver, inputs: SafetyInputs, now: float, config: SafetyConfig
 ) -> SafetyState:
-    """Go on with a maneuver, or end it: in FAULT, or waiting to be enabled. While the lidar is woken it waits."""
-    findings = collect_findings(maneuver.relevant(inputs), config)
+    """Go on with a maneuver, which waits until the lidar runs, or end it: in FAULT, INIT, or enabled as before."""
+    rules = RULES[running.kind]
+    findings = collect_findings(rules.relevant(inputs), config)
     result = maneuver.proceed(running, inputs, findings, now, config)
     if isinstance(result, Maneuver):
-        mode: Mode = "EGRESS" if inputs.resting is None else "INIT"
+        mode: Mode = rules.mode if inputs.resting is None else "INIT"
         return replace(state, mode=mode, stops=(), stopped_since=math.inf, maneuver=result)
-    ended = replace(state, mode="INIT", maneuver=None, maneuver_end=f"the egress ended: {result}")
     faults = tuple(finding for finding in findings if finding.level == Level.FAULT)
-    if not faults:
-        return ended
-    return replace(ended, mode="FAULT", latched=faults, last_reasons=tuple(fault.reason for fault in faults))
+    if faults:
+        state = replace(state, latched=faults, last_reasons=tuple(fault.reason for fault in faults))
+    ended = _interrupted(state)
+    if result.done and state.enabled:
+        return replace(ended, mode="HOLD", last_reasons=(rules.doing,))
+    return replace(ended, enabled=False, maneuver_end=f"{rules.name} ended: {result.reason}")
 
 
 def _advance(
@@ -280,12 +324,12 @@ def _reasons(state: SafetyState, findings: list[Finding]) -> tuple[str, ...]:
         latched = [finding.reason for finding in state.latched]
         return (*latched, *(reason for reason in current if reason not in latched))
     if state.maneuver is not None and state.mode == "INIT":
-        return (*current, "leaves the blocked area as soon as its lidar runs")
+        return (*current, f"as soon as its lidar runs: {RULES[state.maneuver.kind].doing}")
     if state.mode == "INIT":
         ended = (state.maneuver_end,) if state.maneuver_end else ()
         return (*current, *ended, "waiting for an operator to enable")
-    if state.mode == "EGRESS":
-        return (*current, "leaving a blocked area on an operator's command")
+    if state.maneuver is not None:
+        return (*current, RULES[state.maneuver.kind].doing)
     latched = [f"{f.reason} (an operator must enable again)" for f in state.latched if f.reason not in current]
     reasons = (*current, *latched)
     if not reasons and state.mode != "NORMAL":
@@ -294,12 +338,9 @@ def _reasons(state: SafetyState, findings: list[Finding]) -> tuple[str, ...]:
 
 
 def _outputs(state: SafetyState, before: Mode, refusal: str | None, config: SafetyConfig) -> SafetyOutputs:
-    caps: dict[Mode, float] = {
-        "NORMAL": config.speed_normal,
-        "DEGRADED": config.speed_degraded,
-        "EGRESS": config.speed_egress,
-        "DOCK": config.speed_egress,
-    }
+    caps: dict[Mode, float] = {"NORMAL": config.speed_normal, "DEGRADED": config.speed_degraded}
+    if state.maneuver is not None and state.mode in MANEUVERS:
+        caps[state.mode] = RULES[state.maneuver.kind].cap(config)
     stop: Literal["none", "ramp", "immediate"] = "none"
     if state.mode in STOPPED_MODES:
         stop = "immediate" if state.mode in IMMEDIATE_STOP_MODES else "ramp"

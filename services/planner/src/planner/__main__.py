@@ -54,7 +54,7 @@ async def main() -> None:
         leadership = Leadership(
             "planner", keeper, zenoh, health, connected=lambda: zenoh.connected, epochs=lambda: core.fence.epochs
         )
-        service = Service(core, store, zenoh, clock, health, leadership, key=key)
+        service = Service(core, store, zenoh, clock, health, leadership, key=key, staging=loaded.site.staging)
         service.subscribe()
         leadership.subscribe()
         zenoh.declare_liveliness("planner", site)

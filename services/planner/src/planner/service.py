@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 from functools import partial
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
 from prometheus_client import Counter, Gauge
@@ -21,6 +22,7 @@ from fog_runtime.clock import ticker
 from fog_runtime.edges import Edges
 from fog_runtime.zenoh_edge import ASKER
 from planner.cycle import Cycle
+from planner.dock_keeper import DockKeeper
 from planner.map_keeper import MapKeeper
 from planner.mission_keeper import MissionKeeper
 from planner.query_queue import BusyError, QueryQueue
@@ -29,10 +31,10 @@ from planner.robot_commands import RobotOperator
 from planner.threads import Threads
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from fog_contracts.handlers import Handler, Ids, Moment, Publication
-    from fog_contracts.messages import EgressRequest, Message, PlanRequest, Refusal
+    from fog_contracts.messages import EgressRequest, Message, PlanRequest, Pose, Refusal
     from fog_runtime.clock import Clock
     from fog_runtime.edges import Gate
     from fog_runtime.health import Health
@@ -74,8 +76,12 @@ class Service:
         gate: Gate | None = None,
         *,
         key: bytes | None = None,
+        staging: Mapping[str, Pose] = MappingProxyType({}),
     ) -> None:
-        """Prepare; `gate` decides whether this process leads or stands by, `key` signs commands to robots."""
+        """Prepare; `gate` decides whether this process leads or stands by, `key` signs commands to robots.
+
+        staging: by robot, the pose in front of its dock.
+        """
         self._core = core
         self._zenoh = zenoh
         self._gate = gate
@@ -89,6 +95,7 @@ class Service:
         self.missions = MissionKeeper(core, store, clock, health, self._change_goal)
         self._map = MapKeeper(core, zenoh, clock, health, self._queue, on_loaded=self._wake.set)
         self.operator = RobotOperator(zenoh, store, clock, key)
+        self._docks = DockKeeper(staging, self.send)
         self._jobs: set[asyncio.Task[None]] = set()
         self._exported_counts: dict[tuple[int, object], int] = {}
         self.poses: dict[str, RobotPose] = {}
@@ -148,6 +155,9 @@ class Service:
             elif isinstance(message, RobotState):
                 self.states[ids["robot"]] = message
                 self.operator.on_state(ids["robot"], message, at.now)
+                if self._answers:
+                    stored = self.goals.get(ids["robot"])
+                    self._docks.on_state(ids["robot"], message, stored.goal if stored else None, at.now)
             self._cycle.queue_message(channel, handler, ids, message, at)
             if channel in self._core.URGENT:
                 self._wake.set()

@@ -1,0 +1,34 @@
+"""Straight back by a short way, measured by the wheels: off the dock, or from what the robot has bumped into. Pure."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from robot_agent.localization.pose import Pose2
+    from robot_agent.safety.stop_field import Wheels
+
+
+class StraightBack:
+    """One such movement: how far (m) and how fast (m/s)."""
+
+    def __init__(self, distance: float, speed: float) -> None:
+        self._distance = distance
+        self._speed = speed
+        self._begun_at: Pose2 | None = None
+
+    def begin(self, odom: Pose2 | None) -> None:
+        """Begin at this pose in `odom`; None: there is no odometry, and no way to measure it."""
+        self._begun_at = odom
+
+    def remaining(self, odom: Pose2 | None) -> float:
+        """Return the way (m) that is left; infinite if it can't be measured."""
+        if odom is None or self._begun_at is None:
+            return math.inf
+        return self._distance + odom.relative_to(self._begun_at).x
+
+    @property
+    def wheels(self) -> Wheels:
+        """The wheel speeds, m/s."""
+        return -self._speed, -self._speed

@@ -1,0 +1,155 @@
+"""The rules of each maneuver in one table: what it suspends, what refuses it, and when it is over. Pure."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple
+
+from msgspec.structs import replace
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from fog_contracts.messages import Mode
+    from robot_agent.config import SafetyConfig
+    from robot_agent.safety.conditions import SafetyInputs
+
+ManeuverKind = Literal["egress", "dock", "undock", "back_off"]
+
+
+class Rules(NamedTuple):
+    """One row of the table.
+
+    mode: the mode meanwhile. name, doing: what it is called, and what the robot does. relevant: the inputs that count.
+    refusal: why it can't begin, besides what would end it. end: why it is over, and whether it is done. longest: s that
+    it may take. cap: m/s. needs_enable: only an enabled robot begins it. stays_enabled: a robot that was enabled before
+    may drive on when it is done.
+    """
+
+    mode: Mode
+    name: str
+    doing: str
+    relevant: Callable[[SafetyInputs], SafetyInputs]
+    refusal: Callable[[SafetyInputs], str | None]
+    end: Callable[[SafetyInputs, SafetyConfig], tuple[str, bool] | None]
+    longest: Callable[[SafetyConfig], float]
+    cap: Callable[[SafetyConfig], float]
+    needs_enable: bool = False
+    stays_enabled: bool = False
+
+
+def _relevant_to_egress(inputs: SafetyInputs) -> SafetyInputs:
+    return replace(inputs, inside_blocked=None, mission=False)
+
+
+def _refuses_egress(inputs: SafetyInputs) -> str | None:
+    return "the robot is in no blocked area or zone: there is nothing to leave" if not inputs.inside_blocked else None
+
+
+def _egress_end(inputs: SafetyInputs, config: SafetyConfig) -> tuple[str, bool] | None:
+    if not inputs.maneuver_remaining <= config.egress_end:
+        return None
+    still = inputs.inside_blocked
+    if still is None:
+        return "the robot is out", True
+    return f"the way out ends, and the robot is still in {still}", False
+
+
+def _relevant_to_docking(inputs: SafetyInputs) -> SafetyInputs:
+    # The dock itself may press the bumper. What the guardian keeps at rest there shall rest.
+    if inputs.docked_for is not None:
+        return replace(inputs, mission=False, bumper=False, base_stopped=None, docked_for=None)
+    return replace(inputs, mission=False)
+
+
+def _refuses_docking(inputs: SafetyInputs) -> str | None:
+    return "the robot is on its dock" if inputs.docked_for is not None else inputs.dock_problem
+
+
+def _docking_end(inputs: SafetyInputs, config: SafetyConfig) -> tuple[str, bool] | None:
+    if inputs.docked_for is None:
+        return None if inputs.dock_problem is None else (inputs.dock_problem, False)
+    # The contacts may bounce, and the base corrects its place by itself.
+    return ("the robot is on its dock", True) if inputs.docked_for >= config.dock_settled else None
+
+
+def _relevant_to_undocking(inputs: SafetyInputs) -> SafetyInputs:
+    # On its dock the guardian lets the base drive straight back only, and holds the wheels between two of its modes.
+    on_dock = inputs.docked_for is not None
+    return replace(inputs, mission=False, base_stopped=None, docked_for=None, bumper=inputs.bumper and not on_dock)
+
+
+def _refuses_undocking(inputs: SafetyInputs) -> str | None:
+    return "the robot is not on its dock" if inputs.docked_for is None else None
+
+
+def _straight_end(inputs: SafetyInputs, _: SafetyConfig) -> tuple[str, bool] | None:
+    return ("it is done", True) if inputs.maneuver_remaining <= 0.0 else None
+
+
+def _relevant_to_back_off(inputs: SafetyInputs) -> SafetyInputs:
+    # A few centimetres under an operator's eyes: place, map and plan don't matter, base and lidar do.
+    fault = None if inputs.bumped else inputs.base_fault
+    return replace(
+        inputs,
+        base_fault=fault,
+        bumper=False,
+        base_stopped=None,
+        localization="good",
+        inside_blocked=None,
+        map_loaded=True,
+        map_age=0.0,
+        map_gap=0.0,
+        mission=False,
+    )
+
+
+def _refuses_back_off(inputs: SafetyInputs) -> str | None:
+    return None if inputs.bumped else "the robot has bumped into nothing: there is nothing to back off from"
+
+
+RULES: Final[Mapping[ManeuverKind, Rules]] = {
+    "egress": Rules(
+        "EGRESS",
+        "the egress",
+        "leaving a blocked area on an operator's command",
+        _relevant_to_egress,
+        _refuses_egress,
+        _egress_end,
+        lambda c: c.egress_max,
+        lambda c: c.speed_egress,
+    ),
+    "dock": Rules(
+        "DOCK",
+        "the docking",
+        "the base drives into its dock by itself",
+        _relevant_to_docking,
+        _refuses_docking,
+        _docking_end,
+        lambda c: c.dock_max,
+        lambda _: 0.0,
+        needs_enable=True,
+        stays_enabled=True,
+    ),
+    "undock": Rules(
+        "DOCK",
+        "the undocking",
+        "leaving the dock, straight back",
+        _relevant_to_undocking,
+        _refuses_undocking,
+        _straight_end,
+        lambda c: c.undock_max,
+        lambda c: c.speed_egress,
+        stays_enabled=True,
+    ),
+    "back_off": Rules(
+        "EGRESS",
+        "the back-off",
+        "backing off from what it has bumped into, on an operator's command",
+        _relevant_to_back_off,
+        _refuses_back_off,
+        _straight_end,
+        lambda c: c.back_off_max,
+        lambda c: c.speed_back_off,
+    ),
+}
+"""Every maneuver; the mode EGRESS also stands for the back-off, DOCK for both ways."""

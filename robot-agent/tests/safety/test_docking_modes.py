@@ -1,0 +1,294 @@
+"""Docking, undocking and backing off in the gate: who may begin them, what ends them, and what follows."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from robot_agent.safety.conditions import SafetyInputs
+from robot_agent.safety.gate import SafetyState, step
+from robot_agent.safety.maneuver_rules import RULES
+
+DT = 0.05
+CHARGES = "the base is on its charger, where it does not drive"
+HEALTHY = {
+    "map_loaded": True, "map_age": 0.1, "localization": "good", "lidar_age": 0.02, "scan_age": 0.1, "base_age": 0.02,
+}  # fmt: skip
+ON_DOCK = {"docked_for": 9.0, "base_stopped": CHARGES}
+MISSION = {"mission": True, "plan_age": 0.1, "released_remaining": 5.0}
+BUMPED = {"bumped": True, "base_fault": "the bumper is pressed (left)", "bumper": True}
+STOPS = [
+    ({"lidar_age": 0.31}, "the lidar has been silent"),
+    ({"scan_age": 0.46}, "no complete scan"),
+    ({"identical_scans": 3}, "the lidar repeats itself"),
+    ({"localization": "lost"}, "the pose is lost"),
+    ({"inside_blocked": "the zone x"}, "the robot is in the zone x"),
+    ({"map_age": 3.01}, "the map is 3.0 s old"),
+    ({"map_gap": 1.01}, "changes of the map"),
+    ({"base_age": 0.31}, "no message from the guardian"),
+    ({"guardian_lost": "closed"}, "the guardian is not connected"),
+]
+FAULTS = [{"cliff": True}, {"wheel_drop": True}, {"base_fault": "the base left its driving mode: Full"}]
+
+
+class Gate:
+    """A gate, enabled and healthy unless told otherwise."""
+
+    def __init__(self, *, enabled: bool = True, **given) -> None:
+        self.state, self.now, self.out, self.given = SafetyState(), 100.0, None, given
+        if enabled:
+            assert self.run(request="enable").refusal is None
+        self.run(2.2)
+
+    def run(self, seconds: float = DT, *, request: str | None = None, **changes):
+        for _ in range(max(1, round(seconds / DT))):
+            self.now += DT
+            inputs = SafetyInputs(**{**HEALTHY, **self.given, **changes}, request=request)
+            self.state, self.out = step(self.state, inputs, self.now)
+            request = None
+        return self.out
+
+
+def docking() -> Gate:
+    gate = Gate()
+    out = gate.run(request="dock")
+    assert (out.refusal, out.mode, out.cap, out.stop, out.mission_may_drive) == (None, "DOCK", 0.0, "none", False)
+    return gate
+
+
+def undocking(*, enabled: bool = True) -> Gate:
+    gate = Gate(enabled=enabled, **ON_DOCK)
+    out = gate.run(request="undock", maneuver_remaining=0.3)
+    assert (out.refusal, out.mode, out.cap, out.stop) == (None, "DOCK", 0.10, "none")
+    return gate
+
+
+def backing_off() -> Gate:
+    gate = Gate()
+    assert gate.run(**BUMPED).mode == "FAULT"
+    out = gate.run(request="back_off", maneuver_remaining=0.09, **BUMPED)
+    assert (out.refusal, out.mode, out.cap, out.stop) == (None, "EGRESS", 0.05, "none")
+    return gate
+
+
+# --- docking ---
+
+
+def test_docked_robot_stays_enabled_and_holds_on_its_dock_for_hours():
+    gate = docking()
+    assert gate.run(20.0, bumper=False).reasons == ("the base drives into its dock by itself",)
+    assert gate.run(docked_for=0.0, bumper=True).mode == "DOCK"
+    assert gate.run(docked_for=0.9).mode == "DOCK"
+    out = gate.run(docked_for=1.0)
+    assert (out.mode, gate.state.enabled, gate.state.maneuver) == ("HOLD", True, None)
+    out = gate.run(300.0, **ON_DOCK)
+    assert out.reasons == ("the robot is on its dock: a goal or `fognav robot undock` takes it off",)
+    assert gate.state.latched == ()
+
+
+@pytest.mark.parametrize(("changes", "words"), [*STOPS, ({"dock_problem": "a chair"}, "a chair"),
+                                                ({"base_stopped": "60 s"}, "holds the wheels: 60 s")])  # fmt: skip
+def test_condition_that_stops_a_robot_refuses_a_docking_and_ends_one_for_good(changes, words):
+    assert words in Gate().run(request="dock", **changes).refusal
+    gate = docking()
+    out = gate.run(**changes)
+    assert (out.mode, out.stop, gate.state.enabled) == ("INIT", "immediate", False)
+    assert any(reason.startswith("the docking ended: ") and words in reason for reason in out.reasons)
+    assert gate.run(5.0).mode == "INIT"
+
+
+@pytest.mark.parametrize("fault", [*FAULTS, {"bumper": True}])
+def test_fault_during_a_docking_is_latched(fault):
+    gate = docking()
+    assert gate.run(**fault).mode == "FAULT"
+    assert gate.run(5.0).mode == "FAULT"
+    assert "reset it first" in gate.run(request="dock").refusal
+
+
+def test_docking_ends_after_sixty_seconds():
+    gate = docking()
+    assert gate.run(59.9).mode == "DOCK"
+    assert "the docking ended: it took longer than 60 s" in gate.run(0.2).reasons
+
+
+def test_docking_is_refused_to_a_robot_that_is_not_enabled_or_on_its_dock():
+    assert "must be enabled" in Gate(enabled=False).run(request="dock").refusal
+    assert Gate(**ON_DOCK).run(request="dock").refusal == "the robot is on its dock"
+
+
+@pytest.mark.parametrize("make", [docking, undocking])
+def test_disable_ends_a_docking_or_undocking_at_once(make):
+    out = make().run(request="disable")
+    assert (out.mode, out.stop) == ("INIT", "immediate")
+
+
+@pytest.mark.parametrize(("make", "given"), [(docking, {}), (undocking, ON_DOCK), (backing_off, BUMPED)])
+def test_enable_and_other_maneuvers_are_refused_during_one(make, given):
+    gate = make()
+    mode = gate.state.mode
+    for request in ("enable", *RULES):
+        assert gate.run(request=request, maneuver_remaining=0.05, **given).refusal is not None
+        assert gate.out.mode == mode
+
+
+def test_robot_may_be_enabled_on_its_dock():
+    gate = Gate(enabled=False, **ON_DOCK)
+    assert gate.run(request="enable").refusal is None
+    assert gate.run(3.0).mode == "HOLD"
+
+
+# --- undocking ---
+
+
+@pytest.mark.parametrize("enabled", [True, False])
+def test_robot_leaves_its_dock_and_is_enabled_afterwards_only_if_it_was_before(enabled):
+    gate = undocking(enabled=enabled)
+    gate.given = {}
+    assert gate.run(1.0, maneuver_remaining=0.2, base_stopped="not ready").mode == "DOCK"
+    assert gate.run(maneuver_remaining=0.0).mode == ("HOLD" if enabled else "INIT")
+    assert gate.run(2.2).mode == ("NORMAL" if enabled else "INIT")
+    assert gate.run(request="undock").refusal == "the robot is not on its dock"
+
+
+@pytest.mark.parametrize(("changes", "words"), STOPS)
+def test_condition_that_stops_a_robot_refuses_an_undocking_and_ends_one_for_good(changes, words):
+    assert words in Gate(**ON_DOCK).run(request="undock", **changes).refusal
+    gate = undocking()
+    out = gate.run(maneuver_remaining=0.2, **changes)
+    assert (out.mode, gate.state.enabled) == ("INIT", False)
+    assert any(reason.startswith("the undocking ended: ") and words in reason for reason in out.reasons)
+
+
+@pytest.mark.parametrize("fault", [*FAULTS, {"bumper": True, "docked_for": None}])
+def test_fault_during_an_undocking_is_latched(fault):
+    gate = undocking()
+    assert gate.run(bumper=True, maneuver_remaining=0.3).mode == "DOCK"
+    assert gate.run(**{"maneuver_remaining": 0.3, **fault}).mode == "FAULT"
+
+
+def test_undocking_without_progress_ends_after_ten_seconds():
+    gate = undocking()
+    assert gate.run(9.8, maneuver_remaining=0.3).mode == "DOCK"
+    out = gate.run(0.4, maneuver_remaining=0.3, maneuver_problem="an obstacle behind")
+    assert "no nearer to its end for 10 s: an obstacle behind" in "; ".join(out.reasons)
+
+
+def test_undocking_ends_after_fifteen_seconds():
+    gate = undocking()
+    for tenth in range(149):
+        assert gate.run(0.1, maneuver_remaining=0.3 - 0.0015 * tenth).mode == "DOCK"
+    gate.run(0.3, maneuver_remaining=0.01)
+    assert "longer than 15 s" in "; ".join(gate.out.reasons)
+
+
+# --- a mission takes an enabled robot off its dock ---
+
+
+def test_mission_with_released_path_takes_an_enabled_robot_off_its_dock():
+    gate = Gate(**ON_DOCK)
+    out = gate.run(**MISSION)
+    assert (out.mode, out.reasons[-1]) == ("DOCK", "leaving the dock, straight back")
+    gate.given = {}
+    gate.run(**MISSION, maneuver_remaining=0.0)
+    assert gate.run(2.2, **MISSION).mode == "NORMAL"
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"mission": False},
+        {"released_remaining": 0.15},
+        {"released_remaining": math.nan},
+        {"path_problem": "blocked"},
+        {"plan_age": math.inf, "released_remaining": 0.0},
+        {"resting": "waking up"},
+        *(changes for changes, _ in STOPS),
+        {"base_stopped": "not ready"},
+    ],
+)
+def test_nothing_moves_a_robot_off_its_dock_without_a_released_path_and_all_well(changes):
+    gate = Gate(**ON_DOCK)
+    assert gate.run(0.5, **{**MISSION, **changes}).mode != "DOCK"
+    assert gate.out.stop != "none"
+
+
+def test_robot_that_is_disabled_or_waits_for_an_operator_stays_on_its_dock():
+    assert Gate(enabled=False, **ON_DOCK).run(5.0, **MISSION).mode == "INIT"
+    gate = Gate(**ON_DOCK)
+    gate.run(localization="lost")
+    assert gate.run(5.0, **MISSION).mode == "PROTECTIVE_STOP"
+
+
+def test_robot_stays_on_its_dock_until_two_seconds_after_a_protective_stop():
+    gate = Gate(**ON_DOCK)
+    gate.run(lidar_age=1.0)
+    assert gate.run(1.9, **MISSION).mode == "PROTECTIVE_STOP"
+    assert gate.run(0.2, **MISSION).mode == "DOCK"
+
+
+# --- backing off ---
+
+
+def test_robot_that_backed_off_has_its_fault_still():
+    gate = backing_off()
+    assert gate.run(1.0, maneuver_remaining=0.05, **BUMPED).mode == "EGRESS"
+    out = gate.run(maneuver_remaining=0.0, bumped=True, base_fault="the bumper is pressed (left)")
+    assert (out.mode, out.stop) == ("FAULT", "immediate")
+    assert "the bumper is pressed" in out.reasons[0]
+    assert gate.run(request="reset").refusal is None
+    assert gate.run().mode == "INIT"
+
+
+@pytest.mark.parametrize("changes", [
+    {"localization": "lost"}, {"inside_blocked": "x"}, {"map_loaded": False}, {"map_age": 9.0}, {"map_gap": 9.0},
+    {"base_stopped": "x"}, MISSION, {"mission": True, "path_problem": "x"},
+])  # fmt: skip
+def test_place_map_and_plan_do_not_keep_a_robot_from_backing_off(changes):
+    gate = backing_off()
+    assert gate.run(1.0, maneuver_remaining=0.09, **{**BUMPED, **changes}).mode == "EGRESS"
+
+
+@pytest.mark.parametrize(("changes", "words"), [
+    *(stop for stop in STOPS if not {"localization", "inside_blocked", "map_age", "map_gap"} & stop[0].keys()),
+    ({"cliff": True}, "cliff"), ({"wheel_drop": True}, "wheel"),
+])  # fmt: skip
+def test_base_and_lidar_refuse_a_back_off_and_end_one_in_fault(changes, words):
+    gate = Gate()
+    gate.run(**BUMPED)
+    assert words in gate.run(request="back_off", **{**BUMPED, **changes}).refusal
+    gate = backing_off()
+    out = gate.run(maneuver_remaining=0.09, **{**BUMPED, **changes})
+    assert (out.mode, out.stop) == ("FAULT", "immediate")
+
+
+def test_other_fault_during_a_back_off_is_latched():
+    gate = backing_off()
+    gate.run(maneuver_remaining=0.09, cliff=True, base_fault="a cliff sensor sees no floor")
+    assert gate.out.mode == "FAULT"
+    assert any("cliff" in finding.reason for finding in gate.state.latched)
+
+
+def test_disabled_back_off_leaves_the_fault():
+    out = backing_off().run(request="disable", **BUMPED)
+    assert (out.mode, out.stop) == ("FAULT", "immediate")
+
+
+def test_back_off_ends_after_five_seconds():
+    gate = backing_off()
+    assert gate.run(4.9, maneuver_remaining=0.09, **BUMPED).mode == "EGRESS"
+    assert gate.run(0.2, maneuver_remaining=0.09, **BUMPED).mode == "FAULT"
+
+
+def test_back_off_needs_a_bump():
+    assert "bumped into nothing" in Gate().run(request="back_off").refusal
+    gate = Gate()
+    gate.run(cliff=True)
+    assert "bumped into nothing" in gate.run(request="back_off", base_fault="a cliff").refusal
+
+
+def test_back_off_of_an_agent_that_was_restarted_leads_to_init():
+    gate = Gate(enabled=False)
+    assert gate.run(request="back_off", maneuver_remaining=0.09, **BUMPED).mode == "EGRESS"
+    assert gate.run(maneuver_remaining=0.0, bumped=True, base_fault="the bumper is pressed").mode == "INIT"
+    assert "the cause is still there" in gate.run(request="enable", base_fault="the bumper is pressed").refusal

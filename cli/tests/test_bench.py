@@ -52,6 +52,8 @@ async def test_every_robot_of_a_real_planner_gets_its_path_its_refusal_and_a_pat
         assert figures[key] > 0
     assert figures["cut_off_explained_ms"] >= figures["cut_off_ms"]
     assert figures["rss_mb"] > 50
+    for key in ("read_zones_ms", "ready_s", "list_zones_ms", "worst_zone_ms"):
+        assert figures[key] > 0
     # A path of two points has some 100 bytes, and a delta more; a heartbeat of the map comes ten times a second.
     assert figures["bytes_per_robot"] > 200
     assert figures["steady_bytes_per_robot_s"] > 100
@@ -76,7 +78,15 @@ def test_costmap_figures_are_of_the_whole_floor_and_of_legal_zones() -> None:
     figures = costmap.measure(floor, 50, 1)
     assert figures["cells"] == 800 * 1200
     assert figures["portions"] >= 4, "a zone over the whole floor, put and removed"
-    for key in ("full_ms", "window_ms", "worst_zone_ms", "worst_portion_ms", "load_zones_ms", "snapshot_ms"):
+    for key in (
+        "full_ms",
+        "window_ms",
+        "worst_zone_ms",
+        "worst_portion_ms",
+        "load_zones_ms",
+        "snapshot_ms",
+        "worst_obstacles_ms",
+    ):
         assert figures[key] > 0
 
 
@@ -94,6 +104,8 @@ async def test_clients_of_every_kind_are_answered_while_the_heartbeat_is_timed(t
         assert figures[f"idle_{key}"] > 0
         assert figures[key] > 0
     assert figures["rss_mb"] > 50
+    for key in ("read_zones_ms", "ready_s", "list_zones_ms", "worst_zone_ms"):
+        assert figures[key] > 0
 
 
 @pytest.mark.parametrize("error", [NotReadyError("redis: exited with 1"), ServerError("mosquitto is not installed")])

@@ -102,3 +102,15 @@ def test_computing_tests_leave_one_core_free(grouping: ModuleType) -> None:
     groups = {grouping.group_of(str(module)) for module in modules}
     computing = {group for group in groups if group[0] == grouping.COMPUTING}
     assert 1 <= len(computing) <= max(1, (os.cpu_count() or 1) - 1)
+
+
+def test_no_test_times_out_that_was_told_to_try_more(tmp_path):
+    test = tmp_path / "test_slow.py"
+    test.write_text("import time\n\ndef test_takes_its_time():\n    time.sleep(0.5)\n")
+    command = [sys.executable, "-m", "pytest", "-q", "-n0", "-p", "no:cacheprovider", "--timeout=0.1",
+               "--confcutdir=/", "-p", "conftest", str(test)]  # fmt: skip
+    root = Path(__file__).parents[2]
+    for histories, code in (("", 1), ("100000", 0)):
+        environment = {**os.environ, "FOGNAV_HISTORIES": histories, "PYTHONPATH": str(root)}
+        done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert done.returncode == code, done.stdout

@@ -128,7 +128,7 @@ def rest_command(
     zones: Annotated[int, typer.Option("--zones", metavar="Z", min=0, max=4900, help="Zones of 5 x 5 m.")] = 4900,
     json: Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")] = False,
 ) -> None:
-    """Measure how steady the map's heartbeat is under load.
+    """Measure how steady the map's heartbeat is under load, and how long zones take without any.
 
     Clients send a map-service the costliest zones, read all zones and pictures, send invalid and oversized bodies, or
     send and read slowly; another process times the heartbeat (100 ms), without clients (`idle_`) and with them.

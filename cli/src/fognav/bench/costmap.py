@@ -9,12 +9,16 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from fog_contracts import channels as ch
 from fog_contracts.handlers import Moment
 from fog_contracts.messages import (
+    VIEW_SECTORS,
     CorridorShape,
     PolygonShape,
     RectangleShape,
+    RobotObstacles,
     Shape,
+    View,
     Zone,
 )
 from map_service.core import MapCore
@@ -28,6 +32,8 @@ if TYPE_CHECKING:
     from fog_contracts.grid import StaticMap
 
 _AT: Final = Moment(0.0, 0.0)
+_OBSTACLES: Final = 10_000
+"""As many obstacle cells as one robot may hold."""
 
 
 def worst_shapes(floor: StaticMap) -> list[Shape]:
@@ -73,6 +79,7 @@ def measure(floor: StaticMap, zones: int, repeats: int) -> dict[str, float | int
         "portions": len(portions),
         "load_zones_ms": round(load_ms, 1),
         "snapshot_ms": round(_timed(core.costmap.snapshot), 3),
+        "worst_obstacles_ms": round(_worst_obstacles(floor), 3),
     }
 
 
@@ -99,6 +106,28 @@ def _small_changes(core: MapCore, floor: StaticMap, repeats: int) -> list[float]
     )
     put, remove = partial(core.put_zone, prepared.zone, _AT, prepared.spans), partial(core.remove_zone, "small", _AT)
     return [_timed(change) for _ in range(repeats) for change in (put, remove)]
+
+
+def _worst_obstacles(floor: StaticMap) -> float:
+    """Return the longest time (ms) of a robot's report beside as many obstacles as it may hold, seen and cleared."""
+    core = MapCore("bench", floor, 1, layers=make_layers(floor))
+    core.load_zones([], _AT)
+    core.tick(_AT)
+    handle, (left, bottom, *_) = core.handlers()[ch.ROBOT_OBSTACLES], floor.geometry.bounds
+    step, columns = floor.geometry.resolution, min(100, floor.geometry.width)
+    cells = [divmod(number, columns) for number in range(min(_OBSTACLES, columns * min(100, floor.geometry.height)))]
+    points = [(left + step * (column + 0.5), bottom + step * (row + 0.5)) for row, column in cells]
+    middle = points[len(points) // 2 + columns // 2]
+    reports = [
+        RobotObstacles(points=points[first : first + 2000], stamp=0.0, ttl=600.0)
+        for first in range(0, len(points), 2000)
+    ] + [
+        RobotObstacles(
+            points=[], stamp=0.0, ttl=600.0, view=View(x=middle[0], y=middle[1], reach=bytes([255]) * VIEW_SECTORS)
+        )
+        for _ in range(2)
+    ]
+    return max(_timed(partial(handle, {"robot": "r1"}, report, _AT)) for report in reports)
 
 
 def random_zones(floor: StaticMap, count: int) -> list[Zone]:

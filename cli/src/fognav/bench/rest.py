@@ -40,13 +40,16 @@ async def measure(  # all that a run consists of, by name
 ) -> dict[str, float | int | dict[str, int]]:
     """Return the gaps between heartbeats (ms), without clients (`idle_`) and with them, and what these were answered.
 
-    `folder` holds a site (`site.write_site`) of this floor; `zones` are stored before.
+    Before, for a single client: how long it takes to read all zones from Redis, until the service is ready with them,
+    to list them over REST, and until the costliest zone is stored and on the map. `folder` holds a site
+    (`site.write_site`) of this floor; `zones` are stored before.
     """
     config = StackConfig(site_dir=folder, robot="none", extra={"HAZARDS_WAIT_S": "0"})
-    async with _map_service(config, random_zones(floor, zones)) as stack:
+    async with _map_service(config, random_zones(floor, zones)) as (stack, started):
         pid, port = stack.pids()[MAP_SERVICE], stack.port(MAP_SERVICE)
         assert port is not None
         load = Load(port, stack.token, worst_shapes(floor))
+        alone = await load.alone()
         with _listener(stack.zenoh_endpoint) as listener:
             await asyncio.sleep(idle_s)
             idle = _gaps(listener)
@@ -56,6 +59,8 @@ async def measure(  # all that a run consists of, by name
             loaded = _gaps(listener)
             ended = service.cpu_times()
         return {
+            **started,
+            **{name: round(seconds * 1000.0, 1) for name, seconds in alone.items()},
             **_figures("idle_heartbeat_gap", idle),
             **_figures("heartbeat_gap", loaded),
             "requests": dict(sorted(load.answers.items())),
@@ -80,15 +85,20 @@ def _figures(name: str, gaps: list[float]) -> dict[str, float]:
 
 
 @asynccontextmanager
-async def _map_service(config: StackConfig, zones: list[Zone]) -> AsyncIterator[Stack]:
-    """Run a map-service that has these zones, and its servers."""
+async def _map_service(config: StackConfig, zones: list[Zone]) -> AsyncIterator[tuple[Stack, dict[str, float]]]:
+    """Run a map-service that has these zones, and its servers; tell how long it took to read them, and its start."""
+    loop = asyncio.get_running_loop()
     async with Stack(config) as stack:
         await stack.start_servers(_READY_S)
         async with Store(stack.redis_url, SITE) as store:
             await store.restore(zones, Audit(0.0, "bench", "restore"))
+            begun = loop.time()
+            await store.zones()
+            read_s = loop.time() - begun
+        begun = loop.time()
         stack.supervisor.start(MAP_SERVICE)
         await stack.supervisor.wait_ready([*SERVERS, MAP_SERVICE], _READY_S)
-        yield stack
+        yield stack, {"read_zones_ms": round(read_s * 1000.0, 1), "ready_s": round(loop.time() - begun, 2)}
 
 
 @contextmanager

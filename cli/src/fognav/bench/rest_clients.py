@@ -41,6 +41,21 @@ class Load:
         self._authorization = f"Authorization: Bearer {token}\r\n"
         self._shapes = shapes
 
+    async def alone(self) -> dict[str, float]:
+        """Return how long (s) a single client waits for the list of all zones, and for the costliest zone (`_ms`)."""
+        loop = asyncio.get_running_loop()
+        async with _Connection(self._port) as connection:
+            begun = loop.time()
+            await self._ask(connection, "GET", _ZONES)
+            listed, worst = loop.time() - begun, 0.0
+            for shape in self._shapes:
+                body = msgspec.json.encode({"id": "alone", "kind": "BLOCKED", "shape": shape})
+                begun = loop.time()
+                await self._post(connection, body)
+                worst = max(worst, loop.time() - begun)
+                await self._ask(connection, "DELETE", f"{_ZONES}/alone")
+        return {"list_zones_ms": listed, "worst_zone_ms": worst}
+
     async def run(self, clients: int, seconds: float) -> None:
         """Let this many clients, of each kind about as many, ask for `seconds`."""
         kinds = itertools.cycle(self._kinds())

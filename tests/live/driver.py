@@ -25,6 +25,7 @@ from fognav.demo.operator import Operator
 from fognav.demo.scene import Scene
 from fognav.demo.usage import children
 from fognav.stack import AGENT, MAP_SERVICE, PLANNER, WATCHDOG, Stack, StackConfig
+from fognav.stack_doors import doors_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -86,6 +87,7 @@ class LiveSystem:
             base=base,
             lidar=lidar,
             extra={"TRUTH_LOG": str(self._truth_log)},
+            doors=doors_of(self._site.site),
         )
         self.stack = Stack(config, self.events.append)
         self.clock = SystemClock()
@@ -104,10 +106,12 @@ class LiveSystem:
                     role="console",
                     id="test",
                     site=self._site.site.id,
+                    credentials=self.stack.doors.credentials("console"),
                 )
             )
             self.operator = Operator(edge, self.stack, self.scene, self.clock)
-            mqtt = MqttEdge(self.stack.mqtt_url, "live-test", self.clock, site=self._site.site.id)
+            console = self.stack.doors.credentials("console")
+            mqtt = MqttEdge(self.stack.mqtt_url, "live-test", self.clock, site=self._site.site.id, credentials=console)
             mqtt.on(ch.NODE_READING, self._on_reading, NodeReading)
             listening = asyncio.create_task(mqtt.run())
             self._contexts.push_async_callback(_end, listening)

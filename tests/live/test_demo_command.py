@@ -22,6 +22,7 @@ import pytest
 from fog_contracts import channels as ch
 from fog_contracts.messages import MapHeartbeat, SimTruth
 from fog_runtime.clock import SystemClock
+from fog_runtime.credentials import Credentials
 from fog_runtime.record import read
 from fog_runtime.zenoh_edge import ZenohEdge
 
@@ -172,7 +173,11 @@ def assert_replay_gives_the_recorded_maps(recording: Path, out: Path) -> None:
 async def drives(command: Command, children: list[psutil.Process]) -> None:
     """Wait until the robot of a demo has driven another half metre."""
     (router,) = {p.environ()["FOGNAV_ZENOH_CONNECT"] for p in children if "FOGNAV_ZENOH_CONNECT" in p.environ()}
-    opened = ZenohEdge.open(connect=[router], clock=SystemClock(), role="console", id="test", site="estig")
+    (agent,) = (p.environ()["FOGNAV_CREDENTIALS_FILE"] for p in children if p.cmdline()[-1] == "robot_agent")
+    console = Credentials.read(Path(agent).with_name("console.toml"))
+    opened = ZenohEdge.open(
+        connect=[router], clock=SystemClock(), role="console", id="test", site="estig", credentials=console
+    )
     async with opened as edge:
         truth = edge.latest(ch.SIM_TRUTH, SimTruth, robot="r1")
 

@@ -6,6 +6,7 @@ The tests of this module share a robot that drives back and forth in the middle 
 from __future__ import annotations
 
 import asyncio
+import itertools
 import json
 import logging
 import math
@@ -22,6 +23,7 @@ from driver import START, LiveSystem
 
 from fog_contracts.geometry import contains_point
 from fog_contracts.messages import Pose, SimCommand, SimObstacle
+from fog_runtime.mqtt_broker import Broker
 from fog_supervisor import net
 from fognav.stack import AGENT, AGGREGATOR, BROKER, MAP_SERVICE, PLANNER, REDIS, ROUTER
 
@@ -200,17 +202,22 @@ async def test_garbage_on_mqtt_and_on_the_serial_line_stops_no_process(system: L
         b"", b"{", b"null", b"[1,2]", b"\xff\xfe\x00", json.dumps({"seq": "one"}).encode(), generator.randbytes(900),
         b"[" * 1000, b"x" * 200_000,
     ]  # fmt: skip
-    port = system.stack.mqtt_port
-    async with aiomqtt.Client("127.0.0.1", port) as listener:
+    ids = itertools.count()
+
+    def client(user: str) -> aiomqtt.Client:
+        broker = Broker.of(system.stack.mqtt_url, system.stack.doors.credentials(user))
+        return broker.client(f"test-{next(ids)}", None)
+
+    async with client("console") as listener:
         await listener.subscribe(topic)
-        async with aiomqtt.Client("127.0.0.1", port) as sender:
+        async with client("n1") as sender:
             for payload in garbage:
                 await sender.publish(topic, payload, qos=1)
         # The broker disconnects a client that sends more than the largest message.
         with pytest.raises(aiomqtt.MqttError):
-            async with aiomqtt.Client("127.0.0.1", port, timeout=3) as sender:
+            async with client("n1") as sender:
                 await sender.publish(topic, b"x" * 10_000_000, qos=1)
-        async with aiomqtt.Client("127.0.0.1", port) as sender:
+        async with client("n1") as sender:
             await sender.publish(topic, b"the last", qos=1)
         largest = 0
         async with asyncio.timeout(10):

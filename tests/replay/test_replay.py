@@ -64,6 +64,7 @@ from fognav.demo.speed import SpeedWatch
 from fognav.output import WrongUseError
 from fognav.recording import recording, summary
 from fognav.stack import AGENT, MAP_SERVICE, SERVERS, SERVICES, SIMULATOR, WATCHDOG, Stack, StackConfig
+from fognav.stack_doors import doors_of
 from fognav_sim.drive.hazard import entry_distance
 from robot_agent.agent.replay import replay
 
@@ -173,15 +174,18 @@ async def record(path: Path) -> tuple[MapSnapshot, str]:
 
     # The default memory for obstacles would make the recording too long.
     extra = {"OBSTACLE_MEMORY_S": "10", "INPUT_LOG": str(input_log(path))}
-    async with Stack(StackConfig(site_dir=SITE, robot=plan.robot, seed=1, speed=SPEED, extra=extra)) as stack:
-        supervisor = stack.supervisor
+    doors = doors_of(site.site, unrestricted=("test",))
+    config = StackConfig(site_dir=SITE, robot=plan.robot, seed=1, speed=SPEED, extra=extra, doors=doors)
+    async with Stack(config) as stack:
+        supervisor, own = stack.supervisor, stack.doors.credentials("test")
         for name in SERVERS:
             supervisor.start(name)
         await supervisor.wait_ready(SERVERS, READY_TIMEOUT_S)
         opened = ZenohEdge.open(
-            connect=[stack.zenoh_endpoint], clock=clock, role="console", id="replay", site=site.site.id
-        )
-        async with opened as edge, recording(path, mqtt_url=stack.mqtt_url, zenoh=edge, clock=clock):
+            connect=[stack.zenoh_endpoint], clock=clock, role="console", id="replay", site=site.site.id,
+            credentials=own,
+        )  # fmt: skip
+        async with opened as edge, recording(path, mqtt_url=stack.mqtt_url, zenoh=edge, clock=clock, credentials=own):
             # The services must be ready before nodes and robots publish.
             for names in (SERVICES, [SIMULATOR], [WATCHDOG, AGENT]):
                 for name in names:

@@ -18,6 +18,7 @@ from fog_runtime.operator_key import read_operator_key
 from fog_supervisor import net, servers
 from fog_supervisor.supervisor import Event, Program, Supervisor
 from fognav import checkout
+from fognav.stack_doors import Doors, StackDoors
 
 BROKER: Final = "mosquitto"
 REDIS: Final = "redis"
@@ -44,7 +45,8 @@ class StackConfig:
     """Configuration of a stack.
 
     `robot` is the id of the site's robot, `base` and `lidar` name its hardware, and `robot_file` has its settings, of
-    which the ports do not count; `extra` contains further FOGNAV_ settings for every process.
+    which the ports do not count; `extra` contains further FOGNAV_ settings for every process. With `doors` the servers
+    encrypt, and admit only those users; without, everybody on this machine.
     """
 
     site_dir: Path
@@ -55,6 +57,7 @@ class StackConfig:
     seed: int = 1
     speed: float = 1.0
     extra: Mapping[str, str] | None = None
+    doors: Doors | None = None
 
 
 def _new_folder() -> Path:
@@ -92,23 +95,25 @@ class Stack:
         self.operator_key = read_operator_key(self.key_file)
         taken: set[int] = set()
         self.mqtt_port, self.redis_port, self.zenoh_port = (net.free_port(taken) for _ in range(3))
+        self.doors = StackDoors(self.folder, config.doors)
+        self._urls: dict[str, str] = {}
         self.supervisor = Supervisor(on_event)
         self._prepare()
 
     @property
     def zenoh_endpoint(self) -> str:
         """Where the zenoh router listens."""
-        return f"tcp/{net.LOOPBACK}:{self.zenoh_port}"
+        return self._urls[ROUTER]
 
     @property
     def mqtt_url(self) -> str:
         """Where the MQTT broker listens."""
-        return f"mqtt://{net.LOOPBACK}:{self.mqtt_port}"
+        return self._urls[BROKER]
 
     @property
     def redis_url(self) -> str:
         """Where Redis listens."""
-        return f"redis://{net.LOOPBACK}:{self.redis_port}/0"
+        return self._urls[REDIS]
 
     async def __aenter__(self) -> Self:
         return self
@@ -169,30 +174,36 @@ class Stack:
         self._add_servers()
         robot_file = {"ROBOT_FILE": str(self.config.robot_file)} if self.config.robot_file else {}
         hardware = {"BASE": self.config.base, "LIDAR": self.config.lidar, **robot_file}
-        self._add_python(SIMULATOR, "fognav_sim", {**hardware, "RUN_DIR": str(self.folder / "sim")})
+        simulator = {**hardware, **self.doors.node_settings(), "RUN_DIR": str(self.folder / "sim")}
+        self._add_python(SIMULATOR, "fognav_sim", simulator, user="sim")
+        key = {"OPERATOR_KEY_FILE": str(self.key_file)}
         for name, module in zip(SERVICES, ("hazard_aggregator", "map_service", "planner"), strict=True):
-            self._add_python(name, module, {})
+            own = {"TOKENS_FILE": str(self.folder / TOKENS), **(key if name == PLANNER else {})}
+            self._add_python(name, module, own, user=name)
         socket = self.folder / "guardian.sock"
         wires = {
             **hardware,
+            **key,
             "ROBOT": self.config.robot,
             "BASE_PORT": str(self.folder / "sim" / "base"),
             "LIDAR_PORT": str(self.folder / "sim" / "lidar"),
             "GUARDIAN_SOCKET": str(socket),
         }
-        self._add_python(WATCHDOG, "robot_agent.guardian.watchdog", wires, ready=partial(_exists, socket), rank=2)
-        self._add_python(AGENT, "robot_agent", wires, rank=2)
+        robot, ready = self.config.robot, partial(_exists, socket)
+        self._add_python(WATCHDOG, "robot_agent.guardian.watchdog", wires, ready=ready, rank=2)
+        self._add_python(AGENT, "robot_agent", wires, user=robot, rank=2)
 
     def _add_servers(self) -> None:
         data = self.folder / "data"
         for name in (BROKER, REDIS):
             (data / name).mkdir(mode=0o700)
         for program in (
-            servers.mosquitto_program(data / BROKER, self.mqtt_port),
-            servers.redis_program(data / REDIS, self.redis_port),
-            servers.router_program(self.zenoh_port),
+            servers.mosquitto_program(data / BROKER, self.mqtt_port, locks=self.doors.of("mosquitto")),
+            servers.redis_program(data / REDIS, self.redis_port, locks=self.doors.of("redis")),
+            servers.router_program(self.zenoh_port, locks=self.doors.of("zenoh")),
         ):
-            ready = partial(net.server_problem, program.port, program.probe, program.reply)
+            self._urls[program.name] = program.url
+            ready = partial(net.server_problem, program.port, program.probe, program.reply, encrypted=program.encrypted)
             self._add(program.name, program.command, ready=ready)
 
     def _add_python(
@@ -201,6 +212,7 @@ class Stack:
         module: str,
         own: Mapping[str, str],
         *,
+        user: str | None = None,
         ready: Ready | None = None,
         rank: int = 1,
     ) -> None:
@@ -217,8 +229,7 @@ class Stack:
             "REVISION": checkout.revision(),
             "PORT_FILE": str(port_file),
             "DATA_DIR": str(data),
-            "TOKENS_FILE": str(self.folder / TOKENS),
-            "OPERATOR_KEY_FILE": str(self.key_file),
+            **(self.doors.settings(user) if user is not None else {}),
             **(self.config.extra or {}),
             **own,
         }

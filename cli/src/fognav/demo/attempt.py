@@ -20,6 +20,7 @@ from fognav.demo.usage import Usage, children
 from fognav.output import WrongUseError
 from fognav.recording import recording
 from fognav.stack import WATCHDOG, Stack, StackConfig
+from fognav.stack_doors import doors_of
 from fognav_sim.drive.drive import Drive, DriveSummary
 from fognav_sim.drive.evaluation import DriveOutcome
 from fognav_sim.drive.hazard import HazardSchedule
@@ -63,6 +64,7 @@ class Attempt:
             robot_file=options.robot_file,
             seed=options.seed,
             speed=self.scene.speed,
+            doors=doors_of(self.plan.site.site),
         )
         async with Stack(config, self._on_process) as stack, self._keeping_logs(stack):
             if options.hazard and not self.plan.hazard:
@@ -93,8 +95,15 @@ class Attempt:
             return
         numbers = [area.number for area in self.plan.site.site.areas if area.number is not None]
         async with (
-            self._open(stack, clock, "record") as edge,
-            recording(path, mqtt_url=stack.mqtt_url, zenoh=edge, clock=clock, numbers=numbers),
+            self._open(stack, clock, "record", user="recorder") as edge,
+            recording(
+                path,
+                mqtt_url=stack.mqtt_url,
+                zenoh=edge,
+                clock=clock,
+                numbers=numbers,
+                credentials=stack.doors.credentials("recorder"),
+            ),
         ):
             yield
 
@@ -114,9 +123,17 @@ class Attempt:
             if stack.keep_files:
                 self.scene.log_event(f"logs kept in {stack.folder / 'logs'}")
 
-    def _open(self, stack: Stack, clock: SystemClock, name: str) -> contextlib.AbstractAsyncContextManager[ZenohEdge]:
-        site = self.plan.site.site.id
-        return ZenohEdge.open(connect=[stack.zenoh_endpoint], clock=clock, role="console", id=name, site=site)
+    def _open(
+        self, stack: Stack, clock: SystemClock, name: str, user: str = "console"
+    ) -> contextlib.AbstractAsyncContextManager[ZenohEdge]:
+        return ZenohEdge.open(
+            connect=[stack.zenoh_endpoint],
+            clock=clock,
+            role="console",
+            id=name,
+            site=self.plan.site.site.id,
+            credentials=stack.doors.credentials(user),
+        )
 
     def _on_process(self, event: Event) -> None:
         if event.kind == "exited":

@@ -46,6 +46,7 @@ class Presence:
         urls |= {BROKER: stack.mqtt_url, ROUTER: stack.zenoh_endpoint}
         if self._scene.page_url:
             urls[PAGE] = self._scene.page_url
+        credentials = stack.doors.file("console")
         return System(
             name=f"demo-{os.getpid()}",
             kind="demo",
@@ -54,6 +55,7 @@ class Presence:
             pids={"demo": os.getpid(), **stack.pids()},
             token_file=str(stack.token_file),
             key_file=str(stack.key_file),
+            credentials_file=None if credentials is None else str(credentials),
             robots=[self._plan.robot],
             speed=self._scene.speed,
         )

@@ -45,6 +45,7 @@ EDGES = {
     "hazard_aggregator.publisher", "hazard_aggregator.records", "hazard_aggregator.override_api",
     "hazard_aggregator.override_writer", "hazard_aggregator.history_api", "hazard_aggregator.history_keeper",
     "hazard_aggregator.alert_api", "hazard_aggregator.alert_keeper", "hazard_aggregator.unusable_areas",
+    "hazard_aggregator.availability",
     "map_service.__main__", "map_service.api", "map_service.registry", "map_service.service", "map_service.settings",
     "map_service.publisher", "map_service.store", "map_service.times_keeper", "map_service.unusable_zones",
     "map_service.zone_writer",

@@ -173,7 +173,7 @@
 #define FOGNAV_NODE_PROBLEM_QOS 1
 #define FOGNAV_NODE_PROBLEM_RETAINED 1
 
-/* home_assistant, published by a node: Home Assistant's device discovery (JSON) */
+/* home_assistant, published by a node: Home Assistant's device discovery of a node (JSON) */
 #define FOGNAV_HOME_ASSISTANT_TOPIC "homeassistant/device/%s/config" /* node */
 #define FOGNAV_HOME_ASSISTANT_TOPIC_SIZE 61
 #define FOGNAV_HOME_ASSISTANT_LIMIT 8192 /* bytes */

@@ -28,7 +28,6 @@ SIDES: Final = {
 NOT_YET: Final[frozenset[tuple[Role, Channel]]] = frozenset(
     {
         ("hazard-aggregator", ch.NODE_VALUE),
-        ("hazard-aggregator", ch.HOME_ASSISTANT),
         ("console", ch.NODE_UPDATE),
         ("console", ch.PLANNER_PLAN),
     }

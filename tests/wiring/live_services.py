@@ -183,7 +183,7 @@ class MemoryStore:
         return {}
 
     async def load(self) -> Stored:
-        return Stored([], [], [], {})
+        return Stored([], [], [], {}, {})
 
     async def goals(self) -> dict[str, Any]:
         return {}
@@ -268,6 +268,7 @@ class LiveServices:
         self.aggregator = AggregatorService(
             Aggregator(AreaFusion(definitions, loaded.site.nodes, 1, registry=find_rule)),
             MemoryStore(), edges["hazard-aggregator"], edges["hazard-aggregator"], clock, Health(),
+            site=self.site,
         )  # fmt: skip
         self.map = MapService(
             MapCore(

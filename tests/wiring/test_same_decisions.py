@@ -50,6 +50,7 @@ from hazard_aggregator.registry import find_rule
 from map_service.core import MapCore
 from map_service.registry import make_layers
 from planner.core import PlannerCore
+from planner.mission_keeper import Order
 from planner.robot_commands import CommandError
 from robot_agent.agent import input_log as log
 from robot_agent.agent.core import AgentCore
@@ -141,14 +142,17 @@ class Run:
     def decisions(self) -> dict[str, list[Any]]:
         """Return what the system published by itself, by channel: step, ids and content.
 
-        Without alerts: they tell people, and the service makes them of what the core has decided.
+        Without what tells people and other systems: the service makes it of what the core has decided.
         """
         found: dict[str, list[Any]] = {}
         for step, publication in self.bus.published:
-            if not is_external(publication) and publication.channel is not ch.AGGREGATOR_ALERTS:
+            if not is_external(publication) and publication.channel not in TOLD_BY_SERVICES:
                 entry = step, dict(publication.ids), comparable(publication.message)
                 found.setdefault(publication.channel.name, []).append(entry)
         return found
+
+
+TOLD_BY_SERVICES = (ch.AGGREGATOR_ALERTS, ch.AGGREGATOR_AVAILABILITY, ch.HOME_ASSISTANT_AREA)
 
 
 def is_external(publication: Publication) -> bool:
@@ -295,7 +299,7 @@ async def drive_live(recorded: Run) -> tuple[Run, Any]:
             pose = goal(0.0).pose
             assert pose is not None
             for robot in ("r1", OTHER_ROBOT):
-                await live.run(live.planner.send(robot, pose, "tester", place=None, any_heading=True))
+                await live.run(live.planner.send(Order(robot, pose, "tester", any_heading=True)))
         if step == ZONES:
             for zone in (ZONE_SLOW, ZONE_WET):
                 await live.run(live.map.zones.create(zone, "tester"))

@@ -175,8 +175,11 @@ async def test_alert_is_published_acknowledged_kept_over_a_kill_and_in_the_audit
         fog.kill("hazard_aggregator")
         fog.start("hazard_aggregator")
         url = await fog.ready("hazard_aggregator")
-        kept = lambda: heard[-1].epoch > epoch and (heard[-1].total, heard[-1].unseen) == (1, 0)  # noqa: E731
-        await until(kept, "kept", lambda: fog.log("hazard_aggregator"))
+        await until(
+            lambda: heard[-1].epoch > epoch and (heard[-1].total, heard[-1].unseen) == (1, 0),
+            "kept",
+            lambda: fog.log("hazard_aggregator"),
+        )
         removal = {**body, "removed": True}
         assert (await client.put(f"{url}/api/v1/areas/hall", json=removal, headers=tokens["operator"])).is_success
         await until(lambda: heard[-1].total == 0, "ended")

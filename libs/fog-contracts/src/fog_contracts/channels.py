@@ -26,7 +26,7 @@ ROLES: Final[Mapping[Role, str]] = {
     "node": "a sensor node",
     "thesis-node": "a sensor node that publishes on the thesis's topics",
     "thesis-robot": "a robot that subscribes to the thesis's topic",
-    "home-assistant": "Home Assistant, which discovers nodes",
+    "home-assistant": "Home Assistant, which discovers nodes and areas",
     "hazard-aggregator": "turns readings into the state of each area",
     "map-service": "maintains the costmap",
     "planner": "plans paths and stores missions",
@@ -195,6 +195,9 @@ AGGREGATOR_HEARTBEAT = _mqtt("aggregator_heartbeat", V1 + "aggregator/heartbeat"
     limit=64 * KIB,
     publishers=(AGGREGATOR,),    subscribers=(AGGREGATOR, MAP),   durability=VOLATILE, qos=0, rate_hz=5,
     max_age_s=1.5, epoch="epoch")
+AGGREGATOR_AVAILABILITY = _text("aggregator_availability", V1 + "aggregator/availability",              limit=16,
+    publishers=(AGGREGATOR,),    subscribers=(AGGREGATOR, "home-assistant"), durability=LATEST, qos=1,
+    values=(ONLINE, OFFLINE), about="whether the aggregator is connected; `offline` is its last will")
 AGGREGATOR_ALERTS = _mqtt( "aggregator_alerts", V1 + "aggregator/alerts",             m.AlertList,      limit=64 * KIB,
     publishers=(AGGREGATOR,),    subscribers=("home-assistant",), durability=LATEST,   qos=1, epoch="epoch")
 AGGREGATOR_REQUEST = _text("aggregator_request", V1 + "aggregator/request",                             limit=16,
@@ -207,8 +210,11 @@ THESIS_WSN        = _text( "thesis_wsn",        "WSN",                          
     publishers=(AGGREGATOR,),    subscribers=("thesis-robot",),   durability=VOLATILE, qos=1,
     about="`n,x,y` for a blocked area, `n,-999,-999` for a clear one")
 HOME_ASSISTANT    = _text( "home_assistant",    "homeassistant/device/{node}/config",                   limit=8 * KIB,
-    publishers=(NODE, AGGREGATOR), subscribers=("home-assistant",), durability=LATEST, qos=1,
-    about="Home Assistant's device discovery (JSON)")
+    publishers=(NODE,),          subscribers=("home-assistant",), durability=LATEST,   qos=1,
+    about="Home Assistant's device discovery of a node (JSON)")
+HOME_ASSISTANT_AREA = _text("home_assistant_area", "homeassistant/device/{site}/{area}/config",         limit=8 * KIB,
+    publishers=(AGGREGATOR,),    subscribers=("home-assistant",), durability=LATEST,   qos=1,
+    about="Home Assistant's device discovery of an area (JSON)")
 
 # The map, and the hazards and zones in it: zenoh, msgpack
 MAP_DELTA         = _pub(  "map_delta",         FOG + "map/delta",      m.MapDelta,     limit=DELTA_LIMIT,

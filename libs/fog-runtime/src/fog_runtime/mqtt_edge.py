@@ -8,6 +8,7 @@ import asyncio
 import random
 from collections import deque
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, Final, TypeVar, overload
 
@@ -206,7 +207,11 @@ class MqttEdge:
             try:
                 async with broker.client(self._client_id, self._mqtt_will(), inbox) as client:
                     failures = 0
-                    await self._serve(client, broker, inbox)
+                    try:
+                        await self._serve(client, broker, inbox)
+                    except asyncio.CancelledError:
+                        await self._publish_will(client)
+                        raise
             except aiomqtt.MqttError as error:
                 raise_if_cancelled()
                 reason = str(error) or type(error).__name__
@@ -232,6 +237,12 @@ class MqttEdge:
         return aiomqtt.Will(
             self._topic(channel, will.ids), _encoded(channel, will.message), channel.qos, channel.retained
         )
+
+    async def _publish_will(self, client: aiomqtt.Client) -> None:
+        """Publish the last will before an orderly end, at which a broker forgets it."""
+        if (will := self._mqtt_will()) is not None:
+            with suppress(aiomqtt.MqttError):  # without a connection the broker publishes it
+                await client.publish(will.topic, will.payload, will.qos, will.retain)
 
     async def _serve(self, client: aiomqtt.Client, broker: Broker, inbox: Inbox) -> None:
         if topics := self._subscriptions.qos_by_topic():

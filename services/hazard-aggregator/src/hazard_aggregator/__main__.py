@@ -17,6 +17,7 @@ from fog_runtime.settings import describe, load
 from fog_runtime.site import load_site
 from fog_runtime.zenoh_edge import ZenohEdge
 from hazard_aggregator.api import make_api
+from hazard_aggregator.availability import LAST_WILL
 from hazard_aggregator.core import Aggregator
 from hazard_aggregator.fusion import AreaFusion
 from hazard_aggregator.members import Members
@@ -60,7 +61,9 @@ async def main() -> None:
             definitions.values(), loaded.site.nodes, 0, stored.hazards,
             registry=find_rule, default_rule=settings.debounce,
         )  # fmt: skip
-        mqtt = MqttEdge(settings.mqtt_url, process_id("hazard-aggregator"), clock, site=site, credentials=own)
+        mqtt = MqttEdge(
+            settings.mqtt_url, process_id("hazard-aggregator"), clock, site=site, will=LAST_WILL, credentials=own
+        )
         async with ZenohEdge.open(
             connect=settings.zenoh_endpoints, clock=clock, role="hazard-aggregator", id=site, site=site, credentials=own
         ) as zenoh:
@@ -69,7 +72,7 @@ async def main() -> None:
             )
             core = Aggregator(fusion, complete=loaded_from_store)
             boot = boot_id()
-            service = Service(core, store, mqtt, zenoh, clock, health, leadership, boot=boot)
+            service = Service(core, store, mqtt, zenoh, clock, health, leadership, boot=boot, site=site)
             if loaded_from_store:
                 core.load_overrides(
                     StoredOverrides(stored.overrides, stored.rests, boot), Moment(clock.now(), clock.stamp())

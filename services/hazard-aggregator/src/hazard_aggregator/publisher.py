@@ -11,6 +11,7 @@ from prometheus_client import Gauge
 from fog_contracts import channels as ch
 from fog_contracts.messages import AreaHazard, AreaState
 from fog_runtime import logs, metrics
+from hazard_aggregator.area_discovery import discovery_publication
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -30,9 +31,13 @@ _log = logs.get("aggregator")
 
 
 class Publisher:
-    """The way of the core's publications to the edges; `write_pending` is set while hazards must be stored."""
+    """The way of the core's publications to the edges; `write_pending` is set while hazards must be stored.
 
-    def __init__(self, core: Aggregator, edges: Edges, history: HistoryKeeper) -> None:
+    Home Assistant is told of the areas of this `site`; without its id, of none.
+    """
+
+    def __init__(self, core: Aggregator, edges: Edges, history: HistoryKeeper, site: str) -> None:
+        self._site = site
         self.write_pending = asyncio.Event()
         self._core = core
         self._edges = edges
@@ -57,6 +62,8 @@ class Publisher:
         for publication in publications:
             _count(publication)
             self._edges.publish(publication)
+            if publication.channel is ch.AREA_DEFINITION and self._site:
+                self._edges.publish(discovery_publication(self._site, publication))
             if isinstance(hazard := publication.message, AreaHazard):
                 self._history.add(hazard, self._edges.now().stamp)
         WITHHELD.set(len(self._core.withheld()))

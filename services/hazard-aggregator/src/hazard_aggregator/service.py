@@ -12,6 +12,7 @@ from fog_runtime.clock import ticker
 from fog_runtime.edges import Edges
 from hazard_aggregator.alert_keeper import AlertKeeper
 from hazard_aggregator.area_writer import AreaWriter
+from hazard_aggregator.availability import Availability
 from hazard_aggregator.history_keeper import HistoryKeeper
 from hazard_aggregator.override_writer import OverrideWriter
 from hazard_aggregator.publisher import Publisher
@@ -62,8 +63,12 @@ class Service:
         gate: Gate | None = None,
         *,
         boot: str = "",
+        site: str = "",
     ) -> None:
-        """Prepare; `gate` decides whether this process leads or stands by, `boot` is `clock.boot_id`."""
+        """Prepare; `gate` decides whether this process leads or stands by, `boot` is `clock.boot_id`.
+
+        Home Assistant is told of the areas of `site`, the site's id, if that is given.
+        """
         self.core = core
         self._store = store
         self._mqtt = mqtt
@@ -73,8 +78,9 @@ class Service:
         self._edges = Edges(clock, mqtt=mqtt, zenoh=zenoh, gate=gate)
         self._leading = asyncio.Event()
         self.history = HistoryKeeper(core, store, self._leading)
+        self._availability = Availability(self._edges, self._leading)
         self.alerts = AlertKeeper(core, store, self._edges, clock, self._leading)
-        self._publisher = Publisher(core, self._edges, self.history)
+        self._publisher = Publisher(core, self._edges, self.history, site)
         self.records = Records(core, store, self._publisher, mqtt, self._edges, clock, health, boot)
         self.areas = AreaWriter(core, store, self.records, self._publisher, self._edges, clock)
         self.overrides = OverrideWriter(core, store, self.records, self._publisher, self._edges, clock, boot)
@@ -86,6 +92,7 @@ class Service:
         self._edges.serve(self.core.query_handlers())
         self._mqtt.on_connect(self._publisher.republish_all)
         self._mqtt.on_connect(self.alerts.publish)
+        self._availability.subscribe(self._mqtt)
         self._mqtt.on_connection_lost(lambda: self._publisher.announce(self.core.on_connection_lost(self._edges.now())))
 
     async def tick_loop(self) -> None:
@@ -183,6 +190,7 @@ class Service:
             restored = [publication for publication in restored if publication.message is None]
         self._publisher.publish(restored)
         self._leading.set()
+        self._availability.announce()
         self._publisher.write_pending.set()
 
     def stand_by(self) -> None:

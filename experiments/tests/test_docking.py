@@ -2,6 +2,7 @@
 
 import importlib.util
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -11,6 +12,7 @@ from fog_contracts import channels as ch
 from fog_contracts.messages import Pose, RectangleShape, RobotGoal, SimObstacle, Zone
 from fog_runtime.site import LoadedSite
 from fognav_experiments.rigs import System, moment
+from robot_agent.agent.core import AgentCore
 
 _spec = importlib.util.spec_from_file_location("ring_site", Path(__file__).parent / "ring_site.py")
 ring = importlib.util.module_from_spec(_spec)
@@ -30,9 +32,14 @@ def site_with_dock(start=None):
 class Run:
     """The whole system, with an enabled robot in NORMAL; every mode and wheel speed is recorded."""
 
-    def __init__(self, *, site=None):
+    def __init__(self, *, site=None, charge=0.9, dock_below=0.0):
         site = site or site_with_dock()
-        self.system = System(site, site.site.robots[0], 3)
+
+        def make_agent(config, seed):
+            return AgentCore(replace(config, dock_below=dock_below), seed)
+
+        self.system = System(site, site.site.robots[0], 3, make_agent=make_agent)
+        self.base.battery.charge_mah = charge * self.base.battery.capacity_mah
         self.state, self.modes, self.fastest = None, [], {}
         self.system.bus.subscribe({ch.ROBOT_STATE: self._on_state})
         self.until(lambda: self.state and self.state.reasons == ["waiting for an operator to enable"], 12.0)
@@ -204,3 +211,87 @@ def test_site_without_a_dock_and_a_robot_that_is_not_enabled_refuse():
     run = Run()
     run.system.robot.command("disable")
     assert "enable it first" in run.system.robot.command("dock").reason
+
+
+# --- a low battery ---
+
+
+def test_enabled_robot_with_a_low_battery_goes_to_its_dock_once_if_its_settings_say_so():
+    run = Run(charge=0.25, dock_below=0.3)
+    run.until(lambda: run.state.docked and run.state.mode == "HOLD", 30.0)
+    assert run.state.enabled
+    goal = RobotGoal(goal_id="g", pose=Pose(x=1.5, y=2.2, theta=0.0), stamp=0.0)
+    run.system.fog.planner.set_goal("r1", goal, any_heading=True)
+    run.until(lambda: run.state.goal_reached, 30.0)
+    run.until(lambda: run.state.docked, 40.0)  # it was on its dock, so it may go there again
+
+
+@pytest.mark.parametrize(("charge", "dock_below"), [(0.25, 0.0), (0.35, 0.3)])
+def test_robot_stays_where_it_is_with_a_charge_above_the_limit_or_without_one(charge, dock_below):
+    run = Run(charge=charge, dock_below=dock_below)
+    run.run(2.0)
+    assert not run.state.wants_dock
+    assert (run.state.mode, run.wheels) == ("NORMAL", (0.0, 0.0))
+
+
+def test_robot_with_a_low_battery_tries_once_and_waits_for_people_then():
+    run = Run(site=site_with_dock(Pose(x=1.5, y=2.6, theta=-math.pi / 2)), charge=0.25, dock_below=0.3)
+    run.until(lambda: run.state.wants_dock and run.state.goal_id, 1.0)
+    assert run.system.robot.command("cancel").accepted
+    run.run(3.0)
+    assert not run.state.wants_dock
+    assert "docking given up: its goal was cancelled" in run.state.reasons
+    run.system.robot.command("disable")
+    run.run(0.5)
+    run.system.robot.command("enable")
+    run.until(lambda: run.state.wants_dock, 1.0)
+
+
+# --- backing off from a bump ---
+
+
+def test_robot_backs_off_from_a_bump_by_ten_centimetres_at_most_and_keeps_its_fault():
+    run = Run()
+    before, bumped = run.away(), list(run.system.world.pose)
+    bump(run)
+    run.until(lambda: run.state.mode == "FAULT", 1.0)
+    assert "the cause is still there" in run.system.robot.command("reset").reason
+    assert run.system.robot.command("back_off").accepted
+    run.until(lambda: run.state.mode == "EGRESS", 0.5)
+    fastest = 0.0
+    while run.state.mode == "EGRESS":
+        run.system.step()
+        fastest = max(fastest, -min(run.wheels))
+        if math.dist(run.system.world.pose[:2], bumped[:2]) > 0.03:
+            run.base.world.bump_left = False
+    assert 0.07 < run.away() - before <= 0.10
+    assert fastest <= 0.051
+    assert run.state.mode == "FAULT"
+    run.run(1.0)
+    assert run.wheels == (0.0, 0.0)
+    assert run.system.robot.command("back_off").accepted is True
+    run.run(0.3)
+    assert run.system.robot.command("disable").accepted
+    run.run(0.3)
+    assert (run.wheels, run.state.mode) == ((0.0, 0.0), "FAULT")
+    assert run.system.robot.command("reset").accepted
+    run.until(lambda: run.state.mode == "INIT", 0.5)
+
+
+def test_robot_does_not_back_off_into_what_its_lidar_sees_behind_it():
+    run = Run()
+    x, y, _ = run.system.world.pose
+    behind = x + 0.17 + 0.05
+    run.system.world.place(SimObstacle(id="box", polygon=[(behind, y - 0.2), (behind + 0.2, y - 0.2),
+                                                          (behind + 0.2, y + 0.2), (behind, y + 0.2)]))  # fmt: skip
+    bump(run)
+    run.until(lambda: run.state.mode == "FAULT", 1.0)
+    assert run.system.robot.command("back_off").accepted
+    run.until(lambda: run.state.mode == "EGRESS", 0.5)
+    run.until(lambda: run.state.mode == "FAULT", 6.0)
+    assert run.system.world.contacts == 0
+    assert run.system.world.clearance() > 0.01
+
+
+def test_robot_without_a_bump_does_not_back_off():
+    assert "bumped into nothing" in Run().system.robot.command("back_off").reason

@@ -173,6 +173,7 @@ class Agent:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.wheels: tuple[float, float] | None = (0.0, 0.0)
+        self.maneuver = None
         self.reset = False
         self.refused: str | None = None
         self.feedback = None
@@ -201,7 +202,8 @@ class Agent:
                             due = time.monotonic() + 0.05
                             reset, self.reset = self.reset, False
                             left, right = self.wheels
-                            link.send(encode(WheelCommand(seq=seq, left=left, right=right, reset=reset)))
+                            command = WheelCommand(seq=seq, left=left, right=right, reset=reset, maneuver=self.maneuver)
+                            link.send(encode(command))
                         try:
                             data = link.recv(4096)
                         except TimeoutError:

@@ -77,6 +77,8 @@ class Docking:
         if not state.enabled or state.mode == "FAULT":
             return "the robot drives to its dock: enable it first"
         self._ordered_at, self._goal_before, self.given_up = now, mission.goal_id, ""
+        if self._is_ours(mission):
+            mission.resume()  # the planner does not send the robot where it sends it already
         return None
 
     def give_up(self, reason: str = "") -> None:

@@ -138,6 +138,10 @@ class Mission:
         self.drop_path()
         return self._cancelled
 
+    def resume(self) -> None:
+        """Drive to a cancelled goal after all."""
+        self._cancelled = None
+
     def _keep_early(self, path: RobotPath) -> None:
         known = self._early_path
         if known is None or (path.planner_epoch, path.plan_id) >= (known.planner_epoch, known.plan_id):

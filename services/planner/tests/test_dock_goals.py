@@ -1,0 +1,80 @@
+"""Robots that want to their docks: who is sent where, once, and what becomes of a refusal or a lost store."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+
+from fog_contracts.messages import Pose, Refusal, RobotGoal, RobotState
+from fog_contracts.site import RobotSite, Site
+from planner.dock_goals import DockGoals
+from planner.dock_keeper import DockKeeper
+from planner.store import StoreError
+
+FRONT = Pose(x=1.0, y=2.0, theta=0.5)
+
+
+def state(*, wants_dock: bool = True) -> RobotState:
+    return RobotState(
+        mode="NORMAL", reasons=[], enabled=True, battery=0.1, goal_id=None, map_epoch=1, map_seq=1, plan_id=None,
+        wants_dock=wants_dock,
+    )  # fmt: skip
+
+
+def goal(pose: Pose | None) -> RobotGoal:
+    return RobotGoal(goal_id="g", pose=pose, stamp=0.0)
+
+
+def test_robot_that_wants_to_its_dock_is_sent_in_front_of_it_from_any_other_goal() -> None:
+    assert DockGoals({"r1": FRONT}).due("r1", state(), None, 5.0) == FRONT
+    assert DockGoals({"r1": FRONT}).due("r1", state(), goal(Pose(x=9.0, y=9.0, theta=0.0)), 5.0) == FRONT
+
+
+def test_robot_that_is_sent_there_already_or_has_no_dock_or_does_not_want_to_is_not_sent() -> None:
+    docks = DockGoals({"r1": FRONT})
+    assert docks.due("r1", state(), goal(FRONT), 5.0) is None
+    assert docks.due("r2", state(), None, 5.0) is None
+    assert docks.due("r1", state(wants_dock=False), None, 5.0) is None
+
+
+def test_robot_is_sent_again_only_after_two_seconds() -> None:
+    docks = DockGoals({"r1": FRONT, "r2": FRONT})
+    assert docks.due("r1", state(), None, 5.0) == FRONT
+    assert docks.due("r1", state(), None, 6.99) is None
+    assert docks.due("r2", state(), None, 6.99) == FRONT
+    assert docks.due("r1", state(), None, 7.0) == FRONT
+
+
+def test_front_of_the_dock_is_0_7_m_before_it_and_robots_without_one_are_left_out() -> None:
+    robots = [
+        RobotSite(id="r1", start=FRONT, dock=Pose(x=1.0, y=2.0, theta=1.5707963267948966)),
+        RobotSite(id="r2", start=FRONT),
+    ]
+    staging = Site(id="s", robots=robots).staging
+    assert list(staging) == ["r1"]
+    assert (staging["r1"].x, staging["r1"].y) == (pytest.approx(1.0), pytest.approx(1.3))
+    assert staging["r1"].theta == pytest.approx(1.5707963)
+
+
+@pytest.mark.parametrize("outcome", [None, Refusal(code=206, reason="a wall"), StoreError("Redis is away")])
+async def test_refused_or_lost_goal_ends_nothing_and_is_tried_again(outcome: object) -> None:
+    orders = []
+
+    async def send(order):
+        orders.append(order)
+        if isinstance(outcome, Exception):
+            raise outcome
+        return outcome
+
+    keeper = DockKeeper({"r1": FRONT}, send)
+    keeper.on_state("r1", state(), None, 5.0)
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    keeper.on_state("r1", state(), None, 7.0)
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    assert [(order.robot, order.pose, order.any_heading, order.expected) for order in orders] == [
+        ("r1", FRONT, False, None)
+    ] * 2
+    assert "to its dock" in orders[0].who

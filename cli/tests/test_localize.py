@@ -120,6 +120,7 @@ def test_kidnapped_robot_is_found_again(folder):
     _, found = run("localize", "--map", folder / "floor.yaml", "--log", folder / "drive.jsonl.gz", "--kidnap")
     assert found["recovered_after_scans"] is not None
     assert found["recovered_after_scans"] <= 15
+    assert found["falsely_good_share"] == 0.0
 
 
 def test_log_of_another_building_is_never_good(folder, tmp_path):
@@ -220,3 +221,18 @@ def test_recorded_floor_with_real_odometry_meets_its_targets(data_dir, tmp_path)
         )  # fmt: skip
         assert found["converged_right"]
         assert found["falsely_good_share"] == 0.0
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", ["seattle-corrected.log.gz", "intel_odom_ref_scan.jsonl.gz"])
+def test_robot_carried_away_on_a_recorded_floor_is_never_good_elsewhere(data_dir, tmp_path, name):
+    log = data_dir / "lidar_logs" / name
+    if not log.is_file():
+        pytest.skip(f"{log} does not exist")
+    run("map", "from-log", log, "--out", tmp_path / "floor", "--scans", "odd")
+    for seed in (1, 2, 3):
+        _, found = run(
+            "localize", "--map", tmp_path / "floor.yaml", "--log", log, "--scans", "even", "--kidnap", "--seed", seed
+        )
+        assert found["falsely_good_share"] == 0.0
+        assert found["recovered_after_scans"] <= 10

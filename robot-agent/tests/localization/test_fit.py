@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from little_world import L_ROOMS, grid_of
 
 from robot_agent.config import LocalizationConfig
-from robot_agent.localization.fit import Fit, FitMonitor, evaluate_fit, grade_fit
+from robot_agent.localization.fit import Fit, FitMonitor, casts_doubt, evaluate_fit, grade_fit
 from robot_agent.localization.map_fields import map_fields
 from robot_agent.localization.pose import Pose2
 from robot_agent.localization.uncertainty import Uncertainty
@@ -20,7 +20,12 @@ FIELDS = map_fields(*grid_of(L_ROOMS, 15.0, 12.0), LocalizationConfig())
 PLACE = Pose2(5.0, 2.0, 1.0)
 GOOD = Fit(agree=0.95, explained=0.9, contradict=0.02, informative=80)
 FAIR = Fit(agree=0.9, explained=0.8, contradict=0.12, informative=80)
+COVERED = Fit(agree=0.0, explained=0.0, contradict=1.0, informative=2)
 VAGUE = Fit(agree=0.9, explained=0.1, contradict=0.0, informative=4)
+OPENED_DOOR = Fit(agree=0.85, explained=0.8, contradict=0.1, informative=80)
+CROWDED = Fit(agree=0.5, explained=0.4, contradict=0.01, informative=50)
+OCCUPIED_ELSEWHERE = Fit(agree=0.7, explained=0.6, contradict=0.1, informative=80)
+BLURRED = Fit(agree=0.95, explained=0.9, contradict=0.02, informative=80, blurred=0.2)
 CONTRADICTED = Fit(agree=0.6, explained=0.5, contradict=0.3, informative=80)
 WRONG = Fit(agree=0.2, explained=0.2, contradict=0.6, informative=80)
 SURE = Uncertainty(0.05, 0.03, 0.02)
@@ -68,6 +73,9 @@ def test_scan_without_beams_counts_as_contradiction():
         (CONTRADICTED, SURE, "weak", "pass through walls"),
         (WRONG, SURE, "lost", "pass through walls"),
         (VAGUE, SURE, "weak", "too few beams"),
+        (CROWDED, SURE, "good", ""),
+        (OPENED_DOOR, SURE, "weak", "10% of the beams pass through walls of the map, and 85% end at them"),
+        (BLURRED, SURE, "weak", "20% of the beams end beside the walls"),
         (GOOD, Uncertainty(2.0, 1.2, 0.1), "lost", "uncertain by 1.2 m in every direction"),
         (GOOD, Uncertainty(9.0, 0.1, 0.1), "weak", "9.00 m in one direction"),
         (GOOD, Uncertainty(0.4, 0.3, 0.1), "weak", "0.40 m"),
@@ -91,8 +99,38 @@ def test_pose_that_has_not_proved_itself_needs_a_better_fit():
     assert monitor_after(GOOD, GOOD, FAIR, FAIR, FAIR).status == "good"
 
 
-def test_single_bad_scan_keeps_the_pose_and_five_of_nine_lose_it():
-    assert monitor_after(GOOD, GOOD, WRONG).status == "good"
+@pytest.mark.parametrize("fit", [WRONG, CONTRADICTED, OCCUPIED_ELSEWHERE, BLURRED, COVERED, VAGUE])
+def test_pose_is_good_no_longer_than_the_newest_scan_confirms_it(fit):
+    monitor = monitor_after(GOOD, GOOD, fit)
+    assert monitor.status == "weak"
+    monitor.add(GOOD, SURE)
+    assert monitor.status == "weak"
+    monitor.add(GOOD, SURE)
+    assert monitor.status == "good"
+
+
+def test_opened_door_leaves_a_pose_good_that_was_good_before_it():
+    assert monitor_after(GOOD, GOOD, OPENED_DOOR).status == "good"
+    assert monitor_after(GOOD, GOOD, BLURRED, OPENED_DOOR, OPENED_DOOR).status == "weak"
+
+
+@pytest.mark.parametrize(
+    ("fit", "expected"),
+    [(GOOD, False), (CROWDED, False), (OPENED_DOOR, False), (COVERED, False), (CONTRADICTED, True), (WRONG, True),
+     (Fit(agree=0.9, explained=0.9, contradict=0.0, informative=80, blurred=0.4), True)],
+)  # fmt: skip
+def test_doubt_is_cast_by_what_no_right_pose_shows(fit, expected):
+    assert casts_doubt(fit) is expected
+
+
+def test_walls_that_lie_beside_those_of_the_map_blur_the_scan():
+    moved = Pose2(PLACE.x + 0.17, PLACE.y + 0.17, PLACE.theta)
+    assert evaluate_fit(FIELDS, PLACE, points_at(PLACE), 12.0).blurred < 0.05
+    assert evaluate_fit(FIELDS, moved, points_at(PLACE), 12.0).blurred > 0.5
+
+
+def test_single_bad_scan_does_not_lose_the_pose_and_five_of_nine_do():
+    assert monitor_after(GOOD, GOOD, WRONG).status == "weak"
     assert monitor_after(GOOD, GOOD, WRONG, WRONG, WRONG).status == "weak"
     assert monitor_after(GOOD, GOOD, *[WRONG] * 5).status == "lost"
 
@@ -142,7 +180,7 @@ def test_lost_pose_stays_lost_while_the_map_is_searched():
     assert monitor.status == "good"
 
 
-@given(st.lists(st.sampled_from([GOOD, FAIR, VAGUE, CONTRADICTED, WRONG]), max_size=60))
+@given(st.lists(st.sampled_from([GOOD, FAIR, VAGUE, BLURRED, CONTRADICTED, WRONG]), max_size=60))
 def test_any_status_but_good_has_a_reason(fits):
     monitor = FitMonitor()
     for fit in fits:

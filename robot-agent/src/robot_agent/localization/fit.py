@@ -195,15 +195,21 @@ def grade_fit(fit: Fit, spread: Uncertainty, *, proven: bool = False) -> tuple[L
         return "lost", _contradiction(fit)
     if spread.across > _LOST_ACROSS_M:
         return "lost", f"the position is uncertain by {spread.across:.1f} m in every direction"
+    weakness = _weakness(fit, proven=proven)
+    return ("weak", weakness) if weakness else _grade_spread(spread)
+
+
+def _weakness(fit: Fit, *, proven: bool) -> str:
+    """Return why a scan does not confirm a pose; empty if it does."""
     if fit.contradict > _CONTRADICTION_LIMIT:
-        return "weak", _contradiction(fit)
+        return _contradiction(fit)
     if fit.informative < _INFORMATIVE_LEAST:
-        return "weak", "too few beams reach a wall of the map"
+        return "too few beams reach a wall of the map"
     if not _is_clear(fit, proven=proven):
-        return "weak", f"{_contradiction(fit)}, and {fit.agree:.0%} end at them"
+        return f"{_contradiction(fit)}, and {fit.agree:.0%} end at them"
     if fit.blurred > _BLURRED_LIMIT:
-        return "weak", f"{fit.blurred:.0%} of the beams end beside the walls of the map"
-    return _grade_spread(spread)
+        return f"{fit.blurred:.0%} of the beams end beside the walls of the map"
+    return ""
 
 
 def casts_doubt(fit: Fit) -> bool:

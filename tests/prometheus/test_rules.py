@@ -10,7 +10,7 @@ import yaml
 
 ROOT = Path(__file__).parents[2]
 DEPLOYED = ROOT / "deploy" / "prometheus"
-TESTS = Path(__file__).parent / "alerts.test.yml"
+TESTS = sorted(Path(__file__).parent.glob("*.test.yml"))
 ALERTS = [
     rule["alert"]
     for group in yaml.safe_load((DEPLOYED / "rules" / "alerts.yml").read_text("utf-8"))["groups"]
@@ -33,13 +33,13 @@ def test_configuration_is_valid_and_names_files_that_exist() -> None:
 
 @needs_promtool
 def test_each_alert_fires_when_it_must_and_not_before() -> None:
-    assert "SUCCESS" in promtool("test", "rules", str(TESTS))
+    assert promtool("test", "rules", *map(str, TESTS)).count("SUCCESS") == len(TESTS) == 2
 
 
 @pytest.mark.parametrize("alert", ALERTS)
 def test_alert_has_a_test_and_tells_operators_what_to_do(alert: str) -> None:
-    cases = yaml.safe_load(TESTS.read_text("utf-8"))["tests"]
-    expected = [case for test in cases for case in test.get("alert_rule_test", []) if case["alertname"] == alert]
+    tests = [test for file in TESTS for test in yaml.safe_load(file.read_text("utf-8"))["tests"]]
+    expected = [case for test in tests for case in test.get("alert_rule_test", []) if case["alertname"] == alert]
     assert any(case["exp_alerts"] for case in expected), "no test in which it fires"
     operations = (ROOT / "docs" / "operations.md").read_text("utf-8")
     assert re.search(rf"^\*\*{alert}\.\*\* \S", operations, re.MULTILINE), "say in docs/operations.md what to do"

@@ -67,6 +67,9 @@ CONDITION: Final = Gauge(
 )
 DISK_FREE: Final = Gauge("fognav_disk_free_bytes", "Free space of the disk that holds this folder", ["folder"])
 DISK_SIZE: Final = Gauge("fognav_disk_size_bytes", "Size of the disk that holds this folder", ["folder"])
+LAST_BACKUP: Final = Gauge(
+    "fognav_last_backup_seconds", "When the last backup was made (s since the epoch); 0: never"
+)
 CONNECTED: Final = Gauge("fognav_connected", "Whether the connection is up (1) or down (0)", ["transport"])
 CONNECTIONS: Final = Counter("fognav_connections_total", "Connections established", ["transport"])
 
@@ -80,6 +83,11 @@ def watch_disk(folder: Path) -> None:
     """Export size and free space of the disk that holds the folder, as they are when Prometheus asks."""
     DISK_FREE.labels(str(folder)).set_function(lambda: _disk(folder)[1])
     DISK_SIZE.labels(str(folder)).set_function(lambda: _disk(folder)[0])
+
+
+def watch_backup(stamp: Path) -> None:
+    """Export when the last backup was made, which is when this file was written."""
+    LAST_BACKUP.set_function(lambda: stamp.stat().st_mtime if stamp.exists() else 0.0)
 
 
 def _disk(folder: Path) -> tuple[float, float]:

@@ -7,6 +7,7 @@ import os
 
 from fog_contracts import channels as ch
 from fog_runtime import logs, metrics, process
+from fog_runtime.backup_archive import STAMP
 from fog_runtime.clock import SystemClock, WallClock, boot_id
 from fog_runtime.health import Health
 from fog_runtime.http import Front, load_tokens, unused
@@ -36,6 +37,7 @@ async def main() -> None:
     clock = SystemClock(settings.speed)
     health = Health("store", "zones", "mqtt", "map")
     metrics.watch_disk(settings.data_dir)
+    metrics.watch_backup(settings.data_dir / STAMP)
     tokens = load_tokens(settings.tokens_file)
     own = settings.credentials()
     front = Front.fork(

@@ -40,6 +40,8 @@ def _warm_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
         ["bench", "rest"],
         ["goal"],
         ["area", "list"],
+        ["backup"],
+        ["restore"],
         ["store", "status"],
         ["store", "restore"],
         ["store", "accept"],

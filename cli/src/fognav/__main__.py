@@ -15,6 +15,7 @@ from fog_runtime import parts
 from fognav import __version__, checkout, doctor, kernels, system
 from fognav.alert_command import alert_app
 from fognav.area_command import area_app
+from fognav.backup_command import backup_command, restore_command
 from fognav.bench_command import bench_app
 from fognav.ca_command import ca_app
 from fognav.channels_command import channels_command
@@ -68,6 +69,12 @@ app.add_typer(bench_app, name="bench")
 app.command("localize", epilog="Example: fognav localize --map floor.yaml --log drive.log.gz --scans even --json")(
     localize_command
 )
+app.command(
+    "backup", epilog="Example: fognav backup fog.tar.gz --site sites/estig --secrets keys --data /var/lib/fognav"
+)(backup_command)
+app.command(
+    "restore", epilog="Example: fognav restore fog.tar.gz --site sites/estig --secrets keys --data /var/lib/fognav"
+)(restore_command)
 app.command("status", epilog="Example: fognav status --json")(status_command)
 app.command("goal", context_settings=NUMBERS, epilog="Example: fognav goal b")(robot_goal)
 robot_app.command("add", epilog="Example: fognav robot add r2 --locks locks")(robot_add)

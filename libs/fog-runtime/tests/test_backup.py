@@ -201,7 +201,9 @@ def test_command_backs_up_and_restores(tmp_path, here, redis, monkeypatch, capsy
     asyncio.run(fill(redis))
     file = tmp_path / "b.tar.gz"
     assert backup.main(["create", str(file)]) == 0
-    assert "backed up site test: 5 keys of Redis, 2 files of the site, 1 files of the secrets" in capsys.readouterr().out
+    assert (
+        "backed up site test: 5 keys of Redis, 2 files of the site, 1 files of the secrets" in capsys.readouterr().out
+    )
     assert backup.main(["restore", str(file)]) == 1
     assert "--replace deletes them" in capsys.readouterr().err
     assert backup.main(["restore", "--replace", str(file)]) == 0

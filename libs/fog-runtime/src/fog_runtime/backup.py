@@ -17,8 +17,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from fog_runtime.backup_archive import STAMP, Backup, BackupError, File, Key, read_archive, read_folder, write_archive
+from fog_runtime.credentials import NOBODY, Credentials, CredentialsError
 from fog_runtime.files import atomic_write
-from fog_runtime.redis_connection import RedisConnection, StoreError
+from fog_runtime.redis_connection import Command, RedisConnection, StoreError
 from fog_runtime.settings import CommonSettings, SettingsError, load
 from fog_runtime.site import SiteError, load_site
 from fog_runtime.version import VERSION
@@ -40,11 +41,12 @@ class Place(NamedTuple):
     site: str
     folders: dict[str, Path]
     data_dir: Path
+    credentials: Credentials = NOBODY
 
 
 async def create(file: Path, place: Place, now: float) -> Backup:
     """Back up a fog node, which may be running; `now` is in s since the epoch. Raises `BackupError`."""
-    redis = RedisConnection(place.redis_url, timeout_s=_TIMEOUT_S)
+    redis = RedisConnection(place.redis_url, timeout_s=_TIMEOUT_S, credentials=place.credentials)
     try:
         keys = await _dump(redis, place.site)
     except StoreError as error:
@@ -72,7 +74,7 @@ async def restore(file: Path, place: Place, *, replace: bool) -> Backup:
     backup = await asyncio.to_thread(read_archive, file)
     if unknown := sorted(set(backup.folders) - set(place.folders)):
         raise BackupError(f"{file} has a folder {unknown[0]!r}, for which there is no place: name it by its variable")
-    redis = RedisConnection(place.redis_url, timeout_s=_TIMEOUT_S)
+    redis = RedisConnection(place.redis_url, timeout_s=_TIMEOUT_S, credentials=place.credentials)
     try:
         found = await _names(redis, backup.site)
         _require_room(backup, place, found, replace=replace)
@@ -125,9 +127,7 @@ async def _names(redis: RedisConnection, site: str) -> list[bytes]:
         if cursor == 0:
             break
     lifetimes = [int(await redis.read("PTTL", name)) for name in sorted(names)]
-    return [
-        name for name, left in zip(sorted(names), lifetimes, strict=True) if left == -1 or left > _SHORT_LIVED_MS
-    ]
+    return [name for name, left in zip(sorted(names), lifetimes, strict=True) if left == -1 or left > _SHORT_LIVED_MS]
 
 
 async def _dump(redis: RedisConnection, site: str) -> list[Key]:
@@ -149,7 +149,7 @@ async def _dump(redis: RedisConnection, site: str) -> list[Key]:
 
 async def _restore_keys(redis: RedisConnection, keys: Sequence[Key], found: Sequence[bytes]) -> None:
     """Replace the keys that were found by those of the backup, in one transaction."""
-    deleted = [("DEL", *found)] if found else []
+    deleted: list[Command] = [("DEL", *found)] if found else []
     await redis.write(*deleted, *(("RESTORE", key.name, key.lifetime_ms, key.value, "REPLACE") for key in keys))
 
 
@@ -158,7 +158,7 @@ def place_of(settings: CommonSettings, site: str) -> Place:
     folders = {SITE: settings.site_dir}
     if settings.tokens_file is not None:
         folders[SECRETS] = settings.tokens_file.parent
-    return Place(settings.redis_url, site, folders, settings.data_dir)
+    return Place(settings.redis_url, site, folders, settings.data_dir, settings.credentials())
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -179,7 +179,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             # On an empty machine there is no site yet that has an id.
             place = place_of(settings, read_archive(options.file).site)
             backup = asyncio.run(restore(options.file, place, replace=options.replace))
-    except (BackupError, SettingsError, SiteError, ValueError) as error:
+    except (BackupError, CredentialsError, SettingsError, SiteError, ValueError) as error:
         sys.stderr.write(f"{error}\n")
         return 1
     files = ", ".join(f"{len(content)} files of the {name}" for name, content in backup.folders.items())

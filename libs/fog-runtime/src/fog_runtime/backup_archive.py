@@ -1,4 +1,4 @@
-"""The file of a backup: a `tar.gz` of named folders and of Redis's keys, with a manifest that has the hash of each part.
+"""The file of a backup: a `tar.gz` of named folders and of Redis's keys, with a manifest that has each part's hash.
 
     manifest.json          what it contains: a `Manifest`
     redis.msgpack          a list of `Key`
@@ -95,7 +95,7 @@ def write_archive(file: Path, backup: Backup) -> Manifest:
     with tarfile.open(fileobj=packed, mode="w:gz") as archive:
         for path, content in {_MANIFEST: File(msgspec.json.encode(manifest)), **parts}.items():
             member = tarfile.TarInfo(path)
-            member.size, member.mode, member.mtime = len(content.data), content.mode, int(backup.created)
+            member.size, member.mode = len(content.data), content.mode
             member.uid, member.gid = content.uid, content.gid
             archive.addfile(member, io.BytesIO(content.data))
     try:

@@ -67,9 +67,7 @@ CONDITION: Final = Gauge(
 )
 DISK_FREE: Final = Gauge("fognav_disk_free_bytes", "Free space of the disk that holds this folder", ["folder"])
 DISK_SIZE: Final = Gauge("fognav_disk_size_bytes", "Size of the disk that holds this folder", ["folder"])
-LAST_BACKUP: Final = Gauge(
-    "fognav_last_backup_seconds", "When the last backup was made (s since the epoch); 0: never"
-)
+LAST_BACKUP: Final = Gauge("fognav_last_backup_seconds", "When the last backup was made (s since the epoch); 0: never")
 CONNECTED: Final = Gauge("fognav_connected", "Whether the connection is up (1) or down (0)", ["transport"])
 CONNECTIONS: Final = Counter("fognav_connections_total", "Connections established", ["transport"])
 

@@ -1,0 +1,72 @@
+"""`fognav backup` and `fognav restore`: what people decided, the site and the secrets, in one file."""
+
+import asyncio
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fog_runtime import backup
+from fog_runtime.backup_archive import Backup, BackupError, read_archive
+from fog_runtime.credentials import CredentialsError
+from fog_runtime.site import SiteError, load_site
+from fognav.locking import own_credentials
+from fognav.output import FailedError, check_writable, exit_codes, print_line
+
+FileArgument = Annotated[Path, typer.Argument(metavar="FILE", help="The backup, a tar.gz that only you can read.")]
+RedisOption = Annotated[str, typer.Option("--redis", envvar="FOGNAV_REDIS_URL", help="Redis of the fog node.")]
+SiteOption = Annotated[Path, typer.Option("--site", envvar="FOGNAV_SITE_DIR", help="The site's folder.")]
+SecretsOption = Annotated[
+    Path | None, typer.Option("--secrets", help="Folder of tokens, keys and certificates; default: no secrets.")
+]
+DataOption = Annotated[
+    Path, typer.Option("--data", envvar="FOGNAV_DATA_DIR", help="The services' data folder: notes when the backup was.")
+]
+ReplaceOption = Annotated[bool, typer.Option("--replace", help="Replace what is there already.")]
+
+
+def backup_command(
+    file: FileArgument,
+    *,
+    site: SiteOption,
+    data: DataOption,
+    redis: RedisOption = "redis://127.0.0.1:6379/0",
+    secrets: SecretsOption = None,
+) -> None:
+    """Back up a fog node into one file, while it runs."""
+    with exit_codes():
+        check_writable(file)
+        try:
+            place = _place(redis, load_site(site).site.id, site, secrets, data)
+            _report("backed up", asyncio.run(backup.create(file, place, time.time())), file)
+        except (BackupError, CredentialsError, SiteError, ValueError) as error:
+            raise FailedError(str(error)) from error
+
+
+def restore_command(  # one per option of the command
+    file: FileArgument,
+    *,
+    site: SiteOption,
+    data: DataOption,
+    redis: RedisOption = "redis://127.0.0.1:6379/0",
+    secrets: SecretsOption = None,
+    replace: ReplaceOption = False,
+) -> None:
+    """Restore a backup; stop the services before. Everything is checked before anything is changed."""
+    with exit_codes():
+        try:
+            place = _place(redis, read_archive(file).site, site, secrets, data)
+            _report("restored", asyncio.run(backup.restore(file, place, replace=replace)), file)
+        except (BackupError, CredentialsError, ValueError) as error:
+            raise FailedError(str(error)) from error
+
+
+def _place(redis: str, name: str, site: Path, secrets: Path | None, data: Path) -> backup.Place:
+    folders = {backup.SITE: site, **({backup.SECRETS: secrets} if secrets else {})}
+    return backup.Place(redis, name, folders, data, own_credentials(None))
+
+
+def _report(done: str, made: Backup, file: Path) -> None:
+    files = ", ".join(f"{len(content)} files of the {name}" for name, content in made.folders.items())
+    print_line(f"{done} site {made.site}: {len(made.keys)} keys of Redis, {files}: {file}")

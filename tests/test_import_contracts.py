@@ -23,8 +23,11 @@ SOURCES = sorted({path.parent for path in ROOT.glob("*/src/*/__init__.py")} | {
 })  # fmt: skip
 
 EDGES = {
-    "fog_runtime", "fog_supervisor", "fognav_experiments.gaps", "fognav_experiments.lockstep",
-    "fognav_experiments.rigs", "fognav_experiments.smoothness",
+    "fog_runtime", "fog_supervisor", "fognav_experiments.comparison.publish",
+    "fognav_experiments.comparison.records", "fognav_experiments.comparison.report",
+    "fognav_experiments.comparison.runner",
+    "fognav_experiments.comparison.trial", "fognav_experiments.cpu", "fognav_experiments.gaps",
+    "fognav_experiments.lockstep", "fognav_experiments.rigs", "fognav_experiments.smoothness",
     "fognav.__main__", "fognav.bench", "fognav.bench_command",
     "fognav.alert_command", "fognav.ca_command",
     "fognav.area_command", "fognav.backup_command",
@@ -32,6 +35,7 @@ EDGES = {
     "fognav.demo.attempt", "fognav.demo.background", "fognav.demo.operator", "fognav.demo.options",
     "fognav.demo.placement", "fognav.demo.preparation", "fognav.demo.presence", "fognav.demo.report", "fognav.demo.run",
     "fognav.demo.scene", "fognav.demo.usage", "fognav.demo.view", "fognav.demo_command", "fognav.doctor",
+    "fognav.experiment_command",
     "fognav.generated", "fognav.kernels", "fognav.locking", "fognav.operate", "fognav.output", "fognav.page.app",
     "fognav.pytest_progress", "fognav.recording", "fognav.robot_command", "fognav.robot_file_command",
     "fognav.localization", "fognav.localize_command", "fognav.map_command", "fognav.map_picture",

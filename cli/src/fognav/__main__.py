@@ -20,6 +20,7 @@ from fognav.bench_command import bench_app
 from fognav.ca_command import ca_app
 from fognav.channels_command import channels_command
 from fognav.coverage_command import site_coverage
+from fognav.experiment_command import experiment_app
 from fognav.localize_command import localize_command
 from fognav.map_command import map_app
 from fognav.node_command import node_app
@@ -66,6 +67,7 @@ app.add_typer(ca_app, name="ca")
 app.add_typer(map_app, name="map")
 app.add_typer(store_app, name="store")
 app.add_typer(bench_app, name="bench")
+app.add_typer(experiment_app, name="experiment")
 app.command("localize", epilog="Example: fognav localize --map floor.yaml --log drive.log.gz --scans even --json")(
     localize_command
 )

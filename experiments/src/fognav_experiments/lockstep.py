@@ -18,26 +18,43 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from fog_contracts import channels as ch
+from fog_contracts.commands import PROFILE_OF
+from fog_contracts.geometry import distance_to_polygon
 from fog_contracts.handlers import Publication
 from fog_contracts.messages import RobotGoal
 from fog_contracts.stages import SPANS, durations_ms
 from fog_runtime.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fog_runtime.site import load_site
+from fognav_experiments.processes import Measure, unmeasured
 from fognav_experiments.rigs import STAMP, System
 from fognav_sim.barrier import BarrierError
 from fognav_sim.drive.drive import Drive, DriveSummary
 from fognav_sim.drive.evaluation import DriveOutcome
 from fognav_sim.drive.hazard import HazardRequest, HazardSchedule
 from fognav_sim.drive.operator import OperatorPolicy
+from robot_agent.profiles import PROFILES
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from fog_contracts.bus import Bus
     from fog_contracts.handlers import Ids, Moment
-    from fog_contracts.messages import AreaState, HazardArea, Pose, RobotPath, RobotPose, RobotState, SimTruth, Trace
+    from fog_contracts.messages import (
+        AreaState,
+        CommandKind,
+        HazardArea,
+        Pose,
+        ProfileName,
+        RobotPath,
+        RobotPose,
+        RobotState,
+        SimObstacle,
+        SimTruth,
+        Trace,
+    )
     from fog_contracts.site import Place
     from fog_runtime.site import LoadedSite
+    from fognav_experiments.cpu import CpuMeter
     from fognav_sim.sensors import Noise
 
 WARM_UP_S: Final = 12.0
@@ -62,8 +79,10 @@ class LockstepResult(DriveSummary, frozen=True, kw_only=True):
     """The result of a drive, by the simulator's ground truth; lengths in m, times in s of the emulated clock.
 
     `operator_commands` counts the accepted commands, the first enable included. `hazard_at_m` is the distance driven
-    when the barrier was placed, `stages_ms` holds the durations of the hazard's stages, `track` the true positions
-    every 0.25 m.
+    when the barrier was placed, `barrier_distance_m` the smallest one between it and the robot's rim. `paths` counts
+    the paths that the robot followed, `received_bytes` what it received from the fog and its profile uses, since the
+    goal was given; `stops` are its protective stops and faults. `stages_ms` holds the durations of the hazard's stages,
+    `track` the true positions every 0.25 m.
     """
 
     seed: int
@@ -73,6 +92,11 @@ class LockstepResult(DriveSummary, frozen=True, kw_only=True):
     stages_ms: dict[str, float]
     pose_error_m: float
     operator_commands: int
+    profile: ProfileName
+    paths: int
+    barrier_distance_m: float | None
+    received_bytes: int
+    stops: list[str]
     events: list[DriveEvent]
     track: list[tuple[float, float]]
 
@@ -93,16 +117,20 @@ class _Drive:
         bus: Bus | None,
         base: str = DEFAULT_BASE,
         lidar: str = DEFAULT_LIDAR,
+        measure: Measure = unmeasured,
     ) -> None:
         robot = msgspec.structs.replace(site.site.robots[0], start=start)
         self.site, self.goal, self.seed, self.hazard = site, goal, seed, hazard
         bare = msgspec.structs.replace(site.site, areas=[], nodes=[])
         floor = site if watched else dataclasses.replace(site, site=bare)
-        self.system = System(floor, robot, seed, noise=noise, base=base, lidar=lidar, bus=bus)
+        self.system = System(floor, robot, seed, noise=noise, base=base, lidar=lidar, bus=bus, measure=measure)
         self.world = self.system.world
         self.robot = self.system.robot
         self.events: list[DriveEvent] = []
         self.track: list[tuple[float, float]] = []
+        self.barrier: SimObstacle | None = None
+        self.barrier_distance_m = math.inf
+        self.paths: set[tuple[int | None, int]] = set()
         self.planned_m = 0.0
         self.path: RobotPath | None = None
         self.pose: RobotPose | None = None
@@ -113,6 +141,7 @@ class _Drive:
         self.commands = 0
         self.started_at = 0.0
         self.start_distance_m = 0.0
+        self.received_before = 0
         self.operator = OperatorPolicy(self.now)
         self.drive: Drive | None = None
         self._steps = 0
@@ -176,6 +205,8 @@ class _Drive:
         self.state = state
         if self.drive is not None:
             self.drive.on_state(state, at.now)
+            if state.plan_id is not None and state.goal_id == self.goal.goal_id:
+                self.paths.add((state.planner_epoch, state.plan_id))
         return ()
 
     def _on_truth(self, ids: Ids, truth: SimTruth, at: Moment) -> Sequence[Publication]:
@@ -186,6 +217,9 @@ class _Drive:
             for area in entered[self._crossed :]:
                 self.log_event(f"enters {area}")
             self._crossed = len(entered)
+        if self.barrier is not None:
+            distance = distance_to_polygon(self.barrier.polygon, truth.x, truth.y) - self.world.robot.radius
+            self.barrier_distance_m = min(self.barrier_distance_m, distance)
         return ()
 
     def _on_path(self, ids: Ids, path: RobotPath, at: Moment) -> Sequence[Publication]:
@@ -230,12 +264,23 @@ class _Drive:
     def _place_barrier_if_due(self, drive: Drive) -> None:
         if (due := drive.hazard_due()) is not None:
             self.world.place(due.barrier)
+            self.barrier = due.barrier
             drive.on_barrier_placed(due)
             self.log_event(f"barrier appears in {due.area.id}")
+
+    def switch(self, profile: ProfileName) -> str | None:
+        """Let the robot navigate by another profile; return None, or why it does not become ready."""
+        commands: dict[ProfileName, CommandKind] = {name: kind for kind, name in PROFILE_OF.items()}
+        for command in ("disable", commands[profile], "enable"):
+            reply = self.robot.command(command)
+            if not reply.accepted:
+                return reply.reason
+        return self.warm_up()
 
     def start(self) -> Drive:
         """Start the drive to the goal."""
         assert self.goal.pose is not None
+        self.received_before = self.robot.process.received_bytes
         self.started_at, self.start_distance_m = self.now, self.world.distance
         self.drive = Drive(
             goal=(self.goal.pose.x, self.goal.pose.y),
@@ -272,6 +317,11 @@ class _Drive:
             stages_ms=durations_ms(next((t for t in self.traces if t.area == summary.area), None), SPANS),
             pose_error_m=round(self.pose_error, 3),
             operator_commands=self.commands,
+            profile=self.robot.agent.profile.name,
+            paths=len(self.paths),
+            barrier_distance_m=round(self.barrier_distance_m, 3) if self.barrier is not None else None,
+            received_bytes=self.robot.process.received_bytes - self.received_before,
+            stops=drive.evaluation.stops,
             events=self.events,
             track=self.track,
         )
@@ -289,23 +339,34 @@ def run_lockstep(  # noqa: PLR0913  # the options of a run
     base: str = DEFAULT_BASE,
     lidar: str = DEFAULT_LIDAR,
     bus: Bus | None = None,
+    profile: ProfileName = "fog",
+    cpu: CpuMeter | None = None,
 ) -> LockstepResult:
     """Drive the site's first robot from `start` to `goal`; the result is the same for the same arguments.
 
     With `hazard` a barrier blocks an area, as in a demonstration: which one and after which distance the seed draws,
     unless they are requested, and never within 3 m of the robot. Without `watched` the site has neither areas nor
     nodes: the robot's own lidar must find the barrier. `base` and `lidar` name the robot's hardware, `bus` carries the
-    messages (default: a new one). Raises `BarrierError` for an unknown area, one that no barrier can close, or if no
-    area qualifies, `ValueError` for a start inside an obstacle.
+    messages (default: a new one), `profile` says who plans, `cpu` measures the components from the goal on.
+
+    Raises `BarrierError` for an unknown area, one that no barrier can close, or if no area qualifies, `ValueError` for
+    a start inside an obstacle.
     """
     pose = msgspec.convert(
         {"x": goal.x, "y": goal.y, "theta": goal.theta if goal.theta is not None else 0.0}, type(start)
     )
     mission = RobotGoal(goal_id="lockstep-1", pose=pose)
     schedule = HazardSchedule.of(site, seed, hazard) if hazard is not None else None
-    run = _Drive(site, start, mission, seed, noise, watched=watched, hazard=schedule, bus=bus, base=base, lidar=lidar)
+    run = _Drive(
+        site, start, mission, seed, noise,
+        watched=watched, hazard=schedule, bus=bus, base=base, lidar=lidar, measure=cpu.measure if cpu else unmeasured,
+    )  # fmt: skip
     problem = run.warm_up()
+    if problem is None and profile != "fog":
+        problem = run.switch(profile)
     drive = run.start()
+    if cpu is not None:
+        cpu.seconds.clear()
     if problem is not None:
         return run.result(drive, DriveOutcome("stopped", problem))
     run.system.fog.planner.set_goal(run.robot.id, mission, any_heading=goal.theta is None)
@@ -326,6 +387,7 @@ def main() -> None:
     parser.add_argument("--start", help="place to start from (default: the demo's)")
     parser.add_argument("--goal", help="place to drive to (default: the demo's)")
     parser.add_argument("--area", help="area that becomes blocked (default: one of the demo's on the path)")
+    parser.add_argument("--profile", choices=sorted(PROFILES), default="fog", help="who plans (default: fog)")
     parser.add_argument("--no-hazard", action="store_true")
     parser.add_argument("--track", action="store_true", help="include the true track in the result")
     arguments = parser.parse_args()
@@ -342,7 +404,8 @@ def main() -> None:
     )
     hazard = None if arguments.no_hazard else HazardRequest(area=arguments.area)
     try:
-        result = run_lockstep(site, start, goal, arguments.seed, hazard)
+        profile, watched = arguments.profile, arguments.profile != "default"
+        result = run_lockstep(site, start, goal, arguments.seed, hazard, profile=profile, watched=watched)
     except BarrierError as error:
         parser.error(str(error))
     printed = msgspec.to_builtins(result)

@@ -6,10 +6,13 @@ to the broker, fetching snapshots, distance fields. Lockstep and replays share t
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from typing import TYPE_CHECKING, Final
 
 from fog_contracts import channels as ch
-from fog_contracts.messages import MapSnapshot, PlanReply, RobotGoal, RobotState
+from fog_contracts.codec import encode
+from fog_contracts.messages import MapSnapshot, Message, PlanReply, RobotGoal, RobotState
 from planner.dock_goals import DockGoals
 from robot_agent.agent.core import decide
 
@@ -18,20 +21,38 @@ if TYPE_CHECKING:
 
     from fog_contracts.bus import Bus
     from fog_contracts.handlers import Handler, Ids, Moment, Publication
-    from fog_contracts.messages import Message, Pose, Zone
+    from fog_contracts.messages import Pose, ProfileName, Zone
     from hazard_aggregator.core import Aggregator
     from map_service.core import MapCore
     from planner.core import PlannerCore
     from robot_agent.agent.core import AgentCore
     from robot_agent.guardian.link import WheelCommand
 
+Measure = Callable[[str], AbstractContextManager[object]]
+"""Returns what is entered around the work of a component, by its name: it measures what that costs."""
+
+USED: Final[Mapping[ProfileName, frozenset[ch.Channel]]] = {
+    "default": frozenset({ch.ROBOT_GOAL}),
+    "full": frozenset({ch.ROBOT_GOAL, ch.HAZARD, ch.ZONES, ch.MAP_HEARTBEAT}),
+    "fog": frozenset({
+        ch.ROBOT_GOAL, ch.HAZARD, ch.ZONES, ch.MAP_HEARTBEAT, ch.MAP_DELTA, ch.ROBOT_PATH, ch.ROBOT_RELEASE,
+    }),
+}  # fmt: skip
+"""What a robot receives from the fog that its profile uses."""
+
+
+def unmeasured(_component: str) -> AbstractContextManager[object]:
+    """Measure nothing."""
+    return nullcontext()
+
 
 class AggregatorProcess:
     """The hazard-aggregator, with a store without delay."""
 
-    def __init__(self, core: Aggregator, bus: Bus) -> None:
+    def __init__(self, core: Aggregator, bus: Bus, measure: Measure = unmeasured) -> None:
         self.core = core
         self._bus = bus
+        self._measure = measure
         bus.subscribe({channel: self._with_store(handler) for channel, handler in core.handlers().items()})
         bus.serve(core.query_handlers())
 
@@ -41,11 +62,13 @@ class AggregatorProcess:
 
     def tick(self, at: Moment) -> None:
         """Tick the core; call it ten times a second."""
-        self._bus.publish(self._store(self.core.tick(at)))
+        with self._measure("aggregator"):
+            self._bus.publish(self._store(self.core.tick(at)))
 
     def _with_store(self, handler: Handler) -> Handler:
         def handle(ids: Ids, message: Message | str, at: Moment) -> Sequence[Publication]:
-            return self._store(handler(ids, message, at))
+            with self._measure("aggregator"):
+                return self._store(handler(ids, message, at))
 
         return handle
 
@@ -57,11 +80,12 @@ class AggregatorProcess:
 class MapProcess:
     """The map-service; `load_zones` and `put_zone` replace its store and REST API."""
 
-    def __init__(self, core: MapCore, bus: Bus) -> None:
+    def __init__(self, core: MapCore, bus: Bus, measure: Measure = unmeasured) -> None:
         self.core = core
         self._bus = bus
+        self._measure = measure
         self._serving = False
-        bus.subscribe(core.handlers())
+        bus.subscribe({channel: self._measured(handler) for channel, handler in core.handlers().items()})
 
     def load_zones(self, zones: Iterable[Zone], at: Moment) -> None:
         """Load the stored zones; the map is not served before."""
@@ -73,19 +97,34 @@ class MapProcess:
 
     def tick(self, at: Moment) -> None:
         """Tick the core, and serve queries once the map is complete; call it ten times a second."""
-        self._bus.publish(self.core.tick(at))
+        with self._measure("map-service"):
+            self._bus.publish(self.core.tick(at))
         if self.core.serving and not self._serving:
             self._serving = True
             self._bus.serve(self.core.query_handlers())
+
+    def _measured(self, handler: Handler) -> Handler:
+        def handle(ids: Ids, message: Message | str, at: Moment) -> Sequence[Publication]:
+            with self._measure("map-service"):
+                return handler(ids, message, at)
+
+        return handle
 
 
 class PlannerProcess:
     """The planner: messages wait for its next tick; urgent ones trigger it at once."""
 
-    def __init__(self, core: PlannerCore, bus: Bus, staging: Mapping[str, Pose] | None = None) -> None:
+    def __init__(
+        self,
+        core: PlannerCore,
+        bus: Bus,
+        staging: Mapping[str, Pose] | None = None,
+        measure: Measure = unmeasured,
+    ) -> None:
         """`staging`: by robot, the pose in front of its dock."""
         self.core = core
         self._bus = bus
+        self._measure = measure
         self._docks = DockGoals(staging or {})
         self.due = False
         """Whether `tick` is due before its regular time."""
@@ -103,11 +142,12 @@ class PlannerProcess:
         Call it ten times a second, and when it is `due`.
         """
         self.due = False
-        self._bus.publish(self.core.tick(at))
-        self.core.missions.pop_reached()
-        for job in self.core.jobs(at):
-            job.run()
-            self.due = self.core.add(job, at.now) or self.due
+        with self._measure("planner"):
+            self._bus.publish(self.core.tick(at))
+            self.core.missions.pop_reached()
+            for job in self.core.jobs(at):
+                job.run()
+                self.due = self.core.add(job, at.now) or self.due
         if self.core.wants_snapshot(at.now):
             snapshot = self._bus.query(ch.MAP_SNAPSHOT, None, MapSnapshot, at)
             if snapshot is not None:
@@ -131,7 +171,8 @@ class PlannerProcess:
             self.due = self.due or channel in self.core.URGENT
             if isinstance(message, RobotState):
                 self._send_to_dock(ids["robot"], message, at)
-            return handler(ids, message, at)
+            with self._measure("planner"):
+                return handler(ids, message, at)
 
         return handle
 
@@ -139,33 +180,57 @@ class PlannerProcess:
 class AgentProcess:
     """A robot's agent; its caller passes the data of base and lidar to the core."""
 
-    def __init__(self, core: AgentCore, robot: str, bus: Bus) -> None:
+    def __init__(self, core: AgentCore, robot: str, bus: Bus, measure: Measure = unmeasured) -> None:
         self.core = core
         self._bus = bus
-        bus.connect(core, only={"robot": robot})
+        self._measure = measure
+        self.received_bytes = 0
+        """Bytes of the messages that were received and are of use in the robot's profile."""
+        handlers = {channel: self._measured(channel, handler) for channel, handler in core.handlers().items()}
+        bus.subscribe(handlers, only={"robot": robot})
+        bus.serve(core.query_handlers(), only={"robot": robot})
+
+    def _measured(self, channel: ch.Channel, handler: Handler) -> Handler:
+        component = "layers" if channel is ch.MAP_DELTA else "messages"
+
+        def handle(ids: Ids, message: Message, at: Moment) -> Sequence[Publication]:
+            if channel in USED[self.core.profile.name]:
+                self.received_bytes += len(encode(channel, message))
+            with self._measure(component):
+                return handler(ids, message, at)
+
+        return handle
 
     def fetch_map(self, at: Moment) -> None:
         """Load a snapshot if the core requests one and the map is served; call it 20 times a second."""
         if self.core.wants_snapshot(at.now):
             snapshot = self._bus.query(ch.MAP_SNAPSHOT, None, MapSnapshot, at)
             if snapshot is not None:
-                self.core.load(snapshot, at.now)
+                self.received_bytes += len(snapshot.cost) + len(snapshot.speed) + len(snapshot.static)
+                with self._measure("layers"):
+                    self.core.load(snapshot, at.now)
 
     def control(self, at: Moment) -> None:
         """Run the robot's own global planner, if its profile has one, and its local planner, as often as this says."""
-        if (search := self.core.search(at.now)) is not None:
-            self.core.on_found(search.run(), at)
-        job = self.core.control_job(at.now)
-        if job is not None:
-            self.core.accept(decide(job))
+        with self._measure("layers"):
+            search = self.core.search(at.now)
+        if search is not None:
+            with self._measure("global planning"):
+                self.core.on_found(search.run(), at)
+        with self._measure("local planning"):
+            job = self.core.control_job(at.now)
+            if job is not None:
+                self.core.accept(decide(job))
 
     def stream(self, at: Moment) -> WheelCommand:
         """Return the wheel command for the guardian; call it 20 times a second."""
-        return self.core.stream(at.now, at.stamp)
+        with self._measure("safety and wheels"):
+            return self.core.stream(at.now, at.stamp)
 
     def tick(self, at: Moment) -> None:
         """Tick the core; call it ten times a second."""
-        self._bus.publish(self.core.tick(at))
+        with self._measure("messages"):
+            self._bus.publish(self.core.tick(at))
         if (request := self.core.egress_request(at.now)) is not None:
             self.core.on_egress_reply(self._bus.query(ch.PLANNER_EGRESS, request, PlanReply, at), at.now)
 
@@ -179,12 +244,14 @@ class Fog:
         map_: MapCore,
         planner: PlannerCore,
         bus: Bus,
+        *,
         staging: Mapping[str, Pose] | None = None,
+        measure: Measure = unmeasured,
     ) -> None:
-        """`staging`: by robot, the pose in front of its dock."""
-        self.aggregator = AggregatorProcess(aggregator, bus)
-        self.map = MapProcess(map_, bus)
-        self.planner = PlannerProcess(planner, bus, staging)
+        """`staging`: by robot, the pose in front of its dock. `measure`: of the services' work."""
+        self.aggregator = AggregatorProcess(aggregator, bus, measure)
+        self.map = MapProcess(map_, bus, measure)
+        self.planner = PlannerProcess(planner, bus, staging, measure)
 
     def start(self, at: Moment) -> None:
         """Connect everything, with no zones stored."""

@@ -15,7 +15,7 @@ from fog_contracts.handlers import Moment, Publication
 from fog_contracts.messages import CommandReply
 from fog_runtime.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fog_runtime.robot_file import default_robot
-from fognav_experiments.processes import AgentProcess, Fog
+from fognav_experiments.processes import AgentProcess, Fog, Measure, unmeasured
 from fognav_sim import devices
 from fognav_sim.floor import Floor
 from fognav_sim.hardware import STEP_S, Hardware
@@ -80,10 +80,12 @@ class RobotRig:
         base: str = DEFAULT_BASE,
         lidar: str = DEFAULT_LIDAR,
         make_agent: Callable[[AgentConfig, int], AgentCore] = AgentCore,
+        measure: Measure = unmeasured,
     ) -> None:
         """Assemble the robot around its emulated base; `base` names its driver, `lidar` driver and emulator."""
         self.id = robot.id
         self._bus = bus
+        self._measure = measure
         mounted = default_robot(base, lidar)
         driver, self._lidar_driver = make_base(mounted), make_lidar(mounted)
         lidar_emulator = devices.make_lidar(lidar, world.lidar)
@@ -102,7 +104,7 @@ class RobotRig:
         )
         self.agent = make_agent(config, seed)
         self.agent.restore(start_pose(site.site.id, robot))
-        self.process = AgentProcess(self.agent, robot.id, bus)
+        self.process = AgentProcess(self.agent, robot.id, bus, measure)
         self._to_base = b""
         self._to_lidar = self._lidar_driver.begin(start)
         self._from_lidar = b""
@@ -133,18 +135,21 @@ class RobotRig:
             self.process.control(at)
         if step % _STREAM_STEPS == 0:
             command = link.decode_command(link.encode(self.process.stream(at)))
-            self._to_base += self.guardian.on_command(command, at.now).data
+            with self._measure("guardian"):
+                self._to_base += self.guardian.on_command(command, at.now).data
 
     def _run_guardian(self, data: bytes, now: float) -> None:
-        output = self.guardian.on_bytes(data, now)
-        received = list(output.feedback)
-        self._to_base += output.data
-        if self._steps % _GUARDIAN_STEPS == 0:
-            output = self.guardian.tick(now)
-            received += output.feedback
+        with self._measure("guardian"):
+            output = self.guardian.on_bytes(data, now)
+            received = list(output.feedback)
             self._to_base += output.data
-        for feedback in received:
-            self.agent.on_base(link.decode_feedback(link.encode(feedback)), now)
+            if self._steps % _GUARDIAN_STEPS == 0:
+                output = self.guardian.tick(now)
+                received += output.feedback
+                self._to_base += output.data
+        with self._measure("localization"):
+            for feedback in received:
+                self.agent.on_base(link.decode_feedback(link.encode(feedback)), now)
 
     def _run_lidar(self, data: bytes, now: float) -> None:
         self._from_lidar += data
@@ -156,12 +161,15 @@ class RobotRig:
         if not self._lidar_on:
             self._from_lidar = b""
             return
-        received = self._lidar_driver.receive(self._from_lidar, now)
+        with self._measure("lidar driver"):
+            received = self._lidar_driver.receive(self._from_lidar, now)
         self._from_lidar = b""
         if received.samples is not None:
-            self.agent.on_lidar_samples(received.samples, now)
-        for scan in received.scans:
-            self.agent.on_scan(scan, now)
+            with self._measure("safety and wheels"):
+                self.agent.on_lidar_samples(received.samples, now)
+        with self._measure("localization"):
+            for scan in received.scans:
+                self.agent.on_scan(scan, now)
         self._to_lidar += received.data + self._lidar_driver.tick(now)
 
     def command(self, kind: CommandKind) -> CommandReply:
@@ -184,7 +192,9 @@ class RobotRig:
 class FogRig(Fog):
     """The fog node of a site, with its sensor nodes."""
 
-    def __init__(self, site: LoadedSite, world: World, bus: Bus, seed: int, start: float) -> None:
+    def __init__(
+        self, site: LoadedSite, world: World, bus: Bus, seed: int, start: float, *, measure: Measure = unmeasured
+    ) -> None:
         definitions = site.site.definitions()
         super().__init__(
             Aggregator(AreaFusion(definitions, site.site.nodes, epoch=1, registry=find_rule)),
@@ -197,7 +207,8 @@ class FogRig(Fog):
             ),
             PlannerCore(epoch=1),
             bus,
-            site.site.staging,
+            staging=site.site.staging,
+            measure=measure,
         )
         self._bus = bus
         self._world = world
@@ -226,15 +237,17 @@ class System:
         lidar: str = DEFAULT_LIDAR,
         bus: Bus | None = None,
         make_agent: Callable[[AgentConfig, int], AgentCore] = AgentCore,
+        measure: Measure = unmeasured,
     ) -> None:
         """Assemble the system; `base` and `lidar` name the robot's hardware."""
         self.bus = bus or Bus(site.site.id)
         emulator = devices.make_base(base)
         self.world = World(Floor(site.map.geometry, site.map.cells), robot, seed, axle_m=emulator.axle_m, noise=noise)
-        self.fog = FogRig(site, self.world, self.bus, seed, 0.0)
+        self.fog = FogRig(site, self.world, self.bus, seed, 0.0, measure=measure)
         self.robot = RobotRig(
-            site, robot, self.world, emulator, self.bus, seed, 0.0, base=base, lidar=lidar, make_agent=make_agent
-        )
+            site, robot, self.world, emulator, self.bus, seed, 0.0,
+            base=base, lidar=lidar, make_agent=make_agent, measure=measure,
+        )  # fmt: skip
         self._steps = 0
 
     @property

@@ -1,0 +1,114 @@
+"""`fognav experiment`: compare robots that plan for themselves with one that the fog leads, as the thesis did."""
+
+from __future__ import annotations
+
+from pathlib import Path  # noqa: TC003  # Typer reads annotations at run time
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from fognav import checkout, kernels
+from fognav.output import NOT_TRUE, WrongUseError, console, exit_codes, print_line
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from fog_contracts.messages import ProfileName
+    from fognav_experiments.comparison.records import Folder, Record
+    from fognav_experiments.comparison.runner import Task
+
+experiment_app = typer.Typer(help="Compare robots that plan for themselves with one that the fog leads.")
+
+_SETUPS: Final[tuple[ProfileName, ...]] = ("default", "full", "fog")
+
+
+@experiment_app.callback(
+    invoke_without_command=True,
+    epilog="Example: fognav experiment --setups default,full,fog --runs 50 --seed 1 --out results",
+)
+def experiment_command(  # noqa: PLR0913  # each option is an argument
+    context: typer.Context,
+    *,
+    out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Folder of the records.")] = None,
+    setups: Annotated[str, typer.Option("--setups", metavar="A,B", help="default, full, fog.")] = ",".join(_SETUPS),
+    runs: Annotated[int, typer.Option("--runs", metavar="N", min=1, help="Runs of each setup.")] = 50,
+    seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of all draws.")] = 1,
+    only: Annotated[int | None, typer.Option("--only", metavar="RUN", min=1, help="Only this run.")] = None,
+    jobs: Annotated[int, typer.Option("--jobs", metavar="N", min=1, help="Drives at the same time.")] = 1,
+    site: Annotated[Path | None, typer.Option("--site", metavar="DIR", help="Site with experiment.toml.")] = None,
+) -> None:
+    """Repeat the thesis's experiment in lockstep: one drive per run, route and setup.
+
+    A run is the routes of the site's experiment.toml. On each a drawn watched area is blocked at a drawn moment, the
+    same for all setups. Each drive is one file, so a run that was killed goes on where it was when the command is
+    repeated. CPU times are worth comparing when nothing runs beside: --jobs 1. The exit code is 1 if a drive failed.
+    """
+    if context.invoked_subcommand is not None:
+        return
+    from fog_runtime.site import SiteError, load_site  # noqa: PLC0415  # keeps the other commands fast
+    from fognav.bench import machine  # noqa: PLC0415  # same
+    from fognav_experiments.comparison import runner  # noqa: PLC0415  # same
+    from fognav_experiments.comparison.records import Folder, FolderError  # noqa: PLC0415  # same
+
+    with exit_codes():
+        if out is None:
+            raise WrongUseError("name a folder for the records: --out DIR")
+        place = checkout.site_folder(site)
+        try:
+            loaded = load_site(place)
+            asked = runner.tasks(
+                runner.read_spec(loaded, place), seed, [only] if only else range(1, runs + 1), _chosen(setups)
+            )
+            folder = Folder(out)
+            folder.begin(runner.new(loaded, place, seed), {"commit": checkout.revision(), **machine.describe()})
+        except (SiteError, runner.SpecError, FolderError) as error:
+            raise WrongUseError(str(error)) from error
+        kernels.warm_cache(print_line)
+        failed = _show(asked, folder, runner.run(place, asked, folder, jobs))
+    print_line(f"{len(asked) - failed} of {len(asked)} drives succeeded; records in {out}")
+    if failed:
+        raise typer.Exit(NOT_TRUE)
+
+
+@experiment_app.command("report", epilog="Example: fognav experiment report results --out docs/results/estig")
+def report_command(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the records.")],
+    *,
+    out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Folder of the report.")] = None,
+) -> None:
+    """Write the report of an experiment: Markdown, one HTML file, figures and CSV.
+
+    It shows the thesis's figures with ours beside them, paired differences with their tests, and where CPU time went.
+    """
+    from fognav_experiments.comparison.publish import publish  # noqa: PLC0415  # keeps the other commands fast
+    from fognav_experiments.comparison.records import Folder, FolderError  # noqa: PLC0415  # same
+
+    with exit_codes():
+        try:
+            written = publish(Folder(folder), out or folder)
+        except (FolderError, OSError) as error:
+            raise WrongUseError(str(error)) from error
+    for file in written:
+        print_line(str(file))
+
+
+def _chosen(setups: str) -> list[ProfileName]:
+    chosen = [known for name in setups.split(",") for known in _SETUPS if known == name.strip()]
+    if len(chosen) != len(setups.split(",")):
+        raise WrongUseError(f"--setups {setups} names an unknown setup: choose of {', '.join(_SETUPS)}")
+    return chosen
+
+
+def _show(asked: list[Task], folder: Folder, records: Iterator[Record]) -> int:
+    """Show each record as it comes; return how many of those asked for, new and old, failed."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    names = {task.name for task in asked}
+    with Progress(*columns, TimeRemainingColumn(), console=console, disable=not console.is_terminal) as progress:
+        known = sum(folder.has(name) for name in names)
+        task = progress.add_task("drives", total=len(names), completed=known)
+        for record in records:
+            progress.advance(task)
+            time_s = "" if record.time_s is None else f"{record.time_s:6.1f} s"
+            print_line(f"{record.name:20} {record.outcome:8} {record.distance_m:6.1f} m {time_s}  {record.area}")
+    return sum(not record.success for record in folder.read() if record.name in names)

@@ -1,0 +1,169 @@
+"""The result of each drive, one file each, written atomically: what was there when a run was killed is kept."""
+
+from __future__ import annotations
+
+import csv
+from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
+
+from fog_contracts.messages import ProfileName  # read at run time, when a file is decoded
+from fog_runtime.files import SHARED, atomic_write
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+    from pathlib import Path
+
+MOVE_BASE: Final = ("global planning", "layers", "local planning")
+"""Components of a robot whose work the process `move_base` of the ROS navigation stack holds."""
+ON_ROBOT: Final = (*MOVE_BASE, "localization", "safety and wheels", "messages", "lidar driver", "guardian")
+ON_FOG: Final = ("aggregator", "map-service", "planner")
+OF_FOG: Final[dict[ProfileName, tuple[str, ...]]] = {
+    "default": (),
+    "full": ("aggregator", "map-service"),
+    "fog": ON_FOG,
+}
+"""What a setup uses of the fog: in lockstep the rest runs too, and is no part of the setup."""
+
+
+class Record(msgspec.Struct, frozen=True, kw_only=True):
+    """One drive; lengths in m, times in s of the simulated clock, `cpu_s` in s of CPU time by component.
+
+    `barrier_distance_m`: smallest distance between the obstacle and the robot's rim. `reaction_s`: from the obstacle's
+    first reading to the first wheel command on a new path, where there was one. `jobs`: drives that this machine ran at
+    the same time; `load`: its load average at the end. `paths`: paths that the robot followed.
+    """
+
+    setup: ProfileName
+    run: int
+    route: str
+    seed: int
+    area: str
+    moment: str
+    trigger_m: float
+    outcome: str
+    reason: str
+    success: bool
+    distance_m: float
+    time_s: float | None
+    planned_m: float
+    paths: int
+    contacts: int
+    stops: list[str]
+    min_clearance_m: float | None
+    barrier_distance_m: float | None
+    pose_error_m: float
+    reaction_s: float | None
+    received_bytes: int
+    operator_commands: int
+    route_areas: list[str]
+    cpu_s: dict[str, float]
+    jobs: int
+    load: float
+    wall_s: float
+    version: str
+    track: list[tuple[float, float]] = []
+
+    @property
+    def name(self) -> str:
+        """Name of the record's file, without suffix."""
+        return file_name(self.run, self.route, self.setup)
+
+    def cpu_percent(self, components: Iterable[str]) -> float:
+        """Return the share of one core (%) that these components took on average over the drive."""
+        used = sum(self.cpu_s.get(component, 0.0) for component in components)
+        return 100.0 * used / self.time_s if self.time_s else 0.0
+
+
+class Asked(msgspec.Struct, frozen=True, kw_only=True):
+    """What a folder of records is about: it must be the same when it is resumed."""
+
+    site: str
+    site_digest: str
+    seed: int
+
+
+class FolderError(ValueError):
+    """The folder can't be used; the message names the remedy."""
+
+
+class Folder:
+    """A folder with the records of an experiment, and `experiment.json`, which says of which one."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._drives = path / "drives"
+
+    def begin(self, asked: Asked, machine: dict[str, Any]) -> None:
+        """Create the folder, or verify that it is about the same experiment; raises `FolderError`."""
+        file = self.path / "experiment.json"
+        try:
+            self._drives.mkdir(parents=True, exist_ok=True)
+            known = msgspec.json.decode(file.read_bytes()) if file.exists() else None
+        except (OSError, msgspec.DecodeError) as error:
+            raise FolderError(f"{self.path} can't be used: {error}. Name another folder") from error
+        wanted = msgspec.to_builtins(asked)
+        if known is not None and known["asked"] != wanted:
+            raise FolderError(
+                f"{self.path} holds drives of another experiment ({known['asked']}, not {wanted}): name another folder"
+            )
+        if known is None:
+            document = {"asked": wanted, "measured_on": machine}
+            atomic_write(file, msgspec.json.format(msgspec.json.encode(document)), mode=SHARED)
+
+    def machine(self) -> dict[str, Any]:
+        """Return what the first drives were measured on; raises `FolderError` if there are none."""
+        try:
+            found: dict[str, Any] = msgspec.json.decode((self.path / "experiment.json").read_bytes())
+        except OSError as error:
+            raise FolderError(f"{self.path} holds no experiment: run `fognav experiment` first") from error
+        return found
+
+    def has(self, name: str) -> bool:
+        """Whether there is a record with this name."""
+        return self._file(name).exists()
+
+    def write(self, record: Record) -> None:
+        """Write a record; either it is there as a whole afterwards, or not at all."""
+        atomic_write(self._file(record.name), msgspec.json.encode(record), mode=SHARED)
+
+    def read(self) -> list[Record]:
+        """Return all records by run, route and setup; raises `FolderError` for one that can't be read."""
+        records = []
+        for file in sorted(self._drives.glob("*.json")):
+            try:
+                records.append(msgspec.json.decode(file.read_bytes(), type=Record))
+            except (OSError, msgspec.DecodeError) as error:
+                raise FolderError(f"{file} can't be read: {error}. Remove it, and run the experiment again") from error
+        return records
+
+    def _file(self, name: str) -> Path:
+        return self._drives / f"{name}.json"
+
+
+def file_name(run: int, route: str, setup: str) -> str:
+    """Return the name of a drive's record."""
+    return f"{run:04}-{route}-{setup}"
+
+
+def write_csv(path: Path, records: Sequence[Record]) -> None:
+    """Write one row per drive; CPU as s by component, and as % of a core for what `move_base` held and in all."""
+    left_out = {"cpu_s", "track"}
+    fields = [field for field in Record.__struct_fields__ if field not in left_out]
+    shares = {"move_base": MOVE_BASE, "robot": ON_ROBOT}
+    header = [
+        *fields,
+        *(f"cpu_{name.replace(' ', '_')}_s" for name in (*ON_ROBOT, *ON_FOG)),
+        *(f"cpu_{name}_percent" for name in (*shares, "fog")),
+    ]
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(header)
+        for record in records:
+            values = [getattr(record, field) for field in fields]
+            writer.writerow([
+                *("; ".join(value) if isinstance(value, list) else value for value in values),
+                *(round(record.cpu_s.get(name, 0.0), 4) for name in (*ON_ROBOT, *ON_FOG)),
+                *(round(record.cpu_percent(components), 3) for components in shares.values()),
+                round(record.cpu_percent(OF_FOG[record.setup]), 3),
+            ])  # fmt: skip

@@ -1,0 +1,320 @@
+"""The report of a comparison: the thesis's figures and tables with ours beside them, and what ours adds. Pure."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+from fognav_experiments.comparison import figures
+from fognav_experiments.comparison.document import Block, Code, Figure, Heading, Paragraph, Table
+from fognav_experiments.comparison.records import MOVE_BASE, OF_FOG, ON_FOG, ON_ROBOT
+from fognav_experiments.comparison.statistics import Estimate, compare, estimate
+from fognav_experiments.comparison.thesis import REPORTED
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from fog_contracts.messages import ProfileName
+    from fognav_experiments.comparison.records import Record
+
+TITLE: Final = "What the fog saves a robot: the thesis's experiment, repeated"
+SETUPS: Final[tuple[ProfileName, ...]] = ("default", "full", "fog")
+PAIRS: Final[tuple[tuple[ProfileName, ProfileName], ...]] = (("default", "full"), ("default", "fog"), ("full", "fog"))
+
+Drives = dict["ProfileName", "Record"]
+
+
+class Quantity(NamedTuple):
+    """A measured quantity: its figure's title, unit, name of the file, and its value for a drive."""
+
+    title: str
+    unit: str
+    file: str
+    caption: str
+    value: Callable[[Record], float]
+
+
+QUANTITIES: Final = (
+    Quantity(
+        "Distance per route",
+        "m",
+        "distance",
+        "As figures 6.3 and 6.7 of the thesis: mean distance per route, with 95 % confidence intervals.",
+        lambda record: record.distance_m,
+    ),
+    Quantity(
+        "Time per route",
+        "s",
+        "time",
+        "As figures 6.4 and 6.8: mean time per route, with 95 % confidence intervals.",
+        lambda record: record.time_s or 0.0,
+    ),
+    Quantity(
+        "CPU of what move_base held",
+        "% of a core",
+        "cpu-move-base",
+        "As figures 6.5 and 6.9: global planning, layers and local planning, with 95 % confidence intervals.",
+        lambda record: record.cpu_percent(MOVE_BASE),
+    ),
+    Quantity(
+        "CPU of the whole robot",
+        "% of a core",
+        "cpu-robot",
+        "Not in the thesis: all that the robot computes, without the input and output of its processes.",
+        lambda record: record.cpu_percent(ON_ROBOT),
+    ),
+)
+
+
+def paired(records: Sequence[Record]) -> list[Drives]:
+    """Return the drives of each run and route of which every setup that was tried at all has a successful one."""
+    tried = {record.setup for record in records}
+    drives: dict[tuple[int, str], Drives] = defaultdict(dict)
+    for record in records:
+        drives[record.run, record.route][record.setup] = record
+    return [
+        by_setup
+        for _, by_setup in sorted(drives.items())
+        if by_setup.keys() == tried and all(record.success for record in by_setup.values())
+    ]
+
+
+def build(records: Sequence[Record], experiment: Mapping[str, Any]) -> list[Block]:
+    """Return the report of these records, measured on what `experiment` says."""
+    pairs = paired(records)
+    setups = [setup for setup in SETUPS if any(record.setup == setup for record in records)]
+    blocks: list[Block] = [Heading(TITLE, 1), *_introduction(records, pairs, experiment)]
+    if not pairs:
+        return [
+            *blocks,
+            Paragraph("No route has succeeded in every setup yet: there is nothing to compare."),
+        ]
+    met = [by_setup for by_setup in pairs if _met(by_setup)]
+    return [
+        *blocks,
+        Heading("Beside the thesis"),
+        *_beside_thesis(pairs, met, setups),
+        Heading("Distance, time and computation per route"),
+        *_routes(pairs, setups),
+        Heading("Paired differences"),
+        *_differences(pairs, met, setups),
+        Heading("Where the computation goes"),
+        *_components(pairs, setups),
+        Heading("One drive, seen from above"),
+        *_tracks(pairs, setups),
+        Heading("Drives that failed, and contacts"),
+        *_failures(records),
+    ]
+
+
+def _introduction(records: Sequence[Record], pairs: Sequence[Drives], experiment: Mapping[str, Any]) -> list[Block]:
+    asked, measured = experiment["asked"], experiment["measured_on"]
+    setups = ",".join(setup for setup in SETUPS if any(record.setup == setup for record in records))
+    runs = max((record.run for record in records), default=0)
+    command = f"fognav experiment --setups {setups} --runs {runs} --seed {asked['seed']} --out DIR"
+    rows = [[name, str(value)] for name, value in _flat(measured)]
+    jobs = sorted({record.jobs for record in records})
+    speed = sum(record.time_s or 0.0 for record in records) / max(sum(record.wall_s for record in records), 1e-9)
+    rows.append(["lockstep", f"{speed:.1f} times as fast as real time"])
+    loads = [record.load for record in records]
+    return [
+        Paragraph(
+            "A robot drives from stop to stop through a building. On each route something blocks one of the "
+            "corridors that sensors on the walls watch. In the setup `default` the robot does everything "
+            "itself and knows nothing of the obstacle before its own lidar sees it. In `full`, the setup of "
+            "the thesis, it plans itself, too, but a computer in the building tells it which corridor is "
+            "blocked. In `fog`, Fognav's own, that computer also keeps the map and plans. All three are the "
+            "same program with the same algorithms; each meets the same obstacles at the same moments, drawn "
+            "from a seed. All processes' cores, sensors and radio messages are simulated in lockstep; "
+            "distances are those of the simulator's ground truth."
+        ),
+        Paragraph(
+            f"{len(records)} drives stand, {len(pairs)} of them in each of the setups on the same run and "
+            f"route: these are compared. CPU is what the thread spent, by the kernel's account, with {jobs} "
+            f"drives at a time at a load average of {min(loads, default=0.0):.1f} to "
+            f"{max(loads, default=0.0):.1f}; a loaded machine makes all setups dearer alike, so ratios count."
+        ),
+        Code(command),
+        Table(["measured on", ""], [["site", f"{asked['site']} ({asked['site_digest']})"], *rows]),
+    ]
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+    """Return nested values as pairs of a name and a value."""
+    found = []
+    for name, value in values.items():
+        found += _flat(value, f"{prefix}{name} ") if isinstance(value, dict) else [(f"{prefix}{name}", value)]
+    return found
+
+
+def _met(by_setup: Drives) -> bool:
+    """Whether the obstacle stood in the way of a robot that knew nothing of it."""
+    unwarned = by_setup.get("default")
+    return unwarned is not None and unwarned.paths > 1
+
+
+def _beside_thesis(pairs: Sequence[Drives], met: Sequence[Drives], setups: Sequence[ProfileName]) -> list[Block]:
+    ours = {"6.3, 6.7": _saved(pairs, met, QUANTITIES[0]), "6.4, 6.8": _saved(pairs, met, QUANTITIES[1])}
+    shares = {setup: _mean(pairs, setup, QUANTITIES[2]) for setup in setups}
+    ours["6.5, 6.9"] = ", ".join(f"{setup} {found.mean:.2f} %" for setup, found in shares.items())
+    if "default" in shares and "fog" in shares:
+        ours["6.5, 6.9"] += f": default / fog = {shares['default'].mean / shares['fog'].mean:.1f}"
+    ours["6.6, 6.10"] = "all setups run in one process in lockstep, which says nothing of a robot's memory"
+    reactions = [record.reaction_s for drives in pairs for record in drives.values() if record.reaction_s is not None]
+    if reactions:
+        ours["(text)"] = (
+            f"{estimate(reactions).mean:.2f} s from the first echo to the first wheel command ({len(reactions)} drives)"
+        )
+    rows = [
+        [row.figures, row.subject, row.simulated, row.real, ours.get(row.figures, "not measured")] for row in REPORTED
+    ]
+    return [
+        Table(["figure", "what", "thesis, simulated", "thesis, real", "here"], rows),
+        Paragraph(
+            "The thesis draws one of two or three corridors to be blocked, so that often the blocked one is "
+            f"not on the robot's way. The obstacle met a robot that did not know of it in {len(met)} of "
+            f"{len(pairs)} drives here. The floor is another one, made in the manner of the thesis's. Its "
+            "figures 6.11 and 6.12 compare simulation and reality, for which there is no robot here."
+        ),
+    ]
+
+
+def _saved(pairs: Sequence[Drives], met: Sequence[Drives], quantity: Quantity) -> str:
+    """Return in words what `fog` saves against `default`."""
+    words = []
+    for subject, chosen in (("all", pairs), ("obstacle met", met)):
+        both = [drives for drives in chosen if "default" in drives and "fog" in drives]
+        if both:
+            found = compare([quantity.value(d["default"]) for d in both], [quantity.value(d["fog"]) for d in both])
+            words.append(f"{subject}: {_text(found.difference)} {quantity.unit}")
+    return "; ".join(words) or "not measured"
+
+
+def _routes(pairs: Sequence[Drives], setups: Sequence[ProfileName]) -> list[Block]:
+    routes = sorted({drives[setups[0]].route for drives in pairs})
+    blocks: list[Block] = []
+    for quantity in QUANTITIES:
+        series: dict[str, list[Estimate]] = {
+            setup: [
+                estimate([quantity.value(drives[setup]) for drives in pairs if drives[setup].route == route])
+                for route in routes
+            ]
+            for setup in setups
+        }
+        rows = [
+            [_route(route), *(_text(series[setup][number]) for setup in setups)] for number, route in enumerate(routes)
+        ]
+        groups = [_route(route) for route in routes]
+        svg = figures.bars(quantity.title, quantity.unit, groups, series)
+        blocks.append(Figure(f"{quantity.file}.svg", svg, quantity.caption))
+        blocks.append(Table([f"{quantity.title}, {quantity.unit}", *setups], rows))
+    return blocks
+
+
+def _differences(pairs: Sequence[Drives], met: Sequence[Drives], setups: Sequence[ProfileName]) -> list[Block]:
+    rows = []
+    for before, after in PAIRS:
+        if before not in setups or after not in setups:
+            continue
+        for subject, chosen in (("all drives", pairs), ("obstacle met", met)):
+            if not chosen:
+                continue
+            for quantity in QUANTITIES:
+                found = compare(
+                    [quantity.value(drives[before]) for drives in chosen],
+                    [quantity.value(drives[after]) for drives in chosen],
+                )
+                rows.append([
+                    f"{before} - {after}", subject, f"{quantity.title}, {quantity.unit}", _text(found.difference),
+                    str(found.difference.n), _probability(found.p_t), _probability(found.p_flip),
+                ])  # fmt: skip
+    return [
+        Paragraph(
+            "Mean differences of the same run and route, with 95 % confidence intervals, and the probability "
+            "of one as large by chance: by the paired t test, and by the sign-flip test, which assumes no "
+            "distribution. The routes of all runs are pooled."
+        ),
+        Table(["setups", "drives", "quantity", "mean difference", "n", "p (t test)", "p (sign flips)"], rows),
+    ]
+
+
+def _components(pairs: Sequence[Drives], setups: Sequence[ProfileName]) -> list[Block]:
+    rows = []
+    for component in (*ON_ROBOT, *ON_FOG):
+        cells = []
+        for setup in setups:
+            unused = component in ON_FOG and component not in OF_FOG[setup]
+            share = estimate([drives[setup].cpu_percent([component]) for drives in pairs]).mean
+            cells.append("-" if unused else f"{share:.3f}")
+        rows.append([component, *cells])
+    for name, components in (("what move_base held", MOVE_BASE), ("whole robot", ON_ROBOT)):
+        means = (estimate([drives[setup].cpu_percent(components) for drives in pairs]).mean for setup in setups)
+        rows.append([f"sum: {name}", *(f"{mean:.3f}" for mean in means)])
+    received = [
+        f"{estimate([drives[setup].received_bytes / (drives[setup].time_s or 1.0) for drives in pairs]).mean:.0f}"
+        for setup in setups
+    ]
+    rows.append(["received from the fog, bytes/s", *received])
+    return [
+        Paragraph(
+            "Mean share of one core, in %, by component. Left out are decoding of messages, sockets and "
+            "serial ports, which lockstep does not have; what a setup does not use of the fog is not counted."
+        ),
+        Table(["component", *setups], rows),
+    ]
+
+
+def _tracks(pairs: Sequence[Drives], setups: Sequence[ProfileName]) -> list[Block]:
+    first, last = setups[0], setups[-1]
+    drives = max(pairs, key=lambda drives: drives[first].distance_m - drives[last].distance_m)
+    record = drives[first]
+    svg = figures.tracks({setup: drives[setup].track for setup in setups})
+    lengths = ", ".join(f"{setup} {drives[setup].distance_m:.0f} m" for setup in setups)
+    caption = f"As figures 6.1 and 6.2: run {record.run}, {_route(record.route)}, {record.area} is blocked: {lengths}."
+    return [Figure("tracks.svg", svg, caption)]
+
+
+def _failures(records: Sequence[Record]) -> list[Block]:
+    rows = [
+        [record.name, record.outcome, record.reason, str(record.contacts), "; ".join(record.stops)]
+        for record in records
+        if not record.success or record.contacts or record.stops
+    ]
+    if not rows:
+        return [Paragraph(f"None of {len(records)} drives failed, touched anything, or had a protective stop.")]
+    return [Table(["drive", "outcome", "reason", "contacts", "protective stops and faults"], rows)]
+
+
+def summary_rows(records: Sequence[Record]) -> list[list[str]]:
+    """Return the table of means as rows of a CSV file, with a header."""
+    pairs = paired(records)
+    rows = [["quantity", "unit", "route", "setup", "mean", "half_width_95", "n"]]
+    for quantity in QUANTITIES:
+        for route in sorted({record.route for record in records}):
+            for setup in SETUPS:
+                chosen = [drives[setup] for drives in pairs if setup in drives and drives[setup].route == route]
+                if chosen:
+                    found = estimate([quantity.value(record) for record in chosen])
+                    half = "" if found.half is None else f"{found.half:.4f}"
+                    rows.append([quantity.file, quantity.unit, route, setup, f"{found.mean:.4f}", half, str(found.n)])
+    return rows
+
+
+def _mean(pairs: Sequence[Drives], setup: ProfileName, quantity: Quantity) -> Estimate:
+    return estimate([quantity.value(drives[setup]) for drives in pairs])
+
+
+def _route(name: str) -> str:
+    half = len(name) // 2
+    return f"{name[:half].upper()} to {name[half:].upper()}"
+
+
+def _text(found: Estimate) -> str:
+    digits = 1 if abs(found.mean) >= 10.0 else 2
+    return f"{found.mean:.{digits}f}" + ("" if found.half is None else f" ± {found.half:.{digits}f}")
+
+
+def _probability(p: float | None) -> str:
+    if p is None:
+        return "-"
+    return "< 0.0001" if p < 0.0001 else f"{p:.4f}"

@@ -1,0 +1,117 @@
+"""Runs the drives of the comparison that are not recorded yet, several at a time; may be killed at any moment."""
+
+from __future__ import annotations
+
+import hashlib
+import multiprocessing
+import os
+import signal
+import tomllib
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from functools import cache
+from typing import TYPE_CHECKING, NamedTuple
+
+import msgspec
+
+from fog_runtime.site import load_site
+from fognav_experiments.comparison.draws import ExperimentSpec, draw
+from fognav_experiments.comparison.records import Asked, Folder, file_name
+from fognav_experiments.comparison.trial import drive
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from pathlib import Path
+
+    from fog_contracts.messages import ProfileName
+    from fog_runtime.site import LoadedSite
+    from fognav_experiments.comparison.draws import RouteDraw
+    from fognav_experiments.comparison.records import Record
+
+SPEC_FILE = "experiment.toml"
+
+
+class SpecError(ValueError):
+    """A site has no experiment, or an invalid one; the message names file and remedy."""
+
+
+class Task(NamedTuple):
+    """A drive to run."""
+
+    drawn: RouteDraw
+    setup: ProfileName
+
+    @property
+    def name(self) -> str:
+        """Name of its record."""
+        return file_name(self.drawn.run, self.drawn.route.name, self.setup)
+
+
+def read_spec(site: LoadedSite, folder: Path) -> ExperimentSpec:
+    """Return the experiment of a site; raises `SpecError`."""
+    file = folder / SPEC_FILE
+    try:
+        spec = msgspec.convert(tomllib.loads(file.read_text("utf-8")), ExperimentSpec)
+    except FileNotFoundError as error:
+        raise SpecError(f"{file} does not exist. Write [[routes]] with start, goal and areas into it") from error
+    except (OSError, tomllib.TOMLDecodeError, msgspec.ValidationError) as error:
+        raise SpecError(f"{file}: {error}. Correct it") from error
+    if problems := spec.problems(site.site):
+        raise SpecError(f"{file}: the site has no {', no '.join(problems)}. Correct it, or add them to site.toml")
+    return spec
+
+
+def site_digest(folder: Path) -> str:
+    """Return a hash of a site's files: drives on another floor are no part of the same experiment."""
+    digest = hashlib.sha256()
+    for file in sorted(folder.iterdir()):
+        if file.suffix in {".toml", ".yaml", ".pgm", ".png"}:
+            digest.update(file.name.encode() + b"\0" + file.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def tasks(spec: ExperimentSpec, seed: int, runs: Sequence[int], setups: Sequence[ProfileName]) -> list[Task]:
+    """Return the drives of these runs, all setups of a route one after another: what is there is always comparable."""
+    return [Task(drawn, setup) for run in runs for drawn in draw(spec, seed, run) for setup in setups]
+
+
+def run(site_folder: Path, asked: list[Task], folder: Folder, jobs: int = 1) -> Iterator[Record]:
+    """Run the tasks that have no record yet, and yield each record once it is written."""
+    due = [task for task in asked if not folder.has(task.name)]
+    if jobs == 1:
+        for task in due:
+            record = _drive(site_folder, task, jobs)
+            folder.write(record)
+            yield record
+        return
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(jobs, mp_context=context, initializer=_ignore_interrupts) as pool:
+        waiting = {pool.submit(_drive, site_folder, task, jobs) for task in due}
+        try:
+            while waiting:
+                done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
+                for future in done:
+                    folder.write(future.result())
+                    yield future.result()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def new(site: LoadedSite, site_folder: Path, seed: int) -> Asked:
+    """Return what a new folder of this experiment is about."""
+    return Asked(site=site.site.id, site_digest=site_digest(site_folder), seed=seed)
+
+
+def _drive(site_folder: Path, task: Task, jobs: int) -> Record:
+    return drive(_site(site_folder), task.drawn, task.setup, jobs)
+
+
+@cache
+def _site(folder: Path) -> LoadedSite:
+    return load_site(folder)
+
+
+def _ignore_interrupts() -> None:
+    """Leave Ctrl-C to the parent, and yield to whatever else the machine does."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.nice(5)

@@ -1,0 +1,186 @@
+"""The comparison of setups: its draws, its statistics, its files, and a short run of all three setups."""
+
+from __future__ import annotations
+
+import csv
+import importlib.util
+import re
+from collections import Counter
+from pathlib import Path
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fog_runtime.site import load_site
+from fognav_experiments.comparison import runner
+from fognav_experiments.comparison.draws import ExperimentSpec, RouteSpec, draw
+from fognav_experiments.comparison.publish import publish
+from fognav_experiments.comparison.records import MOVE_BASE, Asked, Folder, FolderError
+from fognav_experiments.comparison.report import paired
+from fognav_experiments.comparison.statistics import compare, estimate, t_cdf, t_quantile
+from fognav_experiments.cpu import CpuMeter
+
+ESTIG = Path(__file__).parents[2] / "sites" / "estig"
+_spec = importlib.util.spec_from_file_location("ring_site", Path(__file__).parent / "ring_site.py")
+ring = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(ring)
+
+SPEC = ExperimentSpec(routes=[RouteSpec(start="west", goal="east", areas=["z1"])])
+ASKED = Asked(site="ring", site_digest="0" * 16, seed=1)
+SETUPS = ["default", "full", "fog"]
+RUN = next(run for run in range(1, 100) if draw(SPEC, 1, run)[0].moment == "before")
+"""The route is so short that an obstacle which appears under way would come too late."""
+
+
+# --- draws ---
+
+
+def test_the_site_estig_has_the_thesis_s_routes_and_zones():
+    spec = runner.read_spec(load_site(ESTIG), ESTIG)
+    assert [(route.name, route.areas) for route in spec.routes] == [
+        ("ab", ["z1", "z4"]), ("bc", ["z4", "z7"]), ("cd", ["z5", "z1", "z3"]),
+    ]  # fmt: skip
+
+
+def test_each_run_can_be_drawn_alone_and_every_area_and_moment_comes():
+    spec = runner.read_spec(load_site(ESTIG), ESTIG)
+    runs = [draw(spec, 1, run) for run in range(1, 51)]
+    every = [drawn for run in runs for drawn in run]
+    assert draw(spec, 1, 7) == runs[6]
+    assert draw(spec, 2, 7) != runs[6]
+    areas = Counter((drawn.route.name, drawn.area) for drawn in every)
+    assert len(areas) == 7
+    assert min(areas.values()) > 8
+    assert {drawn.moment for drawn in every} == {"before", "under way"}
+    assert all((drawn.trigger_m == 0.0) == (drawn.moment == "before") for drawn in every)
+
+
+def test_setups_of_a_route_come_one_after_another_and_meet_the_same():
+    asked = runner.tasks(SPEC, 1, [1, 2], SETUPS)
+    assert [task.name for task in asked[:4]] == [
+        "0001-westeast-default", "0001-westeast-full", "0001-westeast-fog", "0002-westeast-default",
+    ]  # fmt: skip
+    assert asked[0].drawn == asked[1].drawn == asked[2].drawn
+
+
+def test_an_experiment_that_the_site_does_not_fit_is_refused(tmp_path):
+    (tmp_path / "experiment.toml").write_text('[[routes]]\nstart = "a"\ngoal = "x"\nareas = ["z1", "z99"]\n')
+    with pytest.raises(runner.SpecError, match=r"no place x, no area z99"):
+        runner.read_spec(load_site(ESTIG), tmp_path)
+    with pytest.raises(runner.SpecError, match="does not exist"):
+        runner.read_spec(load_site(ESTIG), tmp_path / "nowhere")
+
+
+# --- statistics ---
+
+
+@pytest.mark.parametrize(("freedom", "quantile"), [(1, 12.706), (4, 2.776), (9, 2.262), (49, 2.0096), (1000, 1.9623)])
+def test_quantiles_of_student_s_t_are_those_of_the_tables(freedom, quantile):
+    assert t_quantile(0.975, freedom) == pytest.approx(quantile, abs=6e-4)
+    assert t_cdf(quantile, freedom) == pytest.approx(0.975, abs=1e-4)
+    assert t_cdf(-quantile, freedom) == pytest.approx(0.025, abs=1e-4)
+
+
+def test_a_paired_comparison_gives_the_textbook_s_figures():
+    found = compare([5.1, 4.9, 6.2, 5.8, 5.5], [4.2, 4.4, 5.0, 5.1, 4.9])
+    assert found.difference.mean == pytest.approx(0.78)
+    assert found.difference.half == pytest.approx(0.344, abs=1e-3)
+    assert found.p_t == pytest.approx(0.0033, abs=1e-4)
+    assert found.p_flip == 2 / 32
+
+
+@given(st.lists(st.floats(-100, 100), min_size=2, max_size=30), st.floats(-100, 100))
+def test_estimates_move_with_their_values(values, shift):
+    here, there = estimate(values), estimate([value + shift for value in values])
+    assert there.mean == pytest.approx(here.mean + shift, abs=1e-6)
+    assert there.half == pytest.approx(here.half, abs=1e-6)
+    assert compare(values, values).p_flip == 1.0
+
+
+# --- CPU ---
+
+
+def test_cpu_time_is_counted_once_and_for_the_innermost_component():
+    cpu = CpuMeter()
+
+    def work(rounds):
+        return sum(number * number for number in range(rounds))
+
+    with cpu.measure("outer"):
+        work(10_000)
+        with cpu.measure("inner"):
+            work(1_000_000)
+        work(10_000)
+    assert set(cpu.seconds) == {"outer", "inner"}
+    assert cpu.seconds["inner"] > 3.0 * cpu.seconds["outer"] > 0.0
+
+
+# --- records ---
+
+
+def test_a_folder_of_another_experiment_is_refused(tmp_path):
+    Folder(tmp_path).begin(ASKED, {})
+    Folder(tmp_path).begin(ASKED, {"other": "machine"})
+    with pytest.raises(FolderError, match="another experiment"):
+        Folder(tmp_path).begin(msgspec.structs.replace(ASKED, seed=2), {})
+    with pytest.raises(FolderError, match="no drives yet"):
+        publish(Folder(tmp_path), tmp_path)
+
+
+@pytest.fixture(scope="module")
+def short_run(tmp_path_factory):
+    """One run of one route in all setups, killed after the first drive and repeated."""
+    folder = Folder(tmp_path_factory.mktemp("comparison"))
+    folder.begin(ASKED, {"commit": "none", "machine": {"cores": 2}})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(runner, "_site", lambda _folder: ring.ring_site())
+        asked = runner.tasks(SPEC, 1, [RUN], SETUPS)
+        drives = runner.run(folder.path, asked, folder)
+        first = next(drives)
+        drives.close()
+        rest = list(runner.run(folder.path, asked, folder))
+        assert list(runner.run(folder.path, asked, folder)) == []
+    return folder, [first, *rest]
+
+
+def test_a_run_that_was_killed_goes_on_where_it_was(short_run):
+    folder, records = short_run
+    assert [record.setup for record in records] == SETUPS
+    assert sorted(folder.read(), key=lambda record: record.setup) == sorted(records, key=lambda record: record.setup)
+
+
+def test_robots_that_the_fog_warns_drive_less_than_one_that_finds_out_by_itself(short_run):
+    default, full, fog = short_run[1]
+    assert all(record.success for record in (default, full, fog)), [record.reason for record in short_run[1]]
+    assert default.paths > 1
+    assert default.distance_m > fog.distance_m + 0.5
+    assert full.distance_m == pytest.approx(fog.distance_m, abs=1.0)
+
+
+def test_each_setup_computes_what_it_should(short_run):
+    default, full, fog = short_run[1]
+    assert "global planning" not in fog.cpu_s
+    assert default.cpu_s["global planning"] > full.cpu_s["global planning"] > 0.0
+    assert default.cpu_percent(MOVE_BASE) > fog.cpu_percent(MOVE_BASE)
+    assert default.received_bytes < full.received_bytes < fog.received_bytes
+
+
+def test_the_report_needs_no_other_file_and_holds_every_drive(short_run, tmp_path):
+    folder, records = short_run
+    assert paired(records) == [{record.setup: record for record in records}]
+    written = publish(folder, tmp_path)
+    assert all(file.stat().st_size > 100 for file in written)
+    page = (tmp_path / "report.html").read_text("utf-8")
+    assert not re.search(r'(?:src|href)="', page)
+    assert page.count("<svg") == 5
+    text = (tmp_path / "README.md").read_text("utf-8")
+    for figure in re.findall(r"\]\((.+?\.svg)\)", text):
+        assert (tmp_path / figure).is_file()
+    for thesis in ("around 80 m", "6.5, 6.9", "around 110 % -> around 20 %"):
+        assert thesis in text
+    with (tmp_path / "drives.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [float(row["distance_m"]) for row in rows] == [record.distance_m for record in folder.read()]
+    assert all(float(row["cpu_move_base_percent"]) > 0.0 for row in rows)

@@ -29,8 +29,7 @@ _.costmap_published  # messages: stamps of a trace, read by their names in fog_c
 _.plan_published
 _.path_received
 _.first_command
-NODE_VALUE  # channels: rows of the table for other people's programs, which no service of ours uses yet
-HOME_ASSISTANT
+HOME_ASSISTANT  # channels: rows of the table for other people's programs, which no service of ours uses yet
 NODE_UPDATE  # the firmware on a board subscribes to it
 _.ROLES
 _.DURABILITIES

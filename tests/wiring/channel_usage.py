@@ -27,7 +27,6 @@ SIDES: Final = {
 
 NOT_YET: Final[frozenset[tuple[Role, Channel]]] = frozenset(
     {
-        ("hazard-aggregator", ch.NODE_VALUE),
         ("console", ch.NODE_UPDATE),
         ("console", ch.PLANNER_PLAN),
     }

@@ -86,6 +86,7 @@ def node_lines(node: NodeSite) -> list[str]:
         "sonars = [",
         *sonars,
         "]",
+        *([] if node.penalty is None else [f"penalty = {node.penalty}"]),
         "",
     ]
 

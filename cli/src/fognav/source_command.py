@@ -14,7 +14,18 @@ from hazard_aggregator.source_profiles import PROFILES
 
 source_app = typer.Typer(help="Use sensors that speak MQTT as evidence for an area.", no_args_is_help=True)
 
-_SET: tuple[str, ...] = ("label", "polygon", "nodes", "sources", "number", "debounce", "fusion", "unknown", "alerts")
+_SET: tuple[str, ...] = (
+    "label",
+    "polygon",
+    "nodes",
+    "sources",
+    "number",
+    "debounce",
+    "fusion",
+    "unknown",
+    "alerts",
+    "penalty",
+)
 """The fields of an area that an operator sets."""
 
 AreaOption = Annotated[str, typer.Option("--area", metavar="AREA", help="The area that the sensor watches.")]

@@ -6,7 +6,15 @@ from msgspec import structs
 from fog_contracts import channels as ch
 from fog_contracts.handlers import Moment, Publication, RefusedMessageError
 from fog_contracts.hazards import digest
-from fog_contracts.messages import AggregatorHeartbeat, AreaDefinition, AreaHazard, NodeConfig, NodeReading, RobotPose
+from fog_contracts.messages import (
+    AggregatorHeartbeat,
+    AreaDefinition,
+    AreaHazard,
+    NodeConfig,
+    NodeReading,
+    NodeValue,
+    RobotPose,
+)
 from fog_contracts.site import NodeSite, Sonar
 from hazard_aggregator.core import Aggregator
 from hazard_aggregator.fusion import AreaFusion
@@ -68,13 +76,14 @@ def test_handler_of_every_channel_accepts_its_message():
     rig = Rig()
     pose = RobotPose(x=9.0, y=9.0, theta=0.0, covariance=[0.0] * 9, v=0.0, w=0.0, radius=0.2, height=0.3, stamp=0.0)
     rig.read(3.0, 1)
+    rig.deliver(ch.NODE_VALUE, NodeValue(seq=1, boot=1, kind="gas", value=9.0, unit="ppm"), node="n1")
     rig.deliver(ch.NODE_AVAILABILITY, "online", node="n1")
     rig.deliver(ch.THESIS_AREA, "clear", number="7")
     rig.deliver(ch.AREA_HAZARD, stored("blocked", 254), area="hall")
     rig.deliver(ch.ROBOT_POSE, pose, robot="r1")
     rig.deliver(ch.AGGREGATOR_HEARTBEAT, heartbeat(epoch=4))
     rig.deliver(ch.AGGREGATOR_REQUEST, ch.REPUBLISH)
-    assert len(rig.core.handlers()) == 7
+    assert len(rig.core.handlers()) == 8
 
 
 def test_danger_is_published_at_once_with_its_thesis_line():

@@ -259,14 +259,26 @@ class Availability(Message, frozen=True, kw_only=True):
     offline: Meaning = field(default_factory=lambda: ["offline"])
 
 
+Penalty = Annotated[int, Meta(ge=1, le=253)]
+"""The cost of an area that a blocked sensor makes costly instead of impassable."""
+
+
+class Quantity(Message, frozen=True, kw_only=True):
+    """What a node of Fognav measures besides ranges: its id, and the `kind` of its `NodeValue`, such as temperature."""
+
+    node: Id
+    kind: Id
+
+
 class Source(Message, frozen=True, kw_only=True):
-    """Any sensor that speaks MQTT, as evidence for an area.
+    """Any sensor that speaks MQTT, or a quantity that a node measures, as evidence for an area.
 
     `topic` may contain wildcards. `pointer` is where its payload, a JSON document, has the value (None: the payload is
     plain text); `blocked` and `clear` are what it means, or `number` for a number. A `profile` gives all that is not
     given here, with `device` for the name in its topics. `period_s` is the time between two messages; without one the
     sensor publishes on change, and needs an `availability`. With a `penalty`, a blocked sensor makes the area costly
-    instead of impassable. `debounce` as in an area; without it each message counts.
+    instead of impassable. `debounce` as in an area; without it each message counts. A `quantity` has no topic, but the
+    limits of its `number`.
     """
 
     id: Id
@@ -279,8 +291,9 @@ class Source(Message, frozen=True, kw_only=True):
     number: Limits | None = None
     availability: Availability | None = None
     period_s: Annotated[float, Meta(gt=0.0, le=86_400.0, extra={"unit": "s"})] | None = None
-    penalty: Annotated[int, Meta(ge=1, le=253)] | None = None
+    penalty: Penalty | None = None
     debounce: dict[str, Any] = {}
+    quantity: Quantity | None = None
 
 
 class FusionPolicy(Message, frozen=True, kw_only=True):
@@ -298,8 +311,9 @@ class FusionPolicy(Message, frozen=True, kw_only=True):
 class AreaDefinition(Message, frozen=True, kw_only=True):
     """An area: its polygon, the nodes and sources that watch it, and how their readings are debounced and fused.
 
-    `number` identifies it on the thesis's topics. `debounce` holds the rule's name (`rule`) and its options. `epoch` is
-    that of the aggregator that publishes it.
+    `number` identifies it on the thesis's topics. `debounce` holds the rule's name (`rule`) and its options. With a
+    `penalty`, nodes and sources make it costly instead of impassable. `epoch` is that of the aggregator that publishes
+    it.
     """
 
     id: Id
@@ -312,6 +326,7 @@ class AreaDefinition(Message, frozen=True, kw_only=True):
     fusion: FusionPolicy = FusionPolicy()
     unknown: UnknownPolicy = UnknownPolicy()
     alerts: AlertPolicy = AlertPolicy()
+    penalty: Penalty | None = None
     version: Count = 0
     removed: bool = False
     epoch: Count = 0

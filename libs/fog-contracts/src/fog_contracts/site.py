@@ -14,6 +14,7 @@ from fog_contracts.messages import (
     Id,
     Message,
     Metres,
+    Penalty,
     Pose,
     Radians,
     Ring,
@@ -47,7 +48,10 @@ class Sonar(Message, frozen=True, kw_only=True):
 
 
 class NodeSite(Message, frozen=True, kw_only=True):
-    """A sensor node: position, direction (frame `map`), height above the floor, and the area that it watches."""
+    """A sensor node: position, direction (frame `map`), height above the floor, and the area that it watches.
+
+    With a `penalty` it makes the area costly instead of impassable.
+    """
 
     id: Id
     area: Id
@@ -56,6 +60,7 @@ class NodeSite(Message, frozen=True, kw_only=True):
     theta: Radians
     height: Annotated[float, Meta(gt=0.0, le=5.0)] = 0.3
     sonars: Annotated[list[Sonar], Meta(min_length=1, max_length=8)]
+    penalty: Penalty | None = None
 
 
 class AreaSite(Message, frozen=True, kw_only=True):
@@ -69,6 +74,7 @@ class AreaSite(Message, frozen=True, kw_only=True):
     fusion: FusionPolicy = FusionPolicy()
     unknown: UnknownPolicy = UnknownPolicy()
     alerts: AlertPolicy = AlertPolicy()
+    penalty: Penalty | None = None
 
 
 class SourceSite(Source, frozen=True, kw_only=True):
@@ -148,6 +154,7 @@ class Site(Message, frozen=True, kw_only=True):
                 fusion=area.fusion,
                 unknown=area.unknown,
                 alerts=area.alerts,
+                penalty=area.penalty,
             )
             for area in self.areas
         ]

@@ -16,6 +16,7 @@ from fog_contracts.messages import (
     FusionPolicy,
     Id,
     Message,
+    Penalty,
     Ring,
     Source,
     UnknownPolicy,
@@ -62,6 +63,7 @@ class AreaBody(Message, frozen=True, kw_only=True):
     fusion: FusionPolicy = FusionPolicy()
     unknown: UnknownPolicy = UnknownPolicy()
     alerts: AlertPolicy = AlertPolicy()
+    penalty: Penalty | None = None
     removed: bool = False
 
 

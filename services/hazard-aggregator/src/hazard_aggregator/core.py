@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from fog_contracts.channels import Channel
     from fog_contracts.handlers import Handler, Ids, Moment, QueryHandler
-    from fog_contracts.messages import AreaDefinition, AreaHazard, NodeReading, RobotPose
+    from fog_contracts.messages import AreaDefinition, AreaHazard, NodeReading, NodeValue, RobotPose
     from hazard_aggregator.area_override import AreaOverride
     from hazard_aggregator.foreign_messages import ForeignMessage
     from hazard_aggregator.fusion import AreaFusion
@@ -114,6 +114,7 @@ class Aggregator:
         """Return the handler of every channel that the aggregator subscribes to."""
         return {
             ch.NODE_READING: self._on_reading,
+            ch.NODE_VALUE: self._on_value,
             ch.NODE_AVAILABILITY: self._on_availability,
             ch.THESIS_AREA: self._on_thesis_state,
             ch.AREA_HAZARD: self._on_hazard,
@@ -161,8 +162,8 @@ class Aggregator:
         if definition.removed:
             self._outbox.forget(definition.id)
             ended = self._announce(self.overrides.tick(at))
-            return [self._definition_publication(definition), *deletions(definition.id), *ended]
-        return [self._definition_publication(definition), *self._announce(changed)]
+            return [definition_publication(definition, self.epoch), *deletions(definition.id), *ended]
+        return [definition_publication(definition, self.epoch), *self._announce(changed)]
 
     def put_override(self, override: AreaOverride, at: Moment) -> list[Publication]:
         """Put an operator's override, which is stored, into force."""
@@ -197,7 +198,7 @@ class Aggregator:
             publication
             for definition in self.definitions()
             for publication in (
-                deletions(definition.id) if definition.removed else [self._definition_publication(definition)]
+                deletions(definition.id) if definition.removed else [definition_publication(definition, self.epoch)]
             )
         ]
         return [*definitions, *self._hazard_publications(self._outbox.announced()), *configs]
@@ -206,6 +207,9 @@ class Aggregator:
 
     def _on_reading(self, ids: Ids, reading: NodeReading, at: Moment) -> list[Publication]:
         return self._announce(self._fusion.on_reading(ids["node"], reading, at.now, at.stamp))
+
+    def _on_value(self, ids: Ids, value: NodeValue, at: Moment) -> list[Publication]:
+        return self._announce(self._fusion.on_value(ids["node"], value, at.now, at.stamp))
 
     def _on_availability(self, ids: Ids, text: str, at: Moment) -> list[Publication]:
         if text not in ch.NODE_AVAILABILITY.values:
@@ -271,9 +275,6 @@ class Aggregator:
 
     def _announce(self, changed: Iterable[AreaHazard]) -> list[Publication]:
         return self._hazard_publications(self._outbox.offer(changed))
-
-    def _definition_publication(self, definition: AreaDefinition) -> Publication:
-        return definition_publication(definition, self.epoch)
 
     def _hazard_publications(self, hazards: Iterable[AreaHazard]) -> list[Publication]:
         """Return the publications of hazards, each with its line for the thesis's robots."""

@@ -24,13 +24,14 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
     from typing import Final
 
-    from fog_contracts.messages import AreaDefinition, AreaHazard, AreaState, NodeReading, RobotPose
+    from fog_contracts.messages import AreaDefinition, AreaHazard, AreaState, NodeReading, NodeValue, RobotPose
     from fog_contracts.site import NodeSite
     from hazard_aggregator.area_override import AreaOverride
     from hazard_aggregator.debounce import Registry
     from hazard_aggregator.node_report import NodeReport
     from hazard_aggregator.node_state import NodeState
     from hazard_aggregator.reading_order import Rejection
+    from hazard_aggregator.sources import Applied
 
 LATE_TICK_S: Final = 0.5
 """A longer gap (s) between two ticks means that the process itself was stalled."""
@@ -75,8 +76,8 @@ class AreaFusion:
         for definition in definitions:
             self._define(definition)
         for hazard in restored:
-            if (area := self._areas.get(hazard.area)) is not None:
-                area.restore_at_start(hazard)
+            if hazard.area in self._areas:
+                self._areas[hazard.area].restore_at_start(hazard)
 
     # --- State ------------------------------------------------------------------------------------------------------
 
@@ -85,7 +86,7 @@ class AreaFusion:
         return [area.hazard for area in self._areas.values() if area.hazard is not None]
 
     def definitions(self) -> list[AreaDefinition]:
-        """Return all areas, removed ones (`removed`) too, so that they can be taken off the map."""
+        """Return all areas, also removed ones (`removed`)."""
         return [*(area.definition for area in self._areas.values()), *self._tombstones.values()]
 
     def definition(self, area: str) -> AreaDefinition | None:
@@ -124,7 +125,7 @@ class AreaFusion:
             return []
         if not taken.counts:
             self._reject(node_id, "too_soon")
-        classification = self._classify(node_id, reading, now)
+        classification = _classified(self.nodes.get(node_id), reading, self._poses, now)
         if classification.state == "unknown":
             self._reject(node_id, "implausible")
         changed: list[AreaHazard] = []
@@ -155,12 +156,11 @@ class AreaFusion:
         self, topic: str, payload: bytes | None, now: float, stamp: float, *, retained: bool
     ) -> list[AreaHazard]:
         """Apply a message of the sensors that areas name as sources; None: one that is too long."""
-        changed: list[AreaHazard] = []
-        for area, source, understood in self._sources.apply(topic, payload, now, stamp, retained=retained):
-            if not understood:
-                self._reject(source.id, "implausible")
-            changed += self._evaluate(area, stamp)
-        return changed
+        return self._after(self._sources.apply(topic, payload, now, stamp, retained=retained), stamp)
+
+    def on_value(self, node_id: str, value: NodeValue, now: float, stamp: float) -> list[AreaHazard]:
+        """Apply a quantity that a node measured to the sources that are made of it."""
+        return self._after(self._sources.apply_value(node_id, value, now, stamp), stamp)
 
     def on_connection_lost(self, stamp: float) -> list[AreaHazard]:
         """Make unknown what sources said that publish on change only: their changes may be lost."""
@@ -177,6 +177,8 @@ class AreaFusion:
                 node.invalidate("it went offline")
                 node.last_confirmed = now
                 changed += self._evaluate(area, stamp)
+        for area in () if online else self._sources.on_node_offline(node_id):
+            changed += self._evaluate(area, stamp)
         return changed
 
     def on_pose(self, robot: str, pose: RobotPose, now: float) -> list[AreaHazard]:
@@ -197,7 +199,7 @@ class AreaFusion:
         changed: list[AreaHazard] = []
         for area in self._areas.values():
             for name, node in list(area.nodes.items()):
-                if self._is_undefined(area, name) and node.silent_for(now) > THESIS_EXPIRY_S:
+                if _is_undefined(area, name) and node.silent_for(now) > THESIS_EXPIRY_S:
                     del area.nodes[name]
                 else:
                     node.check_silence(node.silent_after(area.definition.unknown), now)
@@ -222,12 +224,10 @@ class AreaFusion:
 
     def restore(self, hazards: Iterable[AreaHazard], stamp: float) -> list[AreaHazard]:
         """Apply hazards that were unreadable at the start; areas that readings have confirmed since keep theirs."""
-        changed: list[AreaHazard] = []
-        for hazard in hazards:
-            if (area := self._areas.get(hazard.area)) is not None:
-                area.restore_late(hazard)
-                changed += self._evaluate(area, stamp)
-        return changed
+        known = [(self._areas[hazard.area], hazard) for hazard in hazards if hazard.area in self._areas]
+        for area, hazard in known:
+            area.restore_late(hazard)
+        return [changed for area, _ in known for changed in self._evaluate(area, stamp)]
 
     def set_epoch(self, epoch: int) -> None:
         """Give all hazards, those to come too, another epoch."""
@@ -266,16 +266,14 @@ class AreaFusion:
                     self._by_node.setdefault(node.id, []).append((area, node))
         self._sources = Sources(self._areas.values())
 
-    @staticmethod
-    def _is_undefined(area: WatchedArea, node: str) -> bool:
-        """Whether a node reports only under the area's number on the thesis's topics."""
-        return node == THESIS_NODE.format(number=area.definition.number) and node not in area.definition.nodes
-
-    def _classify(self, node_id: str, reading: NodeReading, now: float) -> Classification:
-        site = self.nodes.get(node_id)
-        if site is None:
-            return Classification(reading.state, f"the node reports {reading.state} (the site does not define it)")
-        return classify_reading(site, reading, self._poses.fresh(now))
+    def _after(self, applied: Iterable[Applied], stamp: float) -> list[AreaHazard]:
+        """Return the hazards that change with what sources said."""
+        changed: list[AreaHazard] = []
+        for area, source, understood in applied:
+            if not understood:
+                self._reject(source.id, "implausible")
+            changed += self._evaluate(area, stamp)
+        return changed
 
     def _reject(self, node_id: str, reason: Rejection) -> None:
         if len(self._rejections) < _MAX_REJECTIONS:
@@ -289,3 +287,14 @@ class AreaFusion:
             return []
         self._seqs[area.definition.id] = seq
         return [hazard]
+
+
+def _is_undefined(area: WatchedArea, node: str) -> bool:
+    """Whether a node reports only under the area's number on the thesis's topics."""
+    return node == THESIS_NODE.format(number=area.definition.number) and node not in area.definition.nodes
+
+
+def _classified(site: NodeSite | None, reading: NodeReading, poses: RobotPoses, now: float) -> Classification:
+    if site is None:
+        return Classification(reading.state, f"the node reports {reading.state} (the site does not define it)")
+    return classify_reading(site, reading, poses.fresh(now))

@@ -45,6 +45,9 @@ class Members:
                 problem = "a node of the site has this id, and its readings would count as the source's: choose another"
                 raise SourceError(definition.id, f"sources.{source.id}", problem)
             self._new_source(definition, source)
+            if source.quantity is not None and source.quantity.node not in self._sites:
+                problem = f"the site has no node {source.quantity.node}: add it to site.toml first"
+                raise SourceError(definition.id, f"sources.{source.id}.quantity.node", problem)
         number = definition.number
         check_fusion(definition, None if number is None else THESIS_NODE.format(number=number))
 
@@ -54,7 +57,8 @@ class Members:
 
     def thesis_node(self, definition: AreaDefinition) -> NodeState:
         """Return the node of an area that reports by the area's number only."""
-        return NodeState(THESIS_NODE.format(number=definition.number), None, self.new_rule(definition))
+        name = THESIS_NODE.format(number=definition.number)
+        return NodeState(name, None, self.new_rule(definition), area_penalty=definition.penalty)
 
     def of_area(self, definition: AreaDefinition, old: WatchedArea | None) -> dict[str, NodeState]:
         """Return the nodes and sources of an area; those of its `old` definition keep their states."""
@@ -76,6 +80,7 @@ class Members:
             members[source.id] = before if unchanged and before is not None else new
         for member in members.values():
             member.flaps.max_changes = definition.unknown.max_changes
+            member.area_penalty = definition.penalty
         return members
 
     def _new_source(self, definition: AreaDefinition, source: Source) -> SourceState:

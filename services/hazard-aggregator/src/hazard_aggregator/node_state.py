@@ -39,6 +39,7 @@ class NodeState:
     run_began: float = 0.0
     received: int = 0
     ignored: int = 0
+    area_penalty: int | None = None
     flaps: FlapDetector = field(default_factory=lambda: FlapDetector(UnknownPolicy().max_changes))
 
     @property
@@ -49,7 +50,8 @@ class NodeState:
     @property
     def penalty(self) -> int | None:
         """The cost of the area while this one alone is blocked; None: the area is impassable then."""
-        return None
+        own = None if self.site is None else self.site.penalty
+        return self.area_penalty if own is None else own
 
     def silent_after(self, policy: UnknownPolicy) -> float:
         """Return after how long a silence (s) the state is unknown."""
@@ -131,6 +133,7 @@ class SourceState(NodeState):
     """One source of one area, with its profile filled in; `pending` is a retained message of unknown age.
 
     `misread`: its last message was not understood. `new`: its topics are not subscribed to yet, for this source.
+    `value_at`: boot and seq of a node's last value.
     """
 
     source: Source | None = None
@@ -138,11 +141,13 @@ class SourceState(NodeState):
     pending: bytes | None = None
     misread: bool = False
     new: bool = True
+    value_at: tuple[int, int] | None = None
 
     @property
     def penalty(self) -> int | None:
         """The cost of the area while this source alone is blocked; None: the area is impassable then."""
-        return None if self.source is None else self.source.penalty
+        own = None if self.source is None else self.source.penalty
+        return self.area_penalty if own is None else own
 
     def silent_after(self, policy: UnknownPolicy) -> float:  # noqa: ARG002  # a source has its own period
         """Return after how long a silence (s) the state is unknown: never, if the source publishes on change."""

@@ -60,12 +60,18 @@ PROFILES: Final[Mapping[str, Source]] = {
 """What a source of each profile does not say itself; `{device}` is its `device`, `{prefix}` the first level of that."""
 
 
+_VALUE_PERIOD_S: Final = 2.0
+"""A node with several quantities takes turns."""
+
+
 class SourceError(AreaError):
     """A source is invalid; the message names area, source, field and remedy."""
 
 
 def resolve(area: str, source: Source) -> Source:
     """Return a source with what its profile gives, and its topics filled in; raises `SourceError`."""
+    if source.quantity is not None:
+        return _quantity(area, source)
     if source.profile is not None:
         profile = PROFILES.get(source.profile)
         if profile is None:
@@ -80,6 +86,24 @@ def resolve(area: str, source: Source) -> Source:
     source = _filled_in(source)
     _check(area, source)
     return source
+
+
+def _quantity(area: str, source: Source) -> Source:
+    """Return a node's quantity with its period: a node publishes each of its values once a second."""
+    where = f"sources.{source.id}"
+    if source != Source(
+        id=source.id, quantity=source.quantity, number=source.number, period_s=source.period_s,
+        penalty=source.penalty, debounce=source.debounce,
+    ):  # fmt: skip
+        problem = "a node's quantity has a `number`, and may have `period_s`, `penalty` and `debounce`: nothing else"
+        raise SourceError(area, f"{where}.quantity", problem)
+    _check_number(area, source)
+    return source if source.period_s is not None else structs.replace(source, period_s=_VALUE_PERIOD_S)
+
+
+def _check_number(area: str, source: Source) -> None:
+    if source.number is None or (source.number.above is None and source.number.below is None):
+        raise SourceError(area, f"sources.{source.id}.number", "it needs `above` or `below`")
 
 
 def _filled_in(source: Source) -> Source:
@@ -113,8 +137,8 @@ def _check(area: str, source: Source) -> None:
     if source.number is None and not (source.blocked and source.clear):
         problem = "it says neither which values mean blocked and clear, nor the limits of a `number`"
         raise SourceError(area, where, problem)
-    if source.number is not None and source.number.above is None and source.number.below is None:
-        raise SourceError(area, f"{where}.number", "it needs `above` or `below`")
+    if source.number is not None:
+        _check_number(area, source)
     if source.period_s is None and source.availability is None:
         problem = "it has no `period_s` and no `availability`: nobody would notice that it is dead"
         raise SourceError(area, where, problem)

@@ -46,6 +46,11 @@ class SourceReader:
             return Classification("unknown", f"its format has changed: {error}")
         return Classification("unknown", f"{_quoted(value)} means neither blocked nor clear")
 
+    def classify_value(self, value: float) -> Classification:
+        """Return what a number means that came as such, from a node of Fognav."""
+        limits = self._source.number
+        return Classification("unknown", "it has no limits") if limits is None else self._classify_number(value, limits)
+
     def _classify_number(self, value: float, limits: Limits) -> Classification:
         if not _within(value, limits.minimum, limits.maximum):
             self._exceeded = None

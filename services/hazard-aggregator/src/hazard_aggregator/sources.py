@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from itertools import chain
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from hazard_aggregator.node_state import SourceState
 from hazard_aggregator.source_reader import is_online
@@ -13,7 +13,11 @@ from hazard_aggregator.source_reader import is_online
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from fog_contracts.messages import NodeValue
+    from hazard_aggregator.plausibility import Classification
     from hazard_aggregator.watched_area import WatchedArea
+
+_WRAP: Final = 2**32
 
 
 class Applied(NamedTuple):
@@ -40,10 +44,13 @@ class Sources:
         self._wildcards: list[tuple[re.Pattern[str], _Listener]] = []
         self.topics: set[str] = set()
         self._members: list[SourceState] = []
+        self._quantities: dict[str, list[tuple[WatchedArea, SourceState]]] = {}
         for area in areas:
             for member in area.nodes.values():
                 if isinstance(member, SourceState) and member.source is not None:
                     self._members.append(member)
+                    if (quantity := member.source.quantity) is not None:
+                        self._quantities.setdefault(quantity.node, []).append((area, member))
                     self._add(member.source.topic, _Listener(area, member, availability=False))
                     if member.source.availability is not None:
                         self._add(member.source.availability.topic, _Listener(area, member, availability=True))
@@ -61,6 +68,29 @@ class Sources:
             else Applied(area, source, _apply_value(area, source, payload, now, stamp, retained=retained))
             for area, source, availability in found
         ]
+
+    def apply_value(self, node: str, value: NodeValue, now: float, stamp: float) -> list[Applied]:
+        """Apply what a node measured to the sources of its kind, unless they have it, or a newer one, already."""
+        applied = []
+        for area, source in self._quantities.get(node, ()):
+            quantity = None if source.source is None else source.source.quantity
+            if quantity is None or quantity.kind != value.kind:
+                continue
+            if source.value_at is not None and not _is_newer(value, *source.value_at):
+                source.ignored += 1
+                continue
+            source.value_at = value.boot, value.seq
+            if source.reader is not None:
+                understood = _apply(source, source.reader.classify_value(value.value), now, stamp)
+                applied.append(Applied(area, source, understood))
+        return applied
+
+    def on_node_offline(self, node: str) -> list[WatchedArea]:
+        """Forget what a node measured that is no longer connected; return the areas of that."""
+        for _, source in self._quantities.get(node, ()):
+            source.invalidate("it went offline")
+            source.online = False
+        return [area for area, _ in self._quantities.get(node, ())]
 
     def on_connection_lost(self) -> set[str]:
         """Forget what sources said that publish on change only; return the ids of their areas.
@@ -97,6 +127,11 @@ class Sources:
             self._exact.setdefault(topic, []).append(listener)
 
 
+def _is_newer(value: NodeValue, boot: int, seq: int) -> bool:
+    """Whether a value came after that one; the count of a node has 32 bits and wraps."""
+    return value.boot != boot or 0 < (value.seq - seq) % _WRAP < _WRAP // 2
+
+
 def _pattern(topic: str) -> re.Pattern[str]:
     """Return the topics that a subscription matches: + is one level, # any further ones, also none."""
     levels = [{"+": "[^/]*", "#": ".*"}.get(level, re.escape(level)) for level in topic.split("/")]
@@ -131,15 +166,16 @@ def _apply_availability(source: SourceState, payload: bytes | None, now: float, 
 
 
 def _read(source: SourceState, payload: bytes | None, now: float, stamp: float) -> bool:
-    """Apply a value; one that is not understood makes the source unknown at once. Return whether it was.
-
-    Further ones leave the reason: the hazard would change with each of them.
-    """
+    """Apply a value; one that is not understood makes the source unknown at once. Return whether it was."""
     if source.reader is None:
         return False
-    classification = source.reader.classify(payload)
+    return _apply(source, source.reader.classify(payload), now, stamp)
+
+
+def _apply(source: SourceState, classification: Classification, now: float, stamp: float) -> bool:
     if classification.state == "unknown":
         source.receive(now)
+        # Further ones leave the reason: the hazard would change with each of them.
         if not source.misread:
             source.invalidate(classification.reason)
             source.misread = True

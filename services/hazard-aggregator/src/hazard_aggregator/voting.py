@@ -37,6 +37,9 @@ def check_fusion(definition: AreaDefinition, thesis_node: str | None) -> None:
     `thesis_node` is the id of the node that may report by the area's number, alone where nothing else watches it.
     """
     policy = definition.fusion
+    if definition.penalty is not None and policy.rule != "any":
+        problem = "each node or source makes an area with a penalty costly, whatever the others say: use `any`"
+        raise AreaError(definition.id, "fusion.rule", problem)
     members = [*definition.nodes, *(source.id for source in definition.sources if source.penalty is None)]
     if not members and thesis_node is not None:
         members = [thesis_node]

@@ -2,6 +2,7 @@
 
 import asyncio
 import itertools
+import json
 import os
 import signal
 import sys
@@ -10,6 +11,7 @@ import time
 import httpx
 import numpy as np
 import pytest
+from redis.asyncio import Redis
 
 from fog_contracts import channels as ch
 from fog_contracts.grid import GridGeometry, StaticMap
@@ -141,4 +143,27 @@ async def test_client_that_stops_with_twenty_open_snapshots_does_not_silence_the
         finally:
             client.kill()
             await client.wait()
+        assert gap < MAX_AGE_S, f"no heartbeat for {gap:.2f} s"
+
+
+async def test_whoever_reads_the_audit_trail_of_large_zones_does_not_silence_the_heartbeat(fog, until, tokens):
+    zone = json.dumps({"id": "z", "kind": "BLOCKED", "shape": STAR}, default=float)
+    async with Redis.from_url(fog.redis.url) as redis, redis.pipeline(transaction=False) as pipeline:
+        for _ in range(1000):
+            fields = {"at": "1.0", "who": "anna", "action": "replace", "id": "z", "before": zone, "after": zone}
+            pipeline.xadd("fog:test:audit:zone", fields)
+        await pipeline.execute()
+    fog.start("map_service")
+    url = await fog.ready("map_service")
+    async with fog.edges() as (_, zenoh, _connect), httpx.AsyncClient(base_url=url, timeout=60) as client:
+        follower = Follower(zenoh)
+        await follower.load()
+        begin, count, read, address = time.monotonic(), len(follower.beats), 0, "/api/v1/audit?limit=1000"
+        while address:
+            answer = await client.get(address, headers=tokens["viewer"])
+            read += len(answer.json())
+            address = answer.links.get("next", {}).get("url", "")
+        assert read == 1000
+        await until(lambda: len(follower.beats) >= count + 10, "10 heartbeats")
+        gap = follower.longest_gap_since(begin)
         assert gap < MAX_AGE_S, f"no heartbeat for {gap:.2f} s"

@@ -26,6 +26,7 @@ from fog_runtime.http import (
     Tokens,
     app,
     make_app,
+    places,
     unused,
 )
 from fog_runtime.http.link import CoreLink
@@ -72,6 +73,12 @@ class Service:
             service.called.set()
             await service.release.wait()
             return "done"
+
+        routes.urgent("/robots/{robot}/stop")
+
+        @routes.post("/robots/{robot}/stop")
+        async def stop(robot: str) -> str:
+            return robot
 
         @routes.get("/bug")
         async def bug() -> str:
@@ -168,6 +175,42 @@ async def test_body_that_does_not_arrive_is_refused_after_a_while(tmp_path, monk
         assert b" 408 " in await asyncio.wait_for(reader.readline(), DEADLINE_S)
         writer.close()
         assert service.calls == []
+
+
+async def test_client_that_ends_none_of_its_requests_leaves_places_to_others_and_to_stops(tmp_path, monkeypatch):
+    monkeypatch.setattr(places, "MAX_OF_CLIENT", 3)
+    monkeypatch.setattr(places, "MAX_URGENT_OF_CLIENT", 2)
+    begun = b"PUT /zones/z1 HTTP/1.1\r\nHost: fog\r\nContent-Length: 100\r\n\r\n{"
+    async with serving(tmp_path) as (_, client), contextlib.AsyncExitStack() as connections:
+
+        async def begin(request: bytes) -> None:
+            _, writer = await asyncio.open_connection("127.0.0.1", client.base_url.port)
+            connections.callback(writer.close)
+            writer.write(request)
+
+        async def answer(method: str, path: str, status: int) -> httpx.Response:
+            async with asyncio.timeout(DEADLINE_S):
+                while (found := await client.request(method, path)).status_code != status:  # noqa: ASYNC110  # no event tells
+                    await asyncio.sleep(0.01)
+            return found
+
+        for _ in range(3):
+            await begin(begun)
+        refused = await answer("GET", "/encoded", 503)
+        assert (refused.status_code, refused.headers["retry-after"]) == (503, "1")
+        assert refused.headers["content-type"] == "application/problem+json"
+        assert "3 of your requests are being served" in refused.json()["detail"]
+        assert (await client.get("/readyz")).status_code == 200
+        assert (await client.post("/robots/r1/stop")).json() == "r1"
+        other = httpx.AsyncHTTPTransport(local_address="127.0.0.2")
+        async with httpx.AsyncClient(transport=other, base_url=client.base_url) as neighbour:
+            assert (await neighbour.get("/encoded")).status_code == 200
+        for _ in range(2):
+            await begin(begun.replace(b"PUT /zones/z1", b"POST /robots/r1/stop"))
+        await answer("POST", "/robots/r1/stop", 503)
+        await connections.aclose()
+        await answer("GET", "/encoded", 200)
+        await answer("POST", "/robots/r1/stop", 200)
 
 
 async def test_open_request_is_answered_at_the_end(tmp_path):

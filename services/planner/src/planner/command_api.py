@@ -63,6 +63,8 @@ def add_commands(
         check(robot)
         return outcome(robot, await operator.send(body.kind, robot, caller.name, _pose(body, site)))
 
+    routes.urgent("/api/v1/robots/{robot}/stop")
+
     @routes.post(
         "/api/v1/robots/{robot}/stop",
         raises=[CommandError],

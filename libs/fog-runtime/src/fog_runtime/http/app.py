@@ -10,8 +10,9 @@ from fastapi import FastAPI, Response
 from fog_contracts.messages import Message
 from fog_runtime import metrics
 from fog_runtime.health import Health
-from fog_runtime.http.problems import RETRY_AFTER, add_problem_handlers, problem
-from fog_runtime.http.routes import ALWAYS_SERVED, Answer, Routes
+from fog_runtime.http.places import OpenLimit
+from fog_runtime.http.problems import add_problem_handlers, problem
+from fog_runtime.http.routes import Answer, Routes
 from fog_runtime.http.tokens import Tokens
 from fog_runtime.version import VERSION
 
@@ -21,8 +22,6 @@ _DRAIN_FACTOR: Final = 16
 
 BODY_S: Final = 10.0
 """How long a body may take to arrive: a client that sends slowly must not hold a place for long."""
-MAX_OPEN_REQUESTS: Final = 128
-"""Most requests that are served at the same time."""
 
 Scope = MutableMapping[str, Any]
 Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
@@ -86,32 +85,6 @@ class _BodyLimit:
         return bytes(body), None
 
 
-class _OpenLimit:
-    """Serves at most `limit` requests at the same time: further ones are answered with 503 and `Retry-After`.
-
-    Health and metrics are always served.
-    """
-
-    def __init__(self, app: App, limit: int) -> None:
-        self._app = app
-        self._limit = limit
-        self._open = 0
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or scope["path"] in ALWAYS_SERVED:
-            await self._app(scope, receive, send)
-            return
-        if self._open >= self._limit:
-            busy = problem(503, f"{self._open} requests are being served: try again", headers=RETRY_AFTER)
-            await busy(scope, receive, send)
-            return
-        self._open += 1
-        try:
-            await self._app(scope, receive, send)
-        finally:
-            self._open -= 1
-
-
 class Alive(Message, frozen=True, kw_only=True):
     """The process runs."""
 
@@ -166,10 +139,11 @@ def make_app(
     app.state.standby = standby
     app.state.endpoints = {}
     app.state.core = None
+    app.state.urgent = []
     add_problem_handlers(app)
     _add_health(Routes(app, "health"), health)
     app.add_middleware(_BodyLimit, limit=body_limit)
-    app.add_middleware(_OpenLimit, limit=MAX_OPEN_REQUESTS)
+    app.add_middleware(OpenLimit, urgent=app.state.urgent)
     generate = app.openapi
 
     def openapi() -> dict[str, Any]:

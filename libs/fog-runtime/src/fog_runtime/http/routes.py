@@ -31,6 +31,7 @@ from typing import (
 
 import msgspec
 from fastapi import Depends, FastAPI, Header, Request, Response
+from starlette.routing import compile_path
 
 from fog_runtime.http.problems import PROBLEM, Problem, ProblemError
 from fog_runtime.http.tokens import Caller
@@ -138,6 +139,10 @@ class Routes:
             return response
 
         self._app.add_exception_handler(kind, answer)
+
+    def urgent(self, path: str) -> None:
+        """Give requests to this path places of their own, which no other requests take (`fog_runtime.http.places`)."""
+        self._app.state.urgent.append(compile_path(path)[0])
 
     def get(self, path: str, **options: Any) -> Callable[[Handler], Handler]:
         """Add a route that reads."""

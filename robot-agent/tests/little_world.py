@@ -89,6 +89,8 @@ class LittleWorld:
         self.link_delay = self.link_delay_growth = 0.0  # of heartbeats: s, and s per s
         self.bumper = False
         self.fault = None
+        self.stopped = None
+        self.resting = False
         self.path = None
         self.path_on = True
         self.goal = None
@@ -224,7 +226,7 @@ class LittleWorld:
                     status=BaseStatus(bumper_left=self.bumper, battery=0.8),
                     odometry=WheelOdometry(left_m=left, right_m=right),
                     fault=self.fault,
-                    stopped=None,
+                    stopped=self.stopped,
                 ),
                 self.now,
             )
@@ -239,6 +241,7 @@ class LittleWorld:
         if self.steps % 5 == 0:
             command = self.agent.stream(self.now, self.stamp)
             self.resets += command.reset
+            self.resting = command.rest
             if command.reset:
                 self.fault = None
             self.wheels = (command.left, command.right) if self.base_on else (0.0, 0.0)

@@ -192,6 +192,8 @@ class AgentConfig:
     obstacle_limit: int = 400
     rest_after: float = 0.0
     """How long (s) an idle robot waits before it rests, with its lidar's motor at a standstill; 0: it never does."""
+    rest_base: bool = False
+    """Whether its base sleeps then, too."""
     battery_low: float = 0.2
     """Charge (of 1) below which the robot announces a low battery."""
     dock_below: float = 0.0
@@ -291,4 +293,5 @@ def _with_settings(config: AgentConfig, settings: RobotSettings, *, can_rest: bo
         battery_low=settings.power.low_fraction,
         dock_below=settings.power.dock_below,
         rest_after=rest_after,
+        rest_base=settings.power.rest_base,
     )

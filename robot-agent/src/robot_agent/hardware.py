@@ -35,6 +35,9 @@ NO_FRESH_COMMAND: Final = "no fresh command from the agent"
 ON_CHARGER: Final = "the base is on its charger, where it does not drive"
 """Why the guardian keeps the wheels at zero while a charger is connected."""
 
+ASLEEP: Final = "the base is asleep to save power"
+"""Why the guardian keeps the wheels at zero while the agent lets the base rest."""
+
 Options = TypeVar("Options", bound=msgspec.Struct)
 """A driver's own options: a frozen struct whose fields name their units and that refuses unknown fields."""
 
@@ -242,6 +245,14 @@ class BaseDriver(Protocol):
 
     def drive(self, left_m_s: float, right_m_s: float) -> bytes:
         """Return the command that turns the wheels at these speeds until the next one; zeros stop them at once."""
+
+
+@runtime_checkable
+class SleepingDriver(Protocol):
+    """What the driver of a base adds that can be put to sleep, and woken by its `awakening`'s line."""
+
+    def sleep(self) -> bytes:
+        """Return the bytes that put it to sleep: it neither moves nor hears anything then."""
 
 
 @runtime_checkable

@@ -112,3 +112,67 @@ def test_a_robot_without_a_rest_time_never_rests():
         policy.update(busy=False, goal_id=None, now=float(now))
     assert policy.lidar_on
     assert policy.reason is None
+
+
+# --- the base sleeps, too ---
+
+
+class SleepingAgent(AgentCore):
+    """An agent that rests after 20 s, with its base."""
+
+    def __init__(self, config, seed):
+        super().__init__(replace(config, rest_after=AFTER, rest_base=True), seed)
+
+
+class SleepyWorld(World):
+    """A world whose base sleeps while the agent lets it, and needs `wake_s` to wake; it counts the commands to rest."""
+
+    wake_s = 2.5
+
+    def __post_init__(self):
+        self.asked, self.woken_at = [], None
+        super().__post_init__()
+
+    def _step(self):
+        super()._step()
+        if not self.asked or self.asked[-1] != self.resting:
+            self.asked.append(self.resting)
+        if self.resting:
+            self.woken_at, self.stopped = None, "the base is asleep to save power"
+        elif self.stopped:
+            self.woken_at = self.woken_at or self.now
+            waits = self.now - self.woken_at < self.wake_s
+            self.stopped = "the base is not ready to drive yet" if waits else None
+
+
+@pytest.mark.parametrize("wake_s", [0.5, 4.0])
+def test_robot_whose_base_sleeps_holds_and_drives_once_both_are_awake(wake_s):
+    w = SleepyWorld(start_agent=SleepingAgent).ready()
+    w.wake_s = wake_s
+    w.run(AFTER + 1.0)
+    w.run(60.0)
+    assert w.asked == [False, True]
+    assert (w.state().mode, w.state().reasons[0][:7]) == ("HOLD", "at rest")
+    w.modes.clear()
+    w.drive_to(L_PATH[:3])
+    assert w.run(20.0, lambda w: w.travelled > 0.5)
+    assert w.modes == ["HOLD", "NORMAL"]
+    assert w.asked == [False, True, False]
+    assert w.error()[0] < 0.1
+
+
+def test_base_that_does_not_wake_stops_the_robot():
+    w = SleepyWorld(start_agent=SleepingAgent).ready()
+    w.wake_s = 1e9
+    w.run(AFTER + 1.0)
+    w.drive_to(L_PATH[:3])
+    w.run(rest_policy.WAKE_TIMEOUT_S + 0.5)
+    assert w.state().mode == "PROTECTIVE_STOP"
+    assert "the guardian holds the wheels: the base is not ready to drive yet" in w.state().reasons
+    assert w.travelled == 0.0
+
+
+def test_base_of_a_robot_that_shall_not_put_it_to_sleep_stays_awake():
+    w = SleepyWorld(start_agent=RestingAgent).ready()
+    w.run(AFTER + 5.0)
+    assert w.asked == [False]

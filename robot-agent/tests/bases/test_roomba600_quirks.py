@@ -37,6 +37,7 @@ class Line:
         self.now, self.seq, self.wheels = 50.0, 0, (0.0, 0.0)
         self.baud = options.get("baud", 115200)
         self.line_until = None
+        self.rest = False
         self.feedback, self.attempts = [], []
 
     def handle(self, output):
@@ -62,7 +63,7 @@ class Line:
             self.handle(self.core.on_bytes(sent if self.baud == self.base.baud else b"", self.now))
             if step % 5 == 0:
                 self.seq += 1
-                command = WheelCommand(seq=self.seq, left=self.wheels[0], right=self.wheels[1])
+                command = WheelCommand(seq=self.seq, left=self.wheels[0], right=self.wheels[1], rest=self.rest)
                 self.handle(self.core.on_command(command, self.now))
             if step % 2 == 0:
                 self.handle(self.core.tick(self.now))
@@ -164,6 +165,83 @@ def test_a_robot_at_the_other_rate_is_found_and_driven_there(brc, configured):
     attempts = len(line.attempts)
     line.run(10.0)
     assert len(line.attempts) == attempts
+
+
+# --- sleeping while the robot rests ---
+
+
+@pytest.mark.parametrize("brc", ["rts", "dtr"])
+def test_resting_robots_base_sleeps_for_hours_without_a_fault_and_drives_within_three_seconds(brc):
+    line = Line(brc=brc)
+    line.run(0.5)
+    line.rest = True
+    line.run(30.0)
+    assert line.base.asleep
+    assert (line.core.latched, line.core.unanswered, line.attempts) == (None, None, [])
+    assert line.feedback[-1].stopped == "the base is asleep to save power"
+    assert line.now - 50.0 > 30.0
+    line.rest, line.wheels = False, (0.3, 0.25)
+    line.run(3.0)
+    assert [attempt.line.name for attempt in line.attempts] == [brc]
+    assert (line.base.asleep, line.drives, line.core.latched) == (False, True, None)
+
+
+def test_base_that_no_line_could_wake_stays_awake():
+    line = Line()
+    line.rest = True
+    line.run(2.0)
+    assert (line.base.asleep, line.base.mode) == (False, SAFE)
+
+
+def test_base_that_moves_charges_or_has_a_fault_does_not_sleep():
+    line = Line(brc="rts")
+    line.wheels = (0.3, 0.25)
+    line.run(1.0)
+    line.rest = True
+    line.run(1.0)
+    assert not line.base.asleep
+    line = Line(brc="rts")
+    line.run(0.5)
+    line.base.world.home_base = True
+    line.run(0.1)
+    line.rest = True
+    line.run(1.0)
+    assert not line.base.asleep
+    line = Line(brc="rts")
+    line.run(0.5)
+    line.base.world.bump_left = True
+    line.run(0.1)
+    line.rest = True
+    line.run(1.0)
+    assert not line.base.asleep
+    assert "bumper" in line.core.latched
+
+
+def test_base_sleeps_on_when_the_agent_ends_and_is_woken_by_the_next_one():
+    line = Line(brc="rts")
+    line.run(0.5)
+    line.rest = True
+    line.run(1.0)
+    line.handle(line.core.on_agent_lost(line.now))
+    for _ in range(100):
+        line.now += 0.05
+        line.handle(line.core.tick(line.now))
+    assert line.base.asleep
+    line.rest = False
+    line.run(3.0)
+    assert line.base.mode == SAFE
+
+
+def test_base_that_does_not_wake_is_pulsed_again_and_then_named():
+    line = Line(brc="rts")
+    line.run(0.5)
+    line.rest = True
+    line.run(1.0)
+    line.base.pulse_wake_line = lambda _seconds: None
+    line.rest = False
+    line.run(30.0)
+    assert len(line.attempts) > 2
+    assert "pulsed awake without success" in line.core.unanswered
 
 
 def test_pulses_are_no_series_that_changes_the_rate():

@@ -80,6 +80,7 @@ PARTS: Final = (
         (
             "guardian.core",
             "guardian.base_faults",
+            "guardian.base_sleep",
             "guardian.feedback",
             "guardian.link",
             "guardian.maneuvers",

@@ -142,6 +142,13 @@ class PowerSettings(_Table, frozen=True, kw_only=True):
             "until a goal or an operator's command wakes it; 0: never"
         ),
     ] = 600.0
+    rest_base: Annotated[
+        bool,
+        Meta(
+            description="while the robot rests its base sleeps, too, if a line of the adapter wakes it (a Roomba's "
+            "BRC): try it first, single robots do not wake"
+        ),
+    ] = False
 
 
 class RobotSettings(_Table, frozen=True, kw_only=True):

@@ -19,6 +19,8 @@ import math
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
+from msgspec.structs import replace
+
 from fog_contracts import channels as ch
 from fog_contracts.fencing import Fence
 from fog_contracts.follower import MapFollower
@@ -140,7 +142,10 @@ class AgentCore:
 
     def on_base(self, feedback: BaseFeedback, now: float) -> None:
         """Handle feedback of the base."""
+        slept = self._base.asleep
         self._base.on_feedback(feedback, now)
+        if slept and not self._base.asleep:
+            self._localizer.on_unmeasured_motion(*POSSIBLE_WHILE_SUSPENDED, "the base was asleep")
         motion = self._odometry.update(feedback.odometry, now)
         if isinstance(motion, EncoderFault):
             return
@@ -186,13 +191,16 @@ class AgentCore:
 
     def stream(self, now: float, stamp: float) -> WheelCommand:
         """Evaluate safety and return the wheel speeds to send now; call it 20 times a second."""
-        self._rest.update(busy=not self.idle, goal_id=self._driving.mission.goal_id, now=now)
+        goal_id = self._driving.mission.goal_id
+        self._rest.update(busy=not self.idle, goal_id=goal_id, now=now, base_ready=self._base.ready)
         safety = self._evaluate_safety(now)
         if self._maneuvers.may_seek_dock(self._safety.state, self._base.feedback, self._driving, now):
             safety = self._evaluate_safety(now, "dock")
             self._maneuvers.docking.on_begun(safety.refusal)
         maneuver = self._maneuvers.command(self._safety.state, safety, self._driving, now)
-        return maneuver or self._driving.command(safety, self._guard.limit, now, stamp)
+        command = maneuver or self._driving.command(safety, self._guard.limit, now, stamp)
+        rest = self._config.rest_base and not self._rest.lidar_on
+        return replace(command, rest=True) if rest else command
 
     def egress_request(self, now: float) -> EgressRequest | None:
         """Return the query for a way out of a blocked area that is due; pass its reply to `on_egress_reply`."""

@@ -45,8 +45,8 @@ class RestPolicy:
         """Count a whole scan."""
         self._scans += 1
 
-    def update(self, *, busy: bool, goal_id: str | None, now: float) -> None:
-        """Decide anew; `busy`: the robot is not idle, `goal_id`: of its mission."""
+    def update(self, *, busy: bool, goal_id: str | None, now: float, base_ready: bool = True) -> None:
+        """Decide anew; `busy`: the robot is not idle, `goal_id`: of its mission, `base_ready`: its base would drive."""
         if busy or self._woken or goal_id != self._goal_id or math.isnan(self._idle_since):
             self._idle_since = now
         self._woken, self._goal_id = False, goal_id
@@ -55,7 +55,8 @@ class RestPolicy:
             if idle == 0.0:
                 self.lidar_on, self._waking_since, self._scans = True, now, 0
         elif self._waking_since is not None:
-            if self._scans >= SCANS_TO_WAKE or now - self._waking_since > WAKE_TIMEOUT_S:
+            awake = self._scans >= SCANS_TO_WAKE and base_ready
+            if awake or now - self._waking_since > WAKE_TIMEOUT_S:
                 self._waking_since = None
         elif idle >= self._rest_after:
             self.lidar_on = False

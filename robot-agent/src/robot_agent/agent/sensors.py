@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
+from robot_agent.hardware import ASLEEP
+
 if TYPE_CHECKING:
     from robot_agent.guardian.link import BaseFeedback
 
@@ -32,6 +34,16 @@ class BaseSource:
     def on_lost(self, reason: str) -> None:
         """Record that the link broke."""
         self.lost = reason
+
+    @property
+    def ready(self) -> bool:
+        """Whether the guardian does not keep the base at rest."""
+        return self.feedback is not None and self.feedback.stopped is None
+
+    @property
+    def asleep(self) -> bool:
+        """Whether the base sleeps: it does not notice if it is pushed."""
+        return self.feedback is not None and self.feedback.stopped == ASLEEP
 
     def age(self, now: float) -> float:
         """Return the age (s) of the feedback; infinite without any."""

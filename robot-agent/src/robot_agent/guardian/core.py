@@ -17,11 +17,12 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from fog_contracts.messages import SENTENCE_MAX
 from robot_agent.guardian.base_faults import fault_of, is_bump
+from robot_agent.guardian.base_sleep import BaseSleep
 from robot_agent.guardian.feedback import FeedbackPolicy
 from robot_agent.guardian.link import WHEEL_SPEED_MAX_M_S, BaseFeedback, WheelCommand
 from robot_agent.guardian.maneuvers import Maneuvers, Situation
 from robot_agent.guardian.revival import Attempt, Revival
-from robot_agent.hardware import NO_FRESH_COMMAND, ON_CHARGER, DockingDriver
+from robot_agent.hardware import ASLEEP, NO_FRESH_COMMAND, ON_CHARGER, DockingDriver
 
 if TYPE_CHECKING:
     from robot_agent.hardware import BaseDriver, BaseReading, BaseStatus
@@ -42,6 +43,12 @@ class Limits:
     wheel: float = WHEEL_SPEED_MAX_M_S
     linear: float = 0.31
     acceleration: float = 1.65
+
+    def scaled(self, left: float, right: float, base: float) -> tuple[float, float]:
+        """Return wheel speeds within the limits, and that of the `base` (m/s); one factor for both keeps the curve."""
+        fastest = max(abs(left), abs(right))
+        excess = max(1.0, abs(left + right) / 2 / self.linear, fastest / min(self.wheel, base))
+        return left / excess, right / excess
 
 
 class Output(NamedTuple):
@@ -64,6 +71,15 @@ class _Base:
     restrained: bool = False
     """Whether it drove by itself, or without its own protection, and has not reported its driving mode since."""
 
+    def blocked_for(self, now: float) -> float:
+        """Return for how long (s) a wheel motor has been drawing too much current."""
+        if self.reading is None or not self.reading.status.overcurrent:
+            self.overcurrent_since = None
+            return 0.0
+        if self.overcurrent_since is None:
+            self.overcurrent_since = now
+        return now - self.overcurrent_since
+
 
 @dataclass
 class GuardianCore:
@@ -73,7 +89,6 @@ class GuardianCore:
     limits: Limits = field(default_factory=Limits)
 
     def __post_init__(self) -> None:
-        self._wheel_limit = min(self.limits.wheel, self.driver.drive_train.wheel_speed_max_m_s)
         self._base = _Base()
         self._revival = Revival(self.driver.awakening)
         self._command: WheelCommand | None = None
@@ -82,6 +97,7 @@ class GuardianCore:
         self._bumped = False
         """Whether the latched fault is a pressed bumper."""
         self._maneuvers = Maneuvers(self.driver)
+        self._sleep = BaseSleep(self.driver)
         self._wheels = (0.0, 0.0)
         self._sent: tuple[float, float] | None = None
         self._sent_at = _NEVER
@@ -132,7 +148,21 @@ class GuardianCore:
             self._maneuvers.end()
             self._base.awake = False
             return Output(self._wake(now))
+        if self._sleep.asleep or (command.rest and self._base.awake):
+            return self._rest(command, now)
         return self._drive(now)
+
+    def _rest(self, command: WheelCommand, now: float) -> Output:
+        """Put the base to sleep, leave it asleep, or wake it; one that moves, charges or has a fault goes on."""
+        if self._sleep.asleep:
+            if command.rest:
+                return Output()
+            self._base.woken_at = None
+            return Output(attempt=self._sleep.end())
+        if self.moving or self._latched is not None or self._charging(now) or not (data := self._sleep.begin()):
+            return self._drive(now)
+        self._base.awake = False
+        return Output(data)
 
     def on_agent_lost(self, now: float) -> Output:
         """Discard the agent's last command: its link is lost."""
@@ -142,6 +172,8 @@ class GuardianCore:
     def tick(self, now: float) -> Output:
         """Advance time (50 Hz while `moving`, else 15 Hz or more): stale commands, a silent base, repeated stops."""
         base, timing = self._base, self.driver.timing
+        if self._sleep.asleep:
+            return Output(b"", self._reminder(now))
         if not base.awake:
             due = base.woken_at is None or now - base.woken_at > timing.wake_timeout
             # A base that does not drive on its charger is left alone there: waking it would only disturb the charging.
@@ -158,10 +190,10 @@ class GuardianCore:
 
     def stop_command(self) -> bytes:
         """Return the bytes that stop the wheels at an orderly end of the guardian; the base stays awake."""
-        if self._maneuvers.running is None or not isinstance(self.driver, DockingDriver):
+        reading = self._base.reading
+        if self._maneuvers.running is None or reading is None or not isinstance(self.driver, DockingDriver):
             return self.driver.drive(0.0, 0.0)
-        charging = self._base.reading is not None and self._base.reading.status.charging
-        return self.driver.take_control(charging=charging)
+        return self.driver.take_control(charging=reading.status.charging)
 
     def _attempt(self, now: float) -> Attempt | None:
         """Return what to try on a base from which nothing has come since it was woken last."""
@@ -174,9 +206,8 @@ class GuardianCore:
         return attempt
 
     def _charging(self, now: float) -> bool:
-        base = self._base
-        fresh = now - base.reading_at <= self.driver.timing.frame_timeout
-        return base.reading is not None and fresh and base.reading.status.charging
+        fresh = now - self._base.reading_at <= self.driver.timing.frame_timeout
+        return fresh and self._base.reading is not None and self._base.reading.status.charging
 
     def _wake(self, now: float) -> bytes:
         self._base.woken_at, self._base.restrained = now, False
@@ -193,12 +224,7 @@ class GuardianCore:
         backing = self._maneuvers.is_running("back_off")
         if self._latched is not None and not backing:
             return b""
-        if not status.overcurrent:
-            base.overcurrent_since = None
-        elif base.overcurrent_since is None:
-            base.overcurrent_since = now
-        blocked_for = 0.0 if base.overcurrent_since is None else now - base.overcurrent_since
-        fault = fault_of(status, blocked_for, bumper=not self._maneuvers.expects_bumper(status))
+        fault = fault_of(status, base.blocked_for(now), bumper=not self._maneuvers.expects_bumper(status))
         if fault is None:
             return b""
         if backing:
@@ -208,8 +234,8 @@ class GuardianCore:
     def _latch(self, reason: str, now: float) -> bytes:
         first = self._latched is None
         if first:
-            self._latched = reason[:SENTENCE_MAX]  # a driver's own words may fill the whole field
-            self._bumped = is_bump(reason)
+            # A driver's own words may fill the whole field.
+            self._latched, self._bumped = reason[:SENTENCE_MAX], is_bump(reason)
         if self._maneuvers.running is not None:
             return self._end_maneuver(now)
         self._wheels, self._stepped_at = (0.0, 0.0), now
@@ -236,12 +262,10 @@ class GuardianCore:
 
     def _end_maneuver(self, now: float) -> bytes:
         """End the maneuver with the wheels at rest."""
-        own_drive = not self._maneuvers.is_running("back_off")
+        if not self._maneuvers.is_running("back_off"):
+            self._base.awake, self._base.woken_at, self._base.restrained = False, now, True
         self._maneuvers.end()
         self._wheels, self._stepped_at = (0.0, 0.0), now
-        if not own_drive:
-            return self._send(self._wheels, now)
-        self._base.awake, self._base.woken_at, self._base.restrained = False, now, True
         return self._restrain(now)
 
     def _restrain(self, now: float) -> bytes:
@@ -257,11 +281,9 @@ class GuardianCore:
             return Output(begun)
         elapsed = 0.0 if self._stepped_at is None else max(0.0, min(now - self._stepped_at, STEP_S))
         self._stepped_at = now
-        target = self._target(now)
+        left, right = self._target(now)
         gain = self.limits.acceleration * elapsed
-        left = _slew(self._wheels[0], target[0], gain)
-        right = _slew(self._wheels[1], target[1], gain)
-        self._wheels = (left, right)
+        self._wheels = _slew(self._wheels[0], left, gain), _slew(self._wheels[1], right, gain)
         if self._wheels == self._sent and now - self._sent_at < REPEAT_S:
             return Output(begun)
         return Output(begun + self._send(self._wheels, now))
@@ -272,12 +294,7 @@ class GuardianCore:
             return self._maneuvers.wheels(command.left, command.right)
         if command is None or self._latched is not None or self._charging(now):
             return 0.0, 0.0
-        left, right = command.left, command.right
-        mean = abs(left + right) / 2
-        fastest = max(abs(left), abs(right))
-        # One factor for both wheels keeps the curve of the command.
-        excess = max(1.0, mean / self.limits.linear, fastest / self._wheel_limit)
-        return left / excess, right / excess
+        return self.limits.scaled(command.left, command.right, self.driver.drive_train.wheel_speed_max_m_s)
 
     def _fresh_command(self, now: float) -> WheelCommand | None:
         return self._command if now - self._command_at <= COMMAND_FRESH_S else None
@@ -304,15 +321,16 @@ class GuardianCore:
 
     def _stopped(self, now: float) -> str | None:
         """Return why the wheels are kept at zero whatever the agent requests; None: they are not."""
-        if self._fresh_command(now) is not None and self._maneuvers.running is not None:
+        fresh = self._fresh_command(now) is not None
+        if fresh and self._maneuvers.running is not None:
             return None
-        if self._maneuvers.problem is not None:
-            return self._maneuvers.problem
+        if self._maneuvers.problem is not None or self._sleep.asleep:
+            return self._maneuvers.problem or ASLEEP
         if self._charging(now):
             return ON_CHARGER
         if not self._base.awake:
             return "the base is not ready to drive yet"
-        return NO_FRESH_COMMAND if self._fresh_command(now) is None else None
+        return None if fresh else NO_FRESH_COMMAND
 
 
 def _slew(current: float, target: float, gain: float) -> float:

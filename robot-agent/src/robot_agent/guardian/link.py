@@ -28,7 +28,7 @@ class WheelCommand(Struct, frozen=True, kw_only=True):
     """Wheel speeds that the agent requests (m/s), 20 times a second; `seq` grows by one with each.
 
     `reset` passes on an operator's authenticated reset: the guardian clears a latched fault and wakes the base again.
-    `maneuver` goes on as long as it is asked for.
+    `maneuver` goes on as long as it is asked for. `rest`: the base may sleep until a command without it.
     """
 
     seq: Count
@@ -36,6 +36,7 @@ class WheelCommand(Struct, frozen=True, kw_only=True):
     right: WheelSpeed
     reset: bool = False
     maneuver: Maneuver | None = None
+    rest: bool = False
 
 
 class BaseFeedback(Struct, frozen=True, kw_only=True):

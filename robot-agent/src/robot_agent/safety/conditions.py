@@ -135,6 +135,11 @@ def _guardian_heard(inputs: SafetyInputs, config: SafetyConfig) -> bool:
     return inputs.guardian_lost is None and inputs.base_age <= config.base_lost
 
 
+def _held(inputs: SafetyInputs) -> bool:
+    # A resting robot holds anyhow, and its base may sleep; on its dock it rests, too.
+    return inputs.base_stopped is not None and inputs.resting is None and not _rests_on_dock(inputs)
+
+
 def _rests_on_dock(inputs: SafetyInputs) -> bool:
     return inputs.docked_for is not None and inputs.base_stopped in {None, ON_CHARGER}
 
@@ -158,7 +163,7 @@ CONDITIONS: Final[tuple[Condition, ...]] = (
     ),
     Condition(
         Level.PROTECTIVE_STOP,
-        lambda i, c: _guardian_heard(i, c) and i.base_stopped is not None and not _rests_on_dock(i),
+        lambda i, c: _guardian_heard(i, c) and _held(i),
         lambda i: f"the guardian holds the wheels: {i.base_stopped}",
         by_delay=lambda i: i.base_stopped == NO_FRESH_COMMAND,
     ),

@@ -167,6 +167,10 @@ class Roomba600Driver:
         self._safe_sent = not charging
         return 2 * oi.start() if charging else 2 * (oi.start() + oi.safe() + oi.drive_direct(0, 0))
 
+    def sleep(self) -> bytes:
+        """Return Power: the robot switches itself off, until its BRC pin is pulsed."""
+        return oi.drive_direct(0, 0) + oi.power()
+
     def use_baud(self, baud: int) -> None:
         """Ask for the stream that fits into this rate."""
         self._stream = _STREAMS[baud]

@@ -179,6 +179,7 @@ class RoombaEmulator:
             self._leave(OFF)
         elif opcode == 133:
             self._leave(PASSIVE)
+            self.asleep = True
         elif opcode in {130, 131, 132}:
             self._stop_search()
             self.mode = FULL if opcode == 132 else SAFE

@@ -13,9 +13,11 @@ import httpx
 import numpy as np
 import programs
 import pytest
+from redis.asyncio import Redis
 
 from fog_contracts.grid import GridGeometry, StaticMap
 from fog_runtime.clock import SystemClock
+from fog_runtime.credentials import Credentials
 from fog_runtime.locks.site_locks import SiteLocks
 from fog_runtime.maps import save_map
 from fog_runtime.mqtt_edge import MqttEdge
@@ -51,9 +53,11 @@ DEADLINE_S = 60.0
 class Fog:
     """The servers, a site, and processes that can be started and killed."""
 
-    def __init__(self, folder: Path, locks: SiteLocks | None = None) -> None:
+    def __init__(self, folder: Path, *, locked: bool = True) -> None:
         self.folder = folder
-        self.locks = locks
+        self.locks = locks = SiteLocks(folder / "locks", "test", unrestricted=["test"]) if locked else None
+        if locks is not None:
+            locks.make(["127.0.0.1", "localhost"], nodes=["n1"])
         self.mosquitto: Server = start_mosquitto(folder / "mosquitto", locks=locks and locks.folder("mosquitto"))
         self.redis: Server = start_redis(folder / "redis", locks=locks and locks.folder("redis"))
         self.router: Server = start_router(folder / "router", locks=locks and locks.folder("zenoh"))
@@ -91,13 +95,33 @@ class Fog:
         name = name or module
         port_file = self.folder / f"{name}.port"
         port_file.unlink(missing_ok=True)
-        own = (
-            {}
-            if self.locks is None
-            else {"FOGNAV_CREDENTIALS_FILE": str(self.locks.credentials(module.replace("_", "-")))}
-        )
-        environment = {**self.environment, "FOGNAV_PORT_FILE": str(port_file), **own, **environment}
+        own = self.credentials_file(module.replace("_", "-"))
+        environment = {
+            **self.environment,
+            "FOGNAV_PORT_FILE": str(port_file),
+            **({} if own is None else {"FOGNAV_CREDENTIALS_FILE": str(own)}),
+            **environment,
+        }
         self.processes[name] = programs.start(module, environment, self.folder / f"{name}.log")
+
+    def credentials_file(self, user: str) -> Path | None:
+        """Return the file of a user's credentials; None behind open doors."""
+        return None if self.locks is None else self.locks.credentials(user)
+
+    @property
+    def test_credentials(self) -> Credentials:
+        """Those of a user who may do everything on broker and router."""
+        return Credentials.read(self.credentials_file("test"))
+
+    def raw_redis(self) -> Redis:
+        """Return a client of Redis that may do everything."""
+        if self.locks is None:
+            return Redis.from_url(self.redis.url)
+        own = Credentials.read(self.credentials_file("administrator"))
+        return Redis(
+            port=self.redis.port, ssl=True, ssl_ca_data=own.authority, username=own.user,
+            password=own.passwords["redis"],
+        )  # fmt: skip
 
     def kill(self, module: str) -> None:
         """Kill a process, as a crash would."""
@@ -134,11 +158,14 @@ class Fog:
     async def edges(self) -> AsyncIterator[tuple[MqttEdge, ZenohEdge, Callable[[], None]]]:
         """Yield an MQTT edge, a zenoh edge, and a function that connects the former: register MQTT handlers before."""
         clock = SystemClock()
-        mqtt = MqttEdge(self.mosquitto.url, "test", clock, site="test")
+        own = self.test_credentials
+        mqtt = MqttEdge(self.mosquitto.url, "test", clock, site="test", credentials=own)
         tasks: list[asyncio.Task[None]] = []
         async with AsyncExitStack() as stack:
             zenoh = await stack.enter_async_context(
-                ZenohEdge.open(connect=[self.router.endpoint], clock=clock, role="test", id="test", site="test")
+                ZenohEdge.open(
+                    connect=[self.router.endpoint], clock=clock, role="test", id="test", site="test", credentials=own
+                )
             )
             yield mqtt, zenoh, lambda: tasks.append(asyncio.create_task(mqtt.run()))
             for task in tasks:
@@ -257,22 +284,21 @@ def fog(tmp_path: Path) -> Iterator[Fog]:
         running.close()
 
 
-@pytest.fixture
-def locked_fog(tmp_path: Path) -> Iterator[Fog]:
-    """Yield a fog whose servers encrypt, and admit only users with a password."""
-    locks = SiteLocks(tmp_path / "locks", "test")
-    locks.make(["127.0.0.1"])
-    running = Fog(tmp_path, locks)
+@pytest.fixture(scope="module")
+def shared_fog(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fog]:
+    """Yield a fog with a running map-service, shared by the tests of a module that kill and restart nothing."""
+    running = Fog(tmp_path_factory.mktemp("fog"))
     try:
+        running.start("map_service")
         yield running
     finally:
         running.close()
 
 
 @pytest.fixture(scope="module")
-def shared_fog(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fog]:
-    """Yield a fog with a running map-service, shared by the tests of a module that kill and restart nothing."""
-    running = Fog(tmp_path_factory.mktemp("fog"))
+def shared_open_fog(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fog]:
+    """Yield as `shared_fog` one whose servers admit everybody, unencrypted: for tests that change what they send."""
+    running = Fog(tmp_path_factory.mktemp("fog"), locked=False)
     try:
         running.start("map_service")
         yield running

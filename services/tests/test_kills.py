@@ -16,7 +16,6 @@ from typing import Any
 
 import httpx
 import pytest
-from redis.asyncio import Redis
 
 from fog_contracts import channels as ch
 from fog_contracts.messages import AreaHazard, NodeReading
@@ -175,7 +174,7 @@ class Operators:
         """Check that each acknowledged change has exactly one entry in the audit trail."""
         kinds = {"map_service": ["zone"], "hazard_aggregator": ["area", "override"], "planner": ["mission"]}
         async with self.turn["map_service"], self.turn["hazard_aggregator"], self.turn["planner"]:
-            async with Redis.from_url(self.fog.redis.url) as raw:
+            async with self.fog.raw_redis() as raw:
                 entries = {
                     service: sum([await raw.xlen(f"fog:test:audit:{kind}") for kind in found])
                     for service, found in kinds.items()
@@ -198,7 +197,9 @@ class Node:
     seq: Any = field(default_factory=itertools.count)
 
     def __post_init__(self) -> None:
-        self.mqtt = MqttEdge(self.fog.mosquitto.url, "kill-test", SystemClock(), site="test")
+        self.mqtt = MqttEdge(
+            self.fog.mosquitto.url, "kill-test", SystemClock(), site="test", credentials=self.fog.test_credentials
+        )
         self.mqtt.on(ch.AREA_HAZARD, self._on_hazard, AreaHazard)
 
     def _on_hazard(self, ids: Mapping[str, str], hazard: AreaHazard) -> None:

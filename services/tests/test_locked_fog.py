@@ -14,8 +14,7 @@ READY_S = 60.0
 SERVICES = {"hazard_aggregator": "hazard-aggregator", "map_service": "map-service", "planner": "planner"}
 
 
-async def test_services_work_over_https_with_their_own_credentials(locked_fog):
-    fog = locked_fog
+async def test_services_work_over_https_with_their_own_credentials(fog):
     http = fog.locks.folder("http")
     certificate = {
         "FOGNAV_HTTP_CERTIFICATE_FILE": str(http / "server.pem"),
@@ -37,8 +36,7 @@ async def test_services_work_over_https_with_their_own_credentials(locked_fog):
                 assert secret not in fog.log(module)
 
 
-async def test_service_without_credentials_gets_in_nowhere(locked_fog, until):
-    fog = locked_fog
+async def test_service_without_credentials_gets_in_nowhere(fog, until):
     fog.start("map_service", FOGNAV_CREDENTIALS_FILE="")
     url = await fog.url("map_service")
     async with httpx.AsyncClient() as client:
@@ -48,8 +46,7 @@ async def test_service_without_credentials_gets_in_nowhere(locked_fog, until):
     assert "FOGNAV_CREDENTIALS_FILE is not set" in fog.log("map_service")
 
 
-async def test_service_whose_certificate_is_unusable_says_which_file(locked_fog):
-    fog = locked_fog
+async def test_service_whose_certificate_is_unusable_says_which_file(fog):
     key = fog.locks.folder("http") / "server.key"
     other = SiteLocks(fog.folder / "other", "test")
     other.make(["127.0.0.1"])

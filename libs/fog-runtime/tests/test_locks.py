@@ -143,6 +143,22 @@ async def test_redis_admits_services_to_their_own_keys_and_nobody_else(redis, lo
 
 
 @pytest.mark.live
+async def test_locked_redis_has_after_a_restart_what_it_acknowledged_before(tmp_path):
+    locks = SiteLocks(tmp_path / "locks", "lab")
+    locks.make(HOSTS)
+    planner = of(locks, "planner")
+    script = "redis.call('HSET', KEYS[1], 'a', '1') redis.call('HSET', KEYS[1], 'b', '2') return 1"
+    with start_redis(tmp_path / "redis", locks=locks.folder("redis")) as server:
+        assert await redis_says(server.url, planner, "EVAL", script, 1, "fog:lab:goals") == 1
+        server.kill()
+        server.start()
+        assert await redis_says(server.url, planner, "HLEN", "fog:lab:goals") == 2
+        for password in ("", "x"):
+            nobody = Credentials("default", authority=planner.authority, passwords={"redis": password})
+            assert "Redis: " in str(await redis_says(server.url, nobody, "PING"))
+
+
+@pytest.mark.live
 async def test_store_and_lease_need_no_more_than_a_service_may(redis, locks):
     own = of(locks, "planner")
     async with (

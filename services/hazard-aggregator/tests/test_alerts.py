@@ -6,7 +6,6 @@ import httpx
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from redis.asyncio import Redis
 
 from fog_contracts import channels as ch
 from fog_contracts.codec import encode
@@ -183,7 +182,7 @@ async def test_alert_is_published_acknowledged_kept_over_a_kill_and_in_the_audit
         removal = {**body, "removed": True}
         assert (await client.put(f"{url}/api/v1/areas/hall", json=removal, headers=tokens["operator"])).is_success
         await until(lambda: heard[-1].total == 0, "ended")
-    async with Redis.from_url(fog.redis.url) as redis, asyncio.timeout(60):
+    async with fog.raw_redis() as redis, asyncio.timeout(60):
         actions: list[bytes] = []
         while len(actions) < 3:
             actions = [entry[b"action"] for _, entry in await redis.xrange("fog:test:audit:alert")]

@@ -6,7 +6,6 @@ import json
 import httpx
 import msgspec
 import pytest
-from redis.asyncio import Redis
 
 from fog_contracts.messages import AreaDefinition
 
@@ -72,7 +71,7 @@ async def test_one_of_eight_concurrent_changes_to_a_version_succeeds(fog, client
     assert sorted(answer.status_code for answer in answers) == [200] + 7 * [412]
     (label,) = [answer.json()["label"] for answer in answers if answer.status_code == 200]
     assert (await client.get("/api/v1/areas/hall")).json()["definition"]["label"] == label
-    async with Redis.from_url(fog.redis.url) as raw:
+    async with fog.raw_redis() as raw:
         assert json.loads(await raw.hget("fog:test:areas", "hall"))["label"] == label
         ((_, entry),) = await raw.xrange("fog:test:audit:area")
     assert (entry[b"who"], entry[b"id"]) == (b"anna", b"hall")
@@ -81,7 +80,7 @@ async def test_one_of_eight_concurrent_changes_to_a_version_succeeds(fog, client
 
 async def test_version_stored_by_another_writer_is_loaded_after_the_conflict(fog, client, tokens):
     other = AreaDefinition(id="hall", polygon=[(1.0, 1.0), (2.0, 1.0), (2.0, 2.0)], label="elsewhere", version=5)
-    async with Redis.from_url(fog.redis.url) as raw:
+    async with fog.raw_redis() as raw:
         await raw.hset("fog:test:areas", "hall", msgspec.json.encode(other))
     body = {"polygon": POLYGON, "nodes": ["n1"]}
     refused = await client.put("/api/v1/areas/hall", json=body, headers={**tokens["operator"], "If-Match": '"0"'})
@@ -132,7 +131,7 @@ async def test_repeated_put_returns_the_first_result_and_emptied_redis_is_restor
     refused = await client.put("/api/v1/areas/hall", json=body, headers=new)
     assert (refused.status_code, "exists already" in refused.json()["detail"]) == (412, True)
     assert (await client.put("/api/v1/areas/gate", json=body, headers=new)).status_code == 201
-    async with Redis.from_url(fog.redis.url) as raw:
+    async with fog.raw_redis() as raw:
         await raw.flushall()
         refused = await client.put("/api/v1/areas/hall", json=body, headers=tokens["operator"])
         assert (refused.status_code, "nothing was changed" in refused.json()["detail"]) == (503, True)
@@ -190,7 +189,7 @@ async def test_override_counts_at_once_survives_a_kill_and_ends_with_an_entry_in
         assert refused.status_code == 412
         short = await restarted.put(path, json={**body, "ttl_s": 0.2}, headers=tokens["operator"])
         assert short.headers["etag"] == '"2"'
-        async with asyncio.timeout(60), Redis.from_url(fog.redis.url) as raw:
+        async with asyncio.timeout(60), fog.raw_redis() as raw:
             while await raw.hlen("fog:test:overrides"):  # noqa: ASYNC110  # another process deletes it
                 await asyncio.sleep(0.05)
             entries = [entry for _, entry in await raw.xrange("fog:test:audit:override")]

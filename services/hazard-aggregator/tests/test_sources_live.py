@@ -1,10 +1,13 @@
 """Sources in the running aggregator: from the site file and over REST, through a real broker, kept across a kill."""
 
 import asyncio
+import secrets
 
 import aiomqtt
 import httpx
 import pytest
+
+from fog_runtime.mqtt_broker import Broker
 
 pytestmark = pytest.mark.live
 
@@ -29,7 +32,7 @@ async def wait_for(client, area: str, condition) -> dict:
 
 
 def broker(fog) -> aiomqtt.Client:
-    return aiomqtt.Client("127.0.0.1", int(fog.mosquitto.url.rsplit(":", maxsplit=1)[1]))
+    return Broker.of(fog.mosquitto.url, fog.test_credentials).client(f"device-{secrets.token_hex(4)}", None)
 
 
 async def test_sources_of_the_site_and_over_rest_decide_their_areas_and_survive_a_kill(fog, tokens):

@@ -6,6 +6,8 @@ import contextlib
 import aiomqtt
 import pytest
 
+from fog_runtime.mqtt_broker import Broker
+
 pytestmark = pytest.mark.live
 PERIOD_S = 0.1
 """Two sonars and a pause of 50 ms."""
@@ -46,9 +48,9 @@ async def test_thesis_node_and_robot_work_with_the_aggregator(fog, until):
     file.write_text(file.read_text().split("[[nodes]]")[0])
     fog.start("hazard_aggregator")
     await fog.ready("hazard_aggregator")
-    port = int(fog.mosquitto.url.rsplit(":", maxsplit=1)[1])
+    broker = Broker.of(fog.mosquitto.url, fog.test_credentials)
     robot = ThesisRobot()
-    async with aiomqtt.Client("127.0.0.1", port) as client, asyncio.TaskGroup() as tasks:
+    async with broker.client("thesis", None) as client, asyncio.TaskGroup() as tasks:
         await client.subscribe("WSN", qos=1)
 
         async def listen() -> None:

@@ -83,7 +83,7 @@ async def waits(fog, name: str, begins: str) -> None:
 async def test_second_copy_takes_over_after_death_hang_and_partition(fog, proxy, until, service):
     module = COPIES[service]
     first, second = module, f"{module}-2"
-    redis = f"redis://127.0.0.1:{await proxy.start()}/0"
+    redis = f"rediss://127.0.0.1:{await proxy.start()}/0"
     async with receiver(fog) as heard:
         for needed in COPIES.values():
             fog.start(needed)

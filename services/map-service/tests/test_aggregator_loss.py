@@ -171,10 +171,10 @@ class System:
 
 
 @pytest_asyncio.fixture(scope="module", loop_scope="module")
-async def system(shared_fog, until) -> AsyncIterator[System]:
-    await shared_fog.ready("map_service")
-    async with shared_fog.edges() as (mqtt, zenoh, connect):
-        running = System(shared_fog, mqtt, zenoh, until)
+async def system(shared_open_fog, until) -> AsyncIterator[System]:
+    await shared_open_fog.ready("map_service")
+    async with shared_open_fog.edges() as (mqtt, zenoh, connect):
+        running = System(shared_open_fog, mqtt, zenoh, until)
         await running.proxy.start()
         connect()
         await mqtt.wait_connected()

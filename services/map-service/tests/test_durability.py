@@ -7,7 +7,6 @@ import signal
 
 import httpx
 import pytest
-from redis.asyncio import Redis
 
 pytestmark = pytest.mark.live
 CIRCLE = {"kind": "BLOCKED", "shape": {"type": "circle", "centre": [6.0, 3.0], "radius": 0.5}, "reason": "wet floor"}
@@ -23,7 +22,7 @@ async def client(fog):
 
 @pytest.fixture
 async def raw(fog):
-    async with Redis.from_url(fog.redis.url) as raw:
+    async with fog.raw_redis() as raw:
         yield raw
 
 

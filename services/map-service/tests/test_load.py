@@ -36,9 +36,11 @@ WHOLE_FLOOR = {"type": "rectangle", "corner": [0.0, 0.0], "opposite": [100.0, 60
 CROSSING = {"type": "polygon", "points": [[0.1 * i, 30.0 + (-1) ** i * (i % 7)] for i in range(500)]}
 TOO_LONG = {"type": "corridor", "line": [[1.0 + i % 2 * 90.0, 1.0 + i % 2 * 58.0] for i in range(500)], "width": 0.3}
 STOPPED_CLIENT = """
-import sys, time, zenoh
+import pathlib, sys, time, zenoh
+from fog_runtime.credentials import Credentials
 from fog_runtime.zenoh_edge import session_config
-session = zenoh.open(session_config("client", connect=[sys.argv[1]]))
+own = Credentials.read(pathlib.Path(sys.argv[2]))
+session = zenoh.open(session_config("client", connect=[sys.argv[1]], credentials=own))
 session.declare_subscriber("fog/test/map/heartbeat", lambda _: None)
 answers = []
 while not answers:
@@ -131,8 +133,9 @@ async def test_client_that_stops_with_twenty_open_snapshots_does_not_silence_the
         follower = Follower(zenoh)
         await follower.load()
         client = await asyncio.create_subprocess_exec(
-            sys.executable, "-c", STOPPED_CLIENT, fog.router.endpoint, stdout=asyncio.subprocess.PIPE
-        )
+            sys.executable, "-c", STOPPED_CLIENT, fog.router.endpoint, str(fog.credentials_file("test")),
+            stdout=asyncio.subprocess.PIPE,
+        )  # fmt: skip
         try:
             assert await client.stdout.readline() == b"asked\n"
             os.kill(client.pid, signal.SIGSTOP)

@@ -4,7 +4,6 @@ import json
 
 import httpx
 import pytest
-from redis.asyncio import Redis
 
 pytestmark = pytest.mark.live
 CIRCLE = {"type": "circle", "centre": [2.0, 3.0], "radius": 0.2}
@@ -17,7 +16,7 @@ async def test_map_service_starts_without_its_unusable_zones_and_names_them_unti
         "too-costly": {"id": "too-costly", "kind": "PENALTY", "factor": 9.0, "shape": CIRCLE, "version": 1},
         "bow-tie": {"id": "bow-tie", "kind": "BLOCKED", "shape": BOW_TIE, "version": 1},
     }
-    async with Redis.from_url(fog.redis.url) as raw:
+    async with fog.raw_redis() as raw:
         await raw.hset("fog:test:zones", mapping={name: json.dumps(zone) for name, zone in stored.items()})
     fog.start("map_service")
     async with httpx.AsyncClient(base_url=await fog.ready("map_service"), timeout=15) as client:

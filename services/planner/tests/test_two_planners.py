@@ -192,7 +192,7 @@ async def sent(planners: Planners, tokens, leader: str) -> str:
 
 async def test_leader_that_is_cut_off_from_redis_gives_way_to_the_other(fog, proxy, until, tokens):
     fog.start("map_service")
-    url = f"redis://127.0.0.1:{await proxy.start()}/0"
+    url = f"rediss://127.0.0.1:{await proxy.start()}/0"
     async with robot_on_the_floor(fog) as robot:
         fog.start("planner", "planner", FOGNAV_REDIS_URL=url)
         await fog.ready("planner")

@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING, Final, Literal
 
-from fog_contracts.channels import CHANNELS, NODE, ROLES, Channel, Role
+from fog_contracts.channels import AGGREGATOR, CHANNELS, NODE, ROLES, Channel, Role
 from fog_contracts.generate import NOTE
 
 if TYPE_CHECKING:
@@ -40,6 +40,8 @@ def mqtt_acl(site: str = "+", *, unrestricted: Sequence[str] = ()) -> str:
 
 def _section(role: Role, site: str) -> str:
     lines = _lines(role, site)
+    if role == AGGREGATOR:
+        lines.append("read  #")  # a source of an area may publish on any topic
     return "\n".join([f"# {ROLES[role]}", f"user {role}", *(f"topic {line}" for line in lines), ""])
 
 

@@ -32,20 +32,20 @@ TOOLS: Final[Mapping[str, Sequence[Server]]] = {
 }
 """The same for the tools of the fog node's administrator, and for a simulated world."""
 _OWN_TABLES: Final[Mapping[str, Sequence[str]]] = {
-    "hazard-aggregator": ("areas", "hazards", "overrides", "override_rests"),
+    "hazard-aggregator": ("areas", "hazards", "overrides", "override_rests", "alerts", "history:*"),
     "map-service": ("zones", "zone_times"),
     "planner": ("goals",),
 }
 _AUDITED: Final[Mapping[str, Sequence[str]]] = {
-    "hazard-aggregator": ("area", "override", "store"),
+    "hazard-aggregator": ("alert", "area", "override", "store"),
     "map-service": ("zone", "store"),
-    "planner": ("mission", "robot", "store"),
+    "planner": ("mission", "robot", "stop", "store"),
 }
 _BOOKKEEPING: Final = ("probe", "generation", "writes", "floors", "no-attempt", "idempotency:*")
 """Keys that every service of a site writes: by which they notice that Redis lost something."""
 _COMMANDS: Final = (
-    "+get +set +setrange +del +hget +hset +hdel +hgetall +hlen +hincrby +xadd +xrevrange +pttl +eval +multi +exec +wait"
-    " +ping +config|get +client|setname +client|id +hello +auth +select"
+    "+get +set +setrange +del +hget +hset +hdel +hgetall +hlen +hincrby +xadd +xdel +xrange +xrevrange +pttl"
+    " +eval +multi +exec +wait +ping +config|get +client|setname +client|id +hello +auth +select"
 )
 
 
@@ -81,8 +81,12 @@ def redis_administrator_line(user: str, password: str) -> str:
     return f"user {user} on {_redis_secret(password)} ~* &* +@all"
 
 
-REDIS_NOBODY: Final = "user default off"
-"""The line that refuses who gives no name."""
+REDIS_NOBODY: Final = "user default off resetpass ~* &* +@all"
+"""The line that refuses who gives no name.
+
+It needs the rights that it seems to give away: in this user's name Redis repeats its log when it starts, and leaves out
+transactions for which the user has no right (7.0). Nobody can log in as a user that is off.
+"""
 
 
 def _redis_secret(password: str) -> str:

@@ -93,9 +93,7 @@ def test_quota_is_written_in_the_words_of_either_version_of_control_groups(
     monkeypatch.setattr(Path, "rmdir", rmdir)
     with cpu_quota.cpu_quota(0.2, tmp_path) as group:
         group.add(41)
-    words = (
-        {"cpu.max": "20000 100000"} if version == 2 else {"cpu.cfs_period_us": "100000", "cpu.cfs_quota_us": "20000"}
-    )
+    words = {"cpu.max": "2000 10000"} if version == 2 else {"cpu.cfs_period_us": "10000", "cpu.cfs_quota_us": "2000"}
     assert kept == [{**words, "cgroup.procs": "41"}]
     assert removed == [tmp_path if version == 2 else tmp_path / "cpu"]
 

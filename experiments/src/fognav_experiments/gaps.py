@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -28,7 +29,9 @@ from robot_agent.localization.pose import Pose2
 from robot_agent.motion.local_planner import decide, make_job, twist
 from robot_agent.motion.path_follower import PathFollower
 from robot_agent.motion.recent_scans import RecentScans
+from robot_agent.motion.surfaces import smoothed
 from robot_agent.safety.gate import SafetyOutputs
+from robot_agent.safety.stop_field import StopField
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -218,6 +221,9 @@ class _Robot:
         self.points: NDArray[np.float64] = np.zeros((0, 2))
         """Points (n, 2; m) of the last scans, frame `map`."""
         self._scans = RecentScans()
+        self._raw: deque[tuple[float, NDArray[np.float64]]] = deque()
+        """Times of the scans that the stop field remembers, and their points in `map`."""
+        self._field = StopField(_AGENT.footprint, _DRIVE, _AGENT.stop_field)
 
     def scan(self, now: float) -> None:
         """Take a scan: where the beams met something, with noise."""
@@ -228,6 +234,14 @@ class _Robot:
         there = np.column_stack((np.cos(bearings[seen]), np.sin(bearings[seen])))
         self._scans.add(DeskewedScan(ranges[seen, None] * there, self.pose, now), now)
         self.points = self._scans.points(self.pose, now)
+        self._raw.append((now, self.pose.transform(smoothed(ranges[seen, None] * there))))
+
+    def guarded(self, wheels: Wheels, now: float) -> Wheels:
+        """Return what the stop field leaves of these wheel speeds."""
+        while self._raw and self._raw[0][0] < now - _AGENT.stop_field.memory:
+            self._raw.popleft()
+        points = np.vstack([points for _, points in self._raw] or [np.zeros((0, 2))])
+        return self._field.limit(wheels, self.pose.inverse_transform(points)).wheels
 
     def move(self, target: tuple[float, float]) -> None:
         """Drive for a step; each wheel approaches its target as fast as the base stops at least."""
@@ -249,9 +263,10 @@ def _unguarded(wheels: Wheels, _now: float) -> Wheels:
     return wheels
 
 
-def drive(scene: Scene, rng: np.random.Generator, seconds: float = _TIME_S) -> Outcome:
+def drive(scene: Scene, rng: np.random.Generator, seconds: float = _TIME_S, *, stop_field: bool = False) -> Outcome:
     """Let the robot follow the scene's path for a time, or until it has passed, touched something or got stuck."""
     robot = _Robot(scene, rng)
+    guard = robot.guarded if stop_field else _unguarded
     follower = PathFollower(scene.path, math.inf)
     free = np.zeros(_GRID.shape, np.uint8)
     wheels, recoveries = WheelControl(_AGENT), Recoveries()
@@ -279,7 +294,7 @@ def drive(scene: Scene, rng: np.random.Generator, seconds: float = _TIME_S) -> O
                 reversals += turning * decision.w < 0.0
                 turning = decision.w
         if step % _STREAM == 0:
-            wheels.command(_ALLOWED, _unguarded, now)
+            wheels.command(_ALLOWED, guard, now)
         robot.move(wheels.speeds)
         step += 1
     return Outcome(
@@ -290,13 +305,13 @@ def drive(scene: Scene, rng: np.random.Generator, seconds: float = _TIME_S) -> O
     )
 
 
-def series(kind: str, gap: float, seeds: int, seconds: float = _TIME_S) -> Row:
+def series(kind: str, gap: float, seeds: int, seconds: float = _TIME_S, *, stop_field: bool = False) -> Row:
     """Return the outcomes of drives of some seconds at most at one kind of place with gaps of one width (m)."""
     make = KINDS[kind]
     ends = []
     for seed in range(seeds):
         rng = np.random.default_rng((seed, round(gap * 1000), list(KINDS).index(kind)))
-        ends.append(drive(make(gap, rng), rng, seconds))
+        ends.append(drive(make(gap, rng), rng, seconds, stop_field=stop_field))
     times = [end.time_s for end in ends if end.passed]
     return Row(
         kind=kind,
@@ -318,12 +333,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seeds", type=int, default=20, help="drives at each place (default: 20)")
     parser.add_argument("--kind", choices=sorted(KINDS), help="only this kind of place")
     parser.add_argument("--gap", type=float, help="only this width (m)")
+    parser.add_argument("--stop-field", action="store_true", help="limit every command by the stop field, too")
     parser.add_argument("--json", action="store_true", help="print one JSON object per row")
     given = parser.parse_args(arguments)
     contacts = 0
     for kind in [given.kind] if given.kind else KINDS:
         for gap in [given.gap] if given.gap else GAPS:
-            row = series(kind, gap, given.seeds)
+            row = series(kind, gap, given.seeds, stop_field=given.stop_field)
             contacts += row.contacts
             text = (
                 msgspec.json.encode(row).decode()

@@ -166,9 +166,9 @@ class MotionConfig:
     """Free space (m) beside the body from which on the robot passes at full speed."""
     speed_narrow: float = 0.10
     """Speed (m/s) where there is hardly any."""
-    lookahead_narrow: float = 0.35
+    lookahead_narrow: float = 0.2
     """Share of the lookahead that remains there."""
-    path_narrow: float = 4.0
+    path_narrow: float = 16.0
     """How many times more the distance from the path counts there: a curve must not be cut."""
 
 

@@ -64,9 +64,9 @@ def test_lidar_off_the_centre_and_turned_is_placed_by_its_configuration():
 
 
 def test_times_between_first_and_last_sample_are_even():
-    near, localizer = NearPoints(LocalizationConfig(), 1.0, 0.5), driven(0.3, 2.0)
+    near, localizer = NearPoints(LocalizationConfig(), 1.0, 0.5), driven(0.8, 2.0)
     near.add(LidarSamples(np.zeros(3, np.float32), np.full(3, 0.8, np.float32), 1.2, 1.4))
-    assert near.seen_from(localizer, 1.4)[:, 0] == pytest.approx([0.74, 0.77, 0.8], abs=1e-5)
+    assert near.seen_from(localizer, 1.4)[:, 0] == pytest.approx([0.64, 0.72, 0.8], abs=1e-5)
 
 
 def test_nothing_is_seen_without_odometry_or_samples():

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fog_contracts.costs import DEFAULT_INFLATION
+from fog_contracts.costs import DEFAULT_INFLATION, UNKNOWN
 from fog_kernels.body import cover
 from fog_kernels.clearance import clearance
 from fog_kernels.dwa import DwaLimits, DwaSettings
@@ -190,6 +190,22 @@ def test_trail_that_ends_where_the_robot_stands_gives_no_move(theta):
     there = Pose2(0.0, 0.0, math.pi)
     move = RecoveryMove(trail=np.array([(0.0, 0.0)]))
     assert recovery_speeds(move, there, around([], x=0.0, y=0.0), ROUND, PADDING, 0.3) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize(("body", "front", "rear"), [(ROUND, 0.17, 0.17), (LONG, 0.15, 0.3)])
+def test_places_that_nobody_knows_are_not_free_under_any_part_of_the_body(body, front, rear):
+    field = around([])
+    cost = field.cost.copy()
+    east = field.origin_x + field.resolution * np.arange(cost.shape[1])
+    cost[:, east > 2.0] = UNKNOWN
+    field = field._replace(cost=cost)
+    middle, ahead = np.array([1.5]), np.array([0.0])
+    beside = np.array([2.05 - 0.8 * front])
+    assert clearances(field, body, (middle, middle, ahead))[0] > 0.1
+    assert clearances(field, body, (beside, middle, ahead))[0] == 0.0
+    back = RecoveryMove(trail=np.array([(1.9 + step, 1.5) for step in np.arange(0.02, 0.5, 0.02)]))
+    pose = Pose2(2.0 - rear - 0.04, 1.5, math.pi)
+    assert recovery_speeds(back, pose, field, body, PADDING, 0.3) is None
 
 
 def test_unknown_places_are_not_free():

@@ -14,6 +14,8 @@ from fognav.bench.robot_system import RobotSystem
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
+NORMAL_PRIORITY: Final = {"REALTIME_PRIORITY": "0", "AGENT_REALTIME_PRIORITY": "0"}
+"""Settings under a quota, which limits processes of normal priority only."""
 SETTLE_S: Final = 5.0
 """Between a change and the measurement that follows it."""
 
@@ -25,14 +27,19 @@ def measure(seconds: float, quota: float | None, on_phase: Callable[[str], objec
     """
     with ExitStack() as contexts:
         group = None if quota is None else contexts.enter_context(cpu_quota(quota))
-        return asyncio.run(_measure(seconds, (lambda _pid: None) if group is None else group.add, on_phase))
+        if group is None:
+            return asyncio.run(_measure(seconds, lambda _pid: None, {}, on_phase))
+        return asyncio.run(_measure(seconds, group.add, NORMAL_PRIORITY, on_phase))
 
 
 async def _measure(
-    seconds: float, on_start: Callable[[int], object], on_phase: Callable[[str], object]
+    seconds: float,
+    on_start: Callable[[int], object],
+    settings: Mapping[str, str],
+    on_phase: Callable[[str], object],
 ) -> dict[str, object]:
     on_phase("starting fog, simulator and robot")
-    async with RobotSystem(on_start) as system:
+    async with RobotSystem(on_start, settings) as system:
         on_phase("restarting the agent")
         ready_s = await system.restart_agent()
         await system.wait_enabled()

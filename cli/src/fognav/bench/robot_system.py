@@ -7,11 +7,10 @@ from __future__ import annotations
 
 import asyncio
 import time
-from contextlib import AsyncExitStack
 from itertools import cycle
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Final, Self
+from typing import TYPE_CHECKING, Final
 
 from fog_contracts import channels as ch
 from fog_contracts.messages import RobotPose, RobotState
@@ -21,12 +20,13 @@ from fog_runtime.robot_commands import RobotCommands
 from fog_runtime.zenoh_edge import ZenohEdge
 from fog_supervisor import net
 from fognav.bench.office import corridor_rows, make_office
+from fognav.bench.running import RunningSystem, first_child
 from fognav.stack import AGENT, PLANNER, ROBOT, WATCHDOG, Stack, StackConfig
 from fognav_sim.drive.operator import OperatorPolicy
 from fognav_sim.planner_client import put_goal
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from fog_contracts.grid import StaticMap
     from fog_supervisor.supervisor import Event
@@ -59,13 +59,17 @@ def write_site(folder: Path, floor: StaticMap) -> Path:
     return folder
 
 
-class RobotSystem:
+class RobotSystem(RunningSystem):
     """The running system, with an operator who keeps the robot enabled."""
 
-    def __init__(self, on_start: Callable[[int], object]) -> None:
-        """`on_start` is called with the id of each process of the robot that is started, but not with its children."""
+    def __init__(self, on_start: Callable[[int], object], settings: Mapping[str, str] | None = None) -> None:
+        """`on_start` is called with the id of each process of the robot that is started, but not with its children.
+
+        `settings`: further FOGNAV_* variables of all processes, named without the prefix.
+        """
+        super().__init__()
         self._on_start = on_start
-        self._contexts = AsyncExitStack()
+        self._settings = settings
         self._started_at: dict[str, float] = {}
         self._clock = SystemClock()
         self._policy = OperatorPolicy(self._clock.now())
@@ -74,22 +78,11 @@ class RobotSystem:
         """The robot's speed (m/s) by its own last pose."""
         self._goals = cycle(_PLACES)
 
-    async def __aenter__(self) -> Self:
-        try:
-            await self._start()
-        except BaseException:
-            await self._contexts.aclose()
-            raise
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        await self._contexts.aclose()
-
     async def _start(self) -> None:
         contexts = self._contexts
         folder = Path(contexts.enter_context(TemporaryDirectory(prefix="fognav-bench-")))
         site = await asyncio.to_thread(write_site, folder, make_office(*FLOOR_M))
-        config = StackConfig(site_dir=site, robot=NAME)
+        config = StackConfig(site_dir=site, robot=NAME, extra=self._settings)
         self.stack = await contexts.enter_async_context(Stack(config, self._on_event))
         await self.stack.start()
         edge = await contexts.enter_async_context(
@@ -128,10 +121,9 @@ class RobotSystem:
     def pids(self) -> dict[str, int]:
         """Return the ids of the robot's processes, the guardian among them."""
         pids = {name: pid for name, pid in self.stack.pids().items() if name in ROBOT}
-        watchdog = pids[WATCHDOG]
-        children = Path(f"/proc/{watchdog}/task/{watchdog}/children").read_text("ascii").split()
-        if children:
-            pids[GUARDIAN] = int(children[0])
+        guardian = first_child(pids[WATCHDOG])
+        if guardian is not None:
+            pids[GUARDIAN] = guardian
         return pids
 
     async def restart_agent(self) -> float:

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
+from robot_agent.motion.surfaces import smoothed
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -71,4 +73,4 @@ class NearPoints:
         base_x = self._lidar.lidar_x + ranges * np.cos(angles)
         base_y = self._lidar.lidar_y + ranges * np.sin(angles)
         points = np.column_stack((x + cos * base_x - sin * base_y, y + sin * base_x + cos * base_y))
-        self._batches.append(_Batch(points, times))
+        self._batches.append(_Batch(smoothed(points), times))

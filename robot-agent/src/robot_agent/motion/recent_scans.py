@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from robot_agent.motion.surfaces import smoothed
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -24,12 +26,15 @@ class RecentScans:
     """The newest scans of one lidar, placed by odometry relative to the newest one. Times: s, monotonic."""
 
     def __init__(self) -> None:
-        self._scans: deque[tuple[float, DeskewedScan]] = deque(maxlen=SCANS)
+        self._newest: DeskewedScan | None = None
+        self._scans: deque[tuple[float, Pose2, NDArray[np.float64]]] = deque(maxlen=SCANS)
+        """Time, pose in `odom` and points in `base` of each."""
 
     def add(self, scan: DeskewedScan, now: float) -> None:
         """Add the newest scan; the same one again is ignored."""
-        if not self._scans or self._scans[-1][1] is not scan:
-            self._scans.append((now, scan))
+        if self._newest is not scan:
+            self._newest = scan
+            self._scans.append((now, scan.odom, smoothed(scan.points)))
 
     def points(self, newest: Pose2, now: float) -> NDArray[np.float64]:
         """Return all points (n, 2; m) in the frame in which `newest` is the pose of the newest scan."""
@@ -37,7 +42,5 @@ class RecentScans:
             self._scans.popleft()
         if not self._scans:
             return np.zeros((0, 2))
-        last = self._scans[-1][1].odom
-        return np.vstack(
-            [newest.compose(scan.odom.relative_to(last)).transform(scan.points) for _, scan in self._scans]
-        )
+        last = self._scans[-1][1]
+        return np.vstack([newest.compose(odom.relative_to(last)).transform(points) for _, odom, points in self._scans])

@@ -36,6 +36,8 @@ _LOOK_M: Final = 0.1
 _LOOK_RAD: Final = 0.35
 _STEPS: Final = 10
 _ROUNDING_M: Final = 1e-3
+_RIM: Final = np.array([(0.0, 0.0), *((math.cos(turn), math.sin(turn)) for turn in np.arange(16) * math.tau / 16)]).T
+"""Where a disc of radius 1 is looked at: its centre, and its rim every 7 cm of a body of 0.17 m."""
 
 
 class RecoveryMove(NamedTuple):
@@ -60,23 +62,31 @@ def recovery_speeds(
 def clearances(
     around: Clearance, body: Body, poses: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 ) -> NDArray[np.float64]:
-    """Return how far (n; m) the body at poses x, y, theta (each n; frame `map`) is from everything; 0 off the map."""
+    """Return how far (n; m) the body at poses x, y, theta (each n; frame `map`) is from everything.
+
+    0 where any part of it is off the map or over cells that nobody knows.
+    """
     x, y, theta = poses
-    if len(body.discs):
-        cos, sin = np.cos(theta), np.sin(theta)
-        away = [
-            distances(around, np.column_stack((x + cos * bx - sin * by, y + sin * bx + cos * by))) - radius
-            for bx, by, radius in body.discs
-        ]
-        least: NDArray[np.float64] = np.min(away, axis=0)
-    else:
-        least = distances(around, np.column_stack((x, y))) - body.circumscribed
+    cos, sin = np.cos(theta), np.sin(theta)
+    discs = body.discs if len(body.discs) else np.array([(0.0, 0.0, body.circumscribed)])
+    least = np.full(len(x), math.inf)
+    for bx, by, radius in discs:
+        centre_x, centre_y = x + cos * bx - sin * by, y + sin * bx + cos * by
+        away = distances(around, np.column_stack((centre_x, centre_y))) - radius
+        rim_x, rim_y = radius * _RIM
+        known = _known(around, centre_x[:, None] + rim_x, centre_y[:, None] + rim_y).all(axis=1)
+        least = np.minimum(least, np.where(known, away, 0.0))
+    return least
+
+
+def _known(around: Clearance, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which points (n, k; m) are on the map and in cells that somebody knows."""
     last = len(around.cost) - 1
     column = np.floor((x - around.origin_x) / around.resolution).astype(np.int64)
     row = np.floor((y - around.origin_y) / around.resolution).astype(np.int64)
-    outside = (column < 0) | (row < 0) | (column > last) | (row > last)
-    unknown = around.cost[row.clip(0, last), column.clip(0, last)] == UNKNOWN
-    return np.where(outside | unknown, 0.0, least)
+    inside = (column >= 0) & (row >= 0) & (column <= last) & (row <= last)
+    known: NDArray[np.bool_] = inside & (around.cost[row.clip(0, last), column.clip(0, last)] != UNKNOWN)
+    return known
 
 
 def _wanted(move: RecoveryMove, pose: Pose2, cap: float) -> tuple[float, float]:

@@ -8,11 +8,11 @@ import random
 import secrets
 import signal
 import sys
-from contextlib import AsyncExitStack, suppress
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Final, Self
+from typing import Final
 
 from fog_contracts.messages import Pose
 from fog_contracts.site import RobotSite
@@ -24,6 +24,7 @@ from fog_supervisor.supervisor import Program, Supervisor
 from fognav.bench.office import corridor_rows, make_office
 from fognav.bench.reactions.body import BASE, LIDAR, Body
 from fognav.bench.reactions.fog import ROBOT, SITE, Fog
+from fognav.bench.running import RunningSystem, first_child
 
 ROUTER: Final = "zenoh-router"
 WATCHDOG: Final = "watchdog"
@@ -37,26 +38,15 @@ _STEADY_S: Final = 0.4
 _STRAIGHT_M_S: Final = 0.03
 
 
-class Rig:
+class Rig(RunningSystem):
     """The running robot. `folder` gets its files and logs."""
 
     def __init__(self, seed: int) -> None:
-        self._contexts = AsyncExitStack()
+        super().__init__()
         self._rng = random.Random(seed)  # noqa: S311  # when a fault comes, not a secret
         self._seed = seed
         self._clock = SystemClock()
         self._signalled: list[int] = []
-
-    async def __aenter__(self) -> Self:
-        try:
-            await self._start()
-        except BaseException:
-            await self._contexts.aclose()
-            raise
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        await self._contexts.aclose()
 
     async def _start(self) -> None:
         contexts = self._contexts
@@ -114,8 +104,7 @@ class Rig:
         program = WATCHDOG if name == GUARDIAN else name
         pid = self._supervisor.pid(program)
         if pid is not None and name == GUARDIAN:
-            children = Path(f"/proc/{pid}/task/{pid}/children").read_text("ascii").split()
-            pid = int(children[0]) if children else None
+            pid = first_child(pid)
         if pid is None:
             raise ProcessLookupError(f"{name} does not run")
         return pid

@@ -215,6 +215,31 @@ async def test_unanswered_and_damaged_snapshots_are_requested_again(mapping):
     assert mapping.fog.requests == 3
 
 
+async def test_map_that_takes_long_to_prepare_does_not_block_the_stream(mapping, monkeypatch):
+    begun, released, prepare = threading.Event(), threading.Event(), mapping.core.prepare_map
+
+    def prepare_slowly(snapshot):
+        begun.set()
+        released.wait(DEADLINE_S)
+        return prepare(snapshot)
+
+    monkeypatch.setattr(mapping.core, "prepare_map", prepare_slowly)
+    guardian = FakeGuardian()
+    stream = asyncio.create_task(mapping.service.stream_loop(guardian, FakeLidar()))
+    try:
+        mapping.fog.answers.put_nowait(mapping.master.snapshot())
+        await mapping.until(begun.is_set)
+        before = len(guardian.sent)
+        await mapping.until(lambda: len(guardian.sent) >= before + 5)
+        assert mapping.core.replica.version is None
+        released.set()
+        await mapping.until(lambda: mapping.core.replica.version == mapping.master.version)
+    finally:
+        released.set()
+        stream.cancel()
+        await asyncio.gather(stream, return_exceptions=True)
+
+
 async def test_hanging_decision_does_not_block_the_stream(rig, monkeypatch):
     release, begun = threading.Event(), threading.Event()
 

@@ -71,6 +71,30 @@ def test_between_updates_the_pose_follows_the_odometry():
     assert one.pose(Pose2(9.0, 9.0, 1.0).compose(step)) == pytest.approx(START.compose(step))
 
 
+@pytest.mark.parametrize(
+    ("step", "updated"),
+    [
+        (Pose2(0.09, 0.0, 0.0), False),
+        (Pose2(0.11, 0.0, 0.0), True),
+        (Pose2(0.0, 0.0, 0.09), False),
+        (Pose2(0.0, 0.0, -0.11), True),
+    ],
+)
+def test_scan_corrects_the_pose_after_0_1_m_or_0_1_rad_and_not_before(step, updated):
+    one = ParticleFilter(CONFIG, 1)
+    one.start(START, ORIGIN, 0.1, 0.05)
+    one.add(scan_at(START, ORIGIN), FIELDS, recover=False)
+    before = one.covariance.copy()
+    one.add(scan_at(START.compose(step), step), FIELDS, recover=False)
+    assert (one.covariance != before).any() == updated
+
+
+def test_defaults_are_those_that_recorded_drives_with_real_odometry_support():
+    # Odometry of real bases is 5 to 90 times better than alphas of 0.2 say, and sharper weights lose honesty.
+    assert CONFIG.alphas == (0.05, 0.05, 0.05, 0.05)
+    assert (CONFIG.sharpness, CONFIG.beams, CONFIG.particles_min, CONFIG.particles_max) == (12.0, 60, 500, 2000)
+
+
 def test_standing_robot_is_not_updated():
     one = ParticleFilter(CONFIG, 1)
     one.start(START, ORIGIN, 0.1, 0.05)

@@ -120,6 +120,46 @@ def test_turning_robot_is_judged_where_it_will_head():
     assert zone(seeing(missing=40.0, towards=140.0), Twist(-0.3, 2.7)) == "stop"
 
 
+@pytest.mark.parametrize(("turning", "lead"), [(0.8, 0.2), (1.6, 0.4), (3.0, 0.75), (9.0, math.pi / 4)])
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_robot_is_judged_half_of_half_a_second_ahead_and_at_45_degrees_at_most(turning, lead, side):
+    twist = Twist(0.3, side * turning)
+    border = math.degrees(lead + VisibilityConfig().half_width)
+    # Where blind sectors begin to count shows where the robot looks.
+    inside, outside = (seeing(blind=10.0, towards=side * (border + off), walls=OPEN) for off in (-12.5, 12.5))
+    assert (zone(inside, twist), zone(outside, twist)) == ("slow", "free")
+
+
+def test_sector_counts_by_half_of_its_samples_and_by_one_of_two_scans():
+    def after(*returned):
+        visibility = Visibility(VisibilityConfig())
+        for share in returned:
+            angles = np.repeat(sector_angles(), 4)
+            visibility.update(angles, np.tile(np.arange(4) < share, 72), WALLS)
+        return zone(visibility)
+
+    assert (after(2, 2), after(1, 1)) == ("free", "stop")
+    assert (after(2, 1), after(1, 2), after(2, 1, 1)) == ("free", "free", "stop")
+
+
+def test_sector_with_one_sample_is_measured():
+    angles = sector_angles()
+    visibility = Visibility(VisibilityConfig())
+    for _ in range(2):
+        visibility.update(angles, np.ones(72, np.bool_), OPEN)
+    assert zone(visibility) == "free"
+    visibility.update(angles[:0], np.zeros(0, np.bool_), OPEN)
+    assert zone(visibility) == "free"
+    visibility.update(angles[:0], np.zeros(0, np.bool_), OPEN)
+    assert visibility.limit((0.3, 0.3), FORWARD).reason == (
+        "the lidar sees nothing ahead: it is blind there, or faces glass"
+    )
+    assert visibility.limit((-0.3, -0.3), BACKWARD).reason == (
+        "the lidar sees nothing behind: it is blind there, or faces glass"
+    )
+    assert visibility.limit((0.05, 0.05), Twist(0.05, 0.0)).wheels == (0.0, 0.0)
+
+
 @given(st.floats(-20.0, 20.0))
 def test_every_direction_has_a_sector_whose_middle_is_near(angle):
     sector = int(sector_of(np.array([angle]))[0])

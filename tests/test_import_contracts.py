@@ -27,6 +27,7 @@ EDGES = {
     "fognav_experiments.comparison.records", "fognav_experiments.comparison.report",
     "fognav_experiments.comparison.runner",
     "fognav_experiments.comparison.trial", "fognav_experiments.cpu", "fognav_experiments.gaps",
+    "fognav_experiments.scenarios.description", "fognav_experiments.scenarios.stage",
     "fognav_experiments.lockstep", "fognav_experiments.rigs", "fognav_experiments.smoothness",
     "fognav.__main__", "fognav.bench", "fognav.bench_command",
     "fognav.alert_command", "fognav.ca_command",

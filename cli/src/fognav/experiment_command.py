@@ -9,7 +9,8 @@ import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from fognav import checkout, kernels
-from fognav.output import NOT_TRUE, WrongUseError, console, exit_codes, print_line
+from fognav.operate.options import JsonOption  # noqa: TC001  # Typer reads annotations at run time
+from fognav.output import NOT_TRUE, WrongUseError, console, exit_codes, print_json, print_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -91,6 +92,53 @@ def report_command(
             raise WrongUseError(str(error)) from error
     for file in written:
         print_line(str(file))
+
+
+@experiment_app.command("scenarios", epilog="Example: fognav experiment scenarios wifi-gap-5s kidnapped")
+def scenarios_command(
+    names: Annotated[list[str] | None, typer.Argument(metavar="[NAME]...", help="Scenarios; default: all.")] = None,
+    *,
+    json: JsonOption = False,
+) -> None:
+    """Play drives on which something goes wrong, in lockstep, and check how they end.
+
+    Each is a file in experiments/scenarios with what happens and what is expected. The exit code is 1 if one of them
+    ends in another way.
+    """
+    from fognav_experiments.scenarios.stage import ScenarioError, play, read_scenario  # noqa: PLC0415  # keeps others fast
+
+    with exit_codes():
+        files = _scenario_files(names or [])
+        try:
+            scenarios = {file.stem: read_scenario(file) for file in files}
+        except ScenarioError as error:
+            raise WrongUseError(str(error)) from error
+        kernels.warm_cache(print_line)
+        rows = []
+        for name, scenario in scenarios.items():
+            played = play(scenario, checkout.root() / "sites")
+            as_expected = not played.deviations
+            rows.append({
+                "scenario": name, "title": scenario.title, "as_expected": as_expected, "outcome": played.outcome,
+                "distance_m": played.result.distance_m, "time_s": played.result.time_s, "deviations": played.deviations,
+            })  # fmt: skip
+            if not json:
+                mark, time_s = "ok    " if as_expected else "FAILED", played.result.time_s or scenario.seconds
+                print_line(f"{mark} {name:22} {played.outcome:9} {played.result.distance_m:6.1f} m {time_s:6.1f} s")
+                for deviation in played.deviations:
+                    print_line(f"       {deviation}")
+    if json:
+        print_json({"scenarios": rows})
+    if not all(row["as_expected"] for row in rows):
+        raise typer.Exit(NOT_TRUE)
+
+
+def _scenario_files(names: list[str]) -> list[Path]:
+    folder = checkout.root() / "experiments" / "scenarios"
+    known = {file.stem: file for file in sorted(folder.glob("*.toml"))}
+    if unknown := [name for name in names if name not in known]:
+        raise WrongUseError(f"no scenario {', '.join(unknown)}: there are {', '.join(known)}")
+    return [known[name] for name in names or known]
 
 
 def _chosen(setups: str) -> list[ProfileName]:

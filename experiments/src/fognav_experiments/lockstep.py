@@ -101,7 +101,7 @@ class LockstepResult(DriveSummary, frozen=True, kw_only=True):
     track: list[tuple[float, float]]
 
 
-class _Drive:
+class LockstepDrive:
     """One drive: system, scenario and the records of it."""
 
     def __init__(  # noqa: PLR0913  # the parts of a drive
@@ -357,7 +357,7 @@ def run_lockstep(  # noqa: PLR0913  # the options of a run
     )
     mission = RobotGoal(goal_id="lockstep-1", pose=pose)
     schedule = HazardSchedule.of(site, seed, hazard) if hazard is not None else None
-    run = _Drive(
+    run = LockstepDrive(
         site, start, mission, seed, noise,
         watched=watched, hazard=schedule, bus=bus, base=base, lidar=lidar, measure=cpu.measure if cpu else unmeasured,
     )  # fmt: skip

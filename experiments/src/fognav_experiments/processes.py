@@ -184,6 +184,8 @@ class AgentProcess:
         self.core = core
         self._bus = bus
         self._measure = measure
+        self.hears = self.is_heard = True
+        """Whether messages of the fog reach the robot, and the robot's the fog."""
         self.received_bytes = 0
         """Bytes of the messages that were received and are of use in the robot's profile."""
         handlers = {channel: self._measured(channel, handler) for channel, handler in core.handlers().items()}
@@ -194,6 +196,8 @@ class AgentProcess:
         component = "layers" if channel is ch.MAP_DELTA else "messages"
 
         def handle(ids: Ids, message: Message, at: Moment) -> Sequence[Publication]:
+            if not self.hears:
+                return ()
             if channel in USED[self.core.profile.name]:
                 self.received_bytes += len(encode(channel, message))
             with self._measure(component):
@@ -203,7 +207,7 @@ class AgentProcess:
 
     def fetch_map(self, at: Moment) -> None:
         """Load a snapshot if the core requests one and the map is served; call it 20 times a second."""
-        if self.core.wants_snapshot(at.now):
+        if self.hears and self.is_heard and self.core.wants_snapshot(at.now):
             snapshot = self._bus.query(ch.MAP_SNAPSHOT, None, MapSnapshot, at)
             if snapshot is not None:
                 self.received_bytes += len(snapshot.cost) + len(snapshot.speed) + len(snapshot.static)
@@ -230,9 +234,13 @@ class AgentProcess:
     def tick(self, at: Moment) -> None:
         """Tick the core; call it ten times a second."""
         with self._measure("messages"):
-            self._bus.publish(self.core.tick(at))
+            publications = self.core.tick(at)
+            if self.is_heard:
+                self._bus.publish(publications)
         if (request := self.core.egress_request(at.now)) is not None:
-            self.core.on_egress_reply(self._bus.query(ch.PLANNER_EGRESS, request, PlanReply, at), at.now)
+            linked = self.hears and self.is_heard
+            reply = self._bus.query(ch.PLANNER_EGRESS, request, PlanReply, at) if linked else None
+            self.core.on_egress_reply(reply, at.now)
 
 
 class Fog:

@@ -1,0 +1,125 @@
+"""What a scenario's file says: a drive, what happens on it, and what is expected. Pure.
+
+Lengths in m, frame `map`; angles in rad; times in s of the simulated clock, from the goal on.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import msgspec
+from msgspec import Meta
+
+from fog_contracts.messages import Id, Mode, PointXY, ProfileName, Ring
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from fognav_experiments.lockstep import DriveEvent, LockstepResult
+
+Metres = Annotated[float, Meta(ge=0.0)]
+Seconds = Annotated[float, Meta(ge=0.0)]
+
+
+class Event(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="kind"):
+    """Something that happens once the robot has driven `at_m`, and no earlier than `at_s`."""
+
+    at_m: Metres = 0.0
+    at_s: Seconds = 0.0
+
+
+class Obstacle(Event, frozen=True, kw_only=True, tag="obstacle"):
+    """Somebody or something stands on the floor, for `seconds` (0: from then on), which lidar and sonars see."""
+
+    polygon: Ring
+    seconds: Seconds = 0.0
+
+
+class NoGoZone(Event, frozen=True, kw_only=True, tag="zone"):
+    """An operator draws a no-go zone, which no sensor sees; `seconds` later it is lifted (0: never)."""
+
+    polygon: Ring
+    seconds: Seconds = 0.0
+
+
+class SilentNode(Event, frozen=True, kw_only=True, tag="silent-node"):
+    """A sensor node says nothing more, for `seconds` (0: for ever)."""
+
+    node: Id
+    seconds: Seconds = 0.0
+
+
+class LinkGap(Event, frozen=True, kw_only=True, tag="link-gap"):
+    """For `seconds` the robot hears nothing of the fog (`down`), or the fog nothing of the robot (`up`), or both."""
+
+    seconds: Seconds
+    down: bool = True
+    up: bool = True
+
+
+class Kidnapping(Event, frozen=True, kw_only=True, tag="kidnapping"):
+    """Somebody carries the robot to another place; its wheels do not turn meanwhile."""
+
+    to: PointXY
+    theta: float = 0.0
+
+
+class BlindLidar(Event, frozen=True, kw_only=True, tag="blind-lidar"):
+    """From then on nothing returns the lidar's beams between two angles (counter-clockwise, 0: ahead)."""
+
+    begin: float
+    end: float
+
+
+AnyEvent = Obstacle | NoGoZone | SilentNode | LinkGap | Kidnapping | BlindLidar
+
+
+class Expected(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What must be true of the drive, besides that the robot touches nothing.
+
+    `outcome`: how it ends; `driving` if it had not ended after the scenario's time. `modes`: modes that the robot must
+    have entered, `never`: those that it must not have. `reason`: text in one of the reasons of its modes.
+    """
+
+    outcome: str = "reached"
+    distance_m: tuple[Metres, Metres] = (0.0, 1e6)
+    time_s: tuple[Seconds, Seconds] = (0.0, 1e6)
+    modes: list[Mode] = []
+    never: list[Mode] = []
+    reason: str = ""
+
+
+class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A drive from `start` (x, y, theta) to `goal` of the site's first robot; it is ended after `seconds`."""
+
+    title: str
+    start: tuple[float, float, float]
+    goal: PointXY
+    expected: Expected
+    events: list[AnyEvent] = []
+    site: Id = "estig"
+    profile: ProfileName = "fog"
+    seconds: Seconds = 300.0
+    seed: int = 1
+
+
+def deviations(expected: Expected, result: LockstepResult, outcome: str, events: Sequence[DriveEvent]) -> list[str]:
+    """Return what differs from what was expected; `outcome` may be `driving`, `events` are those since the goal."""
+    entered = [event.description for event in events if event.description.startswith("robot: ")]
+    modes = {description.split()[1] for description in entered}
+    found = []
+    if result.contacts:
+        found.append(f"{result.contacts} contacts")
+    if outcome != expected.outcome:
+        found.append(f"outcome {outcome} ({result.reason}), not {expected.outcome}")
+    low, high = expected.distance_m
+    if not low <= result.distance_m <= high:
+        found.append(f"{result.distance_m:.1f} m driven, not {low:g} to {high:g}")
+    shortest, longest = expected.time_s
+    if result.time_s is not None and not shortest <= result.time_s <= longest:
+        found.append(f"it took {result.time_s:.1f} s, not {shortest:g} to {longest:g}")
+    found += [f"never in {mode}" for mode in expected.modes if mode not in modes]
+    found += [f"was in {mode}" for mode in expected.never if mode in modes]
+    if expected.reason and not any(expected.reason in description for description in entered):
+        found.append(f"no reason {expected.reason!r}")
+    return found

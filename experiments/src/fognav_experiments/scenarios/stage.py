@@ -1,0 +1,153 @@
+"""Lets a scenario happen to a drive in lockstep."""
+
+from __future__ import annotations
+
+import tomllib
+from functools import cache, partial
+from typing import TYPE_CHECKING, NamedTuple
+
+import msgspec
+
+from fog_contracts.messages import PolygonShape, Pose, RobotGoal, SimObstacle, Zone
+from fog_runtime.site import load_site
+from fognav_experiments.lockstep import LockstepDrive, LockstepResult
+from fognav_experiments.rigs import moment
+from fognav_experiments.scenarios.description import (
+    BlindLidar,
+    Kidnapping,
+    LinkGap,
+    NoGoZone,
+    Obstacle,
+    Scenario,
+    SilentNode,
+    deviations,
+)
+from fognav_sim.drive.evaluation import DriveOutcome
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from fog_runtime.site import LoadedSite
+    from fognav_experiments.scenarios.description import AnyEvent
+
+
+class ScenarioError(ValueError):
+    """A scenario's file is invalid; the message names file and place."""
+
+
+class Played(NamedTuple):
+    """A scenario that was played: its result, how it ended, and what differs from what was expected."""
+
+    scenario: Scenario
+    result: LockstepResult
+    outcome: str
+    deviations: list[str]
+
+
+def read_scenario(file: Path) -> Scenario:
+    """Return the scenario of a file; raises `ScenarioError`."""
+    try:
+        return msgspec.convert(tomllib.loads(file.read_text("utf-8")), Scenario)
+    except (OSError, tomllib.TOMLDecodeError, msgspec.ValidationError) as error:
+        raise ScenarioError(f"{file}: {error}. Correct it") from error
+
+
+def play(scenario: Scenario, sites: Path) -> Played:
+    """Drive a scenario on its site, one of the folder `sites`."""
+    site = _site(sites / scenario.site)
+    x, y, theta = scenario.start
+    goal = RobotGoal(goal_id="scenario", pose=Pose(x=scenario.goal[0], y=scenario.goal[1], theta=0.0))
+    run = LockstepDrive(
+        site,
+        Pose(x=x, y=y, theta=theta),
+        goal,
+        scenario.seed,
+        None,
+        watched=scenario.profile != "default",
+        hazard=None,
+        bus=None,
+    )
+    problem = run.warm_up()
+    if problem is None and scenario.profile != "fog":
+        problem = run.switch(scenario.profile)
+    drive, before = run.start(), len(run.events)
+    stage = _Stage(run, scenario)
+    outcome = None if problem is None else DriveOutcome("stopped", problem)
+    if outcome is None:
+        run.system.fog.planner.set_goal(run.robot.id, goal, any_heading=True)
+    while outcome is None and stage.elapsed < scenario.seconds:
+        stage.step()
+        run.step()
+        outcome = drive.outcome(run.now)
+    ended = outcome or DriveOutcome("stopped", f"ended after {scenario.seconds:.0f} s")
+    result = run.result(drive, ended)
+    name = "driving" if outcome is None else outcome.kind
+    return Played(scenario, result, name, deviations(scenario.expected, result, name, result.events[before:]))
+
+
+class _Stage:
+    """Begins and ends a scenario's events."""
+
+    def __init__(self, run: LockstepDrive, scenario: Scenario) -> None:
+        self._run = run
+        self._began = run.now
+        self._waiting = list(enumerate(scenario.events))
+        self._ends: list[tuple[float, Callable[[], object]]] = []
+
+    @property
+    def elapsed(self) -> float:
+        """Time since the goal was given, s."""
+        return self._run.now - self._began
+
+    def step(self) -> None:
+        """Begin and end what is due."""
+        due = [
+            (n, event) for n, event in self._waiting if self.elapsed >= event.at_s and self._run.driven >= event.at_m
+        ]
+        for number, event in due:
+            self._waiting.remove((number, event))
+            self._run.log_event(f"event {number}: {type(event).__name__}")
+            self._begin(f"event-{number}", event)
+        for end in [end for end in self._ends if end[0] <= self.elapsed]:
+            self._ends.remove(end)
+            end[1]()
+
+    def _begin(self, name: str, event: AnyEvent) -> None:
+        run = self._run
+        match event:
+            case Obstacle():
+                run.world.place(SimObstacle(id=name, polygon=event.polygon))
+                self._later(event.seconds, partial(run.world.remove, name))
+            case NoGoZone():
+                zone = Zone(id=name, kind="BLOCKED", shape=PolygonShape(points=event.polygon))
+                self._put(zone)
+                self._later(event.seconds, partial(self._put, msgspec.structs.replace(zone, enabled=False, version=2)))
+            case SilentNode():
+                silent = [node for node in run.system.fog.nodes if node.node.id == event.node]
+                for node in silent:
+                    run.system.fog.nodes.remove(node)
+                self._later(event.seconds, partial(run.system.fog.nodes.extend, silent))
+            case LinkGap():
+                self._link(hears=not event.down, is_heard=not event.up)
+                self._later(event.seconds, partial(self._link, hears=True, is_heard=True))
+            case Kidnapping():
+                run.world.kidnap(Pose(x=event.to[0], y=event.to[1], theta=event.theta))
+            case BlindLidar():
+                run.world.no_return_rad = (event.begin, event.end)
+
+    def _put(self, zone: Zone) -> None:
+        self._run.system.fog.map.put_zone(zone, moment(self._run.now))
+
+    def _link(self, *, hears: bool, is_heard: bool) -> None:
+        process = self._run.robot.process
+        process.hears, process.is_heard = hears, is_heard
+
+    def _later(self, seconds: float, action: Callable[[], object]) -> None:
+        if seconds > 0.0:
+            self._ends.append((self.elapsed + seconds, action))
+
+
+@cache
+def _site(folder: Path) -> LoadedSite:
+    return load_site(folder)

@@ -1,7 +1,7 @@
 """The transport of the sensor side: typed publishing and subscribing on MQTT channels over one connection.
 
-MQTT 5, because its brokers give the reason of a refusal. Each connection starts a clean session and subscribes again:
-state that must survive is retained, or published again by `on_connect`, never kept in a broker's session.
+MQTT 3.1.1, which costs far less for each message than MQTT 5 (ADR 37). Each connection starts a clean session and
+subscribes again: state that must survive is retained, or published again by `on_connect`, never kept by a broker.
 """
 
 import asyncio
@@ -14,7 +14,6 @@ from typing import Any, Final, TypeVar, overload
 
 import aiomqtt
 from paho.mqtt.reasoncodes import ReasonCode
-from paho.mqtt.subscribeoptions import SubscribeOptions
 
 from fog_contracts.channels import Channel
 from fog_contracts.codec import ContractError, encode, encode_text
@@ -53,7 +52,7 @@ def _encoded(channel: Channel, message: Message | str | None) -> bytes:
 
 
 async def _subscribe(client: aiomqtt.Client, qos_by_topic: Mapping[str, int]) -> None:
-    codes = await client.subscribe([(topic, SubscribeOptions(qos=qos)) for topic, qos in qos_by_topic.items()])
+    codes = await client.subscribe(list(qos_by_topic.items()))
     for topic, code in zip(qos_by_topic, codes, strict=True):
         if isinstance(code, ReasonCode) and code.is_failure:
             _log.error("subscription_refused", topic=topic, reason=str(code))

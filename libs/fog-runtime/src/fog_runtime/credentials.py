@@ -15,13 +15,13 @@ that is not, a password is sent within this computer only.
 from __future__ import annotations
 
 import ipaddress
-import ssl
 import tomllib
 from typing import TYPE_CHECKING, Final, Literal, Self
 
 import msgspec
 
 if TYPE_CHECKING:
+    import ssl
     from pathlib import Path
 
 Server = Literal["mqtt", "zenoh", "redis"]
@@ -89,6 +89,8 @@ class Credentials:
 
         Raises `CredentialsError` for certificates that can't be used.
         """
+        import ssl  # noqa: PLC0415  # the guardian reads settings, too, and never needs it
+
         try:
             return ssl.create_default_context(cadata=self.authority or None)
         except (ssl.SSLError, ValueError) as error:

@@ -1,6 +1,5 @@
 """The certificate with which a REST API proves its name, for HTTPS."""
 
-import ssl
 from pathlib import Path
 from typing import NamedTuple, Self
 
@@ -22,6 +21,8 @@ class ServerCertificate(NamedTuple):
             return None
         if file is None or key is None:
             raise CertificateError("FOGNAV_HTTP_CERTIFICATE_FILE and FOGNAV_HTTP_KEY_FILE belong together: set both")
+        import ssl  # noqa: PLC0415  # the guardian reads settings, too, and never needs it
+
         try:
             ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(file, key)
         except OSError as error:

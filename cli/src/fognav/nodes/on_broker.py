@@ -8,7 +8,6 @@ from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Final
 
 import aiomqtt
-from paho.mqtt.subscribeoptions import SubscribeOptions
 
 from fog_contracts import channels as ch
 from fog_contracts.codec import ContractError, decode, decode_text, encode_text
@@ -34,7 +33,7 @@ async def _connected(url: str, topics: dict[str, int], credentials: Credentials)
         raise WrongUseError(f"--broker {url}: {error}") from error
     try:
         async with broker.client(f"fognav-node-{os.getpid()}", None) as client:
-            await client.subscribe([(topic, SubscribeOptions(qos=qos)) for topic, qos in topics.items()])
+            await client.subscribe(list(topics.items()))
             yield client
     except aiomqtt.MqttError as error:
         raise FailedError(

@@ -1,0 +1,148 @@
+"""What docs/security.md claims, tried on real servers with the credentials that `fognav ca create` hands out."""
+
+import asyncio
+import queue
+import socket
+import ssl
+
+import paho.mqtt.client as paho
+import pytest
+from paho.mqtt.enums import CallbackAPIVersion
+
+from fog_contracts import channels as ch
+from fog_contracts import messages as m
+from fog_runtime.clock import SystemClock
+from fog_runtime.credentials import Credentials
+from fog_runtime.locks.site_locks import SiteLocks
+from fog_runtime.zenoh_edge import ZenohEdge
+from fog_supervisor.servers import start_mosquitto, start_redis, start_router
+
+pytestmark = pytest.mark.live
+
+WAIT_S = 60.0
+HOSTS = ("127.0.0.1", "localhost")
+MQTT_CONNECT = b"\x10\x0f\x00\x04MQTT\x05\x02\x00\x0a\x00\x00\x02me"
+"""Of a client without user and password."""
+
+
+@pytest.fixture(scope="module")
+def locks(tmp_path_factory):
+    made = SiteLocks(tmp_path_factory.mktemp("locks"), "lab")
+    made.make(HOSTS, robots=["r1", "r2"], nodes=["n1", "n2"])
+    return made
+
+
+@pytest.fixture(scope="module")
+def servers(locks, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("servers")
+    with (
+        start_mosquitto(folder / "mosquitto", locks=locks.folder("mosquitto")) as broker,
+        start_redis(folder / "redis", locks=locks.folder("redis")) as redis,
+        start_router(folder / "router", locks=locks.folder("zenoh")) as router,
+    ):
+        yield {"mosquitto": broker, "redis": redis, "zenoh": router}
+
+
+@pytest.mark.parametrize(("program", "said"), [("mosquitto", MQTT_CONNECT), ("redis", b"PING\r\n")])
+def test_server_answers_nobody_who_does_not_encrypt(servers, program, said):
+    with socket.create_connection(("127.0.0.1", servers[program].port), timeout=WAIT_S) as connection:
+        connection.sendall(said)
+        try:
+            answer = connection.recv(64)
+        except ConnectionResetError:
+            answer = b""
+    assert not answer.startswith((b"\x20", b"+PONG", b"-NOAUTH")), answer
+
+
+def test_broker_refuses_who_gives_no_name(servers, locks):
+    context = Credentials.read(locks.credentials("n1")).tls_context()
+    with socket.create_connection(("127.0.0.1", servers["mosquitto"].port), timeout=WAIT_S) as connection:
+        encrypted = context.wrap_socket(connection, server_hostname="localhost")
+        encrypted.sendall(MQTT_CONNECT)
+        answer = encrypted.recv(64)
+        encrypted.close()
+    assert answer[:1] == b"\x20"
+    assert answer[3] == 0x87, "not authorized"
+
+
+@pytest.mark.parametrize("program", ["mosquitto", "redis", "zenoh"])
+def test_certificate_proves_the_server_s_name_and_no_other(servers, locks, program):
+    """Who can redirect a connection, but has no key of the server, is noticed."""
+    context = Credentials.read(locks.credentials("planner")).tls_context()
+    for name, accepted in (("localhost", True), ("127.0.0.1", True), ("fog.example", False)):
+        with socket.create_connection(("127.0.0.1", servers[program].port), timeout=WAIT_S) as connection:
+            if accepted:
+                context.wrap_socket(connection, server_hostname=name).close()
+            else:
+                with pytest.raises(ssl.SSLCertVerificationError, match=r"fog\.example"):
+                    context.wrap_socket(connection, server_hostname=name)
+
+
+def publish_results(server, credentials, topics):
+    """Publish on each topic with QoS 1, and return the broker's answers: with QoS 0 a refusal is not reported."""
+    client = paho.Client(CallbackAPIVersion.VERSION2, protocol=paho.MQTTv5)
+    client.username_pw_set(credentials.user, credentials.passwords["mqtt"])
+    client.tls_set_context(credentials.tls_context())
+    answers = queue.Queue()
+    client.on_connect = lambda *_: answers.put("connected")
+    client.on_publish = lambda _client, _data, _mid, code, _properties: answers.put(code.getName())
+    client.connect("127.0.0.1", server.port)
+    client.loop_start()
+    try:
+        assert answers.get(timeout=WAIT_S) == "connected"
+        found = []
+        for topic in topics:
+            client.publish(topic, b"x", qos=1)
+            found.append(answers.get(timeout=WAIT_S))
+        return found
+    finally:
+        client.disconnect()
+        client.loop_stop()
+
+
+def test_node_publishes_as_itself_and_neither_as_another_nor_as_a_service(servers, locks):
+    topics = [
+        ch.NODE_READING.key(site="lab", node="n1"),
+        ch.NODE_READING.key(site="lab", node="n2"),
+        ch.AREA_HAZARD.key(site="lab", area="hall"),
+        ch.NODE_UPDATE.key(site="lab", node="n1"),
+    ]
+    own, *others = publish_results(servers["mosquitto"], Credentials.read(locks.credentials("n1")), topics)
+    assert own in {"Success", "No matching subscribers"}
+    assert others == ["Not authorized"] * 3
+
+
+async def test_robot_neither_changes_the_map_nor_speaks_for_another_robot(servers, locks):
+    clock = SystemClock()
+
+    def opened(user, role):
+        own = Credentials.read(locks.credentials(user))
+        return ZenohEdge.open(
+            connect=[servers["zenoh"].url], clock=clock, role=role, id=user, site="lab", credentials=own
+        )
+
+    def delta(seq):
+        return m.MapDelta(
+            epoch=1, seq=seq, part=0, parts=1, layer="cost", x=0, y=0, w=1, h=1, packing="raw", cells=b"0", hash=0
+        )
+
+    def pose(x):
+        return m.RobotPose(x=x, y=0.0, theta=0.0, covariance=[0.0] * 9, v=0.0, w=0.0, radius=0.2, height=0.3, stamp=1.0)
+
+    deltas, poses = [], []
+    async with (
+        opened("r1", "robot-agent") as robot,
+        opened("map-service", "map-service") as map_service,
+        opened("planner", "planner") as planner,
+    ):
+        planner.subscribe(ch.MAP_DELTA, m.MapDelta, lambda _, message: deltas.append(message.seq))
+        planner.subscribe(ch.ROBOT_POSE, m.RobotPose, lambda ids, _: poses.append(ids["robot"]))
+        async with asyncio.timeout(WAIT_S):
+            while not (deltas and poses):
+                robot.publish(ch.MAP_DELTA, delta(666))
+                robot.publish(ch.ROBOT_POSE, pose(6.0), robot="r2")
+                robot.publish(ch.ROBOT_POSE, pose(1.0), robot="r1")
+                map_service.publish(ch.MAP_DELTA, delta(1))
+                await asyncio.sleep(0.05)
+        assert set(deltas) == {1}
+        assert set(poses) == {"r1"}

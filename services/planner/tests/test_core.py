@@ -119,10 +119,10 @@ class Drive:
                 self.goals.append(publication.message)
 
     def follow(self, path: RobotPath | None) -> None:
-        """Let the robot's state name this path."""
+        """Let the robot's state name this path and its goal."""
         state = RobotState(
-            mode="NORMAL", reasons=[], enabled=True, battery=None, goal_id="g1", map_epoch=1, map_seq=0,
-            plan_id=path and path.plan_id, planner_epoch=path and path.planner_epoch,
+            mode="NORMAL", reasons=[], enabled=True, battery=None, goal_id=path and path.goal_id, map_epoch=1,
+            map_seq=0, plan_id=path and path.plan_id, planner_epoch=path and path.planner_epoch,
         )  # fmt: skip
         self.deliver(ch.ROBOT_STATE, state, robot="r1")
 
@@ -239,6 +239,28 @@ def test_path_is_published_again_once_a_second_until_the_robots_state_names_it()
     assert len(drive.paths) == count + 3, "the robot still names the path before"
     released = [release.plan_id for release in drive.releases]
     assert released == sorted(released), "a path that was replaced is not released any more"
+
+
+def test_goal_is_published_once_a_second_until_the_robots_state_agrees_and_then_seldom() -> None:
+    drive = Drive(start=LEFT)
+
+    def published(seconds: float) -> int:
+        count = len(drive.goals)
+        drive.step(seconds)
+        return len(drive.goals) - count
+
+    first = drive.go(*RIGHT)
+    assert published(3.0) in (2, 3)
+    drive.follow(first)
+    assert published(9.0) in (1, 2)
+    drive.follow(None)  # the robot's agent was restarted
+    assert published(3.0) in (3, 4)
+    drive.follow(first)
+    drive.core.cancel("r1")
+    assert published(2.0) in (2, 3)  # the robot still has it
+    assert drive.goals[-1].pose is None
+    drive.follow(None)
+    assert published(9.0) in (1, 2)
 
 
 def test_nothing_is_released_on_an_outdated_map() -> None:

@@ -21,7 +21,6 @@ from fog_contracts.handlers import Publication
 from planner.blocked_regions import BlockedRegions, cover
 from planner.config import PlannerConfig
 from planner.goal_fields import FieldJob, GoalFields
-from planner.mission import received_path
 from planner.missions import Missions
 from planner.path_monitor import effect_of_change, reason_from_pose
 from planner.planning_map import MapTracker
@@ -130,7 +129,7 @@ class PlannerCore:
         return ()
 
     def _on_state(self, ids: Ids, state: RobotState, _at: Moment) -> Sequence[Publication]:
-        self.missions.of(ids["robot"]).received = received_path(state)
+        self.missions.of(ids["robot"]).on_state(state)
         if state.goal_reached and state.goal_id is not None:
             self.missions.reach(ids["robot"], state.goal_id)
         elif state.goal_id is not None and self._knows_missions:

@@ -71,10 +71,15 @@ class Mission:
     refused_search_at: float = -math.inf
     """When a search was last repeated after a refusal."""
     switches: SwitchLimiter = field(default_factory=SwitchLimiter)
-    goal_due: float = math.inf
+    goal_sent: float = -math.inf
+    """When the goal was published last; -inf for one that is new or changed."""
     release_due: float = -math.inf
     received: PathId | None = None
     """The path that the robot has, by its last state."""
+    robots_goal: str | None = None
+    """The goal that the robot has, by its last state ..."""
+    heard: bool = False
+    """... if there was one."""
 
     @property
     def target(self) -> Pose | None:
@@ -88,7 +93,7 @@ class Mission:
             return
         self.goal, self.any_heading = goal, any_heading
         self._reset("goal")
-        self.goal_due = -math.inf
+        self.goal_sent = -math.inf
 
     def end(self) -> None:
         """End the goal, if there is one; its next publication has no pose."""
@@ -96,7 +101,7 @@ class Mission:
             return
         self.goal = structs.replace(self.goal, pose=None)
         self._reset(None)
-        self.goal_due = -math.inf
+        self.goal_sent = -math.inf
 
     def _reset(self, reason: ReplanReason | None) -> None:
         self.plan, self.replan, self.traces, self.danger = None, reason, [], math.inf
@@ -143,11 +148,16 @@ class Mission:
         assert self.plan is not None
         self.plan.refusal, self.plan.path_due = refusal, -math.inf
 
+    def on_state(self, state: RobotState) -> None:
+        """Note what the robot has received."""
+        self.received = received_path(state)
+        self.robots_goal, self.heard = state.goal_id, True
+
     def end_unknown(self, goal_id: str) -> None:
         """End a goal that the robot has and nobody stored any more: it was cancelled, or replaced, unheard by it."""
         if self.target is None and (self.goal is None or self.goal.goal_id != goal_id):
             self.goal = RobotGoal(goal_id=goal_id, pose=None)
-            self.goal_due = -math.inf
+            self.goal_sent = -math.inf
 
     def drop(self) -> None:
         """Forget the goal and its plan, without telling the robot."""
@@ -156,15 +166,18 @@ class Mission:
 
     def publish_all_now(self) -> None:
         """Make goal, path and release due."""
-        self.goal_due = self.release_due = -math.inf
+        self.goal_sent = self.release_due = -math.inf
         if self.plan is not None:
             self.plan.path_due = -math.inf
 
     def due_goal(self, at: Moment, config: PlannerConfig, epoch: int) -> RobotGoal | None:
-        """Return the goal when it is due for publication."""
-        if self.goal is None or at.now < self.goal_due:
+        """Return the goal when it is due for publication: seldom, once the robot's state agrees with it."""
+        if self.goal is None:
             return None
-        self.goal_due = at.now + config.goal_republish_s
+        has_it = self.heard and (self.robots_goal == self.goal.goal_id) == (self.goal.pose is not None)
+        if at.now < self.goal_sent + (config.goal_repeat_s if has_it else config.goal_retry_s):
+            return None
+        self.goal_sent = at.now
         return structs.replace(self.goal, any_heading=self.any_heading, stamp=at.stamp, planner_epoch=epoch)
 
     def due_path(self, at: Moment, config: PlannerConfig, epoch: int, version: Version) -> RobotPath | None:

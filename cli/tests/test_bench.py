@@ -10,7 +10,7 @@ from fog_kernels.components import Components
 from fog_supervisor.servers import ServerError
 from fog_supervisor.supervisor import NotReadyError
 from fognav.__main__ import app
-from fognav.bench import costmap, dwa, fleet, fleet_live, localization, office, rest, site
+from fognav.bench import costmap, dwa, fleet, fleet_live, localization, office, planner, rest, site
 
 
 def test_office_is_connected_and_the_same_for_the_same_seed() -> None:
@@ -71,6 +71,33 @@ def test_figures_come_with_schema_machine_and_versions(monkeypatch: pytest.Monke
     assert printed["machine"]["cores"] >= 1
     assert set(printed["versions"]) == {"python", "numba", "numpy"}
     assert {"replan_p50_ms", "replan_p99_ms", "cut_off_ms", "rss_mb", "bytes_per_robot"} <= printed.keys()
+
+
+@pytest.mark.parametrize("cells", [None, "map"])
+def test_planner_figures_count_what_equals_its_reference(cells, tmp_path, monkeypatch):
+    small = office.make_office(60.0, 40.0)
+    monkeypatch.setattr(planner, "make_office", lambda **_: small)
+    options = ["--queries", "3", "--json"]
+    if cells is not None:
+        rows = ["." * 130, "." * 60 + "@" + "." * 69, "." * 130] + ["." * 130] * 60
+        (tmp_path / "m.map").write_text("\n".join(["type octile", "height 63", "width 130", "map", *rows]))
+        (tmp_path / "m.scen").write_text("version 1\n0\tm.map\t130\t63\t2\t30\t127\t30\t125.0\n")
+        options += ["--map", str(tmp_path / "m.map"), "--scen", str(tmp_path / "m.scen")]
+    done = CliRunner().invoke(app, ["bench", "planner", *options])
+    assert done.exit_code == 0, done.output
+    printed = json.loads(done.stdout)
+    assert printed["queries"] == printed["optimal"] == (3 if cells is None else 1)
+    assert printed["replans"] == printed["replans_optimal"] > 0
+    for key in ("median_ms", "p99_ms", "expansions_median", "replan_median_ms", "field_median_ms"):
+        assert printed[key] > 0
+    assert printed["versions"].keys() == {"python", "numba", "numpy"}
+
+
+def test_planner_bench_names_the_file_that_is_no_map(tmp_path):
+    (tmp_path / "m.map").write_text("a picture")
+    done = CliRunner().invoke(app, ["bench", "planner", "--map", str(tmp_path / "m.map")])
+    assert done.exit_code == 2
+    assert "m.map: needs a line `map`" in " ".join(done.output.split())
 
 
 def test_costmap_figures_are_of_the_whole_floor_and_of_legal_zones() -> None:

@@ -52,8 +52,6 @@ async def test_every_robot_of_a_real_planner_gets_its_path_its_refusal_and_a_pat
         assert figures[key] > 0
     assert figures["cut_off_explained_ms"] >= figures["cut_off_ms"]
     assert figures["rss_mb"] > 50
-    for key in ("read_zones_ms", "ready_s", "list_zones_ms", "worst_zone_ms"):
-        assert figures[key] > 0
     # A path of two points has some 100 bytes, and a delta more; a heartbeat of the map comes ten times a second.
     assert figures["bytes_per_robot"] > 200
     assert figures["steady_bytes_per_robot_s"] > 100

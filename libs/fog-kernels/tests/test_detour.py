@@ -100,6 +100,20 @@ def test_closed_corridor_is_its_own_shadow_and_is_left_by_its_ends_only() -> Non
     assert set(rows.tolist()) <= set(range(1, 8))
 
 
+def test_shadow_that_the_reference_goal_cannot_be_reached_from_is_left_like_any_other() -> None:
+    bound = np.zeros((6, 20), np.uint8)
+    bound[:, 10] = 254  # the reference's goal is behind it
+    closed = bound.copy()
+    closed[2:4, 2:4] = 30  # passable, on the near side
+    planner, patterns = Planner(20, 6), TilePatterns(10**6)
+    reference = planner.goal_field(bound, (15, 3), patterns)
+    shadow = Shadow(closed, bound, reference, [(2, 2)], planner)
+    detour = shadow.detour(np.maximum(reference.costs(shadow.border), 0))
+    assert detour is not None
+    found = planner.plan(closed, (2, 2), (7, 3), field=planner.goal_field(bound, (7, 3), patterns), detour=detour)
+    assert found.cost == planner.plan(closed, (2, 2), (7, 3)).cost
+
+
 def test_raised_goal_still_ends_the_shadow() -> None:
     bound = np.zeros((8, 20), np.uint8)
     closed = bound.copy()

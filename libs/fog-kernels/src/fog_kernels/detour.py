@@ -141,8 +141,6 @@ def _mark_shadow(
         y = np.int64(np.uint32(cell) // np.uint32(width))
         x = cell - y * width
         cost = _cost_to_goal(lowest, tile_columns, slots, patterns, x, y)
-        if cost < 0:
-            continue
         passable = weight[costmap[np.uint64(cell)]] > 0
         within = 0 < x < width - 1 and 0 < y < height - 1
         for k in range(8):
@@ -160,9 +158,9 @@ def _mark_shadow(
                     groups[np.uint64(max(first, second))] = min(first, second)
                 continue
             there = _cost_to_goal(lowest, tile_columns, slots, patterns, x + columns[k], y + rows[k])
-            if there < 0:
-                continue
-            if there > cost:
+            if there < 0 <= cost:
+                continue  # no step leads there
+            if there > cost >= 0:
                 there_weight = np.int64(weight[bound[np.uint64(other)]])
                 if there == cost + lengths[k] * (own + there_weight) and _may_step(
                     bound, weight, cell, columns[k], steps[k]

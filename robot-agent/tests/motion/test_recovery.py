@@ -6,29 +6,16 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from open_floor import LONG, PADDING, ROUND, around
 
-from fog_contracts.costs import DEFAULT_INFLATION, UNKNOWN
-from fog_kernels.body import cover
-from fog_kernels.clearance import clearance
-from fog_kernels.dwa import DwaLimits, DwaSettings
-from robot_agent.footprint import Footprint
+from fog_contracts.costs import UNKNOWN
 from robot_agent.localization.pose import Pose2
 from robot_agent.motion.recovery import MOVE_MAX_S, PATIENCE_S, SERIES, Recovery, Situation, step
 from robot_agent.motion.recovery_moves import RecoveryMove, clearances, recovery_speeds
 from robot_agent.motion.trail import LENGTH_M, Trail
 
-ROUND = cover(Footprint.circle(0.17).polygon)
-LONG = cover(Footprint(((-0.3, -0.12), (0.15, -0.12), (0.15, 0.12), (-0.3, 0.12))).polygon)
-PADDING = DwaSettings().padding
 DT = 0.2
 STUCK = Situation(place=(0.0, 0.0), stuck_for=PATIENCE_S, error=0.5, trail=0.5)
-
-
-def around(points, body=ROUND, x=1.5, y=1.5):
-    return clearance(
-        np.zeros((60, 60), np.uint8), 0.05, 0.0, 0.0, np.array(points, dtype=np.float64).reshape(-1, 2), x, y, body,
-        DEFAULT_INFLATION, DwaLimits(axle=0.235, wheel_max=0.5), DwaSettings(), at_least=1.0,
-    )  # fmt: skip
 
 
 def distance(body, pose, points):

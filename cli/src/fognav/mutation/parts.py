@@ -74,6 +74,20 @@ PARTS: Final = (
         ("safety",),
         ("safety",),
         ("numpy", "hypothesis.strategies", "fog_kernels.sweep", "robot_agent.config", "robot_agent.footprint"),
+        (
+            Equivalent(
+                "visibility",
+                "turns = np.asarray(angles) / math.tau + 0.5",
+                "np.asarray(angles) / math.tau + 0.5 -> np.asarray(angles) / math.tau - 0.5",
+                "whole turns are taken off afterwards",
+            ),
+            Equivalent(
+                "visibility",
+                "return np.array([(sector + 0.5) * math.tau / SECTORS - math.pi for sector in range(SECTORS)])",
+                "(sector + 0.5) * math.tau / SECTORS - math.pi -> (sector + 0.5) * math.tau / SECTORS + math.pi",
+                "directions that differ by whole turns are the same",
+            ),
+        ),
     ),
     Part(
         "guardian",
@@ -125,5 +139,11 @@ PARTS: Final = (
                 "a target of zero is returned before",
             ),
         ),
+    ),
+    Part(
+        "recoveries",
+        ("motion.recovery", "motion.recovery_moves", "motion.trail", "agent.recoveries", "agent.power"),
+        ("motion/test_recovery.py", "motion/test_recovery_limits.py", "agent/test_power.py"),
+        ("numpy", "hypothesis.strategies", "fog_kernels.clearance", "robot_agent.config", "robot_agent.motion.band"),
     ),
 )

@@ -43,6 +43,7 @@ from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.raycast import cast
 from fog_runtime.clock import SystemClock
 from fog_runtime.zenoh_edge import ZenohEdge
+from fognav_sim.hardware import seen_from_dock
 from fognav_sim.pty_port import PtyPort
 from robot_agent.lidars.rplidar_a1.emulator import RplidarEmulator
 
@@ -64,6 +65,8 @@ class Body(Base):
         self.static, self.geometry = grid_of(L_ROOMS, 15.0, 12.0)
         self.solid = (self.static == 254).astype(np.uint8)
         self.pose = pose
+        self.dock: tuple[float, float, float] | None = None
+        """The robot's pose on its dock; set it before the robot starts."""
         self.scanner = RplidarEmulator(self._measure)
         self.lidar_link = folder / "lidar"
         self.lidar_port = PtyPort(self.lidar_link)
@@ -94,6 +97,10 @@ class Body(Base):
             distance, turned = (left + right) / 2 * (now - before), (right - left) / AXLE * (now - before)
             middle = theta + turned / 2
             self.pose = (x + distance * math.cos(middle), y + distance * math.sin(middle), theta + turned)
+            if self.dock is not None:
+                self.robot.set_dock(
+                    *seen_from_dock(self.pose, Pose(x=self.dock[0], y=self.dock[1], theta=self.dock[2]))
+                )
             if data := self.lidar_port.read():
                 self.scanner.receive(data, now)
             self.lidar_port.write(self.scanner.outgoing(now))
@@ -209,7 +216,8 @@ class AgentProcess:
         site.mkdir(exist_ok=True)
         x, y, theta = start
         start_pose = f"start = {{ x = {x}, y = {y}, theta = {theta} }}"
-        (site / "site.toml").write_text(f'id = "{SITE}"\n[[robots]]\nid = "{ROBOT}"\n{start_pose}\n')
+        dock = "" if body.dock is None else "dock = {{ x = {}, y = {}, theta = {} }}\n".format(*body.dock)
+        (site / "site.toml").write_text(f'id = "{SITE}"\n[[robots]]\nid = "{ROBOT}"\n{start_pose}\n{dock}')
         key.write_text(KEY.hex() + "\n")
         self._environment = {
             **os.environ,

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from agent_rig import Robot, until
+from agent_rig import AgentProcess, Robot, until
 from guardian_rig import STOP_S
 
 from fog_contracts import channels as ch
 from fog_contracts.grid import Window
-from fog_contracts.messages import PlanReply
+from fog_contracts.messages import PlanReply, Pose, RobotGoal
 from fog_runtime.signals import TERMINAL_STOPS
 from fog_supervisor.servers import start_router
 from robot_agent.agent.replay import replay
@@ -252,3 +252,24 @@ async def test_robot_leaves_a_blocked_area_by_the_planners_way_on_a_signed_singl
         await until(lambda: robot.fog.state.mode != "EGRESS", "it ends")
     assert robot.fog.state.mode == "INIT"
     assert 2.6 < robot.body.pose[0] < 2.8
+
+
+async def test_robot_goes_to_its_dock_and_leaves_it_on_signed_commands(tmp_path, router):
+    running = Robot(tmp_path, router)
+    running.body.dock = (2.7, 2.0, 0.0)  # 0.7 m before the robot
+    running.agent = AgentProcess(tmp_path, router, running.watchdog, running.body)
+    async with running as robot:
+        await enabled(robot)
+        base, fog = robot.body.robot, robot.fog
+        reply = await fog.command("dock")
+        assert reply.accepted, reply
+        await until(lambda: fog.state.wants_dock, "it wants to its dock")
+        fog.goal = RobotGoal(goal_id="front", pose=Pose(x=2.0, y=2.0, theta=0.0), planner_epoch=3)
+        fog.points = [(1.9, 2.0), (2.0, 2.0)]
+        fog.plan()
+        await until(lambda: base.seeking_dock and robot.body.moving, "the base seeks its dock")
+        await until(lambda: fog.state.docked and fog.state.mode == "HOLD", "it is on its dock")
+        assert fog.state.enabled
+        reply = await fog.command("undock")
+        assert reply.accepted, reply
+        await until(lambda: robot.body.pose[0] < 2.45, "it leaves its dock")

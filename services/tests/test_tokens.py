@@ -14,6 +14,7 @@ pytestmark = pytest.mark.live
 SERVICES = ("hazard_aggregator", "map_service", "planner")
 PUBLIC = {
     "/healthz", "/readyz", "/metrics", "/openapi.json",
+    "/api/v1/alerts", "/api/v1/prometheus/robots",
     "/api/v1/areas", "/api/v1/areas/{area_id}", "/api/v1/areas/{area_id}/history",
     "/api/v1/areas/{area_id}/override", "/api/v1/nodes",
     "/api/v1/hazards", "/api/v1/map", "/api/v1/map.png", "/api/v1/costmap.png", "/api/v1/places",

@@ -180,6 +180,7 @@ async def test_body_that_does_not_arrive_is_refused_after_a_while(tmp_path, monk
 async def test_client_that_ends_none_of_its_requests_leaves_places_to_others_and_to_stops(tmp_path, monkeypatch):
     monkeypatch.setattr(places, "MAX_OF_CLIENT", 3)
     monkeypatch.setattr(places, "MAX_URGENT_OF_CLIENT", 2)
+    monkeypatch.setattr(app, "BODY_S", 2 * DEADLINE_S)
     begun = b"PUT /zones/z1 HTTP/1.1\r\nHost: fog\r\nContent-Length: 100\r\n\r\n{"
     async with serving(tmp_path) as (_, client), contextlib.AsyncExitStack() as connections:
 

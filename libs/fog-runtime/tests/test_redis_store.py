@@ -142,3 +142,6 @@ async def test_redis_without_durable_writes_is_reported(redis: Server):
     async with RedisStore(redis.url, "test") as store, Redis.from_url(redis.url) as raw:
         await raw.config_set("appendfsync", "everysec")
         assert "appendfsync always" in await store.durability_warning()
+        await raw.config_set("appendfsync", "always")
+        await raw.config_set("maxmemory-policy", "allkeys-lru")
+        assert "noeviction" in await store.durability_warning()

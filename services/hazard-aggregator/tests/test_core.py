@@ -316,6 +316,13 @@ def test_everything_is_published_again_on_request_and_another_request_is_refused
         rig.deliver(ch.AGGREGATOR_REQUEST, "restart")
 
 
+def test_flood_of_requests_for_everything_is_answered_twice_a_second():
+    rig = Rig()
+    handle, everything = rig.core.handlers()[ch.AGGREGATOR_REQUEST], rig.core.republish_all()
+    answers = [handle({}, ch.REPUBLISH, Moment(100.0 + 0.01 * step, 0.0)) for step in range(150)]
+    assert [answer for answer in answers if answer] == [everything] * 3
+
+
 def test_thesis_line_has_the_position_of_node_or_area_and_none_when_clear():
     assert wsn_line(AREA, stored("blocked", 254)) == "7,1.000,0.500"
     assert wsn_line(AREA, stored("blocked", 254), NODE) == "7,0.000,0.500"

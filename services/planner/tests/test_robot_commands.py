@@ -209,6 +209,18 @@ async def test_planner_without_a_key_says_so_and_still_stops() -> None:
     assert rig.robot.records == [("r1", "operator", b'{"kind":"disable"}')]
 
 
+async def test_goal_of_an_id_that_two_agents_use_is_refused_until_one_is_gone(rig: Rig) -> None:
+    state = msgspec.structs.replace(rig.operator._states["r1"][0])
+    for number in range(6):
+        boot = f"run-{number % 2}"
+        rig.robot.published[ch.ROBOT_STATE]({"robot": "r1"}, msgspec.structs.replace(state, boot=boot))
+    answer = await rig.client.put("/api/v1/robots/r1/goal", json={"place": "b"}, headers=OPERATOR)
+    assert (answer.status_code, "two agents use the id of robot r1" in answer.json()["detail"]) == (409, True)
+    assert rig.operator.doubled_detail() == "two agents use the id of r1"
+    rig.robot.clock.advance(10.1)
+    assert not rig.operator.is_doubled("r1")
+
+
 async def test_watching_a_robot_waits_for_its_next_state(rig: Rig) -> None:
     view = (await rig.client.get("/api/v1/robots/r1", headers=VIEWER)).json()
     assert (view["id"], view["state"]["clock"]) == ("r1", 100.0)

@@ -27,7 +27,7 @@ operators' commands to robots; `stop`: stops without a token, of which anybody m
 
 PAGE_BYTES: Final = 256 * 1024
 """A page ends with the entry that reaches this size: what changed may be a shape of 500 corners, twice."""
-_AT_ONCE: Final = 25
+_AT_ONCE: Final = 8
 """How many entries are read at a time, so that whoever asks for a thousand delays the event loop by milliseconds."""
 _CURSOR: Final = re.compile(r"([0-9]{1,16})-([0-9]{1,16})\.([a-z]+)")
 

@@ -147,14 +147,16 @@ class RedisStore:
     async def durability_warning(self) -> str:
         """Return why acknowledged writes are not durable, or an empty text; also empty if Redis hides its settings."""
         try:
-            config = await self._redis.read("CONFIG", "GET", "append*")
+            answers = [await self._redis.read("CONFIG", "GET", name) for name in ("append*", "maxmemory-policy")]
         except StoreError:
             return ""
-        values = {_text(name): _text(value) for name, value in _items(config)}
+        values = {_text(name): _text(value) for answer in answers for name, value in _items(answer)}
         durable = values.get("appendonly") == "yes" and values.get("appendfsync") == "always"
         DURABLE.set(durable)
         if not durable:
             return "run Redis with `appendonly yes` and `appendfsync always`: it may lose acknowledged writes"
+        if values.get("maxmemory-policy") != "noeviction":
+            return "run Redis with `maxmemory-policy noeviction`: when it is full, it throws acknowledged records away"
         return ""
 
     async def recall(self, attempt: Attempt | None, kind: type[M]) -> M | None:

@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 
 
 _HALF_TICK_S: Final = 0.05
+REPUBLISH_PAUSE_S: Final = 0.5
+"""Between two answers to requests for everything, each of which is hundreds of messages; the map asks once a second."""
 
 
 class Aggregator:
@@ -53,6 +55,7 @@ class Aggregator:
         self._unlisted: set[str] = set()
         self._foreign = ForeignMessages()
         self._heartbeat_at = -math.inf
+        self._republished_at = -math.inf
 
     # --- State ------------------------------------------------------------------------------------------------------
 
@@ -248,9 +251,12 @@ class Aggregator:
             self._foreign.add("heartbeat", heartbeat.epoch, "")
         return []
 
-    def _on_request(self, _ids: Ids, text: str, _at: Moment) -> list[Publication]:
+    def _on_request(self, _ids: Ids, text: str, at: Moment) -> list[Publication]:
         if text != ch.REPUBLISH:
             raise RefusedMessageError(f"the request is `{ch.REPUBLISH}`, not {text!r}")
+        if at.now - self._republished_at < REPUBLISH_PAUSE_S:
+            return []  # whoever still lacks something asks again
+        self._republished_at = at.now
         return self.republish_all()
 
     def _on_pose(self, ids: Ids, pose: RobotPose, at: Moment) -> Sequence[Publication]:

@@ -239,6 +239,7 @@ def _add_orders(routes: Routes, service: Service, robots: _Robots, site: Site) -
         raises=[IdempotencyError, MissionConflictError, StoreError],
         problems={
             404: "No robot has this id",
+            409: "Two agents use this robot's id",
             422: "The body is invalid, or the goal can never be reached: then with Nav2's `code` and `name`, and the"
             " `nearest` reachable point",
         },
@@ -256,6 +257,9 @@ def _add_orders(routes: Routes, service: Service, robots: _Robots, site: Site) -
         With If-Match, only if it still has the mission that was read; with `If-None-Match: *`, only if it has none.
         """
         robots.check(robot)
+        if service.operator.is_doubled(robot):
+            detail = f"two agents use the id of robot {robot}: switch one off, or give it another id, then try again"
+            raise ProblemError(409, detail)
         pose, any_heading = _goal_pose(body, site)
         order = Order(
             robot,

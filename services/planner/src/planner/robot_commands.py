@@ -10,12 +10,14 @@ import asyncio
 from typing import TYPE_CHECKING, Final
 
 import msgspec
+from prometheus_client import Gauge
 
 from fog_contracts.codec import ContractError
 from fog_contracts.commands import STOPS
 from fog_runtime import logs
 from fog_runtime.clock import ticker
 from fog_runtime.robot_commands import REPLY_TIMEOUT_S, RobotCommands
+from planner.doubled_robots import DoubledRobots
 from planner.stop_records import PERIOD_S, StopRecords
 from planner.store import Audit, StoreError
 
@@ -29,6 +31,8 @@ STATE_MAX_AGE_S: Final = 3.0
 """A command names the robot's clock by its latest state, which comes once a second."""
 
 _RECORDS_PERIOD_S: Final = 10.0
+
+DOUBLED = Gauge("fognav_planner_robots_doubled", "Robots whose id two agents use; nothing is planned for them")
 
 _log = logs.get("planner")
 
@@ -48,12 +52,27 @@ class RobotOperator:
         self._states: dict[str, tuple[RobotState, float]] = {}
         self._changed: dict[str, asyncio.Event] = {}
         self._stops = StopRecords()
+        self._doubled = DoubledRobots()
 
     def on_state(self, robot: str, state: RobotState, now: float) -> None:
         """Record a robot's state, which arrived at `now` (s, monotonic)."""
         self._states[robot] = state, now
+        if self._doubled.on_state(robot, state.boot, now):
+            _log.error(
+                "robot_doubled", robot=robot, remedy="two agents use this id: switch one off, or give it another"
+            )
         if (waiting := self._changed.pop(robot, None)) is not None:
             waiting.set()
+
+    def is_doubled(self, robot: str) -> bool:
+        """Whether two agents use this robot's id now: then nothing is planned for them."""
+        return self._doubled.is_doubled(robot, self._clock.now())
+
+    def doubled_detail(self) -> str:
+        """Count the robots whose id two agents use; return a text for /readyz that names them, empty without any."""
+        found = self._doubled.found(self._clock.now())
+        DOUBLED.set(len(found))
+        return f"two agents use the id of {', '.join(found)}" if found else ""
 
     async def next_state(self, robot: str, after: float) -> RobotState:
         """Return the robot's first state whose `clock` is not `after`; raises `CommandError` when none comes."""

@@ -151,6 +151,8 @@ class Service:
 
         def enqueue(ids: Ids, message: object, at: Moment) -> Sequence[Publication]:
             if isinstance(message, RobotPose):
+                if self.operator.is_doubled(ids["robot"]):
+                    return ()  # nobody knows whose it is: the core plans for no robot whose pose is unknown
                 self.poses[ids["robot"]] = message
             elif isinstance(message, RobotState):
                 self.states[ids["robot"]] = message
@@ -238,6 +240,7 @@ class Service:
                 self._map.request()
             connected = self._zenoh.connected
             self._health.set("zenoh", ok=connected, detail="" if connected else "not connected to the router")
+            self._health.set("robots", ok=True, detail=self.operator.doubled_detail())
             self._update_metrics()
 
     def _change_goal(self, change: Callable[[], object]) -> None:

@@ -2,14 +2,15 @@
 
 import asyncio
 import json
+import secrets
 
-import aiomqtt
 import httpx
 import pytest
 
 from fog_contracts import channels as ch
 from fog_contracts.handlers import Publication
 from fog_contracts.messages import AreaDefinition
+from fog_runtime.mqtt_broker import Broker
 from hazard_aggregator.area_discovery import discovery, discovery_publication
 
 SQUARE = [(0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (0.0, 1.0)]
@@ -51,7 +52,8 @@ def test_largest_description_fits_its_channel_and_a_removed_area_is_forgotten():
 async def retained_areas(fog) -> set[str]:
     """Return the areas that a Home Assistant that starts now discovers."""
     areas = set()
-    async with aiomqtt.Client("127.0.0.1", int(fog.mosquitto.url.rsplit(":", maxsplit=1)[1])) as client:
+    broker = Broker.of(fog.mosquitto.url, fog.test_credentials)
+    async with broker.client(f"home-{secrets.token_hex(4)}", None) as client:
         await client.subscribe("homeassistant/device/test/+/config")
         await client.subscribe("end")
         await client.publish("end", "")

@@ -6,6 +6,7 @@ import ssl
 
 import aiomqtt
 import pytest
+from cryptography import x509
 from redis.asyncio import Redis
 
 from fog_contracts import channels as ch
@@ -249,6 +250,16 @@ def test_rotation_can_neither_be_repeated_nor_finished_twice_and_survives_reopen
     assert not Authority.open(file).rotating
     assert first not in Authority.open(file).trusted
     assert file.stat().st_mode & 0o077 == 0
+
+
+def test_certificates_are_valid_for_a_computer_whose_clock_was_never_set(tmp_path):
+    locks = SiteLocks(tmp_path, "lab")
+    locks.make(HOSTS)
+    locks.authority.rotate(now=NOW)
+    locks.renew(only_due=False)
+    chain = (locks.folder("redis") / "server.pem").read_bytes() + locks.authority.trusted.encode()
+    begins = {each.not_valid_before_utc for each in x509.load_pem_x509_certificates(chain)}
+    assert begins == {dt.datetime(1970, 1, 1, tzinfo=dt.UTC)}
 
 
 def test_certificates_that_expire_soon_are_renewed_and_others_stay(tmp_path):

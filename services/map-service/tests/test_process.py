@@ -324,7 +324,12 @@ async def test_steps_of_the_wall_clock_end_no_zone_and_a_boot_without_a_clock_pu
     def start() -> None:
         port_file = fog.folder / "map_service.port"
         port_file.unlink(missing_ok=True)
-        environment = {**fog.environment, "FOGNAV_PORT_FILE": str(port_file), "FOGNAV_WALL_CLOCK": "trusted"}
+        environment = {
+            **fog.environment,
+            "FOGNAV_CREDENTIALS_FILE": str(fog.credentials_file("map-service")),
+            "FOGNAV_PORT_FILE": str(port_file),
+            "FOGNAV_WALL_CLOCK": "trusted",
+        }
         with (fog.folder / "map_service.log").open("ab") as log:
             command = [sys.executable, "-c", STEPPED_CLOCK, str(error)]
             fog.processes["map_service"] = subprocess.Popen(command, env=environment, stdout=log, stderr=log)

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
 AUTHORITY_DAYS: Final = 3650
 SERVER_DAYS: Final = 730
-_BACKDATED: Final = dt.timedelta(days=2)
-"""A computer without a battery for its clock starts in the past."""
+_VALID_FROM: Final = dt.datetime(1970, 1, 1, tzinfo=dt.UTC)
+"""A computer without a battery for its clock may start there, and would trust nobody before its clock is set."""
 _END_OF_KEY: Final = b"-----END PRIVATE KEY-----\n"
 
 
@@ -180,7 +180,7 @@ def _builder(
         .issuer_name(issuer)
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
-        .not_valid_before(now - _BACKDATED)
+        .not_valid_before(_VALID_FROM)
         .not_valid_after(end)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
         .add_extension(identifier, critical=False)

@@ -73,8 +73,8 @@ EDGES = {
 
 PURE_LIBRARIES = {
     "__future__", "abc", "binascii", "bisect", "collections", "contextlib", "dataclasses", "enum", "functools",
-    "hashlib", "heapq", "hmac", "itertools", "json", "math", "msgspec", "numba", "numpy", "operator", "random", "re",
-    "struct", "textwrap", "typing", "zlib",
+    "hashlib", "heapq", "hmac", "html", "itertools", "json", "math", "msgspec", "numba", "numpy", "operator", "random",
+    "re", "struct", "textwrap", "typing", "zlib",
 }  # fmt: skip
 """What pure modules may import besides each other: no clock, file, process or hidden state; `random` only seeded."""
 

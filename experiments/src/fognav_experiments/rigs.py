@@ -55,6 +55,8 @@ _INITIAL_WHEEL_TRAVEL_M: Final = (28.9, 0.04)
 _GUARDIAN_STEPS: Final = 2
 _LIDAR_STEPS: Final = 2
 _STREAM_STEPS: Final = 5
+_CONTROL_AFTER_STEPS: Final = 2
+"""How much later than the stream decisions begin: `CONTROL_AFTER_S` of the agent's service."""
 TICK_STEPS: Final = 10
 """Steps of 10 ms between two ticks of the cores."""
 
@@ -110,6 +112,7 @@ class RobotRig:
         self._from_lidar = b""
         self._lidar_on = True
         self._steps = 0
+        self._skip = False
         self._nonce = 0
 
     @property
@@ -131,12 +134,18 @@ class RobotRig:
         at, step = moment(self.now), self._steps - 1
         if step % _STREAM_STEPS == 0:
             self.process.fetch_map(at)
-        if step % round(self.agent.profile.control_period / STEP_S) == 0:
+        since_first = step - _CONTROL_AFTER_STEPS
+        if since_first >= 0 and since_first % round(self.agent.profile.control_period / STEP_S) == 0:
             self.process.control(at)
-        if step % _STREAM_STEPS == 0:
+        if step % _STREAM_STEPS == 0 and not self._rests_this_time():
             command = link.decode_command(link.encode(self.process.stream(at)))
             with self._measure("guardian"):
                 self._to_base += self.guardian.on_command(command, at.now).data
+
+    def _rests_this_time(self) -> bool:
+        """Whether the stream leaves this tick out: every other one while the robot has nothing to do."""
+        self._skip = self.agent.idle and not self._skip
+        return self._skip
 
     def _run_guardian(self, data: bytes, now: float) -> None:
         with self._measure("guardian"):

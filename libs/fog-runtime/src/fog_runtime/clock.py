@@ -176,7 +176,7 @@ class Phase:
     def next_tick(self, now: float, period: float, offset: float = 0.0) -> float:
         """Return the first multiple of the period, `offset` s after the common beginning, that is not before `now`."""
         if self._origin is None:
-            self._origin = now - offset
+            self._origin = now
         begin = self._origin + offset
         return begin + math.ceil((now - begin) / period) * period
 

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from robot_agent.hardware import LaserScan
 
 STREAM_S: Final = 0.05
-CONTROL_AFTER_S: Final = 0.025
+CONTROL_AFTER_S: Final = 0.02
 """Decisions begin this long after a tick of the stream: at the same moment, their thread and the loop's would take the
 interpreter from one another some hundred times a second. They end before the next tick, which sends their speeds."""
 PUBLISH_S: Final = 0.1

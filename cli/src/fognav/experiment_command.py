@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from fognav_experiments.comparison.records import Folder, Record
     from fognav_experiments.comparison.runner import Task
 
-experiment_app = typer.Typer(help="Compare robots that plan for themselves with one that the fog leads.")
+experiment_app = typer.Typer(help="Compare setups as the thesis did, and play scenarios.")
 
 _SETUPS: Final[tuple[ProfileName, ...]] = ("default", "full", "fog")
 

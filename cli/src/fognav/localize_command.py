@@ -33,10 +33,10 @@ def localize_command(  # noqa: PLR0913  # each option is an argument
     png: Annotated[Path | None, typer.Option("--png", metavar="F", help="Draw map, reference and estimates.")] = None,
     json: JsonOption = False,
 ) -> None:
-    """Evaluate the localization on a recorded log with reference poses.
+    """Evaluate the localization on a recorded log.
 
-    If the log's odometry is its reference (corrected CARMEN logs), noise is added to it. The exit code is 1 if no pose
-    was found, or one that is wrong.
+    The log has reference poses. If its odometry is its reference (corrected CARMEN logs), noise is added to it. The exit
+    code is 1 if no pose was found, or one that is wrong.
     """
     with exit_codes():
         check_writable(png)

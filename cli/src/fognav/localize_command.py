@@ -35,8 +35,8 @@ def localize_command(  # noqa: PLR0913  # each option is an argument
 ) -> None:
     """Evaluate the localization on a recorded log.
 
-    The log has reference poses. If its odometry is its reference (corrected CARMEN logs), noise is added to it. The exit
-    code is 1 if no pose was found, or one that is wrong.
+    The log has reference poses. If its odometry is its reference (corrected CARMEN logs), noise is added to it. The
+    exit code is 1 if no pose was found, or one that is wrong.
     """
     with exit_codes():
         check_writable(png)

@@ -36,6 +36,15 @@ def test_each_alert_fires_when_it_must_and_not_before() -> None:
     assert promtool("test", "rules", *map(str, TESTS)).count("SUCCESS") == len(TESTS) == 2
 
 
+def test_robots_at_rest_say_what_the_alert_knows() -> None:
+    said = (ROOT / "robot-agent/src/robot_agent/safety/conditions.py").read_text("utf-8")
+    said += (ROOT / "robot-agent/src/robot_agent/agent/rest_policy.py").read_text("utf-8")
+    rule = (DEPLOYED / "rules" / "alerts.yml").read_text("utf-8")
+    beginnings = re.findall(r"reason=~\"([^\"]+)\"", rule)[0].replace(".*", "").split("|")
+    assert len(beginnings) == 3
+    assert [text for text in beginnings if f'"{text}' not in said] == []
+
+
 @pytest.mark.parametrize("alert", ALERTS)
 def test_alert_has_a_test_and_tells_operators_what_to_do(alert: str) -> None:
     tests = [test for file in TESTS for test in yaml.safe_load(file.read_text("utf-8"))["tests"]]

@@ -25,7 +25,7 @@ HostOption = Annotated[
         "--host", metavar="NAME|ADDRESS", help="How clients reach the servers; may be repeated. Default: this computer."
     ),
 ]
-_RELOAD = "the servers use it after a restart; Mosquitto after SIGHUP, the router by itself"
+_RELOAD = "the servers use it after a restart; Mosquitto after SIGHUP, too"
 
 
 @ca_app.command("create", epilog="Example: fognav ca create --site sites/floor --locks locks --host fog.local")

@@ -41,7 +41,7 @@ def robot_add(
         if json:
             print_json({"robot": robot, "credentials": None if file is None else str(file)})
         elif file is None:
-            print_line(f"the router refuses {robot} from now on")
+            print_line(f"the router refuses {robot} once it was restarted")
         else:
             print_line(f"wrote {file}: copy it to the robot, for its owner only, and delete it here")
 

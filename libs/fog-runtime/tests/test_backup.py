@@ -53,7 +53,7 @@ async def fill(redis: Server) -> None:
         await raw.hset("fog:test:zones", mapping={"z1": '{"version": 3}', "z2": b"\x00\xff"})
         await raw.set("fog:test:generation", "abc")
         await raw.set("fog:test:idempotency:1", "done", px=3_600_000)
-        await raw.set("fog:test:map-service:lease", "somebody", px=9_000)
+        await raw.set("fog:test:short-lived", "somebody", px=9_000)
         await raw.zadd("fog:test:order", {"a": 1.5})
         for number in range(300):
             await raw.xadd("fog:test:audit:zone", {"who": "anna", "n": number})
@@ -75,7 +75,7 @@ async def test_empty_machine_gets_everything_of_the_site_back(tmp_path, here, re
     restored = await backup.restore(file, there, replace=False)
     assert (restored.site, restored.created) == ("test", NOW)
     expected = await content(redis)
-    for name in (b"fog:elsewhere:generation", b"fog:test:map-service:lease"):
+    for name in (b"fog:elsewhere:generation", b"fog:test:short-lived"):
         expected.pop(name, None)
     assert await content(other) == expected
     async with Redis.from_url(other.url) as raw:
@@ -119,6 +119,20 @@ async def test_what_is_there_is_replaced_only_when_that_is_wanted(tmp_path, here
         await backup.restore(file, here, replace=True)
         assert await raw.hkeys("fog:test:zones") == [b"z1", b"z2"]
         assert await raw.get("fog:elsewhere:generation") == b"of another site"
+
+
+async def test_backup_is_not_restored_under_a_running_service(tmp_path, here, redis):
+    await fill(redis)
+    file = tmp_path / "backup.tar.gz"
+    await backup.create(file, here, NOW)
+    before = await content(redis)
+    async with Redis.from_url(redis.url) as raw:
+        await raw.set("fog:test:map-service:lease", "somebody")
+        with pytest.raises(BackupError, match="map-service of site test runs: nothing was changed"):
+            await backup.restore(file, here, replace=True)
+        await raw.delete("fog:test:map-service:lease")
+    before.pop(b"fog:test:map-service:lease", None)
+    assert await content(redis) == before
 
 
 async def test_files_of_somebody_else_are_not_overwritten_without_consent(tmp_path, here, redis, other):

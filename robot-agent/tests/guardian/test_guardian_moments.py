@@ -12,6 +12,7 @@ from plain_base import PlainBase, Rig
 
 from robot_agent.guardian import link
 from robot_agent.guardian.core import GuardianCore
+from robot_agent.guardian.link import WheelCommand
 from robot_agent.hardware import Awakening, WakeLine
 
 STAND = b"0.0000,0.0000;"
@@ -238,3 +239,35 @@ def test_command_of_more_than_0_5_m_s_is_no_command(speed, accepted) -> None:
 
 def test_largest_packet_has_4096_bytes() -> None:
     assert link.PACKET_LIMIT == 4096
+
+
+# --- a base that is put to sleep ---
+
+
+class SleepingBase(PlainBase):
+    """One that is woken by a line."""
+
+    def __init__(self) -> None:
+        super().__init__(awakening=Awakening(bauds=(115_200,), line=RTS))
+
+    def sleep(self) -> bytes:
+        return b"sleep;"
+
+
+@pytest.mark.parametrize("late", [{}, {"mode_problem": "it sleeps"}, {"bumper_left": True}])
+def test_frame_that_was_on_its_way_when_the_base_fell_asleep_makes_no_fault_of_its_rest(late) -> None:
+    rig = Rig(base=SleepingBase())
+    rig.drive(0.2, 1.0, 0.0, 0.0)
+    resting = WheelCommand(seq=1, left=0.0, right=0.0, rest=True)
+    assert rig.core.on_command(resting, 1.01).data == b"sleep;"
+    rig.frame(1.02, **late)
+    for step in range(1, 60):
+        assert rig.core.on_command(resting, 1.0 + 0.1 * step).data == b""
+        rig.core.tick(1.0 + 0.1 * step)
+    assert rig.core.latched is None
+    assert rig.core.on_command(WheelCommand(seq=2, left=0.0, right=0.0), 7.0).attempt.line == RTS
+    rig.frame(7.005, **late)
+    assert rig.core.tick(7.01).data == b"wake;"
+    assert rig.core.latched is None
+    rig.frame(7.2)
+    assert rig.wheels(rig.command(7.21))[0] > 0.0

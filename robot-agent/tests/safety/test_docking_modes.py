@@ -87,6 +87,31 @@ def test_docked_robot_stays_enabled_and_holds_on_its_dock_for_hours():
     assert gate.state.latched == ()
 
 
+def stopped_until_somebody_enables() -> Gate:
+    gate = Gate()
+    gate.run(1.0, localization="lost")
+    out = gate.run(5.0)
+    assert (out.mode, gate.state.enabled) == ("PROTECTIVE_STOP", True)
+    assert gate.state.latched
+    return gate
+
+
+def test_robot_that_waits_for_an_operator_does_not_go_to_its_dock_by_itself():
+    gate = stopped_until_somebody_enables()
+    out = gate.run(request="dock")
+    assert (out.refusal, out.mode) == ("the robot must be enabled for that", "PROTECTIVE_STOP")
+    assert gate.state.latched
+
+
+def test_robot_that_waits_for_an_operator_waits_for_one_after_leaving_its_dock_too():
+    gate = stopped_until_somebody_enables()
+    out = gate.run(request="undock", maneuver_remaining=0.3, **ON_DOCK)
+    assert (out.refusal, out.mode) == (None, "DOCK")
+    out = gate.run(maneuver_remaining=0.0)
+    assert (gate.state.enabled, gate.state.maneuver) == (False, None)
+    assert gate.run(5.0).mode == "INIT"
+
+
 @pytest.mark.parametrize(("changes", "words"), [*STOPS, ({"dock_problem": "a chair"}, "a chair"),
                                                 ({"base_stopped": "60 s"}, "holds the wheels: 60 s")])  # fmt: skip
 def test_condition_that_stops_a_robot_refuses_a_docking_and_ends_one_for_good(changes, words):

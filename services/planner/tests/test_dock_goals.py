@@ -10,14 +10,15 @@ from fog_contracts.messages import Pose, Refusal, RobotGoal, RobotState
 from fog_contracts.site import RobotSite, Site
 from planner.dock_goals import DockGoals
 from planner.dock_keeper import DockKeeper
+from planner.mission_keeper import NO_MISSION, MissionConflictError
 from planner.store import StoreError
 
 FRONT = Pose(x=1.0, y=2.0, theta=0.5)
 
 
-def state(*, wants_dock: bool = True) -> RobotState:
+def state(*, wants_dock: bool = True, goal_id: str | None = None) -> RobotState:
     return RobotState(
-        mode="NORMAL", reasons=[], enabled=True, battery=0.1, goal_id=None, map_epoch=1, map_seq=1, plan_id=None,
+        mode="NORMAL", reasons=[], enabled=True, battery=0.1, goal_id=goal_id, map_epoch=1, map_seq=1, plan_id=None,
         wants_dock=wants_dock,
     )  # fmt: skip
 
@@ -28,7 +29,15 @@ def goal(pose: Pose | None) -> RobotGoal:
 
 def test_robot_that_wants_to_its_dock_is_sent_in_front_of_it_from_any_other_goal() -> None:
     assert DockGoals({"r1": FRONT}).due("r1", state(), None, 5.0) == FRONT
-    assert DockGoals({"r1": FRONT}).due("r1", state(), goal(Pose(x=9.0, y=9.0, theta=0.0)), 5.0) == FRONT
+    elsewhere = goal(Pose(x=9.0, y=9.0, theta=0.0))
+    assert DockGoals({"r1": FRONT}).due("r1", state(goal_id="g"), elsewhere, 5.0) == FRONT
+
+
+def test_robot_that_has_not_heard_yet_where_an_operator_sent_it_is_not_sent_to_its_dock() -> None:
+    docks, elsewhere = DockGoals({"r1": FRONT}), goal(Pose(x=9.0, y=9.0, theta=0.0))
+    assert docks.due("r1", state(), elsewhere, 5.0) is None
+    assert docks.due("r1", state(goal_id="an earlier one"), elsewhere, 5.0) is None
+    assert docks.due("r1", state(goal_id="cancelled meanwhile"), None, 5.0) is None
 
 
 def test_robot_that_is_sent_there_already_or_has_no_dock_or_does_not_want_to_is_not_sent() -> None:
@@ -57,6 +66,20 @@ def test_front_of_the_dock_is_0_7_m_before_it_and_robots_without_one_are_left_ou
     assert staging["r1"].theta == pytest.approx(1.5707963)
 
 
+async def test_operator_who_was_faster_is_not_overruled() -> None:
+    orders = []
+
+    async def send(order):
+        orders.append(order)
+        raise MissionConflictError("r1", None)
+
+    keeper, elsewhere = DockKeeper({"r1": FRONT}, send), goal(Pose(x=9.0, y=9.0, theta=0.0))
+    keeper.on_state("r1", state(goal_id="g"), elsewhere, 5.0)
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    assert [order.expected for order in orders] == ["g"]
+
+
 @pytest.mark.parametrize("outcome", [None, Refusal(code=206, reason="a wall"), StoreError("Redis is away")])
 async def test_refused_or_lost_goal_ends_nothing_and_is_tried_again(outcome: object) -> None:
     orders = []
@@ -75,6 +98,6 @@ async def test_refused_or_lost_goal_ends_nothing_and_is_tried_again(outcome: obj
     await asyncio.sleep(0)
     await asyncio.sleep(0)
     assert [(order.robot, order.pose, order.any_heading, order.expected) for order in orders] == [
-        ("r1", FRONT, False, None)
+        ("r1", FRONT, False, NO_MISSION)
     ] * 2
     assert "to its dock" in orders[0].who

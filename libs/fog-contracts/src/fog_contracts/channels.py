@@ -188,7 +188,8 @@ NODE_PROBLEM      = _text( "node_problem",      V1 + "nodes/{node}/problem",    
     publishers=(NODE,),          subscribers=(CONSOLE,),          durability=LATEST,   qos=1,
     about="why a node refused its latest configuration, command or update, in words; empty: nothing refused")
 AREA_HAZARD       = _mqtt( "area_hazard",       V1 + "areas/{area}/hazard",           m.AreaHazard,     limit=8 * KIB,
-    publishers=(AGGREGATOR,),    subscribers=(AGGREGATOR, MAP),   durability=LATEST,   qos=1, epoch="epoch")
+    publishers=(AGGREGATOR,),    subscribers=(AGGREGATOR, MAP, "home-assistant"), durability=LATEST, qos=1,
+    epoch="epoch")
 AREA_DEFINITION   = _mqtt( "area_definition",   V1 + "areas/{area}/definition",       m.AreaDefinition, limit=32 * KIB,
     publishers=(AGGREGATOR,),    subscribers=(MAP,),              durability=LATEST,   qos=1, epoch="epoch")
 AGGREGATOR_HEARTBEAT = _mqtt("aggregator_heartbeat", V1 + "aggregator/heartbeat", m.AggregatorHeartbeat,

@@ -129,6 +129,10 @@ class Detour:
         """Whether the bound is the full one of a cell (column, row)."""
         return bool(0 < self.costs[cell[1], cell[0]] < self.highest)
 
+    def outside(self, cell: tuple[int, int]) -> bool:
+        """Whether a cell (column, row) lies outside the part."""
+        return bool(self.costs[cell[1], cell[0]] == 0)
+
     def offset(self, field: GoalField) -> int | None:
         """Return what is to be added for a goal outside the part; None where its field gives no border cell a cost."""
         costs = field.costs(self.border)

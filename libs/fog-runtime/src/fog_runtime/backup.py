@@ -77,6 +77,7 @@ async def restore(file: Path, place: Place, *, replace: bool) -> Backup:
     redis = RedisConnection(place.redis_url, timeout_s=_TIMEOUT_S, credentials=place.credentials)
     try:
         found = await _names(redis, backup.site)
+        await _require_no_leader(redis, backup.site)
         _require_room(backup, place, found, replace=replace)
         await _restore_keys(redis, backup.keys, found)
     except StoreError as error:
@@ -93,6 +94,13 @@ async def restore(file: Path, place: Place, *, replace: bool) -> Backup:
                     " are not. Make room or grant access, then restore again with --replace"
                 ) from error
     return backup
+
+
+async def _require_no_leader(redis: RedisConnection, site: str) -> None:
+    """Raise `BackupError` while a service runs, which would write what it has in memory over the backup."""
+    for service in ("hazard-aggregator", "map-service", "planner"):
+        if await redis.read("EXISTS", f"fog:{site}:{service}:lease"):
+            raise BackupError(f"the {service} of site {site} runs: nothing was changed. Stop the services first")
 
 
 def _write(path: Path, content: File) -> None:

@@ -276,10 +276,10 @@ class AgentCore:
             self._localizer.initial_pose(pose.x, pose.y, pose.theta)
         return refusal
 
-    def switch_profile(self, name: ProfileName, now: float) -> str | None:
+    def switch_profile(self, name: ProfileName) -> str | None:
         """Navigate by another profile; return why not, None when it is done."""
         self._rest.wake()
-        return self._navigation.switch(name, now, at_rest=self._driving.wheels.at_rest)
+        return self._navigation.switch(name, at_rest=self._driving.wheels.at_rest)
 
     # --- publications ---
 

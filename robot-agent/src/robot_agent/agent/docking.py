@@ -90,7 +90,7 @@ class Docking:
         """Send an enabled robot without a mission to its dock once its battery is low, if its settings say so."""
         if not state.enabled or status.docked:
             self._tried = False
-        if status.battery is None or status.charging or mission.active:
+        if status.battery is None or status.charging or mission.active or state.latched:
             return
         if status.battery < self._config.dock_below and not self._tried and self._ordered_at is None:
             self._tried = self.order(state, mission, docked=False, now=now) is None
@@ -103,7 +103,7 @@ class Docking:
         """Return whether the robot has arrived in front of its dock; end the wish if it can't any more."""
         if self._ordered_at is None:
             return False
-        if not state.enabled or state.mode == "FAULT":
+        if not state.enabled or state.latched or state.mode == "FAULT":
             self.give_up()
         elif self._is_ours(mission):
             if mission.reached:

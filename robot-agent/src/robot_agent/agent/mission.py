@@ -112,6 +112,10 @@ class Mission:
         self._early_path = None
         return path
 
+    def forget_early_path(self) -> None:
+        """Forget the path that came before its goal."""
+        self._early_path = None
+
     def on_release(self, release: RobotRelease, now: float) -> None:
         """Extend the path; the release of one that the robot does not have keeps nothing alive."""
         delay = self._delays.update(release.sent, now)

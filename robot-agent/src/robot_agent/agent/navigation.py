@@ -74,7 +74,7 @@ class Navigation:
 
     def on_map_loaded(self, now: float) -> None:
         """Take over a snapshot that the follower of the fog's map has loaded."""
-        self._begin_onboard(now)
+        self._begin_onboard()
         self._driving.check_path(self.replica, now)
 
     def on_delta(self, delta: MapDelta, now: float) -> None:
@@ -144,21 +144,21 @@ class Navigation:
 
     # --- profiles ---
 
-    def switch(self, name: ProfileName, now: float, *, at_rest: bool) -> str | None:
+    def switch(self, name: ProfileName, *, at_rest: bool) -> str | None:
         """Navigate by another profile; return why not, None when it is done. The present path is dropped."""
         if not at_rest:
             return "the robot is driving: disable it first"
         self.profile = PROFILES[name]
         self._driving.configure(self.profile.motion(self._config.motion))
         self._onboard = None
-        self._begin_onboard(now)
+        self._begin_onboard()
         return None
 
-    def _begin_onboard(self, now: float) -> None:
+    def _begin_onboard(self) -> None:
         if not self.profile.onboard or self._fog.version is None:
             return
         # Only now: a robot that drives by the fog's map has no planner of its own in its memory.
         from robot_agent.onboard.navigator import OnboardNavigator  # noqa: PLC0415  # see above
 
         radius = self._config.footprint.inscribed_radius
-        self._onboard = OnboardNavigator(self.profile, self._fog.replica, radius, now)
+        self._onboard = OnboardNavigator(self.profile, self._fog.replica, radius)

@@ -42,7 +42,7 @@ class CommandTarget(Protocol):
     def set_initial_pose(self, pose: Pose | None) -> str | None:
         """Start localization at a pose in `map`; return why the pose is refused, None when it is accepted."""
 
-    def switch_profile(self, name: ProfileName, now: float) -> str | None:
+    def switch_profile(self, name: ProfileName) -> str | None:
         """Navigate by another profile; return why not, None when it is done."""
 
 
@@ -68,7 +68,7 @@ class OperatorCommands:
             case "initial_pose":
                 return self._start_localization(command.pose)
             case "profile_default" | "profile_full" | "profile_fog":
-                return self._switch(PROFILE_OF[command.kind], at.now)
+                return self._switch(PROFILE_OF[command.kind])
 
     def _cancel(self) -> CommandReply:
         goal = self._robot.cancel_goal()
@@ -88,8 +88,8 @@ class OperatorCommands:
             return _refused(refusal)
         return CommandReply(accepted=True, reason="accepted; the next lidar scans verify it")
 
-    def _switch(self, profile: ProfileName, now: float) -> CommandReply:
-        refusal = self._robot.switch_profile(profile, now)
+    def _switch(self, profile: ProfileName) -> CommandReply:
+        refusal = self._robot.switch_profile(profile)
         if refusal is not None:
             return _refused(refusal)
         return CommandReply(accepted=True, reason=f"the robot navigates by the profile {profile} from now on")

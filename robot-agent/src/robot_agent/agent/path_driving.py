@@ -54,8 +54,9 @@ class PathDriving:
         """Whether the last decision was made within the tolerance of the path's end."""
 
     def configure(self, config: MotionConfig) -> None:
-        """Follow paths by another configuration from now on, and drop the present path."""
+        """Follow paths by another configuration from now on, and drop the present path, and one that came early."""
         self._config = config
+        self.mission.forget_early_path()
         self.mission.drop_path()
         self._stop_following()
 

@@ -157,7 +157,7 @@ class GuardianCore:
         if self._sleep.asleep:
             if command.rest:
                 return Output()
-            self._base.woken_at = None
+            self._base.awake, self._base.woken_at = False, None
             return Output(attempt=self._sleep.end())
         if self.moving or self._latched is not None or self._charging(now) or not (data := self._sleep.begin()):
             return self._drive(now)
@@ -216,6 +216,8 @@ class GuardianCore:
 
     def _check(self, status: BaseStatus, now: float) -> bytes:
         base = self._base
+        if self._sleep.asleep:
+            return b""  # it was on its way when the base was put to sleep
         if not base.awake:
             current = base.woken_at is not None and now - base.woken_at >= self.driver.timing.ignored_after_wake
             if not current or status.mode_problem is not None:

@@ -39,12 +39,12 @@ _EARLY_S: Final = 1e-6
 class OnboardNavigator:
     """Keeps the robot's own costmap up to date and says when to search. Times are s of the robot's monotonic clock."""
 
-    def __init__(self, profile: Profile, floor: Replica, inscribed_radius: float, now: float) -> None:
+    def __init__(self, profile: Profile, floor: Replica, inscribed_radius: float) -> None:
         self._profile = profile
         self._costmap = OnboardCostmap(floor, inscribed_radius)
         geometry = self._costmap.geometry
         self._planner = Planner(geometry.width, geometry.height)
-        self._updated_at = now
+        self._updated_at = -math.inf  # so that the places that the fog closes are on it before the first search
         self._searched_at = -math.inf
         self._searched_goal: RobotGoal | None = None
         self._refused = False

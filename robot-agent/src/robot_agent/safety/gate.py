@@ -187,16 +187,16 @@ def _begin(
         return state, _latched_fault(state)
     if state.maneuver is not None:
         return state, f"the robot makes a maneuver already: {RULES[state.maneuver.kind].doing}"
-    if rules.needs_enable and not state.enabled:
+    if rules.needs_enable and (not state.enabled or state.latched):
         return state, "the robot must be enabled for that"
     begun = maneuver.begin(kind, inputs, now, config)
     if isinstance(begun, str):
         return state, begun
-    # The bump stays latched while the robot backs off from it.
+    # The bump stays latched while the robot backs off from it. What else is latched has to be answered by an operator,
+    # so that the robot is disabled after any other maneuver.
     latched = state.latched if kind == "back_off" else ()
-    return replace(
-        state, mode=rules.mode, enabled=state.enabled and rules.stays_enabled, latched=latched, maneuver=begun
-    ), None
+    enabled = state.enabled and rules.stays_enabled and not state.latched
+    return replace(state, mode=rules.mode, enabled=enabled, latched=latched, maneuver=begun), None
 
 
 def _interrupted(state: SafetyState) -> SafetyState:

@@ -66,7 +66,7 @@ from map_service.store import StoreError
 from map_service.zone_validation import ZoneError
 from map_service.zone_writer import ConflictError
 
-AuditKind = Literal["area", "mission", "override", "robot", "stop", "store", "zone"]
+AuditKind = Literal["alert", "area", "mission", "override", "robot", "stop", "store", "zone"]
 
 Image.preinit()  # the first picture would load PIL's formats, while the map is served
 

@@ -56,8 +56,11 @@ class Detours:
         self._known.clear()
 
     def guide(self, start: Cell, goal: Cell) -> Detour | None:
-        """Return the bound for a search; None without one."""
-        return next((known for known in self._known if known.covers(start) and not known.covers(goal)), None)
+        """Return the bound for a search from a closed part to a goal outside of it; None without one.
+
+        A way that stays inside the part need not cross its border, which the bound supposes.
+        """
+        return next((known for known in self._known if known.covers(start) and known.outside(goal)), None)
 
     def may_add(self, planning_map: PlanningMap) -> bool:
         """Whether another bound may be computed for this version of the map."""

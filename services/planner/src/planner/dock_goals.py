@@ -23,9 +23,15 @@ class DockGoals:
         self._sent_at: dict[str, float] = {}
 
     def due(self, robot: str, state: RobotState, goal: RobotGoal | None, now: float) -> Pose | None:
-        """Return the pose to send a robot to that has just published its state; None when it needs no other goal."""
+        """Return the pose to send a robot to that has just published its state; None when it needs no other goal.
+
+        A state from before the robot heard of its mission, or of the end of it, tells nothing: an operator who has sent
+        it elsewhere meanwhile would be overruled.
+        """
         pose = self._staging.get(robot)
         if pose is None or not state.wants_dock or (goal is not None and goal.pose == pose):
+            return None
+        if state.goal_id != (None if goal is None else goal.goal_id):
             return None
         if now - self._sent_at.get(robot, -math.inf) < PAUSE_S:
             return None

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from fog_contracts.messages import Refusal
 from fog_runtime import logs
 from planner.dock_goals import DockGoals
-from planner.mission_keeper import Order
+from planner.mission_keeper import NO_MISSION, MissionConflictError, Order
 from planner.store import StoreError
 
 if TYPE_CHECKING:
@@ -36,13 +36,16 @@ class DockKeeper:
         """Send the robot, which has just published its state, in front of its dock if it wants to and is not sent."""
         pose = self._goals.due(robot, state, goal, now)
         if pose is not None:
-            task = asyncio.get_running_loop().create_task(self._give(robot, pose), name="dock")
+            replaced = NO_MISSION if goal is None else goal.goal_id
+            task = asyncio.get_running_loop().create_task(self._give(robot, pose, replaced), name="dock")
             self._tasks.add(task)
             task.add_done_callback(self._tasks.discard)
 
-    async def _give(self, robot: str, pose: Pose) -> None:
+    async def _give(self, robot: str, pose: Pose, replaced: str) -> None:
         try:
-            outcome = await self._send(Order(robot, pose, f"robot {robot}, to its dock"))
+            outcome = await self._send(Order(robot, pose, f"robot {robot}, to its dock", expected=replaced))
+        except MissionConflictError:
+            return  # an operator was faster
         except StoreError as error:
             _log.error("dock_goal_failed", robot=robot, reason=str(error))
             return

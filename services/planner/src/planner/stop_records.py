@@ -1,6 +1,6 @@
 """Which stops without a token are recorded one by one, and which are only counted. Pure.
 
-Anybody may stop a robot, as often as they like, and no stop is refused. So that nobody can push the rest out of the
+Anybody may stop a robot, as often as they like. So that nobody can push the rest out of the
 audit trail by that, only the first stop of each sender is an entry of its own, for some senders; what they repeat is
 counted, and one entry per robot and period tells how often.
 """

@@ -15,6 +15,7 @@ user hands out its file; here it may be removed then.
 from __future__ import annotations
 
 import datetime as dt
+import os
 import stat
 from typing import TYPE_CHECKING, Final, Self
 
@@ -82,14 +83,15 @@ class SiteLocks:
     def make(self, hosts: Sequence[str], *, robots: Sequence[str] = (), nodes: Sequence[str] = ()) -> None:
         """Create what is missing: the authority, servers' certificates, the services' and tools' users, these robots'.
 
-        `hosts` are the names and addresses by which clients reach the servers. Certificates that expire soon, or name
-        other hosts, are renewed. Raises `LocksError` or `AuthorityError`.
+        `hosts` are the names and addresses by which clients reach the servers, besides those of before. Certificates
+        that expire soon, or lack one of them, are renewed. Raises `LocksError` or `AuthorityError`.
         """
         known_hosts = _read_plan(self._folder).hosts if (self._folder / _PLAN).exists() else []
         self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         if not (self._folder / AUTHORITY).exists():
             Authority.create(self._folder / AUTHORITY, f"Fognav {self._plan.site}", now=_now())
-        self.renew(hosts, only_due=set(hosts) <= set(known_hosts))
+        wanted = [*known_hosts, *(host for host in hosts if host not in known_hosts)]
+        self.renew(wanted, only_due=wanted == known_hosts)
         own: dict[str, Sequence[Server]] = {**users.SERVICES, **users.TOOLS, REDIS_ADMINISTRATOR: ("redis",)}
         own |= dict.fromkeys(self._plan.unrestricted, ("mqtt", "zenoh"))
         missing = {user: servers for user, servers in own.items() if not self.credentials(user).exists()}
@@ -230,7 +232,11 @@ class SiteLocks:
     def _write(self, program: str, name: str, text: str) -> None:
         file = self.folder(program) / name
         file.parent.mkdir(mode=0o755 if self._plan.mode & 0o077 else 0o700, parents=True, exist_ok=True)
-        atomic_write(file, text.encode(), mode=self._plan.mode)
+        # A file stays readable for whom an administrator gave it to: servers mostly run as users of their own.
+        before = file.stat() if file.exists() else None
+        atomic_write(file, text.encode(), mode=self._plan.mode if before is None else stat.S_IMODE(before.st_mode))
+        if before is not None and os.geteuid() == 0:
+            os.chown(file, before.st_uid, before.st_gid)
 
     def _private(self, folder: str, name: str, text: str) -> None:
         file = self._folder / folder / name

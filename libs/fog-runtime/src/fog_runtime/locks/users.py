@@ -29,6 +29,7 @@ TOOLS: Final[Mapping[str, Sequence[Server]]] = {
     "console": ("mqtt", "zenoh"),
     "recorder": ("mqtt", "zenoh"),
     "sim": ("zenoh",),
+    "home-assistant": ("mqtt",),
 }
 """The same for the tools of the fog node's administrator, and for a simulated world."""
 _OWN_TABLES: Final[Mapping[str, Sequence[str]]] = {

@@ -31,6 +31,10 @@ COMPILED = "libs/fog-kernels"
 MESSAGES = "libs/fog-contracts/src/fog_contracts/messages.py"
 CHANNELS = "libs/fog-contracts/src/fog_contracts/channels.py"
 SHAPES = "libs/fog-contracts/src/fog_contracts/shapes.py"
+MAKE_POLYGONS = {
+    "experiments/src/fognav_experiments/scenarios/stage.py", "robot-agent/src/robot_agent/agent/blocked_places.py"
+}  # fmt: skip
+"""They make a shape of a list of corners, whatever other kinds there are."""
 DRAWING_COMMANDS = {
     f"cli/src/fognav/{name}.py" for name in ("zone_command", "bench/costmap", "bench/fleet", "bench/rest_clients")
 }
@@ -267,7 +271,7 @@ def test_only_messages_shapes_and_the_commands_that_draw_them_distinguish_kinds_
     asking = re.compile(rf"\b({'|'.join(names)})\b|\btype\b\W+({'|'.join(tags)})\b")
     files = [file for source in SOURCES for suffix in ("py", "js") for file in source.parent.rglob(f"*.{suffix}")]
     found = {str(file.relative_to(ROOT)) for file in files if asking.search(file.read_text("utf-8"))}
-    assert found == {MESSAGES, SHAPES, *DRAWING_COMMANDS}
+    assert found == {MESSAGES, SHAPES, *DRAWING_COMMANDS, *MAKE_POLYGONS}
 
 
 # --- The document ---------------------------------------------------------------------------------------------------

@@ -271,3 +271,11 @@ def test_frame_that_was_on_its_way_when_the_base_fell_asleep_makes_no_fault_of_i
     assert rig.core.latched is None
     rig.frame(7.2)
     assert rig.wheels(rig.command(7.21))[0] > 0.0
+
+
+def test_base_that_no_line_wakes_is_not_put_to_sleep() -> None:
+    rig = Rig(base=PlainBase())
+    rig.drive(0.2, 1.0, 0.0, 0.0)
+    assert b"sleep" not in rig.core.on_command(WheelCommand(seq=1, left=0.0, right=0.0, rest=True), 1.01).data
+    rig.frame(1.02)
+    assert rig.wheels(rig.command(1.03))[0] > 0.0

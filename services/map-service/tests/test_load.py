@@ -11,7 +11,6 @@ import time
 import httpx
 import numpy as np
 import pytest
-from redis.asyncio import Redis
 
 from fog_contracts import channels as ch
 from fog_contracts.grid import GridGeometry, StaticMap
@@ -151,7 +150,7 @@ async def test_client_that_stops_with_twenty_open_snapshots_does_not_silence_the
 
 async def test_whoever_reads_the_audit_trail_of_large_zones_does_not_silence_the_heartbeat(fog, until, tokens):
     zone = json.dumps({"id": "z", "kind": "BLOCKED", "shape": STAR}, default=float)
-    async with Redis.from_url(fog.redis.url) as redis, redis.pipeline(transaction=False) as pipeline:
+    async with fog.raw_redis() as redis, redis.pipeline(transaction=False) as pipeline:
         for _ in range(1000):
             fields = {"at": "1.0", "who": "anna", "action": "replace", "id": "z", "before": zone, "after": zone}
             pipeline.xadd("fog:test:audit:zone", fields)

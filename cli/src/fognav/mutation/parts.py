@@ -103,17 +103,12 @@ PARTS: Final = (
         (
             "guardian/test_guardian_core.py",
             "guardian/test_guardian_limits.py",
+            "guardian/test_guardian_maneuvers.py",
             "guardian/test_guardian_moments.py",
             "guardian/test_revival.py",
         ),
         ("numpy", "hypothesis.strategies", "robot_agent.config"),
         (
-            Equivalent(
-                "core",
-                "self._feedback_at = _NEVER",
-                "self._feedback_at = _NEVER -> pass",
-                "the first reading is reported whatever the time, and sets it",
-            ),
             Equivalent(
                 "core",
                 "elapsed = 0.0 if self._stepped_at is None else max(0.0, min(now - self._stepped_at, STEP_S))",

@@ -46,7 +46,7 @@ Waiting for bytes would wake the process for each piece of a frame, which some a
 """
 RESTING_S: Final = 0.055
 """The same while no wheel turns; but a command of the agent is applied at once, and comes a little more often."""
-HEARTBEAT_S: Final = 0.045
+HEARTBEAT_S: Final = 0.04
 """Shortest time between two heartbeats: they share the wake-ups above."""
 AGENT_LIVES_S: Final = 1.0
 """An agent sends a command every 0.05 s; one that was silent for longer than this hangs: another may take its place."""

@@ -256,8 +256,11 @@ def test_console_watches_the_liveliness_of_all_roles_and_a_service_declares_only
 def test_named_robots_may_publish_only_as_themselves():
     rights = rules(zenoh_acl("lab", ["r1", "r2"]))
     assert "fog/lab/robots/r1/pose" in rights["r1", "ingress", "put"]
-    r1 = {key for (name, _, _), keys in rights.items() if name == "r1" for key in keys}
+    r1 = {key for (name, flow, _), keys in rights.items() if name == "r1" and flow == "ingress" for key in keys}
     assert not any("robots/r2" in key or "robots/*" in key for key in r1)
+    learned = {kind for (name, flow, kind), keys in rights.items()
+               if name == "r1" and flow == "egress" and any("robots/*" in key for key in keys)}  # fmt: skip
+    assert learned <= {"declare_subscriber", "query"}, "of other robots, who listens and asks; nothing they publish"
     assert rights["r1", "ingress", "liveliness_token"] == {"fog/lab/live/robot-agent/r1"}
     assert not any(name == "robot-agent" for name, _, _ in rights)
 

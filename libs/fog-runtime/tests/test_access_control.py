@@ -5,6 +5,7 @@ import contextlib
 import json
 import queue
 import time
+from collections import Counter
 
 import paho.mqtt.client as paho
 import pytest
@@ -257,6 +258,44 @@ async def test_acl_allows_publishing_queries_recovery_and_liveliness(tmp_path, o
             await until_present(console, {("planner", "lab"), ("robot-agent", "r1")})
             assert await console.query(ch.PLANNER_PLAN, PLAN, m.PlanReply, 5.0) == m.PlanReply(length=1.0)
             assert await robot.query(ch.ZONES, None, m.ZoneSet, 5.0) == ZONES
+
+
+FROM_ROBOTS = [row for row in ch.CHANNELS.values() if row.kind == "pub" and ch.ROBOT in row.publishers]
+OF_THE_FOG = set(ROLES) - {ch.ROBOT, "r1", "r2"}
+SAMPLES = 40
+
+
+def test_every_channel_of_robots_arrives_at_those_who_subscribe_to_all_robots(tmp_path):
+    """A publisher that learned of no subscription is silent, but not before it asked: so many samples are awaited."""
+    with zenoh_router(tmp_path, zenoh_acl("lab", ["r1", "r2"])) as endpoint, contextlib.ExitStack() as stack:
+
+        def session(user):
+            config = session_config("client", connect=[endpoint])
+            config.insert_json5("transport/auth/usrpwd", json.dumps({"user": user, "password": user}))
+            return stack.enter_context(zenoh.open(config))
+
+        robot, received = session("r1"), queue.Queue()
+        publishers = [robot.declare_publisher(row.key(site="lab", robot="r1")) for row in FROM_ROBOTS]
+        expected = {(user, row) for row in FROM_ROBOTS for user in row.subscribers if user in OF_THE_FOG}
+        sessions = {user: session(user) for user, _ in expected}
+        kept = [
+            sessions[user].declare_subscriber(
+                row.pattern(site="lab"), lambda _, name=(user, row.name): received.put(name)
+            )
+            for user, row in expected
+        ]
+        assert len(kept) == len(expected) > 0
+        expected = {(user, row.name) for user, row in expected}
+        found = Counter()
+        deadline = time.monotonic() + WAIT_S
+        while any(found[each] < SAMPLES for each in expected):
+            assert time.monotonic() < deadline, {each: found[each] for each in expected}
+            for publisher in publishers:
+                publisher.put(b"x")
+            with contextlib.suppress(queue.Empty):
+                while True:
+                    found[received.get(timeout=0.02)] += 1
+        assert set(found) == expected
 
 
 async def test_acl_blocks_messages_and_queries_of_a_role_without_the_right(tmp_path, opened):

@@ -1,6 +1,7 @@
 """Backups of a real Redis and of folders: what is restored is what was there, and nothing is half done."""
 
 import asyncio
+import contextlib
 import io
 import os
 import stat
@@ -104,6 +105,8 @@ async def test_backup_during_writes_has_zones_and_their_count_of_one_moment(tmp_
             assert await raw.hlen("fog:test:zones") == int(await raw.hget("fog:test:writes", "zones") or 0)
     assert not writing.done()
     writing.cancel()
+    with contextlib.suppress(asyncio.CancelledError):
+        await writing
 
 
 async def test_what_is_there_is_replaced_only_when_that_is_wanted(tmp_path, here, redis):

@@ -141,25 +141,30 @@ def _rights(role: Role, site: str, robot: str) -> _Rights:
                 rights.allow("egress", "liveliness_token", key)
             continue
         if publishes:
-            _allow_publishing(rights, row, key)
+            _allow_publishing(rights, row, key, _key(row, site, "*"))
         if subscribes:
             _allow_subscribing(rights, row, key)
     return rights
 
 
-def _allow_publishing(rights: _Rights, row: Channel, key: str) -> None:
+def _allow_publishing(rights: _Rights, row: Channel, key: str, all_keys: str) -> None:
+    """Allow to publish or answer on `key`, to those who subscribe to or ask for `all_keys` (the same of all robots).
+
+    A publisher sends only after it was told of a subscription that meets its key. The fog subscribes to all robots at
+    once, and a rule for one robot's key does not cover that subscription.
+    """
     if row.kind == "query":
         rights.allow("ingress", "declare_queryable reply", key)
-        rights.allow("egress", "query", key)
+        rights.allow("egress", "query", all_keys)
         return
     rights.allow("ingress", "put", key)
-    rights.allow("egress", "declare_subscriber", key)
+    rights.allow("egress", "declare_subscriber", all_keys)
     if row.durability != "volatile":
-        cache = f"{key}/@adv/**"
+        cache, all_caches = f"{key}/@adv/**", f"{all_keys}/@adv/**"
         rights.allow("ingress", "put declare_queryable reply liveliness_token", cache)
         rights.allow("ingress", "declare_queryable reply", key)
-        rights.allow("egress", "declare_subscriber", cache)
-        rights.allow("egress", "query", key, cache)
+        rights.allow("egress", "declare_subscriber", all_caches)
+        rights.allow("egress", "query", all_keys, all_caches)
 
 
 def _allow_subscribing(rights: _Rights, row: Channel, key: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import gc
 import importlib.util
 import re
 from collections import Counter
@@ -21,6 +22,7 @@ from fognav_experiments.comparison.records import MOVE_BASE, Asked, Folder, Fold
 from fognav_experiments.comparison.report import paired
 from fognav_experiments.comparison.statistics import compare, estimate, t_cdf, t_quantile
 from fognav_experiments.cpu import CpuMeter
+from fognav_experiments.rigs import System
 
 ESTIG = Path(__file__).parents[2] / "sites" / "estig"
 _spec = importlib.util.spec_from_file_location("ring_site", Path(__file__).parent / "ring_site.py")
@@ -129,6 +131,11 @@ def test_a_folder_of_another_experiment_is_refused(tmp_path):
         publish(Folder(tmp_path), tmp_path)
 
 
+def systems():
+    """Return the ids of the simulated systems in memory."""
+    return {id(found) for found in gc.get_objects() if isinstance(found, System)}
+
+
 @pytest.fixture(scope="module")
 def short_run(tmp_path_factory):
     """One run of one route in all setups, killed after the first drive and repeated."""
@@ -136,12 +143,14 @@ def short_run(tmp_path_factory):
     folder.begin(ASKED, {"commit": "none", "machine": {"cores": 2}})
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(runner, "_site", lambda _folder: ring.ring_site())
+        before = systems()
         asked = runner.tasks(SPEC, 1, [RUN], SETUPS)
         drives = runner.run(folder.path, asked, folder)
         first = next(drives)
         drives.close()
         rest = list(runner.run(folder.path, asked, folder))
         assert list(runner.run(folder.path, asked, folder)) == []
+        assert systems() <= before, "drives that ended are still in memory"
     return folder, [first, *rest]
 
 

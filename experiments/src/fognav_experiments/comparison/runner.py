@@ -17,6 +17,7 @@ from fog_runtime.site import load_site
 from fognav_experiments.comparison.draws import ExperimentSpec, draw
 from fognav_experiments.comparison.records import Asked, Folder, file_name
 from fognav_experiments.comparison.trial import drive
+from fognav_experiments.lockstep import release_drives
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -103,7 +104,9 @@ def new(site: LoadedSite, site_folder: Path, seed: int) -> Asked:
 
 
 def _drive(site_folder: Path, task: Task, jobs: int) -> Record:
-    return drive(_site(site_folder), task.drawn, task.setup, jobs)
+    record = drive(_site(site_folder), task.drawn, task.setup, jobs)
+    release_drives()
+    return record
 
 
 @cache

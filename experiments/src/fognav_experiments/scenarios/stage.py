@@ -10,7 +10,7 @@ import msgspec
 
 from fog_contracts.messages import PolygonShape, Pose, RobotGoal, SimObstacle, Zone
 from fog_runtime.site import load_site
-from fognav_experiments.lockstep import LockstepDrive, LockstepResult
+from fognav_experiments.lockstep import LockstepDrive, LockstepResult, release_drives
 from fognav_experiments.rigs import moment
 from fognav_experiments.scenarios.description import (
     BlindLidar,
@@ -83,6 +83,8 @@ def play(scenario: Scenario, sites: Path) -> Played:
     ended = outcome or DriveOutcome("stopped", f"ended after {scenario.seconds:.0f} s")
     result = run.result(drive, ended)
     name = "driving" if outcome is None else outcome.kind
+    del drive, run, stage
+    release_drives()
     return Played(scenario, result, name, deviations(scenario.expected, result, name, result.events[before:]))
 
 

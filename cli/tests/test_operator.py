@@ -13,7 +13,8 @@ from fog_runtime.zenoh_edge import ZenohEdge
 from fognav import checkout
 from fognav.demo.operator import Operator
 from fognav.demo.scene import Scene
-from fognav.stack import ROUTER, Stack, StackConfig
+from fognav.programs import ROUTER
+from fognav.stack import Stack, StackConfig
 
 pytestmark = pytest.mark.live
 TIMEOUT_S = 15.0

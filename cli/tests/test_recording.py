@@ -10,7 +10,8 @@ from fog_runtime.mqtt_edge import MqttEdge
 from fog_runtime.zenoh_edge import ZenohEdge
 from fognav import recording
 from fognav.output import WrongUseError
-from fognav.stack import BROKER, ROUTER, Stack, StackConfig
+from fognav.programs import BROKER, ROUTER
+from fognav.stack import Stack, StackConfig
 
 pytestmark = pytest.mark.live
 TIMEOUT_S = 15.0

@@ -10,7 +10,8 @@ import psutil
 import pytest
 
 from fog_supervisor import net
-from fognav.stack import BROKER, REDIS, ROUTER, SERVERS, Stack, StackConfig
+from fognav.programs import BROKER, REDIS, ROUTER, SERVERS
+from fognav.stack import Stack, StackConfig
 
 if TYPE_CHECKING:
     from fog_supervisor.supervisor import Event

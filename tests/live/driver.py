@@ -24,7 +24,8 @@ from fog_supervisor import net
 from fognav.demo.operator import Operator
 from fognav.demo.scene import Scene
 from fognav.demo.usage import children
-from fognav.stack import AGENT, MAP_SERVICE, PLANNER, WATCHDOG, Stack, StackConfig
+from fognav.programs import AGENT, MAP_SERVICE, PLANNER, WATCHDOG
+from fognav.stack import Stack, StackConfig
 from fognav.stack_doors import doors_of
 
 if TYPE_CHECKING:

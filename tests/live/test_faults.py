@@ -25,7 +25,7 @@ from fog_contracts.geometry import contains_point
 from fog_contracts.messages import Pose, SimCommand, SimObstacle
 from fog_runtime.mqtt_broker import Broker
 from fog_supervisor import net
-from fognav.stack import AGENT, AGGREGATOR, BROKER, MAP_SERVICE, PLANNER, REDIS, ROUTER
+from fognav.programs import AGENT, AGGREGATOR, BROKER, MAP_SERVICE, PLANNER, REDIS, ROUTER
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator

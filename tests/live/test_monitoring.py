@@ -21,7 +21,7 @@ from driver import LiveSystem
 
 from fog_contracts.messages import SimCommand, SimObstacle
 from fog_supervisor import net
-from fognav.stack import AGENT, MAP_SERVICE, SERVICES
+from fognav.programs import AGENT, MAP_SERVICE, SERVICES
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator

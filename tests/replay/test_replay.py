@@ -62,8 +62,9 @@ from fognav.demo.options import DrivePlan, Options
 from fognav.demo.scene import Scene
 from fognav.demo.speed import SpeedWatch
 from fognav.output import WrongUseError
+from fognav.programs import AGENT, MAP_SERVICE, SERVERS, SERVICES, SIMULATOR, WATCHDOG
 from fognav.recording import recording, summary
-from fognav.stack import AGENT, MAP_SERVICE, SERVERS, SERVICES, SIMULATOR, WATCHDOG, Stack, StackConfig
+from fognav.stack import Stack, StackConfig
 from fognav.stack_doors import doors_of
 from fognav_sim.drive.hazard import entry_distance
 from robot_agent.agent.replay import replay

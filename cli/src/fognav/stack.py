@@ -1,11 +1,8 @@
 """The whole system on one machine: real brokers, every process of fog and robot, and simulated hardware."""
 
-import asyncio
-import os
 import shutil
-import sys
 import tempfile
-from collections.abc import Awaitable, Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -15,29 +12,32 @@ from typing import Final, Self
 from fog_runtime.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fog_runtime.keys import ADMIN_TOKEN, OPERATOR_KEY, TOKENS, make_keys
 from fog_runtime.operator_key import read_operator_key
-from fog_supervisor import net, servers
-from fog_supervisor.supervisor import Event, Program, Supervisor
-from fognav import checkout
+from fog_supervisor import net
+from fog_supervisor.supervisor import Event, Supervisor
+from fognav.programs import (
+    AGENT,
+    BROKER,
+    MODULES,
+    PLANNER,
+    REDIS,
+    ROBOT,
+    ROUTER,
+    SERVERS,
+    SERVICES,
+    SIMULATOR,
+    WATCHDOG,
+    ProgramSet,
+    ServerPorts,
+    SystemFolder,
+    exists,
+    server_programs,
+    simulated_robot_settings,
+    simulator_settings,
+)
 from fognav.stack_doors import Doors, StackDoors
-
-BROKER: Final = "mosquitto"
-REDIS: Final = "redis"
-ROUTER: Final = "zenoh-router"
-AGGREGATOR: Final = "hazard-aggregator"
-MAP_SERVICE: Final = "map-service"
-PLANNER: Final = "planner"
-SIMULATOR: Final = "simulator"
-WATCHDOG: Final = "robot-watchdog"
-AGENT: Final = "robot-agent"
-
-SERVERS: Final = (BROKER, REDIS, ROUTER)
-SERVICES: Final = (AGGREGATOR, MAP_SERVICE, PLANNER)
-ROBOT: Final = (WATCHDOG, AGENT)
 
 _SOCKET_PATH_LIMIT: Final = 80
 """Unix socket paths are limited to 108 bytes; folders up to this length leave room for the file's name."""
-
-Ready = Callable[[], Awaitable[str | None]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,15 +68,6 @@ def _new_folder() -> Path:
     return folder
 
 
-async def _exists(path: Path) -> str | None:
-    exists = await asyncio.to_thread(path.exists)
-    return None if exists else f"{path} does not exist yet"
-
-
-def _nothing() -> None:
-    pass
-
-
 class Stack:
     """All processes of one demonstration, by name; leaving the context ends them and removes their files.
 
@@ -86,6 +77,7 @@ class Stack:
     def __init__(self, config: StackConfig, on_event: Callable[[Event], None] = lambda _: None) -> None:
         self.config = config
         self.folder = _new_folder()
+        self.files = SystemFolder(self.folder)
         self.keep_files = False
         make_keys(self.folder)
         self.token_file = self.folder / ADMIN_TOKEN
@@ -153,11 +145,11 @@ class Stack:
 
     def log(self, name: str) -> Path:
         """Return the log file of a process."""
-        return self.folder / "logs" / f"{name}.log"
+        return self.files.log(name)
 
     def port_file(self, name: str) -> Path:
         """Return the file to which a process writes the port of its HTTP server."""
-        return self.folder / "ports" / name
+        return self.files.port_file(name)
 
     def port(self, name: str) -> int | None:
         """Return the port of a process's HTTP server, or None before it listens."""
@@ -169,99 +161,34 @@ class Stack:
         return {name: pid for name, pid in found if pid is not None}
 
     def _prepare(self) -> None:
-        for name in ("logs", "ports", "data", "sim"):
-            (self.folder / name).mkdir(mode=0o700)
-        self._add_servers()
+        ports = ServerPorts(mqtt=self.mqtt_port, redis=self.redis_port, zenoh=self.zenoh_port)
+        server_set = server_programs(self.files, ports, self.doors.of)
+        self._urls = {program.name: program.url for program in server_set}
+        programs = ProgramSet(
+            self.supervisor,
+            self.files,
+            {
+                "SITE_DIR": str(self.config.site_dir),
+                "SPEED": repr(self.config.speed),
+                "SEED": str(self.config.seed),
+                "MQTT_URL": self.mqtt_url,
+                "REDIS_URL": self.redis_url,
+                "ZENOH_CONNECT": self.zenoh_endpoint,
+                **(self.config.extra or {}),
+            },
+        )
+        for program in server_set:
+            programs.add_server(program)
         robot_file = {"ROBOT_FILE": str(self.config.robot_file)} if self.config.robot_file else {}
         hardware = {"BASE": self.config.base, "LIDAR": self.config.lidar, **robot_file}
-        simulator = {**hardware, **self.doors.node_settings(), "RUN_DIR": str(self.folder / "sim")}
-        self._add_python(SIMULATOR, "fognav_sim", simulator, user="sim")
+        simulator = {**simulator_settings(self.folder, hardware), **self.doors.node_settings()}
+        programs.add_python(SIMULATOR, MODULES[SIMULATOR], {**simulator, **self.doors.settings("sim")})
         key = {"OPERATOR_KEY_FILE": str(self.key_file)}
-        for name, module in zip(SERVICES, ("hazard_aggregator", "map_service", "planner"), strict=True):
+        for name in SERVICES:
             own = {"TOKENS_FILE": str(self.folder / TOKENS), **(key if name == PLANNER else {})}
-            self._add_python(name, module, own, user=name)
-        socket = self.folder / "guardian.sock"
-        wires = {
-            **hardware,
-            **key,
-            "ROBOT": self.config.robot,
-            "BASE_PORT": str(self.folder / "sim" / "base"),
-            "LIDAR_PORT": str(self.folder / "sim" / "lidar"),
-            "GUARDIAN_SOCKET": str(socket),
-        }
-        robot, ready = self.config.robot, partial(_exists, socket)
-        self._add_python(WATCHDOG, "robot_agent.guardian.watchdog", wires, ready=ready, rank=2)
-        self._add_python(AGENT, "robot_agent", wires, user=robot, rank=2)
-
-    def _add_servers(self) -> None:
-        data = self.folder / "data"
-        for name in (BROKER, REDIS):
-            (data / name).mkdir(mode=0o700)
-        for program in (
-            servers.mosquitto_program(data / BROKER, self.mqtt_port, locks=self.doors.of("mosquitto")),
-            servers.redis_program(data / REDIS, self.redis_port, locks=self.doors.of("redis")),
-            servers.router_program(self.zenoh_port, locks=self.doors.of("zenoh")),
-        ):
-            self._urls[program.name] = program.url
-            ready = partial(net.server_problem, program.port, program.probe, program.reply, encrypted=program.encrypted)
-            self._add(program.name, program.command, ready=ready)
-
-    def _add_python(
-        self,
-        name: str,
-        module: str,
-        own: Mapping[str, str],
-        *,
-        user: str | None = None,
-        ready: Ready | None = None,
-        rank: int = 1,
-    ) -> None:
-        port_file = self.port_file(name)
-        data = self.folder / "data" / name
-        data.mkdir()
-        settings = {
-            "SITE_DIR": str(self.config.site_dir),
-            "SPEED": repr(self.config.speed),
-            "SEED": str(self.config.seed),
-            "MQTT_URL": self.mqtt_url,
-            "REDIS_URL": self.redis_url,
-            "ZENOH_CONNECT": self.zenoh_endpoint,
-            "REVISION": checkout.revision(),
-            "PORT_FILE": str(port_file),
-            "DATA_DIR": str(data),
-            **(self.doors.settings(user) if user is not None else {}),
-            **(self.config.extra or {}),
-            **own,
-        }
-        self._add(
-            name,
-            (sys.executable, "-m", module),
-            environment={f"FOGNAV_{key}": value for key, value in settings.items()},
-            ready=ready or partial(net.readiness, port_file),
-            before=partial(port_file.unlink, missing_ok=True),
-            rank=rank,
-        )
-
-    def _add(
-        self,
-        name: str,
-        arguments: tuple[str, ...],
-        *,
-        ready: Ready,
-        environment: Mapping[str, str] | None = None,
-        before: Callable[[], None] = _nothing,
-        rank: int = 0,
-    ) -> None:
-        # Settings of this shell must not affect the processes.
-        inherited = {key: value for key, value in os.environ.items() if not key.startswith("FOGNAV_")}
-        self.supervisor.add(
-            Program(
-                name=name,
-                arguments=arguments,
-                environment={**inherited, "PYTHONUNBUFFERED": "1", **(environment or {})},
-                log=self.log(name),
-                ready=ready,
-                before=before,
-                rank=rank,
-            )
-        )
+            programs.add_python(name, MODULES[name], {**own, **self.doors.settings(name)})
+        robot = self.config.robot
+        wires = {**simulated_robot_settings(self.folder, robot, hardware), **key}
+        ready = partial(exists, Path(wires["GUARDIAN_SOCKET"]))
+        programs.add_python(WATCHDOG, MODULES[WATCHDOG], wires, ready=ready, rank=2)
+        programs.add_python(AGENT, MODULES[AGENT], {**wires, **self.doors.settings(robot)}, rank=2)

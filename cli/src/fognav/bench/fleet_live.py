@@ -27,7 +27,8 @@ from fognav.bench.fleet import closures, hazard_message, percentile
 from fognav.bench.fleet_stand_ins import Receivers, StandIns
 from fognav.bench.site import SITE, write_site
 from fognav.output import FailedError
-from fognav.stack import PLANNER, REDIS, ROUTER, Stack, StackConfig
+from fognav.programs import PLANNER, REDIS, ROUTER
+from fognav.stack import Stack, StackConfig
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Mapping

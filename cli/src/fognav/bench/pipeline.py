@@ -25,7 +25,8 @@ from fog_supervisor import net
 from fognav.bench.office import make_office
 from fognav.bench.site import SITE, write_site
 from fognav.output import FailedError
-from fognav.stack import AGGREGATOR, MAP_SERVICE, SERVERS, Stack, StackConfig
+from fognav.programs import AGGREGATOR, MAP_SERVICE, SERVERS
+from fognav.stack import Stack, StackConfig
 
 if TYPE_CHECKING:
     from collections.abc import Callable

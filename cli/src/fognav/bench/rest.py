@@ -20,7 +20,8 @@ from fog_runtime.redis_store import Audit
 from fognav.bench.costmap import random_zones, worst_shapes
 from fognav.bench.rest_clients import Load
 from fognav.bench.site import SITE
-from fognav.stack import MAP_SERVICE, SERVERS, Stack, StackConfig
+from fognav.programs import MAP_SERVICE, SERVERS
+from fognav.stack import Stack, StackConfig
 from map_service.store import Store
 
 if TYPE_CHECKING:

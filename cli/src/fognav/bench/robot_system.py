@@ -21,7 +21,8 @@ from fog_runtime.zenoh_edge import ZenohEdge
 from fog_supervisor import net
 from fognav.bench.office import corridor_rows, make_office
 from fognav.bench.running import RunningSystem, first_child
-from fognav.stack import AGENT, PLANNER, ROBOT, WATCHDOG, Stack, StackConfig
+from fognav.programs import AGENT, PLANNER, ROBOT, WATCHDOG
+from fognav.stack import Stack, StackConfig
 from fognav_sim.drive.operator import OperatorPolicy
 from fognav_sim.planner_client import put_goal
 

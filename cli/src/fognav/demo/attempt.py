@@ -18,8 +18,9 @@ from fognav.demo.scene import Scene
 from fognav.demo.speed import SpeedWatch, TooFastError
 from fognav.demo.usage import Usage, children
 from fognav.output import WrongUseError
+from fognav.programs import WATCHDOG
 from fognav.recording import recording
-from fognav.stack import WATCHDOG, Stack, StackConfig
+from fognav.stack import Stack, StackConfig
 from fognav.stack_doors import doors_of
 from fognav_sim.drive.drive import Drive, DriveSummary
 from fognav_sim.drive.evaluation import DriveOutcome

@@ -27,7 +27,8 @@ from fog_runtime.robot_commands import RobotCommands
 from fog_runtime.zenoh_edge import ZenohEdge
 from fog_supervisor import net
 from fognav.demo.scene import Scene
-from fognav.stack import PLANNER, Stack
+from fognav.programs import PLANNER
+from fognav.stack import Stack
 from fognav_sim.drive.hazard import path_length
 from fognav_sim.drive.operator import OperatorPolicy
 from fognav_sim.planner_client import put_goal

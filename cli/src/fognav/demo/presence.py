@@ -12,7 +12,8 @@ from fognav.demo.options import DrivePlan
 from fognav.demo.scene import Scene
 from fognav.operate.registry import Registration, System, registered
 from fognav.output import FailedError, WrongUseError
-from fognav.stack import AGENT, BROKER, ROUTER, SERVICES, Stack
+from fognav.programs import AGENT, BROKER, ROUTER, SERVICES
+from fognav.stack import Stack
 
 PAGE: Final = "page"
 _SLOW_ZONE: Final = (1.0, 0.1)

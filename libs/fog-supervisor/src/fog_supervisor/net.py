@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Final
 
 LOOPBACK: Final = "127.0.0.1"
+EVERY_ADDRESS: Final = ("0.0.0.0", "")  # noqa: S104  # compared, not listened on
 PORTS = range(20_000, 32_000)
 """Below the ephemeral ports: a client that connects to a restarting server could otherwise be assigned the server's
 own port, and even connect to itself."""
@@ -98,13 +99,20 @@ def request(  # noqa: PLR0913  # the parts of a request
         return Response(response.status, text)
 
 
-async def readiness(port_file: Path) -> str | None:
-    """Return what a process still waits for by its `/readyz`, or None when it is ready."""
+def reachable(address: str) -> str:
+    """Return where programs of this computer reach a server that listens on an address, which may be every one."""
+    return LOOPBACK if address in EVERY_ADDRESS else address
+
+
+async def readiness(port_file: Path, *, host: str = LOOPBACK, encrypted: bool = False) -> str | None:
+    """Return what a process still waits for by its `/readyz`, or None when it is ready; `encrypted`: by HTTPS."""
     port = read_port(port_file)
     if port is None:
         return "it has not written its port file yet"
     try:
-        response = await asyncio.to_thread(request, "GET", port, "/readyz")
+        response = await asyncio.to_thread(
+            request, "GET", port, "/readyz", host=host, tls=unverified() if encrypted else None
+        )
     except (OSError, http.client.HTTPException) as error:
         return f"/readyz does not answer: {error}"
     if response.status == http.client.OK:
@@ -125,14 +133,14 @@ def unverified() -> ssl.SSLContext:
 
 
 async def server_problem(
-    port: int, probe: bytes = b"", expected: bytes = b"", *, encrypted: bool = False
+    port: int, probe: bytes = b"", expected: bytes = b"", *, host: str = LOOPBACK, encrypted: bool = False
 ) -> str | None:
     """Return None when a server accepts connections on the port and answers `probe` as expected, else what is wrong.
 
     `encrypted`: by TLS.
     """
     try:
-        opened = asyncio.open_connection(LOOPBACK, port, ssl=unverified() if encrypted else None)
+        opened = asyncio.open_connection(host, port, ssl=unverified() if encrypted else None)
         reader, writer = await asyncio.wait_for(opened, HTTP_TIMEOUT_S)
     except (OSError, TimeoutError) as error:
         return f"no server listens on port {port}: {error}"

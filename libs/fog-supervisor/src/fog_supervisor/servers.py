@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import IO, Final, Self
 
 from fog_supervisor import configurations
-from fog_supervisor.net import LOOPBACK, free_port, unverified
+from fog_supervisor.net import LOOPBACK, free_port, reachable, unverified
 
 _READY_S: Final = 60.0
 """Long, because a server that can't start ends at once, and a busy machine may be ten times slower."""
@@ -40,10 +40,12 @@ def find_program(*names: str) -> Path | None:
 
 @dataclass(frozen=True, kw_only=True)
 class ServerProgram:
-    """How to run a server on a loopback port; it is ready when it accepts connections and sends `reply` to `probe`."""
+    """How to run a server on a port; it is ready when it accepts connections and sends `reply` to `probe`."""
 
     name: str
     port: int
+    address: str = LOOPBACK
+    """On which it listens."""
     url: str
     command: tuple[str, ...]
     probe: bytes = b""
@@ -54,7 +56,7 @@ class ServerProgram:
     def ready(self) -> bool:
         """Whether it accepts connections and sends the expected reply."""
         try:
-            with socket.create_connection((LOOPBACK, self.port), timeout=0.5) as connection:
+            with socket.create_connection((reachable(self.address), self.port), timeout=0.5) as connection:
                 if not self.probe:
                     return True
                 if not self.encrypted:
@@ -76,8 +78,10 @@ def _installed(name: str, package: str) -> str:
     return str(path)
 
 
-def mosquitto_program(folder: Path, port: int, *, locks: Path | None = None, extra: str = "") -> ServerProgram:
-    """Return an MQTT broker, configured in `folder`; `extra` is appended to its configuration.
+def mosquitto_program(
+    folder: Path, port: int, *, address: str = LOOPBACK, locks: Path | None = None, extra: str = ""
+) -> ServerProgram:
+    """Return an MQTT broker that listens on `address`, configured in `folder`; `extra` is added to its configuration.
 
     With the folder of its `locks` (`fog_runtime.locks`) it encrypts and admits only the users there, else everybody.
     Raises `ServerError` when it is not installed.
@@ -86,12 +90,13 @@ def mosquitto_program(folder: Path, port: int, *, locks: Path | None = None, ext
     # As root, Mosquitto switches to another user, who may have no access to a private folder.
     lines = [*(["user root"] if os.geteuid() == 0 else []), *extra.splitlines()]
     file = folder / "mosquitto.conf"
-    text = configurations.mosquitto(f"{port} {LOOPBACK}", str(folder), locks=_text(locks), extra=lines)
+    text = configurations.mosquitto(f"{port} {address}", str(folder), locks=_text(locks), extra=lines)
     file.write_text(text, "utf-8")
     scheme = "mqtt" if locks is None else "mqtts"
     return ServerProgram(
-        name="mosquitto", port=port, url=f"{scheme}://{LOOPBACK}:{port}", command=(program, "-c", str(file))
-    )
+        name="mosquitto", port=port, address=address, url=f"{scheme}://{reachable(address)}:{port}",
+        command=(program, "-c", str(file)),
+    )  # fmt: skip
 
 
 def redis_program(folder: Path, port: int, *, locks: Path | None = None) -> ServerProgram:
@@ -115,12 +120,13 @@ def redis_program(folder: Path, port: int, *, locks: Path | None = None) -> Serv
     )
 
 
-def router_program(port: int, *, locks: Path | None = None) -> ServerProgram:
-    """Return a zenoh router; `locks` as for `mosquitto_program`."""
-    endpoint = f"{'tcp' if locks is None else 'tls'}/{LOOPBACK}:{port}"
-    arguments = configurations.router_arguments(endpoint, locks=_text(locks))
+def router_program(port: int, *, address: str = LOOPBACK, locks: Path | None = None) -> ServerProgram:
+    """Return a zenoh router; `address` and `locks` as for `mosquitto_program`."""
+    scheme = "tcp" if locks is None else "tls"
+    arguments = configurations.router_arguments(f"{scheme}/{address}:{port}", locks=_text(locks))
     command = (sys.executable, "-m", "fog_runtime.router", *arguments)
-    return ServerProgram(name="zenoh-router", port=port, url=endpoint, command=command)
+    url = f"{scheme}/{reachable(address)}:{port}"
+    return ServerProgram(name="zenoh-router", port=port, address=address, url=url, command=command)
 
 
 def _text(path: Path | None) -> str | None:

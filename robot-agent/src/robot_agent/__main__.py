@@ -7,7 +7,6 @@ It drives through the guardian, which stops the wheels when the agent is gone. T
 from __future__ import annotations
 
 import asyncio
-import gc
 import os
 import secrets
 from functools import partial
@@ -90,7 +89,6 @@ async def main() -> None:
             zenoh.declare_liveliness("robot-agent", settings.robot)
             # What the start has made stays: no later collection of garbage looks at it, and delays a wheel command.
             release_startup_memory()
-            gc.freeze()
             # After the start, which takes all the time that it gets.
             priority = settings.agent_realtime_priority if settings.speed == 1.0 else 0
             _log.info("started", priority=run_in_real_time(priority))

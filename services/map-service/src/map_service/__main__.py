@@ -13,6 +13,7 @@ from fog_runtime.health import Health
 from fog_runtime.http import Front, load_tokens, unused
 from fog_runtime.leadership import Leadership, process_id
 from fog_runtime.lease_store import LeaseStore
+from fog_runtime.memory import release_startup_memory
 from fog_runtime.mqtt_edge import MqttEdge
 from fog_runtime.settings import describe, load
 from fog_runtime.site import load_site
@@ -32,6 +33,7 @@ async def main() -> None:
     settings = load(Settings, environ=os.environ)
     logs.configure("map-service", settings.log_level, settings.log_format)
     _log.info("settings_loaded", **describe(settings))
+    release_startup_memory()
     loaded = load_site(settings.site_dir)
     site = settings.site or loaded.site.id
     clock = SystemClock(settings.speed)

@@ -8,13 +8,15 @@ import time
 
 import aiomqtt
 import pytest
+from paho.mqtt.publish import multiple
 from prometheus_client import REGISTRY
 
 from fog_contracts import channels as ch
 from fog_contracts import messages as m
-from fog_contracts.codec import ContractError
+from fog_contracts.codec import ContractError, encode
 from fog_runtime.clock import SystemClock
 from fog_runtime.mqtt_edge import MqttEdge, Will
+from fog_runtime.mqtt_inputs import MqttEdgeWithInputs
 from fog_supervisor.servers import start_mosquitto
 
 pytestmark = pytest.mark.live
@@ -353,3 +355,41 @@ async def test_cancellation_ends_a_connection_that_is_lost_meanwhile(broker):
             with pytest.raises(asyncio.CancelledError):
                 await task
     assert vanishing.connections == 1
+
+
+async def test_what_a_process_says_does_not_wait_behind_inputs_that_it_has_not_read(broker):
+    backlog, said = 400, 100  # a client sends no more than 20 publications that are not acknowledged
+    heard: list[int] = []
+
+    def slow(_ids, message):
+        heard.append(message.seq)
+        time.sleep(0.004)  # work: the loop has nothing to wait for
+
+    edge = MqttEdgeWithInputs(broker.url, "slow", SystemClock(), site="lab", inputs=[ch.NODE_READING])
+    edge.on(ch.NODE_READING, slow, m.NodeReading)
+    topic = ch.NODE_READING.key(site="lab", node="n1")
+    async with running(edge):
+        # It blocks, and the edge reads nothing meanwhile.
+        multiple([(topic, encode(ch.NODE_READING, reading(seq)), 1) for seq in range(backlog)], port=broker.port)
+        for seq in range(said):
+            edge.publish_nowait(ch.AREA_HAZARD, hazard(seq), area="a1")
+        await until(lambda: edge.pending == 0, "the broker acknowledged no hazard")
+        assert len(heard) < backlog / 2
+        await until(lambda: len(heard) == backlog, "readings were lost")
+        assert heard == sorted(heard)
+
+
+async def test_loss_of_either_connection_is_told_and_only_that_of_the_inputs_to_those_who_need_them(broker):
+    lost: list[str] = []
+    edge = MqttEdgeWithInputs(broker.url, "two", SystemClock(), site="lab", inputs=[ch.NODE_READING])
+    readings: list[m.NodeReading] = []
+    edge.on(ch.NODE_READING, lambda _, message: readings.append(message), m.NodeReading)
+    edge.on_connection_lost(lambda: lost.append("inputs"))
+    async with running(edge):
+        for name, expected in (("two", []), ("two-inputs", ["inputs"])):
+            async with aiomqtt.Client("127.0.0.1", broker.port, identifier=name):  # a broker ends the older one
+                await until(lambda: not edge.connected, f"{name} is still connected")
+            await asyncio.wait_for(edge.wait_connected(), 30)
+            assert lost == expected
+        await edge.publish(ch.NODE_READING, reading(1), node="n1")
+        await until(lambda: readings, "no reading after the reconnect")

@@ -1,11 +1,13 @@
 """Publishes the readings of many nodes and the poses of many robots, as a process of its own: no other work delays it.
 
-`python -m fognav.bench.node_load SITE MQTT_URL ZENOH_ENDPOINT NODES RATE ROBOTS SECONDS`. One node at a time sees an
-obstacle for a while, in turn. At the end it writes what it has sent as one JSON object.
+`python -m fognav.bench.node_load SITE MQTT_URL ZENOH_ENDPOINT NODES RATE ROBOTS SECONDS`. From the first line of its
+standard input on, so many seconds are measured: nodes see obstacles, in turn. At the end it writes what it has sent as
+one JSON object.
 """
 
 from __future__ import annotations
 
+import math
 import secrets
 import socket
 import sys
@@ -23,7 +25,10 @@ from fog_contracts.messages import NodeReading, RobotPose
 from fog_runtime.zenoh_edge import session_config
 
 BLOCKED_S: Final = 0.5
-"""How long a node sees its obstacle; after as long, another node sees the next one."""
+"""How long a node sees its obstacle."""
+HAZARDS_HZ: Final = 5.0
+_REST: Final = 20.0
+"""How many obstacles come in a second, and how long (s) a node sees none in between: it would be believed to flap."""
 _STRIDE: Final = 0.618
 """From one such node to the next, as a share of all nodes: they spread over the areas."""
 _POSE_HZ: Final = 10.0
@@ -35,17 +40,23 @@ def main() -> None:
     """Publish as the command line says."""
     site, url, endpoint = sys.argv[1:4]
     nodes, robots, rate, seconds = int(sys.argv[4]), int(sys.argv[6]), float(sys.argv[5]), float(sys.argv[7])
-    stop = threading.Event()
+    stop, begun = threading.Event(), threading.Event()
+    threading.Thread(target=_await_line, args=(begun,), daemon=True).start()
     with _connected(url) as broker, zenoh.open(session_config("client", connect=[endpoint])) as session:
         poses = threading.Thread(target=_publish_poses, args=(session, site, robots, stop))
         poses.start()
-        sent, late_s = _publish_readings(broker, site, nodes, rate, seconds)
+        sent, late_s = _publish_readings(broker, site, nodes, rate, seconds, begun)
         stop.set()
         poses.join()
         broker.sendall(b"\xe0\x00")  # DISCONNECT
         while broker.recv(4096):  # the broker closes once it has read everything
             pass
     sys.stdout.buffer.write(msgspec.json.encode({"sent": sent, "late_s": round(late_s, 3)}) + b"\n")
+
+
+def _await_line(begun: threading.Event) -> None:
+    sys.stdin.readline()
+    begun.set()
 
 
 def _connected(url: str) -> socket.socket:
@@ -79,23 +90,41 @@ def _packet(topic: bytes, payload: bytes) -> bytes:
     return b"\x30" + _length(2 + len(topic) + len(payload)) + len(topic).to_bytes(2, "big") + topic + payload
 
 
-def _publish_readings(broker: socket.socket, site: str, nodes: int, rate: float, seconds: float) -> tuple[int, float]:
-    """Publish every node's readings, spread over each period; return how many, and how late (s) they were at most."""
+def _publish_readings(
+    broker: socket.socket, site: str, nodes: int, rate: float, seconds: float, begun: threading.Event
+) -> tuple[int, float]:
+    """Publish every node's readings, spread over each period; return how many, and how late (s) the measured ones were.
+
+    All count that were sent, those before the measurement too.
+    """
     topics = [ch.NODE_READING.key(site=site, node=f"n{i}").encode() for i in range(nodes)]
     boot = secrets.randbits(32)
-    begin, late_s, rounds = time.monotonic(), 0.0, round(seconds * rate)
-    for seq in range(rounds):
-        elapsed = seq / rate
-        seen = int(elapsed / (2.0 * BLOCKED_S)) * round(_STRIDE * nodes)
-        blocked = seen % nodes if elapsed % (2.0 * BLOCKED_S) < BLOCKED_S and elapsed > BLOCKED_S else -1
-        clear, near = _payload(boot, seq, elapsed, near=False), _payload(boot, seq, elapsed, near=True)
+    begin, late_s, seq, measured = time.monotonic(), 0.0, 0, 0
+    while measured < round(seconds * rate):
+        blocked = _blocked(nodes, measured / rate)
+        clear, near = _payload(boot, seq, seq / rate, near=False), _payload(boot, seq, seq / rate, near=True)
         for first in range(0, nodes, _BATCH):
-            due = begin + elapsed + first / nodes / rate
-            late_s = max(late_s, time.monotonic() - due)
+            due = begin + seq / rate + first / nodes / rate
+            if measured:
+                late_s = max(late_s, time.monotonic() - due)
             time.sleep(max(0.0, due - time.monotonic()))
             batch = range(first, min(first + _BATCH, nodes))
-            broker.sendall(b"".join(_packet(topics[i], near if i == blocked else clear) for i in batch))
-    return rounds * nodes, late_s
+            broker.sendall(b"".join(_packet(topics[i], near if i in blocked else clear) for i in batch))
+        seq += 1
+        measured += begun.is_set()
+    return seq * nodes, late_s
+
+
+def _blocked(nodes: int, elapsed: float) -> set[int]:
+    """Return the nodes that see an obstacle after so much of the measurement (s); the first comes after a period."""
+    period = max(1.0 / HAZARDS_HZ, _REST / nodes)
+    latest, duration = int(elapsed / period), math.ceil(BLOCKED_S / period)
+    stride = round(_STRIDE * nodes) or 1
+    return {
+        index * stride % nodes
+        for index in range(max(1, latest - duration), latest + 1)
+        if elapsed - index * period < BLOCKED_S
+    }
 
 
 def _payload(boot: int, seq: int, elapsed: float, *, near: bool) -> bytes:
@@ -115,11 +144,12 @@ def _payload(boot: int, seq: int, elapsed: float, *, near: bool) -> bytes:
 
 
 def _publish_poses(session: zenoh.Session, site: str, robots: int, stop: threading.Event) -> None:
+    """Publish poses behind all nodes: none explains an echo."""
     keys = [ch.ROBOT_POSE.key(site=site, robot=f"r{i}") for i in range(robots)]
     while not stop.wait(1.0 / _POSE_HZ):
         for index, key in enumerate(keys):
             pose = RobotPose(
-                x=2.0 + index, y=3.0, theta=0.0, covariance=[0.01] * 9, v=0.2, w=0.0, radius=0.17, height=0.35,
+                x=2.0 + index, y=1.0, theta=0.0, covariance=[0.01] * 9, v=0.2, w=0.0, radius=0.17, height=0.35,
                 stamp=time.time(),
             )  # fmt: skip
             session.put(key, encode(ch.ROBOT_POSE, pose))

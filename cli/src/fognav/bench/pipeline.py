@@ -1,15 +1,16 @@
 """Measures the way from many nodes' readings to the map: real broker, aggregator and map-service, the load apart.
 
-The time of a hazard runs from its confirmation, by the clock of this machine, to the arrival of the map's delta at a
-zenoh subscriber in this process, so that broker, both services and the router count.
+The time of a hazard runs from its first reading, as it reached the aggregator, or from its confirmation, by the clock
+of this machine, to the arrival of the map's delta at a zenoh subscriber in this process: broker, both services and the
+router count.
 """
 
 from __future__ import annotations
 
 import asyncio
-import subprocess
 import sys
 import time
+from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
@@ -29,19 +30,67 @@ from fognav.programs import AGGREGATOR, MAP_SERVICE, SERVERS
 from fognav.stack import Stack, StackConfig
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from asyncio.subprocess import Process
+    from collections.abc import AsyncIterator, Callable
     from pathlib import Path
 
     from fog_contracts.grid import StaticMap
 
 LARGEST_AREA: Final = 130
-"""Nodes of one area; the others share theirs with three more."""
+"""Nodes of one area, at most a third of all; the others share theirs with three more."""
 _AREA: Final = 4
 _SIDE: Final = 1.0
 """Side of an area (m)."""
-_SETTLE_S: Final = 3.0
-_WARM_UP_S: Final = 4.0
 _READY_S: Final = 120.0
+_POLL_S: Final = 0.5
+_STILL: Final = 3
+"""So many polls without another reading, and all that arrive have arrived."""
+MB: Final = 1e6
+
+
+class _Fog:
+    """The running processes of one measurement."""
+
+    def __init__(self, stack: Stack) -> None:
+        self._stack = stack
+        self.processes = {name: psutil.Process(stack.pids()[name]) for name in (AGGREGATOR, MAP_SERVICE)}
+
+    def cpu_s(self) -> dict[str, float]:
+        """Return the CPU time (s) that each process has used."""
+        return {name: sum(process.cpu_times()[:2]) for name, process in self.processes.items()}
+
+    def rss_mb(self) -> dict[str, float]:
+        """Return the memory of each process."""
+        return {name: round(process.memory_info().rss / MB, 1) for name, process in self.processes.items()}
+
+    async def received(self) -> int:
+        """Return how many readings the aggregator has received, whether they count or not."""
+        return sum(node["received"] + node["ignored"] for node in await self._list("/api/v1/nodes"))
+
+    async def all_received(self) -> int:
+        """Return the same, once none has arrived for a while."""
+        received, still = await self.received(), 0
+        while still < _STILL:
+            await asyncio.sleep(_POLL_S)
+            before, received = received, await self.received()
+            still = still + 1 if received == before else 0
+        return received
+
+    async def wait_clear(self) -> None:
+        """Wait until all areas are clear; raises `FailedError`."""
+        for _ in range(round(_READY_S / _POLL_S)):
+            if all(view["state"] == "clear" for view in await self._list("/api/v1/nodes")):
+                return
+            await asyncio.sleep(_POLL_S)
+        raise FailedError("nodes are not clear though all measure that: this machine can't keep up")
+
+    async def _list(self, path: str) -> list[dict[str, Any]]:
+        port = self._stack.port(AGGREGATOR)
+        assert port is not None
+        answer = await asyncio.to_thread(net.request, "GET", port, path, token=self._stack.token)
+        if not isinstance(answer.body, list):
+            raise FailedError(f"the aggregator does not answer {path}: {answer.reason}")
+        return answer.body
 
 
 async def measure(
@@ -56,42 +105,38 @@ async def measure(
         for name in (AGGREGATOR, MAP_SERVICE):
             stack.supervisor.start(name)
         await stack.supervisor.wait_ready([*SERVERS, AGGREGATOR, MAP_SERVICE], _READY_S)
-        processes = {name: psutil.Process(stack.pids()[name]) for name in (AGGREGATOR, MAP_SERVICE)}
-        on_phase(f"{nodes} nodes at {rate:g} Hz for {seconds:g} s")
-        delays: list[float] = []
+        fog, traces = _Fog(stack), _Traces()
         with zenoh.open(session_config("client", connect=[stack.zenoh_endpoint])) as session:
-            # The first hazards meet kernels that are loaded just then.
-            await asyncio.to_thread(_load, stack, nodes, rate, robots, _WARM_UP_S)
-            warm_up = await _received(stack)
-            session.declare_subscriber(ch.MAP_DELTA.key(site=SITE), lambda sample: delays.extend(_delays(sample)))
-            before = {name: sum(process.cpu_times()[:2]) for name, process in processes.items()}
-            load = await asyncio.to_thread(_load, stack, nodes, rate, robots, seconds)
-            cpu = {name: sum(process.cpu_times()[:2]) - before[name] for name, process in processes.items()}
-            await asyncio.sleep(_SETTLE_S)
-        received = await _received(stack) - warm_up
-        # On a machine that can't keep up, readings are too old to count, and no hazard may come of them.
-        p50, p99 = (round(1000 * float(np.percentile(delays, p)), 1) if delays else None for p in (50, 99))
+            session.declare_subscriber(ch.MAP_DELTA.key(site=SITE), traces.on_delta)
+            async with _load(stack, nodes, rate, robots, seconds) as load:
+                # Kernels are loaded just then, and each node's first readings change its area.
+                on_phase(f"{nodes} nodes at {rate:g} Hz, until all are clear")
+                await fog.wait_clear()
+                on_phase(f"the same with hazards for {seconds:g} s")
+                cpu, memory = fog.cpu_s(), fog.rss_mb()
+                sent = await _ended(load, seconds)
+                cpu = {name: used - cpu[name] for name, used in fog.cpu_s().items()}
+                received = await fog.all_received()
         return {
-            "sent": load["sent"],
-            "lost": load["sent"] - received,
-            "hazards": len(delays),
-            "confirmed_to_delta_p50_ms": p50,
-            "confirmed_to_delta_p99_ms": p99,
-            "load_late_s": load["late_s"],
+            "sent": sent["sent"],
+            "lost": sent["sent"] - received,
+            "load_late_s": sent["late_s"],
+            **traces.figures(),
             "aggregator_cpu_percent": round(100 * cpu[AGGREGATOR] / seconds, 1),
-            "aggregator_us_per_reading": round(1e6 * cpu[AGGREGATOR] / load["sent"], 1),
+            "aggregator_us_per_reading": round(1e6 * cpu[AGGREGATOR] / (nodes * rate * seconds), 1),
             "map_cpu_percent": round(100 * cpu[MAP_SERVICE] / seconds, 1),
-            "aggregator_rss_mb": round(processes[AGGREGATOR].memory_info().rss / 1e6, 1),
+            "rss_mb_before": memory,
+            "rss_mb_after": fog.rss_mb(),
         }
 
 
 def write_nodes(folder: Path, nodes: int) -> None:
-    """Write a site with so many nodes: up to 130 of them watch one area, the others one for each four."""
+    """Write a site with so many nodes: up to 130 of them watch one area, each four of the others another one."""
     floor = make_office(60.0, 40.0, seed=1)
     write_site(folder, floor)
     corners = _free_corners(floor)
     lines: list[str] = []
-    first = min(LARGEST_AREA, nodes)
+    first = min(LARGEST_AREA, max(1, nodes // 3))
     areas = ["z0"] * first + [f"z{1 + i // _AREA}" for i in range(nodes - first)]
     for index, area in enumerate(dict.fromkeys(areas)):
         x, y = corners[index % len(corners)]
@@ -114,28 +159,52 @@ def _free_corners(floor: StaticMap) -> list[tuple[float, float]]:
     return [(left + float(column) * _SIDE, bottom + float(row) * _SIDE) for row, column in free]
 
 
-def _load(stack: Stack, nodes: int, rate: float, robots: int, seconds: float) -> dict[str, Any]:
+@asynccontextmanager
+async def _load(stack: Stack, nodes: int, rate: float, robots: int, seconds: float) -> AsyncIterator[Process]:
+    """Run the load generator, which measures once it is told to."""
     options = [SITE, stack.mqtt_url, stack.zenoh_endpoint, str(nodes), str(rate), str(robots), str(seconds)]
-    command = [sys.executable, "-m", "fognav.bench.node_load", *options]
-    done = subprocess.run(command, capture_output=True, timeout=4 * seconds + 60, check=False)
-    if done.returncode != 0:
-        raise FailedError(f"the load generator failed: {done.stderr.decode(errors='replace').strip()[-500:]}")
-    return msgspec.json.decode(done.stdout.splitlines()[-1], type=dict[str, Any])
+    pipe = asyncio.subprocess.PIPE
+    load = await asyncio.create_subprocess_exec(
+        sys.executable, "-m", "fognav.bench.node_load", *options, stdin=pipe, stdout=pipe, stderr=pipe
+    )
+    try:
+        yield load
+    finally:
+        if load.returncode is None:
+            load.kill()
+            await load.wait()
 
 
-def _delays(sample: zenoh.Sample) -> list[float]:
-    """Return the times (s) since the confirmation of the hazards in a delta."""
-    now = time.time()
-    delta = decode(ch.MAP_DELTA, sample.payload.to_bytes(), MapDelta)
-    last = delta.part == delta.parts - 1
-    return [now - trace.confirmed for trace in delta.traces if trace.confirmed > 0] if last else []
+async def _ended(load: Process, seconds: float) -> dict[str, Any]:
+    """Let the load generator measure; return what it sent. Raises `FailedError`."""
+    async with asyncio.timeout(4 * seconds + 60):
+        out, err = await load.communicate(b"begin\n")
+    if load.returncode != 0:
+        raise FailedError(f"the load generator failed: {err.decode(errors='replace').strip()[-500:]}")
+    return msgspec.json.decode(out.splitlines()[-1], type=dict[str, Any])
 
 
-async def _received(stack: Stack) -> int:
-    """Return how many readings the aggregator has received, whether they count or not."""
-    port = stack.port(AGGREGATOR)
-    assert port is not None
-    answer = await asyncio.to_thread(net.request, "GET", port, "/api/v1/nodes", token=stack.token)
-    if not isinstance(answer.body, list):
-        raise FailedError(f"the aggregator does not list its nodes: {answer.reason}")
-    return sum(node["received"] + node["ignored"] for node in answer.body)
+class _Traces:
+    """The hazards that reached the map, with the times (s) since their first reading and since their confirmation."""
+
+    def __init__(self) -> None:
+        self._ages: list[tuple[float, float]] = []
+
+    def on_delta(self, sample: zenoh.Sample) -> None:
+        """Note the hazards of a delta that has arrived; it is called on another thread."""
+        now = time.time()
+        delta = decode(ch.MAP_DELTA, sample.payload.to_bytes(), MapDelta)
+        if delta.part == delta.parts - 1:
+            self._ages += [
+                (now - trace.first_reading, now - trace.confirmed) for trace in delta.traces if trace.confirmed > 0
+            ]
+
+    def figures(self) -> dict[str, Any]:
+        """Return how many hazards there were, and percentiles of their times (ms)."""
+        # On a machine that can't keep up, readings are too old to count, and no hazard may come of them.
+        figures: dict[str, Any] = {"hazards": len(self._ages)}
+        for index, name in enumerate(("reading_to_delta", "confirmed_to_delta")):
+            for p in (50, 99):
+                ages = [age[index] for age in self._ages]
+                figures[f"{name}_p{p}_ms"] = round(1000 * float(np.percentile(ages, p)), 1) if ages else None
+        return figures

@@ -61,7 +61,7 @@ async def _subscribe(client: aiomqtt.Client, qos_by_topic: Mapping[str, int]) ->
 class MqttEdge:
     """One process's connection to the broker. All handlers run on the event loop's thread."""
 
-    def __init__(  # what a connection is
+    def __init__(  # noqa: PLR0913  # what a connection is
         self,
         url: str,
         client_id: str,
@@ -70,8 +70,11 @@ class MqttEdge:
         site: str,
         will: Will | None = None,
         credentials: Credentials = NOBODY,
+        transport: str = "mqtt",
     ) -> None:
         """Prepare a connection that `run` opens. `site` is filled into every topic that contains one.
+
+        `transport` is its name in the metrics of connections.
 
         `url` may list several brokers, comma separated, that are bridged: each failure moves on to the next one. Raises
         `ValueError` for an invalid address, or one over which the password in `credentials` could be read.
@@ -81,7 +84,8 @@ class MqttEdge:
         self._clock = clock
         self._site = site
         self._will = will
-        self._subscriptions = Subscriptions(clock, site=site)
+        self._transport = transport
+        self.subscriptions = Subscriptions(clock, site=site)
         self._on_connect: list[Callable[[], Awaitable[None]]] = []
         self._on_connection_lost: list[Callable[[], object]] = []
         self._client: aiomqtt.Client | None = None
@@ -130,7 +134,7 @@ class MqttEdge:
         Channels without a message type deliver text. `numbers` lists the areas of the thesis's topics, for which MQTT
         has no wildcard.
         """
-        self._subscriptions.add(channel, handler, kind, numbers)
+        self.subscriptions.add(channel, handler, kind, numbers)
 
     async def add_number(self, channel: Channel, number: str | int) -> None:
         """Subscribe the handlers of one of the thesis's channels to one more area, now and after every connection.
@@ -138,7 +142,7 @@ class MqttEdge:
         Without a connection the subscription is made at the next one.
         """
         topic = channel.key(number=str(number))
-        added, client = self._subscriptions.add_topic(channel, topic), self._client
+        added, client = self.subscriptions.add_topic(channel, topic), self._client
         if not added or client is None:
             return
         try:
@@ -154,7 +158,7 @@ class MqttEdge:
         They replace those of the call before, now and after every connection. The broker delivers the retained messages
         of those in `again` once more, though they were subscribed to before.
         """
-        added, dropped = self._subscriptions.set_foreign(topics, handler, again)
+        added, dropped = self.subscriptions.set_foreign(topics, handler, again)
         client = self._client
         if client is None:
             return
@@ -202,7 +206,7 @@ class MqttEdge:
         """Connect and stay connected until cancelled; after a failure at the next broker."""
         failures = 0
         while True:
-            broker, inbox = self._brokers[0], Inbox(self._subscriptions.deliver)
+            broker, inbox = self._brokers[0], Inbox(self.subscriptions.deliver)
             try:
                 async with broker.client(self._client_id, self._mqtt_will(), inbox) as client:
                     failures = 0
@@ -244,12 +248,12 @@ class MqttEdge:
                 await client.publish(will.topic, will.payload, will.qos, will.retain)
 
     async def _serve(self, client: aiomqtt.Client, broker: Broker, inbox: Inbox) -> None:
-        if topics := self._subscriptions.qos_by_topic():
+        if topics := self.subscriptions.qos_by_topic():
             await _subscribe(client, topics)
         self._client = client
         self._changed.set()
-        metrics.CONNECTED.labels("mqtt").set(1)
-        metrics.CONNECTIONS.labels("mqtt").inc()
+        metrics.CONNECTED.labels(self._transport).set(1)
+        metrics.CONNECTIONS.labels(self._transport).inc()
         _log.info("broker_connected", broker=str(broker), client=self._client_id)
         for callback in self._on_connect:
             self._spawn(callback(), "on_connect")
@@ -259,7 +263,7 @@ class MqttEdge:
 
     def _on_disconnected(self) -> None:
         was_connected, self._client = self._client is not None, None
-        metrics.CONNECTED.labels("mqtt").set(0)
+        metrics.CONNECTED.labels(self._transport).set(0)
         for task in list(self._tasks):
             task.cancel()
         for callback in self._on_connection_lost if was_connected else ():

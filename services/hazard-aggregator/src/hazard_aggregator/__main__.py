@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import os
+from typing import Final
 
+from fog_contracts import channels as ch
 from fog_contracts.handlers import Moment
 from fog_runtime import logs, process
 from fog_runtime.clock import SystemClock, boot_id
@@ -13,7 +15,7 @@ from fog_runtime.http import Front, load_tokens, unused
 from fog_runtime.leadership import Leadership, process_id
 from fog_runtime.lease_store import LeaseStore
 from fog_runtime.memory import release_startup_memory
-from fog_runtime.mqtt_edge import MqttEdge
+from fog_runtime.mqtt_inputs import MqttEdgeWithInputs
 from fog_runtime.settings import describe, load
 from fog_runtime.site import load_site
 from fog_runtime.zenoh_edge import ZenohEdge
@@ -28,6 +30,9 @@ from hazard_aggregator.service import Service
 from hazard_aggregator.settings import Settings
 from hazard_aggregator.store import Store, load_at_start
 from hazard_aggregator.unusable_areas import UnusableAreas
+
+SENSORS: Final = (ch.NODE_READING, ch.NODE_VALUE, ch.NODE_AVAILABILITY, ch.THESIS_AREA)
+"""What nodes say comes in one order, and does not delay what the aggregator says (ADR 37)."""
 
 _log = logs.get("aggregator")
 
@@ -63,9 +68,10 @@ async def main() -> None:
             definitions.values(), loaded.site.nodes, 0, stored.hazards,
             registry=find_rule, default_rule=settings.debounce,
         )  # fmt: skip
-        mqtt = MqttEdge(
-            settings.mqtt_url, process_id("hazard-aggregator"), clock, site=site, will=LAST_WILL, credentials=own
-        )
+        mqtt = MqttEdgeWithInputs(
+            settings.mqtt_url, process_id("hazard-aggregator"), clock, site=site, inputs=SENSORS, will=LAST_WILL,
+            credentials=own,
+        )  # fmt: skip
         async with ZenohEdge.open(
             connect=settings.zenoh_endpoints, clock=clock, role="hazard-aggregator", id=site, site=site, credentials=own
         ) as zenoh:

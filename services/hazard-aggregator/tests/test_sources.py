@@ -389,6 +389,25 @@ def test_flapping_source_is_unknown_until_it_keeps_one_state():
     assert rig.send("t", "0") == "clear"
 
 
+@pytest.mark.parametrize("value", [20, 60])
+def test_source_that_is_understood_and_not_in_turn_flaps_and_makes_no_hazard_with_each_message(value):
+    rig = Rig(Source(id="s1", topic="t", number=ABOVE_40, period_s=10.0), unknown=UnknownPolicy(max_changes=6))
+    for step in range(600):
+        rig.send("t", value if step % 2 == 0 else 500 + step)
+        rig.wait(0.1)
+    assert len(rig.hazards) <= 6 + 2
+    assert "it flaps" in rig.hazard.cause
+    for _ in range(60):
+        rig.send("t", 500)
+        rig.wait(0.1)
+    assert "500 is implausible" in rig.hazard.cause
+    for _ in range(60):
+        rig.send("t", value)
+        rig.wait(0.1)
+    assert rig.hazard.state == ("clear" if value == 20 else "blocked")
+    assert len(rig.hazards) <= 6 + 2 + 2
+
+
 @given(st.lists(st.tuples(st.floats(0.0, 30.0), st.sampled_from(["blocked", "clear"])), max_size=60))
 def test_few_changes_within_a_minute_are_no_flapping(steps):
     detector, now, changes, last = FlapDetector(5), 0.0, [], None

@@ -14,7 +14,7 @@ STEADY_S: Final = 5.0
 
 
 class FlapDetector:
-    """Counts the changes between blocked and clear within a minute."""
+    """Counts the changes of state within a minute; nodes tell only those between blocked and clear."""
 
     def __init__(self, max_changes: int) -> None:
         self.max_changes = max_changes

@@ -72,6 +72,12 @@ class NodeState:
         self.run_state = None
         self.rule.reset()
 
+    def flap(self) -> None:
+        """Set the state to unknown until it is steady."""
+        reason = f"it flaps: it changed more than {self.flaps.max_changes} times within a minute"
+        if self.reason != reason:
+            self.invalidate(reason)
+
     def restore_blocked(self) -> None:
         """Set the state in which an earlier run left the node's area."""
         self.state = "blocked"
@@ -119,9 +125,7 @@ class NodeState:
         if confirmed == "unknown":
             self.run_state = None
         elif self.flaps.update(confirmed, taken_at):
-            reason = f"it flaps: it changed more than {self.flaps.max_changes} times within a minute"
-            if self.reason != reason:
-                self.invalidate(reason)
+            self.flap()
             return
         if confirmed != self.state or self.unconfirmed:
             # Later readings of the same state leave the reason: the hazard would change with every centimetre.

@@ -175,8 +175,10 @@ def _read(source: SourceState, payload: bytes | None, now: float, stamp: float) 
 def _apply(source: SourceState, classification: Classification, now: float, stamp: float) -> bool:
     if classification.state == "unknown":
         source.receive(now)
+        if source.flaps.update("unknown", now):  # it is understood and not, in turn
+            source.flap()
         # Further ones leave the reason: the hazard would change with each of them.
-        if not source.misread:
+        elif not source.misread:
             source.invalidate(classification.reason)
             source.misread = True
         return False

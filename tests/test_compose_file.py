@@ -1,20 +1,91 @@
 """What docker-compose.yml says, without an engine (tests/compose runs it on one)."""
 
+import re
 from pathlib import Path
+from typing import Any
 
 import yaml
 
-COMPOSE = yaml.safe_load((Path(__file__).parents[1] / "docker-compose.yml").read_text("utf-8"))
+from fog_runtime.locks.handing_out import OWNERS, SIMULATION
+
+ROOT = Path(__file__).parents[1]
+COMPOSE = yaml.safe_load((ROOT / "docker-compose.yml").read_text("utf-8"))
+SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
+HANDS_OUT = {"locks", "sim-locks"}
+PI_MIB = 4096
+"""Memory of the Raspberry Pi on which a fog node is to run."""
+
+
+def mounts(service: str) -> dict[str, str]:
+    """Return what a service mounts, by its path there."""
+    # A variable with a default has a colon of its own.
+    volumes = [re.sub(r"\$\{[A-Z_]+:-([^}]*)\}", r"\1", text) for text in SERVICES[service].get("volumes", [])]
+    return {path: source for source, path in (text.split(":")[:2] for text in volumes)}
+
+
+def mebibytes(limit: str) -> int:
+    return int(limit.removesuffix("m"))
 
 
 def test_no_registry_is_asked_for_an_image_of_ours():
-    ours = {name: service for name, service in COMPOSE["services"].items() if service["image"].startswith("fognav/")}
+    ours = {name: service for name, service in SERVICES.items() if service["image"].startswith("fognav/")}
     assert len(ours) >= 6
     assert [name for name, service in ours.items() if "build" not in service] == []
+    assert {service.get("pull_policy") for service in ours.values()} == {"never"}
+
+
+def test_images_of_others_have_one_version_each():
+    others = {service["image"] for service in SERVICES.values() if not service["image"].startswith("fognav/")}
+    assert [image for image in others if not re.search(r":v?\d+\.\d+\.\d+(-\w+)?$", image)] == []
 
 
 def test_services_of_one_image_are_built_alike():
     builds: dict[str, list[object]] = {}
-    for service in COMPOSE["services"].values():
+    for service in SERVICES.values():
         builds.setdefault(service["image"], []).append(service.get("build"))
     assert [image for image, found in builds.items() if any(build != found[0] for build in found)] == []
+
+
+def test_each_program_mounts_its_own_locks_and_no_other_s():
+    readers: dict[str, set[str]] = {}
+    for name in SERVICES.keys() - HANDS_OUT:
+        for source in mounts(name).values():
+            if source.endswith("locks"):
+                readers.setdefault(source, set()).add(name)
+    own = {f"{program}-locks": {program} for program in OWNERS if program != SIMULATION}
+    assert readers == {**own, "sim-locks": {"sim-robot"}, "locks": {"backup"}}
+
+
+def test_whoever_hands_out_secrets_has_no_network_and_a_place_for_each_program():
+    for name in HANDS_OUT:
+        assert SERVICES[name]["network_mode"] == "none"
+    assert {f"/out/{program}" for program in OWNERS} == {path for path in mounts("sim-locks") if path[:5] == "/out/"}
+    assert {path: mounts("sim-locks")[path] for path in mounts("locks")} == mounts("locks")
+
+
+def test_no_secret_is_in_an_environment_or_a_command():
+    shown = yaml.safe_dump([[each.get("environment"), each.get("command")] for each in SERVICES.values()])
+    assert not re.search(r"PASSWORD|SECRET|_TOKEN:|://[^/\s]+@", shown, re.IGNORECASE)
+
+
+def test_only_broker_router_and_gateway_are_reachable_from_outside():
+    assert {name for name, service in SERVICES.items() if "ports" in service} == {"mosquitto", "zenoh", "gateway"}
+    assert SERVICES["redis"]["networks"] == ["store"]
+    internal = {name for name, network in COMPOSE["networks"].items() if network and network.get("internal")}
+    assert internal == {"store", "web"}
+
+
+def test_memory_limits_leave_room_on_a_raspberry_pi():
+    assert [name for name, service in SERVICES.items() if "mem_limit" not in service] == []
+    always = {name: service for name, service in SERVICES.items() if service.get("restart") != "no"}
+    total = sum(mebibytes(service["mem_limit"]) for name, service in always.items() if name != "sim-robot")
+    assert total < PI_MIB * 3 / 4
+
+
+def test_example_of_settings_names_every_variable_with_its_default():
+    text = (ROOT / "docker-compose.yml").read_text("utf-8")
+    used = dict(re.findall(r"\$\{(FOGNAV_\w+):-([^}]*)\}", text))
+    named = dict(re.findall(r"^(FOGNAV_\w+)=(.*)$", (ROOT / ".env.example").read_text("utf-8"), re.MULTILINE))
+    assert named.keys() == used.keys()
+    own = {"FOGNAV_HOSTS", "FOGNAV_BIND"}
+    assert {name: named[name] for name in named.keys() - own} == {name: used[name] for name in used.keys() - own}

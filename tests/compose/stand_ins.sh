@@ -4,7 +4,7 @@
 # the mounted configuration rely on: user and uid, entry point, folders and their owners. Their names differ, so that
 # nobody mistakes them for the originals.
 #
-#     tests/compose/stand_ins.sh          builds the missing ones of fognav-stand-in/mosquitto, /redis and /prometheus
+#     tests/compose/stand_ins.sh          builds the missing ones of fognav-stand-in/mosquitto, /redis, /caddy and /prometheus
 #
 # Needs a Debian base image of the name below, and Debian's package servers through the host's network.
 set -eu
@@ -23,7 +23,7 @@ RUN groupadd --system --gid 1883 mosquitto && useradd --system --uid 1883 --gid 
     && rm -rf /var/lib/apt/lists/* && mkdir -p /mosquitto/config /mosquitto/data /mosquitto/log \\
     && chown -R mosquitto:mosquitto /mosquitto
 VOLUME ["/mosquitto/data", "/mosquitto/log"]
-EXPOSE 1883
+EXPOSE 8883
 CMD ["/usr/sbin/mosquitto", "-c", "/mosquitto/config/mosquitto.conf"]
 DOCKERFILE
 
@@ -37,6 +37,19 @@ VOLUME ["/data"]
 WORKDIR /data
 EXPOSE 6379
 CMD ["redis-server"]
+DOCKERFILE
+
+# The original's program has this capability in its file, without which it can't be started; hence cap_add.
+stand_in fognav-stand-in/caddy <<DOCKERFILE
+FROM $base
+RUN apt-get update -qq \\
+    && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends caddy busybox libcap2-bin \\
+       >/dev/null \\
+    && rm -rf /var/lib/apt/lists/* && ln -s /bin/busybox /usr/local/bin/wget \\
+    && setcap cap_net_bind_service=+ep /usr/bin/caddy && mkdir -p /config/caddy /data/caddy
+WORKDIR /srv
+EXPOSE 80 443
+CMD ["caddy", "run", "--config", "/etc/caddy/Caddyfile", "--adapter", "caddyfile"]
 DOCKERFILE
 
 # Busybox provides the wget that the original has for healthchecks.

@@ -25,6 +25,7 @@ import pytest
 from fog_contracts import channels as ch
 from fog_contracts.messages import RobotPose, RobotState
 from fog_runtime.clock import SystemClock
+from fog_runtime.credentials import Credentials
 from fog_runtime.zenoh_edge import ZenohEdge
 
 if TYPE_CHECKING:
@@ -33,14 +34,16 @@ if TYPE_CHECKING:
 ROOT: Final = Path(__file__).parents[2]
 STAND_INS: Final = Path(__file__).with_name("stand_ins.sh")
 SERVICES: Final = ("hazard-aggregator", "map-service", "planner")
-FOG: Final = {*SERVICES, "zenoh", "mosquitto", "redis", "prometheus"}
+FOG: Final = {*SERVICES, "zenoh", "mosquitto", "redis", "prometheus", "gateway"}
+ONCE: Final = {"locks", "kernels", "sim-locks"}
+"""The containers that do something and end."""
 PORTS: Final = {
-    "hazard-aggregator": ("FOGNAV_AGGREGATOR_PORT", 8000),
-    "map-service": ("FOGNAV_MAP_PORT", 8000),
-    "planner": ("FOGNAV_PLANNER_PORT", 8000),
-    "zenoh": ("FOGNAV_ZENOH_PORT", 7447),
-    "mosquitto": ("FOGNAV_MQTT_PORT", 1883),
-    "prometheus": ("FOGNAV_PROMETHEUS_PORT", 9090),
+    "FOGNAV_HTTPS_PORT": ("gateway", 8443),
+    "FOGNAV_AGGREGATOR_PORT": ("gateway", 8001),
+    "FOGNAV_MAP_PORT": ("gateway", 8002),
+    "FOGNAV_PLANNER_PORT": ("gateway", 8003),
+    "FOGNAV_ZENOH_PORT": ("zenoh", 7447),
+    "FOGNAV_MQTT_PORT": ("mosquitto", 8883),
 }
 HEALTHY_S: Final = 180.0
 """On a busy machine of two cores; an idle one needs 20 s, most of it for compiling the kernels."""
@@ -127,8 +130,10 @@ class Project:
     def __init__(self, folder: Path) -> None:
         self.name = f"fognav-test-{secrets.token_hex(4)}"
         self.start_log = ""
+        self._folder = folder
+        self._credentials: dict[str, Credentials] = {}
         self._env = {k: v for k, v in os.environ.items() if not k.startswith(("FOGNAV_", "COMPOSE_"))}
-        self._env |= {"FOGNAV_BIND": "127.0.0.1"} | {variable: "0" for variable, _ in PORTS.values()}
+        self._env |= {"FOGNAV_BIND": "127.0.0.1"} | dict.fromkeys(PORTS, "0")
         self._command = ["docker", "compose", "--project-name", self.name, "--env-file", os.devnull]
         self._command += ["--file", "docker-compose.yml"]
         services = json.loads(self("config", "--format", "json"))["services"]
@@ -155,12 +160,30 @@ class Project:
         found = json.loads(docker("inspect", *ids)) if ids else []
         return {container["Config"]["Labels"]["com.docker.compose.service"]: container for container in found}
 
-    def address(self, service: str) -> str:
-        """Return the address at which a service's port is published now; a restart changes it."""
-        return self("port", service, str(PORTS[service][1])).strip()
+    def address(self, variable: str) -> str:
+        """Return the address at which a port is published now; a restart changes it."""
+        service, port = PORTS[variable]
+        return self("port", service, str(port)).strip()
 
-    def url(self, service: str, path: str) -> str:
-        return f"http://{self.address(service)}{path}"
+    def get(self, path: str, **options: Any) -> httpx.Response:
+        """Ask the gateway."""
+        return self.request("GET", path, **options)
+
+    def request(self, method: str, path: str, **options: Any) -> httpx.Response:
+        url = f"https://{self.address('FOGNAV_HTTPS_PORT')}{path}"
+        with httpx.Client(verify=self.credentials("console").tls_context()) as client:
+            return client.request(method, url, **options)
+
+    def locks(self, *arguments: str) -> str:
+        """Run a command of the container that has all secrets."""
+        return self("run", "--rm", "--no-TTY", "--no-deps", "locks", *arguments)
+
+    def credentials(self, user: str) -> Credentials:
+        if user not in self._credentials:
+            file = self._folder / f"{user}.toml"
+            file.write_text(self.locks("show", f"credentials/{user}.toml"), "utf-8")
+            self._credentials[user] = Credentials.read(file)
+        return self._credentials[user]
 
     def inside(self, service: str, script: str) -> str:
         """Run a shell command inside a service's container."""
@@ -233,20 +256,20 @@ def health(project: Project, service: str) -> str:
 
 
 def token(fog: Project) -> dict[str, str]:
-    return {"Authorization": f"Bearer {fog.inside('map-service', 'cat /run/fognav/admin.token').strip()}"}
+    return {"Authorization": f"Bearer {fog.locks('show', 'admin.token').strip()}"}
 
 
 def test_one_up_makes_every_service_healthy_and_creates_the_secrets(fog: Project) -> None:
     containers = fog.containers()
-    assert set(containers) == FOG | {"keys"}
-    assert containers["keys"]["State"]["ExitCode"] == 0
+    assert set(containers) == FOG | {"locks", "kernels"}
+    assert [containers[name]["State"]["ExitCode"] for name in ("locks", "kernels")] == [0, 0]
     assert {name: fog.containers()[name]["State"]["Health"]["Status"] for name in FOG} == dict.fromkeys(FOG, "healthy")
 
 
 def test_first_start_logs_no_warning(fog: Project) -> None:
     lines = fog.start_log.splitlines()
     events = [json.loads(line) for line in lines if line.startswith("{")]
-    listening = {event["process"] for event in events if event["event"] == "listening"}
+    listening = {event["process"] for event in events if event.get("event") == "listening"}
     assert listening >= {*SERVICES, "router"}, "the log is not complete"
     problems = [event for event in events if event["level"] not in {"info", "debug"}]
     # With the default settings of a host Redis warns that it may be unable to fork.
@@ -261,12 +284,17 @@ def test_ports_are_published_only_on_the_configured_address(fog: Project) -> Non
         for name, container in fog.containers().items()
         if any((ports := container["NetworkSettings"]["Ports"]).values())
     }
-    assert published == {name: [(f"{port}/tcp", "127.0.0.1")] for name, (_, port) in PORTS.items()}
+    expected: dict[str, list[tuple[str, str]]] = {}
+    for service, port in PORTS.values():
+        expected.setdefault(service, []).append((f"{port}/tcp", "127.0.0.1"))
+    assert {name: sorted(ports) for name, ports in published.items()} == {
+        name: sorted(ports) for name, ports in expected.items()
+    }
 
 
 def test_prometheus_sees_every_service_up(fog: Project) -> None:
     def missing() -> str | None:
-        answer = httpx.get(fog.url("prometheus", "/api/v1/query"), params={"query": 'up{job="fog"}'})
+        answer = fog.get("/prometheus/api/v1/query", params={"query": 'up{job="fog"}'})
         up = {sample["metric"]["process"]: sample["value"][1] for sample in answer.json()["data"]["result"]}
         return None if up == dict.fromkeys(SERVICES, "1") else f"up: {up}"
 
@@ -274,25 +302,31 @@ def test_prometheus_sees_every_service_up(fog: Project) -> None:
 
 
 def test_zone_created_with_the_admin_token_survives_a_restart_of_the_map_service(fog: Project) -> None:
-    assert httpx.post(fog.url("map-service", "/api/v1/zones"), json=ZONE).status_code == 401
-    created = httpx.post(fog.url("map-service", "/api/v1/zones"), json=ZONE, headers=token(fog))
+    admin = token(fog)
+    assert fog.request("POST", "/api/v1/zones", json=ZONE).status_code == 401
+    created = fog.request("POST", "/api/v1/zones", json=ZONE, headers=admin)
     assert created.status_code == 201, created.text
     zone = created.json()
 
     fog("restart", "map-service")
     wait(lambda: None if health(fog, "map-service") == "healthy" else "the map-service is not healthy", HEALTHY_S)
 
-    listed = httpx.get(fog.url("map-service", "/api/v1/zones")).json()
+    listed = fog.get("/api/v1/zones").json()
     assert zone in listed["zones"]
     assert zone["id"] in listed["active"]
-    deleted = httpx.delete(fog.url("map-service", f"/api/v1/zones/{zone['id']}"), headers=token(fog))
+    deleted = fog.request("DELETE", f"/api/v1/zones/{zone['id']}", headers=admin)
     assert deleted.status_code == 204, deleted.text
 
 
 async def test_simulated_robot_is_enabled_and_drives(sim: Project) -> None:
     clock = SystemClock()
     async with ZenohEdge.open(
-        connect=[f"tcp/{sim.address('zenoh')}"], clock=clock, role="test", id="compose", site="estig"
+        connect=[f"tls/{sim.address('FOGNAV_ZENOH_PORT')}"],
+        clock=clock,
+        role="console",
+        id="compose",
+        site="estig",
+        credentials=sim.credentials("console"),
     ) as edge:
         states = edge.latest(ch.ROBOT_STATE, RobotState, robot="r1")
         poses = edge.latest(ch.ROBOT_POSE, RobotPose, robot="r1")
@@ -314,7 +348,7 @@ async def test_simulated_robot_is_enabled_and_drives(sim: Project) -> None:
 
 def test_no_process_is_root_or_has_a_capability_or_can_write_to_its_image(sim: Project) -> None:
     for service, container in sim.containers().items():
-        if service == "keys":  # it has finished
+        if service in ONCE:
             continue
         users = docker("top", container["Id"], "-eo", "uid,pid").split()[2::2]
         assert users, service
@@ -329,7 +363,7 @@ def test_no_process_is_root_or_has_a_capability_or_can_write_to_its_image(sim: P
 def test_prometheus_records_the_robots_cpu_time(sim: Project) -> None:
     def seconds() -> float | None:
         query = {"query": 'process_cpu_seconds_total{robot="r1"}'}
-        found = httpx.get(sim.url("prometheus", "/api/v1/query"), params=query).json()["data"]["result"]
+        found = sim.get("/prometheus/api/v1/query", params=query).json()["data"]["result"]
         return float(found[0]["value"][1]) if found else None
 
     wait(lambda: "no sample of the robot" if seconds() is None else None, 60)
@@ -369,7 +403,7 @@ def test_stop_ends_every_container_cleanly_and_up_restarts_them(sim: Project) ->
     sim("stop")
     duration = time.monotonic() - started
     exit_codes = {name: container["State"]["ExitCode"] for name, container in sim.containers().items()}
-    assert exit_codes == dict.fromkeys([*FOG, "keys", "sim-robot"], 0)
+    assert exit_codes == dict.fromkeys([*FOG, *ONCE, "sim-robot"], 0)
     assert duration < STOP_S
     sim("up", "--detach", "--no-build", timeout_s=300)
     restarts = {name: container["RestartCount"] for name, container in sim.containers().items()}

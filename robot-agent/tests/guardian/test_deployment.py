@@ -257,3 +257,19 @@ def test_the_units_commands_guard_a_base_and_stop_it_after_the_watchdog_is_kille
         )
         assert missing.returncode == 1
         assert "stop_failed" in missing.stderr
+
+
+def test_robot_with_credentials_connects_encrypted_and_one_without_does_not(tmp_path):
+    credentials = tmp_path / "r1.toml"
+    credentials.write_text('user = "r1"\n')
+    install(tmp_path / "locked", "--credentials", str(credentials))
+    env = (tmp_path / "locked/etc/fognav/robot.env").read_text()
+    assert "FOGNAV_ZENOH_CONNECT=tls/fog.local:7447\n" in env
+    assert "FOGNAV_CREDENTIALS_FILE=/etc/fognav/credentials.toml\n" in env
+    copied = tmp_path / "locked/etc/fognav/credentials.toml"
+    assert copied.read_text() == 'user = "r1"\n'
+    assert copied.stat().st_mode & 0o007 == 0
+    install(tmp_path / "open")
+    env = (tmp_path / "open/etc/fognav/robot.env").read_text()
+    assert "FOGNAV_ZENOH_CONNECT=tcp/fog.local:7447\n" in env
+    assert "FOGNAV_CREDENTIALS_FILE=\n" in env

@@ -18,6 +18,7 @@ from fog_contracts.codec import ContractError
 from fog_contracts.messages import RobotState
 from fog_runtime import logs, process
 from fog_runtime.clock import SystemClock, ticker
+from fog_runtime.credentials import Credentials
 from fog_runtime.operator_key import read_operator_key
 from fog_runtime.robot_commands import RobotCommands
 from fog_runtime.settings import CommonSettings, SettingsError, describe, load
@@ -38,9 +39,15 @@ class Settings(CommonSettings, frozen=True, kw_only=True):
     run_dir: Path
     planner_url: str
     token_file: Path
+    credentials_dir: Path | None = None
+    """Folder with the credentials of `console`, `sim`, the robot and its nodes, `NAME.toml`; None: all are nobody."""
     robot: str = ""
     seed: int = 1
     agent_http_port: int = 9100
+
+    def file_of(self, user: str) -> Path | None:
+        """Return the file of a user's credentials."""
+        return None if self.credentials_dir is None else self.credentials_dir / f"{user}.toml"
 
 
 class _Operator:
@@ -114,16 +121,20 @@ def _programs(settings: Settings, robot: str) -> list[Program]:
         "GUARDIAN_SOCKET": run / "guardian.sock",
         "ROBOT": robot,
     }
+    if settings.credentials_dir is not None:
+        own["NODE_CREDENTIALS_DIR"] = settings.credentials_dir
     programs = []
-    for name, module, http_port in (
-        ("simulator", "fognav_sim", 0),
-        ("watchdog", "robot_agent.guardian.watchdog", 0),
-        ("robot-agent", "robot_agent", settings.agent_http_port),
+    for name, module, http_port, user in (
+        ("simulator", "fognav_sim", 0, "sim"),
+        ("watchdog", "robot_agent.guardian.watchdog", 0, None),
+        ("robot-agent", "robot_agent", settings.agent_http_port, robot),
     ):
         data = settings.data_dir / name
         for folder in (data, logs_folder, run / "wires"):
             folder.mkdir(parents=True, exist_ok=True)
         mine = {**own, "DATA_DIR": data, "HTTP_PORT": http_port}
+        if user is not None and (file := settings.file_of(user)) is not None:
+            mine["CREDENTIALS_FILE"] = file
         environment = {**os.environ, **{f"FOGNAV_{key}": str(value) for key, value in mine.items()}}
         arguments = (sys.executable, "-m", module)
         programs.append(Program(name=name, arguments=arguments, log=logs_folder / name, environment=environment))
@@ -154,7 +165,7 @@ async def main() -> None:
             role="console",
             id=robot,
             site=settings.site or site.id,
-            credentials=settings.credentials(),
+            credentials=Credentials.read(settings.file_of("console")),
         ) as edge,
         Supervisor(_log_program_event) as supervisor,
     ):

@@ -2,6 +2,7 @@
 
 import http.client
 import os
+import ssl
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Final
 import psutil
 
 from fog_supervisor import net
+from fognav.locking import own_credentials
 from fognav.operate.registry import System, registered
 
 FOG_NODE: Final = "fog-node"
@@ -98,36 +100,41 @@ def _setting(process: psutil.Process, name: str) -> str:
 
 
 def _fog_node(processes: list[tuple[str, psutil.Process]]) -> System | None:
-    """Return the fog node whose REST APIs are at this machine's published ports."""
-    urls = addresses(net.LOOPBACK)
+    """Return the fog node whose REST APIs are at this machine's published ports.
+
+    One with locks is asked by HTTPS, if the environment names credentials. Raises `WrongUseError` for unusable ones.
+    """
+    own = own_credentials()
+    tls = own.tls_context() if own.authority else None
+    urls = addresses(net.LOOPBACK, locked=tls is not None)
     titles = {name: f"Fognav {name}" for name in SERVICE_PORTS}
-    answering = {name for name, setting in SERVICE_PORTS.items() if _title(port(setting)) == titles[name]}
+    answering = {name for name, setting in SERVICE_PORTS.items() if _title(port(setting), tls) == titles[name]}
     if not answering:
         return None
     return System(
         name=FOG_NODE,
         kind="fog node",
-        site=_site(port(SERVICE_PORTS[MAP_SERVICE])) if MAP_SERVICE in answering else "",
+        site=_site(port(SERVICE_PORTS[MAP_SERVICE]), tls) if MAP_SERVICE in answering else "",
         urls={name: url for name, url in urls.items() if name in answering or name in (ROUTER, BROKER)},
         pids={name: process.pid for name, process in processes},
     )
 
 
-def _get(port: int, path: str) -> dict[str, object]:
+def _get(port: int, path: str, tls: ssl.SSLContext | None) -> dict[str, object]:
     try:
-        response = net.request("GET", port, path)
+        response = net.request("GET", port, path, tls=tls)
     except (OSError, http.client.HTTPException):
         return {}
     return response.body if response.status == http.client.OK and isinstance(response.body, dict) else {}
 
 
-def _title(port: int) -> str:
-    info = _get(port, "/openapi.json").get("info")
+def _title(port: int, tls: ssl.SSLContext | None) -> str:
+    info = _get(port, "/openapi.json", tls).get("info")
     return str(info.get("title", "")) if isinstance(info, dict) else ""
 
 
-def _site(port: int) -> str:
-    return str(_get(port, "/api/v1/map").get("site", ""))
+def _site(port: int, tls: ssl.SSLContext | None) -> str:
+    return str(_get(port, "/api/v1/map", tls).get("site", ""))
 
 
 def _robots(processes: list[tuple[str, psutil.Process]]) -> list[System]:

@@ -11,16 +11,22 @@ SHARED: Final = 0o644
 """Everyone reads: what a person makes with one command and gives to programs of other users, such as a site."""
 
 
-def atomic_write(path: Path, data: bytes, *, mode: int = PRIVATE) -> None:
+def atomic_write(path: Path, data: bytes, *, mode: int = PRIVATE, owner: int | None = None) -> None:
     """Write a file durably; readers, even after a power cut, see either the old content or the new, never a part.
 
-    `mode` are the file's permissions, whatever those of an earlier one were.
+    `mode` are the file's permissions, whatever those of an earlier one were; as root one may name an `owner` (uid), who
+    also owns the file's folder if that is created.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
+    if not path.parent.is_dir():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if owner is not None:
+            os.chown(path.parent, owner, owner)
     descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
         with os.fdopen(descriptor, "wb") as file:
             os.fchmod(descriptor, mode)
+            if owner is not None:
+                os.fchown(descriptor, owner, owner)
             file.write(data)
             file.flush()
             os.fsync(file.fileno())

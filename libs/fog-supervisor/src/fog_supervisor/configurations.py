@@ -15,7 +15,9 @@ MQTT_PACKET_LIMIT: Final = 256 * 1024
 """Largest MQTT packet (bytes): above every MQTT channel's limit, small enough not to exhaust the memory."""
 MQTT_QUEUE_LIMIT: Final = 10_000
 """Messages that the broker queues for a slow or disconnected client."""
-MQTT_PORT: Final = 1883
+MQTTS_PORT: Final = 8883
+DEPLOYED_LOCKS: Final = "/run/locks"
+"""Where each server's container has its part of the locks."""
 REDIS_PORT: Final = 6379
 
 
@@ -104,8 +106,8 @@ def router_arguments(endpoint: str, *, locks: str | None = None) -> list[str]:
 def deployed() -> dict[str, str]:
     """Return the files that the compose file mounts into its servers, by their paths below `deploy/`."""
     return {
-        "mosquitto/mosquitto.conf": mosquitto(str(MQTT_PORT), "/mosquitto/data"),
-        "redis/redis.conf": redis("0.0.0.0", "/data"),  # noqa: S104  # inside a container; compose publishes no port
+        "mosquitto/mosquitto.conf": mosquitto(str(MQTTS_PORT), "/mosquitto/data", locks=DEPLOYED_LOCKS),
+        "redis/redis.conf": redis("0.0.0.0", "/data", locks=DEPLOYED_LOCKS),  # noqa: S104  # inside a container; compose publishes no port
     }
 
 

@@ -86,13 +86,20 @@ class SiteLocks:
         `hosts` are the names and addresses by which clients reach the servers, besides those of before. Certificates
         that expire soon, or lack one of them, are renewed. Raises `LocksError` or `AuthorityError`.
         """
-        known_hosts = _read_plan(self._folder).hosts if (self._folder / _PLAN).exists() else []
+        before = _read_plan(self._folder) if (self._folder / _PLAN).exists() else self._plan
+        if before.site != self._plan.site:
+            raise LocksError(
+                f"{self._folder} has the locks of site {before.site}, not of {self._plan.site}: name a folder (or "
+                "volume) of its own for each site"
+            )
+        known_hosts = before.hosts
         self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         if not (self._folder / AUTHORITY).exists():
             Authority.create(self._folder / AUTHORITY, f"Fognav {self._plan.site}", now=_now())
         wanted = [*known_hosts, *(host for host in hosts if host not in known_hosts)]
         self.renew(wanted, only_due=wanted == known_hosts)
         own: dict[str, Sequence[Server]] = {**users.SERVICES, **users.TOOLS, REDIS_ADMINISTRATOR: ("redis",)}
+        own[users.HEALTH] = users.HEALTH_SERVERS
         own |= dict.fromkeys(self._plan.unrestricted, ("mqtt", "zenoh"))
         missing = {user: servers for user, servers in own.items() if not self.credentials(user).exists()}
         # The credentials of robots and nodes need not stay here.
@@ -100,6 +107,7 @@ class SiteLocks:
         handed_out |= dict.fromkeys(nodes, ("mqtt",))
         known = self.users()
         self._set_users(missing | {user: servers for user, servers in handed_out.items() if user not in known})
+        self._write_rights_in_redis()
         self._write_access()
 
     @property
@@ -185,7 +193,7 @@ class SiteLocks:
         return changed
 
     def _add(self, user: str, servers: Sequence[Server]) -> Path:
-        if user in ROLES or user in self._plan.unrestricted or user == REDIS_ADMINISTRATOR:
+        if user in ROLES or user in self._plan.unrestricted or user in (REDIS_ADMINISTRATOR, users.HEALTH):
             raise LocksError(f"{user} is the name of a part of Fognav: give the robot or node another id")
         self._set_users({user: servers})
         self._write_access()
@@ -213,7 +221,18 @@ class SiteLocks:
             return users.zenoh_line(user, password)
         if user == REDIS_ADMINISTRATOR:
             return users.redis_administrator_line(user, password)
+        if user == users.HEALTH:
+            return users.redis_health_line(user, password)
         return users.redis_line(user, password, self._plan.site)
+
+    def _write_rights_in_redis(self) -> None:
+        """Write what this version's services may do in Redis, in whose list rights and passwords are one line."""
+        lines = []
+        for line in self._lines("redis"):
+            file = self.credentials(_user(line))
+            known = file.exists()
+            lines.append(self._line("redis", _user(line), Credentials.read(file).passwords["redis"]) if known else line)
+        self._write("redis", USERS, "".join(f"{line}\n" for line in lines))
 
     def _lines(self, program: str) -> list[str]:
         file = self.folder(program) / USERS

@@ -32,6 +32,9 @@ TOOLS: Final[Mapping[str, Sequence[Server]]] = {
     "home-assistant": ("mqtt",),
 }
 """The same for the tools of the fog node's administrator, and for a simulated world."""
+HEALTH: Final = "health"
+"""Who asks broker and Redis whether they are well, and may do nothing else."""
+HEALTH_SERVERS: Final[Sequence[Server]] = ("mqtt", "redis")
 _OWN_TABLES: Final[Mapping[str, Sequence[str]]] = {
     "hazard-aggregator": ("areas", "hazards", "overrides", "override_rests", "alerts", "history:*"),
     "map-service": ("zones", "zone_times"),
@@ -80,6 +83,11 @@ def redis_line(user: str, password: str, site: str) -> str:
 def redis_administrator_line(user: str, password: str) -> str:
     """Return a line of Redis's `aclfile` for somebody who may do everything, such as a backup."""
     return f"user {user} on {_redis_secret(password)} ~* &* +@all"
+
+
+def redis_health_line(user: str, password: str) -> str:
+    """Return a line of Redis's `aclfile` for who only asks whether it answers."""
+    return f"user {user} on {_redis_secret(password)} resetchannels -@all +ping"
 
 
 REDIS_NOBODY: Final = "user default off resetpass ~* &* +@all"

@@ -1,0 +1,170 @@
+"""The locks of a fog node in containers: `python -m fog_runtime.locks [make | COMMAND …]`.
+
+`make` creates what is missing, and hands out to each program what is its own (`handing_out`); every other command does
+so afterwards. Where the command `fognav` is installed, `fognav ca`, `robot add`, `node add` and `token` do the same in
+the folder of the locks.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime as dt
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import msgspec
+
+from fog_contracts.messages import Id
+from fog_runtime.credentials import CredentialsError
+from fog_runtime.keys import TOKENS, make_keys
+from fog_runtime.locks.authority import AuthorityError
+from fog_runtime.locks.handing_out import hand_out
+from fog_runtime.locks.site_locks import LocksError, SiteLocks
+from fog_runtime.settings import SettingsError, load
+from fog_runtime.site import SiteError, load_site
+from fog_runtime.token_file import ROLES, TokensError, create_token, read_tokens, revoke_token
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from fog_contracts.site import Site
+
+_SERVERS: Final = ("mosquitto", "redis", "zenoh", "gateway", "localhost", "127.0.0.1")
+"""How containers, and the host itself, reach the servers."""
+
+
+class Settings(msgspec.Struct, frozen=True, kw_only=True):
+    """Where the locks are, and for which site and hosts."""
+
+    site_dir: Path
+    locks_dir: Path
+    handed_out_dir: Path
+    hosts: str = ""
+    """Names and addresses by which robots, nodes and people reach the fog node, comma separated."""
+
+
+def _make(settings: Settings, site: Site) -> SiteLocks:
+    """Create what is missing."""
+    locks = SiteLocks(settings.locks_dir, site.id)
+    hosts = [host for host in (part.strip() for part in settings.hosts.split(",")) if host]
+    locks.make(
+        [*_SERVERS, *hosts], robots=[robot.id for robot in site.robots], nodes=[node.id for node in site.nodes]
+    )  # fmt: skip
+    make_keys(settings.locks_dir)
+    return locks
+
+
+def _carry_out(options: argparse.Namespace, locks: SiteLocks) -> str:
+    """Carry out a command; return what it prints. Raises `LocksError`, `AuthorityError`, `TokensError`, `OSError`."""
+    match options.command:
+        case "robot":
+            return locks.add_robot(_id(options.id)).read_text("utf-8")
+        case "node":
+            return locks.add_node(_id(options.id)).read_text("utf-8")
+        case "remove":
+            if not locks.remove(options.id):
+                raise LocksError(f"{options.id} is unknown. Known are: {', '.join(sorted(locks.users()))}")
+        case "certificate":
+            return locks.authority.trusted
+        case "show":
+            return _shown(locks, options.file)
+        case "token":
+            return _change_tokens(options, locks.directory / TOKENS)
+        case "rotate":
+            _rotate(locks, finish=options.finish)
+    return ""
+
+
+def _change_tokens(options: argparse.Namespace, file: Path) -> str:
+    if options.action == "create":
+        return create_token(file, options.name, options.role) + "\n"
+    if options.action == "revoke":
+        revoke_token(file, options.name)
+        return ""
+    return "".join(f"{entry.name}: {entry.role}\n" for entry in read_tokens(file))
+
+
+def _rotate(locks: SiteLocks, *, finish: bool) -> None:
+    if finish:
+        locks.authority.finish()
+    else:
+        locks.authority.rotate(now=dt.datetime.now(dt.UTC))
+    locks.trust_again()
+    locks.renew(only_due=False)
+
+
+def _id(text: str) -> str:
+    try:
+        return msgspec.convert(text, Id)
+    except msgspec.ValidationError as error:
+        raise LocksError(f"{text} is no id: use only a to z, 0 to 9 and -, at most 32") from error
+
+
+def _shown(locks: SiteLocks, name: str) -> str:
+    file = (locks.directory / name).resolve()
+    if not file.is_relative_to(locks.directory.resolve()) or not file.is_file():
+        files = sorted(path for path in locks.directory.rglob("*") if path.is_file())
+        names = ", ".join(path.relative_to(locks.directory).as_posix() for path in files)
+        raise LocksError(f"the locks have no file {name}. They have: {names}")
+    return file.read_text("utf-8")
+
+
+def _keep_owner(folder: Path) -> None:
+    """Give what was created as root to the owner of the folder, who may be a user of the host."""
+    owner = folder.stat()
+    if os.geteuid() == 0 and owner.st_uid != 0:
+        for path in folder.rglob("*"):
+            os.chown(path, owner.st_uid, owner.st_gid, follow_symlinks=False)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="locks", description="The locks of a fog node in containers.")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND")
+    commands.add_parser("make", help="create what is missing, and hand it out (default)")
+    commands.add_parser("certificate", help="print the authority's certificate, for browsers and curl")
+    commands.add_parser("robot", help="let a robot in; prints its credentials").add_argument("id")
+    commands.add_parser("node", help="let a sensor node in; prints its credentials").add_argument("id")
+    commands.add_parser("remove", help="let a robot or node in no longer").add_argument("id")
+    commands.add_parser("show", help="print a file: admin.token, credentials/NAME.toml, …").add_argument("file")
+    rotating = commands.add_parser("rotate", help="replace the authority; both are trusted until --finish")
+    rotating.add_argument("--finish", action="store_true")
+    actions = commands.add_parser("token", help="who may use the REST APIs").add_subparsers(
+        dest="action", metavar="ACTION", required=True
+    )
+    creating = actions.add_parser("create", help="prints the token, once")
+    creating.add_argument("name")
+    creating.add_argument("role", choices=ROLES)
+    actions.add_parser("list")
+    actions.add_parser("revoke").add_argument("name")
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Carry out the command line; return the exit code."""
+    options = _parser().parse_args(arguments)
+    os.umask(0o077)
+    try:
+        settings = load(Settings, environ=os.environ)
+        site = load_site(settings.site_dir).site
+        locks = _make(settings, site)
+        printed = _carry_out(options, locks)
+        _keep_owner(settings.locks_dir)
+        changed = hand_out(
+            locks,
+            settings.handed_out_dir,
+            robots=[robot.id for robot in site.robots],
+            nodes=[node.id for node in site.nodes],
+        )
+    except (AuthorityError, CredentialsError, LocksError, SettingsError, SiteError, TokensError, OSError) as error:
+        sys.stderr.write(f"{error}\n")
+        return 1
+    sys.stdout.write(printed)
+    for file in changed:
+        sys.stderr.write(f"handed out {file.relative_to(settings.handed_out_dir)}\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,109 @@
+"""Which files of a site's locks each program of a fog node gets: in a folder of its own, which only it can read.
+
+    mosquitto/  server.pem server.key users access authority.pem mosquitto_sub     the last two: its check of health
+    redis/      server.pem server.key users authority.pem health
+    zenoh/      server.pem server.key users access.json5
+    gateway/    server.pem server.key
+    hazard-aggregator/, map-service/, planner/    credentials.toml tokens.toml, the planner also operator.key
+    simulation/ operator.key token credentials/NAME.toml                           of a simulated robot and its nodes
+
+A folder that does not exist is left out: containers get one each, as a volume.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from fog_runtime.credentials import Credentials
+from fog_runtime.files import atomic_write
+from fog_runtime.keys import OPERATOR_KEY, TOKENS
+from fog_runtime.locks import users
+from fog_runtime.locks.site_locks import CREDENTIALS
+from fog_runtime.token_file import create_token, read_tokens, revoke_token, token_hash
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+    from fog_runtime.locks.site_locks import SiteLocks
+
+SIMULATION: Final = "simulation"
+TOKEN: Final = "token"  # noqa: S105  # a file's name
+_FOGNAV_UID: Final = 10001
+"""The user of our images (deploy/images)."""
+OWNERS: Final[Mapping[str, int]] = {
+    "mosquitto": 1883,
+    "redis": 999,
+    "zenoh": _FOGNAV_UID,
+    "gateway": 10002,
+    **dict.fromkeys([*users.SERVICES, SIMULATION], _FOGNAV_UID),
+}
+"""As which user each program runs in its container: those of the images, and of docker-compose.yml."""
+_BROKER_CHECK: Final = """\
+-h localhost
+-p 8883
+--cafile {folder}/authority.pem
+-u {user}
+-P {password}
+"""
+
+
+def hand_out(
+    locks: SiteLocks, out: Path, *, robots: Sequence[str], nodes: Sequence[str], seen_as: str = "/run/locks"
+) -> list[Path]:
+    """Bring the programs' folders in `out` up to date; return the files that changed.
+
+    The locks' folder also has the site's keys (`fog_runtime.keys`); `seen_as` is a folder's path in its container.
+    Raises `OSError`, and `CredentialsError` or `TokensError` for files that can't be used.
+    """
+    if (out / SIMULATION).is_dir():
+        _make_token(locks.directory / TOKENS, out / SIMULATION / TOKEN)
+    changed = []
+    for program, files in _contents(locks, robots, nodes, seen_as).items():
+        folder = out / program
+        if not folder.is_dir():
+            continue
+        for name, data in files.items():
+            if not (folder / name).exists() or (folder / name).read_bytes() != data:
+                atomic_write(folder / name, data, owner=OWNERS[program])
+                changed.append(folder / name)
+    return changed
+
+
+def _contents(
+    locks: SiteLocks, robots: Sequence[str], nodes: Sequence[str], seen_as: str
+) -> dict[str, dict[str, bytes]]:
+    """Return each program's files by their names."""
+    trusted = locks.authority.trusted.encode()
+    health = Credentials.read(locks.credentials(users.HEALTH)).passwords
+    check = _BROKER_CHECK.format(folder=seen_as, user=users.HEALTH, password=health["mqtt"])
+    tokens = (locks.directory / TOKENS).read_bytes()
+    key = (locks.directory / OPERATOR_KEY).read_bytes()
+    found = {
+        "mosquitto": {**_folder(locks, "mosquitto"), "authority.pem": trusted, "mosquitto_sub": check.encode()},
+        "redis": {**_folder(locks, "redis"), "authority.pem": trusted, "health": health["redis"].encode()},
+        "zenoh": _folder(locks, "zenoh"),
+        "gateway": _folder(locks, "http"),
+    }
+    for service in users.SERVICES:
+        found[service] = {"credentials.toml": locks.credentials(service).read_bytes(), TOKENS: tokens}
+    found["planner"][OPERATOR_KEY] = key
+    # Those of robots and nodes may have been handed out already, and removed here.
+    simulated = [file for user in ("console", "sim", *robots, *nodes) if (file := locks.credentials(user)).exists()]
+    found[SIMULATION] = {OPERATOR_KEY: key, **{f"{CREDENTIALS}/{file.name}": file.read_bytes() for file in simulated}}
+    return found
+
+
+def _folder(locks: SiteLocks, program: str) -> dict[str, bytes]:
+    return {file.name: file.read_bytes() for file in sorted(locks.folder(program).iterdir()) if file.is_file()}
+
+
+def _make_token(tokens: Path, file: Path) -> None:
+    """Give the simulated robot's operator a token of its own, if it has none that is valid."""
+    known = [entry for entry in read_tokens(tokens) if entry.name == SIMULATION]
+    if known:
+        if file.exists() and token_hash(file.read_text("ascii").strip()) == known[0].sha256:
+            return
+        revoke_token(tokens, SIMULATION)
+    token = create_token(tokens, SIMULATION, "operator")
+    atomic_write(file, f"{token}\n".encode(), owner=OWNERS[SIMULATION])

@@ -61,12 +61,12 @@ def experiment_command(  # noqa: PLR0913  # each option is an argument
             asked = runner.tasks(
                 runner.read_spec(loaded, place), seed, [only] if only else range(1, runs + 1), _chosen(setups)
             )
-            folder = Folder(out)
-            folder.begin(runner.new(loaded, place, seed), {"commit": checkout.revision(), **machine.describe()})
+            folder, commit = Folder(out), checkout.revision()
+            folder.begin(runner.new(loaded, place, seed), {"commit": commit, **machine.describe()})
         except (SiteError, runner.SpecError, FolderError) as error:
             raise WrongUseError(str(error)) from error
         kernels.warm_cache(print_line)
-        failed = _show(asked, folder, runner.run(place, asked, folder, jobs))
+        failed = _show(asked, folder, runner.run(place, asked, folder, jobs, commit))
     print_line(f"{len(asked) - failed} of {len(asked)} drives succeeded; records in {out}")
     if failed:
         raise typer.Exit(NOT_TRUE)

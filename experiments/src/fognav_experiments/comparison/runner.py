@@ -75,18 +75,18 @@ def tasks(spec: ExperimentSpec, seed: int, runs: Sequence[int], setups: Sequence
     return [Task(drawn, setup) for run in runs for drawn in draw(spec, seed, run) for setup in setups]
 
 
-def run(site_folder: Path, asked: list[Task], folder: Folder, jobs: int = 1) -> Iterator[Record]:
-    """Run the tasks that have no record yet, and yield each record once it is written."""
+def run(site_folder: Path, asked: list[Task], folder: Folder, jobs: int = 1, commit: str = "") -> Iterator[Record]:
+    """Run the tasks that have no record yet, and yield each record once it is written; `commit` is only recorded."""
     due = [task for task in asked if not folder.has(task.name)]
     if jobs == 1:
         for task in due:
-            record = _drive(site_folder, task, jobs)
+            record = _drive(site_folder, task, jobs, commit)
             folder.write(record)
             yield record
         return
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(jobs, mp_context=context, initializer=_ignore_interrupts) as pool:
-        waiting = {pool.submit(_drive, site_folder, task, jobs) for task in due}
+        waiting = {pool.submit(_drive, site_folder, task, jobs, commit) for task in due}
         try:
             while waiting:
                 done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
@@ -103,8 +103,8 @@ def new(site: LoadedSite, site_folder: Path, seed: int) -> Asked:
     return Asked(site=site.site.id, site_digest=site_digest(site_folder), seed=seed)
 
 
-def _drive(site_folder: Path, task: Task, jobs: int) -> Record:
-    record = drive(_site(site_folder), task.drawn, task.setup, jobs)
+def _drive(site_folder: Path, task: Task, jobs: int, commit: str) -> Record:
+    record = drive(_site(site_folder), task.drawn, task.setup, jobs, commit)
     release_drives()
     return record
 

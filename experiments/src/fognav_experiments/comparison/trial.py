@@ -22,10 +22,10 @@ if TYPE_CHECKING:
     from fognav_experiments.comparison.draws import RouteDraw
 
 
-def drive(site: LoadedSite, drawn: RouteDraw, setup: ProfileName, jobs: int = 1) -> Record:
+def drive(site: LoadedSite, drawn: RouteDraw, setup: ProfileName, jobs: int = 1, commit: str = "") -> Record:
     """Drive a drawn route in a setup; the same but for CPU and wall time whenever it is repeated.
 
-    `jobs`: drives that run at the same time on this machine; it is only recorded. Raises `BarrierError` for an area
+    `jobs`: drives that run at the same time on this machine, and `commit` are only recorded. Raises `BarrierError` for an area
     that no barrier closes.
     """
     places = site.site.places
@@ -62,6 +62,7 @@ def drive(site: LoadedSite, drawn: RouteDraw, setup: ProfileName, jobs: int = 1)
             "load": round(os.getloadavg()[0], 2),
             "wall_s": round(time.perf_counter() - begun, 1),
             "version": version("fognav-experiments"),
+            "commit": commit,
         },
         Record,
     )

@@ -1,6 +1,6 @@
 """Scenarios: every file can be played on its site, and what deviates from its expectation is found.
 
-FOGNAV_SCENARIOS=all plays all of them (about 4 minutes), otherwise two short ones.
+FOGNAV_SCENARIOS=all plays all of them (about 10 minutes), otherwise three short ones.
 """
 
 from __future__ import annotations
@@ -13,12 +13,14 @@ import pytest
 
 from fog_runtime.site import load_site
 from fognav_experiments.lockstep import DriveEvent
-from fognav_experiments.scenarios.description import Expected, Scenario, SilentNode, deviations
+from fognav_experiments.scenarios.description import Expected, FaultyNode, Scenario, SilentNode, deviations
 from fognav_experiments.scenarios.stage import ScenarioError, play, read_scenario
 
 ROOT = Path(__file__).parents[2]
 FILES = {file.stem: file for file in sorted((ROOT / "experiments" / "scenarios").glob("*.toml"))}
-PLAYED = sorted(FILES) if os.environ.get("FOGNAV_SCENARIOS") == "all" else ["no-way-left", "wifi-gap-5s"]
+PLAYED = (
+    sorted(FILES) if os.environ.get("FOGNAV_SCENARIOS") == "all" else ["map-restarts", "no-way-left", "wifi-gap-5s"]
+)
 
 
 @pytest.mark.parametrize("name", FILES)
@@ -30,7 +32,7 @@ def test_every_scenario_is_about_its_site(name):
         column, row = site.map.geometry.cell(x, y)
         assert site.map.cells[row, column] == 0
     nodes = {node.id for node in site.site.nodes}
-    assert {event.node for event in scenario.events if isinstance(event, SilentNode)} <= nodes
+    assert {event.node for event in scenario.events if isinstance(event, (FaultyNode, SilentNode))} <= nodes
 
 
 @pytest.mark.parametrize("name", PLAYED)
@@ -74,5 +76,5 @@ def test_each_deviation_from_what_is_expected_is_found(expected, result, outcome
 
 def test_scenarios_can_be_told_from_one_another():
     titles = [read_scenario(file).title for file in FILES.values()]
-    assert len(set(titles)) == len(titles) >= 12
+    assert len(set(titles)) == len(titles) >= 25
     assert isinstance(read_scenario(FILES["kidnapped"]), Scenario)

@@ -77,18 +77,21 @@ def report_command(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the records.")],
     *,
     out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Folder of the report.")] = None,
+    site: Annotated[Path | None, typer.Option("--site", metavar="DIR", help="Site of the drives.")] = None,
 ) -> None:
     """Write the report of an experiment: Markdown, one HTML file, figures and CSV.
 
     It shows the thesis's figures with ours beside them, paired differences with their tests, and where CPU time went.
     """
+    from fog_runtime.site import SiteError  # noqa: PLC0415  # keeps the other commands fast
     from fognav_experiments.comparison.publish import publish  # noqa: PLC0415  # keeps the other commands fast
     from fognav_experiments.comparison.records import Folder, FolderError  # noqa: PLC0415  # same
+    from fognav_experiments.comparison.runner import SpecError  # noqa: PLC0415  # same
 
     with exit_codes():
         try:
-            written = publish(Folder(folder), out or folder)
-        except (FolderError, OSError) as error:
+            written = publish(Folder(folder), out or folder, checkout.site_folder(site))
+        except (FolderError, SiteError, SpecError, OSError) as error:
             raise WrongUseError(str(error)) from error
     for file in written:
         print_line(str(file))

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 from fog_contracts import channels as ch
 from fog_contracts.codec import encode
 from fog_contracts.messages import MapSnapshot, Message, PlanReply, RobotGoal, RobotState
+from fognav_experiments.link import Link
 from planner.dock_goals import DockGoals
 from robot_agent.agent.core import decide
 
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
     from fog_contracts.bus import Bus
-    from fog_contracts.handlers import Handler, Ids, Moment, Publication
+    from fog_contracts.handlers import Handler, Ids, Moment, Publication, QueryHandler
     from fog_contracts.messages import Pose, ProfileName, Zone
     from hazard_aggregator.core import Aggregator
     from map_service.core import MapCore
@@ -46,15 +47,37 @@ def unmeasured(_component: str) -> AbstractContextManager[object]:
     return nullcontext()
 
 
-class AggregatorProcess:
+class FogProcess:
+    """A process of the fog, which may die; another one takes its place on the bus then."""
+
+    def __init__(self, bus: Bus) -> None:
+        self._bus = bus
+        self._connected: list[Handler | QueryHandler] = []
+        self.alive = True
+
+    def stop(self) -> None:
+        """Die: nothing is received, answered or published any more."""
+        self.alive = False
+        self._bus.disconnect(self._connected)
+
+    def _subscribe(self, handlers: Mapping[ch.Channel, Handler]) -> None:
+        self._bus.subscribe(handlers)
+        self._connected += handlers.values()
+
+    def _serve(self, query_handlers: Mapping[ch.Channel, QueryHandler]) -> None:
+        self._bus.serve(query_handlers)
+        self._connected += query_handlers.values()
+
+
+class AggregatorProcess(FogProcess):
     """The hazard-aggregator, with a store without delay."""
 
     def __init__(self, core: Aggregator, bus: Bus, measure: Measure = unmeasured) -> None:
+        super().__init__(bus)
         self.core = core
-        self._bus = bus
         self._measure = measure
-        bus.subscribe({channel: self._with_store(handler) for channel, handler in core.handlers().items()})
-        bus.serve(core.query_handlers())
+        self._subscribe({channel: self._with_store(handler) for channel, handler in core.handlers().items()})
+        self._serve(core.query_handlers())
 
     def connect(self) -> None:
         """Publish everything again, as after each connection to the broker."""
@@ -77,15 +100,15 @@ class AggregatorProcess:
         return [*publications, *self.core.mark_stored(self.core.to_store())]
 
 
-class MapProcess:
+class MapProcess(FogProcess):
     """The map-service; `load_zones` and `put_zone` replace its store and REST API."""
 
     def __init__(self, core: MapCore, bus: Bus, measure: Measure = unmeasured) -> None:
+        super().__init__(bus)
         self.core = core
-        self._bus = bus
         self._measure = measure
         self._serving = False
-        bus.subscribe({channel: self._measured(handler) for channel, handler in core.handlers().items()})
+        self._subscribe({channel: self._measured(handler) for channel, handler in core.handlers().items()})
 
     def load_zones(self, zones: Iterable[Zone], at: Moment) -> None:
         """Load the stored zones; the map is not served before."""
@@ -101,7 +124,7 @@ class MapProcess:
             self._bus.publish(self.core.tick(at))
         if self.core.serving and not self._serving:
             self._serving = True
-            self._bus.serve(self.core.query_handlers())
+            self._serve(self.core.query_handlers())
 
     def _measured(self, handler: Handler) -> Handler:
         def handle(ids: Ids, message: Message | str, at: Moment) -> Sequence[Publication]:
@@ -111,7 +134,7 @@ class MapProcess:
         return handle
 
 
-class PlannerProcess:
+class PlannerProcess(FogProcess):
     """The planner: messages wait for its next tick; urgent ones trigger it at once."""
 
     def __init__(
@@ -122,14 +145,14 @@ class PlannerProcess:
         measure: Measure = unmeasured,
     ) -> None:
         """`staging`: by robot, the pose in front of its dock."""
+        super().__init__(bus)
         self.core = core
-        self._bus = bus
         self._measure = measure
         self._docks = DockGoals(staging or {})
         self.due = False
         """Whether `tick` is due before its regular time."""
-        bus.subscribe({channel: self._with_wake_up(channel, handler) for channel, handler in core.handlers().items()})
-        bus.serve(core.query_handlers())
+        self._subscribe({c: self._with_wake_up(c, handler) for c, handler in core.handlers().items()})
+        self._serve(core.query_handlers())
 
     def set_goal(self, robot: str, goal: RobotGoal, *, any_heading: bool = False) -> None:
         """Give a robot a goal, as an operator does."""
@@ -184,8 +207,8 @@ class AgentProcess:
         self.core = core
         self._bus = bus
         self._measure = measure
-        self.hears = self.is_heard = True
-        """Whether messages of the fog reach the robot, and the robot's the fog."""
+        self.link = Link()
+        """The robot's Wi-Fi: all messages go through it."""
         self.received_bytes = 0
         """Bytes of the messages that were received and are of use in the robot's profile."""
         handlers = {channel: self._measured(channel, handler) for channel, handler in core.handlers().items()}
@@ -195,19 +218,24 @@ class AgentProcess:
     def _measured(self, channel: ch.Channel, handler: Handler) -> Handler:
         component = "layers" if channel is ch.MAP_DELTA else "messages"
 
-        def handle(ids: Ids, message: Message, at: Moment) -> Sequence[Publication]:
-            if not self.hears:
-                return ()
+        def receive(ids: Ids, message: Message, at: Moment) -> Sequence[Publication]:
             if channel in USED[self.core.profile.name]:
                 self.received_bytes += len(encode(channel, message))
             with self._measure(component):
                 return handler(ids, message, at)
 
+        def handle(ids: Ids, message: Message, at: Moment) -> Sequence[Publication]:
+            return self.link.down(lambda when: receive(ids, message, when), at)
+
         return handle
+
+    def deliver(self, at: Moment) -> None:
+        """Deliver what a slow link has held back long enough; call it every 10 ms."""
+        self._bus.publish(self.link.due(at))
 
     def fetch_map(self, at: Moment) -> None:
         """Load a snapshot if the core requests one and the map is served; call it 20 times a second."""
-        if self.hears and self.is_heard and self.core.wants_snapshot(at.now):
+        if self.link.whole and self.core.wants_snapshot(at.now):
             snapshot = self._bus.query(ch.MAP_SNAPSHOT, None, MapSnapshot, at)
             if snapshot is not None:
                 self.received_bytes += len(snapshot.cost) + len(snapshot.speed) + len(snapshot.static)
@@ -235,11 +263,9 @@ class AgentProcess:
         """Tick the core; call it ten times a second."""
         with self._measure("messages"):
             publications = self.core.tick(at)
-            if self.is_heard:
-                self._bus.publish(publications)
+        self._bus.publish(self.link.up(publications, at))
         if (request := self.core.egress_request(at.now)) is not None:
-            linked = self.hears and self.is_heard
-            reply = self._bus.query(ch.PLANNER_EGRESS, request, PlanReply, at) if linked else None
+            reply = self._bus.query(ch.PLANNER_EGRESS, request, PlanReply, at) if self.link.whole else None
             self.core.on_egress_reply(reply, at.now)
 
 
@@ -274,5 +300,6 @@ class Fog:
     def tick(self, at: Moment) -> None:
         """Tick all three; call it ten times a second."""
         for process in (self.aggregator, self.map, self.planner):
-            process.tick(at)
+            if process.alive:
+                process.tick(at)
             self.deliver(at)

@@ -6,7 +6,7 @@ and guardian as bytes on their lines, and an operator. Lockstep leaves out socke
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Literal
 
 from fog_contracts import channels as ch
 from fog_contracts.bus import Bus
@@ -15,7 +15,16 @@ from fog_contracts.handlers import Moment, Publication
 from fog_contracts.messages import CommandReply
 from fog_runtime.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fog_runtime.robot_file import default_robot
-from fognav_experiments.processes import AgentProcess, Fog, Measure, unmeasured
+from fognav_experiments.processes import (
+    AgentProcess,
+    AggregatorProcess,
+    Fog,
+    FogProcess,
+    MapProcess,
+    Measure,
+    PlannerProcess,
+    unmeasured,
+)
 from fognav_sim import devices
 from fognav_sim.floor import Floor
 from fognav_sim.hardware import STEP_S, Hardware
@@ -38,7 +47,7 @@ from robot_agent.registry import make_base, make_lidar
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from fog_contracts.messages import CommandKind
+    from fog_contracts.messages import CommandKind, Zone
     from fog_contracts.site import RobotSite
     from fog_runtime.site import LoadedSite
     from fognav_sim.emulators import BaseEmulator
@@ -57,6 +66,7 @@ _LIDAR_STEPS: Final = 2
 _STREAM_STEPS: Final = 5
 _CONTROL_AFTER_STEPS: Final = 2
 """How much later than the stream decisions begin: `CONTROL_AFTER_S` of the agent's service."""
+FogProcessName = Literal["aggregator", "map-service", "planner"]
 TICK_STEPS: Final = 10
 """Steps of 10 ms between two ticks of the cores."""
 
@@ -132,6 +142,7 @@ class RobotRig:
     def act(self) -> None:
         """Run the agent's loops that are due: as those of its process, all of them in the first step."""
         at, step = moment(self.now), self._steps - 1
+        self.process.deliver(at)
         if step % _STREAM_STEPS == 0:
             self.process.fetch_map(at)
         since_first = step - _CONTROL_AFTER_STEPS
@@ -198,32 +209,76 @@ class RobotRig:
         return reply
 
 
+def make_aggregator(site: LoadedSite, epoch: int) -> Aggregator:
+    """Return the aggregator of a site, as it starts."""
+    return Aggregator(AreaFusion(site.site.definitions(), site.site.nodes, epoch=epoch, registry=find_rule))
+
+
+def make_map(site: LoadedSite, epoch: int) -> MapCore:
+    """Return the map-service of a site, as it starts; its zones are not loaded yet."""
+    layers = make_layers(site.map, site.site.layers)
+    return MapCore(site.site.id, site.map, epoch=epoch, layers=layers, definitions=site.site.definitions())
+
+
 class FogRig(Fog):
     """The fog node of a site, with its sensor nodes."""
 
     def __init__(
         self, site: LoadedSite, world: World, bus: Bus, seed: int, start: float, *, measure: Measure = unmeasured
     ) -> None:
-        definitions = site.site.definitions()
         super().__init__(
-            Aggregator(AreaFusion(definitions, site.site.nodes, epoch=1, registry=find_rule)),
-            MapCore(
-                site.site.id,
-                site.map,
-                epoch=1,
-                layers=make_layers(site.map, site.site.layers),
-                definitions=definitions,
-            ),
+            make_aggregator(site, 1),
+            make_map(site, 1),
             PlannerCore(epoch=1),
             bus,
             staging=site.site.staging,
             measure=measure,
         )
         self._bus = bus
+        self._site = site
+        self._measured_by = measure
+        self._zones: dict[str, Zone] = {}
         self._world = world
         # The nodes were switched on at different times.
         self.nodes = make_nodes(site.site.nodes, seed, start, apart=0.013)
         self.start(moment(start))
+
+    def put_zone(self, zone: Zone, at: Moment) -> None:
+        """Add or replace an operator's zone, and store it."""
+        self._zones[zone.id] = zone
+        self.map.put_zone(zone, at)
+
+    def stop(self, process: FogProcessName) -> None:
+        """Let a process die."""
+        running: dict[FogProcessName, FogProcess] = {
+            "aggregator": self.aggregator,
+            "map-service": self.map,
+            "planner": self.planner,
+        }
+        running[process].stop()
+
+    def start_again(self, process: FogProcessName, at: Moment) -> None:
+        """Start a process that has stopped: with what its store holds and what the broker retains."""
+        match process:
+            case "aggregator":
+                hazards = self.aggregator.core.announced().values()
+                core = make_aggregator(self._site, self.aggregator.core.epoch + 1)
+                self.aggregator = AggregatorProcess(core, self._bus, self._measured_by)
+                self._bus.publish(core.restore([], hazards, at))
+            case "map-service":
+                epoch = self.map.core.costmap.version.epoch + 1
+                self.map = MapProcess(make_map(self._site, epoch), self._bus, self._measured_by)
+                self.map.load_zones(self._zones.values(), at)
+                self._bus.publish(self.aggregator.core.republish_all())  # what the broker has retained
+            case "planner":
+                ended = self.planner.core
+                self.planner = PlannerProcess(
+                    PlannerCore(epoch=ended.epoch + 1), self._bus, self._site.site.staging, self._measured_by
+                )
+                for robot, mission in ended.missions.active():
+                    if mission.goal is not None:
+                        self.planner.set_goal(robot, mission.goal, any_heading=mission.any_heading)
+        self.deliver(at)
 
     def measure(self, now: float) -> None:
         """Let the nodes publish the readings that are due."""

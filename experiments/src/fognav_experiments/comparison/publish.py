@@ -4,25 +4,34 @@ from __future__ import annotations
 
 import csv
 import io
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from fog_runtime.files import SHARED, atomic_write
+from fog_runtime.site import load_site
+from fognav_experiments.comparison import runner
 from fognav_experiments.comparison.document import Figure, to_html, to_markdown
+from fognav_experiments.comparison.draws import draw
+from fognav_experiments.comparison.geometry import RouteGeometry
 from fognav_experiments.comparison.records import FolderError, write_csv
 from fognav_experiments.comparison.report import TITLE, build, summary_rows
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
-    from fognav_experiments.comparison.records import Folder
+    from fognav_experiments.comparison.geometry import Saving
+    from fognav_experiments.comparison.records import Folder, Record
 
 
-def publish(folder: Folder, target: Path) -> list[Path]:
-    """Write the report of a folder's records into another one, or the same; return its files. Raises `FolderError`."""
+def publish(folder: Folder, target: Path, site: Path | None = None) -> list[Path]:
+    """Write the report of a folder's records into another one, or the same; return its files. Raises `FolderError`.
+
+    `site`: folder of the floor; with it the report says what the map allows, if the drives were on this very floor.
+    """
     experiment, records = folder.machine(), folder.read()
     if not records:
         raise FolderError(f"{folder.path} holds no drives yet: run `fognav experiment --out {folder.path}` first")
-    blocks = build(records, experiment)
+    blocks = build(records, experiment, _savings(records, experiment["asked"], site))
     summary = io.StringIO()
     csv.writer(summary, lineterminator="\n").writerows(summary_rows(records))
     texts = {
@@ -35,3 +44,14 @@ def publish(folder: Folder, target: Path) -> list[Path]:
         atomic_write(target / name, text.encode(), mode=SHARED)
     write_csv(target / "drives.csv", records)
     return [target / name for name in (*texts, "drives.csv")]
+
+
+def _savings(records: Sequence[Record], asked: dict[str, Any], place: Path | None) -> dict[tuple[int, str], Saving]:
+    """Return, by run and route, what the map allows to save; nothing for another floor than that of the drives."""
+    if place is None or runner.site_digest(place) != asked["site_digest"]:
+        return {}
+    site = load_site(place)
+    spec, geometry = runner.read_spec(site, place), RouteGeometry(site)
+    drawn = [route for run in {record.run for record in records} for route in draw(spec, asked["seed"], run)]
+    found = {(route.run, route.route.name): geometry.saving(route) for route in drawn}
+    return {key: saving for key, saving in found.items() if saving is not None}

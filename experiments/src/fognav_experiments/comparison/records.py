@@ -31,8 +31,8 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
 
     `barrier_distance_m`: smallest distance between the obstacle and the robot's rim. `reaction_s`: from the obstacle's
     first reading to the first wheel command on a new path, where there was one. `jobs`: drives that this machine ran at
-    the same time; `load`: its load average at the end. `paths`: paths that the robot followed. `commit`: revision of the
-    program, empty if it is the one that the folder was begun with.
+    the same time; `load`: its load average at the end. `paths`: paths that the robot followed. `commit`: the
+    program's revision, empty if it is the one that the folder was begun with.
     """
 
     setup: ProfileName

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from fognav_experiments.comparison import figures
+from fognav_experiments.comparison import figures, limits
 from fognav_experiments.comparison.document import Block, Code, Figure, Heading, Paragraph, Table
 from fognav_experiments.comparison.records import MOVE_BASE, OF_FOG, ON_FOG, ON_ROBOT
 from fognav_experiments.comparison.statistics import Estimate, compare, estimate
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from fog_contracts.messages import ProfileName
+    from fognav_experiments.comparison.geometry import Saving
     from fognav_experiments.comparison.records import Record
 
 TITLE: Final = "What the fog saves a robot: the thesis's experiment, repeated"
@@ -79,8 +80,14 @@ def paired(records: Sequence[Record]) -> list[Drives]:
     ]
 
 
-def build(records: Sequence[Record], experiment: Mapping[str, Any]) -> list[Block]:
-    """Return the report of these records, measured on what `experiment` says."""
+def build(
+    records: Sequence[Record], experiment: Mapping[str, Any], savings: Mapping[tuple[int, str], Saving] | None = None
+) -> list[Block]:
+    """Return the report of these records, measured on what `experiment` says.
+
+    `savings`: by run and route, what the map alone says of them, as far as that is known.
+    """
+    savings = savings or {}
     pairs = paired(records)
     setups = [setup for setup in SETUPS if any(record.setup == setup for record in records)]
     blocks: list[Block] = [Heading(TITLE, 1), *_introduction(records, pairs, experiment)]
@@ -89,7 +96,7 @@ def build(records: Sequence[Record], experiment: Mapping[str, Any]) -> list[Bloc
             *blocks,
             Paragraph("No route has succeeded in every setup yet: there is nothing to compare."),
         ]
-    met = [by_setup for by_setup in pairs if _met(by_setup)]
+    met = [by_setup for by_setup in pairs if _met(by_setup, savings)]
     return [
         *blocks,
         Heading("Beside the thesis"),
@@ -98,6 +105,7 @@ def build(records: Sequence[Record], experiment: Mapping[str, Any]) -> list[Bloc
         *_routes(pairs, setups),
         Heading("Paired differences"),
         *_differences(pairs, met, setups),
+        *_bounds(pairs, savings),
         Heading("Where the computation goes"),
         *_components(pairs, setups),
         Heading("One drive, seen from above"),
@@ -116,6 +124,9 @@ def _introduction(records: Sequence[Record], pairs: Sequence[Drives], experiment
     jobs = sorted({record.jobs for record in records})
     speed = sum(record.time_s or 0.0 for record in records) / max(sum(record.wall_s for record in records), 1e-9)
     rows.append(["lockstep", f"{speed:.1f} times as fast as real time"])
+    for commit in sorted({record.commit for record in records} - {""}):
+        count = sum(record.commit == commit for record in records)
+        rows.append(["commit", f"{commit}: {count} of the drives (all setups of a route by the same)"])
     loads = [record.load for record in records]
     return [
         Paragraph(
@@ -147,10 +158,33 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
     return found
 
 
-def _met(by_setup: Drives) -> bool:
+def _met(by_setup: Drives, savings: Mapping[tuple[int, str], Saving]) -> bool:
     """Whether the obstacle stood in the way of a robot that knew nothing of it."""
+    saving = savings.get(_key(by_setup))
+    if saving is not None:
+        return saving.met
     unwarned = by_setup.get("default")
     return unwarned is not None and unwarned.paths > 1
+
+
+def _key(by_setup: Drives) -> tuple[int, str]:
+    record = next(iter(by_setup.values()))
+    return record.run, record.route
+
+
+def _bounds(pairs: Sequence[Drives], savings: Mapping[tuple[int, str], Saving]) -> list[Block]:
+    both = [drives for drives in pairs if "default" in drives and "fog" in drives and _key(drives) in savings]
+    distance, time = (quantity.value for quantity in QUANTITIES[:2])
+    drives = [
+        (
+            savings[_key(drives)],
+            distance(drives["default"]) - distance(drives["fog"]),
+            time(drives["default"]) - time(drives["fog"]),
+        )
+        for drives in both
+    ]
+    blocks = limits.geometry(drives)
+    return [Heading("What the floor allows to save"), *blocks] if blocks else []
 
 
 def _beside_thesis(pairs: Sequence[Drives], met: Sequence[Drives], setups: Sequence[ProfileName]) -> list[Block]:
@@ -158,12 +192,17 @@ def _beside_thesis(pairs: Sequence[Drives], met: Sequence[Drives], setups: Seque
     shares = {setup: _mean(pairs, setup, QUANTITIES[2]) for setup in setups}
     ours["6.5, 6.9"] = ", ".join(f"{setup} {found.mean:.2f} %" for setup, found in shares.items())
     if "default" in shares and "fog" in shares:
-        ours["6.5, 6.9"] += f": default / fog = {shares['default'].mean / shares['fog'].mean:.1f}"
+        whole = [_mean(pairs, setup, QUANTITIES[3]).mean for setup in ("default", "fog")]
+        ours["6.5, 6.9"] += (
+            f": default / fog = {shares['default'].mean / shares['fog'].mean:.1f}; "
+            f"whole robot {whole[0]:.2f} % and {whole[1]:.2f} %: {whole[0] / whole[1]:.1f}"
+        )
     ours["6.6, 6.10"] = "all setups run in one process in lockstep, which says nothing of a robot's memory"
     reactions = [record.reaction_s for drives in pairs for record in drives.values() if record.reaction_s is not None]
     if reactions:
         ours["(text)"] = (
-            f"{estimate(reactions).mean:.2f} s from the first echo to the first wheel command ({len(reactions)} drives)"
+            f"{estimate(reactions).mean:.2f} s from the first echo to the first wheel command "
+            f"({len(reactions)} drives); not comparable, see below"
         )
     rows = [
         [row.figures, row.subject, row.simulated, row.real, ours.get(row.figures, "not measured")] for row in REPORTED
@@ -176,6 +215,12 @@ def _beside_thesis(pairs: Sequence[Drives], met: Sequence[Drives], setups: Seque
             f"{len(pairs)} drives here. The floor is another one, made in the manner of the thesis's. Its "
             "figures 6.11 and 6.12 compare simulation and reality, for which there is no robot here."
         ),
+        Paragraph(
+            "The time from an echo to a wheel command is not comparable with the thesis's 3 s: lockstep has the "
+            "waiting times (of measuring, debouncing and control), but no radio, no brokers and no time of "
+            "computation, all of which the thesis's robot had. `fognav demo --report FILE` measures it over real "
+            "processes."
+        ),
     ]
 
 
@@ -186,7 +231,7 @@ def _saved(pairs: Sequence[Drives], met: Sequence[Drives], quantity: Quantity) -
         both = [drives for drives in chosen if "default" in drives and "fog" in drives]
         if both:
             found = compare([quantity.value(d["default"]) for d in both], [quantity.value(d["fog"]) for d in both])
-            words.append(f"{subject}: {_text(found.difference)} {quantity.unit}")
+            words.append(f"{subject}: {limits.text(found.difference)} {quantity.unit}")
     return "; ".join(words) or "not measured"
 
 
@@ -202,7 +247,8 @@ def _routes(pairs: Sequence[Drives], setups: Sequence[ProfileName]) -> list[Bloc
             for setup in setups
         }
         rows = [
-            [_route(route), *(_text(series[setup][number]) for setup in setups)] for number, route in enumerate(routes)
+            [_route(route), *(limits.text(series[setup][number]) for setup in setups)]
+            for number, route in enumerate(routes)
         ]
         groups = [_route(route) for route in routes]
         svg = figures.bars(quantity.title, quantity.unit, groups, series)
@@ -225,7 +271,7 @@ def _differences(pairs: Sequence[Drives], met: Sequence[Drives], setups: Sequenc
                     [quantity.value(drives[after]) for drives in chosen],
                 )
                 rows.append([
-                    f"{before} - {after}", subject, f"{quantity.title}, {quantity.unit}", _text(found.difference),
+                    f"{before} - {after}", subject, f"{quantity.title}, {quantity.unit}", limits.text(found.difference),
                     str(found.difference.n), _probability(found.p_t), _probability(found.p_flip),
                 ])  # fmt: skip
     return [
@@ -250,27 +296,28 @@ def _components(pairs: Sequence[Drives], setups: Sequence[ProfileName]) -> list[
     for name, components in (("what move_base held", MOVE_BASE), ("whole robot", ON_ROBOT)):
         means = (estimate([drives[setup].cpu_percent(components) for drives in pairs]).mean for setup in setups)
         rows.append([f"sum: {name}", *(f"{mean:.3f}" for mean in means)])
-    largest = setups[0]
-    shares = {name: estimate([drives[largest].cpu_percent([name]) for drives in pairs]).mean for name in MOVE_BASE}
     received = [
         f"{estimate([drives[setup].received_bytes / (drives[setup].time_s or 1.0) for drives in pairs]).mean:.0f}"
         for setup in setups
     ]
     rows.append(["received from the fog, bytes/s", *received])
-    return [
+    blocks: list[Block] = [
         Paragraph(
             "Mean share of one core, in %, by component. Left out are decoding of messages, sockets and "
             "serial ports, which lockstep does not have; what a setup does not use of the fog is not counted."
         ),
         Table(["component", *setups], rows),
-        Paragraph(
-            f"Of what move_base held, `{largest}` spends {shares['global planning']:.2f} % on searching paths, "
-            f"{shares['layers']:.2f} % on layers and {shares['local planning']:.2f} % on local planning. The last of "
-            "these can shrink by the rate of control alone, so it bounds the ratio between setups: the faster the "
-            "search is, the less is saved by not doing it. A stack whose search is slower, or whose layers are "
-            "computed as a whole each time, has a larger ratio."
-        ),
     ]
+    if "default" in setups and "fog" in setups:
+        first, last = ({name: _share(pairs, setup, [name]) for name in MOVE_BASE} for setup in ("default", "fog"))
+        blocks.append(
+            limits.computation(first, last, (_share(pairs, "default", ON_ROBOT), _share(pairs, "fog", ON_ROBOT)))
+        )
+    return blocks
+
+
+def _share(pairs: Sequence[Drives], setup: ProfileName, components: Sequence[str]) -> float:
+    return estimate([drives[setup].cpu_percent(components) for drives in pairs]).mean
 
 
 def _tracks(pairs: Sequence[Drives], setups: Sequence[ProfileName]) -> list[Block]:
@@ -316,11 +363,6 @@ def _mean(pairs: Sequence[Drives], setup: ProfileName, quantity: Quantity) -> Es
 def _route(name: str) -> str:
     half = len(name) // 2
     return f"{name[:half].upper()} to {name[half:].upper()}"
-
-
-def _text(found: Estimate) -> str:
-    digits = 1 if abs(found.mean) >= 10.0 else 2
-    return f"{found.mean:.{digits}f}" + ("" if found.half is None else f" ± {found.half:.{digits}f}")
 
 
 def _probability(p: float | None) -> str:

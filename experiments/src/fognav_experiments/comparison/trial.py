@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 def drive(site: LoadedSite, drawn: RouteDraw, setup: ProfileName, jobs: int = 1, commit: str = "") -> Record:
     """Drive a drawn route in a setup; the same but for CPU and wall time whenever it is repeated.
 
-    `jobs`: drives that run at the same time on this machine, and `commit` are only recorded. Raises `BarrierError` for an area
-    that no barrier closes.
+    `jobs` (drives that run at the same time on this machine) and `commit` are only recorded. Raises `BarrierError` for
+    an area that no barrier closes.
     """
     places = site.site.places
     origin, goal = places[drawn.route.start], places[drawn.route.goal]

@@ -5,7 +5,7 @@ Lengths in m, frame `map`; angles in rad; times in s of the simulated clock, fro
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import msgspec
 from msgspec import Meta
@@ -49,6 +49,32 @@ class SilentNode(Event, frozen=True, kw_only=True, tag="silent-node"):
     seconds: Seconds = 0.0
 
 
+class FaultyNode(Event, frozen=True, kw_only=True, tag="faulty-node"):
+    """A sensor node goes wrong, for `seconds` (0: for ever).
+
+    stuck: its sonars' lines hang, and it knows. flapping: it says blocked and clear by turns, a second each.
+    lies-clear: it says that nothing is there, whatever it sees; lies-blocked: that something is.
+    """
+
+    node: Id
+    fault: Literal["stuck", "flapping", "lies-clear", "lies-blocked"]
+    seconds: Seconds = 0.0
+
+
+class SlowLink(Event, frozen=True, kw_only=True, tag="slow-link"):
+    """For `seconds` each message between robot and fog takes `delay_s`, and none is lost."""
+
+    seconds: Seconds
+    delay_s: Seconds
+
+
+class Restart(Event, frozen=True, kw_only=True, tag="restart"):
+    """A process of the fog dies, and is there again `seconds` later, with what its store holds."""
+
+    process: Literal["aggregator", "map-service", "planner"]
+    seconds: Annotated[float, Meta(gt=0.0)]
+
+
 class LinkGap(Event, frozen=True, kw_only=True, tag="link-gap"):
     """For `seconds` the robot hears nothing of the fog (`down`), or the fog nothing of the robot (`up`), or both."""
 
@@ -71,7 +97,7 @@ class BlindLidar(Event, frozen=True, kw_only=True, tag="blind-lidar"):
     end: float
 
 
-AnyEvent = Obstacle | NoGoZone | SilentNode | LinkGap | Kidnapping | BlindLidar
+AnyEvent = Obstacle | NoGoZone | SilentNode | FaultyNode | LinkGap | SlowLink | Restart | Kidnapping | BlindLidar
 
 
 class Expected(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -14,22 +14,29 @@ from fognav_experiments.lockstep import LockstepDrive, LockstepResult, release_d
 from fognav_experiments.rigs import moment
 from fognav_experiments.scenarios.description import (
     BlindLidar,
+    FaultyNode,
     Kidnapping,
     LinkGap,
     NoGoZone,
     Obstacle,
+    Restart,
     Scenario,
     SilentNode,
+    SlowLink,
     deviations,
 )
+from fognav_experiments.scenarios.node_faults import FaultyNodeSim
 from fognav_sim.drive.evaluation import DriveOutcome
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
+    from fog_contracts.messages import Id
     from fog_runtime.site import LoadedSite
+    from fognav_experiments.rigs import FogProcessName
     from fognav_experiments.scenarios.description import AnyEvent
+    from fognav_sim.nodes import SensorNode
 
 
 class ScenarioError(ValueError):
@@ -126,24 +133,43 @@ class _Stage:
                 self._put(zone)
                 self._later(event.seconds, partial(self._put, msgspec.structs.replace(zone, enabled=False, version=2)))
             case SilentNode():
-                silent = [node for node in run.system.fog.nodes if node.node.id == event.node]
-                for node in silent:
-                    run.system.fog.nodes.remove(node)
-                self._later(event.seconds, partial(run.system.fog.nodes.extend, silent))
+                self._replace_node(event.node, lambda _node: [], event.seconds)
+            case FaultyNode():
+                fault = event.fault
+                self._replace_node(event.node, lambda node: [FaultyNodeSim(node, fault)], event.seconds)
             case LinkGap():
                 self._link(hears=not event.down, is_heard=not event.up)
                 self._later(event.seconds, partial(self._link, hears=True, is_heard=True))
+            case SlowLink():
+                self._delay(event.delay_s)
+                self._later(event.seconds, partial(self._delay, 0.0))
+            case Restart():
+                run.system.fog.stop(event.process)
+                self._later(event.seconds, partial(self._start_again, event.process))
             case Kidnapping():
                 run.world.kidnap(Pose(x=event.to[0], y=event.to[1], theta=event.theta))
             case BlindLidar():
                 run.world.no_return_rad = (event.begin, event.end)
 
     def _put(self, zone: Zone) -> None:
-        self._run.system.fog.map.put_zone(zone, moment(self._run.now))
+        self._run.system.fog.put_zone(zone, moment(self._run.now))
+
+    def _replace_node(self, name: Id, replaced: Callable[[SensorNode], list[SensorNode]], seconds: float) -> None:
+        """Let others take the place of a node; `seconds` later it is back."""
+        fog = self._run.system.fog
+        known = list(fog.nodes)
+        fog.nodes = [other for node in known for other in (replaced(node) if node.node.id == name else [node])]
+        self._later(seconds, partial(setattr, fog, "nodes", known))
+
+    def _start_again(self, process: FogProcessName) -> None:
+        self._run.system.fog.start_again(process, moment(self._run.now))
 
     def _link(self, *, hears: bool, is_heard: bool) -> None:
-        process = self._run.robot.process
-        process.hears, process.is_heard = hears, is_heard
+        link = self._run.robot.process.link
+        link.hears, link.is_heard = hears, is_heard
+
+    def _delay(self, seconds: float) -> None:
+        self._run.robot.process.link.delay_s = seconds
 
     def _later(self, seconds: float, action: Callable[[], object]) -> None:
         if seconds > 0.0:

@@ -70,6 +70,12 @@ class Bus:
         self.subscribe(core.handlers(), only=only)
         self.serve(core.query_handlers(), only=only)
 
+    def disconnect(self, handlers: Iterable[Handler | QueryHandler]) -> None:
+        """End the subscriptions and services of these handlers, as when their process dies."""
+        ended = set(map(id, handlers))
+        self._subscriptions = [s for s in self._subscriptions if id(s.handler) not in ended]
+        self._services = [s for s in self._services if id(s.query_handler) not in ended]
+
     def publish(self, publications: Iterable[Publication]) -> None:
         """Queue messages for delivery; raises `ContractError` for one that violates its channel's contract."""
         for publication in publications:

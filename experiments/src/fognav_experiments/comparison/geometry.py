@@ -1,0 +1,152 @@
+"""What knowing of an obstacle saves in distance, from the map alone: for a robot that decides at once. Pure.
+
+It bounds what an experiment can find: the robot that is warned turns the moment the obstacle appears, the other one
+the moment its lidar can see any point of it, and both then know all of it and drive shortest paths.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from fog_contracts.costs import DEFAULT_INFLATION, LETHAL, Inflation
+from fog_contracts.messages import Pose, RobotGoal
+from fog_contracts.raster import polygon_spans
+from fog_kernels.astar import Planner
+from fog_kernels.inflation import inflate, inflation_table
+from fog_kernels.raycast import cast
+from fog_kernels.spans import raise_costs
+from fognav_sim.barrier import barrier_across
+from robot_agent.onboard.search import Search
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from fognav_experiments.comparison.draws import RouteDraw
+    from fognav_sim.drive.hazard import SiteWithMap
+
+    Floats = NDArray[np.float64]
+    Cells = NDArray[np.uint8]
+
+LIDAR_M: Final = 12.0
+"""Reach of the experiment's lidar."""
+_STEP_M: Final = 0.25
+_SPACING_M: Final = 0.2
+_TOLERANCE_M: Final = 0.1
+
+
+class Saving(NamedTuple):
+    """Distances (m) of a robot that nobody warns, and of one that is; `met`: whether the obstacle barred the way."""
+
+    unwarned_m: float
+    warned_m: float
+    met: bool
+
+    @property
+    def saved_m(self) -> float:
+        """What the warning saves, m."""
+        return self.unwarned_m - self.warned_m
+
+
+class RouteGeometry:
+    """Shortest paths on a site's map, with and without the obstacle of a draw."""
+
+    def __init__(self, site: SiteWithMap) -> None:
+        self._site = site
+        inflation = Inflation(
+            inscribed_radius=site.site.robots[0].radius,
+            inflation_radius=DEFAULT_INFLATION.inflation_radius,
+            cost_scaling=DEFAULT_INFLATION.cost_scaling,
+        )
+        grid = site.map.geometry
+        self._table = inflation_table(grid.resolution, inflation)
+        self._open = inflate(site.map.cells, self._table)
+        self._walls = np.ascontiguousarray(site.map.cells == LETHAL, dtype=np.uint8)
+        self._planner = Planner(grid.width, grid.height)
+
+    def saving(self, drawn: RouteDraw) -> Saving | None:
+        """Return what a warning saves on a drawn route; None if the obstacle leaves no way to the goal."""
+        places = self._site.site.places
+        start, goal = places[drawn.route.start], places[drawn.route.goal]
+        polygon = self._barrier(drawn)
+        closed = self._with(polygon)
+        way = self._path(self._open, (start.x, start.y), (goal.x, goal.y))
+        if way is None:
+            return None
+        along = _along(way)
+        if drawn.trigger_m >= along[-1]:
+            return Saving(float(along[-1]), float(along[-1]), met=False)
+        warned = self._rest(closed, way, drawn.trigger_m, goal.x, goal.y)
+        seen = self._first_sight(way, drawn.trigger_m, polygon)
+        unwarned = float(along[-1]) if seen is None else self._rest(closed, way, seen, goal.x, goal.y)
+        if warned is None or unwarned is None:
+            return None
+        met = bool(np.any(closed[self._rows(way)] >= LETHAL))
+        return Saving(unwarned, min(warned, unwarned), met)
+
+    def _barrier(self, drawn: RouteDraw) -> Floats:
+        site = self._site.site
+        area = next(area for area in site.areas if area.id == drawn.area)
+        return np.array(barrier_across(area, site, self._site.map, drawn.seed).polygon)
+
+    def _with(self, polygon: Floats) -> Cells:
+        """Return the costs with an obstacle on the floor."""
+        cells = self._site.map.cells.copy()
+        spans = polygon_spans([(float(x), float(y)) for x, y in polygon], self._site.map.geometry)
+        window = spans.window
+        part = np.ascontiguousarray(cells[window.rows, window.columns])
+        raise_costs([(spans, LETHAL)], window.x, window.y, part)
+        cells[window.rows, window.columns] = part
+        return inflate(cells, self._table)
+
+    def _rows(self, way: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        cells, inside = self._site.map.geometry.cells(_every(way, _STEP_M / 5))
+        return cells[inside][:, 1], cells[inside][:, 0]
+
+    def _path(self, cost: Cells, start: tuple[float, float], goal: tuple[float, float]) -> Floats | None:
+        wanted = RobotGoal(goal_id="geometry", pose=Pose(x=goal[0], y=goal[1], theta=0.0))
+        search = Search(planner=self._planner, cost=cost, geometry=self._site.map.geometry, start=start, goal=wanted)
+        found = search.run()
+        return np.array(found.points) if found.points else None
+
+    def _rest(self, cost: Cells, way: Floats, driven: float, x: float, y: float) -> float | None:
+        """Return the length (m) of the way up to `driven`, and from there on the shortest one at these costs."""
+        px, py = _at(way, driven)
+        rest = self._path(cost, (px, py), (x, y))
+        return None if rest is None else driven + float(_along(rest)[-1])
+
+    def _first_sight(self, way: Floats, since: float, polygon: Floats) -> float | None:
+        """Return the distance (m) along the way, at least `since`, from which the lidar sees some of an obstacle."""
+        outline = _every(np.vstack((polygon, polygon[:1])), _SPACING_M)
+        grid = self._site.map.geometry
+        for driven in np.arange(since, _along(way)[-1], _STEP_M):
+            x, y = _at(way, float(driven))
+            away = outline - (x, y)
+            distances = np.hypot(away[:, 0], away[:, 1])
+            near = distances <= LIDAR_M
+            if not near.any():
+                continue
+            angles = np.arctan2(away[near, 1], away[near, 0])
+            free = cast(self._walls, grid.resolution, grid.origin_x, grid.origin_y, x, y, angles, LIDAR_M + 1.0)
+            if (free >= distances[near] - _TOLERANCE_M).any():
+                return float(driven)
+        return None
+
+
+def _along(way: Floats) -> Floats:
+    """Return the length (m) from the start to each point of a line (n, 2)."""
+    steps = np.hypot(*np.diff(way, axis=0).T)
+    return np.concatenate(([0.0], np.cumsum(steps)))
+
+
+def _at(way: Floats, driven: float) -> tuple[float, float]:
+    along = _along(way)
+    return float(np.interp(driven, along, way[:, 0])), float(np.interp(driven, along, way[:, 1]))
+
+
+def _every(way: Floats, spacing: float) -> Floats:
+    """Return points of a line, `spacing` (m) apart."""
+    along = _along(way)
+    places = np.append(np.arange(0.0, along[-1], spacing), along[-1])
+    return np.column_stack((np.interp(places, along, way[:, 0]), np.interp(places, along, way[:, 1])))

@@ -1,0 +1,54 @@
+"""Sensor nodes that go wrong: what a healthy one measures, changed on its way."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, Literal
+
+import msgspec
+
+if TYPE_CHECKING:
+    from fog_contracts.messages import AreaState, NodeCalibration, NodeConfig, NodeReading
+    from fognav_sim.nodes import SensorNode
+    from fognav_sim.world import World
+
+Fault = Literal["stuck", "flapping", "lies-clear", "lies-blocked"]
+FLAP_S: Final = 1.0
+"""How long a flapping node says the same."""
+_NEAR_M: Final = 0.6
+_MARGIN_M: Final = 0.1
+
+
+class FaultyNodeSim:
+    """A node with a fault: it measures as the healthy one in it does, and reports something else."""
+
+    def __init__(self, healthy: SensorNode, fault: Fault) -> None:
+        self.node = healthy.node
+        self._healthy = healthy
+        self._fault: Fault = fault
+
+    def configure(self, config: NodeConfig) -> bool:
+        """Apply a configuration."""
+        return self._healthy.configure(config)
+
+    def command(self, text: str) -> str | None:
+        """Begin what a command asks for; return None, or why not."""
+        return self._healthy.command(text)
+
+    def take_calibration(self) -> NodeCalibration | None:
+        """Return the calibration that has ended since the last call, if one has."""
+        return self._healthy.take_calibration()
+
+    def poll(self, world: World, now: float) -> list[NodeReading]:
+        """Run the node up to `now` (s); return what it reports."""
+        return [self._report(reading, now) for reading in self._healthy.poll(world, now)]
+
+    def _report(self, reading: NodeReading, now: float) -> NodeReading:
+        sonars = self.node.sonars
+        if self._fault == "stuck":
+            none: list[float | None] = [None] * len(sonars)
+            return msgspec.structs.replace(reading, range_m=none, status=["stuck"] * len(sonars), state="unknown")
+        blocked = int(now / FLAP_S) % 2 == 0 if self._fault == "flapping" else self._fault == "lies-blocked"
+        # The wall across the corridor is a little farther away than the limit.
+        ranges: list[float | None] = [_NEAR_M if blocked else sonar.range_limit + _MARGIN_M for sonar in sonars]
+        state: AreaState = "blocked" if blocked else "clear"
+        return msgspec.structs.replace(reading, range_m=ranges, status=["ok"] * len(sonars), state=state)

@@ -1,0 +1,39 @@
+"""A robot's link in lockstep: nothing is lost or overtaken by a delay, and nothing passes a gap."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fog_contracts import channels as ch
+from fog_contracts.handlers import Publication
+from fognav_experiments.link import Link
+from fognav_experiments.rigs import moment
+
+
+@given(st.lists(st.tuples(st.floats(0.0, 3.0), st.floats(0.0, 3.0)), max_size=40))
+def test_a_slow_link_loses_nothing_and_keeps_the_order(messages):
+    """Each message: the time since the one before, and the link's delay from then on."""
+    link, arrived, now = Link(), [], 0.0
+    for number, (pause, delay) in enumerate(messages):
+        now += pause
+        link.due(moment(now))
+        link.delay_s = delay
+        link.down(lambda at, number=number, sent=now, delay=delay: arrived.append((number, at.now - sent, delay)) or (),
+                  moment(now))  # fmt: skip
+    link.due(moment(now + 10.0))
+    assert [number for number, _, _ in arrived] == list(range(len(messages)))
+    assert all(took >= delay - 1e-9 for _, took, delay in arrived)
+
+
+def test_each_direction_can_be_cut_alone():
+    link, heard = Link(), []
+    said = [Publication(ch.ROBOT_STATE, None)]
+    link.hears = False
+    link.down(lambda at: heard.append(at) or (), moment(1.0))
+    assert list(link.up(said, moment(1.0))) == said
+    assert not link.whole
+    link.hears, link.is_heard = True, False
+    link.down(lambda at: heard.append(at) or (), moment(2.0))
+    assert list(link.up(said, moment(2.0))) == []
+    assert [at.now for at in heard] == [2.0]

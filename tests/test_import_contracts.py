@@ -39,7 +39,7 @@ EDGES = {
     "fognav.demo.scene", "fognav.demo.usage", "fognav.demo.view", "fognav.demo_command", "fognav.doctor",
     "fognav.experiment_command",
     "fognav.generated", "fognav.kernels", "fognav.locking", "fognav.operate", "fognav.output", "fognav.page.app",
-    "fognav.programs",
+    "fognav.hosting", "fognav.programs", "fognav.up_command",
     "fognav.pytest_progress", "fognav.recording", "fognav.robot_command", "fognav.robot_file_command",
     "fognav.localization", "fognav.localize_command", "fognav.map_command", "fognav.map_picture",
     "fognav.mutation",

@@ -43,6 +43,7 @@ from fognav.source_command import source_app
 from fognav.status_command import status_command
 from fognav.store_command import store_app
 from fognav.token_command import token_app
+from fognav.up_command import down_command, logs_command, up_command
 from fognav.zone_command import zone_app
 from fognav_sim import emulators
 
@@ -77,6 +78,9 @@ app.command(
 app.command(
     "restore", epilog="Example: fognav restore fog.tar.gz --site sites/estig --secrets keys --data /var/lib/fognav"
 )(restore_command)
+app.command("up", epilog="Example: fognav up --site sites/estig --site sites/floor2")(up_command)
+app.command("down", epilog="Example: fognav down")(down_command)
+app.command("logs", epilog="Example: fognav logs map-service -f")(logs_command)
 app.command("status", epilog="Example: fognav status --json")(status_command)
 app.command("goal", context_settings=NUMBERS, epilog="Example: fognav goal b")(robot_goal)
 robot_app.command("add", epilog="Example: fognav robot add r2 --locks locks")(robot_add)

@@ -1,14 +1,13 @@
 """`fognav ca`: the site's own certificate authority, and with it the users and access lists of its servers."""
 
 import datetime as dt
-import socket
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from fognav import checkout
-from fognav.locking import LocksOption, locks_errors, named_folder, open_locks
+from fognav.locking import LocksOption, locks_errors, named_folder, open_locks, own_hosts
 from fognav.nodes import site_file
 from fognav.operate.options import JsonOption
 from fognav.output import NOT_TRUE, exit_codes, print_json, print_line
@@ -95,17 +94,6 @@ def ca_show(*, locks: LocksOption = None, json: JsonOption = False) -> None:
         _show(opened, json=json)
         if opened.expiring():
             raise typer.Exit(NOT_TRUE)
-
-
-def own_hosts() -> list[str]:
-    """Return the names and addresses by which clients may reach this computer."""
-    import psutil  # noqa: PLC0415  # keeps the other commands fast
-
-    name = socket.gethostname()
-    found = [name, f"{name}.local", "localhost"]
-    for addresses in psutil.net_if_addrs().values():
-        found += [each.address for each in addresses if each.family == socket.AF_INET]
-    return list(dict.fromkeys(found))
 
 
 def _show(locks: "SiteLocks", *, json: bool) -> None:

@@ -1,6 +1,7 @@
 """The locks of a site's servers as the commands use them: their folder, and their errors in a user's words."""
 
 import os
+import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -70,3 +71,14 @@ def locks_errors() -> Iterator[None]:
         raise FailedError(str(error)) from error
     except OSError as error:
         raise FailedError(f"{error.filename} can't be used: {error.strerror}. Run this as its owner") from error
+
+
+def own_hosts() -> list[str]:
+    """Return the names and addresses by which clients may reach this computer."""
+    import psutil  # noqa: PLC0415  # keeps the other commands fast
+
+    name = socket.gethostname()
+    found = [name, f"{name}.local", "localhost"]
+    for addresses in psutil.net_if_addrs().values():
+        found += [each.address for each in addresses if each.family == socket.AF_INET]
+    return list(dict.fromkeys(found))

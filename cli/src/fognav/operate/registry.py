@@ -1,4 +1,4 @@
-"""The register of the demos that run on this machine: a private folder per user with one file for each demo.
+"""The register of the demos and fog nodes of this machine: a private folder per user with one file for each.
 
 A demo writes its file when it is up, keeps it current, and removes it at its end. A killed demo leaves its file behind:
 whoever reads the register notices, by process id and start time, that the demo is gone, and removes the file.
@@ -28,7 +28,7 @@ class System(msgspec.Struct, frozen=True, kw_only=True):
     """A system that runs on this machine, with all that an operator's commands need to reach it.
 
     `urls` has the address of each part, and `pids` the process ids, by the parts' names. `speed` is how many times
-    faster than real time its clock runs.
+    faster than real time its clock runs. `data` is the folder of a fog node that `fognav up` runs.
     """
 
     name: str
@@ -41,6 +41,7 @@ class System(msgspec.Struct, frozen=True, kw_only=True):
     credentials_file: str | None = None
     robots: list[str] = []
     speed: float = 1.0
+    data: str | None = None
 
 
 class _Entry(msgspec.Struct, frozen=True, kw_only=True):

@@ -12,7 +12,7 @@ from fog_contracts.channels import AGGREGATOR, CHANNELS, NODE, ROLES, Channel, R
 from fog_contracts.generate import NOTE
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
 Access = Literal["read", "write"]
 
@@ -26,14 +26,20 @@ _HEAD: Final = f"""\
 """
 
 
-def mqtt_acl(site: str = "+", *, unrestricted: Sequence[str] = ()) -> str:
+def mqtt_acl(
+    site: str = "+", *, unrestricted: Sequence[str] = (), floors: Mapping[str, Sequence[str]] | None = None
+) -> str:
     """Return the list for one site, or, without a site's id, for all sites that share the broker.
 
-    The users named in `unrestricted` may publish and receive everything.
+    The users named in `unrestricted` may publish and receive everything. `floors` are further sites with their own
+    users, named `SITE.NAME`, and their nodes: each may only use topics that name its site, and so none of the thesis.
     """
     sections = [_HEAD]
     sections += [_section(role, site) for role in ROLES if role != NODE and _lines(role, site)]
     sections += [f"user {user}\ntopic readwrite #\ntopic read $SYS/#\n" for user in unrestricted]
+    for floor, nodes in (floors or {}).items():
+        sections += [_floor_section(role, floor) for role in ROLES if role != NODE and _floor_lines(role, floor)]
+        sections += [_floor_node(floor, node) for node in nodes]
     sections.append(_nodes(site))
     return "\n".join(sections)
 
@@ -43,6 +49,23 @@ def _section(role: Role, site: str) -> str:
     if role == AGGREGATOR:
         lines.append("read  #")  # a source of an area may publish on any topic
     return "\n".join([f"# {ROLES[role]}", f"user {role}", *(f"topic {line}" for line in lines), ""])
+
+
+def _floor_section(role: Role, floor: str) -> str:
+    lines = _floor_lines(role, floor)
+    if role == AGGREGATOR:
+        # The thesis's topics, of one level, belong to the first site.
+        lines += ["deny  +", "read  #"]
+    return "\n".join([f"# {ROLES[role]} ({floor})", f"user {floor}.{role}", *(f"topic {line}" for line in lines), ""])
+
+
+def _floor_node(floor: str, node: str) -> str:
+    lines = [f"topic {access:5} {_topic(row, floor, node)}" for access, row in _rights(NODE) if "site" in row.fields]
+    return "\n".join([f"# {ROLES[NODE]} ({floor})", f"user {floor}.{node}", *lines, ""])
+
+
+def _floor_lines(role: Role, floor: str) -> list[str]:
+    return [f"{access:5} {_topic(row, floor)}" for access, row in _rights(role) if "site" in row.fields]
 
 
 def _nodes(site: str) -> str:

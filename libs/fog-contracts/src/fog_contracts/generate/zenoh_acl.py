@@ -13,7 +13,7 @@ from fog_contracts.channels import CHANNELS, ROBOT, ROLES, Channel, Role
 from fog_contracts.generate import NOTE
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
 Flow = Literal["ingress", "egress"]
 
@@ -73,15 +73,21 @@ class _Rights:
         ]
 
 
-def zenoh_acl(site: str = "*", robots: Sequence[str] = (), *, unrestricted: Sequence[str] = ()) -> str:
+def zenoh_acl(
+    site: str = "*",
+    robots: Sequence[str] = (),
+    *,
+    unrestricted: Sequence[str] = (),
+    floors: Mapping[str, Sequence[str]] | None = None,
+) -> str:
     """Return the router's `access_control` as JSON5: for one site and its robots by id, or for all sites by role.
 
-    The users named in `unrestricted` may do everything.
+    The users named in `unrestricted` may do everything. `floors` are further sites with their own users, named
+    `SITE.NAME`, and their robots.
     """
-    clients: list[tuple[str, Role]] = []
-    for role in ROLES:
-        names = robots if role == ROBOT and robots else (role,)
-        clients += [(name, role) for name in names]
+    clients = _clients(site, robots)
+    for floor, floor_robots in (floors or {}).items():
+        clients += _clients(floor, floor_robots, f"{floor}.")
     rules: list[dict[str, object]] = []
     subjects: list[dict[str, object]] = []
     policies: list[dict[str, object]] = []
@@ -89,9 +95,8 @@ def zenoh_acl(site: str = "*", robots: Sequence[str] = (), *, unrestricted: Sequ
         rules.append(_EVERYTHING)
         subjects.append({"id": "unrestricted", "usernames": list(unrestricted)})
         policies.append({"subjects": ["unrestricted"], "rules": [_EVERYTHING["id"]]})
-    for name, role in clients:
-        robot = name if role == ROBOT and robots else "*"
-        client_rules = _rights(role, site, robot).rules(name)
+    for name, rights in clients:
+        client_rules = rights.rules(name)
         if not client_rules:
             continue
         rules += client_rules
@@ -109,6 +114,17 @@ def zenoh_acl(site: str = "*", robots: Sequence[str] = (), *, unrestricted: Sequ
             "  },\n}\n",
         ]
     )
+
+
+def _clients(site: str, robots: Sequence[str], prefix: str = "") -> list[tuple[str, _Rights]]:
+    """Return the users of a site, their names with a prefix, and what each may do."""
+    clients = []
+    for role in ROLES:
+        if role == ROBOT and robots:
+            clients += [(f"{prefix}{robot}", _rights(role, site, robot)) for robot in robots]
+        else:
+            clients.append((f"{prefix}{role}", _rights(role, site, "*")))
+    return clients
 
 
 def _array(title: str, rows: Sequence[dict[str, object]]) -> str:

@@ -7,6 +7,7 @@
     zenoh/      server.pem server.key users access.json5
     http/       server.pem server.key             of the REST APIs and the gateway
     credentials/NAME.toml                         one file for each user (`fog_runtime.credentials`)
+    credentials/SITE/NAME.toml                    the same for further sites of the same servers, its floors
 
 Each server reads its own folder, each service its own credentials, so that none has another's secrets. Whoever adds a
 user hands out its file; here it may be removed then.
@@ -49,6 +50,7 @@ class _Plan(msgspec.Struct, frozen=True):
     hosts: list[str] = []
     unrestricted: list[str] = []
     mode: int = PRIVATE
+    floors: list[str] = []
 
 
 class LocksError(ValueError):
@@ -93,6 +95,7 @@ class SiteLocks:
                 "volume) of its own for each site"
             )
         known_hosts = before.hosts
+        self._plan = msgspec.structs.replace(self._plan, floors=before.floors)
         self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         if not (self._folder / AUTHORITY).exists():
             Authority.create(self._folder / AUTHORITY, f"Fognav {self._plan.site}", now=_now())
@@ -102,18 +105,40 @@ class SiteLocks:
         own[users.HEALTH] = users.HEALTH_SERVERS
         own |= dict.fromkeys(self._plan.unrestricted, ("mqtt", "zenoh"))
         missing = {user: servers for user, servers in own.items() if not self.credentials(user).exists()}
+        self._set_users(missing | self._not_yet_admitted(robots, nodes))
+        self._write_rights_in_redis()
+        self._write_access()
+
+    def add_floor(self, site: str, *, robots: Sequence[str] = (), nodes: Sequence[str] = ()) -> None:
+        """Admit the services, tools, robots and nodes of a further site to the same servers; those known stay.
+
+        Its users are named `SITE.NAME`, so that none of them can act on another floor. Raises as `make`, after which
+        it is called.
+        """
+        if site not in self.sites:
+            self._save(msgspec.structs.replace(self._plan, floors=[*self._plan.floors, site]))
+        own = {users.on_floor(site, name): servers for name, servers in {**users.SERVICES, **users.TOOLS}.items()}
+        missing = {user: servers for user, servers in own.items() if not self.credentials(user).exists()}
+        members = ([users.on_floor(site, each) for each in kind] for kind in (robots, nodes))
+        self._set_users(missing | self._not_yet_admitted(*members))
+        self._write_access()
+
+    def _not_yet_admitted(self, robots: Sequence[str], nodes: Sequence[str]) -> dict[str, Sequence[Server]]:
         # The credentials of robots and nodes need not stay here.
         handed_out: dict[str, Sequence[Server]] = dict.fromkeys(robots, ("zenoh",))
         handed_out |= dict.fromkeys(nodes, ("mqtt",))
         known = self.users()
-        self._set_users(missing | {user: servers for user, servers in handed_out.items() if user not in known})
-        self._write_rights_in_redis()
-        self._write_access()
+        return {user: servers for user, servers in handed_out.items() if user not in known}
 
     @property
     def directory(self) -> Path:
         """The folder."""
         return self._folder
+
+    @property
+    def sites(self) -> list[str]:
+        """The site for which the locks were made, then its further floors, in the order in which they were added."""
+        return [self._plan.site, *self._plan.floors]
 
     def users(self) -> set[str]:
         """Return everybody whom a server admits."""
@@ -121,7 +146,8 @@ class SiteLocks:
 
     def credentials(self, user: str) -> Path:
         """Return the file of a user's credentials."""
-        return self._folder / CREDENTIALS / f"{user}.toml"
+        floor, name = users.of_floor(user)
+        return self._folder / CREDENTIALS / floor / f"{name}.toml"
 
     def folder(self, program: str) -> Path:
         """Return the folder of one of `PROGRAMS`."""
@@ -166,9 +192,12 @@ class SiteLocks:
             self._write(program, KEY, issued.key.decode())
             self._write(program, CERTIFICATE, issued.chain.decode())
             renewed.append(program)
-        self._plan = msgspec.structs.replace(self._plan, hosts=list(hosts))
-        atomic_write(self._folder / _PLAN, msgspec.json.format(msgspec.json.encode(self._plan)), mode=PRIVATE)
+        self._save(msgspec.structs.replace(self._plan, hosts=list(hosts)))
         return renewed
+
+    def _save(self, plan: _Plan) -> None:
+        self._plan = plan
+        atomic_write(self._folder / _PLAN, msgspec.json.format(msgspec.json.encode(plan)), mode=PRIVATE)
 
     def expiries(self) -> dict[str, dt.datetime]:
         """Return when the authority and each server's certificate expire; raises `AuthorityError`."""
@@ -183,7 +212,7 @@ class SiteLocks:
     def trust_again(self) -> list[Path]:
         """Write into all credentials here which authorities to trust now; return the files. Raises as `make`."""
         changed = []
-        for file in sorted((self._folder / CREDENTIALS).glob("*.toml")):
+        for file in sorted((self._folder / CREDENTIALS).rglob("*.toml")):
             known = Credentials.read(file)
             text = to_toml(
                 known.user, authority=self.authority.trusted, passwords=known.passwords, token=known.token
@@ -193,7 +222,7 @@ class SiteLocks:
         return changed
 
     def _add(self, user: str, servers: Sequence[Server]) -> Path:
-        if user in ROLES or user in self._plan.unrestricted or user in (REDIS_ADMINISTRATOR, users.HEALTH):
+        if self._is_reserved(user):
             raise LocksError(f"{user} is the name of a part of Fognav: give the robot or node another id")
         self._set_users({user: servers})
         self._write_access()
@@ -212,7 +241,9 @@ class SiteLocks:
                 self._write(program, USERS, "".join(f"{line}\n" for line in [*kept, *new]))
         # Last: whatever is cut short before is done again by the next `make`.
         for user, own in passwords.items():
-            self._private(CREDENTIALS, f"{user}.toml", to_toml(user, authority=trusted, passwords=own))
+            file = self.credentials(user)
+            file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            atomic_write(file, to_toml(user, authority=trusted, passwords=own).encode(), mode=PRIVATE)
 
     def _line(self, server: Server, user: str, password: str) -> str:
         if server == "mqtt":
@@ -223,7 +254,7 @@ class SiteLocks:
             return users.redis_administrator_line(user, password)
         if user == users.HEALTH:
             return users.redis_health_line(user, password)
-        return users.redis_line(user, password, self._plan.site)
+        return users.redis_line(user, password, users.of_floor(user)[0] or self._plan.site)
 
     def _write_rights_in_redis(self) -> None:
         """Write what this version's services may do in Redis, in whose list rights and passwords are one line."""
@@ -241,12 +272,23 @@ class SiteLocks:
         return [users.REDIS_NOBODY] if program == "redis" else []
 
     def _write_access(self) -> None:
-        """Write what each user may do; robots are the router's users who have no role."""
-        known = (_user(line) for line in self._lines("zenoh"))
-        robots = [user for user in known if user not in ROLES and user not in self._plan.unrestricted]
-        self._write("mosquitto", ACCESS, mqtt_acl(self._plan.site, unrestricted=self._plan.unrestricted))
-        access = zenoh_acl(self._plan.site, robots, unrestricted=self._plan.unrestricted)
+        """Write what each user may do; robots and nodes are the users who have no role."""
+        plan = self._plan
+        nodes = {floor: self._members("mosquitto", floor) for floor in plan.floors}
+        robots = {floor: self._members("zenoh", floor) for floor in plan.floors}
+        self._write("mosquitto", ACCESS, mqtt_acl(plan.site, unrestricted=plan.unrestricted, floors=nodes))
+        own = self._members("zenoh", "")
+        access = zenoh_acl(plan.site, own, unrestricted=plan.unrestricted, floors=robots)
         self._write("zenoh", f"{ACCESS}.json5", access)
+
+    def _members(self, program: str, floor: str) -> list[str]:
+        """Return the users of a program who are no part of Fognav, by their names on a floor (or the first site)."""
+        members = [user for line in self._lines(program) if not self._is_reserved(user := _user(line))]
+        return [name for own, name in map(users.of_floor, members) if own == floor]
+
+    def _is_reserved(self, user: str) -> bool:
+        parts = {*ROLES, REDIS_ADMINISTRATOR, users.HEALTH}
+        return users.of_floor(user)[1] in parts or user in self._plan.unrestricted
 
     def _write(self, program: str, name: str, text: str) -> None:
         file = self.folder(program) / name
@@ -256,11 +298,6 @@ class SiteLocks:
         atomic_write(file, text.encode(), mode=self._plan.mode if before is None else stat.S_IMODE(before.st_mode))
         if before is not None and os.geteuid() == 0:
             os.chown(file, before.st_uid, before.st_gid)
-
-    def _private(self, folder: str, name: str, text: str) -> None:
-        file = self._folder / folder / name
-        file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        atomic_write(file, text.encode(), mode=PRIVATE)
 
 
 def _read_plan(folder: Path) -> _Plan:

@@ -58,6 +58,17 @@ def new_password() -> str:
     return secrets.token_urlsafe(PASSWORD_BYTES)
 
 
+def on_floor(floor: str, user: str) -> str:
+    """Return how the servers call a user of a further site; ids have no dots."""
+    return f"{floor}.{user}"
+
+
+def of_floor(user: str) -> tuple[str, str]:
+    """Return the further site of a user (an empty text: the first site), and its name there."""
+    floor, _, name = user.rpartition(".")
+    return floor, name
+
+
 def mqtt_line(user: str, password: str) -> str:
     """Return a line of Mosquitto's password file: `$7$`, PBKDF2 with SHA-512 (mosquitto_passwd(1))."""
     salt = secrets.token_bytes(12)
@@ -75,7 +86,8 @@ def redis_line(user: str, password: str, site: str) -> str:
 
     It may read the whole audit trail. Raises `KeyError` for a user that is no service.
     """
-    own = [*_OWN_TABLES[user], *_BOOKKEEPING, *(f"audit:{kind}" for kind in _AUDITED[user]), f"{user}:*"]
+    _, service = of_floor(user)
+    own = [*_OWN_TABLES[service], *_BOOKKEEPING, *(f"audit:{kind}" for kind in _AUDITED[service]), f"{service}:*"]
     keys = " ".join([*(f"~fog:{site}:{name}" for name in own), f"%R~fog:{site}:audit:*"])
     return f"user {user} on {_redis_secret(password)} resetchannels -@all {_COMMANDS} {keys}"
 

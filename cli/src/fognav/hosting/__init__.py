@@ -1,0 +1,1 @@
+"""A fog node on this machine without containers: `fognav up`, `down` and `logs`."""

@@ -1,0 +1,143 @@
+"""`fognav up`, `down` and `logs`: a fog node on this machine, without containers."""
+
+import asyncio
+import os
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final
+
+import psutil
+import typer
+
+from fognav import checkout, kernels, system
+from fognav.locking import locks_errors, own_hosts
+from fognav.operate.registry import registered
+from fognav.output import FailedError, exit_codes, print_line
+
+if TYPE_CHECKING:
+    from fognav.hosting.folders import NodeFolder
+
+_STOP_S: Final = 60.0
+_POLL_S: Final = 0.05
+_KIND: Final = "fog node"
+_UP: Final = "up"
+
+SitesOption = Annotated[
+    list[Path] | None,
+    typer.Option("--site", metavar="D", help="Folder of a site, or a name in sites/; once for each floor."),
+]
+DataOption = Annotated[
+    Path | None,
+    typer.Option("--data", metavar="DIR", help="Folder of all data; default: fognav in XDG_DATA_HOME."),
+]
+
+
+def up_command(  # noqa: PLR0913  # each option is an argument
+    *,
+    site: SitesOption = None,
+    data: DataOption = None,
+    bind: Annotated[
+        str,
+        typer.Option("--bind", envvar="FOGNAV_BIND", metavar="ADDRESS", help="On which address to listen."),
+    ] = "0.0.0.0",  # noqa: S104  # behind locks
+    host: Annotated[
+        list[str] | None,
+        typer.Option("--host", metavar="NAME", help="Another name of this computer, for its certificates."),
+    ] = None,
+    sim: Annotated[bool, typer.Option("--sim", help="Simulate each site's first robot and its sensor nodes.")] = False,
+    systemd: Annotated[bool, typer.Option("--systemd", help="Write a unit for systemd instead of running.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Install missing system packages without asking.")] = False,
+) -> None:
+    """Run a fog node on this machine until Ctrl-C.
+
+    It has broker, Redis, router, and the services of each site. All doors have locks. Data stays in one folder, and is
+    used again by the next start.
+    """
+    from fognav.hosting.folders import NodeFolder, default_data  # noqa: PLC0415  # keeps the other commands fast
+    from fognav.hosting.unit import NAME, write_unit  # noqa: PLC0415  # same
+
+    with exit_codes(), locks_errors():
+        folders = [checkout.site_folder(each) for each in site] if site else [checkout.site_folder(None)]
+        path = (data or default_data()).absolute()
+        if systemd:
+            options = [word for each in folders for word in ("--site", str(each))]
+            options += ["--data", str(path), "--bind", bind, *(["--sim"] if sim else [])]
+            options += [word for each in host or [] for word in ("--host", each)]
+            print_line(f"wrote {write_unit(['up', *options])}. Start it now and at each boot:")
+            print_line(f"  systemctl --user daemon-reload && systemctl --user enable --now {NAME}")
+            print_line(f"  loginctl enable-linger {os.environ.get('USER', '$USER')}")
+            return
+        try:
+            system.ensure([system.MOSQUITTO, system.REDIS], yes=yes, print_line=print_line)
+            kernels.warm_cache(print_line)
+        except (system.MissingToolsError, kernels.KernelsError) as error:
+            raise FailedError(str(error)) from error
+        folder = NodeFolder(path)
+        with folder.in_use():
+            _run(folders, folder, bind, [*own_hosts(), *(host or [])], sim=sim)
+
+
+def _run(folders: list[Path], folder: "NodeFolder", bind: str, hosts: list[str], *, sim: bool) -> None:
+    from fognav.hosting.floors import hosted_sites  # noqa: PLC0415  # keeps the other commands fast
+    from fognav.hosting.node import NodeConfig  # noqa: PLC0415  # same
+    from fognav.hosting.running import run_node  # noqa: PLC0415  # same
+
+    sites, locks = hosted_sites(folders, folder.locks, hosts)
+    config = NodeConfig(folder=folder, sites=sites, locks=locks, address=bind, simulate=sim)
+    asyncio.run(run_node(config, print_line))
+
+
+def down_command() -> None:
+    """End the fog node of `fognav up`; its data stays."""
+    with exit_codes():
+        pids = {each.pids[_UP] for each in registered() if each.kind == _KIND and _UP in each.pids}
+        if not pids:
+            print_line("no fog node of yours runs on this machine without containers")
+        for pid in pids:
+            _end(pid)
+
+
+def _end(pid: int) -> None:
+    try:
+        process = psutil.Process(pid)
+        process.terminate()
+        deadline = time.monotonic() + _STOP_S
+        # One that has ended stays a zombie until its parent looks.
+        while process.is_running() and process.status() != psutil.STATUS_ZOMBIE:
+            if time.monotonic() > deadline:
+                raise FailedError(
+                    f"process {pid} has not ended within {_STOP_S:.0f} s: look at its terminal, or kill it"
+                )
+            time.sleep(_POLL_S)
+    except psutil.NoSuchProcess:
+        pass
+    print_line(f"the fog node (process {pid}) has ended")
+
+
+def logs_command(
+    name: Annotated[list[str] | None, typer.Argument(metavar="NAME", help="Programs; default: all.")] = None,
+    *,
+    follow: Annotated[bool, typer.Option("--follow", "-f", help="Show what is added, until Ctrl-C.")] = False,
+    lines: Annotated[int, typer.Option("--lines", "-n", min=0, help="How many lines of each at first.")] = 20,
+    data: DataOption = None,
+) -> None:
+    """Show the logs of the fog node of `fognav up`."""
+    from fognav.hosting import log_files  # noqa: PLC0415  # keeps the other commands fast
+    from fognav.hosting.folders import default_data  # noqa: PLC0415  # same
+
+    with exit_codes():
+        running = next((each.data for each in registered() if each.kind == _KIND and each.data), None)
+        folder = (data or (Path(running) if running else default_data())) / "logs"
+        files = {file.stem: file for file in sorted(folder.glob("*.log"))}
+        if unknown := [each for each in name or [] if each not in files]:
+            raise FailedError(
+                f"{folder} has no log of {unknown[0]}, only of: {', '.join(files) or 'nothing'}. "
+                "Name one of these, or the data folder (--data)"
+            )
+        shown = {each: files[each] for each in name or files}
+        if not shown:
+            raise FailedError(f"{folder} has no logs: start a fog node (fognav up), or name its folder with --data")
+        try:
+            log_files.show(shown, lines, follow=follow)
+        except KeyboardInterrupt:
+            return

@@ -1,0 +1,116 @@
+"""A fog node without containers, as a person runs it: `fognav up`, `status`, `logs` and `down`, with real servers."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+from fog_supervisor import net
+
+pytestmark = [pytest.mark.live, pytest.mark.timeout(300)]
+
+START_S = 180.0
+PORTS = ("MQTT", "REDIS", "ZENOH", "AGGREGATOR", "MAP", "PLANNER")
+
+
+class Node:
+    """A fog node's data, ports and register, apart from those of other tests."""
+
+    def __init__(self, folder: Path, *options: str) -> None:
+        self.data = folder / "data"
+        self.options = options
+        (folder / "runtime").mkdir(mode=0o700)
+        self.printed = folder / "up.txt"
+        taken: set[int] = set()
+        # Further floors use the ports above.
+        ports = {f"FOGNAV_{name}_PORT": str(net.free_port(taken)) for name in PORTS}
+        inherited = {key: value for key, value in os.environ.items() if not key.startswith("FOGNAV_")}
+        self.environment = {**inherited, **ports, "XDG_RUNTIME_DIR": str(folder / "runtime")}
+        self.process: subprocess.Popen[bytes] | None = None
+
+    def up(self) -> None:
+        command = [sys.executable, "-m", "fognav", "up", "--data", str(self.data), "--bind", "127.0.0.1"]
+        with self.printed.open("wb") as output:
+            self.process = subprocess.Popen(
+                [*command, *self.options], env=self.environment, stdin=subprocess.DEVNULL, stdout=output, stderr=output
+            )
+        self.wait(lambda: "is up:" in self.printed.read_text(), "it is up")
+
+    def run(self, *arguments: str) -> str:
+        done = subprocess.run(
+            [sys.executable, "-m", "fognav", *arguments],
+            env=self.environment, capture_output=True, text=True, timeout=60, check=False,
+        )  # fmt: skip
+        assert done.returncode == 0, f"{arguments}: {done.stdout}{done.stderr}\n{self.printed.read_text()}"
+        return done.stdout + done.stderr
+
+    def systems(self) -> dict[str, dict[str, Any]]:
+        status = json.loads(self.run("status", "--json").partition("\nfognav:")[0])
+        return {system["site"]: system for system in status["systems"] if system["name"].startswith("fog-")}
+
+    def wait(self, condition: Callable[[], object], what: str) -> None:
+        deadline = time.monotonic() + START_S
+        assert self.process is not None
+        while not condition():
+            assert self.process.poll() is None, self.printed.read_text()
+            assert time.monotonic() < deadline, f"not in time: {what}\n{self.printed.read_text()}"
+            time.sleep(0.1)
+
+    def down(self) -> None:
+        assert self.process is not None
+        pids = [pid for system in self.systems().values() for pid in system["pids"].values()]
+        assert "has ended" in self.run("down")
+        assert self.process.wait(60) == 0, self.printed.read_text()
+        assert not any(psutil.pid_exists(pid) for pid in pids)
+
+    def end(self) -> None:
+        if self.process is not None and self.process.poll() is None:
+            self.process.terminate()
+            self.process.wait(60)
+
+
+@pytest.fixture
+def node(tmp_path: Path) -> Iterator[Node]:
+    made = Node(tmp_path)
+    yield made
+    made.end()
+
+
+def require_refused(node: Node, data: Path, reason: str) -> None:
+    again = subprocess.run(
+        [sys.executable, "-m", "fognav", "up", "--data", str(data), "--bind", "127.0.0.1"],
+        env=node.environment, capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert again.returncode == 1
+    assert reason in again.stderr
+
+
+def test_zone_survives_a_killed_service_and_a_restart_of_the_node(node):
+    node.up()
+    (system,) = node.systems().values()
+    assert set(system["connected"]) >= {"map-service/estig", "planner/estig", "hazard-aggregator/estig"}
+    node.run("zone", "add", "--circle", "90,20,1", "--reason", "wet floor")
+
+    killed = system["pids"]["map-service"]
+    os.kill(killed, signal.SIGKILL)
+    node.wait(lambda: node.systems()["estig"]["pids"].get("map-service", killed) != killed, "a new map-service")
+    node.wait(lambda: "map-service/estig" in node.systems()["estig"]["connected"], "it is connected again")
+    assert "wet floor" in node.run("zone", "list")
+    assert "settings_loaded" in node.run("logs", "map-service", "-n", "1000")
+
+    require_refused(node, node.data, "already runs with the data")
+    require_refused(node, node.data / "other", "can't listen on")
+
+    node.down()
+    assert node.run("down").startswith("no fog node")
+    node.up()
+    assert "wet floor" in node.run("zone", "list")
+    node.down()

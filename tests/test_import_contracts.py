@@ -44,7 +44,7 @@ EDGES = {
     "fognav.localization", "fognav.localize_command", "fognav.map_command", "fognav.map_picture",
     "fognav.mutation",
     "fognav.node_command", "fognav.nodes.on_broker", "fognav.nodes.provisioning", "fognav.nodes.simulated",
-    "fognav.nodes.site_file", "fognav.site_command", "fognav.source_command", "fognav.stack", "fognav.stack_doors",
+    "fognav.nodes.site_file", "fognav.nodes.updating", "fognav.site_command", "fognav.source_command", "fognav.stack", "fognav.stack_doors",
     "fognav.status_command", "fognav.store_command", "fognav.system", "fognav.testing", "fognav.token_command",
     "fognav.zone_command",
     "fog_kernels.warm",

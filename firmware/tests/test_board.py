@@ -4,14 +4,22 @@ import hashlib
 import json
 import shutil
 import subprocess
+from contextlib import suppress
 from pathlib import Path
+from queue import Empty, Queue
+from threading import Event, Thread
+from urllib.request import urlopen
 
 import msgspec
+import paho.mqtt.client as paho
 import pytest
+from typer.testing import CliRunner
 
 from fog_contracts import channels as ch
 from fog_contracts.codec import decode, encode
 from fog_contracts.messages import NodeCalibration, NodeConfig, NodeReading, NodeUpdate, NodeValue
+from fog_supervisor.servers import start_mosquitto
+from fognav.node_command import node_app
 
 # Compiled once, not by each worker of a parallel run.
 pytestmark = pytest.mark.xdist_group("firmware-board")
@@ -64,12 +72,12 @@ def make_key(folder, name):
 class Board:
     """A board that is switched on: it runs as long as a test lets time pass, and tells what it does."""
 
-    def __init__(self, program, pins, flash):
+    def __init__(self, program, pins, flash, boot=4):
         self.pins = pins
         self.flash = flash
         self._process = subprocess.Popen(
             [program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-            env={"FLASH": str(flash), "ASAN_OPTIONS": "detect_leaks=0"},
+            env={"FLASH": str(flash), "ASAN_OPTIONS": "detect_leaks=0", "RANDOM_BITS": str(boot)},
         )  # fmt: skip
         self.restarted = False
         self.started = self._read()
@@ -120,7 +128,7 @@ def switch_on(programs, tmp_path):
             Path(tmp_path / "node.json").write_text(json.dumps(settings))
         if authority is not None:
             Path(tmp_path / "ca.pem").write_text(authority)
-        boards.append(Board(programs[board], BOARDS[board][1], tmp_path))
+        boards.append(Board(programs[board], BOARDS[board][1], tmp_path, boot=4 + len(boards)))
         return boards[-1]
 
     yield switch_on
@@ -403,3 +411,78 @@ def test_image_that_differs_from_what_was_signed_is_not_started(updatable, tmp_p
     assert "flash complete" not in lines
     assert not board.restarted
     assert not (tmp_path / "update.txt").exists()
+
+
+class Bridge(Thread):
+    """Passes messages between a board and a real broker, and the image that the board will fetch, until `ended`."""
+
+    def __init__(self, port, restart, folder):
+        super().__init__(daemon=True)
+        self.ended = Event()
+        self.boards = [restart()]
+        self._restart, self._folder = restart, folder
+        self._inbox = Queue()
+        self._client = paho.Client(paho.CallbackAPIVersion.VERSION2)
+        self._client.on_message = lambda _client, _data, message: self._inbox.put(message.payload.decode())
+        self._client.connect("127.0.0.1", port)
+        self._client.subscribe(ch.NODE_UPDATE.key(site="lab", node="n1"), 1)
+        self._client.loop_start()
+
+    def run(self):
+        while not self.ended.is_set():
+            if self.boards[-1].restarted:
+                self.boards.append(self._restart())
+                self.boards[-1].measures(3000, 3000)
+            for line in self.boards[-1].run(0.5):
+                if line.startswith("publish "):
+                    topic, qos, retained, text = line.removeprefix("publish ").split("|", 3)
+                    self._client.publish(topic, text, int(qos), bool(int(retained)))
+            with suppress(Empty):
+                self._deliver(self._inbox.get(timeout=0.1))
+        self._client.loop_stop()
+
+    def _deliver(self, text):
+        if text:
+            with urlopen(json.loads(text)["url"], timeout=10) as answer:
+                (self._folder / "served").write_bytes(answer.read())
+        self.boards[-1].send(ch.NODE_UPDATE, text)
+
+
+@pytest.fixture
+def bridge(switch_on, tmp_path):
+    """A board whose `update_key` is that of `key.pem`, on a real broker; and how to update it from the command line."""
+    if not cryptography("esp8266"):
+        pytest.skip(NO_CRYPTOGRAPHY.format(CRYPTOGRAPHY["esp8266"][0]))
+    made = CliRunner().invoke(node_app, ["key", str(tmp_path / "key.pem")])
+    assert made.exit_code == 0, made.output
+    (tmp_path / "node.json").write_text(json.dumps({**SETTINGS, "update_key": made.output.strip()}))
+    (tmp_path / "firmware.bin").write_bytes(IMAGE)
+    with start_mosquitto(tmp_path / "broker") as broker:
+        bridge = Bridge(broker.port, switch_on, tmp_path)
+        bridge.start()
+
+        def update(number, key="key.pem"):
+            words = ["update", "n1", "--image", str(tmp_path / "firmware.bin"), "--number", str(number)]
+            words += ["--key", str(tmp_path / key), "--broker", f"mqtt://127.0.0.1:{broker.port}", "--site-id", "lab"]
+            return CliRunner().invoke(node_app, [*words, "--seconds", "60"])
+
+        yield bridge, update
+        bridge.ended.set()
+        bridge.join()
+
+
+@pytest.mark.live
+def test_command_updates_a_node_over_a_real_broker_and_withdraws_the_offer(bridge, tmp_path):
+    board, update = bridge
+    done = update(2)
+    assert done.exit_code == 0, done.output
+    assert "node n1 has started anew, with firmware test" in done.output
+    assert (tmp_path / "flashed").read_bytes() == IMAGE
+    assert len(board.boards) == 2
+    refused = update(1)
+    assert refused.exit_code == 1
+    assert "node n1 was not updated: the update is older than what runs" in refused.output
+    make_key(tmp_path, "other.pem")
+    refused = update(3, "other.pem")
+    assert "not signed by the key in update_key" in refused.output
+    assert len(board.boards) == 2

@@ -463,3 +463,17 @@ def test_update_that_the_board_itself_refuses_is_not_tried_again(board):
 )
 def test_malformed_offer_is_refused_in_words(board, text, words):
     assert words in board.offer_text(text.encode())
+
+
+def test_withdrawn_offer_is_not_fetched_any_further_and_may_come_again(board):
+    board.stalls_at = 600
+    assert board.offer() is None
+    assert board.run(1) == []
+    assert board.offer_text(b"") is None
+    assert board.calls[1:] == [("close",), ("abandon",)]
+    assert board.run(1000) == []
+    assert not board.busy
+    board.stalls_at = 10**9
+    assert board.offer() is None
+    assert board.run(10) == []
+    assert board.started

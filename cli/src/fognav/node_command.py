@@ -4,6 +4,7 @@ import asyncio
 import math
 import time
 from collections.abc import Coroutine
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, TypeVar
 
@@ -11,13 +12,13 @@ import msgspec
 import typer
 
 from fog_contracts import channels as ch
-from fog_contracts.messages import Id, NodeCalibration, NodeReading
+from fog_contracts.messages import Id, NodeCalibration, NodeReading, NodeUpdate
 from fog_contracts.site import NodeSite
 from fog_runtime.credentials import Credentials
 from fog_runtime.site import LoadedSite
 from fognav import checkout, kernels
 from fognav.locking import LocksOption, locks_errors, locks_folder, open_locks, own_credentials
-from fognav.nodes import on_broker, provisioning, site_file
+from fognav.nodes import on_broker, provisioning, site_file, updating
 from fognav.operate.fog import Fog, find_fog
 from fognav.operate.options import NUMBERS, FogOption, JsonOption
 from fognav.operate.systems import AGGREGATOR, BROKER
@@ -200,6 +201,58 @@ def node_calibrate(  # noqa: PLR0913  # each option is an argument
                 print_line(f"sonar {index + 1}: {_RESULTS[learned.result[index]]}; blocked below {limit:.2f} m{silent}")
         if failed:
             raise FailedError(f"node {name} keeps its old limits: {', '.join(failed)}")
+
+
+@node_app.command("key", epilog="Example: fognav node key update-key.pem")
+def node_key(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="The private key (PEM); made if there is none.")],
+) -> None:
+    """Print the public half of the key that signs updates: `update_key` of a board's node.json.
+
+    Keep the file where no server is: who has it can put any program onto the nodes.
+    """
+    with exit_codes():
+        print_line(updating.make_key(file))
+
+
+@node_app.command(
+    "update", epilog="Example: fognav node update n1 --image firmware.bin --number 2 --key update-key.pem"
+)
+def node_update(  # noqa: PLR0913  # each option is an argument
+    name: NameArgument,
+    *,
+    image: Annotated[Path, typer.Option("--image", metavar="F", help="The firmware, as PlatformIO makes it.")],
+    number: Annotated[
+        int, typer.Option("--number", metavar="N", min=1, max=2**31 - 1, help="Its number: above what runs.")
+    ],
+    key: Annotated[Path, typer.Option("--key", metavar="F", help="The private key that signs it: fognav node key.")],
+    board: Annotated[Literal["d1-mini", "d1-mini32"], typer.Option("--board", help="For which it is.")] = "d1-mini",
+    address: Annotated[
+        str | None, typer.Option("--url", metavar="URL", help="Where it is served; default: by this command.")
+    ] = None,
+    seconds: Annotated[float, typer.Option("--seconds", metavar="S", min=1.0, help="How long to wait.")] = 300.0,
+    broker: BrokerOption = None,
+    site: Annotated[str | None, typer.Option("--site-id", metavar="ID", help="Default: the running system's.")] = None,
+    fog: FogOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Sign new firmware, offer it to a node, and wait until the node has started anew.
+
+    The node fetches it while it goes on measuring. The offer is withdrawn at the end.
+    """
+    with exit_codes():
+        data = updating.read_image(image)
+        url, site_id, own = _on(fog, broker, site)
+        with nullcontext(address) if address is not None else updating.served(data, url) as where:
+            try:
+                offer = msgspec.convert(updating.signed_offer(data, number, board, key, where), NodeUpdate)
+            except msgspec.ValidationError as error:
+                raise WrongUseError(f"the offer is not valid: {error}") from error
+            reading = _run(on_broker.update(url, site_id, _checked(name), offer, own, seconds=seconds))
+        if json:
+            print_json({"node": name, "number": number, "sha256": offer.sha256, "fw": reading.fw, "boot": reading.boot})
+        else:
+            print_line(f"node {name} has started anew, with firmware {reading.fw or 'that does not tell its name'}")
 
 
 @node_app.command(

@@ -16,7 +16,7 @@
 #define INPUT_PULLUP 2
 #define CHANGE 3
 #define A0 17
-#define RANDOM_REG32 4u
+#define RANDOM_REG32 esp_random()
 
 class String : public std::string {
 public:

@@ -140,7 +140,11 @@ int analogRead(uint8_t) { return analog; }
 int digitalPinToInterrupt(int pin) { return pin; }
 void attachInterruptArg(uint8_t pin, void (*handler)(void*), void* argument, int) { interrupts[pin] = {handler, argument}; }
 void configTime(long, int, const char* server) { printf("time from %s\n", server); }
-uint32_t esp_random() { return 4; }
+// A number that the test chooses: else every start would be the same boot.
+uint32_t esp_random() {
+    const char* chosen = getenv("RANDOM_BITS");
+    return chosen == nullptr ? 4 : static_cast<uint32_t>(strtoul(chosen, nullptr, 10));
+}
 void enableLoopWDT() { printf("watchdog\n"); }
 uint16_t ranger_mm() { return static_cast<uint16_t>(range_mm); }
 float thermometer_c() { return static_cast<float>(celsius); }

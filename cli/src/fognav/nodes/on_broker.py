@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 import aiomqtt
 
 from fog_contracts import channels as ch
-from fog_contracts.codec import ContractError, decode, decode_text, encode_text
+from fog_contracts.codec import ContractError, decode, decode_text, encode, encode_text
 from fog_contracts.messages import NodeCalibration, NodeReading
 from fog_runtime.credentials import NOBODY, Credentials
 from fog_runtime.mqtt_broker import Broker
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     from fog_contracts.channels import Channel
+    from fog_contracts.messages import NodeUpdate
 
 CALIBRATION_S: Final = 60.0
 """A node measures some seconds per sonar; without an answer after this it is not there, or its firmware is too old."""
@@ -90,6 +91,40 @@ async def learn(url: str, site: str, node: str, command: str, credentials: Crede
             f"node {node} did not answer within {CALIBRATION_S:.0f} s: check that it is online (fognav node list)"
         ) from None
     raise FailedError(f"the broker closed the connection before node {node} answered: try again")
+
+
+async def update(
+    url: str, site: str, node: str, offer: NodeUpdate, credentials: Credentials = NOBODY, *, seconds: float
+) -> NodeReading:
+    """Offer a node an update, and return its first reading after the restart; the offer is withdrawn then.
+
+    Raises `FailedError` with the node's own words if it refused or failed, or if it has not restarted after `seconds`.
+    """
+    reading, problem = (channel.key(site=site, node=node) for channel in (ch.NODE_READING, ch.NODE_PROBLEM))
+    topic, channel = ch.NODE_UPDATE.key(site=site, node=node), ch.NODE_UPDATE
+    before: int | None = None
+    async with _connected(url, {reading: 0, problem: 1}, credentials) as client:
+        try:
+            async with asyncio.timeout(seconds):
+                async for message in client.messages:
+                    if message.topic.value == reading:
+                        found = decode(ch.NODE_READING, _bytes(message), NodeReading)
+                        if before is None:
+                            await client.publish(topic, encode(channel, offer), qos=channel.qos, retain=True)
+                        elif found.boot != before:
+                            return found
+                        before = found.boot
+                    elif before is not None and not message.retain and (words := _bytes(message).decode()):
+                        raise FailedError(f"node {node} was not updated: {words}")
+        except TimeoutError:
+            what = "is not there (fognav node list)" if before is None else "has not restarted"
+            raise FailedError(f"node {node} {what}: waited {seconds:g} s") from None
+        except ContractError as error:
+            raise FailedError(f"what node {node} says was not understood: {error}") from error
+        finally:
+            if before is not None:
+                await client.publish(topic, b"", qos=channel.qos, retain=True)
+    raise FailedError(f"the broker closed the connection before node {node} was updated: try again")
 
 
 def _answer(keys: dict[Channel, str], message: aiomqtt.Message) -> NodeCalibration | str:

@@ -93,6 +93,10 @@ size_t signed_text(const UpdateOffer& offer, char* buffer, size_t size) {
 }
 
 const char* Updater::offer(const char* text, size_t size, uint32_t now_ms) {
+    if (size == 0) {
+        withdraw();
+        return nullptr;
+    }
     UpdateOffer found;
     const char* problem = read_update(text, size, found);
     if (problem != nullptr) return problem;
@@ -106,16 +110,22 @@ const char* Updater::offer(const char* text, size_t size, uint32_t now_ms) {
     if (!port_.signature_is_good(signed_lines, length, found.signature, found.signature_size)) {
         return "the update is not signed by the key in update_key of node.json";
     }
-    if (phase_ == Phase::fetching) {
-        port_.close();
-        port_.abandon_flash();
-    }
+    withdraw();
     offer_ = found;
     attempts_ = 0;
     wait_ms_ = 0;
     since_ms_ = now_ms;
     phase_ = Phase::due;
     return nullptr;
+}
+
+void Updater::withdraw() {
+    if (phase_ == Phase::fetching) {
+        port_.close();
+        port_.abandon_flash();
+    }
+    phase_ = Phase::idle;
+    offer_ = UpdateOffer();
 }
 
 const char* Updater::step(uint32_t now_ms) {

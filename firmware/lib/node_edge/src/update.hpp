@@ -75,7 +75,7 @@ public:
         : port_(port), board_(board), number_(number > remembered ? number : remembered) {}
 
     // Take an offer (JSON); return nullptr, or why it is refused. An offer of what runs already is neither, nor is the
-    // offer again that was taken last; another one replaces that, even while it is fetched.
+    // offer again that was taken last; another one replaces that, even while it is fetched. An empty text withdraws it.
     const char* offer(const char* text, size_t size, uint32_t now_ms);
 
     // Go on; call it in every turn of the loop (millis(), 32 bits that wrap). Return nullptr, or why the update failed.
@@ -86,6 +86,7 @@ public:
 private:
     enum class Phase : uint8_t { idle, due, fetching };
 
+    void withdraw();
     const char* begin(uint32_t now_ms);
     const char* fetch(uint32_t now_ms);
     bool hash_is_right();

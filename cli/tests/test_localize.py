@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,8 +16,10 @@ from fog_contracts.grid import GridGeometry, StaticMap
 from fog_kernels.raycast import cast
 from fog_runtime.maps import load_map, save_map
 from fognav.__main__ import app
+from fognav.localization.evaluation import track
 from fognav.localization.logs import read_log
 from fognav.output import WrongUseError
+from robot_agent.config import LocalizationConfig
 from robot_agent.localization.pose import Pose2
 
 BEAMS = np.arange(180) * math.pi / 180.0 - math.pi / 2.0
@@ -236,3 +239,29 @@ def test_robot_carried_away_on_a_recorded_floor_is_never_good_elsewhere(data_dir
         )
         assert found["falsely_good_share"] == 0.0
         assert found["recovered_after_scans"] <= 10
+
+
+@pytest.mark.data
+def test_robot_carried_between_places_that_look_alike_is_not_good_where_suddenly_fewer_beams_agree(data_dir, tmp_path):
+    """Two thirds of the beams agree at the old place on a recorded floor, and none passes through a wall there."""
+    log = data_dir / "lidar_logs" / "intel_odom_ref_scan.jsonl.gz"
+    if not log.is_file():
+        pytest.skip(f"{log} does not exist")
+    run("map", "from-log", log, "--out", tmp_path / "floor", "--scans", "odd")
+    before, after = (read_log(log).select("even")[part] for part in (slice(48, 68), slice(402, 427)))
+    last, first = before[-1], after[0]
+    carried = [
+        replace(
+            scan,
+            stamp=last.stamp + 1.0 + scan.stamp - first.stamp,
+            odom=last.odom.compose(scan.odom.relative_to(first.odom)),
+        )
+        for scan in after
+    ]
+    samples = track(
+        load_map(tmp_path / "floor.yaml"), [*before, *carried], LocalizationConfig(range_max=30.0), seed=485191,
+        search=False,
+    )  # fmt: skip
+    assert samples[len(before) - 1].status == "good"
+    assert not [sample for sample in samples if sample.status == "good" and sample.position_error > 0.5]
+    assert samples[-1].status == "good"

@@ -144,14 +144,34 @@ def test_global_localization_fails_when_places_look_alike():
     assert len(localizer.hypotheses) > 1
 
 
-def test_pose_stays_good_with_people_around_the_robot():
-    place = PLACES[1]
+def people_around(place, angles):
     solid = SOLID.copy()
-    for angle in (0.3, 1.5, 2.9, 4.4):
+    for angle in angles:
         column, row = GEOMETRY.cell(place.x + 0.7 * math.cos(angle), place.y + 0.7 * math.sin(angle))
         solid[row - 3 : row + 4, column - 3 : column + 4] = 1
+    return solid
+
+
+def test_pose_stays_good_while_people_gather_around_the_robot():
+    place, angles = PLACES[1], (0.3, 1.5, 2.9, 4.4)
     localizer, now = standing(place, prepare=lambda one: one.initial_pose(*place))
-    standing(place, localizer=localizer, solid=solid, start=now, scans=30)
+    for count in range(1, len(angles) + 1):
+        _, now = standing(
+            place, localizer=localizer, solid=people_around(place, angles[:count]), start=now, scans=15
+        )  # fmt: skip
+        assert localizer.status == "good"
+
+
+def test_robot_that_is_suddenly_surrounded_is_weak_but_never_lost_and_good_again_without_the_crowd():
+    place = PLACES[1]
+    localizer, now = standing(place, prepare=lambda one: one.initial_pose(*place))
+    crowd = people_around(place, (0.3, 1.5, 2.9, 4.4))
+    for _ in range(10):
+        _, now = standing(place, localizer=localizer, solid=crowd, start=now, scans=3)
+        assert localizer.status == "weak"
+        assert "something stands before them" in localizer.detail
+        assert error_of(localizer, now, place)[0] < 0.06
+    standing(place, localizer=localizer, start=now, scans=3)
     assert localizer.status == "good"
 
 

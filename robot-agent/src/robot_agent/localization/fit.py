@@ -31,9 +31,9 @@ right poses, some in a crowd, fail here, and 97 % of those at wrong poses."""
 _CONTRADICTION_PROVEN: Final = 0.12
 _AGREEMENT_PROVEN: Final = 0.8
 """One that was good before may also stay so within these limits: a door was opened, yet the rest is as it was."""
-_BLURRED_LIMIT: Final = 0.15
-"""Share of blurred beams above which a pose is not good: 0.2 % of those at right poses, half of the wrong ones that the
-limits above let through."""
+_BLURRED_LIMIT: Final = 0.1
+"""Share of blurred beams above which a pose is not good: 0.6 % of those at right poses, and more
+than half of the wrong ones that the limits above let through."""
 _BLURRED_DOUBT: Final = 0.3
 """Share of blurred beams above which a pose is in doubt."""
 _INFORMATIVE_LEAST: Final = 8
@@ -101,6 +101,8 @@ class FitMonitor:
         """Reason of the status; empty when good."""
         self.trial_failed = False
         """Whether the newest scan ended a trial without success."""
+        self.fits = False
+        """Whether the newest scan by itself confirms the pose, whatever else speaks against it."""
         self._recent: deque[Localization] = deque(maxlen=9)
         self._contradicted = 0
         self._proven = False
@@ -135,14 +137,12 @@ class FitMonitor:
             self.status = "weak"
         self.detail = detail
 
-    def add(self, fit: Fit, spread: Uncertainty, *, verified: bool = True) -> None:
-        """Add the fit of the newest scan, with the pose's standard deviations.
-
-        A pose that was in doubt is at most weak until it is `verified` that no other place looks like it.
-        """
+    def add(self, fit: Fit, spread: Uncertainty, *, doubt: str = "") -> None:
+        """Add the fit of the newest scan, with the pose's standard deviations; a pose in `doubt` is at most weak."""
         grade, reason = grade_fit(fit, spread, proven=self._proven)
-        if grade == "good" and not verified:
-            grade, reason = "weak", "the pose was in doubt and fits again: other places may look like this one"
+        self.fits = grade == "good"
+        if self.fits and doubt:
+            grade, reason = "weak", doubt
         self._contradicted = self._contradicted + 1 if fit.contradict > _CONTRADICTION_LIMIT else 0
         if self._contradicted >= _CONTRADICTED_SCANS_LIMIT:
             grade = "lost"

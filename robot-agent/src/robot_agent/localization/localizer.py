@@ -17,7 +17,8 @@ import numpy as np
 
 from robot_agent.config import LocalizationConfig
 from robot_agent.localization.deskew import DeskewedScan, deskew
-from robot_agent.localization.fit import FitMonitor, casts_doubt, evaluate_fit
+from robot_agent.localization.doubt import Doubt
+from robot_agent.localization.fit import FitMonitor, evaluate_fit
 from robot_agent.localization.hypotheses import apart
 from robot_agent.localization.map_fields import MapFields, map_fields
 from robot_agent.localization.odometry_buffer import OdometryBuffer
@@ -42,8 +43,6 @@ _FOUND_SIGMAS: Final = (0.2, 0.1)
 """Standard deviations (m, rad) of a place that a search found, which the next scan narrows."""
 _LOCAL_SIGMAS: Final = (1.0, 0.5)
 """Standard deviations (m, rad) within which a lost robot is looked for first."""
-_VERIFIED_AFTER_M: Final = 5.0
-"""A pose that was in doubt is verified by a search of the whole map, or by fitting for so long a drive."""
 _VERIFY_EVERY_S: Final = 5.0
 """Least time between two searches of the whole map that only confirm the pose, as while a door stands open."""
 _LOCAL_SCANS: Final = 5
@@ -73,8 +72,7 @@ class Localizer:
         self._relocalization = Relocalization(self._config)
         self._local_scans = 0
         """Scans since a lost robot was looked for near its last pose; 0 while it is not lost."""
-        self._doubted_at: Pose2 | None = None
-        """Odometry at which scans last cast doubt on the pose, or it was found again; None once it is verified."""
+        self._doubt = Doubt()
         self._verify_again_at = -math.inf
         self.scan: DeskewedScan | None = None
         """The newest scan, without its skew."""
@@ -131,7 +129,7 @@ class Localizer:
         if self.scan is None or self._fields is None:
             return
         if self._filter.has_pose:
-            self._filter.add(self.scan, self._fields, recover=self._monitor.status != "good")
+            self._filter.add(self.scan, self._fields, recover=self._monitor.status != "good" and not self._monitor.fits)
             self._evaluate(self.scan, self._fields, now)
         if self._relocalization.active:
             self._relocalization.on_scan(self.scan, self._fields)
@@ -250,7 +248,7 @@ class Localizer:
     def _start(self, pose: Pose2, sigma_xy: float, sigma_theta: float) -> None:
         self._relocalization.cancel()
         self._local_scans = 0
-        self._doubted_at = None
+        self._doubt.restart()
         odom = self._odometry.latest() or Pose2(0.0, 0.0, 0.0)
         self._filter.start(pose, odom, sigma_xy, sigma_theta)
 
@@ -259,9 +257,8 @@ class Localizer:
         pose = self._filter.pose(scan.odom)
         assert pose is not None
         fit = evaluate_fit(fields, pose, scan.beams(_FIT_BEAMS), self._config.range_max)
-        if self._filter.jumped or casts_doubt(fit):
-            self._doubted_at = scan.odom
-        self._monitor.add(fit, self._filter.uncertainty, verified=self._doubted_at is None)
+        self._doubt.add(fit, scan.odom, jumped=self._filter.jumped)
+        self._monitor.add(fit, self._filter.uncertainty, doubt=self._doubt.reason)
         if self._monitor.status == "lost":
             self._look_nearby(scan, now)
             return
@@ -269,10 +266,10 @@ class Localizer:
         if self._monitor.trial_failed:
             self.global_localization()
         elif self._monitor.status in {"good", "weak"}:
-            if self._doubted_at is None:
+            if not self._doubt.to_verify:
                 self._relocalization.cancel()
-            else:
-                self._verify(scan, fields, self._doubted_at, now)
+            elif self._may_verify(now):
+                self._relocalization.begin(scan, fields)
 
     def _look_nearby(self, scan: DeskewedScan, now: float) -> None:
         """Look for a lost robot near its last pose, since most slipped or were pushed; then on the whole map."""
@@ -280,17 +277,13 @@ class Localizer:
         if self._local_scans == 1:
             self._filter.widen(scan.odom, *_LOCAL_SIGMAS)
             self._monitor.restart()
-            self._doubted_at = scan.odom
+            self._doubt.begin(scan.odom)
         elif self._local_scans > _LOCAL_SCANS and not self._relocalization.active and self._may_search(now):
             self.global_localization()
 
-    def _verify(self, scan: DeskewedScan, fields: MapFields, doubted_at: Pose2, now: float) -> None:
-        """Search the whole map for places that look like that of a pose in doubt."""
-        driven = scan.odom.relative_to(doubted_at)
-        if math.hypot(driven.x, driven.y) > _VERIFIED_AFTER_M:
-            self._doubted_at = None
-        elif not self._relocalization.active and self._relocalization.may_begin(now) and now >= self._verify_again_at:
-            self._relocalization.begin(scan, fields)
+    def _may_verify(self, now: float) -> bool:
+        """Whether the last search of the whole map for places that look like that of the pose is long enough ago."""
+        return not self._relocalization.active and self._relocalization.may_begin(now) and now >= self._verify_again_at
 
     def _may_search(self, now: float) -> bool:
         """Whether the pose is lost and the last search is long enough ago."""
@@ -301,12 +294,12 @@ class Localizer:
         outcome = self._relocalization.outcome(now)
         if outcome is None:
             return
-        verifying = self._doubted_at is not None and self._monitor.status == "weak"
+        verifying = self._doubt.to_verify and self._monitor.status == "weak"
         if outcome.pose is None:
             if not verifying:
                 self._monitor.lose(outcome.detail)
             return
-        self._doubted_at = None
+        self._doubt.verify()
         pose = self._filter.pose(outcome.odom)
         if verifying and pose is not None and not apart(pose, outcome.pose):
             self._verify_again_at = now + _VERIFY_EVERY_S

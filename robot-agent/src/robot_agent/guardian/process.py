@@ -26,6 +26,7 @@ from fog_runtime.robot_file import load_robot
 from fog_runtime.settings import SettingsError, load
 from robot_agent.device_signature import LISTEN_S, LineCheck
 from robot_agent.guardian.core import GuardianCore, Limits, Output
+from robot_agent.guardian.heartbeat import Heartbeats
 from robot_agent.guardian.link import PACKET_LIMIT, WheelCommand, decode_command, encode
 from robot_agent.guardian.protection import lock_memory, run_in_real_time
 from robot_agent.guardian.watchdog import BAD_SETTINGS, PORT_LOST
@@ -46,8 +47,6 @@ Waiting for bytes would wake the process for each piece of a frame, which some a
 """
 RESTING_S: Final = 0.055
 """The same while no wheel turns; but a command of the agent is applied at once, and comes a little more often."""
-HEARTBEAT_S: Final = 0.04
-"""Shortest time between two heartbeats: they share the wake-ups above."""
 AGENT_LIVES_S: Final = 1.0
 """An agent sends a command every 0.05 s; one that was silent for longer than this hangs: another may take its place."""
 REFUSE_S: Final = 2.0
@@ -86,7 +85,7 @@ class Guardian:
         self._moving = False
         self._agent: socket.socket | None = None
         self._agent_heard_at = -1.0
-        self._heartbeat_at = -1.0
+        self._heartbeats = Heartbeats()
         self._latched: str | None = None
         self._pulse: tuple[Literal["rts", "dtr"], float] | None = None
         self._corrupted = 0
@@ -119,8 +118,9 @@ class Guardian:
         self._poll.register(descriptor, select.POLLIN)
 
     def _wait(self, seconds: float) -> None:
-        """Wait for an event, `seconds` at most, and handle it."""
-        for descriptor, _ in self._poll.poll(1000.0 * self._clock.real(seconds)):
+        """Wait for an event, `seconds` at most and no longer than the next heartbeat may, and handle it."""
+        left = self._heartbeats.wait(seconds, self._clock.now())
+        for descriptor, _ in self._poll.poll(1000.0 * self._clock.real(left)):
             if (handler := self._events.get(descriptor)) is not None:  # None: closed by the handler before
                 handler()
 
@@ -298,10 +298,8 @@ class Guardian:
             self._drop_agent(self._core.unanswered)
 
     def _send_heartbeat(self) -> None:
-        now = self._clock.now()
-        if now - self._heartbeat_at < HEARTBEAT_S:
+        if not self._heartbeats.is_due(self._clock.now()):
             return
-        self._heartbeat_at = now
         # A full pipe means that the watchdog hangs, a broken one that it ended; the other pipe reports the latter too.
         with suppress(BlockingIOError, BrokenPipeError):
             os.write(self._settings.heartbeat_fd, b".")

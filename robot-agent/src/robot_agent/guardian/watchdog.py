@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from fog_runtime import parts, signals
 from fog_runtime.default_parts import DEFAULT_BASE
 from fog_runtime.service_manager import ServiceManager
+from robot_agent.guardian.heartbeat import silence_limit
 from robot_agent.guardian.protection import lock_memory, run_in_real_time
 from robot_agent.port_names import PortNameError
 from robot_agent.serial_port import Port, PortLost, open_port, refuse_speed
@@ -35,10 +36,6 @@ PORT_LOST: Final = 3
 """Exit code of the guardian when the port is lost: reopen it."""
 BAD_SETTINGS: Final = 78
 """Exit code of the guardian (EX_CONFIG of sysexits.h) when a restart would fail again."""
-SILENCE_S: Final = 0.15
-"""The guardian sends a heartbeat every 0.05 s; without one for this long it is killed as hung."""
-SILENCE_MIN_S: Final = 0.05
-"""Real seconds: in a simulation faster than real time, delays of the scheduler must not count as a hang."""
 STARTUP_S: Final = 15.0
 """Real seconds until a guardian without any heartbeat is killed as hung; the wheels are at rest meanwhile."""
 REPEAT_S: Final = 0.1
@@ -254,8 +251,7 @@ def _guard(port: Port, settings: Settings) -> int:
     if (refusal := refuse_speed(speed, port.device)) is not None:
         raise BadSettings(refusal)
     log_event("port_open", path=settings.path)
-    silence_s = max(SILENCE_S / speed, SILENCE_MIN_S)
-    while (code := guard_once(port, base, silence_s)) not in {PORT_LOST, BAD_SETTINGS}:
+    while (code := guard_once(port, base, silence_limit(speed))) not in {PORT_LOST, BAD_SETTINGS}:
         hold(port, base.hold, RESTART_S / speed)
     return code
 

@@ -50,6 +50,8 @@ from robot_agent.lidars.rplidar_a1.emulator import RplidarEmulator
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from locked_servers import LockedRouter
+
     from fog_runtime.slots import Slot
 
 SITE = "lab"
@@ -206,7 +208,7 @@ class AgentProcess:
     """The agent, as `python -m robot_agent` starts it."""
 
     def __init__(
-        self, folder: Path, router: str, watchdog: Watchdog, body: Body, further=None, start=(2.0, 2.0, 0.0)
+        self, folder: Path, router: LockedRouter, watchdog: Watchdog, body: Body, further=None, start=(2.0, 2.0, 0.0)
     ) -> None:
         self.log_file = folder / "agent.log"
         self.data = folder / "data"
@@ -227,7 +229,8 @@ class AgentProcess:
             "FOGNAV_LIDAR_PORT": str(body.lidar_link),
             "FOGNAV_GUARDIAN_SOCKET": str(watchdog.socket),
             "FOGNAV_OPERATOR_KEY_FILE": str(key),
-            "FOGNAV_ZENOH_CONNECT": router,
+            "FOGNAV_ZENOH_CONNECT": router.url,
+            **router.site.environment(ROBOT),
             "FOGNAV_PORT_FILE": str(self._port_file),
             "FOGNAV_SEED": "1",
             "FOGNAV_INPUT_LOG": str(self.input_log),
@@ -285,7 +288,7 @@ async def until(condition, expected: str, deadline_s: float = DEADLINE_S):
 class Robot:
     """The whole robot, started; `fog` is None until `async with`."""
 
-    def __init__(self, folder: Path, router: str, **further: str) -> None:
+    def __init__(self, folder: Path, router: LockedRouter, **further: str) -> None:
         """Prepare; `further` variables configure the agent."""
         self.body = Body(folder)
         self.watchdog = Watchdog(folder, self.body.link)
@@ -298,7 +301,10 @@ class Robot:
         for part in (self.body, self.watchdog, self.agent):
             self._parts.enter_context(part)
         clock = SystemClock()
-        self._open = ZenohEdge.open(connect=[self._router], clock=clock, role="fog", id="test", site=SITE)
+        own = self._router.site.credentials()
+        self._open = ZenohEdge.open(
+            connect=[self._router.url], clock=clock, role="fog", id="test", site=SITE, credentials=own
+        )
         edge = await self._open.__aenter__()
         self.fog = Fog(edge, clock, self.body)
         self._fog_task = asyncio.create_task(self.fog.run())

@@ -12,15 +12,16 @@ from pathlib import Path
 import numpy as np
 import programs
 import pytest
+from locked_servers import LockedSite
 
 from fog_contracts import channels as ch
 from fog_contracts.grid import GridGeometry, StaticMap
 from fog_contracts.messages import CommandReply, NodeReading, Pose, SimCommand, SimObstacle, SimTruth
 from fog_runtime.clock import SystemClock
+from fog_runtime.locks.site_locks import CREDENTIALS
 from fog_runtime.maps import save_map
 from fog_runtime.mqtt_edge import MqttEdge
 from fog_runtime.zenoh_edge import ZenohEdge
-from fog_supervisor.servers import start_mosquitto, start_router
 
 pytestmark = pytest.mark.live
 
@@ -53,8 +54,8 @@ async def until(condition, description, seconds=45.0):
 class Rig:
     """The simulator's environment, and what it has published."""
 
-    def __init__(self, folder, mqtt_url, zenoh):
-        self.folder, self.mqtt_url, self.zenoh = folder, mqtt_url, zenoh
+    def __init__(self, folder, mqtt_url, zenoh, site):
+        self.folder, self.mqtt_url, self.zenoh, self.site = folder, mqtt_url, zenoh, site
         self.run, self.truth_log, self.port_file = folder / "run", folder / "truth.jsonl", folder / "port"
         self.readings, self.availability, self.truths = [], [], []
         self.edge = None
@@ -69,8 +70,9 @@ class Rig:
             "MQTT_URL": self.mqtt_url,
             "ZENOH_CONNECT": self.zenoh,
             "SPEED": speed,
+            "NODE_CREDENTIALS_DIR": self.site.locks.directory / CREDENTIALS,
         }
-        environment = os.environ | {f"FOGNAV_{key}": str(value) for key, value in values.items()}
+        environment = os.environ | self.site.environment("sim") | {f"FOGNAV_{key}": str(v) for key, v in values.items()}
         return programs.start("fognav_sim", environment, self.folder / "sim.log")
 
     async def send_command(self, **command):
@@ -92,15 +94,19 @@ def write_site(folder):
 @contextlib.asynccontextmanager
 async def simulator(folder: Path, speed=1):
     write_site(folder / "site")
-    with start_mosquitto(folder / "mosquitto") as broker, start_router(folder / "router") as router:
-        url = broker.endpoint if "://" in broker.endpoint else f"mqtt://{broker.endpoint}"
-        rig = Rig(folder, url, router.endpoint)
+    site = LockedSite(folder, "lab", robots=["r1"], nodes=["n1"])
+    with site.mosquitto() as broker, site.router() as router:
+        rig = Rig(folder, broker.url, router.url, site)
         clock = SystemClock()
-        mqtt = MqttEdge(url, "test", clock, site="lab")
+        console = site.credentials("console")
+        mqtt = MqttEdge(broker.url, "test", clock, site="lab", credentials=console)
         mqtt.on(ch.NODE_READING, lambda _, reading: rig.readings.append(reading), NodeReading)
         mqtt.on(ch.NODE_AVAILABILITY, lambda _, text: rig.availability.append(text))
         listening = asyncio.create_task(mqtt.run())
-        async with ZenohEdge.open(connect=[router.endpoint], clock=clock, role="test", id="t", site="lab") as rig.edge:
+        opened = ZenohEdge.open(
+            connect=[router.url], clock=clock, role="console", id="t", site="lab", credentials=console
+        )
+        async with opened as rig.edge:
             rig.edge.subscribe(ch.SIM_TRUTH, SimTruth, lambda _, truth: rig.truths.append(truth), robot="r1")
             await mqtt.wait_connected()
             process = rig.start(speed)

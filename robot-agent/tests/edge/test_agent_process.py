@@ -9,14 +9,14 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from agent_rig import AgentProcess, Robot, until
+from agent_rig import ROBOT, SITE, AgentProcess, Robot, until
 from guardian_rig import STOP_S
+from locked_servers import locked_router
 
 from fog_contracts import channels as ch
 from fog_contracts.grid import Window
 from fog_contracts.messages import PlanReply, Pose, RobotGoal
 from fog_runtime.signals import TERMINAL_STOPS
-from fog_supervisor.servers import start_router
 from robot_agent.agent.replay import replay
 from robot_agent.localization.localizer import SavedPose
 
@@ -25,8 +25,8 @@ pytestmark = [pytest.mark.live, pytest.mark.reaction, pytest.mark.timeout(150)]
 
 @pytest.fixture(scope="module")
 def router(tmp_path_factory):
-    with start_router(tmp_path_factory.mktemp("router")) as server:
-        yield server.url
+    with locked_router(tmp_path_factory.mktemp("router"), SITE, robots=[ROBOT]) as running:
+        yield running
 
 
 @pytest.fixture

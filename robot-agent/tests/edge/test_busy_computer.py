@@ -13,9 +13,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
-from agent_rig import Robot, until
+from agent_rig import ROBOT, SITE, Robot, until
+from locked_servers import locked_router
 
-from fog_supervisor.servers import start_router
 from robot_agent.guardian.protection import run_in_real_time
 
 BURST_S = float(os.environ.get("FOGNAV_BURST_S", "4"))
@@ -28,8 +28,8 @@ pytestmark = [pytest.mark.live, pytest.mark.reaction, pytest.mark.timeout(150 + 
 
 @pytest.fixture
 def router(tmp_path_factory):
-    with start_router(tmp_path_factory.mktemp("router")) as server:
-        yield server.url
+    with locked_router(tmp_path_factory.mktemp("router"), SITE, robots=[ROBOT]) as running:
+        yield running
 
 
 @contextmanager

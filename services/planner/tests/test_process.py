@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 import programs
 import pytest
+from locked_servers import LockedSite
 
 from fog_contracts import channels as ch
 from fog_contracts.commands import CommandGate
@@ -40,7 +41,7 @@ from fog_runtime.clock import SystemClock, ticker
 from fog_runtime.http import token_hash
 from fog_runtime.redis_connection import RedisConnection
 from fog_runtime.zenoh_edge import ZenohEdge
-from fog_supervisor.servers import Server, start_redis, start_router
+from fog_supervisor.servers import Server
 
 pytestmark = pytest.mark.live
 
@@ -104,11 +105,12 @@ class Environment:
         router: Server,
         redis: Server,
         edge: ZenohEdge,
-        clock: SystemClock,
+        site: LockedSite,
         further: dict[str, str] | None = None,
     ) -> None:
-        self.further = further or {}
-        self.folder, self.router, self.redis, self.edge, self.clock = folder, router, redis, edge, clock
+        self.further = {**site.environment("planner"), **(further or {})}
+        self.site = site
+        self.folder, self.router, self.redis, self.edge, self.clock = folder, router, redis, edge, SystemClock()
         self.geometry = GridGeometry(200, 120, 0.1, 0.0, 0.0)
         self.static = static_map()
         self.table = inflation_table(0.1, DEFAULT_INFLATION)
@@ -190,10 +192,18 @@ class Environment:
 @asynccontextmanager
 async def running_planner(folder: Path, **further: str) -> AsyncIterator[Environment]:
     write_site(folder / "site")
-    clock = SystemClock()
-    with start_router(folder / "router") as router, start_redis(folder / "redis") as redis:
-        async with ZenohEdge.open(connect=[router.endpoint], clock=clock, role="test", id="test", site="test") as edge:
-            env = Environment(folder / "site", router, redis, edge, clock, further)
+    site = LockedSite(folder, "test", robots=["r1"])
+    with site.router() as router, site.redis() as redis:
+        opened = ZenohEdge.open(
+            connect=[router.endpoint],
+            clock=SystemClock(),
+            role="test",
+            id="test",
+            site="test",
+            credentials=site.credentials(),
+        )
+        async with opened as edge:
+            env = Environment(folder / "site", router, redis, edge, site, further)
             env.start()
             publishing = asyncio.create_task(env.publish_heartbeats_and_poses())
             try:
@@ -235,7 +245,7 @@ async def test_operator_without_a_key_enables_a_robot_through_the_planner_and_th
             assert done.json()["reason"] == "operator may enable"
             stopped = await client.post("/api/v1/robots/r1/stop")
             assert stopped.json()["reason"] == "stop from 127.0.0.1 may disable"
-        redis = RedisConnection(env.redis.url)
+        redis = RedisConnection(env.redis.url, credentials=env.site.credentials("administrator"))
         trails = [await redis.read("XRANGE", f"fog:test:audit:{kind}", "-", "+") for kind in ("robot", "stop")]
         await redis.aclose()
         last = [trail[-1][1] for trail in trails]

@@ -1,0 +1,63 @@
+"""Servers behind the locks of a site, as in the field: what is off in tests is broken there."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Final
+
+from fog_runtime.credentials import VARIABLE, Credentials
+from fog_runtime.locks.site_locks import SiteLocks
+from fog_supervisor.servers import Server, start_mosquitto, start_redis, start_router
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from pathlib import Path
+
+TESTER: Final = "test"
+"""A user who may do everything on broker and router: it stands for all processes that a test does not run."""
+
+
+class LockedSite:
+    """The locks of a site in a folder, and its servers."""
+
+    def __init__(self, folder: Path, site: str, *, robots: Sequence[str] = (), nodes: Sequence[str] = ()) -> None:
+        """Make the locks for these robots and nodes."""
+        self._folder = folder
+        self.locks = SiteLocks(folder / "locks", site, unrestricted=[TESTER])
+        self.locks.make(["127.0.0.1", "localhost"], robots=robots, nodes=nodes)
+
+    def environment(self, user: str) -> dict[str, str]:
+        """Return the variable by which a process is this user."""
+        return {VARIABLE: str(self.locks.credentials(user))}
+
+    def credentials(self, user: str = TESTER) -> Credentials:
+        """Return a user's credentials."""
+        return Credentials.read(self.locks.credentials(user))
+
+    def mosquitto(self) -> Server:
+        """Start the broker."""
+        return start_mosquitto(self._folder / "mosquitto", locks=self.locks.folder("mosquitto"))
+
+    def redis(self) -> Server:
+        """Start Redis."""
+        return start_redis(self._folder / "redis", locks=self.locks.folder("redis"))
+
+    def router(self) -> Server:
+        """Start the router."""
+        return start_router(self._folder / "router", locks=self.locks.folder("zenoh"))
+
+
+class LockedRouter:
+    """A running router, and the locks of its site."""
+
+    def __init__(self, server: Server, site: LockedSite) -> None:
+        self.url = server.url
+        self.site = site
+
+
+@contextmanager
+def locked_router(folder: Path, site: str, *, robots: Sequence[str] = ()) -> Iterator[LockedRouter]:
+    """Run a router with locks for these robots."""
+    locked = LockedSite(folder, site, robots=robots)
+    with locked.router() as server:
+        yield LockedRouter(server, locked)

@@ -29,6 +29,7 @@ from fognav.bench.site import SITE, write_site
 from fognav.output import FailedError
 from fognav.programs import PLANNER, REDIS, ROUTER
 from fognav.stack import Stack, StackConfig
+from fognav.stack_doors import Doors
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Mapping
@@ -39,6 +40,8 @@ if TYPE_CHECKING:
 QUIET_S: Final = 1.0
 """How long no path may change until a measurement ends; the bytes of a change are counted for as long."""
 _READY_S: Final = 120.0
+_BENCH: Final = "bench"
+"""The user who stands for the map-service and the robots."""
 _FIELD_BYTES: Final = re.compile(r"^fognav_planner_goal_fields_bytes (\S+)$", re.MULTILINE)
 
 
@@ -165,11 +168,12 @@ async def _planner(map_: FleetMap, fleet: Mapping[str, Trip], quiet_s: float) ->
     """Run a planner with its servers, all on the loopback address, and the stand-ins; end them with the context."""
     with TemporaryDirectory(prefix="fognav-") as folder:
         write_site(Path(folder), map_.floor)
-        async with Stack(StackConfig(site_dir=Path(folder), robot="none")) as stack:
+        doors = Doors(site=SITE, unrestricted=(_BENCH,))
+        async with Stack(StackConfig(site_dir=Path(folder), robot="none", doors=doors)) as stack:
             for name in (REDIS, ROUTER):
                 stack.supervisor.start(name)
             await stack.supervisor.wait_ready([REDIS, ROUTER], _READY_S)
-            async with _stand_ins(stack.zenoh_endpoint, map_, fleet, quiet_s) as world:
+            async with _stand_ins(stack, map_, fleet, quiet_s) as world:
                 stack.supervisor.start(PLANNER)
                 try:
                     await stack.supervisor.wait_ready([PLANNER], _READY_S)
@@ -180,13 +184,15 @@ async def _planner(map_: FleetMap, fleet: Mapping[str, Trip], quiet_s: float) ->
 
 @asynccontextmanager
 async def _stand_ins(
-    endpoint: str, map_: FleetMap, fleet: Mapping[str, Trip], quiet_s: float
+    stack: Stack, map_: FleetMap, fleet: Mapping[str, Trip], quiet_s: float
 ) -> AsyncIterator[StandIns]:
     """Run map-service and robots on two sessions of the router: what the planner sees, and what reaches the robots."""
-    with await asyncio.to_thread(zenoh.open, session_config("client", connect=[endpoint])) as session:
+    endpoint, own = stack.zenoh_endpoint, stack.doors.credentials(_BENCH)
+    config = session_config("client", connect=[endpoint], credentials=own)
+    with await asyncio.to_thread(zenoh.open, config) as session:
         receivers = Receivers(session, SITE, list(fleet))
         async with ZenohEdge.open(
-            connect=[endpoint], clock=SystemClock(), role="map-service", id=SITE, site=SITE
+            connect=[endpoint], clock=SystemClock(), role="map-service", id=SITE, site=SITE, credentials=own
         ) as edge:
             world = StandIns(edge, map_, fleet, receivers, quiet_s)
             publishing = asyncio.create_task(world.publish_loop(), name="stand-ins")

@@ -1,7 +1,8 @@
-"""Measures the time between the heartbeats of a map, as a process of its own: `python -m fognav.bench.heartbeats`.
+"""Measures the time between the heartbeats of a map, as a process of its own.
 
-Nothing else runs in this process, so that no other work delays what it measures. Each line on standard input ends a
-measurement, whose gaps (s) are written as one JSON list.
+`python -m fognav.bench.heartbeats SITE ENDPOINT CREDENTIALS_FILE`. Nothing else runs in this process, so that no other
+work delays what it measures. Each line on standard input ends a measurement, whose gaps (s) are written as one JSON
+list.
 """
 
 from __future__ import annotations
@@ -9,19 +10,22 @@ from __future__ import annotations
 import itertools
 import sys
 import time
+from pathlib import Path
 
 import msgspec
 import zenoh
 
 from fog_contracts import channels as ch
+from fog_runtime.credentials import Credentials
 from fog_runtime.zenoh_edge import session_config
 
 
 def main() -> None:
-    """Listen to the site and endpoint that the command line names, until standard input ends."""
-    site, endpoint = sys.argv[1:]
+    """Listen as the command line says, until standard input ends."""
+    site, endpoint, own = sys.argv[1:]
+    config = session_config("client", connect=[endpoint], credentials=Credentials.read(Path(own)))
     times: list[float] = []
-    with zenoh.open(session_config("client", connect=[endpoint])) as session:
+    with zenoh.open(config) as session:
         session.declare_subscriber(ch.MAP_HEARTBEAT.key(site=site), lambda _: times.append(time.monotonic()))
         begin = time.monotonic()
         for _ in sys.stdin:

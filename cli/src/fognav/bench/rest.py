@@ -1,7 +1,7 @@
 """Measures how steadily a map-service sends its heartbeat while clients ask it for all that costs it time.
 
-A real process with Redis, broker and router of its own; the heartbeat is timed by another process. The same run
-measures it without clients first: on a busy machine only the two together mean something.
+A real process with Redis, broker and router of its own, locked as in the field; the heartbeat is timed by another
+process. The same run measures it without clients first: on a busy machine only the two together mean something.
 """
 
 from __future__ import annotations
@@ -20,8 +20,9 @@ from fog_runtime.redis_store import Audit
 from fognav.bench.costmap import random_zones, worst_shapes
 from fognav.bench.rest_clients import Load
 from fognav.bench.site import SITE
-from fognav.programs import MAP_SERVICE, SERVERS
+from fognav.programs import MAP_SERVICE, PLANNER, SERVERS
 from fognav.stack import Stack, StackConfig
+from fognav.stack_doors import Doors
 from map_service.store import Store
 
 if TYPE_CHECKING:
@@ -45,13 +46,13 @@ async def measure(  # all that a run consists of, by name
     to list them over REST, and until the costliest zone is stored and on the map. `folder` holds a site
     (`site.write_site`) of this floor; `zones` are stored before.
     """
-    config = StackConfig(site_dir=folder, robot="none", extra={"HAZARDS_WAIT_S": "0"})
+    config = StackConfig(site_dir=folder, robot="none", extra={"HAZARDS_WAIT_S": "0"}, doors=Doors(site=SITE))
     async with _map_service(config, random_zones(floor, zones)) as (stack, started):
         pid, port = stack.pids()[MAP_SERVICE], stack.port(MAP_SERVICE)
         assert port is not None
         load = Load(port, stack.token, worst_shapes(floor))
         alone = await load.alone()
-        with _listener(stack.zenoh_endpoint) as listener:
+        with _listener(stack) as listener:
             await asyncio.sleep(idle_s)
             idle = _gaps(listener)
             service, *fronts = psutil.Process(pid), *psutil.Process(pid).children()
@@ -91,7 +92,7 @@ async def _map_service(config: StackConfig, zones: list[Zone]) -> AsyncIterator[
     loop = asyncio.get_running_loop()
     async with Stack(config) as stack:
         await stack.start_servers(_READY_S)
-        async with Store(stack.redis_url, SITE) as store:
+        async with Store(stack.redis_url, SITE, credentials=stack.doors.credentials(MAP_SERVICE)) as store:
             await store.restore(zones, Audit(0.0, "bench", "restore"))
             begun = loop.time()
             await store.zones()
@@ -103,8 +104,10 @@ async def _map_service(config: StackConfig, zones: list[Zone]) -> AsyncIterator[
 
 
 @contextmanager
-def _listener(endpoint: str) -> Iterator[subprocess.Popen[bytes]]:
-    command = (sys.executable, "-m", "fognav.bench.heartbeats", SITE, endpoint)
+def _listener(stack: Stack) -> Iterator[subprocess.Popen[bytes]]:
+    command = (
+        sys.executable, "-m", "fognav.bench.heartbeats", SITE, stack.zenoh_endpoint, str(stack.doors.file(PLANNER)),
+    )  # fmt: skip
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         _gaps(process)  # once it listens
         yield process

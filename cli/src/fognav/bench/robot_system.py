@@ -23,6 +23,7 @@ from fognav.bench.office import corridor_rows, make_office
 from fognav.bench.running import RunningSystem, first_child
 from fognav.programs import AGENT, PLANNER, ROBOT, WATCHDOG
 from fognav.stack import Stack, StackConfig
+from fognav.stack_doors import Doors
 from fognav_sim.drive.operator import OperatorPolicy
 from fognav_sim.planner_client import put_goal
 
@@ -83,12 +84,18 @@ class RobotSystem(RunningSystem):
         contexts = self._contexts
         folder = Path(contexts.enter_context(TemporaryDirectory(prefix="fognav-bench-")))
         site = await asyncio.to_thread(write_site, folder, make_office(*FLOOR_M))
-        config = StackConfig(site_dir=site, robot=NAME, extra=self._settings)
+        doors = Doors(site=_SITE, robots=(NAME,))
+        config = StackConfig(site_dir=site, robot=NAME, extra=self._settings, doors=doors)
         self.stack = await contexts.enter_async_context(Stack(config, self._on_event))
         await self.stack.start()
         edge = await contexts.enter_async_context(
             ZenohEdge.open(
-                connect=[self.stack.zenoh_endpoint], clock=self._clock, role="console", id="bench", site=_SITE
+                connect=[self.stack.zenoh_endpoint],
+                clock=self._clock,
+                role="console",
+                id="bench",
+                site=_SITE,
+                credentials=self.stack.doors.credentials("console"),
             )
         )
         self._commands = RobotCommands(edge, operator="bench", key=self.stack.operator_key)

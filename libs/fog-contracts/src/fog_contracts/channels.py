@@ -235,7 +235,7 @@ PLANNER_PLAN      = _query("planner_plan",      FOG + "planner/plan",           
 PLANNER_EGRESS    = _query("planner_egress",    FOG + "planner/egress",           m.EgressRequest,  limit=KIB,
     publishers=(PLANNER,), subscribers=(ROBOT,),           reply=m.PlanReply, reply_limit=4 * MIB)
 ROBOT_GOAL        = _pub(  "robot_goal",        FOG + "robots/{robot}/goal",      m.RobotGoal,      limit=KIB,
-    publishers=(PLANNER,), subscribers=(ROBOT, CONSOLE),   durability=VOLATILE, rate_hz=1, epoch="planner_epoch")
+    publishers=(PLANNER,), subscribers=(ROBOT, CONSOLE),   durability=VOLATILE, rate_hz=0.2, epoch="planner_epoch")
 ROBOT_PATH        = _pub(  "robot_path",        FOG + "robots/{robot}/path",      m.RobotPath,      limit=MIB,
     publishers=(PLANNER,), subscribers=(ROBOT, CONSOLE),   durability=LATEST, epoch="planner_epoch")
 ROBOT_RELEASE     = _pub(  "robot_release",     FOG + "robots/{robot}/release",   m.RobotRelease,   limit=128,

@@ -28,9 +28,9 @@ class PlannerConfig:
     release_period_s: float = ROBOT_RELEASE.period_s
     path_retry_s: float = 1.0
     """How often a path is published again while the robot's state does not name its plan."""
-    goal_retry_s: float = ROBOT_GOAL.period_s
+    goal_retry_s: float = 1.0
     """How often a goal, or its end, is published again while the robot's state does not agree."""
-    goal_repeat_s: float = 5.0
+    goal_repeat_s: float = ROBOT_GOAL.period_s
     """How often it is published when the robot has it: for consoles that connect later."""
     max_pose_age_s: float = 3.0 * ROBOT_POSE.max_age_s
     """Nothing is planned for a robot whose last pose is older: it is disconnected.

@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import programs
 import pytest
@@ -71,7 +72,7 @@ class Lab:
 
     def start_aggregator(self) -> None:
         self.aggregator = programs.start("hazard_aggregator", self.services, self.folder / "aggregator.log")
-        self.wait(lambda: "n8" in self.run("./fognav node list"), "the aggregator knows the node")
+        self.wait(lambda: "n8" in self.listed("nodes"), "the aggregator knows the node")
 
     def words(self, command: str) -> list[str]:
         """The command with the page's folders in the test's, run by this interpreter."""
@@ -86,21 +87,29 @@ class Lab:
             [*self.words(command), *extra], cwd=ROOT, env=self.environment, capture_output=True, text=True,
             timeout=WAIT_S, check=False,
         )  # fmt: skip
-        assert done.returncode == 0 or " node list" in command, f"{command}\n{done.stdout}{done.stderr}"
+        assert done.returncode == 0, f"{command}\n{done.stdout}{done.stderr}"
         return done.stdout + done.stderr
 
     def simulate(self, command: str) -> None:
         self.end_node()
         with (self.folder / "node.log").open("wb") as log:
             self.node = subprocess.Popen(self.words(command), cwd=ROOT, env=self.environment, stdout=log, stderr=log)
-        self.wait(lambda: re.search(r"n8: .* ago", self.run("./fognav node list")), "the node is heard")
+        self.wait(lambda: self.listed("nodes")["n8"]["age_s"] is not None, "the node is heard")
+
+    def listed(self, what: str) -> dict[str, Any]:
+        """What the aggregator lists, by id; a command would start an interpreter for each look."""
+        try:
+            body = net.request("GET", self.port, f"/api/v1/{what}").body
+        except ConnectionRefusedError:
+            return {}  # it is starting
+        return {view["id"]: view for view in body} if isinstance(body, list) else {}
 
     def wait(self, condition, what: str) -> None:
         deadline = time.monotonic() + WAIT_S
         while not condition():
             assert self.node is None or self.node.poll() is None, (self.folder / "node.log").read_text()
             assert time.monotonic() < deadline, what
-            time.sleep(0.2)
+            time.sleep(0.05)
 
     def end_node(self) -> None:
         if self.node is not None:

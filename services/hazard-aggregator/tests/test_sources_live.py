@@ -7,6 +7,8 @@ import aiomqtt
 import httpx
 import pytest
 
+from fog_contracts import channels as ch
+from fog_contracts.messages import AreaHazard, MapDelta, NodeValue
 from fog_runtime.mqtt_broker import Broker
 
 pytestmark = pytest.mark.live
@@ -93,3 +95,37 @@ async def test_invalid_source_is_refused_with_the_field(fog, tokens):
     assert answer.status_code == 422
     assert answer.json()["errors"][0]["field"] == "body.sources.s1.profile"
     assert "zigbee2mqtt-occupancy" in answer.json()["detail"]
+
+
+HEAT_OF_A_NODE = """
+[[sources]]
+id = "heat"
+area = "hall"
+quantity = { node = "n1", kind = "temperature" }
+number = { above = 40.0, hysteresis = 2.0 }
+"""
+
+
+async def test_temperature_of_a_node_becomes_a_hazard_and_changes_the_map(fog, until):
+    """The payload is the one that the firmware's own test gets of a DS18B20 at 41.5 degrees."""
+    file = fog.site / "site.toml"
+    file.write_text(file.read_text() + HEAT_OF_A_NODE)
+    for module in ("hazard_aggregator", "map_service"):
+        fog.start(module)
+        await fog.ready(module)
+    hazards: list[AreaHazard] = []
+    deltas: list[MapDelta] = []
+    async with fog.edges() as (mqtt, zenoh, connect):
+        mqtt.on(ch.AREA_HAZARD, lambda _, hazard: hazards.append(hazard), AreaHazard)
+        zenoh.subscribe(ch.MAP_DELTA, MapDelta, lambda _, delta: deltas.append(delta))
+        connect()
+        await mqtt.wait_connected()
+        for seq in range(1, 4):
+            hot = NodeValue(seq=seq, boot=7, kind="temperature", value=41.5, unit="C")
+            await mqtt.publish(ch.NODE_VALUE, hot, node="n1")
+        await until(lambda: hazards and hazards[-1].state == "blocked", "blocked", lambda: fog.log("hazard_aggregator"))
+        assert "source heat: 41.5 is above 40" in hazards[-1].cause
+        await until(
+            lambda: any(cause.kind == "hazard" and cause.state == "blocked" for d in deltas for cause in d.causes),
+            "a delta of the hazard", lambda: fog.log("map_service"),
+        )  # fmt: skip

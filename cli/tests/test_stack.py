@@ -10,7 +10,7 @@ import psutil
 import pytest
 
 from fog_supervisor import net
-from fognav.programs import BROKER, REDIS, ROUTER, SERVERS
+from fognav.programs import BROKER, REDIS, ROUTER, SERVERS, WATCHDOG
 from fognav.stack import Stack, StackConfig
 
 if TYPE_CHECKING:
@@ -105,3 +105,15 @@ async def test_settings_of_the_shell_do_not_reach_the_processes(
         environment = psutil.Process(stack.pids()[ROUTER]).environ()
     assert "FOGNAV_HTTP_PORT" not in environment
     assert os.environ["FOGNAV_HTTP_PORT"] == "80"
+
+
+async def test_watchdog_of_a_simulated_robot_gets_no_operators_key(tmp_path: Path) -> None:
+    async with Stack(StackConfig(site_dir=tmp_path, robot="r1")) as stack:
+        stack.supervisor.start(WATCHDOG)
+        deadline = time.monotonic() + TIMEOUT_S
+        while WATCHDOG not in stack.pids():
+            assert time.monotonic() < deadline, "the watchdog was not started"
+            await asyncio.sleep(0.02)
+        environment = psutil.Process(stack.pids()[WATCHDOG]).environ()
+    assert "FOGNAV_GUARDIAN_SOCKET" in environment
+    assert "FOGNAV_OPERATOR_KEY_FILE" not in environment

@@ -188,7 +188,7 @@ class Stack:
             own = {"TOKENS_FILE": str(self.folder / TOKENS), **(key if name == PLANNER else {})}
             programs.add_python(name, MODULES[name], {**own, **self.doors.settings(name)})
         robot = self.config.robot
-        wires = {**simulated_robot_settings(self.folder, robot, hardware), **key}
+        wires = simulated_robot_settings(self.folder, robot, hardware)
         ready = partial(exists, Path(wires["GUARDIAN_SOCKET"]))
         programs.add_python(WATCHDOG, MODULES[WATCHDOG], wires, ready=ready, rank=2)
-        programs.add_python(AGENT, MODULES[AGENT], {**wires, **self.doors.settings(robot)}, rank=2)
+        programs.add_python(AGENT, MODULES[AGENT], {**wires, **key, **self.doors.settings(robot)}, rank=2)

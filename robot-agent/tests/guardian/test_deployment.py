@@ -205,6 +205,13 @@ def test_the_watchdog_is_protected_and_the_agent_may_compile():
     assert "After" not in watchdog.read_text(), "the watchdog waits for nothing"
 
 
+def test_the_watchdog_can_not_read_the_operators_key():
+    watchdog, agent = (DEPLOY / "systemd" / name for name in UNITS)
+    assert entries(watchdog, "UnsetEnvironment") == ["FOGNAV_OPERATOR_KEY_FILE"]
+    assert entries(watchdog, "InaccessiblePaths") == ["-/etc/fognav/operator.key"]
+    assert entries(agent, "InaccessiblePaths") == []
+
+
 def test_watchdog_and_guardian_load_without_executable_memory():
     done = subprocess.run(
         [sys.executable, "-c", NO_EXECUTABLE_MEMORY, LOADS_ALL], check=False, capture_output=True, text=True, timeout=60

@@ -159,6 +159,12 @@ def test_ending_guardian_stops_a_base_that_seeks():
     assert seeking().core.stop_command() == b"take;"
 
 
+def test_ending_guardian_stops_a_base_that_has_not_yet_obeyed_the_end_of_its_search():
+    rig = seeking()
+    assert rig.step(None) == b"take;"
+    assert rig.core.stop_command() == b"take;", "the first one may have been lost"
+
+
 # --- leaving the dock ---
 
 

@@ -74,6 +74,8 @@ class Maneuvers:
             return ManeuverInputs(self._back_off.remaining(odom), self._guard.reason)
         if kind == "dock" or self.docking.ordered:
             return ManeuverInputs(dock_problem=self._dock_problem(replica, now, running=kind == "dock"))
+        if kind != "egress":
+            return ManeuverInputs()  # what is left of an earlier way out must not end a maneuver that begins now
         self.egress.advance(trusted, now)
         return ManeuverInputs(self.egress.remaining, self.egress.problem(self._guard.reason))
 

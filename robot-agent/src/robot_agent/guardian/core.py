@@ -190,8 +190,8 @@ class GuardianCore:
 
     def stop_command(self) -> bytes:
         """Return the bytes that stop the wheels at an orderly end of the guardian; the base stays awake."""
-        reading = self._base.reading
-        if self._maneuvers.running is None or reading is None or not isinstance(self.driver, DockingDriver):
+        reading, by_itself = self._base.reading, self._maneuvers.running is not None or self._base.restrained
+        if not by_itself or reading is None or not isinstance(self.driver, DockingDriver):
             return self.driver.drive(0.0, 0.0)
         return self.driver.take_control(charging=reading.status.charging)
 

@@ -35,7 +35,11 @@ LIMITS: Final[Mapping[Maneuver, Limit]] = {
     "leave_dock": Limit(3.0, 0.4, 0.10),
     "back_off": Limit(4.0, 0.095, 0.05),
 }
-"""The wheels need a few millimetres to come to rest: a robot backs off by 0.10 m at most."""
+"""The wheels need a few millimetres to come to rest: a robot backs off by 0.10 m at most.
+
+Leaving the dock ends here as soon as the charger's contacts part, after some centimetres; the rest of the agent's
+0.3 m is ordinary driving. These bounds are for contacts that stick, or a dock that comes along.
+"""
 _NAMES: Final[Mapping[Maneuver, str]] = {
     "seek_dock": "the base's search for its dock", "leave_dock": "leaving the dock", "back_off": "backing off",
 }  # fmt: skip

@@ -1,0 +1,42 @@
+"""What the safety gate is told of maneuvers: of the one that runs, and of no other."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import pytest
+from little_world import AGENT
+
+from fog_contracts.messages import PlanReply
+from robot_agent.agent.maneuvers import Maneuvers
+from robot_agent.localization.localizer import Localizer
+from robot_agent.localization.pose import Pose2
+from robot_agent.safety.gate import SafetyState
+from robot_agent.safety.maneuver import Maneuver
+
+END = Pose2(1.0, 0.0, 0.0)
+
+
+def state(kind=None) -> SafetyState:
+    return SafetyState(maneuver=None if kind is None else Maneuver(0.0, math.inf, 0.0, kind))
+
+
+@pytest.fixture
+def at_the_end_of_a_way_out():
+    """Maneuvers of a robot that has just arrived at the end of its way out of a blocked area."""
+    maneuvers = Maneuvers(AGENT, Localizer(), SimpleNamespace(reason=None))
+    maneuvers.egress.begin()
+    reply = PlanReply(points=[(0.0, 0.0), (1.0, 0.0)])
+    maneuvers.egress.on_reply(reply, Pose2(0.0, 0.0, 0.0), 0.0)
+    assert maneuvers.inputs(state("egress"), None, Pose2(0.5, 0.0, 0.0), 1.0).remaining == pytest.approx(0.5)
+    assert maneuvers.inputs(state("egress"), None, END, 5.0).remaining == pytest.approx(0.0, abs=0.01)
+    return maneuvers
+
+
+def test_next_maneuver_does_not_begin_with_the_way_that_was_left_of_an_egress(at_the_end_of_a_way_out):
+    assert at_the_end_of_a_way_out.inputs(state(), None, END, 5.1).remaining == math.inf
+
+
+def test_way_straight_back_without_odometry_has_no_end(at_the_end_of_a_way_out):
+    assert at_the_end_of_a_way_out.inputs(state("undock"), None, END, 5.1).remaining == math.inf

@@ -34,6 +34,6 @@ ENV FOGNAV_REVISION=${REVISION} FOGNAV_MODULE=${MODULE} FOGNAV_KERNELS=${KERNELS
     NUMBA_CACHE_DIR=/var/cache/fognav/numba PYTHONUNBUFFERED=1
 USER fognav
 EXPOSE 8000
-HEALTHCHECK --interval=5s --timeout=3s --start-period=60s --retries=6 \
+HEALTHCHECK --interval=5s --timeout=3s --start-period=60s --retries=3 \
     CMD ["fognav-ready", "8000", "/readyz"]
 ENTRYPOINT ["fognav-start"]

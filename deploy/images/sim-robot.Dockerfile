@@ -24,6 +24,6 @@ ENV FOGNAV_REVISION=${REVISION} FOGNAV_MODULE=fognav_sim.robot_unit FOGNAV_KERNE
     FOGNAV_RUN_DIR=/tmp/fognav NUMBA_CACHE_DIR=/var/cache/fognav/numba PYTHONUNBUFFERED=1
 USER fognav
 EXPOSE 9100
-HEALTHCHECK --interval=5s --timeout=3s --start-period=120s --retries=6 \
-    CMD ["fognav-ready", "9100", "/readyz"]
+HEALTHCHECK --interval=5s --timeout=3s --start-period=120s --retries=3 \
+    CMD ["sh", "-c", "fognav-ready 9100 /readyz && fognav-ready 9101 /readyz"]
 ENTRYPOINT ["fognav-start"]

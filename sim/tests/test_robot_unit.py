@@ -2,8 +2,12 @@
 
 from typing import Any, cast
 
+import msgspec
+
 from fog_contracts.messages import RobotState
-from fognav_sim.robot_unit import Settings, _Operator
+from fog_runtime.health import Health
+from fognav_sim.robot_unit import Settings, _Operator, _programs
+from fognav_sim.unit_health import UnitHealth
 
 
 class Session:
@@ -28,9 +32,33 @@ def test_arrival_that_is_reported_between_two_looks_leads_to_the_next_goal(tmp_p
         token_file=tmp_path / "token", operator_key_file=tmp_path / "key",
     )  # fmt: skip
     session = Session()
-    operator = _Operator(settings, "r1", ("a", "b"), cast("Any", session))
+    operator = _Operator(settings, "r1", ("a", "b"), cast("Any", session), Health())
     operator._shuttle.under_way = True
     session.handler({}, state(goal="g", reached=True))
     session.handler({}, state(goal=None, reached=False))
     assert operator._shuttle.legs == 1
     assert operator._shuttle.goal_due(state(goal=None, reached=False)) == "a"
+
+
+def test_robot_is_well_while_it_speaks_and_is_in_no_fault():
+    health = UnitHealth("r1")
+    assert all(health.conditions(100.0).values()), "it has never spoken"
+    driving = state(goal="g", reached=False)
+    health.on_state(driving, 100.0)
+    assert health.conditions(105.0) == {"speaks": "", "no_fault": ""}
+    assert health.conditions(106.5)["speaks"] == "r1 has told no state for 6 s"
+    health.on_state(msgspec.structs.replace(driving, mode="FAULT", reasons=["bumper", "cliff"]), 107.0)
+    assert health.conditions(107.0) == {"speaks": "", "no_fault": "FAULT: bumper; cliff"}
+    health.on_state(driving, 108.0)
+    assert health.conditions(108.0) == {"speaks": "", "no_fault": ""}
+
+
+def test_each_program_gets_its_own_credentials(tmp_path):
+    settings = Settings(
+        site_dir=tmp_path, data_dir=tmp_path, run_dir=tmp_path, planner_url="http://planner:8000",
+        token_file=tmp_path / "token", operator_key_file=tmp_path / "key", credentials_dir=tmp_path / "own",
+    )  # fmt: skip
+    files = {each.name: each.environment.get("FOGNAV_CREDENTIALS_FILE") for each in _programs(settings, "r7")}
+    assert files["simulator"] == str(tmp_path / "own" / "sim.toml")
+    assert files["robot-agent"] == str(tmp_path / "own" / "r7.toml")
+    assert files["watchdog"] is None

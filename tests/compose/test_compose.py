@@ -14,6 +14,7 @@ import os
 import re
 import secrets
 import shutil
+import signal
 import subprocess
 import time
 from pathlib import Path
@@ -320,6 +321,7 @@ def test_zone_created_with_the_admin_token_survives_a_restart_of_the_map_service
 
 async def test_simulated_robot_is_enabled_and_drives(sim: Project) -> None:
     clock = SystemClock()
+    # Its certificate is for 127.0.0.1, where the port is published.
     async with ZenohEdge.open(
         connect=[f"tls/{sim.address('FOGNAV_ZENOH_PORT')}"],
         clock=clock,
@@ -358,6 +360,18 @@ def test_no_process_is_root_or_has_a_capability_or_can_write_to_its_image(sim: P
             continue
         refused = sim.inside(service, "touch /usr/fognav 2>&1 || echo refused")
         assert "Read-only file system" in refused, f"{service}: {refused}"
+
+
+@pytest.mark.parametrize(("service", "program"), [("planner", "python -m planner"), ("sim-robot", "-m robot_agent")])
+def test_container_whose_program_hangs_is_unhealthy_until_it_goes_on(sim: Project, service: str, program: str) -> None:
+    found = docker("top", sim.containers()[service]["Id"], "-eo", "pid,args").splitlines()[1:]
+    pid = min(int(line.split()[0]) for line in found if line.endswith(program))
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        wait(lambda: None if health(sim, service) == "unhealthy" else f"the {service} calls itself healthy", 60)
+    finally:
+        os.kill(pid, signal.SIGCONT)
+    wait(lambda: None if health(sim, service) == "healthy" else f"the {service} stays unhealthy", 90)
 
 
 def test_prometheus_records_the_robots_cpu_time(sim: Project) -> None:
@@ -408,6 +422,22 @@ def test_stop_ends_every_container_cleanly_and_up_restarts_them(sim: Project) ->
     sim("up", "--detach", "--no-build", timeout_s=300)
     restarts = {name: container["RestartCount"] for name, container in sim.containers().items()}
     sim.wait_healthy({*FOG, "sim-robot"}, restarts)
+
+
+def test_reboot_that_starts_everything_at_once_and_redis_last_loses_nothing(fog: Project) -> None:
+    admin = token(fog)
+    zone = fog.request("POST", "/api/v1/zones", json=ZONE, headers=admin).json()
+    containers = {name: container["Id"] for name, container in fog.containers().items() if name in FOG}
+    # What an engine does when the machine boots: no order, no dependencies, and nothing that runs once.
+    docker("kill", *containers.values())
+    docker("start", *(id_ for name, id_ in containers.items() if name != "redis"))
+    wait(lambda: None if health(fog, "map-service") != "healthy" else "the map-service is ready without Redis", 5)
+    docker("start", containers["redis"])
+    restarts = {name: container["RestartCount"] for name, container in fog.containers().items()}
+    started = time.monotonic()
+    fog.wait_healthy(FOG, restarts)
+    print(f"healthy {time.monotonic() - started:.0f} s after Redis")  # noqa: T201  # shown by `pytest -s`
+    assert zone["id"] in fog.get("/api/v1/zones").json()["active"]
 
 
 def test_container_stops_while_it_compiles_its_kernels(fog: Project) -> None:

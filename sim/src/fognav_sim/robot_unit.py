@@ -19,6 +19,7 @@ from fog_contracts.messages import RobotState
 from fog_runtime import logs, process
 from fog_runtime.clock import SystemClock, ticker
 from fog_runtime.credentials import Credentials
+from fog_runtime.health import Health, serve_health
 from fog_runtime.operator_key import read_operator_key
 from fog_runtime.robot_commands import RobotCommands
 from fog_runtime.settings import CommonSettings, SettingsError, describe, load
@@ -27,6 +28,7 @@ from fog_runtime.zenoh_edge import ZenohEdge
 from fog_supervisor.supervisor import Event, Program, Supervisor
 from fognav_sim.drive.operator import OperatorCommand, OperatorPolicy, Shuttle
 from fognav_sim.planner_client import put_goal
+from fognav_sim.unit_health import UnitHealth
 
 _POLICY_PERIOD_S: Final = 1.0
 _TIMEOUT_S: Final = 5.0
@@ -44,6 +46,8 @@ class Settings(CommonSettings, frozen=True, kw_only=True):
     robot: str = ""
     seed: int = 1
     agent_http_port: int = 9100
+    health_port: int = 9101
+    """Where `/readyz` says whether the robot speaks over the fog and is in no fault."""
 
     def file_of(self, user: str) -> Path | None:
         """Return the file of a user's credentials."""
@@ -53,7 +57,9 @@ class Settings(CommonSettings, frozen=True, kw_only=True):
 class _Operator:
     """Acts as the operator of the robot: enables it, resets faults, sends goals."""
 
-    def __init__(self, settings: Settings, robot: str, places: tuple[str, str], edge: ZenohEdge) -> None:
+    def __init__(
+        self, settings: Settings, robot: str, places: tuple[str, str], edge: ZenohEdge, health: Health
+    ) -> None:
         self._settings = settings
         self._robot = robot
         self._clock = SystemClock(settings.speed)
@@ -64,11 +70,15 @@ class _Operator:
         self._state: RobotState | None = None
         self._policy = OperatorPolicy(self._clock.now())
         self._shuttle = Shuttle(*places)
+        self._health = health
+        self._unit_health = UnitHealth(robot)
         edge.subscribe(ch.ROBOT_STATE, RobotState, self._on_state, robot=robot)
 
     async def run(self) -> None:
         """Send the commands and goals that are due, once a second, until cancelled."""
         async for now in ticker(self._clock, _POLICY_PERIOD_S):
+            for name, problem in self._unit_health.conditions(now).items():
+                self._health.set(name, not problem, problem)
             state = self._state
             if state is None:
                 continue
@@ -81,6 +91,7 @@ class _Operator:
     def _on_state(self, _ids: dict[str, str], state: RobotState) -> None:
         """Record a state; an arrival is reported for a tenth of a second only, so every state is looked at."""
         self._state = state
+        self._unit_health.on_state(state, self._clock.now())
         if (place := self._shuttle.on_state(state)) is not None:
             _log.info("arrived", place=place, legs=self._shuttle.legs)
 
@@ -158,6 +169,7 @@ async def main() -> None:
     if settings.operator_key_file is None:
         raise SettingsError("FOGNAV_OPERATOR_KEY_FILE is missing: name the site's operator.key")
     robot = settings.robot or site.robots[0].id
+    health = Health("speaks", "no_fault")
     async with (
         ZenohEdge.open(
             connect=settings.zenoh_endpoints,
@@ -172,7 +184,8 @@ async def main() -> None:
         for program in _programs(settings, robot):
             supervisor.add(program)
             supervisor.start(program.name)
-        await _Operator(settings, robot, (site.demo.start, site.demo.goal), edge).run()
+        with serve_health(health, "127.0.0.1", settings.health_port):
+            await _Operator(settings, robot, (site.demo.start, site.demo.goal), edge, health).run()
 
 
 if __name__ == "__main__":

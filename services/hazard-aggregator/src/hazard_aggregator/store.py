@@ -9,7 +9,7 @@ import msgspec
 from msgspec import structs
 
 from fog_contracts.messages import AreaDefinition, AreaHazard, Count, Id, Message, Ring
-from fog_runtime import logs, store_scripts
+from fog_runtime import logs, store_keys, store_scripts
 from fog_runtime.audit import CursorError
 from fog_runtime.redis_store import Audit, Outcome, RecoveryError, RedisStore, StoreError, StoreLostError, Table
 from hazard_aggregator.alerts import StoredAlerts
@@ -41,13 +41,13 @@ __all__ = [
     "load_at_start",
 ]
 
-_AREAS: Final = Table("areas", "area")
-_HAZARDS: Final = "hazards"
-_OVERRIDES: Final = Table("overrides", "override")
-_RESTS: Final = "override_rests"
-_ALERTS: Final = "alerts"
+_AREAS: Final = Table(store_keys.AREAS, "area")
+_HAZARDS: Final = store_keys.HAZARDS
+_OVERRIDES: Final = Table(store_keys.OVERRIDES, "override")
+_RESTS: Final = store_keys.OVERRIDE_RESTS
+_ALERTS: Final = store_keys.ALERTS
 _ALL: Final = "all"
-_HISTORY: Final = "history"
+_HISTORY: Final = store_keys.HISTORY
 _CURSOR: Final = re.compile(r"[0-9]{1,15}-[0-9]{1,15}")
 
 _log = logs.get("store")

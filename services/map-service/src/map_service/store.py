@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Final
 from msgspec import structs
 
 from fog_contracts.messages import Message, Zone
+from fog_runtime import store_keys
 from fog_runtime.redis_store import ANY, Audit, Outcome, RecoveryError, RedisStore, StoreError, StoreLostError, Table
 from map_service.zone_times import Progress
 
@@ -17,10 +18,10 @@ if TYPE_CHECKING:
 
 __all__ = ["Audit", "Outcome", "RecoveryError", "Store", "StoreError", "StoreLostError"]
 
-_ZONES: Final = Table("zones", "zone")
+_ZONES: Final = Table(store_keys.ZONES, "zone")
 
 
-_TIMES: Final = "zone_times"
+_TIMES: Final = store_keys.ZONE_TIMES
 _ALL: Final = "all"
 
 

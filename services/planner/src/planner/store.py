@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from fog_contracts.messages import Message, RobotGoal
+from fog_runtime import store_keys
 from fog_runtime.redis_store import ANY, Audit, Outcome, RecoveryError, RedisStore, StoreError, StoreLostError, Table
 
 if TYPE_CHECKING:
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
 
 __all__ = ["ANY", "Audit", "RecoveryError", "Store", "StoreError", "StoreLostError", "StoredGoal"]
 
-_GOALS: Final = Table("goals", "mission", version="goal.goal_id")
+_GOALS: Final = Table(store_keys.GOALS, "mission", version="goal.goal_id")
 
 
 class StoredGoal(Message, frozen=True, kw_only=True):

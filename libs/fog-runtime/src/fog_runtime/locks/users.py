@@ -10,6 +10,7 @@ import hashlib
 import secrets
 from typing import TYPE_CHECKING, Final
 
+from fog_runtime import store_keys
 from fog_runtime.credentials import SERVERS, Server
 
 if TYPE_CHECKING:
@@ -35,18 +36,6 @@ TOOLS: Final[Mapping[str, Sequence[Server]]] = {
 HEALTH: Final = "health"
 """Who asks broker and Redis whether they are well, and may do nothing else."""
 HEALTH_SERVERS: Final[Sequence[Server]] = ("mqtt", "redis")
-_OWN_TABLES: Final[Mapping[str, Sequence[str]]] = {
-    "hazard-aggregator": ("areas", "hazards", "overrides", "override_rests", "alerts", "history:*"),
-    "map-service": ("zones", "zone_times"),
-    "planner": ("goals",),
-}
-_AUDITED: Final[Mapping[str, Sequence[str]]] = {
-    "hazard-aggregator": ("alert", "area", "override", "store"),
-    "map-service": ("zone", "store"),
-    "planner": ("mission", "robot", "stop", "store"),
-}
-_BOOKKEEPING: Final = ("probe", "generation", "writes", "floors", "no-attempt", "idempotency:*")
-"""Keys that every service of a site writes: by which they notice that Redis lost something."""
 _COMMANDS: Final = (
     "+get +set +setrange +del +hget +hset +hdel +hgetall +hlen +hincrby +xadd +xdel +xrange +xrevrange +pttl"
     " +eval +multi +exec +wait +ping +config|get +client|setname +client|id +hello +auth +select"
@@ -87,7 +76,8 @@ def redis_line(user: str, password: str, site: str) -> str:
     It may read the whole audit trail. Raises `KeyError` for a user that is no service.
     """
     _, service = of_floor(user)
-    own = [*_OWN_TABLES[service], *_BOOKKEEPING, *(f"audit:{kind}" for kind in _AUDITED[service]), f"{service}:*"]
+    audited = (f"audit:{kind}" for kind in store_keys.AUDITED[service])
+    own = [*store_keys.OWN[service], *store_keys.BOOKKEEPING, *audited, f"{service}:*"]
     keys = " ".join([*(f"~fog:{site}:{name}" for name in own), f"%R~fog:{site}:audit:*"])
     return f"user {user} on {_redis_secret(password)} resetchannels -@all {_COMMANDS} {keys}"
 

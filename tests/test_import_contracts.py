@@ -37,7 +37,7 @@ EDGES = {
     "fognav.demo.attempt", "fognav.demo.background", "fognav.demo.operator", "fognav.demo.options",
     "fognav.demo.placement", "fognav.demo.preparation", "fognav.demo.presence", "fognav.demo.report", "fognav.demo.run",
     "fognav.demo.scene", "fognav.demo.usage", "fognav.demo.view", "fognav.demo_command", "fognav.doctor",
-    "fognav.experiment_command",
+    "fognav.experiment_command", "fognav.film",
     "fognav.generated", "fognav.kernels", "fognav.locking", "fognav.operate", "fognav.output", "fognav.page.app",
     "fognav.hosting", "fognav.programs", "fognav.up_command",
     "fognav.pytest_progress", "fognav.recording", "fognav.robot_command", "fognav.robot_file_command",

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from fog_contracts.messages import ProfileName
     from fognav_experiments.comparison.records import Folder, Record
     from fognav_experiments.comparison.runner import Task
+    from fognav_experiments.scenarios.stage import Played
 
 experiment_app = typer.Typer(help="Compare setups as the thesis did, and play scenarios.")
 
@@ -101,6 +102,7 @@ def report_command(
 def scenarios_command(
     names: Annotated[list[str] | None, typer.Argument(metavar="[NAME]...", help="Scenarios; default: all.")] = None,
     *,
+    table: Annotated[Path | None, typer.Option("--table", metavar="F", help="Write a table (Markdown) here.")] = None,
     json: JsonOption = False,
 ) -> None:
     """Play drives on which something goes wrong, in lockstep, and check how they end.
@@ -108,7 +110,8 @@ def scenarios_command(
     Each is a file in experiments/scenarios with what happens and what is expected. The exit code is 1 if one of them
     ends in another way.
     """
-    from fognav_experiments.scenarios.stage import ScenarioError, play, read_scenario  # noqa: PLC0415  # keeps others fast
+    from fog_runtime.files import SHARED, atomic_write  # noqa: PLC0415  # keeps the other commands fast
+    from fognav_experiments.scenarios.stage import ScenarioError, markdown_table, play, read_scenario  # noqa: PLC0415  # same
 
     with exit_codes():
         files = _scenario_files(names or [])
@@ -117,23 +120,74 @@ def scenarios_command(
         except ScenarioError as error:
             raise WrongUseError(str(error)) from error
         kernels.warm_cache(print_line)
-        rows = []
+        drives = {}
         for name, scenario in scenarios.items():
-            played = play(scenario, checkout.root() / "sites")
-            as_expected = not played.deviations
-            rows.append({
-                "scenario": name, "title": scenario.title, "as_expected": as_expected, "outcome": played.outcome,
-                "distance_m": played.result.distance_m, "time_s": played.result.time_s, "deviations": played.deviations,
-            })  # fmt: skip
+            drives[name] = play(scenario, checkout.root() / "sites")
             if not json:
-                mark, time_s = "ok    " if as_expected else "FAILED", played.result.time_s or scenario.seconds
-                print_line(f"{mark} {name:22} {played.outcome:9} {played.result.distance_m:6.1f} m {time_s:6.1f} s")
-                for deviation in played.deviations:
-                    print_line(f"       {deviation}")
+                _print_played(name, drives[name])
+        if table is not None:
+            atomic_write(table, markdown_table(drives).encode(), mode=SHARED)
     if json:
-        print_json({"scenarios": rows})
-    if not all(row["as_expected"] for row in rows):
+        print_json({"scenarios": [_played_row(name, played) for name, played in drives.items()]})
+    if any(played.deviations for played in drives.values()):
         raise typer.Exit(NOT_TRUE)
+
+
+def _played_row(name: str, played: Played) -> dict[str, object]:
+    return {
+        "scenario": name, "title": played.scenario.title, "as_expected": not played.deviations,
+        "outcome": played.outcome, "distance_m": played.result.distance_m, "time_s": played.result.time_s,
+        "deviations": played.deviations,
+    }  # fmt: skip
+
+
+def _print_played(name: str, played: Played) -> None:
+    mark, time_s = "FAILED" if played.deviations else "ok    ", played.result.time_s or played.scenario.seconds
+    print_line(f"{mark} {name:22} {played.outcome:9} {played.result.distance_m:6.1f} m {time_s:6.1f} s")
+    for deviation in played.deviations:
+        print_line(f"       {deviation}")
+
+
+@experiment_app.command("film", epilog="Example: fognav experiment film drive.gif --run 2 --route ab")
+def film_command(  # each option is an argument
+    out: Annotated[Path, typer.Argument(metavar="FILE.gif", help="File of the film.")],
+    *,
+    run: Annotated[int, typer.Option("--run", metavar="N", min=1, help="Run of the experiment.")] = 2,
+    route: Annotated[str | None, typer.Option("--route", metavar="R", help="Its route, as ab; default: first.")] = None,
+    setups: Annotated[str, typer.Option("--setups", metavar="A,B", help="default, full, fog.")] = "default,fog",
+    seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of all draws.")] = 1,
+    site: Annotated[Path | None, typer.Option("--site", metavar="DIR", help="Site with experiment.toml.")] = None,
+) -> None:
+    """Film one route of an experiment in several setups, side by side: map, hazards, paths and tracks, as a GIF.
+
+    The drives are repeated in lockstep, which gives the same ones whenever it is done by the same program.
+    """
+    from fog_runtime.site import SiteError, load_site  # noqa: PLC0415  # keeps the other commands fast
+    from fognav.film import Film, record  # noqa: PLC0415  # same
+    from fognav_experiments.comparison import runner  # noqa: PLC0415  # same
+    from fognav_experiments.comparison.draws import draw  # noqa: PLC0415  # same
+
+    with exit_codes():
+        if out.suffix != ".gif":
+            raise WrongUseError(f"{out} is no GIF: name a file that ends in .gif")
+        place = checkout.site_folder(site)
+        try:
+            loaded = load_site(place)
+            drawn = {found.route.name: found for found in draw(runner.read_spec(loaded, place), seed, run)}
+        except (SiteError, runner.SpecError) as error:
+            raise WrongUseError(str(error)) from error
+        name = route or next(iter(drawn))
+        if name not in drawn:
+            raise WrongUseError(f"no route {name}: there are {', '.join(drawn)}")
+        kernels.warm_cache(print_line)
+        recordings = [record(loaded, drawn[name], setup) for setup in _chosen(setups)]
+        try:
+            size = Film(loaded, drawn[name], recordings).write(out)
+        except OSError as error:
+            raise WrongUseError(f"{out} can't be written: {error.strerror}. Name another file") from error
+    for recording in recordings:
+        print_line(f"{recording.setup:8} {recording.distance_m:6.1f} m {recording.time_s:6.1f} s")
+    print_line(f"{out}: {size / 1e6:.2f} MB")
 
 
 def _scenario_files(names: list[str]) -> list[Path]:

@@ -29,7 +29,7 @@ from fognav_experiments.scenarios.node_faults import FaultyNodeSim
 from fognav_sim.drive.evaluation import DriveOutcome
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
     from pathlib import Path
 
     from fog_contracts.messages import Id
@@ -93,6 +93,18 @@ def play(scenario: Scenario, sites: Path) -> Played:
     del drive, run, stage
     release_drives()
     return Played(scenario, result, name, deviations(scenario.expected, result, name, result.events[before:]))
+
+
+def markdown_table(drives: Mapping[str, Played]) -> str:
+    """Return a Markdown table of scenarios that were played, by name: what happens, and how each drive ended."""
+    rows = [
+        f"| [{name}](../../experiments/scenarios/{name}.toml) | {played.scenario.title} | {played.outcome} | "
+        f"{played.result.distance_m:.1f} | {played.result.time_s or played.scenario.seconds:.0f} | "
+        f"{'; '.join(played.deviations) or 'yes'} |"
+        for name, played in drives.items()
+    ]
+    header = ["| scenario | what happens | outcome | m | s | as expected |", "| --- | --- | --- | --- | --- | --- |"]
+    return "\n".join([*header, *rows]) + "\n"
 
 
 class _Stage:

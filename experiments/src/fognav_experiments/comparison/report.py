@@ -126,7 +126,7 @@ def _introduction(records: Sequence[Record], pairs: Sequence[Drives], experiment
     rows.append(["lockstep", f"{speed:.1f} times as fast as real time"])
     for commit in sorted({record.commit for record in records} - {""}):
         count = sum(record.commit == commit for record in records)
-        rows.append(["commit", f"{commit}: {count} of the drives (all setups of a route by the same)"])
+        rows.append(["commit", f"{commit}: {count} of the drives"])
     loads = [record.load for record in records]
     return [
         Paragraph(

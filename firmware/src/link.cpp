@@ -14,7 +14,8 @@ void BoardLink::begin(const char* authority) {
     snprintf(value_, sizeof value_, FOGNAV_NODE_VALUE_TOPIC, site, node);
     snprintf(calibration_topic_, sizeof calibration_topic_, FOGNAV_NODE_CALIBRATION_TOPIC, site, node);
     snprintf(problem_topic_, sizeof problem_topic_, FOGNAV_NODE_PROBLEM_TOPIC, site, node);
-    snprintf(client_id_, sizeof client_id_, "node-%s", node);
+    // With the site: a broker that serves several floors disconnects one of two clients with the same id.
+    snprintf(client_id_, sizeof client_id_, "node-%s-%s", site, node);
     inbox_.begin(site, node);
     WiFi.persistent(false);  // the flash is not made for a write at every start
     WiFi.mode(WIFI_STA);

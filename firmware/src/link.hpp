@@ -77,7 +77,7 @@ private:
     char value_[FOGNAV_NODE_VALUE_TOPIC_SIZE] = "";
     char calibration_topic_[FOGNAV_NODE_CALIBRATION_TOPIC_SIZE] = "";
     char problem_topic_[FOGNAV_NODE_PROBLEM_TOPIC_SIZE] = "";
-    char client_id_[kIdSize + 5] = "";
+    char client_id_[2 * kIdSize + 6] = "";
 };
 
 }  // namespace fognav

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,6 +18,7 @@ from fog_supervisor import net
 
 pytestmark = [pytest.mark.live, pytest.mark.timeout(300)]
 
+ROOT = Path(__file__).parents[2]
 START_S = 180.0
 PORTS = ("MQTT", "REDIS", "ZENOH", "AGGREGATOR", "MAP", "PLANNER")
 
@@ -47,7 +49,7 @@ class Node:
     def run(self, *arguments: str) -> str:
         done = subprocess.run(
             [sys.executable, "-m", "fognav", *arguments],
-            env=self.environment, capture_output=True, text=True, timeout=60, check=False,
+            cwd=ROOT, env=self.environment, capture_output=True, text=True, timeout=60, check=False,
         )  # fmt: skip
         assert done.returncode == 0, f"{arguments}: {done.stdout}{done.stderr}\n{self.printed.read_text()}"
         return done.stdout + done.stderr
@@ -106,6 +108,16 @@ def test_zone_survives_a_killed_service_and_a_restart_of_the_node(node):
     assert "wet floor" in node.run("zone", "list")
     assert "settings_loaded" in node.run("logs", "map-service", "-n", "1000")
 
+    backup = node.data / "fog.tar.gz"
+    node.environment["FOGNAV_CREDENTIALS_FILE"] = str(node.data / "locks" / "credentials" / "administrator.toml")
+    redis = f"rediss://127.0.0.1:{node.environment['FOGNAV_REDIS_PORT']}/0"
+    saved = node.run(
+        "backup", str(backup), "--redis", redis, "--site", "sites/estig",
+        "--secrets", str(node.data / "keys" / "estig"), "--data", str(node.data / "data" / "map-service"),
+    )  # fmt: skip
+    del node.environment["FOGNAV_CREDENTIALS_FILE"]
+    assert "backed up site estig" in saved
+
     require_refused(node, node.data, "already runs with the data")
     require_refused(node, node.data / "other", "can't listen on")
 
@@ -114,3 +126,41 @@ def test_zone_survives_a_killed_service_and_a_restart_of_the_node(node):
     node.up()
     assert "wet floor" in node.run("zone", "list")
     node.down()
+
+
+def second_floor(folder: Path) -> Path:
+    """A copy of the floor estig with an id of its own."""
+    site = folder / "upstairs"
+    shutil.copytree(ROOT / "sites" / "estig", site)
+    text = (site / "site.toml").read_text("utf-8")
+    (site / "site.toml").write_text(text.replace('id = "estig"', 'id = "upstairs"', 1), "utf-8")
+    return site
+
+
+def test_two_floors_on_one_node_have_a_robot_each_and_share_no_hazard(tmp_path):
+    floors = ("estig", "upstairs")
+    node = Node(tmp_path, "--site", "estig", "--site", str(second_floor(tmp_path)), "--sim")
+
+    def states(floor: str) -> dict[str, str]:
+        answer = json.loads(node.run("area", "list", "--json", "--fog", f"fog-{floor}").partition("\nfognav:")[0])
+        return {area["definition"]["id"]: area["hazard"]["state"] for area in answer["areas"]}
+
+    try:
+        node.up()
+        systems = node.systems()
+        servers = ("mosquitto", "redis", "zenoh-router")
+        assert [systems["estig"]["pids"][name] for name in servers] == [
+            systems["upstairs"]["pids"][name] for name in servers
+        ]
+        for floor in floors:
+            node.wait(lambda floor=floor: set(states(floor).values()) == {"clear"}, f"{floor} is clear")
+            assert "robot-agent/r1" in node.systems()[floor]["connected"]
+            node.run("robot", "status", "--fog", f"fog-{floor}")
+        node.run("area", "override", "z1", "--state", "blocked", "--for", "1h", "--reason", "box", "--fog", "fog-estig")
+        node.wait(lambda: states("estig")["z1"] == "blocked", "the hazard is on its floor")
+        node.run("zone", "add", "--circle", "90,20,1", "--reason", "wet floor", "--fog", "fog-upstairs")
+        assert set(states("upstairs").values()) == {"clear"}
+        assert "wet floor" not in node.run("zone", "list", "--fog", "fog-estig")
+        node.down()
+    finally:
+        node.end()

@@ -14,6 +14,7 @@ from fog_contracts import messages as m
 from fog_runtime.clock import SystemClock
 from fog_runtime.credentials import Credentials
 from fog_runtime.locks.site_locks import SiteLocks
+from fog_runtime.redis_connection import RedisConnection, StoreError
 from fog_runtime.zenoh_edge import ZenohEdge
 from fog_supervisor.servers import start_mosquitto, start_redis, start_router
 
@@ -30,6 +31,7 @@ MQTT_CONNECT = b"\x10\x0f\x00\x04MQTT\x05\x02\x00\x0a\x00\x00\x02me"
 def locks(tmp_path_factory):
     made = SiteLocks(tmp_path_factory.mktemp("locks"), "lab")
     made.make(HOSTS, robots=["r1", "r2"], nodes=["n1", "n2"])
+    made.add_floor("attic", robots=["r1"], nodes=["n1"])
     return made
 
 
@@ -111,6 +113,75 @@ def test_node_publishes_as_itself_and_neither_as_another_nor_as_a_service(server
     own, *others = publish_results(servers["mosquitto"], Credentials.read(locks.credentials("n1")), topics)
     assert own in {"Success", "No matching subscribers"}
     assert others == ["Not authorized"] * 3
+
+
+def test_nodes_and_services_of_a_floor_publish_nothing_on_another(servers, locks):
+    """The same ids on two floors of one broker are two users, and the thesis's topics belong to the first floor."""
+    reading = {site: ch.NODE_READING.key(site=site, node="n1") for site in ("lab", "attic")}
+    hazard = {site: ch.AREA_HAZARD.key(site=site, area="hall") for site in ("lab", "attic")}
+    for user, allowed, refused in (
+        ("n1", [reading["lab"]], [reading["attic"]]),
+        ("attic.n1", [reading["attic"]], [reading["lab"], "area 3"]),
+        ("hazard-aggregator", [hazard["lab"], "WSN"], [hazard["attic"]]),
+        ("attic.hazard-aggregator", [hazard["attic"]], [hazard["lab"], "WSN"]),
+    ):
+        answers = publish_results(servers["mosquitto"], Credentials.read(locks.credentials(user)), [*allowed, *refused])
+        assert set(answers[: len(allowed)]) <= {"Success", "No matching subscribers"}, user
+        assert answers[len(allowed) :] == ["Not authorized"] * len(refused), user
+
+
+async def test_robot_is_heard_on_its_own_floor_only(servers, locks):
+    clock = SystemClock()
+
+    def opened(user, role, site):
+        own = Credentials.read(locks.credentials(user))
+        return ZenohEdge.open(
+            connect=[servers["zenoh"].url], clock=clock, role=role, id=user.rpartition(".")[2], site=site,
+            credentials=own,
+        )  # fmt: skip
+
+    def pose(x):
+        return m.RobotPose(x=x, y=0.0, theta=0.0, covariance=[0.0] * 9, v=0.0, w=0.0, radius=0.2, height=0.3, stamp=1.0)
+
+    heard = {"lab": set(), "attic": set()}
+    async with (
+        opened("r1", "robot-agent", "lab") as robot,
+        opened("attic.r1", "robot-agent", "attic") as upstairs,
+        opened("attic.r1", "robot-agent", "lab") as intruder,
+        opened("planner", "planner", "lab") as planner,
+        opened("attic.planner", "planner", "attic") as planner_upstairs,
+    ):
+        planner.subscribe(ch.ROBOT_POSE, m.RobotPose, lambda _, message: heard["lab"].add(message.x))
+        planner_upstairs.subscribe(ch.ROBOT_POSE, m.RobotPose, lambda _, message: heard["attic"].add(message.x))
+        sent = 0
+        async with asyncio.timeout(WAIT_S):
+            while sent < MANY or not all(heard.values()):
+                intruder.publish(ch.ROBOT_POSE, pose(6.0), robot="r1")
+                robot.publish(ch.ROBOT_POSE, pose(1.0), robot="r1")
+                upstairs.publish(ch.ROBOT_POSE, pose(2.0), robot="r1")
+                sent += 1
+                await asyncio.sleep(0.05)
+    assert heard == {"lab": {1.0}, "attic": {2.0}}
+
+
+async def test_service_stores_nothing_for_another_floor(servers, locks):
+    own = Credentials.read(locks.credentials("attic.map-service"))
+    redis = RedisConnection(servers["redis"].url, timeout_s=WAIT_S, credentials=own)
+    try:
+        await redis.write(("HSET", "fog:attic:zones", "a", "b"))
+        with pytest.raises(StoreError, match="permission"):
+            await redis.write(("HSET", "fog:lab:zones", "a", "b"))
+    finally:
+        await redis.aclose()
+
+
+def test_locks_that_are_made_again_keep_the_floors(locks):
+    before = {user: locks.credentials(user).read_text() for user in ("attic.n1", "attic.planner", "n1")}
+    again = SiteLocks(locks.directory, "lab")
+    again.make(HOSTS, robots=["r1", "r2"], nodes=["n1", "n2"])
+    assert again.sites == ["lab", "attic"]
+    assert {user: again.credentials(user).read_text() for user in before} == before
+    assert "user attic.n1" in (locks.folder("mosquitto") / "access").read_text()
 
 
 async def test_robot_neither_changes_the_map_nor_speaks_for_another_robot(servers, locks):

@@ -201,7 +201,9 @@ class VirtualNode:
         self._clock = clock
         self._id = sonars.node.id
         will = Will(ch.NODE_AVAILABILITY, ch.OFFLINE, {"node": self._id})
-        self._mqtt = MqttEdge(url, f"node-{self._id}", clock, site=site, will=will, credentials=credentials)
+        # As a board: a broker that serves several floors disconnects one of two clients with the same id.
+        client = f"node-{site}-{self._id}"
+        self._mqtt = MqttEdge(url, client, clock, site=site, will=will, credentials=credentials)
         self._mqtt.on(ch.NODE_CONFIG, self._on_config, NodeConfig)
         self._mqtt.on(ch.NODE_COMMAND, self._on_command)
         self._problem: str | None = None

@@ -44,7 +44,8 @@ def unit_text(arguments: Sequence[str]) -> str:
     """Return the unit that runs `fognav` with these arguments and the settings (FOGNAV_*) of this shell."""
     settings = sorted((name, value) for name, value in os.environ.items() if name.startswith("FOGNAV_"))
     environment = "".join(f"Environment={_quoted(f'{name}={value}')}\n" for name, value in settings)
-    command = " ".join(_quoted(word) for word in [*_program(), *arguments])
+    # In a command line, unlike in the environment, `$` has a meaning, too (systemd.service(5)).
+    command = " ".join(_quoted(word).replace("$", "$$") for word in [*_program(), *arguments])
     return _TEXT.format(command=command, environment=environment)
 
 
@@ -65,6 +66,6 @@ def _program() -> list[str]:
 
 
 def _quoted(word: str) -> str:
-    """Return a word as systemd reads it: `%` and `$` have a meaning there (systemd.service(5))."""
-    escaped = word.replace("\\", "\\\\").replace('"', '\\"').replace("%", "%%").replace("$", "$$")
+    """Return a word as systemd reads it: `%` has a meaning there (systemd.syntax(7))."""
+    escaped = word.replace("\\", "\\\\").replace('"', '\\"').replace("%", "%%")
     return escaped if shlex.quote(word) == word else f'"{escaped}"'

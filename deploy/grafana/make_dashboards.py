@@ -64,7 +64,7 @@ def _text(page: Dashboard) -> str:
             .refresh(VariableRefresh.ON_TIME_RANGE_CHANGED)
             .multi(multi=True)
             .include_all(include_all=True)
-            .all_value(".*")
+            .all_value(".+")
         )
     y, ids = 0, count(1)
     for title, panels in page.rows:

@@ -7,6 +7,7 @@ import importlib.util
 import json
 import shutil
 import subprocess
+import sys
 import time
 import urllib.error
 import urllib.parse
@@ -68,6 +69,19 @@ class Prometheus:
                  f"--web.listen-address=127.0.0.1:{self.port}"], stdout=log, stderr=log,
             )  # fmt: skip
 
+    def wait_ready(self) -> None:
+        deadline = time.monotonic() + 60.0
+        while True:
+            try:
+                with urllib.request.urlopen(f"http://127.0.0.1:{self.port}/-/ready", timeout=5.0):
+                    return
+            except urllib.error.HTTPError as error:
+                error.close()
+            except urllib.error.URLError:
+                assert self.process.poll() is None, self.log.read_text()
+            assert time.monotonic() < deadline, self.log.read_text()
+            time.sleep(0.05)
+
     def close(self) -> None:
         self.process.terminate()
         self.process.wait(30)
@@ -95,8 +109,11 @@ async def system(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Live
 @pytest.fixture(scope="module")
 def prometheus(tmp_path_factory: pytest.TempPathFactory, system: LiveSystem) -> Iterator[Prometheus]:
     running = Prometheus(tmp_path_factory.mktemp("prometheus"), system)
-    yield running
-    running.close()
+    try:
+        running.wait_ready()
+        yield running
+    finally:
+        running.close()
 
 
 def panels() -> list[tuple[str, str, str]]:
@@ -117,7 +134,11 @@ def panels() -> list[tuple[str, str, str]]:
 
 
 def as_grafana_asks(query: str) -> str:
-    return query.replace("$__rate_interval", "15s").replace("$robot", ".*")
+    """Fill in what Grafana does with all robots chosen."""
+    (chosen,) = json.loads((DEPLOYED / "grafana" / "dashboards" / "fognav-robots.json").read_text("utf-8"))[
+        "templating"
+    ]["list"]
+    return query.replace("$__rate_interval", "15s").replace("$robot", chosen["allValue"])
 
 
 async def test_every_panel_has_data_and_every_rule_works_while_a_robot_drives_and_a_hazard_appears(
@@ -131,11 +152,12 @@ async def test_every_panel_has_data_and_every_rule_works_while_a_robot_drives_an
     deadline = time.monotonic() + 90.0
     while missing:
         assert time.monotonic() < deadline, f"no data: {missing}"
-        try:
-            missing = [entry for entry in missing if not await asyncio.to_thread(prometheus.series, entry[2])]
-        except urllib.error.URLError:
-            assert prometheus.process.poll() is None, prometheus.log.read_text()
+        missing = [entry for entry in missing if not await asyncio.to_thread(prometheus.series, entry[2])]
         await asyncio.sleep(0.5)
+    for page, panel, query in panels():
+        if page == "Robots":
+            found = [series["metric"] for series in prometheus.series(as_grafana_asks(query))]
+            assert {labels.get("robot") for labels in found} == {"r1"}, f"{panel} shows what is no robot: {found}"
     groups = prometheus.ask("rules")["groups"]
     rules = [rule for group in groups for rule in group["rules"]]
     assert len(rules) > 25
@@ -152,6 +174,22 @@ async def test_every_panel_has_data_and_every_rule_works_while_a_robot_drives_an
     assert firing & {"ServiceDown", "NotOneLeader", "BrokerDown", "StoreDown", "StoreLost", "StoreNotDurable"} == set()
 
 
+def drawn(prometheus: Prometheus, folder: Path) -> set[str]:
+    """Return the pages of which the command has drawn a picture."""
+    command = [sys.executable, str(DEPLOYED / "grafana" / "draw_panels.py"), "--out", str(folder), "--minutes", "1"]
+    address = f"http://127.0.0.1:{prometheus.port}"
+    done = subprocess.run([*command, "--prometheus", address], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    return {file.stem for file in folder.glob("*.png")}
+
+
+async def test_pictures_of_all_pages_are_drawn_from_the_panels_own_queries(
+    tmp_path: Path, prometheus: Prometheus
+) -> None:
+    pages = {file.stem for file in (DEPLOYED / "grafana" / "dashboards").glob("*.json")}
+    assert await asyncio.to_thread(drawn, prometheus, tmp_path) == pages
+
+
 async def test_robot_that_is_gone_is_no_target_any_more(system: LiveSystem, prometheus: Prometheus) -> None:
     def robots() -> list[str]:
         found = prometheus.ask("targets")["activeTargets"]
@@ -159,12 +197,7 @@ async def test_robot_that_is_gone_is_no_target_any_more(system: LiveSystem, prom
 
     async def wait(expected: list[str], timeout_s: float) -> None:
         deadline = time.monotonic() + timeout_s
-        while True:
-            try:
-                if await asyncio.to_thread(robots) == expected:
-                    return
-            except urllib.error.URLError:
-                assert prometheus.process.poll() is None, prometheus.log.read_text()
+        while await asyncio.to_thread(robots) != expected:
             assert time.monotonic() < deadline, f"robots are not {expected}"
             await asyncio.sleep(0.2)
 

@@ -1,6 +1,7 @@
 """`fognav bench`: the figures that others rely on are there, and those that can be checked are right."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from fog_supervisor.servers import ServerError
 from fog_supervisor.supervisor import NotReadyError
 from fognav.__main__ import app
 from fognav.bench import costmap, dwa, fleet, fleet_live, localization, office, planner, rest, site
+from fognav.bench import floor as floor_bench
 
 
 def test_office_is_connected_and_the_same_for_the_same_seed() -> None:
@@ -55,6 +57,22 @@ async def test_every_robot_of_a_real_planner_gets_its_path_its_refusal_and_a_pat
     # A path of two points has some 100 bytes, and a delta more; a heartbeat of the map comes ten times a second.
     assert figures["bytes_per_robot"] > 200
     assert figures["steady_bytes_per_robot_s"] > 100
+
+
+@pytest.mark.live
+async def test_real_services_start_on_a_floor_and_lead_a_robot_across_it_and_round_a_zone(tmp_path: Path) -> None:
+    cells = floor_bench.prepare(tmp_path, 60.0, 40.0)
+    assert cells == 1200 * 800
+    steps: list[str] = []
+    figures = await floor_bench.measure(tmp_path, cells, 60.0, 40.0, steps.append)
+    assert steps == ["starting the map-service", "starting the planner", "planning"]
+    for key in ("map_ready_s", "planner_ready_s", "path_ms", "replan_ms"):
+        assert figures[key] > 0
+    for service in ("map", "planner"):
+        assert figures[f"{service}_peak_mb"] >= figures[f"{service}_rss_mb"] > 50
+        assert figures[f"{service}_peak_bytes_per_cell"] == pytest.approx(
+            1e6 * figures[f"{service}_peak_mb"] / cells, rel=0.01
+        )
 
 
 def test_figures_come_with_schema_machine_and_versions(monkeypatch: pytest.MonkeyPatch) -> None:

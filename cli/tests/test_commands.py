@@ -34,6 +34,7 @@ def _warm_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
         ["replay"],
         ["status"],
         ["bench", "fleet"],
+        ["bench", "floor"],
         ["bench", "robot"],
         ["bench", "reactions"],
         ["bench", "mutation"],

@@ -65,6 +65,35 @@ def fleet_command(  # noqa: PLR0913  # the options of a command
         console.print(f"{name:24} {value}", markup=False)
 
 
+@bench_app.command("floor", epilog="Example: fognav bench floor --width 500 --height 500 --json")
+def floor_command(
+    *,
+    width: Annotated[float, typer.Option("--width", metavar="M", min=40.0, max=2000.0, help="Width (m).")] = 500.0,
+    height: Annotated[float, typer.Option("--height", metavar="M", min=30.0, max=2000.0, help="Height (m).")] = 500.0,
+    json: Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")] = False,
+) -> None:
+    """Measure a map-service and a planner on a large floor, at 5 cm per cell.
+
+    Real processes: until each is ready, their memory, a snapshot of the map, a path across the whole floor, and another
+    one after a zone closed it. By default the largest floor that there may be, 10,000 x 10,000 cells; it takes some
+    minutes, and memory of several GB.
+    """
+    from fognav.bench import floor, machine  # noqa: PLC0415  # keeps the other commands fast
+
+    kernels.warm_cache(lambda text: console.print(text, markup=False))
+    with exit_codes(), TemporaryDirectory(prefix="fognav-") as folder:
+        cells = floor.prepare(Path(folder), width, height)
+        figures = asyncio.run(
+            floor.measure(Path(folder), cells, width, height, lambda step: console.print(step, markup=False))
+        )
+    asked = {"width": width, "height": height}
+    if json:
+        print_json({"bench": "floor", **asked, **figures, **machine.describe()})
+        return
+    for name, value in (asked | figures).items():
+        console.print(f"{name:26} {value}", markup=False)
+
+
 @bench_app.command("costmap", epilog="Example: fognav bench costmap --zones 5000 --json")
 def costmap_command(
     *,

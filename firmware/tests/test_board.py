@@ -155,7 +155,7 @@ def test_node_joins_connects_announces_itself_and_publishes_what_it_measures(swi
     board.measures(1000, 3000)
     lines = board.run(5)
     assert board.started[:4] == [
-        "server fog.local 1883", "client node-n1", "user n1", "will fog/v1/lab/nodes/n1/availability 1 1 offline",
+        "server fog.local 1883", "client node-lab-n1", "user n1", "will fog/v1/lab/nodes/n1/availability 1 1 offline",
     ]  # fmt: skip
     assert lines[:2] == ["join net", "connect"]
     assert [f"subscribe {row.key(site='lab', node='n1')} 1" in lines for row in (

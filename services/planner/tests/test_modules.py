@@ -16,6 +16,7 @@ from fog_contracts.costs import DEFAULT_INFLATION, INSCRIBED
 from fog_contracts.grid import GridGeometry
 from fog_contracts.handlers import Moment
 from fog_contracts.messages import (
+    MAX_CELLS,
     WEEKDAYS,
     MapDelta,
     PointXY,
@@ -639,3 +640,7 @@ def test_egress_is_found_however_large_the_blocked_area_is() -> None:
     assert cost[row, column] < 253
     assert x < 2.0
     assert out.route.length == pytest.approx(16.2, abs=0.3)
+
+
+def test_limit_of_a_search_lets_it_expand_every_cell_of_the_largest_map() -> None:
+    assert PlannerConfig().max_expansions >= MAX_CELLS

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from fog_contracts.channels import MAP_HEARTBEAT, ROBOT_GOAL, ROBOT_POSE, ROBOT_RELEASE
 from fog_contracts.costs import DEFAULT_INFLATION, Inflation
 from fog_contracts.geometry import PATH_SPACING_M
+from fog_contracts.messages import MAX_CELLS
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,8 @@ class PlannerConfig:
     max_map_age_s: float = MAP_HEARTBEAT.max_age_s
     delta_grace_s: float = 0.5
     """How long a heartbeat may be ahead of the deltas before a snapshot is fetched."""
-    max_expansions: int = 50_000_000
+    max_expansions: int = 2 * MAX_CELLS
+    """More than a search expands on the largest map; fewer would refuse goals there that can be reached."""
     quick_expansions: int = 40_000
     """After so many expanded cells (1 ms) a search first asks whether the goal can be reached at all ..."""
     detour_searches: int = 3

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from typing import TYPE_CHECKING, Final
 
@@ -34,7 +35,7 @@ class RecentScans:
         """Add the newest scan; the same one again is ignored."""
         if self._newest is not scan:
             self._newest = scan
-            self._scans.append((now, scan.odom, smoothed(scan.points)))
+            self._scans.append((now, scan.odom, smoothed(scan.points, math.inf)))  # the stop field guards the rest
 
     def points(self, newest: Pose2, now: float) -> NDArray[np.float64]:
         """Return all points (n, 2; m) in the frame in which `newest` is the pose of the newest scan."""

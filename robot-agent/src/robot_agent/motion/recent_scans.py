@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from typing import TYPE_CHECKING, Final
 
@@ -35,7 +34,7 @@ class RecentScans:
         """Add the newest scan; the same one again is ignored."""
         if self._newest is not scan:
             self._newest = scan
-            self._scans.append((now, scan.odom, smoothed(scan.points, math.inf)))  # the stop field guards the rest
+            self._scans.append((now, scan.odom, smoothed(scan.points)))
 
     def points(self, newest: Pose2, now: float) -> NDArray[np.float64]:
         """Return all points (n, 2; m) in the frame in which `newest` is the pose of the newest scan."""

@@ -12,15 +12,15 @@ if TYPE_CHECKING:
 _SURFACE_M: Final = 0.06
 """Neighbours in a scan that are nearer than this may lie on one surface."""
 SHIFT_MAX_M: Final = 0.01
-"""The stop field moves no point farther: noise is of this size, and half its margin remains if it was none."""
+"""No point is moved farther: noise is of this size, and half the stop field's margin remains if it was none."""
 
 
-def smoothed(points: NDArray[np.float64], shift_max: float = SHIFT_MAX_M) -> NDArray[np.float64]:
+def smoothed(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return a scan's points (n, 2; m, in the order of its beams), each moved towards the mean with its neighbours.
 
     Noise of single beams would close a gap: the nearest of some hundred points on its sides is three standard
     deviations too near. But neighbours may also be a thin leg and the wall close behind it, or the two sides of an
-    edge, so a point moves by `shift_max` (m) at most: whatever is measured to a point, it grows by no more than that.
+    edge, so a point moves by `SHIFT_MAX_M` at most: whatever is measured to a point, it grows by no more than that.
     """
     following = np.roll(points, -1, axis=0) - points
     joined = np.hypot(following[:, 0], following[:, 1]) < _SURFACE_M
@@ -28,6 +28,6 @@ def smoothed(points: NDArray[np.float64], shift_max: float = SHIFT_MAX_M) -> NDA
     shift = towards_next - np.roll(towards_next, 1, axis=0)
     count = 1.0 + joined + np.roll(joined, 1)
     shift /= count[:, None]
-    farthest = np.maximum(np.hypot(shift[:, 0], shift[:, 1]) / shift_max, 1.0)
+    farthest = np.maximum(np.hypot(shift[:, 0], shift[:, 1]) / SHIFT_MAX_M, 1.0)
     nearer: NDArray[np.float64] = points + shift / farthest[:, None]
     return nearer

@@ -144,7 +144,6 @@ def _parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Carry out the command line; return the exit code."""
     options = _parser().parse_args(arguments)
-    os.umask(0o077)
     try:
         settings = load(Settings, environ=os.environ)
         site = load_site(settings.site_dir).site
@@ -167,4 +166,5 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
+    os.umask(0o077)
     sys.exit(main())

@@ -32,6 +32,7 @@ def locks(tmp_path_factory):
     made = SiteLocks(tmp_path_factory.mktemp("locks"), "lab")
     made.make(HOSTS, robots=["r1", "r2"], nodes=["n1", "n2"])
     made.add_floor("attic", robots=["r1"], nodes=["n1"])
+    made.add_device("zigbee2mqtt", ["zigbee2mqtt/#"])
     return made
 
 
@@ -182,6 +183,20 @@ def test_locks_that_are_made_again_keep_the_floors(locks):
     assert again.sites == ["lab", "attic"]
     assert {user: again.credentials(user).read_text() for user in before} == before
     assert "user attic.n1" in (locks.folder("mosquitto") / "access").read_text()
+
+
+@pytest.mark.parametrize(
+    ("user", "own", "of_others"),
+    [
+        ("zigbee2mqtt", "zigbee2mqtt/fire_door", "shellies/door"),
+        ("thesis-node", ch.THESIS_AREA.key(number="3"), ch.THESIS_WSN.key()),
+    ],
+)
+def test_sensors_of_others_publish_on_their_own_topics_only(servers, locks, user, own, of_others):
+    topics = [own, of_others, ch.AREA_HAZARD.key(site="lab", area="hall"), ch.NODE_READING.key(site="lab", node="n1")]
+    done, *refused = publish_results(servers["mosquitto"], Credentials.read(locks.credentials(user)), topics)
+    assert done in {"Success", "No matching subscribers"}
+    assert refused == ["Not authorized"] * 3
 
 
 async def test_robot_neither_changes_the_map_nor_speaks_for_another_robot(servers, locks):

@@ -5,7 +5,8 @@ from typing import Annotated, Any
 import msgspec
 import typer
 
-from fog_contracts.messages import AreaDefinition, Limits, Source
+from fog_contracts.messages import AreaDefinition, Id, Limits, Source
+from fognav.locking import LocksOption, locks_errors, open_locks
 from fognav.operate.fog import Fog, find_fog
 from fognav.operate.options import FogOption, JsonOption
 from fognav.operate.systems import AGGREGATOR
@@ -120,6 +121,28 @@ def source_list(*, fog: FogOption = None, json: JsonOption = False) -> None:
             print_line(f"{row['area']}/{row['id']}: {state}")
         if not rows:
             print_line("no sources")
+
+
+@source_app.command("user", epilog="Example: fognav source user zigbee2mqtt --topic 'zigbee2mqtt/#' --locks locks")
+def source_user(
+    name: Annotated[str, typer.Argument(metavar="USER", help="The user's name: a to z, 0 to 9 and -.")],
+    *,
+    topic: Annotated[list[str], typer.Option("--topic", metavar="T", help="What it may publish and read; repeatable.")],
+    locks: LocksOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Let a sensor, or the gateway of many, use a locked broker: these topics and no other."""
+    with exit_codes(), locks_errors():
+        try:
+            msgspec.convert(name, Id)
+        except msgspec.ValidationError as error:
+            raise WrongUseError(f"{name!r}: a user has only a to z, 0 to 9 and -, at most 32") from error
+        file = open_locks(locks).add_device(name, topic)
+        if json:
+            print_json({"user": name, "topics": topic, "credentials": str(file)})
+        else:
+            print_line(f"wrote {file}: its user, password and certificate are what {name} needs; then delete it here")
+            print_line("the broker knows it once it has read its lists again (SIGHUP)")
 
 
 @source_app.command("profiles", epilog="Example: fognav source profiles")

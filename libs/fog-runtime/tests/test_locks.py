@@ -300,6 +300,38 @@ def test_a_robot_is_added_replaced_and_removed(tmp_path):
         locks.add_robot("planner")
 
 
+def test_a_device_keeps_its_topics_when_locks_are_made_again_and_loses_them_with_its_user(tmp_path):
+    locks = SiteLocks(tmp_path / "locks", "lab")
+    locks.make(["localhost"], nodes=["n1"])
+    locks.add_device("z2m", ["zigbee2mqtt/#"])
+    access = locks.folder("mosquitto") / "access"
+    SiteLocks(tmp_path / "locks", "lab").make(["fog.local"])
+    SiteLocks.open(tmp_path / "locks").add_node("n2")
+    assert "user z2m\ntopic readwrite zigbee2mqtt/#\n" in access.read_text()
+    assert SiteLocks.open(tmp_path / "locks").remove("z2m")
+    assert "z2m" not in access.read_text()
+
+
+@pytest.mark.parametrize(
+    ("name", "topic"),
+    [
+        ("n1", "zigbee2mqtt/#"), ("planner", "zigbee2mqtt/#"), ("z2m", "#"), ("z2m", "+/#"), ("z2m", "WSN"),
+        ("z2m", "fog/v1/lab/#"), ("z2m", "zigbee2mqtt/#/state"), ("z2m", "$SYS/#"),
+        ("z2m", "a/b\nuser planner\ntopic #"),
+    ],
+)  # fmt: skip
+def test_a_device_gets_no_name_and_no_topic_of_others(tmp_path, name, topic):
+    locks = SiteLocks(tmp_path / "locks", "lab")
+    locks.make(["localhost"], nodes=["n1"])
+    before = (locks.folder("mosquitto") / "access").read_text()
+    with pytest.raises(LocksError, match=name):
+        locks.add_device(name, [topic])
+    assert (locks.folder("mosquitto") / "access").read_text() == before
+    locks.add_device("lidar-gate", ["gate/+/state"])
+    with pytest.raises(LocksError, match="device already"):
+        locks.add_node("lidar-gate")
+
+
 def test_no_file_holds_a_password_that_another_server_accepts(locks):
     """A server that was broken into gives away no password for another one."""
     planner = of(locks, "planner")

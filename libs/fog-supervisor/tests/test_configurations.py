@@ -13,7 +13,7 @@ from fog_supervisor import configurations
 from fog_supervisor.servers import mosquitto_program, redis_program, router_program, start_mosquitto, start_redis
 
 ROOT = Path(__file__).parents[3]
-INSTANCE_SETTINGS = ("listener ", "persistence_location ", "user ", "bind ", "port ", "dir ")
+INSTANCE_SETTINGS = ("listener ", "persistence_location ", "user ", "bind ", "tls-port ", "dir ")
 
 
 def shared_lines(text: str) -> list[str]:
@@ -33,10 +33,11 @@ def test_stale_configuration_is_reported_with_the_remedy(tmp_path: Path, capsys:
     assert "redis.conf is stale: run python -m fog_supervisor.configurations --write" in capsys.readouterr().out
 
 
-def test_private_servers_have_the_limits_and_durability_of_deployed_ones(tmp_path: Path) -> None:
+def test_private_servers_have_the_limits_durability_and_locks_of_deployed_ones(tmp_path: Path) -> None:
     deployed = configurations.deployed()
-    mosquitto_program(tmp_path, 1)
-    redis_program(tmp_path, 1)
+    locks = Path(configurations.DEPLOYED_LOCKS)
+    mosquitto_program(tmp_path, 1, locks=locks)
+    redis_program(tmp_path, 1, locks=locks)
     for name in ("mosquitto", "redis"):
         private = (tmp_path / f"{name}.conf").read_text()
         assert shared_lines(private) == shared_lines(deployed[f"{name}/{name}.conf"])
@@ -46,11 +47,14 @@ def test_private_servers_have_the_limits_and_durability_of_deployed_ones(tmp_pat
 
 def test_compose_starts_the_router_with_the_arguments_of_a_private_one() -> None:
     service = yaml.safe_load((ROOT / "docker-compose.yml").read_text())["services"]["zenoh"]
-    endpoint = service["command"][1]
-    assert service["command"] == configurations.router_arguments(endpoint)
+    given = [tuple(argument.split("=", 1)) for argument in service["command"]]
+    endpoint = dict(given)["--listen"]
+    locks = configurations.DEPLOYED_LOCKS
+    assert [text for pair in given for text in pair] == configurations.router_arguments(endpoint, locks=locks)
     assert service["build"]["args"]["MODULE"] == router.__name__
-    private = router_program(7447)
-    assert list(private.command[1:]) == ["-m", router.__name__, *configurations.router_arguments(private.url)]
+    private = router_program(7447, locks=Path(locks))
+    arguments = configurations.router_arguments(private.url, locks=locks)
+    assert list(private.command[1:]) == ["-m", router.__name__, *arguments]
 
 
 def test_every_mqtt_message_fits_into_the_brokers_packet_limit() -> None:

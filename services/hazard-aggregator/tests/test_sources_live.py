@@ -107,7 +107,7 @@ number = { above = 40.0, hysteresis = 2.0 }
 
 
 async def test_temperature_of_a_node_becomes_a_hazard_and_changes_the_map(fog, until):
-    """The payload is the one that the firmware's own test gets of a DS18B20 at 41.5 degrees."""
+    """The payload is the one that the firmware's own test gets of a DS18B20, at 41.5 degrees."""
     file = fog.site / "site.toml"
     file.write_text(file.read_text() + HEAT_OF_A_NODE)
     for module in ("hazard_aggregator", "map_service"):

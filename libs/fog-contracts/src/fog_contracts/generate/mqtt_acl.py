@@ -27,16 +27,24 @@ _HEAD: Final = f"""\
 
 
 def mqtt_acl(
-    site: str = "+", *, unrestricted: Sequence[str] = (), floors: Mapping[str, Sequence[str]] | None = None
+    site: str = "+",
+    *,
+    unrestricted: Sequence[str] = (),
+    floors: Mapping[str, Sequence[str]] | None = None,
+    devices: Mapping[str, Sequence[str]] | None = None,
 ) -> str:
     """Return the list for one site, or, without a site's id, for all sites that share the broker.
 
     The users named in `unrestricted` may publish and receive everything. `floors` are further sites with their own
     users, named `SITE.NAME`, and their nodes: each may only use topics that name its site, and so none of the thesis.
+    `devices` are sensors and gateways of others with the topics that they may use.
     """
     sections = [_HEAD]
     sections += [_section(role, site) for role in ROLES if role != NODE and _lines(role, site)]
     sections += [f"user {user}\ntopic readwrite #\ntopic read $SYS/#\n" for user in unrestricted]
+    for device, topics in (devices or {}).items():
+        lines = [f"topic readwrite {topic}" for topic in topics]
+        sections.append("\n".join(["# A device of others: only its own topics", f"user {device}", *lines, ""]))
     for floor, nodes in (floors or {}).items():
         sections += [_floor_section(role, floor) for role in ROLES if role != NODE and _floor_lines(role, floor)]
         sections += [_floor_node(floor, node) for node in nodes]

@@ -59,10 +59,8 @@ def _make(settings: Settings, site: Site) -> SiteLocks:
 def _carry_out(options: argparse.Namespace, locks: SiteLocks) -> str:
     """Carry out a command; return what it prints. Raises `LocksError`, `AuthorityError`, `TokensError`, `OSError`."""
     match options.command:
-        case "robot":
-            return locks.add_robot(_id(options.id)).read_text("utf-8")
-        case "node":
-            return locks.add_node(_id(options.id)).read_text("utf-8")
+        case "robot" | "node" | "device":
+            return _added(options, locks).read_text("utf-8")
         case "remove":
             if not locks.remove(options.id):
                 raise LocksError(f"{options.id} is unknown. Known are: {', '.join(sorted(locks.users()))}")
@@ -75,6 +73,13 @@ def _carry_out(options: argparse.Namespace, locks: SiteLocks) -> str:
         case "rotate":
             _rotate(locks, finish=options.finish)
     return ""
+
+
+def _added(options: argparse.Namespace, locks: SiteLocks) -> Path:
+    name = _id(options.id)
+    if options.command == "device":
+        return locks.add_device(name, options.topic)
+    return locks.add_robot(name) if options.command == "robot" else locks.add_node(name)
 
 
 def _change_tokens(options: argparse.Namespace, file: Path) -> str:
@@ -126,7 +131,10 @@ def _parser() -> argparse.ArgumentParser:
     commands.add_parser("certificate", help="print the authority's certificate, for browsers and curl")
     commands.add_parser("robot", help="let a robot in; prints its credentials").add_argument("id")
     commands.add_parser("node", help="let a sensor node in; prints its credentials").add_argument("id")
-    commands.add_parser("remove", help="let a robot or node in no longer").add_argument("id")
+    device = commands.add_parser("device", help="let a sensor of others use topics of its own; prints its credentials")
+    device.add_argument("id")
+    device.add_argument("topic", nargs="+", help="such as zigbee2mqtt/#")
+    commands.add_parser("remove", help="let a robot, node or device in no longer").add_argument("id")
     commands.add_parser("show", help="print a file: admin.token, credentials/NAME.toml, …").add_argument("file")
     rotating = commands.add_parser("rotate", help="replace the authority; both are trusted until --finish")
     rotating.add_argument("--finish", action="store_true")

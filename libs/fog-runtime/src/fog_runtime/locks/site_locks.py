@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import datetime as dt
 import os
+import re
 import stat
 from typing import TYPE_CHECKING, Final, Self
 
@@ -42,6 +43,8 @@ PROGRAMS: Final = ("mosquitto", "redis", "zenoh", "http")
 CERTIFICATE, KEY, USERS, ACCESS = "server.pem", "server.key", "users", "access"
 REDIS_ADMINISTRATOR: Final = "administrator"
 _RENEW_BEFORE: Final = dt.timedelta(days=SERVER_DAYS // 3)
+_DEVICE_TOPIC: Final = re.compile(r"(?!fog/)[\w.-]+/(?:(?:[\w.-]+|\+)/)*(?:[\w.-]+|\+|#)", re.ASCII)
+"""No topic of one level, such as the thesis's, and none of Fognav's own."""
 _PROGRAM_OF: Final[Mapping[Server, str]] = {"mqtt": "mosquitto", "zenoh": "zenoh", "redis": "redis"}
 
 
@@ -51,6 +54,7 @@ class _Plan(msgspec.Struct, frozen=True):
     unrestricted: list[str] = []
     mode: int = PRIVATE
     floors: list[str] = []
+    devices: dict[str, list[str]] = {}
 
 
 class LocksError(ValueError):
@@ -95,13 +99,14 @@ class SiteLocks:
                 "volume) of its own for each site"
             )
         known_hosts = before.hosts
-        self._plan = msgspec.structs.replace(self._plan, floors=before.floors)
+        self._plan = msgspec.structs.replace(self._plan, floors=before.floors, devices=before.devices)
         self._folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         if not (self._folder / AUTHORITY).exists():
             Authority.create(self._folder / AUTHORITY, f"Fognav {self._plan.site}", now=_now())
         wanted = [*known_hosts, *(host for host in hosts if host not in known_hosts)]
         self.renew(wanted, only_due=wanted == known_hosts)
-        own: dict[str, Sequence[Server]] = {**users.SERVICES, **users.TOOLS, REDIS_ADMINISTRATOR: ("redis",)}
+        own: dict[str, Sequence[Server]] = {**users.SERVICES, **users.TOOLS, **users.THESIS}
+        own[REDIS_ADMINISTRATOR] = ("redis",)
         own[users.HEALTH] = users.HEALTH_SERVERS
         own |= dict.fromkeys(self._plan.unrestricted, ("mqtt", "zenoh"))
         missing = {user: servers for user, servers in own.items() if not self.credentials(user).exists()}
@@ -164,7 +169,27 @@ class SiteLocks:
 
     def add_node(self, node: str) -> Path:
         """Let a sensor node in, or give it a new password; return its credentials. Raises `LocksError`."""
+        if node in self._plan.devices:
+            raise LocksError(f"{node} is a device already: give the node another id")
         return self._add(node, ("mqtt",))
+
+    def add_device(self, device: str, topics: Sequence[str]) -> Path:
+        """Let a sensor or gateway of others use these MQTT topics (wildcards below the first level) and no other.
+
+        One that is known gets a new password and these topics. Returns its credentials. Raises `LocksError`.
+        """
+        for topic in topics:
+            if not _DEVICE_TOPIC.fullmatch(topic):
+                raise LocksError(
+                    f"{device} can't have the topic {topic!r}: name one of its own with two levels at least, such as "
+                    "zigbee2mqtt/#, of letters, digits, '_', '.' and '-', and none below fog/"
+                )
+        if device in self.users() - set(self._plan.devices):
+            raise LocksError(f"{device} is a robot or node already: give the device another name")
+        if self._is_reserved(device):
+            raise LocksError(f"{device} is the name of a part of Fognav: give the device another name")
+        self._save(msgspec.structs.replace(self._plan, devices={**self._plan.devices, device: list(topics)}))
+        return self._add(device, ("mqtt",))
 
     def remove(self, user: str) -> bool:
         """Refuse a user from now on, once the servers have read their lists again; return whether there was one."""
@@ -174,6 +199,11 @@ class SiteLocks:
             found |= len(kept) < len(self._lines(program))
             self._write(program, USERS, "".join(f"{line}\n" for line in kept))
         self.credentials(user).unlink(missing_ok=True)
+        self._save(
+            msgspec.structs.replace(
+                self._plan, devices={name: topics for name, topics in self._plan.devices.items() if name != user}
+            )
+        )
         self._write_access()
         return found
 
@@ -276,7 +306,8 @@ class SiteLocks:
         plan = self._plan
         nodes = {floor: self._members("mosquitto", floor) for floor in plan.floors}
         robots = {floor: self._members("zenoh", floor) for floor in plan.floors}
-        self._write("mosquitto", ACCESS, mqtt_acl(plan.site, unrestricted=plan.unrestricted, floors=nodes))
+        access = mqtt_acl(plan.site, unrestricted=plan.unrestricted, floors=nodes, devices=plan.devices)
+        self._write("mosquitto", ACCESS, access)
         own = self._members("zenoh", "")
         access = zenoh_acl(plan.site, own, unrestricted=plan.unrestricted, floors=robots)
         self._write("zenoh", f"{ACCESS}.json5", access)

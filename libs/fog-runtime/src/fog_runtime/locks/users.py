@@ -33,6 +33,8 @@ TOOLS: Final[Mapping[str, Sequence[Server]]] = {
     "home-assistant": ("mqtt",),
 }
 """The same for the tools of the fog node's administrator, and for a simulated world."""
+THESIS: Final[Mapping[str, Sequence[Server]]] = {"thesis-node": ("mqtt",), "thesis-robot": ("mqtt",)}
+"""Nodes and robots of the master's thesis, of the first site only: its topics name no site."""
 HEALTH: Final = "health"
 """Who asks broker and Redis whether they are well, and may do nothing else."""
 HEALTH_SERVERS: Final[Sequence[Server]] = ("mqtt", "redis")

@@ -14,6 +14,7 @@ from fog_contracts import messages as m
 from fog_runtime.clock import SystemClock
 from fog_runtime.credentials import NOBODY, Credentials, CredentialsError, to_toml
 from fog_runtime.lease_store import LeaseStore
+from fog_runtime.locks import users
 from fog_runtime.locks.authority import Authority, AuthorityError
 from fog_runtime.locks.site_locks import LocksError, SiteLocks
 from fog_runtime.mqtt_broker import Broker
@@ -312,6 +313,29 @@ def test_a_device_keeps_its_topics_when_locks_are_made_again_and_loses_them_with
     assert "z2m" not in access.read_text()
 
 
+@pytest.mark.parametrize("name", ["default", "planner", "administrator", "health"])
+def test_no_part_of_fognav_is_removed_and_redis_goes_on_to_refuse_who_gives_no_name(tmp_path, name):
+    locks = SiteLocks(tmp_path / "locks", "lab")
+    locks.make(["localhost"])
+    with pytest.raises(LocksError, match=f"{name} is the name of a part"):
+        locks.remove(name)
+    with pytest.raises(LocksError, match=f"{name} is the name of a part"):
+        locks.make(["localhost"], robots=[name])
+    file = locks.folder("redis") / "users"
+    file.write_text("".join(line for line in file.read_text().splitlines(keepends=True) if "default" not in line))
+    locks.make(["localhost"])
+    assert file.read_text().splitlines().count(users.REDIS_NOBODY) == 1
+
+
+def test_robot_and_node_of_the_same_id_are_refused_before_one_of_them_loses_its_password(tmp_path):
+    locks = SiteLocks(tmp_path / "locks", "lab")
+    with pytest.raises(LocksError, match=r"^x1: a robot, a node and a device of one site need different ids"):
+        locks.make(["localhost"], robots=["x1", "r1"], nodes=["x1"])
+    locks.make(["localhost"], robots=["x1"])
+    with pytest.raises(LocksError, match=r"^x1: a robot"):
+        locks.add_node("x1")
+
+
 @pytest.mark.parametrize(
     ("name", "topic"),
     [
@@ -328,7 +352,7 @@ def test_a_device_gets_no_name_and_no_topic_of_others(tmp_path, name, topic):
         locks.add_device(name, [topic])
     assert (locks.folder("mosquitto") / "access").read_text() == before
     locks.add_device("lidar-gate", ["gate/+/state"])
-    with pytest.raises(LocksError, match="device already"):
+    with pytest.raises(LocksError, match=r"^lidar-gate: a robot"):
         locks.add_node("lidar-gate")
 
 

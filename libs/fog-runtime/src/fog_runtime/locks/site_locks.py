@@ -42,6 +42,8 @@ PROGRAMS: Final = ("mosquitto", "redis", "zenoh", "http")
 """The folders of what has a certificate."""
 CERTIFICATE, KEY, USERS, ACCESS = "server.pem", "server.key", "users", "access"
 REDIS_ADMINISTRATOR: Final = "administrator"
+_ANYBODY: Final = "default"
+"""Redis's name for who gives none."""
 _RENEW_BEFORE: Final = dt.timedelta(days=SERVER_DAYS // 3)
 _DEVICE_TOPIC: Final = re.compile(r"(?!fog/)[\w.-]+/(?:(?:[\w.-]+|\+)/)*(?:[\w.-]+|\+|#)", re.ASCII)
 """No topic of one level, such as the thesis's, and none of Fognav's own."""
@@ -129,6 +131,9 @@ class SiteLocks:
         self._write_access()
 
     def _not_yet_admitted(self, robots: Sequence[str], nodes: Sequence[str]) -> dict[str, Sequence[Server]]:
+        self._require_different_ids(robots, nodes)
+        for member in (*robots, *nodes):
+            self._require_free_name(member)
         # The credentials of robots and nodes need not stay here.
         handed_out: dict[str, Sequence[Server]] = dict.fromkeys(robots, ("zenoh",))
         handed_out |= dict.fromkeys(nodes, ("mqtt",))
@@ -147,7 +152,7 @@ class SiteLocks:
 
     def users(self) -> set[str]:
         """Return everybody whom a server admits."""
-        return {_user(line) for program in _PROGRAM_OF.values() for line in self._lines(program)} - {"default"}
+        return {_user(line) for program in _PROGRAM_OF.values() for line in self._lines(program)} - {_ANYBODY}
 
     def credentials(self, user: str) -> Path:
         """Return the file of a user's credentials."""
@@ -165,12 +170,12 @@ class SiteLocks:
 
     def add_robot(self, robot: str) -> Path:
         """Let a robot in, or give it a new password; return its credentials. Raises `LocksError`."""
+        self._require_different_ids([robot], [])
         return self._add(robot, ("zenoh",))
 
     def add_node(self, node: str) -> Path:
         """Let a sensor node in, or give it a new password; return its credentials. Raises `LocksError`."""
-        if node in self._plan.devices:
-            raise LocksError(f"{node} is a device already: give the node another id")
+        self._require_different_ids([], [node])
         return self._add(node, ("mqtt",))
 
     def add_device(self, device: str, topics: Sequence[str]) -> Path:
@@ -184,15 +189,18 @@ class SiteLocks:
                     f"{device} can't have the topic {topic!r}: name one of its own with two levels at least, such as "
                     "zigbee2mqtt/#, of letters, digits, '_', '.' and '-', and none below fog/"
                 )
+        self._require_free_name(device)
         if device in self.users() - set(self._plan.devices):
             raise LocksError(f"{device} is a robot or node already: give the device another name")
-        if self._is_reserved(device):
-            raise LocksError(f"{device} is the name of a part of Fognav: give the device another name")
         self._save(msgspec.structs.replace(self._plan, devices={**self._plan.devices, device: list(topics)}))
         return self._add(device, ("mqtt",))
 
     def remove(self, user: str) -> bool:
-        """Refuse a user from now on, once the servers have read their lists again; return whether there was one."""
+        """Refuse a robot, node or device from now on, once the servers have read their lists again.
+
+        Returns whether there was one. Raises `LocksError` for a part of Fognav.
+        """
+        self._require_free_name(user)
         found = False
         for program in _PROGRAM_OF.values():
             kept = [line for line in self._lines(program) if _user(line) != user]
@@ -252,8 +260,7 @@ class SiteLocks:
         return changed
 
     def _add(self, user: str, servers: Sequence[Server]) -> Path:
-        if self._is_reserved(user):
-            raise LocksError(f"{user} is the name of a part of Fognav: give the robot or node another id")
+        self._require_free_name(user)
         self._set_users({user: servers})
         self._write_access()
         return self.credentials(user)
@@ -290,10 +297,12 @@ class SiteLocks:
         """Write what this version's services may do in Redis, in whose list rights and passwords are one line."""
         lines = []
         for line in self._lines("redis"):
+            if _user(line) == _ANYBODY:
+                continue
             file = self.credentials(_user(line))
             known = file.exists()
             lines.append(self._line("redis", _user(line), Credentials.read(file).passwords["redis"]) if known else line)
-        self._write("redis", USERS, "".join(f"{line}\n" for line in lines))
+        self._write("redis", USERS, "".join(f"{line}\n" for line in [users.REDIS_NOBODY, *lines]))
 
     def _lines(self, program: str) -> list[str]:
         file = self.folder(program) / USERS
@@ -317,8 +326,21 @@ class SiteLocks:
         members = [user for line in self._lines(program) if not self._is_reserved(user := _user(line))]
         return [name for own, name in map(users.of_floor, members) if own == floor]
 
+    def _require_different_ids(self, robots: Sequence[str], nodes: Sequence[str]) -> None:
+        known_nodes, known_robots = ({_user(line) for line in self._lines(each)} for each in ("mosquitto", "zenoh"))
+        taken = set(robots) & ({*nodes} | known_nodes) | set(nodes) & ({*known_robots} | {*self._plan.devices})
+        if taken := {user for user in taken if not self._is_reserved(user)}:
+            raise LocksError(
+                f"{', '.join(sorted(taken))}: a robot, a node and a device of one site need different ids, since each "
+                "is a user of its servers: rename one of them"
+            )
+
+    def _require_free_name(self, user: str) -> None:
+        if self._is_reserved(user):
+            raise LocksError(f"{user} is the name of a part of Fognav: give the robot, node or device another id")
+
     def _is_reserved(self, user: str) -> bool:
-        parts = {*ROLES, REDIS_ADMINISTRATOR, users.HEALTH}
+        parts = {*ROLES, REDIS_ADMINISTRATOR, users.HEALTH, _ANYBODY}
         return users.of_floor(user)[1] in parts or user in self._plan.unrestricted
 
     def _write(self, program: str, name: str, text: str) -> None:

@@ -1,14 +1,21 @@
 """A fog node on this machine: its folder, its logs, its sites' names and ports, and its unit."""
 
+import asyncio
+import errno
 import shutil
 import stat
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from fognav.hosting import log_files, unit
+from fognav.hosting import log_files, running, unit
 from fognav.hosting.floors import hosted_sites
 from fognav.hosting.folders import FORMAT, NodeFolder, default_data
+from fognav.hosting.node import LocalNode, NodeConfig
+from fognav.locking import locks_errors
+from fognav.operate.registry import Registration, registered
 from fognav.output import FailedError, WrongUseError
 
 ESTIG = Path(__file__).parents[2] / "sites" / "estig"
@@ -99,3 +106,73 @@ def test_unit_runs_the_same_command_with_this_shell_s_settings(monkeypatch):
     assert command.endswith('/fognav up --site "/srv/my floor" --data "/$$d"')
     assert "Environment=FOGNAV_MAP_PORT=9002\n" in text
     assert 'Environment="FOGNAV_BIND=a $b %%c"\n' in text
+
+
+async def until(condition: Callable[[], object]) -> None:
+    deadline = time.monotonic() + 20.0
+    while not condition():
+        assert time.monotonic() < deadline
+        await asyncio.sleep(0.01)
+
+
+@pytest.fixture
+def node(tmp_path: Path) -> LocalNode:
+    """A fog node of which nothing runs yet."""
+    folder = NodeFolder(tmp_path / "data")
+    sites, locks = hosted_sites([ESTIG], folder.locks, ["localhost"])
+    return LocalNode(NodeConfig(folder=folder, sites=sites, locks=locks, address="127.0.0.2"), lambda _: None)
+
+
+async def test_bookkeeping_that_fails_is_told_once_and_ends_nothing(node, tmp_path, monkeypatch):
+    monkeypatch.setattr(running, "PERIOD_S", 0.01)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    (tmp_path / "fognav").mkdir(mode=0o755)  # not private, so it can't be used
+    keys = node.config.folder.keys("estig")
+    for name in ("admin.token", "tokens.toml"):
+        (keys / name).unlink()
+    log = node.config.folder.log("planner")
+    with log.open("wb") as file:
+        file.truncate(log_files.LIMIT_BYTES)
+    before = log.with_name(log.name + ".before")
+    before.mkdir()
+
+    told: list[str] = []
+    site = node.config.sites[0]
+    with Registration(lambda: node.system(site)) as registration:
+        attending = asyncio.create_task(running.attend(node, [registration], told.append))
+        try:
+            await until(lambda: len(told) >= 2)
+            assert "site estig" in told[0]
+            assert "not a private folder" in told[0]
+            assert "log of planner" in told[1]
+            await asyncio.sleep(0.1)
+            before.rmdir()
+            await until(lambda: log.stat().st_size == 0)
+            (tmp_path / "fognav").chmod(0o700)
+            await until(registered)
+            assert len(told) == 2
+            before.unlink()
+            before.mkdir()
+            with log.open("wb") as file:
+                file.truncate(log_files.LIMIT_BYTES)
+            await until(lambda: len(told) == 3)  # it is told again after it has worked
+            assert not attending.done()
+        finally:
+            attending.cancel()
+            await asyncio.wait({attending})
+
+
+def test_log_is_cut_without_a_copy_on_a_full_disk(tmp_path):
+    file, before = tmp_path / "planner.log", tmp_path / "planner.log.before"
+    file.write_text("0123456789")
+    before.symlink_to("/dev/full")
+    with pytest.raises(OSError, match="No space left"):
+        log_files.bound(file, limit=10)
+    assert file.stat().st_size == 0
+    assert not before.is_symlink()
+    log_files.bound(file, limit=10)
+
+
+def test_error_without_a_file_is_told_without_one():
+    with pytest.raises(FailedError, match="a file can't be used: No space left on device"), locks_errors():
+        raise OSError(errno.ENOSPC, "No space left on device")

@@ -70,6 +70,8 @@ def locks_errors() -> Iterator[None]:
     except (AuthorityError, LocksError) as error:
         raise FailedError(str(error)) from error
     except OSError as error:
+        if error.filename is None:
+            raise FailedError(f"a file can't be used: {error.strerror or error}. Is the disk full (df)?") from error
         raise FailedError(f"{error.filename} can't be used: {error.strerror}. Run this as its owner") from error
 
 

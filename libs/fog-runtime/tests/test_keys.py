@@ -31,3 +31,11 @@ def test_token_without_its_tokens_file_is_refused_by_name(tmp_path):
     (tmp_path / "tokens.toml").unlink()
     with pytest.raises(FileExistsError, match=r"admin\.token"):
         make_keys(tmp_path)
+
+
+def test_admin_token_that_is_kept_elsewhere_is_not_missed(tmp_path):
+    make_keys(tmp_path)
+    (tmp_path / "admin.token").unlink()
+    before = (tmp_path / "tokens.toml").read_text()
+    assert make_keys(tmp_path) == []
+    assert (tmp_path / "tokens.toml").read_text() == before

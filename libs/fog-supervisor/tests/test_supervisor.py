@@ -79,6 +79,20 @@ async def test_killed_program_is_restarted(bench: Bench) -> None:
     assert not psutil.pid_exists(first)
 
 
+async def test_program_that_could_not_be_started_is_tried_again(bench: Bench) -> None:
+    name = "logs/sleeper"  # in a folder that is missing for a moment
+    bench.add(name, SLEEPER)
+    bench.supervisor.start(name)
+    await until(lambda: "exited" in bench.event_kinds(name), "the event")
+    assert bench.events[0].detail.startswith("could not be started: [Errno 2] No such file or directory")
+    with pytest.raises(NotReadyError, match="could not be started"):
+        await bench.supervisor.wait_ready([name], 0.0)
+    (bench.folder / "logs").mkdir()
+    await until(lambda: bench.supervisor.pid(name) is not None, "the start")
+    assert bench.event_kinds(name)[-1] == "started"
+    await bench.supervisor.stop(name)
+
+
 async def test_restart_delay_doubles_while_a_program_keeps_exiting(bench: Bench) -> None:
     bench.add("broken", "raise SystemExit(3)")
     bench.supervisor.start("broken")

@@ -1,5 +1,6 @@
 """Logs of a fog node's programs: bounded, for it runs for months on a small disk, and shown to people."""
 
+import errno
 import sys
 import time
 from collections.abc import Mapping
@@ -14,14 +15,26 @@ _PERIOD_S: Final = 0.2
 def bound(file: Path, limit: int = LIMIT_BYTES) -> None:
     """Begin a log anew when it has reached the limit (bytes), and keep what it had in NAME.log.before.
 
-    The program goes on writing to the same file. What it writes between the copy and the cut is lost.
+    The program goes on writing to the same file. What it writes between the copy and the cut is lost. Raises `OSError`;
+    where there is no space for the copy, the log is cut without it before that.
     """
     try:
         if file.stat().st_size < limit:
             return
     except FileNotFoundError:
         return
-    file.with_name(file.name + _BEFORE).write_bytes(file.read_bytes())
+    before = file.with_name(file.name + _BEFORE)
+    try:
+        before.write_bytes(file.read_bytes())
+    except OSError as error:
+        if error.errno in {errno.ENOSPC, errno.EDQUOT}:
+            before.unlink(missing_ok=True)  # a part of a copy would take space, and pass for the whole
+            _cut(file)
+        raise
+    _cut(file)
+
+
+def _cut(file: Path) -> None:
     # Supervised programs append, so they write on at the new end.
     with file.open("r+b") as log:
         log.truncate(0)

@@ -67,6 +67,8 @@ class LocalNode:
         self.supervisor = Supervisor(on_event)
         self._sites: dict[str, HostedSite] = {}
         self._devices: list[Path] = []
+        # Made once: who deletes admin.token later, when it is kept elsewhere, must not end the node.
+        self._keys = {site.id: config.folder.keys(site.id) for site in config.sites}
         ports = ServerPorts(
             mqtt=port(MQTTS_PORT), redis=port(REDIS_PORT), zenoh=port(ZENOH_PORT), address=config.address
         )
@@ -91,10 +93,13 @@ class LocalNode:
         return [site.name(service) for site in self.config.sites for service in SERVICES]
 
     @property
-    def listening(self) -> dict[str, int]:
-        """The ports on which the programs will listen, by what each is for."""
-        services = {site.name(name): number for site in self.config.sites for name, number in site.ports.items()}
-        return {program.name: program.port for program in self.server_set} | services
+    def listening(self) -> dict[str, tuple[str, int]]:
+        """The address and port on which each program will listen, by its name."""
+        address = self.config.address
+        services = {
+            site.name(name): (address, number) for site in self.config.sites for name, number in site.ports.items()
+        }
+        return {program.name: (program.address, program.port) for program in self.server_set} | services
 
     async def start(self, timeout_s: float) -> None:
         """Start everything, servers first, and wait until each program is ready; raises `NotReadyError`."""
@@ -109,7 +114,7 @@ class LocalNode:
 
     def system(self, site: HostedSite) -> System:
         """Return a site's part of the fog node as it is now."""
-        folder, keys = self.config.folder, self.config.folder.keys(site.id)
+        folder, keys = self.config.folder, self._keys[site.id]
         host = net.reachable(self.config.address)
         own = [name for name in self.supervisor.names if self._sites.get(name, site) is site]
         found = {name: self.supervisor.pid(name) for name in own}
@@ -148,7 +153,7 @@ class LocalNode:
         return {"CREDENTIALS_FILE": str(self.config.locks.credentials(site.name(user)))}
 
     def _add_services(self, site: HostedSite) -> None:
-        keys, http = self.config.folder.keys(site.id), self.config.locks.folder("http")
+        keys, http = self._keys[site.id], self.config.locks.folder("http")
         for service in SERVICES:
             settings = {
                 "TOKENS_FILE": str(keys / TOKENS),
@@ -166,7 +171,7 @@ class LocalNode:
         if not robots:
             raise WrongUseError(f"{site.directory}/site.toml has no [[robots]]: add one with its start")
         robot = robots[0].id
-        key = {"OPERATOR_KEY_FILE": str(self.config.folder.keys(site.id) / OPERATOR_KEY)}
+        key = {"OPERATOR_KEY_FILE": str(self._keys[site.id] / OPERATOR_KEY)}
         # Paths of sockets are short, and that of the data may be long.
         folder = Path(tempfile.mkdtemp(prefix="fognav-"))
         self._devices.append(folder)

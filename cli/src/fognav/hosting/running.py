@@ -3,7 +3,7 @@
 import asyncio
 import contextlib
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Final
 
 from fog_runtime import signals
@@ -16,7 +16,28 @@ from fognav.output import FailedError
 
 READY_S: Final = 180.0
 """Real seconds for each group of programs to become ready: a Raspberry Pi after a cold boot is slow."""
-_PERIOD_S: Final = 1.0
+PERIOD_S: Final = 1.0
+"""Between two rounds of bookkeeping."""
+
+
+class Troubles:
+    """Bookkeeping that fails without ending the fog node: each trouble is printed once, until it is over."""
+
+    def __init__(self, print_line: Callable[[str], None]) -> None:
+        self._print_line = print_line
+        self._lasting: set[str] = set()
+
+    @contextlib.contextmanager
+    def told(self, trouble: str) -> Iterator[None]:
+        """Print the trouble, if an `OSError` or `FailedError` leaves this context for the first time in a row."""
+        try:
+            yield
+        except (OSError, FailedError) as error:
+            if trouble not in self._lasting:
+                self._lasting.add(trouble)
+                self._print_line(f"{trouble}: {error}")
+        else:
+            self._lasting.discard(trouble)
 
 
 async def run_node(config: NodeConfig, print_line: Callable[[str], None]) -> None:
@@ -24,7 +45,13 @@ async def run_node(config: NodeConfig, print_line: Callable[[str], None]) -> Non
 
     Raises `FailedError` when a port is taken, `NotReadyError` when a program does not become ready, and as `LocalNode`.
     """
-    node = LocalNode(config, lambda event: _tell(event, print_line))
+
+    def say(line: str) -> None:
+        # A full disk or a closed terminal behind standard output must not end the programs: nobody is left to tell.
+        with contextlib.suppress(OSError):
+            print_line(line)
+
+    node = LocalNode(config, lambda event: _tell(event, say))
     running = asyncio.current_task()
     assert running is not None
     loop, stopped = asyncio.get_running_loop(), False
@@ -47,7 +74,7 @@ async def run_node(config: NodeConfig, print_line: Callable[[str], None]) -> Non
                     each.update()
                 await node.start(READY_S)
                 _announce(node, print_line)
-                await _attend(node, registrations)
+                await attend(node, registrations, say)
     except asyncio.CancelledError:
         if not stopped:
             raise
@@ -63,17 +90,20 @@ def _registration(node: LocalNode, index: int) -> Registration:
     return Registration(lambda: node.system(site))
 
 
-async def _attend(node: LocalNode, registrations: list[Registration]) -> None:
-    """Keep the register and the service manager informed, and the logs bounded."""
+async def attend(node: LocalNode, registrations: list[Registration], print_line: Callable[[str], None]) -> None:
+    """Keep the register and the service manager informed, and the logs bounded; robots need none of that to drive."""
     manager = ServiceManager()
     manager.ready()
+    troubles = Troubles(print_line)
     while True:
-        for each in registrations:
-            each.update()
+        for site, each in zip(node.config.sites, registrations, strict=True):
+            with troubles.told(f"the entry of site {site.id} in the register is not current"):
+                each.update()
         for name in node.supervisor.names:
-            await asyncio.to_thread(log_files.bound, node.config.folder.log(name))
+            with troubles.told(f"the log of {name} could not be kept and begun anew"):
+                await asyncio.to_thread(log_files.bound, node.config.folder.log(name))
         manager.alive()
-        await asyncio.sleep(_PERIOD_S)
+        await asyncio.sleep(PERIOD_S)
 
 
 def _tell(event: Event, print_line: Callable[[str], None]) -> None:
@@ -90,8 +120,7 @@ def _announce(node: LocalNode, print_line: Callable[[str], None]) -> None:
 
 def _require_free_ports(node: LocalNode) -> None:
     """Raise `FailedError` if another program listens already where one of these shall."""
-    address = node.config.address
-    for name, number in node.listening.items():
+    for name, (address, number) in node.listening.items():
         with socket.socket() as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             try:

@@ -28,16 +28,14 @@ def make_keys(directory: Path, *, mode: int = 0o600) -> list[Path]:
     """Create the missing secrets; return the new files.
 
     A token is useless without its entry in `tokens.toml`, so these two are created together: raises `FileExistsError`
-    when only one of them exists.
+    when only `admin.token` exists. Without it, `tokens.toml` is complete: the token may be kept elsewhere.
     """
     directory.mkdir(parents=True, exist_ok=True)
     created: list[Path] = []
     token_file, tokens_file, key_file = (directory / name for name in (ADMIN_TOKEN, TOKENS, OPERATOR_KEY))
-    if token_file.exists() != tokens_file.exists():
-        existing = token_file if token_file.exists() else tokens_file
-        missing = tokens_file if token_file.exists() else token_file
-        raise FileExistsError(f"{existing} exists, but {missing} does not: remove the one or restore the other")
-    if not token_file.exists():
+    if token_file.exists() and not tokens_file.exists():
+        raise FileExistsError(f"{token_file} exists, but {tokens_file} does not: remove the one or restore the other")
+    if not tokens_file.exists():
         token = secrets.token_urlsafe(TOKEN_BYTES)
         _write_new(token_file, token + "\n", mode)
         _write_new(tokens_file, f'[[tokens]]\nname = "admin"\nrole = "admin"\nsha256 = "{token_hash(token)}"\n', mode)

@@ -217,11 +217,15 @@ class Supervisor:
         delay = BACKOFF_MIN_S
         while True:
             started = time.monotonic()
-            process = await self._spawn(supervised)
-            code = await process.wait()
-            supervised.process = None
-            await _end_leftovers(process.pid)
-            exit_text = f"exit code {code}" if code >= 0 else f"ended by {signal.Signals(-code).name}"
+            try:
+                process = await self._spawn(supervised)
+            except OSError as error:  # no file descriptors left, no log folder: it may pass, as a crash may
+                exit_text = f"could not be started: {error}"
+            else:
+                code = await process.wait()
+                supervised.process = None
+                await _end_leftovers(process.pid)
+                exit_text = f"exit code {code}" if code >= 0 else f"ended by {signal.Signals(-code).name}"
             if not supervised.wanted:
                 self._emit(supervised, "stopped", exit_text)
                 return
@@ -265,7 +269,7 @@ class Supervisor:
     def _not_ready_text(self, name: str, reason: str) -> str:
         supervised = self._get(name)
         restarts = (
-            f" (started {supervised.starts} times; last exit: {supervised.last_exit})" if supervised.starts > 1 else ""
+            f" (started {supervised.starts} times; last exit: {supervised.last_exit})" if supervised.starts != 1 else ""
         )
         log = supervised.program.log
         return f"{name} is not ready: {reason}{restarts}. The end of {log}:\n{log_tail(log)}"

@@ -3,9 +3,11 @@
 import asyncio
 import errno
 import shutil
+import socket
 import stat
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -176,3 +178,13 @@ def test_log_is_cut_without_a_copy_on_a_full_disk(tmp_path):
 def test_error_without_a_file_is_told_without_one():
     with pytest.raises(FailedError, match="a file can't be used: No space left on device"), locks_errors():
         raise OSError(errno.ENOSPC, "No space left on device")
+
+
+async def test_port_is_required_free_at_the_address_where_its_program_listens(node):
+    assert {address for name, (address, _) in node.listening.items() if name != "redis"} == {"127.0.0.2"}
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        node.server_set = [
+            replace(each, port=other.getsockname()[1]) for each in node.server_set if each.name == "redis"
+        ]
+        with pytest.raises(FailedError, match=r"redis can't listen on 127\.0\.0\.1 port"):
+            running.require_free_ports(node)

@@ -136,6 +136,26 @@ def test_register_forgets_a_demo_that_was_killed(runtime: Path) -> None:
     assert list(runtime.iterdir()) == []
 
 
+def test_register_keeps_the_systems_of_one_name_of_two_processes_apart(runtime: Path) -> None:
+    code = (
+        "import sys; from fognav.operate.registry import *\n"
+        "with Registration(lambda: System(name='fog-estig', kind='fog node', site='', urls={}, pids={})) as entry:\n"
+        "    entry.update(); print('up', flush=True); sys.stdin.read()"
+    )
+    with Registration(lambda: system("fog-estig", "http://x")) as registration:
+        registration.update()
+        process = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"up\n"
+        assert sorted(found.kind for found in registered()) == ["demo", "fog node"]
+        assert "several systems of this machine are named fog-estig" in run(
+            "zone", "list", "--fog", "fog-estig", code=2
+        )
+        process.communicate()  # it ends
+        assert [found.kind for found in registered()] == ["demo"]
+    assert list(runtime.iterdir()) == []
+
+
 def test_register_forgets_a_demo_whose_process_id_belongs_to_another_process(runtime: Path) -> None:
     with Registration(lambda: system("demo-1", "http://x")) as registration:
         registration.update()

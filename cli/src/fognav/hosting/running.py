@@ -65,7 +65,7 @@ async def run_node(config: NodeConfig, print_line: Callable[[str], None]) -> Non
     for number in signals.ending():
         loop.add_signal_handler(number, stop)
     try:
-        _require_free_ports(node)
+        require_free_ports(node)
         async with node.supervisor:
             with contextlib.ExitStack() as entries:
                 registrations = [_registration(node, index) for index in range(len(config.sites))]
@@ -118,7 +118,7 @@ def _announce(node: LocalNode, print_line: Callable[[str], None]) -> None:
         print_line(f"  token in {system.token_file}; operate it from another terminal: fognav status")
 
 
-def _require_free_ports(node: LocalNode) -> None:
+def require_free_ports(node: LocalNode) -> None:
     """Raise `FailedError` if another program listens already where one of these shall."""
     for name, (address, number) in node.listening.items():
         with socket.socket() as probe:

@@ -143,7 +143,14 @@ def find_fog(address: str | None) -> Fog:
     """
     named = address or os.environ.get(FOG)
     if named:
-        return Fog(next((demo for demo in registered() if demo.name == named), None) or _fog_node(named))
+        found = [system for system in registered() if system.name == named]
+        if len(found) > 1:
+            folders = ", ".join(str(system.data) for system in found)
+            raise WrongUseError(
+                f"several systems of this machine are named {named} (data in {folders}): end all but one, "
+                "or give the other's site an id of its own in its site.toml"
+            )
+        return Fog(found[0] if found else _fog_node(named))
     fogs = [system for system in find_systems() if system.kind != "robot"]
     if not fogs:
         raise FailedError(

@@ -89,9 +89,9 @@ class Registration:
         system = self._describe()
         if system == self._written:
             return
-        if self._file is None:
-            self._file = folder() / f"{system.name}.json"
         own = psutil.Process()
+        # Two fog nodes of one site have the same name, and each its own entry.
+        self._file = folder() / f"{system.name}.{own.pid}.json"
         entry = _Entry(pid=own.pid, started=own.create_time(), system=system)
         atomic_write(self._file, msgspec.json.encode(entry))
         self._written = system

@@ -16,7 +16,6 @@ user hands out its file; here it may be removed then.
 from __future__ import annotations
 
 import datetime as dt
-import os
 import re
 import stat
 from typing import TYPE_CHECKING, Final, Self
@@ -30,6 +29,7 @@ from fog_runtime.credentials import Credentials, Server, to_toml
 from fog_runtime.files import PRIVATE, atomic_write
 from fog_runtime.locks import users
 from fog_runtime.locks.authority import SERVER_DAYS, Authority, expiry
+from fog_runtime.locks.server_files import ANYBODY, ServerFiles, user_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -40,10 +40,7 @@ AUTHORITY: Final = "authority.pem"
 CREDENTIALS: Final = "credentials"
 PROGRAMS: Final = ("mosquitto", "redis", "zenoh", "http")
 """The folders of what has a certificate."""
-CERTIFICATE, KEY, USERS, ACCESS = "server.pem", "server.key", "users", "access"
-REDIS_ADMINISTRATOR: Final = "administrator"
-_ANYBODY: Final = "default"
-"""Redis's name for who gives none."""
+CERTIFICATE, KEY, ACCESS = "server.pem", "server.key", "access"
 _RENEW_BEFORE: Final = dt.timedelta(days=SERVER_DAYS // 3)
 _DEVICE_TOPIC: Final = re.compile(r"(?!fog/)[\w.-]+/(?:(?:[\w.-]+|\+)/)*(?:[\w.-]+|\+|#)", re.ASCII)
 """No topic of one level, such as the thesis's, and none of Fognav's own."""
@@ -108,7 +105,7 @@ class SiteLocks:
         wanted = [*known_hosts, *(host for host in hosts if host not in known_hosts)]
         self.renew(wanted, only_due=wanted == known_hosts)
         own: dict[str, Sequence[Server]] = {**users.SERVICES, **users.TOOLS, **users.THESIS}
-        own[REDIS_ADMINISTRATOR] = ("redis",)
+        own[users.REDIS_ADMINISTRATOR] = ("redis",)
         own[users.HEALTH] = users.HEALTH_SERVERS
         own |= dict.fromkeys(self._plan.unrestricted, ("mqtt", "zenoh"))
         missing = {user: servers for user, servers in own.items() if not self.credentials(user).exists()}
@@ -141,6 +138,10 @@ class SiteLocks:
         return {user: servers for user, servers in handed_out.items() if user not in known}
 
     @property
+    def _files(self) -> ServerFiles:
+        return ServerFiles(self._folder, self._plan.mode)
+
+    @property
     def directory(self) -> Path:
         """The folder."""
         return self._folder
@@ -152,7 +153,7 @@ class SiteLocks:
 
     def users(self) -> set[str]:
         """Return everybody whom a server admits."""
-        return {_user(line) for program in _PROGRAM_OF.values() for line in self._lines(program)} - {_ANYBODY}
+        return {user for program in _PROGRAM_OF.values() for user in self._files.members(program)}
 
     def credentials(self, user: str) -> Path:
         """Return the file of a user's credentials."""
@@ -161,7 +162,7 @@ class SiteLocks:
 
     def folder(self, program: str) -> Path:
         """Return the folder of one of `PROGRAMS`."""
-        return self._folder / program
+        return self._files.folder(program)
 
     @property
     def authority(self) -> Authority:
@@ -203,9 +204,10 @@ class SiteLocks:
         self._require_free_name(user)
         found = False
         for program in _PROGRAM_OF.values():
-            kept = [line for line in self._lines(program) if _user(line) != user]
-            found |= len(kept) < len(self._lines(program))
-            self._write(program, USERS, "".join(f"{line}\n" for line in kept))
+            lines = self._files.lines(program)
+            kept = [line for line in lines if user_of(line) != user]
+            found |= len(kept) < len(lines)
+            self._files.write_lines(program, kept)
         self.credentials(user).unlink(missing_ok=True)
         self._save(
             msgspec.structs.replace(
@@ -227,8 +229,8 @@ class SiteLocks:
             if only_due and file.exists() and expiry(file) - _now() > _RENEW_BEFORE:
                 continue
             issued = authority.issue(program, hosts, now=_now())
-            self._write(program, KEY, issued.key.decode())
-            self._write(program, CERTIFICATE, issued.chain.decode())
+            self._files.write(program, KEY, issued.key.decode())
+            self._files.write(program, CERTIFICATE, issued.chain.decode())
             renewed.append(program)
         self._save(msgspec.structs.replace(self._plan, hosts=list(hosts)))
         return renewed
@@ -272,43 +274,33 @@ class SiteLocks:
             user: {server: users.new_password() for server in servers} for user, servers in added.items()
         }
         for server, program in _PROGRAM_OF.items():
-            new = [self._line(server, user, own[server]) for user, own in passwords.items() if server in own]
-            kept = [line for line in self._lines(program) if _user(line) not in {_user(each) for each in new}]
+            new = [
+                users.line(server, user, own[server], self._plan.site)
+                for user, own in passwords.items()
+                if server in own
+            ]
+            replaced = {user_of(each) for each in new}
             if new:
-                self._write(program, USERS, "".join(f"{line}\n" for line in [*kept, *new]))
+                kept = [line for line in self._files.lines(program) if user_of(line) not in replaced]
+                self._files.write_lines(program, [*kept, *new])
         # Last: whatever is cut short before is done again by the next `make`.
         for user, own in passwords.items():
             file = self.credentials(user)
             file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             atomic_write(file, to_toml(user, authority=trusted, passwords=own).encode(), mode=PRIVATE)
 
-    def _line(self, server: Server, user: str, password: str) -> str:
-        if server == "mqtt":
-            return users.mqtt_line(user, password)
-        if server == "zenoh":
-            return users.zenoh_line(user, password)
-        if user == REDIS_ADMINISTRATOR:
-            return users.redis_administrator_line(user, password)
-        if user == users.HEALTH:
-            return users.redis_health_line(user, password)
-        return users.redis_line(user, password, users.of_floor(user)[0] or self._plan.site)
-
     def _write_rights_in_redis(self) -> None:
         """Write what this version's services may do in Redis, in whose list rights and passwords are one line."""
-        lines = []
-        for line in self._lines("redis"):
-            if _user(line) == _ANYBODY:
+        lines = [users.REDIS_NOBODY]
+        for line in self._files.lines("redis"):
+            if (user := user_of(line)) == ANYBODY:
                 continue
-            file = self.credentials(_user(line))
+            file = self.credentials(user)
             known = file.exists()
-            lines.append(self._line("redis", _user(line), Credentials.read(file).passwords["redis"]) if known else line)
-        self._write("redis", USERS, "".join(f"{line}\n" for line in [users.REDIS_NOBODY, *lines]))
-
-    def _lines(self, program: str) -> list[str]:
-        file = self.folder(program) / USERS
-        if file.exists():
-            return file.read_text("utf-8").splitlines()
-        return [users.REDIS_NOBODY] if program == "redis" else []
+            lines.append(
+                users.line("redis", user, Credentials.read(file).passwords["redis"], self._plan.site) if known else line
+            )
+        self._files.write_lines("redis", lines)
 
     def _write_access(self) -> None:
         """Write what each user may do; robots and nodes are the users who have no role."""
@@ -316,19 +308,19 @@ class SiteLocks:
         nodes = {floor: self._members("mosquitto", floor) for floor in plan.floors}
         robots = {floor: self._members("zenoh", floor) for floor in plan.floors}
         access = mqtt_acl(plan.site, unrestricted=plan.unrestricted, floors=nodes, devices=plan.devices)
-        self._write("mosquitto", ACCESS, access)
+        self._files.write("mosquitto", ACCESS, access)
         own = self._members("zenoh", "")
         access = zenoh_acl(plan.site, own, unrestricted=plan.unrestricted, floors=robots)
-        self._write("zenoh", f"{ACCESS}.json5", access)
+        self._files.write("zenoh", f"{ACCESS}.json5", access)
 
     def _members(self, program: str, floor: str) -> list[str]:
         """Return the users of a program who are no part of Fognav, by their names on a floor (or the first site)."""
-        members = [user for line in self._lines(program) if not self._is_reserved(user := _user(line))]
+        members = [user for user in self._files.members(program) if not self._is_reserved(user)]
         return [name for own, name in map(users.of_floor, members) if own == floor]
 
     def _require_different_ids(self, robots: Sequence[str], nodes: Sequence[str]) -> None:
-        known_nodes, known_robots = ({_user(line) for line in self._lines(each)} for each in ("mosquitto", "zenoh"))
-        taken = set(robots) & ({*nodes} | known_nodes) | set(nodes) & ({*known_robots} | {*self._plan.devices})
+        known_nodes, known_robots = (set(self._files.members(each)) for each in ("mosquitto", "zenoh"))
+        taken = set(robots) & ({*nodes} | known_nodes) | set(nodes) & (known_robots | {*self._plan.devices})
         if taken := {user for user in taken if not self._is_reserved(user)}:
             raise LocksError(
                 f"{', '.join(sorted(taken))}: a robot, a node and a device of one site need different ids, since each "
@@ -340,26 +332,12 @@ class SiteLocks:
             raise LocksError(f"{user} is the name of a part of Fognav: give the robot, node or device another id")
 
     def _is_reserved(self, user: str) -> bool:
-        parts = {*ROLES, REDIS_ADMINISTRATOR, users.HEALTH, _ANYBODY}
+        parts = {*ROLES, users.REDIS_ADMINISTRATOR, users.HEALTH, ANYBODY}
         return users.of_floor(user)[1] in parts or user in self._plan.unrestricted
-
-    def _write(self, program: str, name: str, text: str) -> None:
-        file = self.folder(program) / name
-        file.parent.mkdir(mode=0o755 if self._plan.mode & 0o077 else 0o700, parents=True, exist_ok=True)
-        # A file stays readable for whom an administrator gave it to: servers mostly run as users of their own.
-        before = file.stat() if file.exists() else None
-        atomic_write(file, text.encode(), mode=self._plan.mode if before is None else stat.S_IMODE(before.st_mode))
-        if before is not None and os.geteuid() == 0:
-            os.chown(file, before.st_uid, before.st_gid)
 
 
 def _read_plan(folder: Path) -> _Plan:
     return msgspec.json.decode((folder / _PLAN).read_bytes(), type=_Plan)
-
-
-def _user(line: str) -> str:
-    """Return whose line it is, in any of the lists: `name:…`, or Redis's `user name …`."""
-    return line.split()[1] if line.startswith("user ") else line.partition(":")[0]
 
 
 def _now() -> dt.datetime:

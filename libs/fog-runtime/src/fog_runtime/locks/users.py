@@ -35,6 +35,7 @@ TOOLS: Final[Mapping[str, Sequence[Server]]] = {
 """The same for the tools of the fog node's administrator, and for a simulated world."""
 THESIS: Final[Mapping[str, Sequence[Server]]] = {"thesis-node": ("mqtt",), "thesis-robot": ("mqtt",)}
 """Nodes and robots of the master's thesis, of the first site only: its topics name no site."""
+REDIS_ADMINISTRATOR: Final = "administrator"
 HEALTH: Final = "health"
 """Who asks broker and Redis whether they are well, and may do nothing else."""
 HEALTH_SERVERS: Final[Sequence[Server]] = ("mqtt", "redis")
@@ -58,6 +59,19 @@ def of_floor(user: str) -> tuple[str, str]:
     """Return the further site of a user (an empty text: the first site), and its name there."""
     floor, _, name = user.rpartition(".")
     return floor, name
+
+
+def line(server: Server, user: str, password: str, site: str) -> str:
+    """Return a user's line in a server's list; `site` is the first one's, to which users without a floor belong."""
+    if server == "mqtt":
+        return mqtt_line(user, password)
+    if server == "zenoh":
+        return zenoh_line(user, password)
+    if user == REDIS_ADMINISTRATOR:
+        return redis_administrator_line(user, password)
+    if user == HEALTH:
+        return redis_health_line(user, password)
+    return redis_line(user, password, of_floor(user)[0] or site)
 
 
 def mqtt_line(user: str, password: str) -> str:

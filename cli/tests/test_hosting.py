@@ -12,7 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from fognav.hosting import log_files, running, unit
+from fog_runtime import backup
+from fog_runtime.redis_connection import RedisConnection
+from fognav.hosting import log_files, restoring, running, unit
 from fognav.hosting.floors import hosted_sites
 from fognav.hosting.folders import FORMAT, NodeFolder, default_data
 from fognav.hosting.node import LocalNode, NodeConfig
@@ -121,7 +123,7 @@ async def until(condition: Callable[[], object]) -> None:
 def node(tmp_path: Path) -> LocalNode:
     """A fog node of which nothing runs yet."""
     folder = NodeFolder(tmp_path / "data")
-    sites, locks = hosted_sites([ESTIG], folder.locks, ["localhost"])
+    sites, locks = hosted_sites([ESTIG], folder.locks, ["localhost", "127.0.0.1"])
     return LocalNode(NodeConfig(folder=folder, sites=sites, locks=locks, address="127.0.0.2"), lambda _: None)
 
 
@@ -188,3 +190,29 @@ async def test_port_is_required_free_at_the_address_where_its_program_listens(no
         ]
         with pytest.raises(FailedError, match=r"redis can't listen on 127\.0\.0\.1 port"):
             running.require_free_ports(node)
+
+
+def connected(place: backup.Place) -> RedisConnection:
+    return RedisConnection(place.redis_url, timeout_s=10.0, credentials=place.credentials)
+
+
+async def test_backup_is_restored_into_a_node_that_is_down(node, tmp_path):
+    site, folder, file = tmp_path / "site", node.config.folder, tmp_path / "fog.tar.gz"
+    shutil.copytree(ESTIG, site)
+    async with restoring.redis_of(folder, "estig", site) as place:
+        redis = connected(place)
+        await redis.write(("SET", "fog:estig:zones", "wet floor"))
+        await redis.aclose()
+        await backup.create(file, place, 1.0)
+    token = (folder.keys("estig") / "admin.token").read_text()
+    for lost in (folder.data("redis"), folder.keys("estig"), site):
+        shutil.rmtree(lost)
+    with folder.in_use(), pytest.raises(FailedError, match="fognav down"):
+        await restoring.restore(file, folder, site, replace=False)
+    await restoring.restore(file, folder, site, replace=False)
+    assert (folder.keys("estig") / "admin.token").read_text() == token
+    assert (site / "site.toml").read_bytes() == (ESTIG / "site.toml").read_bytes()
+    async with restoring.redis_of(folder, "estig", site) as place:
+        redis = connected(place)
+        assert await redis.read("GET", "fog:estig:zones") == b"wet floor"
+        await redis.aclose()

@@ -117,14 +117,21 @@ def test_zone_survives_a_killed_service_and_a_restart_of_the_node(node):
     )  # fmt: skip
     del node.environment["FOGNAV_CREDENTIALS_FILE"]
     assert "backed up site estig" in saved
+    node.run("zone", "add", "--circle", "80,20,1", "--reason", "after the backup")
+    restoring = ("restore", str(backup), "--site", "sites/estig", "--up", str(node.data), "--replace")
+    with pytest.raises(AssertionError, match="already runs with the data"):
+        node.run(*restoring)
 
     require_refused(node, node.data, "already runs with the data")
     require_refused(node, node.data / "other", "can't listen on")
 
     node.down()
     assert node.run("down").startswith("no fog node")
+    assert "restored site estig" in node.run(*restoring)
     node.up()
-    assert "wet floor" in node.run("zone", "list")
+    zones = node.run("zone", "list")
+    assert "wet floor" in zones
+    assert "after the backup" not in zones
     node.down()
 
 

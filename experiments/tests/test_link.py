@@ -26,6 +26,18 @@ def test_a_slow_link_loses_nothing_and_keeps_the_order(messages):
     assert all(took >= delay - 1e-9 for _, took, delay in arrived)
 
 
+def test_what_is_under_way_when_the_link_is_cut_is_lost():
+    link, heard = Link(), []
+    link.delay_s = 1.0
+    link.down(lambda at: heard.append(at.now) or (), moment(0.0))
+    link.hears = False
+    link.due(moment(2.0))
+    link.hears = True
+    link.down(lambda at: heard.append(at.now) or (), moment(3.0))
+    link.due(moment(5.0))
+    assert heard == [5.0]
+
+
 def test_each_direction_can_be_cut_alone():
     link, heard = Link(), []
     said = [Publication(ch.ROBOT_STATE, None)]

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from types import SimpleNamespace
 
 import msgspec
 import pytest
@@ -14,7 +15,7 @@ import pytest
 from fog_runtime.site import load_site
 from fognav_experiments.lockstep import DriveEvent
 from fognav_experiments.scenarios.description import Expected, FaultyNode, Scenario, SilentNode, deviations
-from fognav_experiments.scenarios.stage import ScenarioError, play, read_scenario
+from fognav_experiments.scenarios.stage import ScenarioError, _Stage, play, read_scenario
 
 ROOT = Path(__file__).parents[2]
 FILES = {file.stem: file for file in sorted((ROOT / "experiments" / "scenarios").glob("*.toml"))}
@@ -78,3 +79,18 @@ def test_scenarios_can_be_told_from_one_another():
     titles = [read_scenario(file).title for file in FILES.values()]
     assert len(set(titles)) == len(titles) >= 25
     assert isinstance(read_scenario(FILES["kidnapped"]), Scenario)
+
+
+def test_nodes_that_fail_at_the_same_time_come_back_each_at_its_own_end():
+    nodes = [SimpleNamespace(node=SimpleNamespace(id=name)) for name in ("n1", "n2", "n3")]
+    fog = SimpleNamespace(nodes=nodes)
+    drive = SimpleNamespace(now=0.0, driven=0.0, system=SimpleNamespace(fog=fog), log_event=lambda _text: None)
+    events = [SilentNode(node="n1", seconds=10.0), SilentNode(node="n2", seconds=20.0)]
+    stage = _Stage(drive, SimpleNamespace(events=events))
+
+    def heard(now):
+        drive.now = now
+        stage.step()
+        return sorted(node.node.id for node in fog.nodes)
+
+    assert [heard(now) for now in (0.0, 10.0, 20.0)] == [["n3"], ["n1", "n3"], ["n1", "n2", "n3"]]

@@ -152,6 +152,18 @@ def people_around(place, angles):
     return solid
 
 
+def test_pose_that_the_search_found_elsewhere_is_judged_by_what_is_usual_there():
+    """Where the robot was before, more beams agreed: there was no crowd."""
+    before, place = PLACES[0], PLACES[1]
+    localizer, now = standing(before, prepare=lambda each: each.initial_pose(*before), scans=15)
+    assert localizer.status == "good"
+    crowd = people_around(place, (0.3, 1.5, 2.9, 4.4))
+    for _ in range(6):
+        localizer, now = standing(place, localizer=localizer, solid=crowd, start=now, scans=15)
+    assert localizer.status == "good", localizer.detail
+    assert error_of(localizer, now, place)[0] < 0.1
+
+
 def test_pose_stays_good_while_people_gather_around_the_robot():
     place, angles = PLACES[1], (0.3, 1.5, 2.9, 4.4)
     localizer, now = standing(place, prepare=lambda one: one.initial_pose(*place))

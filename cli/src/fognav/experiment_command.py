@@ -10,7 +10,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from fognav import checkout, kernels
 from fognav.operate.options import JsonOption  # noqa: TC001  # Typer reads annotations at run time
-from fognav.output import NOT_TRUE, WrongUseError, console, exit_codes, print_json, print_line
+from fognav.output import NOT_TRUE, FailedError, WrongUseError, console, exit_codes, print_json, print_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -163,7 +163,7 @@ def film_command(  # each option is an argument
     The drives are repeated in lockstep, which gives the same ones whenever it is done by the same program.
     """
     from fog_runtime.site import SiteError, load_site  # noqa: PLC0415  # keeps the other commands fast
-    from fognav.film import Film, record  # noqa: PLC0415  # same
+    from fognav.film import Film, UnfinishedDriveError, record  # noqa: PLC0415  # same
     from fognav_experiments.comparison import runner  # noqa: PLC0415  # same
     from fognav_experiments.comparison.draws import draw  # noqa: PLC0415  # same
 
@@ -180,7 +180,10 @@ def film_command(  # each option is an argument
         if name not in drawn:
             raise WrongUseError(f"no route {name}: there are {', '.join(drawn)}")
         kernels.warm_cache(print_line)
-        recordings = [record(loaded, drawn[name], setup) for setup in _chosen(setups)]
+        try:
+            recordings = [record(loaded, drawn[name], setup) for setup in _chosen(setups)]
+        except UnfinishedDriveError as error:
+            raise FailedError(str(error)) from error
         try:
             size = Film(loaded, drawn[name], recordings).write(out)
         except OSError as error:

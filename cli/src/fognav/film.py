@@ -47,6 +47,10 @@ _WHITE, _WALL, _UNKNOWN, _DEFAULT, _FOG, _FULL, _RED, _PINK, _GREY = range(len(_
 _COLOUR: Final[dict[ProfileName, int]] = {"default": _DEFAULT, "full": _FULL, "fog": _FOG}
 
 
+class UnfinishedDriveError(RuntimeError):
+    """A drive that has no end to show; the message says in which setup, and what happened."""
+
+
 @dataclass
 class Recording:
     """One drive as it was seen on the channels: times in s from the goal on, positions in m, frame `map`."""
@@ -61,7 +65,7 @@ class Recording:
 
 
 def record(site: LoadedSite, drawn: RouteDraw, setup: ProfileName) -> Recording:
-    """Drive a drawn route in lockstep, and keep what the film shows."""
+    """Drive a drawn route in lockstep, and keep what the film shows; raises `UnfinishedDriveError`."""
     film, bus, clock = Recording(setup), Bus(site.site.id), [0.0]
 
     def on_truth(_ids: Ids, truth: SimTruth, at: Moment) -> Sequence[Publication]:
@@ -86,7 +90,9 @@ def record(site: LoadedSite, drawn: RouteDraw, setup: ProfileName) -> Recording:
     result = run_lockstep(
         site, start, goal, drawn.seed, hazard, watched=setup != "default", profile=setup, bus=bus
     )  # fmt: skip
-    film.time_s, film.distance_m = result.time_s or 0.0, result.distance_m
+    if result.time_s is None:
+        raise UnfinishedDriveError(f"the robot of setup {setup} did not reach its goal: {result.outcome}")
+    film.time_s, film.distance_m = result.time_s, result.distance_m
     began = clock[0] - film.time_s
     appears = (event.time_s for event in result.events if event.description.startswith("barrier appears"))
     film.barrier_at = next(appears, math.inf)

@@ -243,12 +243,15 @@ def node_update(  # noqa: PLR0913  # each option is an argument
     with exit_codes():
         data = updating.read_image(image)
         url, site_id, own = _on(fog, broker, site)
-        with nullcontext(address) if address is not None else updating.served(data, url) as where:
+        elsewhere = None if address is None else updating.ServedImage(address, fetched=True)
+        with nullcontext(elsewhere) if elsewhere is not None else updating.served(data, url) as image_at:
             try:
-                offer = msgspec.convert(updating.signed_offer(data, number, board, key, where), NodeUpdate)
+                offer = msgspec.convert(updating.signed_offer(data, number, board, key, image_at.url), NodeUpdate)
             except msgspec.ValidationError as error:
                 raise WrongUseError(f"the offer is not valid: {error}") from error
             reading = _run(on_broker.update(url, site_id, _checked(name), offer, own, seconds=seconds))
+        if not image_at.fetched:
+            raise FailedError(f"node {name} has restarted without fetching the image: look at its power, and try again")
         if json:
             print_json({"node": name, "number": number, "sha256": offer.sha256, "fw": reading.fw, "boot": reading.boot})
         else:

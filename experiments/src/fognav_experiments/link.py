@@ -16,13 +16,14 @@ if TYPE_CHECKING:
 class Link:
     """The messages between the fog and one robot, in their order.
 
-    `hears`, `is_heard`: whether messages reach the robot, and the robot's the fog. `delay_s`: how long each takes.
+    `hears`, `is_heard`: whether messages reach the robot, and the robot's the fog; what is under way when that ends is
+    lost. `delay_s`: how long each takes.
     """
 
     def __init__(self) -> None:
         self.hears = self.is_heard = True
         self.delay_s = 0.0
-        self._under_way: deque[tuple[float, Arrival]] = deque()
+        self._under_way: deque[tuple[float, bool, Arrival]] = deque()
 
     @property
     def whole(self) -> bool:
@@ -31,23 +32,25 @@ class Link:
 
     def down(self, arrive: Arrival, at: Moment) -> Sequence[Publication]:
         """Send a message to the robot; return what its handler publishes, if it arrives at once."""
-        return self._pass(arrive, at) if self.hears else ()
+        return self._pass(arrive, at, down=True) if self.hears else ()
 
     def up(self, publications: Sequence[Publication], at: Moment) -> Sequence[Publication]:
         """Send what the robot publishes; return what arrives at once."""
-        return self._pass(lambda _when: publications, at) if self.is_heard and publications else ()
+        return self._pass(lambda _when: publications, at, down=False) if self.is_heard and publications else ()
 
     def due(self, at: Moment) -> Sequence[Publication]:
         """Let what was under way long enough arrive; return what is published then. Call it every 10 ms."""
         published: list[Publication] = []
         while self._under_way and self._under_way[0][0] <= at.now:
-            published += self._under_way.popleft()[1](at)
+            _, down, arrive = self._under_way.popleft()
+            if self.hears if down else self.is_heard:
+                published += arrive(at)
         return published
 
-    def _pass(self, arrive: Arrival, at: Moment) -> Sequence[Publication]:
+    def _pass(self, arrive: Arrival, at: Moment, *, down: bool) -> Sequence[Publication]:
         if self.delay_s <= 0.0 and not self._under_way:
             return arrive(at)
         # Nothing overtakes what is under way, as on a TCP connection.
         last = self._under_way[-1][0] if self._under_way else at.now
-        self._under_way.append((max(at.now + self.delay_s, last), arrive))
+        self._under_way.append((max(at.now + self.delay_s, last), down, arrive))
         return ()

@@ -88,6 +88,18 @@ def test_a_second_installation_keeps_what_was_changed_on_the_robot(installed):
     assert toml.read_text() == before
 
 
+def test_a_second_installation_with_credentials_lets_the_robot_through_a_locked_router(installed, tmp_path):
+    env, credentials = installed / "etc/fognav/robot.env", tmp_path / "r1.toml"
+    env.write_text(env.read_text().replace("r1", "r9"))
+    credentials.write_text("")
+    assert environment(installed)["FOGNAV_ZENOH_CONNECT"] == "tcp/fog.local:7447"
+    install(installed, "--credentials", str(credentials))
+    found = environment(installed)
+    assert found["FOGNAV_ZENOH_CONNECT"] == "tls/fog.local:7447"
+    assert found["FOGNAV_CREDENTIALS_FILE"] == "/etc/fognav/credentials.toml"
+    assert found["FOGNAV_ROBOT"] == "r9"
+
+
 class Update:
     """The installer on a machine of stand-ins: a copy whose folders are below `home`, and commands that write a log."""
 

@@ -42,6 +42,15 @@ def test_lower_agreement_is_usual_after_a_drive():
     assert doubt_after(0.98, 0.98, *[0.7] * 7).reason == ""
 
 
+def test_lower_agreement_is_usual_after_a_drive_in_a_small_room():
+    doubt = doubt_after(0.98, 0.98)
+    suspect = []
+    for number in range(9):
+        doubt.add(fit(0.7), Pose2(0.5 + 0.3 * (number % 2), 0.0, 0.0), jumped=False)
+        suspect.append(bool(doubt.reason))
+    assert suspect == [True] * 7 + [False] * 2
+
+
 def test_robot_that_stands_stays_suspect_as_long_as_something_stands_before_it():
     assert doubt_after(0.98, 0.98, *[0.7] * 100, step=0.0).reason
     assert doubt_after(0.98, 0.98, *[0.7] * 100, 0.98, step=0.0).reason == ""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import threading
 from contextlib import contextmanager
+from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import TYPE_CHECKING, Final
 
@@ -29,6 +30,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
+_THIS_COMPUTER: Final = ("localhost", "127.0.0.1", "::1")
+_SOMEWHERE: Final = "tcp/192.0.2.1:9"
+"""Behind the default route; nothing is sent to it (TEST-NET-1, RFC 5737)."""
 _MAX_BYTES: Final = 4 * 1024 * 1024
 
 
@@ -71,13 +75,22 @@ def read_image(file: Path) -> bytes:
     return image
 
 
+@dataclass
+class ServedImage:
+    """An image that nodes can fetch, and whether one has fetched it to its end."""
+
+    url: str
+    fetched: bool = False
+
+
 @contextmanager
-def served(image: bytes, broker: str) -> Iterator[str]:
-    """Serve an image over HTTP, and yield the URL at which a node can fetch it that reaches the same broker.
+def served(image: bytes, broker: str) -> Iterator[ServedImage]:
+    """Serve an image over HTTP, at the URL at which a node can fetch it that reaches the same broker.
 
     Not encrypted: what the node fetches is compared with the hash that is signed. Raises `WrongUseError` where the
     broker's address says no way to this computer.
     """
+    found = ServedImage("")
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
@@ -85,18 +98,24 @@ def served(image: bytes, broker: str) -> Iterator[str]:
             self.send_header("Content-Length", str(len(image)))
             self.end_headers()
             self.wfile.write(image)
+            found.fetched = True
 
         def log_message(self, format: str, *args: object) -> None:  # noqa: A002  # the name that its base gives it
             """Say nothing: standard error belongs to the command."""
 
     with ThreadingHTTPServer(("", 0), Handler) as server:
         known = Broker.of(broker)
-        address = reachable_address("", server.server_port, [f"tcp/{known.host}:{known.port}"])
+        towards = f"tcp/{known.host}:{known.port}"
+        address = reachable_address("", server.server_port, [towards])
+        if known.host in _THIS_COMPUTER:
+            # A board comes from the network; only a simulated node would find this computer at its own loopback.
+            address = reachable_address("", server.server_port, [_SOMEWHERE]) or address
         if not address:
             raise WrongUseError(f"no network leads to {known}: serve the image elsewhere, and name it with --url")
         threading.Thread(target=server.serve_forever, daemon=True).start()
+        found.url = f"http://{address}/firmware.bin"
         try:
-            yield f"http://{address}/firmware.bin"
+            yield found
         finally:
             server.shutdown()
 

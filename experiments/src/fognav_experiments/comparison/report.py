@@ -226,13 +226,13 @@ def _beside_thesis(pairs: Sequence[Drives], met: Sequence[Drives], setups: Seque
 
 def _saved(pairs: Sequence[Drives], met: Sequence[Drives], quantity: Quantity) -> str:
     """Return in words what `fog` saves against `default`."""
-    words = []
+    words = ["default - fog"]
     for subject, chosen in (("all", pairs), ("obstacle met", met)):
         both = [drives for drives in chosen if "default" in drives and "fog" in drives]
         if both:
             found = compare([quantity.value(d["default"]) for d in both], [quantity.value(d["fog"]) for d in both])
             words.append(f"{subject}: {limits.text(found.difference)} {quantity.unit}")
-    return "; ".join(words) or "not measured"
+    return "; ".join(words) if len(words) > 1 else "not measured"
 
 
 def _routes(pairs: Sequence[Drives], setups: Sequence[ProfileName]) -> list[Block]:

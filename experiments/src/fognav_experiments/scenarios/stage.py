@@ -169,9 +169,14 @@ class _Stage:
     def _replace_node(self, name: Id, replaced: Callable[[SensorNode], list[SensorNode]], seconds: float) -> None:
         """Let others take the place of a node; `seconds` later it is back."""
         fog = self._run.system.fog
-        known = list(fog.nodes)
-        fog.nodes = [other for node in known for other in (replaced(node) if node.node.id == name else [node])]
-        self._later(seconds, partial(setattr, fog, "nodes", known))
+        before = [node for node in fog.nodes if node.node.id == name]
+        kept = [node for node in fog.nodes if node.node.id != name]
+        fog.nodes = [*kept, *(other for node in before for other in replaced(node))]
+        self._later(seconds, partial(self._restore_node, name, before))
+
+    def _restore_node(self, name: Id, before: list[SensorNode]) -> None:
+        fog = self._run.system.fog
+        fog.nodes = [*(node for node in fog.nodes if node.node.id != name), *before]
 
     def _start_again(self, process: FogProcessName) -> None:
         self._run.system.fog.start_again(process, moment(self._run.now))

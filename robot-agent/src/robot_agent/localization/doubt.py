@@ -36,14 +36,16 @@ class Doubt:
         """Odometry at which scans last cast doubt on the pose, or it was found again; None once it is verified."""
         self._level: float | None = None
         """Share of agreeing beams that is usual here; None before the first scan of a pose."""
-        self._suspect_since: Pose2 | None = None
+        self._suspect_for_m: float | None = None
+        """How far the robot has driven since the pose became suspect, in however small a room."""
+        self._last: Pose2 | None = None
 
     @property
     def reason(self) -> str:
         """Why a pose that fits is not good; empty if it may be."""
         if self._since is not None:
             return "the pose was in doubt and fits again: other places may look like this one"
-        if self._suspect_since is not None:
+        if self._suspect_for_m is not None:
             return "suddenly fewer beams end at walls of the map: something stands before them, or the robot was moved"
         return ""
 
@@ -62,7 +64,7 @@ class Doubt:
 
     def restart(self) -> None:
         """Forget everything of another pose."""
-        self._since = self._level = self._suspect_since = None
+        self._since = self._level = self._suspect_for_m = None
 
     def add(self, fit: Fit, odom: Pose2, *, jumped: bool) -> None:
         """Add the fit of the newest scan; `jumped`: whether it moved the estimate to another place."""
@@ -70,18 +72,21 @@ class Doubt:
             self._since = odom
         elif self._since is not None and _driven(self._since, odom) > _VERIFIED_AFTER_M:
             self._since = None
-        self._follow_level(fit.agree, odom)
+        self._follow_level(fit.agree, 0.0 if self._last is None else _driven(self._last, odom))
+        self._last = odom
 
-    def _follow_level(self, agree: float, odom: Pose2) -> None:
+    def _follow_level(self, agree: float, step_m: float) -> None:
         if self._level is None:
             self._level = agree
         elif agree >= self._level - _SUDDEN_DROP:
-            self._suspect_since = None
+            self._suspect_for_m = None
             self._level += _LEVEL_GAIN * (agree - self._level)
-        elif self._suspect_since is None:
-            self._suspect_since = odom
-        elif _driven(self._suspect_since, odom) > _ACCEPTED_AFTER_M:
-            self._level, self._suspect_since = agree, None
+        elif self._suspect_for_m is None:
+            self._suspect_for_m = 0.0
+        elif (further := self._suspect_for_m + step_m) > _ACCEPTED_AFTER_M:
+            self._level, self._suspect_for_m = agree, None
+        else:
+            self._suspect_for_m = further
 
 
 def _driven(since: Pose2, odom: Pose2) -> float:

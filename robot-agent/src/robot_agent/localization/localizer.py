@@ -121,6 +121,7 @@ class Localizer:
         self._relocalization.cancel()
         if not self._filter.observe(observation.pose, observation.covariance, odom):
             self._monitor.begin("checking the pose that was measured")
+            self._doubt.restart()
         return True
 
     def on_scan(self, scan: LaserScan, now: float) -> None:
@@ -307,6 +308,7 @@ class Localizer:
         if verifying:
             self._monitor.lose("the robot was found elsewhere on the map: it was carried, or its pose was wrong")
         self._monitor.restart()
+        self._doubt.restart()
         self._local_scans = 1
         self._filter.start(outcome.pose, outcome.odom, *_FOUND_SIGMAS)
         self._filter.add(scan, fields, recover=False)

@@ -15,6 +15,8 @@ _PAGE_TITLE: Final = 30
 _COLOURS: Final = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#ff7f0e", "#17becf", "#8c564b", "#e377c2", "#7f7f7f")
 _INK, _GRID, _NOTHING = "#222222", "#dddddd", "#b00020"
 _LEGENDS: Final = 14
+_SHOWN: Final = {"percentunit": ("%", 100.0)}
+"""Grafana's units that are read more easily in another one: its name and what to multiply by."""
 _LEGEND_CHARACTERS: Final = 33
 
 
@@ -49,7 +51,9 @@ class _Plot:
 
     def draw(self, panel: Panel, series: list[Series]) -> None:
         """Draw frame, series and legend, or that there are none."""
-        self._pen.text((self._x + _LEFT, self._y + 8), f"{panel.title} [{panel.unit}]", fill=_INK, font_size=13)
+        unit, factor = _SHOWN.get(panel.unit, (panel.unit, 1.0))
+        series = [Series(each.name, [(at, factor * value) for at, value in each.points]) for each in series]
+        self._pen.text((self._x + _LEFT, self._y + 8), f"{panel.title} [{unit}]", fill=_INK, font_size=13)
         left, top = self._x + _LEFT, self._y + _TOP
         self._pen.rectangle((left, top, left + self._inner_width, top + self._inner_height), outline=_GRID)
         self._pen.text((left, top + self._inner_height + 5), f"-{self._seconds:g} s", fill=_INK)

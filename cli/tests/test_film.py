@@ -8,12 +8,26 @@ import pytest
 from PIL import Image
 
 from fog_runtime.site import load_site
-from fognav.film import FRAME_S, Film, Recording
+from fognav.film import FRAME_S, Film, UnfilmedDriveError
 from fognav_experiments.comparison import runner
 from fognav_experiments.comparison.draws import draw
+from fognav_experiments.comparison.records import Record
+from fognav_experiments.comparison.timeline import Timeline
 
 ESTIG = Path(__file__).parents[2] / "sites" / "estig"
 PINK, RED = (246, 178, 178), (208, 40, 40)
+
+
+def a_record(**changes):
+    return Record(
+        **{
+            "setup": "fog", "run": 2, "route": "ab", "seed": 1, "area": "z4", "moment": "before", "trigger_m": 0.0,
+            "outcome": "reached", "reason": "", "success": True, "distance_m": 1.0, "time_s": 10.0, "planned_m": 1.0,
+            "paths": 1, "contacts": 0, "stops": [], "min_clearance_m": None, "barrier_distance_m": None,
+            "pose_error_m": 0.0, "reaction_s": None, "received_bytes": 0, "operator_commands": 1, "route_areas": [],
+            "cpu_s": {}, "jobs": 1, "load": 0.0, "wall_s": 1.0, "version": "",
+        } | changes
+    )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -21,16 +35,18 @@ def pictures(tmp_path_factory):
     site = load_site(ESTIG)
     drawn = draw(runner.read_spec(site, ESTIG), 1, 2)[0]
     start = (site.site.places["a"].x, site.site.places["a"].y)
-    recordings = [
-        Recording(
-            setup, poses=[(0.1 * step, (start[0], start[1] + 0.01 * step)) for step in range(int(10 * time_s))],
-            blocked=[(0.0, drawn.area, False), (6.0, drawn.area, True)], barrier_at=5.0, time_s=time_s,
-            distance_m=time_s / 10.0,
+    records = [
+        a_record(
+            setup=setup, time_s=time_s, distance_m=time_s / 10.0,
+            timeline=Timeline(
+                poses=[(0.1 * step, start[0], start[1] + 0.01 * step) for step in range(int(10 * time_s))],
+                paths=[], areas=[(0.0, drawn.area, False), (6.0, drawn.area, True)], barrier_at=5.0,
+            ),
         )
         for setup, time_s in (("default", 20.0), ("fog", 10.0))
     ]  # fmt: skip
     file = tmp_path_factory.mktemp("film") / "film.gif"
-    size = Film(site, drawn, recordings).write(file)
+    size = Film(site, drawn, records).write(file)
     assert size == file.stat().st_size < 200_000
     shown = []
     with Image.open(file) as film:
@@ -58,3 +74,8 @@ def test_only_the_robot_that_the_fog_tells_knows_of_the_blocked_area(pictures):
     assert all(RED not in colours(panel) for panel in before)
     assert all(RED in colours(panel) for panel in after)
     assert [PINK in colours(panel) for panel in after] == [False, True]
+
+
+def test_a_drive_that_was_recorded_without_what_is_to_be_seen_is_refused_by_name():
+    with pytest.raises(UnfilmedDriveError, match="0002-ab-fog has nothing to show"):
+        Film(load_site(ESTIG), draw(runner.read_spec(load_site(ESTIG), ESTIG), 1, 2)[0], [a_record()])

@@ -214,3 +214,18 @@ def test_the_report_needs_no_other_file_and_holds_every_drive(short_run, tmp_pat
         rows = list(csv.DictReader(file))
     assert [float(row["distance_m"]) for row in rows] == [record.distance_m for record in folder.read()]
     assert all(float(row["cpu_move_base_percent"]) > 0.0 for row in rows)
+
+
+def test_a_film_finds_in_the_records_what_happened_and_when(short_run):
+    for record in short_run[1]:
+        seen = record.timeline
+        assert seen.barrier_at == pytest.approx(0.0, abs=0.2)
+        assert seen.poses[0][0] == pytest.approx(0.0, abs=1.0)
+        assert seen.poses[-1][0] == pytest.approx(record.time_s, abs=1.0)
+        assert bool(seen.paths) == (record.setup == "fog")
+        blocked = [area for at, area, blocked in seen.areas if blocked and at > 0.0]
+        assert blocked == ([] if record.setup == "default" else ["z1"])
+    folder = short_run[0]
+    assert [record.setup for record in folder.read_drives(RUN, "westeast", ["fog", "default"])] == ["fog", "default"]
+    with pytest.raises(FolderError, match=f"no drive {RUN + 1:04}-westeast-fog: run"):
+        folder.read_drives(RUN + 1, "westeast", ["fog"])

@@ -10,7 +10,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from fognav import checkout, kernels
 from fognav.operate.options import JsonOption  # noqa: TC001  # Typer reads annotations at run time
-from fognav.output import NOT_TRUE, FailedError, WrongUseError, console, exit_codes, print_json, print_line
+from fognav.output import NOT_TRUE, WrongUseError, console, exit_codes, print_json, print_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -148,48 +148,40 @@ def _print_played(name: str, played: Played) -> None:
         print_line(f"       {deviation}")
 
 
-@experiment_app.command("film", epilog="Example: fognav experiment film drive.gif --run 2 --route ab")
+@experiment_app.command("film", epilog="Example: fognav experiment film drive.gif --from drives --run 2 --route ab")
 def film_command(  # each option is an argument
     out: Annotated[Path, typer.Argument(metavar="FILE.gif", help="File of the film.")],
     *,
+    source: Annotated[Path, typer.Option("--from", metavar="DIR", help="Folder of the records.")],
     run: Annotated[int, typer.Option("--run", metavar="N", min=1, help="Run of the experiment.")] = 2,
     route: Annotated[str | None, typer.Option("--route", metavar="R", help="Its route, as ab; default: first.")] = None,
     setups: Annotated[str, typer.Option("--setups", metavar="A,B", help="default, full, fog.")] = "default,fog",
-    seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of all draws.")] = 1,
     site: Annotated[Path | None, typer.Option("--site", metavar="DIR", help="Site with experiment.toml.")] = None,
 ) -> None:
     """Film one route of an experiment in several setups, side by side: map, hazards, paths and tracks, as a GIF.
 
-    The drives are repeated in lockstep, which gives the same ones whenever it is done by the same program.
+    The drives are those of the records that `fognav experiment --out DIR` wrote; nothing is driven again.
     """
     from fog_runtime.site import SiteError, load_site  # noqa: PLC0415  # keeps the other commands fast
-    from fognav.film import Film, UnfinishedDriveError, record  # noqa: PLC0415  # same
+    from fognav.film import Film, UnfilmedDriveError  # noqa: PLC0415  # same
     from fognav_experiments.comparison import runner  # noqa: PLC0415  # same
-    from fognav_experiments.comparison.draws import draw  # noqa: PLC0415  # same
+    from fognav_experiments.comparison.records import Folder, FolderError  # noqa: PLC0415  # same
 
     with exit_codes():
         if out.suffix != ".gif":
             raise WrongUseError(f"{out} is no GIF: name a file that ends in .gif")
         place = checkout.site_folder(site)
         try:
-            loaded = load_site(place)
-            drawn = {found.route.name: found for found in draw(runner.read_spec(loaded, place), seed, run)}
-        except (SiteError, runner.SpecError) as error:
+            loaded, folder = load_site(place), Folder(source)
+            drawn = runner.recorded_draw(folder, loaded, place, run, route)
+            records = folder.read_drives(run, drawn.route.name, _chosen(setups))
+            size = Film(loaded, drawn, records).write(out)
+        except (SiteError, runner.SpecError, FolderError, UnfilmedDriveError) as error:
             raise WrongUseError(str(error)) from error
-        name = route or next(iter(drawn))
-        if name not in drawn:
-            raise WrongUseError(f"no route {name}: there are {', '.join(drawn)}")
-        kernels.warm_cache(print_line)
-        try:
-            recordings = [record(loaded, drawn[name], setup) for setup in _chosen(setups)]
-        except UnfinishedDriveError as error:
-            raise FailedError(str(error)) from error
-        try:
-            size = Film(loaded, drawn[name], recordings).write(out)
         except OSError as error:
             raise WrongUseError(f"{out} can't be written: {error.strerror}. Name another file") from error
-    for recording in recordings:
-        print_line(f"{recording.setup:8} {recording.distance_m:6.1f} m {recording.time_s:6.1f} s")
+    for record in records:
+        print_line(f"{record.setup:8} {record.distance_m:6.1f} m {record.time_s:6.1f} s")
     print_line(f"{out}: {size / 1e6:.2f} MB")
 
 

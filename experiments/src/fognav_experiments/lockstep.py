@@ -80,10 +80,9 @@ class LockstepResult(DriveSummary, frozen=True, kw_only=True):
     """The result of a drive, by the simulator's ground truth; lengths in m, times in s of the emulated clock.
 
     `operator_commands` counts the accepted commands, the first enable included. `hazard_at_m` is the distance driven
-    when the barrier was placed, `barrier_distance_m` the smallest one between it and the robot's rim. `paths` counts
-    the paths that the robot followed, `received_bytes` what it received from the fog and its profile uses, since the
-    goal was given; `stops` are its protective stops and faults. `stages_ms` holds the durations of the hazard's stages,
-    `track` the true positions every 0.25 m.
+    when the barrier was placed, `barrier_distance_m` the smallest one between it and the robot's rim. `received_bytes`
+    is what the robot received from the fog and its profile uses, since the goal was given. `stages_ms` holds the
+    durations of the hazard's stages, `track` the true positions every 0.25 m.
     """
 
     seed: int
@@ -94,10 +93,8 @@ class LockstepResult(DriveSummary, frozen=True, kw_only=True):
     pose_error_m: float
     operator_commands: int
     profile: ProfileName
-    paths: int
     barrier_distance_m: float | None
     received_bytes: int
-    stops: list[str]
     events: list[DriveEvent]
     track: list[tuple[float, float]]
 
@@ -131,7 +128,6 @@ class LockstepDrive:
         self.track: list[tuple[float, float]] = []
         self.barrier: SimObstacle | None = None
         self.barrier_distance_m = math.inf
-        self.paths: set[tuple[int | None, int]] = set()
         self.planned_m = 0.0
         self.path: RobotPath | None = None
         self.pose: RobotPose | None = None
@@ -206,8 +202,6 @@ class LockstepDrive:
         self.state = state
         if self.drive is not None:
             self.drive.on_state(state, at.now)
-            if state.plan_id is not None and state.goal_id == self.goal.goal_id:
-                self.paths.add((state.planner_epoch, state.plan_id))
         return ()
 
     def _on_truth(self, ids: Ids, truth: SimTruth, at: Moment) -> Sequence[Publication]:
@@ -319,10 +313,8 @@ class LockstepDrive:
             pose_error_m=round(self.pose_error, 3),
             operator_commands=self.commands,
             profile=self.robot.agent.profile.name,
-            paths=len(self.paths),
             barrier_distance_m=round(self.barrier_distance_m, 3) if self.barrier is not None else None,
             received_bytes=self.robot.process.received_bytes - self.received_before,
-            stops=drive.evaluation.stops,
             events=self.events,
             track=self.track,
         )

@@ -28,7 +28,7 @@ def publish(folder: Folder, target: Path, site: Path | None = None) -> list[Path
 
     `site`: folder of the floor; with it the report says what the map allows, if the drives were on this very floor.
     """
-    experiment, records = folder.machine(), folder.read()
+    experiment, records = folder.description(), folder.read()
     if not records:
         raise FolderError(f"{folder.path} holds no drives yet: run `fognav experiment --out {folder.path}` first")
     blocks = build(records, experiment, _savings(records, experiment["asked"], site))

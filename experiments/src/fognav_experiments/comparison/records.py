@@ -9,6 +9,7 @@ import msgspec
 
 from fog_contracts.messages import ProfileName  # read at run time, when a file is decoded
 from fog_runtime.files import SHARED, atomic_write
+from fognav_experiments.comparison.timeline import Timeline  # read at run time, when a file is decoded
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -32,7 +33,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     `barrier_distance_m`: smallest distance between the obstacle and the robot's rim. `reaction_s`: from the obstacle's
     first reading to the first wheel command on a new path, where there was one. `jobs`: drives that this machine ran at
     the same time; `load`: its load average at the end. `paths`: paths that the robot followed. `commit`: the
-    program's revision, empty if it is the one that the folder was begun with.
+    program's revision, empty if it is the one that the folder was begun with. `timeline`: what a film shows.
     """
 
     setup: ProfileName
@@ -65,6 +66,8 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     version: str
     commit: str = ""
     track: list[tuple[float, float]] = []
+    modes: dict[str, int] = {}
+    timeline: Timeline | None = None
 
     @property
     def name(self) -> str:
@@ -113,8 +116,8 @@ class Folder:
             document = {"asked": wanted, "measured_on": machine}
             atomic_write(file, msgspec.json.format(msgspec.json.encode(document)), mode=SHARED)
 
-    def machine(self) -> dict[str, Any]:
-        """Return what the first drives were measured on; raises `FolderError` if there are none."""
+    def description(self) -> dict[str, Any]:
+        """Return what was asked, and what the first drives were measured on; raises `FolderError` if there are none."""
         try:
             found: dict[str, Any] = msgspec.json.decode((self.path / "experiment.json").read_bytes())
         except OSError as error:
@@ -139,6 +142,17 @@ class Folder:
                 raise FolderError(f"{file} can't be read: {error}. Remove it, and run the experiment again") from error
         return records
 
+    def read_drives(self, run: int, route: str, setups: Iterable[str]) -> list[Record]:
+        """Return the records of a run's route in these setups; raises `FolderError` if one is missing."""
+        known = {record.name: record for record in self.read()}
+        wanted = [file_name(run, route, setup) for setup in setups]
+        if missing := [name for name in wanted if name not in known]:
+            raise FolderError(
+                f"{self.path} holds no drive {', '.join(missing)}: run `fognav experiment --only {run} --out "
+                f"{self.path}` first"
+            )
+        return [known[name] for name in wanted]
+
     def _file(self, name: str) -> Path:
         return self._drives / f"{name}.json"
 
@@ -150,7 +164,7 @@ def file_name(run: int, route: str, setup: str) -> str:
 
 def write_csv(path: Path, records: Sequence[Record]) -> None:
     """Write one row per drive; CPU as s by component, and as % of a core for what `move_base` held and in all."""
-    left_out = {"cpu_s", "track"}
+    left_out = {"cpu_s", "track", "modes", "timeline"}
     fields = [field for field in Record.__struct_fields__ if field not in left_out]
     shares = {"move_base": MOVE_BASE, "robot": ON_ROBOT}
     header = [

@@ -15,7 +15,7 @@ import msgspec
 
 from fog_runtime.site import load_site
 from fognav_experiments.comparison.draws import ExperimentSpec, draw
-from fognav_experiments.comparison.records import Asked, Folder, file_name
+from fognav_experiments.comparison.records import Asked, Folder, FolderError, file_name
 from fognav_experiments.comparison.trial import drive
 from fognav_experiments.lockstep import release_drives
 
@@ -101,6 +101,20 @@ def run(site_folder: Path, asked: list[Task], folder: Folder, jobs: int = 1, com
 def new(site: LoadedSite, site_folder: Path, seed: int) -> Asked:
     """Return what a new folder of this experiment is about."""
     return Asked(site=site.site.id, site_digest=site_digest(site_folder), seed=seed)
+
+
+def recorded_draw(folder: Folder, site: LoadedSite, place: Path, run: int, route: str | None) -> RouteDraw:
+    """Return how a recorded run drew a route, by default its first one.
+
+    Raises `FolderError` for another floor than that of the records, and `SpecError`.
+    """
+    asked = msgspec.convert(folder.description()["asked"], Asked)
+    if asked.site_digest != site_digest(place):
+        raise FolderError(f"{folder.path} holds drives on another floor than {place}: name theirs with --site")
+    drawn = {found.route.name: found for found in draw(read_spec(site, place), asked.seed, run)}
+    if route is not None and route not in drawn:
+        raise SpecError(f"no route {route}: there are {', '.join(drawn)}")
+    return drawn[route] if route is not None else next(iter(drawn.values()))
 
 
 def _drive(site_folder: Path, task: Task, jobs: int, commit: str) -> Record:

@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
+from fog_contracts.bus import Bus
 from fog_contracts.messages import Pose
 from fog_contracts.stages import TOTAL
 from fognav_experiments.comparison.records import Record
+from fognav_experiments.comparison.timeline import TimelineRecorder
 from fognav_experiments.cpu import CpuMeter
 from fognav_experiments.lockstep import run_lockstep
 from fognav_sim.drive.hazard import HazardRequest
@@ -31,7 +33,8 @@ def drive(site: LoadedSite, drawn: RouteDraw, setup: ProfileName, jobs: int = 1,
     places = site.site.places
     origin, goal = places[drawn.route.start], places[drawn.route.goal]
     start = Pose(x=origin.x, y=origin.y, theta=drawn.theta if origin.theta is None else origin.theta)
-    cpu = CpuMeter()
+    cpu, bus = CpuMeter(), Bus(site.site.id)
+    recorder = TimelineRecorder(bus, setup)
     begun = time.perf_counter()
     result = run_lockstep(
         site,
@@ -42,7 +45,9 @@ def drive(site: LoadedSite, drawn: RouteDraw, setup: ProfileName, jobs: int = 1,
         watched=setup != "default",
         profile=setup,
         cpu=cpu,
+        bus=bus,
     )
+    appears = (event.time_s for event in result.events if event.description.startswith("barrier appears"))
     total = result.stages_ms.get(TOTAL)
     shared = {
         name: getattr(result, name) for name in Record.__struct_fields__ if name in type(result).__struct_fields__
@@ -63,6 +68,7 @@ def drive(site: LoadedSite, drawn: RouteDraw, setup: ProfileName, jobs: int = 1,
             "wall_s": round(time.perf_counter() - begun, 1),
             "version": version("fognav-experiments"),
             "commit": commit,
+            "timeline": None if result.time_s is None else recorder.timeline(result.time_s, next(appears, None)),
         },
         Record,
     )

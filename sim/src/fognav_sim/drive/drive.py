@@ -26,7 +26,8 @@ class DriveSummary(msgspec.Struct, frozen=True, kw_only=True):
 
     `time_s` is None for a drive that was broken off. `area` is the area that was or would have become blocked,
     `area_entered` and `area_clearance_m` concern the robot's centre from then on. `route_areas` lists the areas that
-    the robot crossed, in order; `plans` counts the planner's plans.
+    the robot crossed, in order; `plans` counts the planner's plans, `paths` the paths that the robot followed, and
+    `modes` how often it entered each of its modes; `stops` are its protective stops and faults.
     """
 
     outcome: OutcomeKind
@@ -40,6 +41,9 @@ class DriveSummary(msgspec.Struct, frozen=True, kw_only=True):
     area_clearance_m: float | None = None
     route_areas: list[str] = []
     plans: int = 0
+    paths: int = 0
+    modes: dict[str, int] = {}
+    stops: list[str] = []
 
 
 class Drive:
@@ -129,6 +133,9 @@ class Drive:
             area_clearance_m=_finite(evaluation.blocked_clearance_m),
             route_areas=list(evaluation.route_areas),
             plans=evaluation.plans,
+            paths=len(evaluation.followed),
+            modes=dict(evaluation.modes),
+            stops=list(evaluation.stops),
         )
 
 

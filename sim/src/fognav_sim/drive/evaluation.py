@@ -58,6 +58,8 @@ class DriveEvaluation:
     """How often the robot entered each of its modes."""
     stops: list[str] = field(default_factory=list)
     """Each PROTECTIVE_STOP and FAULT of the robot, with its reasons."""
+    followed: set[tuple[int | None, int]] = field(default_factory=set)
+    """The paths to its goal that the robot followed: epoch and id of each plan."""
     _mode: str = ""
     _truth: SimTruth | None = None
     _start_distance_m: float | None = None
@@ -100,6 +102,8 @@ class DriveEvaluation:
             self.modes[state.mode] += 1
             if state.mode in {"PROTECTIVE_STOP", "FAULT"}:
                 self.stops.append(f"{state.mode}: {'; '.join(state.reasons) or 'no reason given'}")
+        if state.plan_id is not None and state.goal_id == self.goal_id:
+            self.followed.add((state.planner_epoch, state.plan_id))
         if state.goal_reached and state.goal_id in {self.goal_id, None}:
             self._arrival_claimed_at = now if self._arrival_claimed_at is None else self._arrival_claimed_at
         elif state.goal_id == self.goal_id:

@@ -6,6 +6,7 @@ Time is simulated, and each process has an event loop of its own, so that one ca
 
 import asyncio
 import os
+import threading
 
 import pytest
 from hypothesis import settings
@@ -341,3 +342,25 @@ Copies.TestCase.settings = settings(
     max_examples=int(os.environ.get("FOGNAV_HISTORIES", "15")), stateful_step_count=25, deadline=None
 )
 test_receivers_accept_one_writer_at_a_time_and_one_leads_again = Copies.TestCase
+
+
+def test_messages_of_another_thread_are_sent_behind_those_that_were_held_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    member = Leadership(SERVICE, None, None, Health(), connected=lambda: True)
+    monkeypatch.setattr(member._lease, "epoch", 5)
+    permissions, sent, sending = iter(["pending", "granted", "granted"]), [], threading.Event()
+    monkeypatch.setattr(member._lease, "permission", lambda _now: next(permissions))
+    message = MapHeartbeat(epoch=5, seq=1, hash=1, sent=(0, 0.0))
+
+    def send_slowly() -> None:
+        sending.set()
+        threading.Event().wait(0.05)
+        sent.append("held back")
+
+    member.admit(ch.MAP_HEARTBEAT, message, send_slowly)
+    assert sent == []
+    other = threading.Thread(target=member.admit, args=(ch.MAP_HEARTBEAT, message, lambda: sent.append("second")))
+    other.start()
+    assert sending.wait(10.0)
+    member.admit(ch.MAP_HEARTBEAT, message, lambda: sent.append("third"))
+    other.join()
+    assert sent == ["held back", "second", "third"]

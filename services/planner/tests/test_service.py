@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import threading
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
@@ -42,6 +44,11 @@ class Session:
 
     def serve(self, channel: ch.Channel, _handler: object, **_ids: str) -> None:
         self.served.add(channel)
+
+    connected = True
+
+    def publish(self, channel: ch.Channel, message: object, **ids: str) -> None:
+        """Publish nothing."""
 
     def refuse(self, channel: ch.Channel, key: str, reason: str) -> None:
         self.refused.append((channel, key, reason))
@@ -221,6 +228,53 @@ def test_paths_are_published_one_by_one_and_a_long_cycle_leaves_the_rest_for_the
     assert rig.service._cycle.run(rig.service._edges.now, emit).unfinished
     assert not rig.service._cycle.run(rig.service._edges.now, emit).unfinished
     assert core.searched == robots
+
+
+class WaitingCore(PlannerCore):
+    """Whose second search waits until the first one's path was published; notes whether it was."""
+
+    def __init__(self, published: threading.Event) -> None:
+        super().__init__(epoch=1)
+        self.searching, self.may_end = threading.Event(), threading.Event()
+        self.waited_for_path: list[bool] = []
+        self._published = published
+
+    def plan(self, at: Moment) -> Iterator[str]:
+        for number, robot in enumerate(super().plan(at)):
+            if number:
+                self.waited_for_path.append(self._published.wait(10.0))
+            else:
+                self.searching.set()
+                self.may_end.wait(10.0)
+            yield robot
+
+
+async def test_path_is_published_while_the_event_loop_is_busy_and_others_are_searched(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    published = threading.Event()
+    core = WaitingCore(published)
+    rig = Rig(core)
+    ring_map = RingMap()
+    core.load(ring_map.master.snapshot(), 10.0)
+    core.handlers()[ch.MAP_HEARTBEAT]({}, ring_map.master.heartbeat(0.0), Moment(10.0, 10.0))
+    for robot in ("r0", "r1"):
+        core.handlers()[ch.ROBOT_POSE]({"robot": robot}, pose(*LEFT), Moment(10.0, 10.0))
+        core.set_goal(robot, goal(*RIGHT, robot))
+    monkeypatch.setattr(
+        rig.session, "publish", lambda channel, *_, **__: published.set() if channel is ch.ROBOT_PATH else None
+    )
+    planning = asyncio.create_task(rig.service.plan_loop())
+    rig.service._wake.set()
+    while not core.searching.is_set():  # noqa: ASYNC110  # set on another thread
+        await asyncio.sleep(0.001)
+    core.may_end.set()
+    assert published.wait(10.0)  # keeps the event loop busy meanwhile
+    while len(core.waited_for_path) < 1:  # noqa: ASYNC110  # as above
+        await asyncio.sleep(0.001)
+    planning.cancel()
+    rig.service.close()
+    assert core.waited_for_path == [True]
 
 
 class FullQueue:

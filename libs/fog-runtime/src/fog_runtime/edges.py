@@ -32,7 +32,7 @@ class Gate(Protocol):
     """Whether this process may act (`fog_runtime.leadership`)."""
 
     def admit(self, channel: Channel, message: object, send: Callable[[], None]) -> None:
-        """Send a message now, later or never."""
+        """Send a message now, later or never; called on the thread that publishes."""
 
     def answers(self) -> bool:
         """Whether this process answers queries."""
@@ -109,7 +109,8 @@ class Edges:
     def publish(self, publication: Publication) -> None:
         """Publish without waiting; a message that violates its channel's contract is logged, counted and not published.
 
-        It must not end the loop of a process: the others of its publications still matter.
+        It must not end the loop of a process: the others of its publications still matter. On zenoh any thread may
+        publish, unless the channel is served, too.
         """
         if self._gate is None:
             self._publish_now(publication)

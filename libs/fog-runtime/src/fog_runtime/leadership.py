@@ -11,6 +11,7 @@ import os
 import re
 import secrets
 import socket
+import threading
 import time
 from collections import deque
 from typing import TYPE_CHECKING, Final, Protocol
@@ -80,7 +81,7 @@ def process_id(service: Role) -> str:
 
 
 class Leadership:
-    """Whether this process leads. For one event loop."""
+    """Whether this process leads. For one event loop; only `admit` may be called on other threads."""
 
     def __init__(
         self,
@@ -110,6 +111,8 @@ class Leadership:
         self._serving = 0
         """The epoch with which the service has published everything; 0 before."""
         self._waiting: deque[tuple[Channel, Callable[[], None]]] = deque(maxlen=_HELD_BACK)
+        self._sending = threading.Lock()
+        """Held while messages are sent or held back, so that they leave in their order."""
         self._takeover: asyncio.Task[None] | None = None
         self._announced_at = 0.0
         health.set("lease", ok=False, detail="waiting for the lease")
@@ -121,16 +124,17 @@ class Leadership:
 
         A message with an epoch is sent only if it is the current one: a core may not have taken it yet.
         """
-        permission = self._lease.permission(time.monotonic())
-        epoch = getattr(message, channel.epoch) if channel.epoch and message is not None else self._lease.epoch
-        if permission == "refused" or epoch != self._lease.epoch:
-            return
-        if permission == "granted":
-            self._send_waiting()
-            send()
-            return
-        HELD_BACK.labels(channel.name).inc()
-        self._waiting.append((channel, send))
+        with self._sending:
+            permission = self._lease.permission(time.monotonic())
+            epoch = getattr(message, channel.epoch) if channel.epoch and message is not None else self._lease.epoch
+            if permission == "refused" or epoch != self._lease.epoch:
+                return
+            if permission == "granted":
+                self._send_waiting()
+                send()
+                return
+            HELD_BACK.labels(channel.name).inc()
+            self._waiting.append((channel, send))
 
     def answers(self) -> bool:
         """Whether this process answers queries: it leads, and its lease is certain."""
@@ -191,15 +195,17 @@ class Leadership:
                 continue
             reply = await self._keeper.acquire(self.holder, request)
             self._lease.on_reply(request, reply, time.monotonic())
-            if self._lease.permission(time.monotonic()) == "granted" and self._term[0] == self._lease.epoch:
-                self._send_waiting()
+            with self._sending:
+                if self._lease.permission(time.monotonic()) == "granted" and self._term[0] == self._lease.epoch:
+                    self._send_waiting()
 
     def _apply(self, member: Member, tasks: asyncio.TaskGroup) -> None:
         """Tell the service, the metrics and the health when another epoch, or none, is ours."""
         term = (self._lease.epoch, self._lease.confirmed)
         if term != self._term:
             if term[0] != self._term[0]:
-                self._waiting.clear()
+                with self._sending:
+                    self._waiting.clear()
             before, self._term = self._term, term
             if self._takeover is not None:
                 self._takeover.cancel()
@@ -245,6 +251,7 @@ class Leadership:
             self._zenoh.publish(ch.LEADER, leader, role=self._service)
 
     def _send_waiting(self) -> None:
+        """Send what was held back; the caller holds the lock."""
         while self._waiting:
             _, send = self._waiting.popleft()
             send()

@@ -121,12 +121,13 @@ def _asker(query: Any) -> str:  # noqa: ANN401  # as above
 
 
 class _Publisher:
-    """Publishes on one key; messages that must not be lost are queued until the session opens."""
+    """Publishes on one key, from any thread; messages that must not be lost are queued until the session opens."""
 
     def __init__(self, channel: Channel, key: str) -> None:
         self._channel = channel
         self._key = key
         self._depth = _CACHE_DEPTH[channel.durability]
+        self._lock = threading.Lock()
         self._pending: deque[bytes] = deque(maxlen=self._depth)
         self._put: Callable[[bytes], object] | None = None
 
@@ -142,19 +143,22 @@ class _Publisher:
                 sample_miss_detection=miss,
                 publisher_detection=True,
             )
-            self._put = advanced.put
+            put: Callable[[bytes], object] = advanced.put
         else:
-            self._put = session.declare_publisher(self._key, congestion_control=drop).put
-        while self._pending:
-            self._send(self._put, self._pending.popleft())
+            put = session.declare_publisher(self._key, congestion_control=drop).put
+        with self._lock:
+            self._put = put
+            while self._pending:
+                self._send(put, self._pending.popleft())
 
     def put(self, data: bytes) -> None:
-        if self._put is not None:
-            self._send(self._put, data)
-        elif self._depth:
-            self._pending.append(data)
-        else:
-            metrics.DROPPED.labels(self._channel.name).inc()
+        with self._lock:
+            if self._put is not None:
+                self._send(self._put, data)
+            elif self._depth:
+                self._pending.append(data)
+            else:
+                metrics.DROPPED.labels(self._channel.name).inc()
 
     def _send(self, put: Callable[[bytes], object], data: bytes) -> None:
         put(data)
@@ -349,7 +353,10 @@ class _Queryable:
 
 
 class ZenohEdge:
-    """The zenoh session of a process. All handlers run on the thread of the event loop that opened it."""
+    """The zenoh session of a process. All handlers run on the thread of the event loop that opened it.
+
+    Everything but `publish` is called on that thread.
+    """
 
     def __init__(
         self, clock: Clock, *, site: str, role: Role, name: str, connect: Sequence[str], credentials: Credentials
@@ -365,6 +372,8 @@ class ZenohEdge:
         self._session: zenoh.Session | None = None
         self._closed = False
         self._publishers: dict[str, _Publisher] = {}
+        self._lock = threading.Lock()
+        """Held while a publisher is added, and while the session begins to take declarations."""
         self._declared: list[object] = []
         self._undeclared: list[Callable[[zenoh.Session], object]] = []
         self._tasks: set[asyncio.Task[None]] = set()
@@ -412,7 +421,7 @@ class ZenohEdge:
         return self._session is not None and not self._closed and bool(self._session.info.routers_zid())
 
     def publish(self, channel: Channel, message: Message, **ids: str) -> None:
-        """Publish without waiting; raises `ContractError` when the message violates the channel's contract.
+        """Publish without waiting, from any thread; raises `ContractError` for a message that violates its contract.
 
         Without a connection the message is lost, except on channels of durability `recovered` and, for the latest
         message, `latest`: these messages reach their subscribers as soon as there is a connection.
@@ -421,9 +430,17 @@ class ZenohEdge:
         data = encode(channel, message)
         publisher = self._publishers.get(key)
         if publisher is None:
-            publisher = self._publishers[key] = _Publisher(channel, key)
-            self._declare(publisher.declare)
+            publisher = self._add_publisher(channel, key)
         publisher.put(data)
+
+    def _add_publisher(self, channel: Channel, key: str) -> _Publisher:
+        with self._lock:
+            publisher = self._publishers.get(key)
+            if publisher is not None:
+                return publisher
+            publisher = self._publishers[key] = _Publisher(channel, key)
+        self._declare(publisher.declare)
+        return publisher
 
     def subscribe(self, channel: Channel, kind: type[M], handler: Callable[[Ids, M], object], **ids: str) -> None:
         """Call `handler(ids, message)` for each message, with every value of the ids that are not given.
@@ -548,11 +565,13 @@ class ZenohEdge:
         return channel.key(**self._with_site(channel, ids))
 
     def _declare(self, declare: Callable[[zenoh.Session], object]) -> None:
-        if self._session is None:
-            self._undeclared.append(declare)
-        else:
-            # zenoh undeclares what is no longer referenced.
-            self._declared.append(declare(self._session))
+        with self._lock:
+            session = self._session
+            if session is None:
+                self._undeclared.append(declare)
+                return
+        # zenoh undeclares what is no longer referenced.
+        self._declared.append(declare(session))
 
     def _config(self) -> zenoh.Config:
         return session_config("client", connect=self._connect, credentials=self._credentials)
@@ -567,10 +586,11 @@ class ZenohEdge:
                 reason=str(error), credentials=self._credentials.origin,
             )  # fmt: skip
             return False
-        self._session = session
+        with self._lock:
+            self._session = session
+            pending, self._undeclared = self._undeclared, []
         metrics.CONNECTED.labels("zenoh").set_function(lambda: float(self.connected))
         metrics.CONNECTIONS.labels("zenoh").inc()
-        pending, self._undeclared = self._undeclared, []
         for declare in pending:
             self._declared.append(declare(session))
         _log.info("router_connected", client=self._client_name, connect=list(self._connect), zid=str(session.zid()))

@@ -45,6 +45,8 @@ if TYPE_CHECKING:
 
 TICK_S: Final = 0.1
 BUSY_PAUSE_S: Final = 0.25
+MOST_UNRECORDED: Final = 1000
+"""After so many publications they are recorded although searches are left."""
 
 PLANS = Counter("fognav_plans_total", "Replans, by reason", ["reason"])
 REFUSALS = Counter("fognav_plan_refusals_total", "Replans that ended in a refusal, by Nav2's code", ["code"])
@@ -101,6 +103,8 @@ class Service:
         self.poses: dict[str, RobotPose] = {}
         self.states: dict[str, RobotState] = {}
         self._paths: dict[str, RobotPath] = {}
+        self._sent: list[Publication] = []
+        """What was published and is not recorded yet."""
 
     # --- For the API ------------------------------------------------------------------------------------------------
 
@@ -219,19 +223,19 @@ class Service:
             self._wake.set()
 
     async def plan_loop(self) -> None:
-        """Run planning cycles: at every tick, and at once after an urgent message."""
-        loop = asyncio.get_running_loop()
+        """Run planning cycles: at every tick, and at once after an urgent message.
 
-        def emit(publications: Sequence[Publication]) -> None:
-            if publications:
-                loop.call_soon_threadsafe(self._publish, publications)
-
+        Each path is published on the core's thread as soon as it is found. What else there is to do about it waits
+        for the end of the searches: here it would take turns with them, since one thread runs Python at a time.
+        """
         while True:
             await self._wake.wait()
             self._wake.clear()
-            result = await self._threads.run("core", lambda: self._cycle.run(self._edges.now, emit))
+            result = await self._threads.run("core", lambda: self._cycle.run(self._edges.now, self._publish))
             if result.unfinished:
                 self._wake.set()
+            if not result.unfinished or len(self._sent) >= MOST_UNRECORDED:
+                self._record()
             for robot, goal_id in result.reached:
                 self.missions.end(robot, goal_id)
             for job in result.jobs:
@@ -267,13 +271,20 @@ class Service:
     # --- Publications and metrics -----------------------------------------------------------------------------------
 
     def _publish(self, publications: Sequence[Publication]) -> None:
+        """Publish on the calling thread."""
         for publication in publications:
+            self._edges.publish(publication)
+        self._sent += publications
+
+    def _record(self) -> None:
+        """Record what was published since the last call, for logs, metrics and the API."""
+        sent, self._sent = self._sent, []
+        for publication in sent:
             message = publication.message
             if isinstance(message, RobotPath):
                 self._record_path(publication.ids["robot"], message)
             elif isinstance(message, RobotRelease):
                 self._record_release(publication.ids["robot"], message)
-            self._edges.publish(publication)
 
     def _record_path(self, robot: str, path: RobotPath) -> None:
         """Record what the API shows, and report a plan when it is first published, a refusal when it changes."""

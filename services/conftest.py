@@ -16,12 +16,12 @@ import pytest
 from redis.asyncio import Redis
 
 from fog_contracts.grid import GridGeometry, StaticMap
+from fog_runtime.access.credentials import Credentials
 from fog_runtime.clock import SystemClock
-from fog_runtime.credentials import Credentials
+from fog_runtime.configuration.maps import save_map
 from fog_runtime.locks.site_locks import SiteLocks
-from fog_runtime.maps import save_map
-from fog_runtime.mqtt_edge import MqttEdge
-from fog_runtime.zenoh_edge import ZenohEdge
+from fog_runtime.transports.mqtt_edge import MqttEdge
+from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fog_supervisor.servers import Server, start_mosquitto, start_redis, start_router
 
 SITE = """

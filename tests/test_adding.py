@@ -37,7 +37,7 @@ MAKE_POLYGONS = {
 """They make a shape of a list of corners, whatever other kinds there are."""
 DRAWING_COMMANDS = {
     f"cli/src/fognav/{name}.py"
-    for name in ("zone_command", "bench/costmap", "bench/fleet", "bench/floor", "bench/rest_clients")
+    for name in ("commands/zone", "bench/costmap", "bench/fleet", "bench/floor", "bench/rest_clients")
 }
 AGGREGATOR = "services/hazard-aggregator/src/hazard_aggregator/core.py"
 MAP_API = "services/map-service/src/map_service/api.py"

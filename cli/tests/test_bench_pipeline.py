@@ -2,7 +2,7 @@
 
 import pytest
 
-from fog_runtime.site import load_site
+from fog_runtime.configuration.site import load_site
 from fognav.bench import pipeline
 
 

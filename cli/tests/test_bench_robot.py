@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from fog_runtime import task_usage
-from fog_runtime.site import load_site
+from fog_runtime.configuration.site import load_site
+from fog_runtime.machine import task_usage
 from fognav.bench import cpu_quota, office, robot, robot_system
 from fognav.output import WrongUseError
 

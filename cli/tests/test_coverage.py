@@ -10,8 +10,8 @@ from PIL import Image
 
 from fog_contracts.messages import SimObstacle
 from fog_contracts.site import Place, Site
-from fog_runtime.maps import save_map
-from fog_runtime.site import LoadedSite, load_site
+from fog_runtime.configuration.maps import save_map
+from fog_runtime.configuration.site import LoadedSite, load_site
 from fognav.coverage import OBSTACLE_RADIUS_M, Coverage, coverage
 from fognav_sim.floor import Floor
 from fognav_sim.node import classify, default_config

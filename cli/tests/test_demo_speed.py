@@ -3,7 +3,7 @@
 import pytest
 
 from fog_contracts.messages import LoopHealth, Mode, RobotState, SimTruth
-from fog_runtime.site import load_site
+from fog_runtime.configuration.site import load_site
 from fognav import checkout
 from fognav.demo.attempt import Attempt
 from fognav.demo.options import DrivePlan, Options

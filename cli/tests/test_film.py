@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from fog_runtime.site import load_site
+from fog_runtime.configuration.site import load_site
 from fognav.film import FRAME_S, Film, UnfilmedDriveError
 from fognav_experiments.comparison import runner
 from fognav_experiments.comparison.draws import draw

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from fog_runtime import backup
-from fog_runtime.redis_connection import RedisConnection
+from fog_runtime.stores.redis_connection import RedisConnection
 from fognav.hosting import log_files, restoring, running, unit
 from fognav.hosting.floors import hosted_sites
 from fognav.hosting.folders import FORMAT, NodeFolder, default_data

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from fog_contracts.grid import GridGeometry, StaticMap
 from fog_kernels.raycast import cast
-from fog_runtime.maps import load_map, save_map
+from fog_runtime.configuration.maps import load_map, save_map
 from fognav.__main__ import app
 from fognav.localization.evaluation import track
 from fognav.localization.logs import read_log

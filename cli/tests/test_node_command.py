@@ -20,9 +20,9 @@ from typer.testing import CliRunner
 
 from fog_contracts.messages import NodeCalibration
 from fog_contracts.site import NodeSite, Sonar
-from fog_runtime.site import load_site
+from fog_runtime.configuration.site import load_site
 from fog_supervisor.servers import start_mosquitto
-from fognav.node_command import node_app
+from fognav.commands.node import node_app
 from fognav.nodes import on_broker, provisioning, site_file
 from fognav.output import FailedError, WrongUseError
 from fognav_sim.firmware import Core, FirmwareError, build_library, find_compiler

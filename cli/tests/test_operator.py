@@ -8,8 +8,8 @@ import pytest
 from fog_contracts import channels as ch
 from fog_contracts.messages import AreaHazard, CommandReply, HazardArea, RobotCommand, RobotState
 from fog_runtime.clock import SystemClock
-from fog_runtime.site import load_site
-from fog_runtime.zenoh_edge import ZenohEdge
+from fog_runtime.configuration.site import load_site
+from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fognav import checkout
 from fognav.demo.operator import Operator
 from fognav.demo.scene import Scene

@@ -25,7 +25,7 @@ from fog_contracts.messages import (
     Trace,
 )
 from fog_contracts.site import AreaSite, DemoPlan, NodeSite, Place, RobotSite, Site, Sonar
-from fog_runtime.site import LoadedSite
+from fog_runtime.configuration.site import LoadedSite
 from fog_supervisor import net
 from fognav import system
 from fognav.demo.options import Options

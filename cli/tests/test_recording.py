@@ -6,8 +6,8 @@ import pytest
 from fog_contracts import channels as ch
 from fog_contracts.messages import AreaHazard, RobotPose
 from fog_runtime.clock import SystemClock
-from fog_runtime.mqtt_edge import MqttEdge
-from fog_runtime.zenoh_edge import ZenohEdge
+from fog_runtime.transports.mqtt_edge import MqttEdge
+from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fognav import recording
 from fognav.output import WrongUseError
 from fognav.programs import BROKER, ROUTER

@@ -8,12 +8,12 @@ import msgspec
 import pytest
 from typer.testing import CliRunner
 
-from fog_runtime import parts
-from fog_runtime.robot_file import default_robot, parse_robot
-from fog_runtime.settings import SettingsError
+from fog_runtime.configuration import parts
+from fog_runtime.configuration.robot_file import default_robot, parse_robot
+from fog_runtime.configuration.settings import SettingsError
 from fognav.__main__ import app
+from fognav.commands.robot_file import effective, robot_text
 from fognav.demo.options import hardware
-from fognav.robot_file_command import effective, robot_text
 from robot_agent import registry
 
 run = CliRunner().invoke

@@ -7,7 +7,7 @@ import pytest
 from rich.console import Console
 
 from fog_contracts.messages import AreaHazard, HazardArea
-from fog_runtime.site import load_site
+from fog_runtime.configuration.site import load_site
 from fognav.demo.scene import Scene
 from fognav.demo.view import render
 

@@ -7,7 +7,7 @@ import numpy as np
 from fog_contracts.grid import GridGeometry, StaticMap
 from fog_contracts.messages import Pose
 from fog_contracts.site import AreaSite, DemoPlan, NodeSite, Place, RobotSite, Site, Sonar
-from fog_runtime.site import LoadedSite
+from fog_runtime.configuration.site import LoadedSite
 
 RESOLUTION = 0.05
 FREE = [  # left, bottom, right, top (m): the ring, and niches that make every place look different

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fog_runtime.site import load_site
+from fog_runtime.configuration.site import load_site
 from fognav_experiments.comparison import runner
 from fognav_experiments.comparison.draws import ExperimentSpec, RouteSpec, draw
 from fognav_experiments.comparison.geometry import RouteGeometry

@@ -10,7 +10,7 @@ import pytest
 
 from fog_contracts import channels as ch
 from fog_contracts.messages import Pose, RectangleShape, RobotGoal, SimObstacle, Zone
-from fog_runtime.site import LoadedSite
+from fog_runtime.configuration.site import LoadedSite
 from fognav_experiments.rigs import System, moment
 from robot_agent.agent.core import AgentCore
 

@@ -9,7 +9,7 @@ import pytest
 
 from fog_contracts.bus import Bus
 from fog_contracts.geometry import contains_point
-from fog_runtime.site import load_site
+from fog_runtime.configuration.site import load_site
 from fognav_experiments.lockstep import run_lockstep
 from fognav_experiments.rigs import FogRig
 from fognav_sim.barrier import BarrierError

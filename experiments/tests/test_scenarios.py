@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import msgspec
 import pytest
 
-from fog_runtime.site import load_site
+from fog_runtime.configuration.site import load_site
 from fognav_experiments.lockstep import DriveEvent
 from fognav_experiments.scenarios.description import Expected, FaultyNode, Scenario, SilentNode, deviations
 from fognav_experiments.scenarios.stage import ScenarioError, _Stage, play, read_scenario

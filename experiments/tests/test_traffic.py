@@ -24,7 +24,7 @@ from fog_contracts.messages import (
     RobotState,
     Trace,
 )
-from fog_runtime.site import LoadedSite, load_site
+from fog_runtime.configuration.site import LoadedSite, load_site
 from fognav_experiments.processes import MapProcess, PlannerProcess
 from fognav_sim.drive.hazard import path_length
 from map_service.core import MapCore

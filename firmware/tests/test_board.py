@@ -19,7 +19,7 @@ from fog_contracts import channels as ch
 from fog_contracts.codec import decode, encode
 from fog_contracts.messages import NodeCalibration, NodeConfig, NodeReading, NodeUpdate, NodeValue
 from fog_supervisor.servers import start_mosquitto
-from fognav.node_command import node_app
+from fognav.commands.node import node_app
 
 # Compiled once, not by each worker of a parallel run.
 pytestmark = pytest.mark.xdist_group("firmware-board")

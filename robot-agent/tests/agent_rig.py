@@ -42,7 +42,7 @@ from fog_contracts.replica import MasterMap
 from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.raycast import cast
 from fog_runtime.clock import SystemClock
-from fog_runtime.zenoh_edge import ZenohEdge
+from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fognav_sim.hardware import seen_from_dock
 from fognav_sim.pty_port import PtyPort
 from robot_agent.lidars.rplidar_a1.emulator import RplidarEmulator

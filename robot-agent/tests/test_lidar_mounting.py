@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fog_contracts.robot import BaseSettings, LidarSettings, RobotSettings
-from fog_runtime.robot_file import RobotFile
+from fog_runtime.configuration.robot_file import RobotFile
 from fognav_sim.sensors import LidarPlace
 from robot_agent.config import LocalizationConfig
 from robot_agent.hardware import LaserScan, LidarSamples

@@ -19,8 +19,8 @@ from fog_contracts.commands import sign
 from fog_contracts.messages import AreaHazard, HazardArea, PolygonShape, RobotCommand, Zone, ZoneSet
 from fog_contracts.replica import MapError
 from fog_runtime.record import Recorder, read_entries
-from robot_agent.agent import input_log as log
-from robot_agent.agent.replay import ReplayError, main, replay
+from robot_agent.agent.recording import input_log as log
+from robot_agent.agent.recording.replay import ReplayError, main, replay
 from robot_agent.localization.absolute import AbsoluteObservation
 from robot_agent.localization.pose import Pose2
 
@@ -127,7 +127,7 @@ def test_replays_in_other_processes_with_other_hash_seeds_give_the_same_outputs(
     path, _ = drive
 
     def run(hash_seed):
-        command = [sys.executable, "-m", "robot_agent.agent.replay", str(path)]
+        command = [sys.executable, "-m", "robot_agent.agent.recording.replay", str(path)]
         environment = {**os.environ, "PYTHONHASHSEED": str(hash_seed)}
         done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
         assert done.returncode == 0, done.stderr + done.stdout

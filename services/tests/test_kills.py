@@ -20,7 +20,7 @@ import pytest
 from fog_contracts import channels as ch
 from fog_contracts.messages import AreaHazard, NodeReading
 from fog_runtime.clock import SystemClock
-from fog_runtime.mqtt_edge import MqttEdge
+from fog_runtime.transports.mqtt_edge import MqttEdge
 
 pytestmark = pytest.mark.live
 KILLS = int(os.environ.get("FOGNAV_KILLS", "1"))

@@ -18,10 +18,10 @@ from fog_contracts import channels as ch
 from fog_contracts.grid import GridGeometry, StaticMap
 from fog_contracts.messages import CommandReply, NodeReading, Pose, SimCommand, SimObstacle, SimTruth
 from fog_runtime.clock import SystemClock
+from fog_runtime.configuration.maps import save_map
 from fog_runtime.locks.site_locks import CREDENTIALS
-from fog_runtime.maps import save_map
-from fog_runtime.mqtt_edge import MqttEdge
-from fog_runtime.zenoh_edge import ZenohEdge
+from fog_runtime.transports.mqtt_edge import MqttEdge
+from fog_runtime.transports.zenoh_edge import ZenohEdge
 
 pytestmark = pytest.mark.live
 

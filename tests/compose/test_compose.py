@@ -25,9 +25,9 @@ import pytest
 
 from fog_contracts import channels as ch
 from fog_contracts.messages import RobotPose, RobotState
+from fog_runtime.access.credentials import Credentials
 from fog_runtime.clock import SystemClock
-from fog_runtime.credentials import Credentials
-from fog_runtime.zenoh_edge import ZenohEdge
+from fog_runtime.transports.zenoh_edge import ZenohEdge
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Self
 from fog_contracts import channels as ch
 from fog_contracts.messages import NodeReading, SimCommand
 from fog_runtime.clock import SystemClock
-from fog_runtime.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
-from fog_runtime.mqtt_edge import MqttEdge
-from fog_runtime.site import load_site
-from fog_runtime.zenoh_edge import ZenohEdge
+from fog_runtime.configuration.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
+from fog_runtime.configuration.site import load_site
+from fog_runtime.transports.mqtt_edge import MqttEdge
+from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fog_supervisor import net
 from fognav.demo.operator import Operator
 from fognav.demo.scene import Scene

@@ -21,10 +21,10 @@ import pytest
 
 from fog_contracts import channels as ch
 from fog_contracts.messages import MapHeartbeat, SimTruth
+from fog_runtime.access.credentials import Credentials
 from fog_runtime.clock import SystemClock
-from fog_runtime.credentials import Credentials
 from fog_runtime.record import read
-from fog_runtime.zenoh_edge import ZenohEdge
+from fog_runtime.transports.zenoh_edge import ZenohEdge
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -15,7 +15,7 @@ from typing import Any
 import programs
 import pytest
 
-from fog_runtime.site import load_site
+from fog_runtime.configuration.site import load_site
 from fog_supervisor import net
 from fog_supervisor.servers import start_mosquitto, start_redis, start_router
 

@@ -29,8 +29,8 @@ from fog_contracts.messages import (
     RobotPath,
     ZoneSet,
 )
+from fog_runtime.configuration.site import LoadedSite, load_site
 from fog_runtime.record import read
-from fog_runtime.site import LoadedSite, load_site
 from fognav_experiments.processes import AggregatorProcess, MapProcess, PlannerProcess
 from hazard_aggregator.core import Aggregator
 from hazard_aggregator.fusion import AreaFusion

@@ -51,9 +51,9 @@ from fog_contracts.messages import (
     SimObstacle,
 )
 from fog_runtime.clock import SystemClock
+from fog_runtime.configuration.site import load_site
 from fog_runtime.record import RecordError, read
-from fog_runtime.site import load_site
-from fog_runtime.zenoh_edge import ZenohEdge
+from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fog_supervisor import net
 from fognav.demo.attempt import Attempt
 from fognav.demo.background import Background
@@ -67,7 +67,7 @@ from fognav.recording import recording, summary
 from fognav.stack import Stack, StackConfig
 from fognav.stack_doors import doors_of
 from fognav_sim.drive.hazard import entry_distance
-from robot_agent.agent.replay import replay
+from robot_agent.agent.recording.replay import replay
 
 if TYPE_CHECKING:
     from collections.abc import Callable

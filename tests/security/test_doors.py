@@ -11,11 +11,11 @@ from paho.mqtt.enums import CallbackAPIVersion
 
 from fog_contracts import channels as ch
 from fog_contracts import messages as m
+from fog_runtime.access.credentials import Credentials
 from fog_runtime.clock import SystemClock
-from fog_runtime.credentials import Credentials
 from fog_runtime.locks.site_locks import SiteLocks
-from fog_runtime.redis_connection import RedisConnection, StoreError
-from fog_runtime.zenoh_edge import ZenohEdge
+from fog_runtime.stores.redis_connection import RedisConnection, StoreError
+from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fog_supervisor.servers import start_mosquitto, start_redis, start_router
 
 pytestmark = pytest.mark.live

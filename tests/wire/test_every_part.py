@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fog_runtime import parts
-from fog_runtime.robot_file import default_robot, load_robot
-from fog_runtime.settings import SettingsError
+from fog_runtime.configuration import parts
+from fog_runtime.configuration.robot_file import default_robot, load_robot
+from fog_runtime.configuration.settings import SettingsError
 from fognav_sim import devices, emulators
 from robot_agent import registry
 from robot_agent.guardian.core import GuardianCore

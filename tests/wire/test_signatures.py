@@ -9,8 +9,8 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from fog_runtime import parts
-from fog_runtime.robot_file import default_robot
+from fog_runtime.configuration import parts
+from fog_runtime.configuration.robot_file import default_robot
 from fognav_sim import devices
 from robot_agent import registry
 from robot_agent.device_signature import LISTEN_S, LineCheck, foreign

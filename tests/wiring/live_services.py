@@ -25,7 +25,7 @@ from map_service.service import Service as MapService
 from planner.core import PlannerCore
 from planner.service import Service as PlannerService
 from robot_agent.agent.core import AgentCore
-from robot_agent.agent.map_loader import MapLoader
+from robot_agent.agent.edges.map_loader import MapLoader
 from robot_agent.agent.service import Service as AgentService
 
 if TYPE_CHECKING:
@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 
     from fog_contracts.channels import Channel, Role
     from fog_contracts.messages import Message
-    from fog_runtime.mqtt_subscriptions import ForeignHandler
-    from fog_runtime.site import LoadedSite
+    from fog_runtime.configuration.site import LoadedSite
+    from fog_runtime.transports.mqtt_subscriptions import ForeignHandler
     from robot_agent.config import AgentConfig
     from robot_agent.guardian.link import WheelCommand
 

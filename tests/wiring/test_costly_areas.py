@@ -7,7 +7,7 @@ from fog_contracts import channels as ch
 from fog_contracts.bus import Bus
 from fog_contracts.handlers import Moment, Publication
 from fog_contracts.messages import Limits, NodeValue, Quantity, Source
-from fog_runtime.site import load_site
+from fog_runtime.configuration.site import load_site
 from fognav import checkout
 from hazard_aggregator.core import Aggregator
 from hazard_aggregator.fusion import AreaFusion

@@ -50,10 +50,10 @@ from hazard_aggregator.registry import find_rule
 from map_service.core import MapCore
 from map_service.registry import make_layers
 from planner.core import PlannerCore
-from planner.mission_keeper import Order
+from planner.keepers.mission_keeper import Order
 from planner.robot_commands import CommandError
-from robot_agent.agent import input_log as log
 from robot_agent.agent.core import AgentCore
+from robot_agent.agent.recording import input_log as log
 
 if TYPE_CHECKING:
     from robot_agent.config import AgentConfig
@@ -327,12 +327,12 @@ def live(lockstep: Run) -> tuple[Run, Any]:
     with pytest.MonkeyPatch.context() as patch:
         for module in (
             "planner.threads",
-            "robot_agent.agent.map_loader",
+            "robot_agent.agent.edges.map_loader",
             "robot_agent.agent.service",
             "fog_runtime.work",
         ):
             patch.setattr(f"{module}.ThreadPoolExecutor", live_services.InlineExecutor)
-        patch.setattr("planner.mission_keeper.secrets.token_hex", lambda _: GOAL_ID)
+        patch.setattr("planner.keepers.mission_keeper.secrets.token_hex", lambda _: GOAL_ID)
         return asyncio.run(drive_live(lockstep))
 
 
@@ -375,7 +375,7 @@ def test_live_services_reply_refuse_and_drive_as_in_lockstep(lockstep, live):
 def table_pairs(live: Any, kind: str, side: str) -> set[Any]:
     """Return the table's pairs of role and channel on one side, for the roles that run here.
 
-    Here each service runs once and always leads: without `fog_runtime.leadership`, which announces the leader.
+    Here each service runs once and always leads: without `fog_runtime.leases.leadership`, which announces the leader.
     """
     rows = [row for row in ch.CHANNELS.values() if row.kind == kind and row is not ch.LEADER]
     return {(role, row) for row in rows for role in getattr(row, side) if role in live.edges} - usage.NOT_YET

@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from fog_contracts.channels import Channel
     from fog_contracts.handlers import Ids, Moment
     from fog_contracts.messages import Message
-    from fog_runtime.site import LoadedSite
-    from fog_runtime.zenoh_edge import ZenohEdge
+    from fog_runtime.configuration.site import LoadedSite
+    from fog_runtime.transports.zenoh_edge import ZenohEdge
     from fognav.stack import Stack
     from fognav_experiments.lockstep import LockstepResult
 

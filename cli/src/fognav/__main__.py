@@ -11,19 +11,27 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from fog_runtime import parts
+from fog_runtime.configuration import parts
 from fognav import __version__, checkout, doctor, kernels, system
-from fognav.alert_command import alert_app
-from fognav.area_command import area_app
-from fognav.backup_command import backup_command, restore_command
-from fognav.bench_command import bench_app
-from fognav.ca_command import ca_app
-from fognav.channels_command import channels_command
-from fognav.coverage_command import site_coverage
-from fognav.experiment_command import experiment_app
-from fognav.localize_command import localize_command
-from fognav.map_command import map_app
-from fognav.node_command import node_app
+from fognav.commands.alert import alert_app
+from fognav.commands.area import area_app
+from fognav.commands.backup import backup_command, restore_command
+from fognav.commands.bench import bench_app
+from fognav.commands.ca import ca_app
+from fognav.commands.channels import channels_command
+from fognav.commands.coverage import site_coverage
+from fognav.commands.experiment import experiment_app
+from fognav.commands.localize import localize_command
+from fognav.commands.map import map_app
+from fognav.commands.node import node_app
+from fognav.commands.robot import robot_app, robot_goal
+from fognav.commands.robot_file import robot_add, robot_check, robot_new
+from fognav.commands.source import source_app
+from fognav.commands.status import status_command
+from fognav.commands.store import store_app
+from fognav.commands.token import token_app
+from fognav.commands.up import down_command, logs_command, up_command
+from fognav.commands.zone import zone_app
 from fognav.operate.options import NUMBERS, JsonOption
 from fognav.output import (
     NOT_TRUE,
@@ -37,14 +45,6 @@ from fognav.output import (
     print_line,
     write_report,
 )
-from fognav.robot_command import robot_app, robot_goal
-from fognav.robot_file_command import robot_add, robot_check, robot_new
-from fognav.source_command import source_app
-from fognav.status_command import status_command
-from fognav.store_command import store_app
-from fognav.token_command import token_app
-from fognav.up_command import down_command, logs_command, up_command
-from fognav.zone_command import zone_app
 from fognav_sim import emulators
 
 app = typer.Typer(
@@ -232,10 +232,10 @@ def demo_command(  # noqa: PLR0913  # each option is an argument
     The exit code is 0 if the robot reached the goal without contact and avoided the blocked area; 1 if it did not, or
     the demo was interrupted (see the report); 2 if an option or file can't be used.
     """
-    from fog_runtime.settings import SettingsError  # noqa: PLC0415  # same
-    from fog_runtime.site import SiteError, load_site  # noqa: PLC0415  # keeps the other commands fast
+    from fog_runtime.configuration.settings import SettingsError  # noqa: PLC0415  # same
+    from fog_runtime.configuration.site import SiteError, load_site  # noqa: PLC0415  # keeps the other commands fast
+    from fognav.commands.demo import run_demo  # noqa: PLC0415  # same
     from fognav.demo.options import Options, hardware  # noqa: PLC0415  # same
-    from fognav.demo_command import run_demo  # noqa: PLC0415  # same
 
     try:
         folder = checkout.site_folder(site)
@@ -346,7 +346,7 @@ def site_new(
 
     This writes a commented DIR/site.toml with places, a robot and watched areas, as a starting point.
     """
-    from fognav.site_command import new_site  # noqa: PLC0415  # keeps the other commands fast
+    from fognav.commands.site import new_site  # noqa: PLC0415  # keeps the other commands fast
 
     try:
         kernels.warm_cache(print_line)
@@ -368,7 +368,7 @@ def site_check(
     json: JsonOption = False,
 ) -> None:
     """Check a site: map, ids, and that everything is on free floor."""
-    from fognav.site_command import check_site  # noqa: PLC0415  # keeps the other commands fast
+    from fognav.commands.site import check_site  # noqa: PLC0415  # keeps the other commands fast
 
     try:
         found = check_site(checkout.site_folder(folder))

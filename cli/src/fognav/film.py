@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from fog_contracts.messages import PointXY, ProfileName
-    from fog_runtime.site import LoadedSite
+    from fog_runtime.configuration.site import LoadedSite
     from fognav_experiments.comparison.draws import RouteDraw
     from fognav_experiments.comparison.records import Record
     from fognav_experiments.comparison.timeline import Timeline

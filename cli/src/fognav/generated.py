@@ -15,10 +15,10 @@ from fog_contracts.generate.mqtt_acl import mqtt_acl
 from fog_contracts.generate.robot_toml import robot_settings_markdown
 from fog_contracts.generate.zenoh_acl import zenoh_acl
 from fog_runtime.clock import SystemClock
+from fog_runtime.configuration.robot_file import default_robot
+from fog_runtime.configuration.site import load_site
 from fog_runtime.health import Health
 from fog_runtime.http import Tokens, unused
-from fog_runtime.robot_file import default_robot
-from fog_runtime.site import load_site
 from fognav import checkout
 
 if TYPE_CHECKING:
@@ -31,9 +31,9 @@ WRITE: Final = "./fognav channels --write"
 def rest_routes() -> dict[str, OpenApi]:
     """Return each service's OpenAPI description by the service's name."""
     # The services import kernels and web frameworks, which takes time: only this function needs them.
-    from hazard_aggregator.api import make_api as make_aggregator  # noqa: PLC0415  # see above
+    from hazard_aggregator.rest.api import make_api as make_aggregator  # noqa: PLC0415  # see above
     from map_service.api import make_api as make_map  # noqa: PLC0415  # same
-    from planner.api import make_api as make_planner  # noqa: PLC0415  # same
+    from planner.rest.api import make_api as make_planner  # noqa: PLC0415  # same
 
     loaded = load_site(checkout.site_folder(None))
     clock, health, tokens = SystemClock(), Health(), Tokens()

@@ -24,8 +24,8 @@ from fog_contracts.geometry import distance_to_polygon
 from fog_contracts.handlers import Publication
 from fog_contracts.messages import RobotGoal
 from fog_contracts.stages import SPANS, durations_ms
-from fog_runtime.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
-from fog_runtime.site import load_site
+from fog_runtime.configuration.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
+from fog_runtime.configuration.site import load_site
 from fognav_experiments.processes import Measure, unmeasured
 from fognav_experiments.rigs import STAMP, System
 from fognav_sim.barrier import BarrierError
@@ -54,7 +54,7 @@ if TYPE_CHECKING:
         Trace,
     )
     from fog_contracts.site import Place
-    from fog_runtime.site import LoadedSite
+    from fog_runtime.configuration.site import LoadedSite
     from fognav_experiments.cpu import CpuMeter
     from fognav_sim.sensors import Noise
 

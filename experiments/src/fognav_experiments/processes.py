@@ -14,7 +14,7 @@ from fog_contracts import channels as ch
 from fog_contracts.codec import encode
 from fog_contracts.messages import MapSnapshot, Message, PlanReply, RobotGoal, RobotState
 from fognav_experiments.link import Link
-from planner.dock_goals import DockGoals
+from planner.keepers.dock_goals import DockGoals
 from robot_agent.agent.core import decide
 
 if TYPE_CHECKING:

@@ -13,8 +13,8 @@ from fog_contracts.bus import Bus
 from fog_contracts.commands import signed_command
 from fog_contracts.handlers import Moment, Publication
 from fog_contracts.messages import CommandReply
-from fog_runtime.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
-from fog_runtime.robot_file import default_robot
+from fog_runtime.configuration.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
+from fog_runtime.configuration.robot_file import default_robot
 from fognav_experiments.processes import (
     AgentProcess,
     AggregatorProcess,
@@ -37,7 +37,7 @@ from map_service.core import MapCore
 from map_service.registry import make_layers
 from planner.core import PlannerCore
 from robot_agent.agent.core import AgentCore
-from robot_agent.agent.pose_keeper import start_pose
+from robot_agent.agent.sensing.pose_keeper import start_pose
 from robot_agent.config import agent_config
 from robot_agent.guardian import link
 from robot_agent.guardian.core import GuardianCore
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
     from fog_contracts.messages import CommandKind, Zone
     from fog_contracts.site import RobotSite
-    from fog_runtime.site import LoadedSite
+    from fog_runtime.configuration.site import LoadedSite
     from fognav_sim.emulators import BaseEmulator
     from fognav_sim.sensors import Noise
     from robot_agent.config import AgentConfig

@@ -17,7 +17,7 @@ import numpy as np
 
 from fog_contracts import channels as ch
 from fog_contracts.messages import Pose, RobotGoal, RobotState
-from fog_runtime.site import load_site
+from fog_runtime.configuration.site import load_site
 from fognav_experiments.rigs import System
 from robot_agent.agent.core import AgentCore
 from robot_agent.localization.pose import wrap
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from fog_contracts.handlers import Ids, Moment, Publication
     from fog_contracts.site import Place
-    from fog_runtime.site import LoadedSite
+    from fog_runtime.configuration.site import LoadedSite
     from robot_agent.config import AgentConfig
     from robot_agent.guardian.link import WheelCommand
 

@@ -16,9 +16,9 @@ from fog_contracts import channels as ch
 from fog_contracts import messages as m
 from fog_contracts.generate.mqtt_acl import mqtt_acl
 from fog_contracts.generate.zenoh_acl import zenoh_acl
-from fog_runtime import zenoh_edge
 from fog_runtime.clock import SystemClock
-from fog_runtime.zenoh_edge import ZenohEdge, session_config
+from fog_runtime.transports import zenoh_edge
+from fog_runtime.transports.zenoh_edge import ZenohEdge, session_config
 from fog_supervisor.net import free_port
 from fog_supervisor.servers import start_mosquitto
 

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from fog_runtime.audit import KINDS, PAGE_BYTES, read_page
-from fog_runtime.redis_connection import RedisConnection
+from fog_runtime.stores.audit import KINDS, PAGE_BYTES, read_page
+from fog_runtime.stores.redis_connection import RedisConnection
 from fog_supervisor.servers import start_redis
 
 pytestmark = pytest.mark.live

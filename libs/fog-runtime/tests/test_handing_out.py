@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from fog_runtime.credentials import Credentials
+from fog_runtime.access.credentials import Credentials
 from fog_runtime.keys import ADMIN_TOKEN, OPERATOR_KEY, TOKENS
 from fog_runtime.locks import __main__ as command
 from fog_runtime.locks.handing_out import OWNERS, SIMULATION

@@ -18,12 +18,12 @@ from fog_contracts import channels as ch
 from fog_contracts.fencing import Fence
 from fog_contracts.handlers import Publication, RefusedMessageError
 from fog_contracts.messages import Leader, MapHeartbeat, ZoneSet
-from fog_runtime import leadership
 from fog_runtime.clock import ManualClock
-from fog_runtime.edges import Edges
 from fog_runtime.health import Health
-from fog_runtime.leadership import Leadership
-from fog_runtime.redis_connection import StoreError
+from fog_runtime.leases import leadership
+from fog_runtime.leases.leadership import Leadership
+from fog_runtime.stores.redis_connection import StoreError
+from fog_runtime.transports.edges import Edges
 
 STEP_S = 0.01
 TAKEOVER_S = 2.0

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 from lease_model import LEASE_S, LeaseModel
 
-from fog_runtime.lease import Granted, Held, Lease
+from fog_runtime.leases.lease import Granted, Held, Lease
 
 ATTEMPT_S, STEP_S = 0.4, 0.05
 TAKEOVER_S = 2.0

@@ -8,8 +8,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from lease_model import LeaseModel
 
-from fog_runtime.lease import ATTEMPT_S, Granted, Held, Request
-from fog_runtime.lease_store import LeaseStore
+from fog_runtime.leases.lease import ATTEMPT_S, Granted, Held, Request
+from fog_runtime.leases.lease_store import LeaseStore
 from fog_supervisor.servers import Server, start_redis
 
 pytestmark = pytest.mark.live
@@ -36,7 +36,7 @@ STEPS = st.lists(
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(steps=STEPS)
 def test_redis_decides_as_the_model_does(redis: Server, steps, monkeypatch):
-    monkeypatch.setattr("fog_runtime.lease_store._now_ms", lambda: 3)
+    monkeypatch.setattr("fog_runtime.leases.lease_store._now_ms", lambda: 3)
     asyncio.run(compare(redis, steps))
 
 

@@ -11,18 +11,18 @@ from redis.asyncio import Redis
 
 from fog_contracts import channels as ch
 from fog_contracts import messages as m
+from fog_runtime.access.credentials import NOBODY, Credentials, CredentialsError, to_toml
 from fog_runtime.clock import SystemClock
-from fog_runtime.credentials import NOBODY, Credentials, CredentialsError, to_toml
-from fog_runtime.lease_store import LeaseStore
+from fog_runtime.leases.lease_store import LeaseStore
 from fog_runtime.locks import users
 from fog_runtime.locks.authority import Authority, AuthorityError
 from fog_runtime.locks.site_locks import LocksError, SiteLocks
-from fog_runtime.mqtt_broker import Broker
-from fog_runtime.mqtt_edge import MqttEdge
-from fog_runtime.redis_connection import RedisConnection, StoreError
-from fog_runtime.redis_store import RedisStore
 from fog_runtime.router import RouterLocks, RouterLocksError
-from fog_runtime.zenoh_edge import ZenohEdge
+from fog_runtime.stores.redis_connection import RedisConnection, StoreError
+from fog_runtime.stores.redis_store import RedisStore
+from fog_runtime.transports.mqtt_broker import Broker
+from fog_runtime.transports.mqtt_edge import MqttEdge
+from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fog_supervisor.servers import start_mosquitto, start_redis, start_router
 
 # The client library forgets the socket whose server was not to be trusted; Python closes it, and mentions that.

@@ -12,7 +12,7 @@ from hypothesis.extra import numpy as hnp
 from PIL import Image
 
 from fog_contracts.grid import GridGeometry, StaticMap
-from fog_runtime.maps import MapFileError, load_map, load_occupancy, save_map
+from fog_runtime.configuration.maps import MapFileError, load_map, load_occupancy, save_map
 
 KEYS = {
     "image": "m.png", "resolution": 0.05, "origin": "[1.0, -2.0, 0.0]", "negate": 0,
@@ -225,7 +225,7 @@ free_thresh: 0.196
 LOAD = """
 import resource, sys
 from pathlib import Path
-from fog_runtime.maps import load_map, Image
+from fog_runtime.configuration.maps import load_map, Image
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 static = load_map(Path(sys.argv[1]))
 used = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024

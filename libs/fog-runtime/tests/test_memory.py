@@ -13,7 +13,7 @@ import gc
 import numpy as np
 from numba import njit
 from fog_kernels.components import Components
-from fog_runtime.memory import release_startup_memory
+from fog_runtime.machine.memory import release_startup_memory
 
 Components(np.zeros((50, 50), np.uint8))
 print(release_startup_memory())

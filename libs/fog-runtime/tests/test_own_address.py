@@ -2,7 +2,7 @@
 
 import pytest
 
-from fog_runtime.own_address import reachable_address
+from fog_runtime.machine.own_address import reachable_address
 
 
 def test_server_on_every_address_is_announced_with_the_address_on_the_way_to_the_fog():
@@ -32,6 +32,6 @@ def test_nothing_is_announced_without_a_way_to_the_fog(endpoints):
 
 
 def test_loopback_is_not_announced_to_a_fog_elsewhere(monkeypatch):
-    monkeypatch.setattr("fog_runtime.own_address._own_side", lambda _towards: "192.0.2.20")
+    monkeypatch.setattr("fog_runtime.machine.own_address._own_side", lambda _towards: "192.0.2.20")
     assert reachable_address("127.0.0.1", 9100, ["tcp/192.0.2.1:7447"]) == ""
     assert reachable_address("localhost", 9100, ["tcp/192.0.2.1:7447"]) == ""

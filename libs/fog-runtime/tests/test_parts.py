@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from fog_runtime import parts
+from fog_runtime.configuration import parts
 
 GROUP = "fognav.test_parts"
 

@@ -9,9 +9,9 @@ from mcap.reader import make_reader
 from fog_contracts import channels as ch
 from fog_contracts import messages as m
 from fog_runtime.clock import ManualClock, SystemClock
-from fog_runtime.mqtt_edge import MqttEdge
 from fog_runtime.record import Recorder, RecordError, read, read_entries, record_all, replay
-from fog_runtime.zenoh_edge import ZenohEdge
+from fog_runtime.transports.mqtt_edge import MqttEdge
+from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fog_supervisor.servers import start_mosquitto, start_router
 
 

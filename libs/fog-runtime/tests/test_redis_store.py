@@ -7,10 +7,10 @@ import pytest
 from redis.asyncio import Redis
 
 from fog_contracts.messages import Message
-from fog_runtime.lease import Request
-from fog_runtime.lease_store import LeaseStore
-from fog_runtime.redis_connection import StoreRefusedError
-from fog_runtime.redis_store import ANY, Audit, RedisStore, StoreError, Table
+from fog_runtime.leases.lease import Request
+from fog_runtime.leases.lease_store import LeaseStore
+from fog_runtime.stores.redis_connection import StoreRefusedError
+from fog_runtime.stores.redis_store import ANY, Audit, RedisStore, StoreError, Table
 from fog_supervisor.servers import Server, start_redis
 
 pytestmark = pytest.mark.live

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fog_runtime.robot_file import ROBOT_FILE, default_robot, load_robot, parse_robot
-from fog_runtime.settings import SettingsError
-from fog_runtime.toml_lines import find_line, key_lines
+from fog_runtime.configuration.robot_file import ROBOT_FILE, default_robot, load_robot, parse_robot
+from fog_runtime.configuration.settings import SettingsError
+from fog_runtime.configuration.toml_lines import find_line, key_lines
 
 FILE = Path("robot.toml")
 TEXT = """# my robot

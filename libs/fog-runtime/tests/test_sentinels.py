@@ -16,8 +16,8 @@ from redis.asyncio import Redis
 from redis.exceptions import RedisError
 
 from fog_contracts.messages import Message
-from fog_runtime.redis_connection import RedisAddress, parse_address
-from fog_runtime.redis_store import Audit, RedisStore, StoreError, Table
+from fog_runtime.stores.redis_connection import RedisAddress, parse_address
+from fog_runtime.stores.redis_store import Audit, RedisStore, StoreError, Table
 from fog_supervisor import configurations
 from fog_supervisor.net import LOOPBACK, free_port
 from fog_supervisor.servers import Server, ServerProgram, find_program

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from fog_runtime import service_manager
-from fog_runtime.service_manager import ServiceManager
+from fog_runtime.machine import service_manager
+from fog_runtime.machine.service_manager import ServiceManager
 
 
 @pytest.mark.parametrize("kind", ["path", "abstract"])

@@ -9,8 +9,8 @@ import pytest
 from fog_contracts import channels as ch
 from fog_contracts import messages as m
 from fog_runtime.clock import SystemClock
-from fog_runtime.mqtt_edge import MqttEdge
-from fog_runtime.zenoh_edge import ZenohEdge
+from fog_runtime.transports.mqtt_edge import MqttEdge
+from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fog_supervisor import configurations
 from fog_supervisor.net import LOOPBACK, free_port
 from fog_supervisor.servers import Server, ServerProgram, start_mosquitto, start_router

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from fog_contracts.grid import GridGeometry, StaticMap
-from fog_runtime.maps import save_map
-from fog_runtime.site import SiteError, load_site
+from fog_runtime.configuration.maps import save_map
+from fog_runtime.configuration.site import SiteError, load_site
 
 SITE = """
 id = "lab"

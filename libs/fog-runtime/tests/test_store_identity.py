@@ -2,8 +2,8 @@
 
 import pytest
 
-from fog_runtime.redis_connection import StoreError
-from fog_runtime.store_identity import LOST, StoreIdentity, StoreLostError
+from fog_runtime.stores.redis_connection import StoreError
+from fog_runtime.stores.store_identity import LOST, StoreIdentity, StoreLostError
 
 
 def verify(identity: StoreIdentity, generation: str, writes: dict[str, int]) -> None:

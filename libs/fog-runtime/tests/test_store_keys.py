@@ -1,8 +1,8 @@
 """What each service may write in Redis follows from the keys that its store uses."""
 
-from fog_runtime import store_keys
-from fog_runtime.audit import KINDS
 from fog_runtime.locks.users import SERVICES, redis_line
+from fog_runtime.stores import store_keys
+from fog_runtime.stores.audit import KINDS
 
 
 def test_every_service_has_its_keys_and_no_key_has_two_writers():

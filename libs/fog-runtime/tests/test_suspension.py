@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from fog_runtime.suspension import SuspensionMonitor
+from fog_runtime.machine.suspension import SuspensionMonitor
 
 
 def test_suspension_is_the_growth_of_boot_time_over_monotonic_time():

@@ -17,8 +17,8 @@ from fog_contracts import messages as m
 from fog_contracts.codec import ContractError, encode
 from fog_contracts.handlers import RefusedMessageError
 from fog_runtime.clock import SystemClock
-from fog_runtime.reply_parts import PART_BYTES, decode_announcement
-from fog_runtime.zenoh_edge import ASKER, ZenohEdge, session_config
+from fog_runtime.transports.reply_parts import PART_BYTES, decode_announcement
+from fog_runtime.transports.zenoh_edge import ASKER, ZenohEdge, session_config
 from fog_supervisor.net import free_port
 from fog_supervisor.servers import start_router
 

@@ -13,22 +13,23 @@ from functools import partial
 
 from prometheus_client import REGISTRY
 
-from fog_runtime import logs, process, signals
+from fog_runtime import logs, process
 from fog_runtime.clock import SystemClock
+from fog_runtime.configuration.robot_file import describe_robot, load_robot
+from fog_runtime.configuration.settings import describe, load
 from fog_runtime.health import Health, serve_health
-from fog_runtime.memory import release_startup_memory
-from fog_runtime.own_address import reachable_address
-from fog_runtime.robot_file import describe_robot, load_robot
-from fog_runtime.settings import describe, load
-from fog_runtime.zenoh_edge import ZenohEdge, use_one_thread
+from fog_runtime.machine import signals
+from fog_runtime.machine.memory import release_startup_memory
+from fog_runtime.machine.own_address import reachable_address
+from fog_runtime.transports.zenoh_edge import ZenohEdge, use_one_thread
 from robot_agent import registry
-from robot_agent.agent.guardian_client import GuardianClient
-from robot_agent.agent.input_writer import open_core
-from robot_agent.agent.lidar_edge import LidarEdge
-from robot_agent.agent.map_loader import MapLoader
+from robot_agent.agent.edges.guardian_client import GuardianClient
+from robot_agent.agent.edges.lidar_edge import LidarEdge
+from robot_agent.agent.edges.map_loader import MapLoader
+from robot_agent.agent.edges.store import Store
+from robot_agent.agent.recording.input_writer import open_core
 from robot_agent.agent.service import Service
 from robot_agent.agent.settings import Settings, read_footprint, read_operator_key, read_port, read_site
-from robot_agent.agent.store import Store
 from robot_agent.config import agent_config
 from robot_agent.device_signature import LineCheck
 from robot_agent.guardian.protection import run_in_real_time

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Final
 
-from fog_runtime import parts
-from fog_runtime.settings import SettingsError
+from fog_runtime.configuration import parts
+from fog_runtime.configuration.settings import SettingsError
 from robot_agent.device_signature import Signature
 from robot_agent.hardware import BaseFactory, LidarFactory
 
 if TYPE_CHECKING:
     import msgspec
 
-    from fog_runtime.robot_file import RobotFile
+    from fog_runtime.configuration.robot_file import RobotFile
     from robot_agent.hardware import BaseDriver, LidarDriver
 
 BASES: Final = "fognav.bases"

@@ -16,7 +16,7 @@ from fog_contracts.robot import (
     RobotSettings,
 )
 from fog_contracts.site import RobotSite
-from fog_runtime.robot_file import default_robot
+from fog_runtime.configuration.robot_file import default_robot
 from robot_agent.config import agent_config
 from robot_agent.footprint import Footprint
 from robot_agent.guardian.core import Limits

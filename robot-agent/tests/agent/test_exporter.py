@@ -8,7 +8,7 @@ import pytest
 from prometheus_client import CollectorRegistry, generate_latest
 
 from fog_contracts.messages import LoopHealth, Power, RobotState
-from robot_agent.agent.exporter import Observed, RobotCollector, parent
+from robot_agent.agent.edges.exporter import Observed, RobotCollector, parent
 from robot_agent.localization.uncertainty import Uncertainty
 
 

@@ -20,7 +20,7 @@ from fog_contracts.messages import (
     ZoneSet,
 )
 from robot_agent.agent.blocked_places import BlockedPlaces
-from robot_agent.agent.obstacle_reporter import ObstacleReporter, view
+from robot_agent.agent.sensing.obstacle_reporter import ObstacleReporter, view
 from robot_agent.localization.localizer import Pose2
 
 GEOMETRY = GridGeometry(100, 100, 0.1, 0.0, 0.0)

@@ -5,7 +5,7 @@ import math
 import msgspec
 import pytest
 
-from robot_agent.agent.pose_keeper import SEARCH_AGAIN_S, PoseKeeper
+from robot_agent.agent.sensing.pose_keeper import SEARCH_AGAIN_S, PoseKeeper
 from robot_agent.localization.localizer import SavedPose
 
 POSE = SavedPose(site="lab", x=1.0, y=2.0, theta=3.1, sigma_xy=0.1, sigma_theta=0.1)

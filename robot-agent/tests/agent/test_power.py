@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from fog_contracts.messages import Power
-from fog_runtime.robot_file import default_robot
+from fog_runtime.configuration.robot_file import default_robot
 from robot_agent.agent.power import power_warnings
 from robot_agent.bases.diffdrive.emulator import DiffDriveEmulator
 from robot_agent.bases.roomba600.driver import MEASURE_S

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from robot_agent.agent.wheel_control import WheelControl
+from robot_agent.agent.path.wheel_control import WheelControl
 from robot_agent.config import agent_config
 from robot_agent.hardware import DriveTrain, LidarTraits
 from robot_agent.motion.local_planner import Decision

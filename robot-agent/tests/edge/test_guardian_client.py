@@ -8,7 +8,7 @@ import pytest
 from guardian_rig import DEADLINE_S
 
 from fog_runtime.clock import SystemClock
-from robot_agent.agent.guardian_client import FEEDBACK_TIMEOUT_S, RESET_VALID_S, GuardianClient
+from robot_agent.agent.edges.guardian_client import FEEDBACK_TIMEOUT_S, RESET_VALID_S, GuardianClient
 from robot_agent.guardian.link import BaseFeedback, WheelCommand, decode_command, encode
 from robot_agent.hardware import BaseStatus, WheelOdometry
 

@@ -7,11 +7,11 @@ from guardian_rig import DEADLINE_S
 from little_world import AGENT, LittleWorld
 
 from fog_runtime.record import Recorder, read_entries
-from robot_agent.agent import input_writer
 from robot_agent.agent.core import AgentCore
-from robot_agent.agent.input_log import TOPIC_OF_ENTRY, BaseLost, EntriesLost, LoggedAgent
-from robot_agent.agent.input_writer import LOST, InputWriter, open_core
-from robot_agent.agent.replay import replay
+from robot_agent.agent.recording import input_writer
+from robot_agent.agent.recording.input_log import TOPIC_OF_ENTRY, BaseLost, EntriesLost, LoggedAgent
+from robot_agent.agent.recording.input_writer import LOST, InputWriter, open_core
+from robot_agent.agent.recording.replay import replay
 
 
 def lost():

@@ -9,10 +9,10 @@ import pytest
 from guardian_rig import DEADLINE_S
 
 from fog_runtime.clock import SystemClock
-from fog_runtime.robot_file import default_robot
-from fog_runtime.settings import SettingsError
+from fog_runtime.configuration.robot_file import default_robot
+from fog_runtime.configuration.settings import SettingsError
 from fognav_sim.pty_port import PtyPort
-from robot_agent.agent.lidar_edge import LidarEdge
+from robot_agent.agent.edges.lidar_edge import LidarEdge
 from robot_agent.bases.roomba600.emulator import RoombaEmulator
 from robot_agent.device_signature import LineCheck
 from robot_agent.lidars.rplidar_a1 import protocol as rplidar

@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import pytest
 
-from fog_runtime.robot_file import load_robot
-from fog_runtime.settings import SettingsError, load
+from fog_runtime.configuration.robot_file import load_robot
+from fog_runtime.configuration.settings import SettingsError, load
 from robot_agent.agent.settings import Settings, read_footprint, read_operator_key, read_site
 
 SITE = """

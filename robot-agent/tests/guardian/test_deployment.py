@@ -14,8 +14,8 @@ import guardian_rig as rigs
 import pytest
 from guardian_rig import wait_for
 
-from fog_runtime.robot_file import ROBOT_FILE, load_robot
-from fog_runtime.settings import load
+from fog_runtime.configuration.robot_file import ROBOT_FILE, load_robot
+from fog_runtime.configuration.settings import load
 from robot_agent.agent.settings import Settings
 
 DEPLOY = Path(__file__).parents[3] / "deploy/robot"
@@ -30,7 +30,7 @@ os.execv(sys.executable, [sys.executable, "-c", sys.argv[1]])
 LOADS_ALL = """
 import mmap
 import robot_agent.guardian.process, robot_agent.guardian.stop_base
-from fog_runtime.robot_file import default_robot
+from fog_runtime.configuration.robot_file import default_robot
 from robot_agent.registry import make_base, signatures
 make_base(default_robot()), signatures()
 try:

@@ -9,7 +9,7 @@ import pytest
 from open_floor import LONG, PADDING, ROUND, around
 
 from fog_contracts.costs import UNKNOWN
-from robot_agent.agent.recoveries import Recoveries
+from robot_agent.agent.path.recoveries import Recoveries
 from robot_agent.localization.pose import Pose2
 from robot_agent.motion.local_planner import Decision
 from robot_agent.motion.path_follower import PathFollower

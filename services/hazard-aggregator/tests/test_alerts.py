@@ -18,8 +18,8 @@ from fog_contracts.messages import (
     AreaHazard,
     HazardOverride,
 )
-from hazard_aggregator.alerts import LISTED, AlertError, Alerts
-from hazard_aggregator.node_report import NodeReport
+from hazard_aggregator.areas.alerts import LISTED, AlertError, Alerts
+from hazard_aggregator.areas.node_report import NodeReport
 
 SQUARE = [(0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (0.0, 1.0)]
 POLICY = AlertPolicy(unknown_after_s=10.0, blocked_after_s=20.0, node_after_s=5.0)

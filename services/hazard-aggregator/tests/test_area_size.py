@@ -7,7 +7,7 @@ from fog_contracts.codec import encode
 from fog_contracts.messages import AreaDefinition, AreaHazard
 from fog_runtime.health import Health
 from hazard_aggregator.area_size import AreaError, check_size
-from hazard_aggregator.unusable_areas import UnusableAreas
+from hazard_aggregator.writers.unusable_areas import UnusableAreas
 
 POLYGON = [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0)]
 

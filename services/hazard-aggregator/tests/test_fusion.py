@@ -12,8 +12,8 @@ from fog_contracts.messages import AreaDefinition, AreaHazard, NodeReading, Robo
 from fog_contracts.site import NodeSite, Sonar
 from hazard_aggregator.debounce import DebounceError, Observation, RuleFactory
 from hazard_aggregator.fusion import AreaFusion
-from hazard_aggregator.reading_order import FORGOTTEN_S, ReadingOrder
 from hazard_aggregator.registry import find_rule
+from hazard_aggregator.sensors.reading_order import FORGOTTEN_S, ReadingOrder
 
 SQUARE = [(0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (0.0, 1.0)]
 LIMIT = 1.2

@@ -12,8 +12,8 @@ import pytest
 from fog_contracts.messages import AreaDefinition, NodeReading
 from fog_contracts.site import NodeSite, Sonar
 from hazard_aggregator.fusion import AreaFusion
-from hazard_aggregator.reading_order import FORGOTTEN_S, MIN_PERIOD_S, SILENT_S
 from hazard_aggregator.registry import find_rule
+from hazard_aggregator.sensors.reading_order import FORGOTTEN_S, MIN_PERIOD_S, SILENT_S
 
 READINGS = int(os.environ.get("FOGNAV_PERMUTED_READINGS", "12000"))
 SEQS = 2**32

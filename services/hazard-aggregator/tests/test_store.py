@@ -8,14 +8,14 @@ import pytest
 from redis.asyncio import Redis
 
 from fog_contracts.messages import AreaDefinition, AreaHazard
-from fog_runtime.audit import CursorError
 from fog_runtime.health import Health
+from fog_runtime.stores.audit import CursorError
 from fog_supervisor.servers import Server, start_redis
-from hazard_aggregator.area_history import period_of
+from hazard_aggregator.areas.area_history import period_of
 from hazard_aggregator.debounce import make_rule
 from hazard_aggregator.registry import find_rule
 from hazard_aggregator.store import Audit, Store, StoreError
-from hazard_aggregator.unusable_areas import UnusableAreas
+from hazard_aggregator.writers.unusable_areas import UnusableAreas
 
 pytestmark = pytest.mark.live
 AUDIT = Audit(at=1.0, who="anna", action="put")

@@ -10,21 +10,21 @@ from fog_contracts.handlers import Moment
 from fog_contracts.messages import AreaDefinition
 from fog_runtime.clock import ManualClock
 from fog_runtime.health import Health
-from fog_runtime.idempotency import Attempt
+from fog_runtime.stores.idempotency import Attempt
 from fog_supervisor.servers import start_redis
-from hazard_aggregator.area_override import AreaOverride
-from hazard_aggregator.area_writer import ConflictError
+from hazard_aggregator.areas.area_override import AreaOverride
 from hazard_aggregator.core import Aggregator
 from hazard_aggregator.fusion import AreaFusion
 from hazard_aggregator.registry import find_rule
 from hazard_aggregator.service import Service
 from hazard_aggregator.store import Audit, Store, StoreError
+from hazard_aggregator.writers.area_writer import ConflictError
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
 
-    from fog_runtime.redis_store import Outcome
+    from fog_runtime.stores.redis_store import Outcome
 
 pytestmark = pytest.mark.live
 HALL = AreaDefinition(id="hall", polygon=[(0, 0), (1, 0), (1, 1)])

@@ -16,7 +16,7 @@ from fog_contracts import channels as ch
 from fog_contracts.grid import GridGeometry, StaticMap
 from fog_contracts.messages import MapDelta, MapHeartbeat, MapSnapshot
 from fog_contracts.replica import Applied, Replica
-from fog_runtime.maps import save_map
+from fog_runtime.configuration.maps import save_map
 
 pytestmark = pytest.mark.live
 MAX_AGE_S = 1.0
@@ -36,8 +36,8 @@ CROSSING = {"type": "polygon", "points": [[0.1 * i, 30.0 + (-1) ** i * (i % 7)] 
 TOO_LONG = {"type": "corridor", "line": [[1.0 + i % 2 * 90.0, 1.0 + i % 2 * 58.0] for i in range(500)], "width": 0.3}
 STOPPED_CLIENT = """
 import pathlib, sys, time, zenoh
-from fog_runtime.credentials import Credentials
-from fog_runtime.zenoh_edge import session_config
+from fog_runtime.access.credentials import Credentials
+from fog_runtime.transports.zenoh_edge import session_config
 own = Credentials.read(pathlib.Path(sys.argv[2]))
 session = zenoh.open(session_config("client", connect=[sys.argv[1]], credentials=own))
 session.declare_subscriber("fog/test/map/heartbeat", lambda _: None)

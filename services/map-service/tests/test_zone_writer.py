@@ -13,7 +13,7 @@ from fog_contracts.grid import GridGeometry
 from fog_contracts.messages import CircleShape, Message, Zone
 from fog_runtime.clock import ManualClock
 from fog_runtime.health import Health
-from fog_runtime.idempotency import Attempt
+from fog_runtime.stores.idempotency import Attempt
 from fog_supervisor.servers import start_redis
 from map_service.core import MapCore
 from map_service.registry import make_layers
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from fog_contracts import channels as ch
-    from fog_runtime.redis_store import Outcome
+    from fog_runtime.stores.redis_store import Outcome
 
 pytestmark = pytest.mark.live
 ATTEMPT = Attempt.of("ann", "k1", "POST /api/v1/zones", None)

@@ -38,7 +38,7 @@ from fog_contracts.messages import (
 from fog_kernels.astar import Planner
 from planner.config import PlannerConfig
 from planner.core import PlannerCore
-from planner.route import Route
+from planner.search.route import Route
 
 
 def crosses(points: NDArray[np.float64], cost: Grid, geometry: GridGeometry) -> bool:

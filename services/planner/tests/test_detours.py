@@ -12,7 +12,7 @@ from fog_contracts import channels as ch
 from fog_contracts.handlers import Moment
 from planner.config import PlannerConfig
 from planner.core import PlannerCore
-from planner.path_search import PathSearch
+from planner.search.path_search import PathSearch
 
 WALLS = ((2.0, 2.0, 18.0, 5.0), (2.0, 7.0, 18.0, 10.0))
 """Leave three corridors from left to right."""

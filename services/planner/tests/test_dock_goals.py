@@ -8,9 +8,9 @@ import pytest
 
 from fog_contracts.messages import Pose, Refusal, RobotGoal, RobotState
 from fog_contracts.site import RobotSite, Site
-from planner.dock_goals import DockGoals
-from planner.dock_keeper import DockKeeper
-from planner.mission_keeper import NO_MISSION, MissionConflictError
+from planner.keepers.dock_goals import DockGoals
+from planner.keepers.dock_keeper import DockKeeper
+from planner.keepers.mission_keeper import NO_MISSION, MissionConflictError
 from planner.store import StoreError
 
 FRONT = Pose(x=1.0, y=2.0, theta=0.5)

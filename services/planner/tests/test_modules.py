@@ -33,18 +33,18 @@ from fog_contracts.replica import MapError, Version
 from fog_contracts.shapes import rasterize_shape
 from fog_kernels.astar import Planner
 from fog_kernels.inflation import inflate, inflation_table
-from planner.blocked_regions import BlockedRegions, cover
 from planner.config import PlannerConfig
-from planner.egress import find_egress
-from planner.goal_fields import FieldJob, GoalFields
-from planner.mission import Mission, Plan
-from planner.path_monitor import distance_to_change, effect_of_change, may_save, reason_from_pose
-from planner.path_search import PathSearch, SearchResult
-from planner.planning_map import CostChange, MapTracker, PlanningMap
-from planner.refusals import refuse
-from planner.regions import Region, Regions
-from planner.replan_policy import is_kept
-from planner.route import Route
+from planner.maps.planning_map import CostChange, MapTracker, PlanningMap
+from planner.reasons.blocked_regions import BlockedRegions, cover
+from planner.reasons.refusals import refuse
+from planner.reasons.regions import Region, Regions
+from planner.replanning.mission import Mission, Plan
+from planner.replanning.path_monitor import distance_to_change, effect_of_change, may_save, reason_from_pose
+from planner.replanning.replan_policy import is_kept
+from planner.search.egress import find_egress
+from planner.search.goal_fields import FieldJob, GoalFields
+from planner.search.path_search import PathSearch, SearchResult
+from planner.search.route import Route
 
 CONFIG = PlannerConfig()
 TRACE = Trace(area="z1", epoch=1, seq=5)

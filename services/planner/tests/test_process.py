@@ -39,8 +39,8 @@ from fog_contracts.replica import MasterMap
 from fog_kernels.inflation import inflate, inflation_table
 from fog_runtime.clock import SystemClock, ticker
 from fog_runtime.http import token_hash
-from fog_runtime.redis_connection import RedisConnection
-from fog_runtime.zenoh_edge import ZenohEdge
+from fog_runtime.stores.redis_connection import RedisConnection
+from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fog_supervisor.servers import Server
 
 pytestmark = pytest.mark.live

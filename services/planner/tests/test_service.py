@@ -18,11 +18,11 @@ from fog_contracts.messages import EgressRequest, PlanRequest, Pose, RobotGoal, 
 from fog_runtime.clock import ManualClock
 from fog_runtime.health import Health
 from fog_runtime.http import Tokens
-from fog_runtime.zenoh_edge import ASKER
-from planner.api import make_api
+from fog_runtime.transports.zenoh_edge import ASKER
 from planner.core import PlannerCore
 from planner.cycle import MOST_SEARCHING_S, CycleResult
 from planner.query_queue import BusyError
+from planner.rest.api import make_api
 from planner.service import Service
 
 if TYPE_CHECKING:

@@ -11,11 +11,11 @@ from functools import partial
 from fog_contracts.site import RobotSite
 from fog_runtime import logs, process
 from fog_runtime.clock import SystemClock
+from fog_runtime.configuration.robot_file import load_robot
+from fog_runtime.configuration.settings import SettingsError, describe, load
+from fog_runtime.configuration.site import LoadedSite, load_site
 from fog_runtime.health import Health, serve_health
-from fog_runtime.robot_file import load_robot
-from fog_runtime.settings import SettingsError, describe, load
-from fog_runtime.site import LoadedSite, load_site
-from fog_runtime.zenoh_edge import ZenohEdge
+from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fognav_sim import devices
 from fognav_sim.floor import Floor
 from fognav_sim.hardware import Hardware

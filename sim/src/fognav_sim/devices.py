@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from fog_runtime import parts
-from fog_runtime.settings import SettingsError
+from fog_runtime.configuration import parts
+from fog_runtime.configuration.settings import SettingsError
 from fognav_sim.emulators import BASES, LIDARS
 
 if TYPE_CHECKING:

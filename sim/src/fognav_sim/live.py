@@ -15,9 +15,9 @@ from fog_contracts import channels as ch
 from fog_contracts.geometry import GeometryError
 from fog_contracts.messages import CommandReply, NodeConfig, SimCommand
 from fog_runtime import logs
+from fog_runtime.access.credentials import NOBODY, Credentials
 from fog_runtime.clock import Ticker
-from fog_runtime.credentials import NOBODY, Credentials
-from fog_runtime.mqtt_edge import MqttEdge, Will
+from fog_runtime.transports.mqtt_edge import MqttEdge, Will
 from fognav_sim.hardware import STEP_S
 from fognav_sim.pty_port import PtyPort
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from types import TracebackType
 
     from fog_runtime.clock import Clock
-    from fog_runtime.zenoh_edge import ZenohEdge
+    from fog_runtime.transports.zenoh_edge import ZenohEdge
     from fognav_sim.hardware import Hardware
     from fognav_sim.nodes import SensorNode
     from fognav_sim.world import World

@@ -3,14 +3,15 @@
 from pathlib import Path
 from typing import Literal
 
-from fog_runtime.credentials import NOBODY, Credentials
-from fog_runtime.settings import CommonSettings
+from fog_runtime.access.credentials import NOBODY, Credentials
+from fog_runtime.configuration.settings import CommonSettings
 
 
 class Settings(CommonSettings, frozen=True, kw_only=True):
     """FOGNAV_RUN_DIR: folder of the devices `base` and `lidar`; FOGNAV_TRUTH_LOG: file for the ground truth.
 
-    The robot's hardware, and the lidar's place on it, are those of its robot file (`fog_runtime.robot_file`).
+    The robot's hardware, and the lidar's place on it, are those of its robot file
+    (`fog_runtime.configuration.robot_file`).
     """
 
     run_dir: Path

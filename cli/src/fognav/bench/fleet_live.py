@@ -20,7 +20,7 @@ import psutil
 import zenoh
 
 from fog_runtime.clock import SystemClock
-from fog_runtime.zenoh_edge import ZenohEdge, session_config
+from fog_runtime.transports.zenoh_edge import ZenohEdge, session_config
 from fog_supervisor import net
 from fog_supervisor.supervisor import NotReadyError, log_tail
 from fognav.bench.fleet import closures, hazard_message, percentile

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from fog_contracts.channels import Channel
     from fog_contracts.messages import HazardArea, MapDelta
-    from fog_runtime.zenoh_edge import ZenohEdge
+    from fog_runtime.transports.zenoh_edge import ZenohEdge
     from fognav.bench.fleet import FleetMap, Trip
 
 _STEP_S: Final = 0.01

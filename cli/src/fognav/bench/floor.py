@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 from fog_contracts import channels as ch
 from fog_contracts.messages import MapSnapshot, RobotPath, RobotPose
 from fog_runtime.clock import SystemClock, ticker
-from fog_runtime.zenoh_edge import ZenohEdge
+from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fog_supervisor import net
 from fog_supervisor.supervisor import NotReadyError, log_tail
 from fognav.bench.office import corridor_rows, make_office

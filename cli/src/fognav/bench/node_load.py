@@ -22,7 +22,7 @@ import zenoh
 from fog_contracts import channels as ch
 from fog_contracts.codec import encode
 from fog_contracts.messages import NodeReading, RobotPose
-from fog_runtime.zenoh_edge import session_config
+from fog_runtime.transports.zenoh_edge import session_config
 
 BLOCKED_S: Final = 0.5
 """How long a node sees its obstacle."""

@@ -23,7 +23,7 @@ from fog_kernels.components import Components
 from fog_kernels.inflation import inflate, inflation_table
 from fog_kernels.steps import STRAIGHT
 from fog_kernels.tiles import TilePatterns
-from fog_runtime.maps import load_map
+from fog_runtime.configuration.maps import load_map
 from fognav.bench.fleet import percentile
 from fognav.bench.office import make_office
 

@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 import psutil
 
-from fog_runtime.redis_store import Audit
+from fog_runtime.stores.redis_store import Audit
 from fognav.bench.costmap import random_zones, worst_shapes
 from fognav.bench.rest_clients import Load
 from fognav.bench.site import SITE

@@ -7,7 +7,7 @@ import time
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Final
 
-from fog_runtime.task_usage import ProcessUsage, memory_mb, sample, usage
+from fog_runtime.machine.task_usage import ProcessUsage, memory_mb, sample, usage
 from fognav.bench.cpu_quota import cpu_quota
 from fognav.bench.robot_system import RobotSystem
 

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Final
 from fog_contracts import channels as ch
 from fog_contracts.messages import RobotPose, RobotState
 from fog_runtime.clock import SystemClock
-from fog_runtime.maps import save_map
+from fog_runtime.configuration.maps import save_map
 from fog_runtime.robot_commands import RobotCommands
-from fog_runtime.zenoh_edge import ZenohEdge
+from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fog_supervisor import net
 from fognav.bench.office import corridor_rows, make_office
 from fognav.bench.running import RunningSystem, first_child

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from fog_runtime.maps import save_map
+from fog_runtime.configuration.maps import save_map
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -6,7 +6,7 @@ from collections.abc import AsyncIterator
 from typing import Final
 
 from fog_runtime.clock import Clock, SystemClock
-from fog_runtime.zenoh_edge import ZenohEdge
+from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fog_supervisor.supervisor import Event
 from fognav.demo.background import Background
 from fognav.demo.operator import Operator

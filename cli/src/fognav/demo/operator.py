@@ -24,7 +24,7 @@ from fog_contracts.messages import (
 )
 from fog_runtime.clock import Clock
 from fog_runtime.robot_commands import RobotCommands
-from fog_runtime.zenoh_edge import ZenohEdge
+from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fog_supervisor import net
 from fognav.demo.scene import Scene
 from fognav.programs import PLANNER

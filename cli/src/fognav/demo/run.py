@@ -3,7 +3,7 @@
 import asyncio
 from collections.abc import Callable
 
-from fog_runtime.site import LoadedSite
+from fog_runtime.configuration.site import LoadedSite
 from fognav.demo.attempt import Attempt
 from fognav.demo.options import DrivePlan, Options
 from fognav.demo.report import modes, report

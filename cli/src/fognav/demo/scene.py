@@ -21,7 +21,7 @@ from fog_contracts.messages import (
     Trace,
 )
 from fog_contracts.stages import Traces, durations_ms, hazard_to_path_ms
-from fog_runtime.site import LoadedSite
+from fog_runtime.configuration.site import LoadedSite
 from fognav_sim.drive.evaluation import DriveOutcome
 
 _EVENTS: Final = 200

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from fog_runtime.configuration.site import LoadedSite, SiteError, load_site
 from fog_runtime.locks.site_locks import CREDENTIALS, SiteLocks
 from fog_runtime.locks.users import on_floor
-from fog_runtime.site import LoadedSite, SiteError, load_site
 from fognav.operate.systems import SERVICE_PORTS, port
 from fognav.output import WrongUseError
 

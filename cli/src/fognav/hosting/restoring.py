@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Final
 
 from fog_runtime import backup
+from fog_runtime.access.credentials import Credentials
 from fog_runtime.backup_archive import Backup, read_archive
-from fog_runtime.credentials import Credentials
 from fog_runtime.locks.site_locks import SiteLocks
 from fog_runtime.locks.users import REDIS_ADMINISTRATOR
 from fog_supervisor import net, servers

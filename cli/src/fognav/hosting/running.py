@@ -6,8 +6,8 @@ import socket
 from collections.abc import Callable, Iterator
 from typing import Final
 
-from fog_runtime import signals
-from fog_runtime.service_manager import ServiceManager
+from fog_runtime.machine import signals
+from fog_runtime.machine.service_manager import ServiceManager
 from fog_supervisor.supervisor import Event
 from fognav.hosting import log_files
 from fognav.hosting.node import LocalNode, NodeConfig

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from fog_contracts.geometry import Point
     from fog_contracts.site import NodeSite
-    from fog_runtime.site import LoadedSite
+    from fog_runtime.configuration.site import LoadedSite
 
 PERSON_RADIUS_M: Final = 0.25
 _MITE_M: Final = 0.01

@@ -6,8 +6,8 @@ import re
 import tomllib
 from typing import TYPE_CHECKING
 
+from fog_runtime.configuration.site import SITE_FILE, LoadedSite, SiteError, load_site
 from fog_runtime.files import SHARED, atomic_write
-from fog_runtime.site import SITE_FILE, LoadedSite, SiteError, load_site
 from fognav.output import FailedError, WrongUseError
 from fognav.site_text import node_lines
 

@@ -12,7 +12,7 @@ from fog_contracts.commands import STOPS
 from fog_contracts.messages import CommandKind, Pose, RobotPose, RobotState
 from fog_runtime.clock import SystemClock
 from fog_runtime.robot_commands import REPLY_TIMEOUT_S, RobotCommands
-from fog_runtime.zenoh_edge import ZenohEdge
+from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fognav.operate.fog import Fog, router
 from fognav.operate.outcome import Outcome
 from fognav.output import FailedError

@@ -158,7 +158,7 @@ def _robots(processes: list[tuple[str, psutil.Process]]) -> list[System]:
 
 def _site_of(process: psutil.Process) -> str:
     """Return the id of a process's site by its settings, or an empty text if they can't be seen."""
-    from fog_runtime.site import SITE_FILE  # noqa: PLC0415  # numpy: keeps the commands fast
+    from fog_runtime.configuration.site import SITE_FILE  # noqa: PLC0415  # numpy: keeps the commands fast
 
     if site := _setting(process, "SITE"):
         return site

@@ -6,8 +6,8 @@ import csv
 import io
 from typing import TYPE_CHECKING, Any
 
+from fog_runtime.configuration.site import load_site
 from fog_runtime.files import SHARED, atomic_write
-from fog_runtime.site import load_site
 from fognav_experiments.comparison import runner
 from fognav_experiments.comparison.document import Figure, to_html, to_markdown
 from fognav_experiments.comparison.draws import draw

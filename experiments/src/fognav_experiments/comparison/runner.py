@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 
-from fog_runtime.site import load_site
+from fog_runtime.configuration.site import load_site
 from fognav_experiments.comparison.draws import ExperimentSpec, draw
 from fognav_experiments.comparison.records import Asked, Folder, FolderError, file_name
 from fognav_experiments.comparison.trial import drive
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from fog_contracts.messages import ProfileName
-    from fog_runtime.site import LoadedSite
+    from fog_runtime.configuration.site import LoadedSite
     from fognav_experiments.comparison.draws import RouteDraw
     from fognav_experiments.comparison.records import Record
 

@@ -20,7 +20,7 @@ from fognav_sim.drive.hazard import HazardRequest
 
 if TYPE_CHECKING:
     from fog_contracts.messages import ProfileName
-    from fog_runtime.site import LoadedSite
+    from fog_runtime.configuration.site import LoadedSite
     from fognav_experiments.comparison.draws import RouteDraw
 
 

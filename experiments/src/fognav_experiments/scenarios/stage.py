@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import msgspec
 
 from fog_contracts.messages import PolygonShape, Pose, RobotGoal, SimObstacle, Zone
-from fog_runtime.site import load_site
+from fog_runtime.configuration.site import load_site
 from fognav_experiments.lockstep import LockstepDrive, LockstepResult, release_drives
 from fognav_experiments.rigs import moment
 from fognav_experiments.scenarios.description import (
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from fog_contracts.messages import Id
-    from fog_runtime.site import LoadedSite
+    from fog_runtime.configuration.site import LoadedSite
     from fognav_experiments.rigs import FogProcessName
     from fognav_experiments.scenarios.description import AnyEvent
     from fognav_sim.nodes import SensorNode

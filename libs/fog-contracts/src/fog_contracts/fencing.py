@@ -1,7 +1,8 @@
 """Fencing: receivers refuse messages of an epoch below the highest that they received from that service. Pure.
 
-A service has one leader at a time, whose epoch is larger than that of every leader before it (`fog_runtime.lease`). A
-leader that was replaced without knowing it, because it was stopped or cut off, still sends its own epoch.
+A service has one leader at a time, whose epoch is larger than that of every leader before it
+(`fog_runtime.leases.lease`). A leader that was replaced without knowing it, because it was stopped or cut off, still
+sends its own epoch.
 """
 
 from __future__ import annotations

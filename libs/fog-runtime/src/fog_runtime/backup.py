@@ -16,12 +16,12 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
+from fog_runtime.access.credentials import NOBODY, Credentials, CredentialsError
 from fog_runtime.backup_archive import STAMP, Backup, BackupError, File, Key, read_archive, read_folder, write_archive
-from fog_runtime.credentials import NOBODY, Credentials, CredentialsError
+from fog_runtime.configuration.settings import CommonSettings, SettingsError, load
+from fog_runtime.configuration.site import SiteError, load_site
 from fog_runtime.files import atomic_write
-from fog_runtime.redis_connection import Command, RedisConnection, StoreError
-from fog_runtime.settings import CommonSettings, SettingsError, load
-from fog_runtime.site import SiteError, load_site
+from fog_runtime.stores.redis_connection import Command, RedisConnection, StoreError
 from fog_runtime.version import VERSION
 
 if TYPE_CHECKING:

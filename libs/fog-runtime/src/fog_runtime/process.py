@@ -7,7 +7,8 @@ import signal
 from collections.abc import Awaitable, Callable
 from typing import Final
 
-from fog_runtime import logs, signals
+from fog_runtime import logs
+from fog_runtime.machine import signals
 
 ENDING_S: Final = 9.0
 """How long an orderly end may take: less than container engines and service managers wait before they kill."""

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from fog_runtime.clock import Clock
-    from fog_runtime.mqtt_edge import MqttEdge
-    from fog_runtime.zenoh_edge import ZenohEdge
+    from fog_runtime.transports.mqtt_edge import MqttEdge
+    from fog_runtime.transports.zenoh_edge import ZenohEdge
 
 _CHUNK: Final = 64 * 1024
 """Bytes that a crash may lose."""

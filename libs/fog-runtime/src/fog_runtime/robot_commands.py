@@ -6,7 +6,7 @@ from typing import Final
 from fog_contracts import channels as ch
 from fog_contracts.commands import STOPS, signed_command, unsigned_stop
 from fog_contracts.messages import CommandKind, CommandReply, Pose, RobotState
-from fog_runtime.zenoh_edge import ZenohEdge
+from fog_runtime.transports.zenoh_edge import ZenohEdge
 
 REPLY_TIMEOUT_S: Final = 2.0
 

@@ -15,8 +15,8 @@ from pathlib import Path
 import zenoh
 
 from fog_runtime import logs, process
-from fog_runtime.credentials import Credentials
-from fog_runtime.zenoh_edge import session_config
+from fog_runtime.access.credentials import Credentials
+from fog_runtime.transports.zenoh_edge import session_config
 
 _log = logs.get("router")
 

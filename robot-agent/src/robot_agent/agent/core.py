@@ -27,19 +27,19 @@ from fog_contracts.follower import MapFollower
 from fog_contracts.messages import LoopHealth
 from robot_agent.agent.blocked_places import BlockedPlaces
 from robot_agent.agent.fog_inputs import FogInputs
-from robot_agent.agent.maneuvers import Maneuvers
+from robot_agent.agent.maneuvering.maneuvers import Maneuvers
 from robot_agent.agent.motion_guard import MotionGuard
 from robot_agent.agent.navigation import Navigation
-from robot_agent.agent.obstacle_reporter import ObstacleReporter
 from robot_agent.agent.operator_commands import OperatorCommands, initial_pose_refusal
-from robot_agent.agent.path_driving import PathDriving
-from robot_agent.agent.pose_keeper import PoseKeeper
+from robot_agent.agent.path.path_driving import PathDriving
 from robot_agent.agent.prepared_map import PreparedMap, prepare_map
 from robot_agent.agent.publishing import PublishingPolicy
 from robot_agent.agent.reports import hindrances, robot_pose, robot_state
 from robot_agent.agent.rest_policy import RestPolicy
 from robot_agent.agent.safety_supervisor import SafetySupervisor, safety_inputs
-from robot_agent.agent.sensors import BaseSource, LidarSource
+from robot_agent.agent.sensing.obstacle_reporter import ObstacleReporter
+from robot_agent.agent.sensing.pose_keeper import PoseKeeper
+from robot_agent.agent.sensing.sensors import BaseSource, LidarSource
 from robot_agent.localization.localizer import Localizer, SavedPose
 from robot_agent.motion.local_planner import Decision, Job, decide
 from robot_agent.odometry import EncoderFault, Odometry, possible_motion

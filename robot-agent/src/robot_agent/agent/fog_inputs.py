@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from fog_contracts.messages import MapDelta, MapHeartbeat, RobotGoal, RobotPath, RobotRelease
     from robot_agent.agent.blocked_places import BlockedPlaces
     from robot_agent.agent.navigation import Navigation
-    from robot_agent.agent.path_driving import PathDriving
+    from robot_agent.agent.path.path_driving import PathDriving
     from robot_agent.localization.localizer import Localizer
 
 

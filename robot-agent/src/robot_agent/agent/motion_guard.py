@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from robot_agent.agent.lidar_view import LidarView
-from robot_agent.agent.near_points import NearPoints
+from robot_agent.agent.sensing.lidar_view import LidarView
+from robot_agent.agent.sensing.near_points import NearPoints
 from robot_agent.safety.stop_field import StopField
 
 if TYPE_CHECKING:

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from fog_contracts.raster import Spans
     from fog_contracts.replica import Replica, Version
     from robot_agent.agent.blocked_places import BlockedPlaces
-    from robot_agent.agent.obstacle_reporter import ObstacleReporter
-    from robot_agent.agent.path_driving import PathDriving
+    from robot_agent.agent.path.path_driving import PathDriving
+    from robot_agent.agent.sensing.obstacle_reporter import ObstacleReporter
     from robot_agent.config import AgentConfig
     from robot_agent.localization.localizer import Localizer
     from robot_agent.localization.pose import Pose2

@@ -11,9 +11,9 @@ from robot_agent.safety.conditions import SafetyInputs
 from robot_agent.safety.gate import SafetyState, step
 
 if TYPE_CHECKING:
-    from robot_agent.agent.mission import Mission
     from robot_agent.agent.navigation import Navigation
-    from robot_agent.agent.sensors import BaseSource, LidarSource
+    from robot_agent.agent.path.mission import Mission
+    from robot_agent.agent.sensing.sensors import BaseSource, LidarSource
     from robot_agent.config import SafetyConfig
     from robot_agent.localization.localizer import Localizer
     from robot_agent.safety.conditions import Request

@@ -17,11 +17,11 @@ from fog_contracts.codec import ContractError
 from fog_contracts.messages import CommandReply, LoopHealth, PlanReply, RobotCommand, RobotState
 from fog_runtime import logs, metrics
 from fog_runtime.clock import Phase, Ticker
-from fog_runtime.edges import Edges
-from fog_runtime.service_manager import ServiceManager
-from fog_runtime.suspension import SuspensionMonitor
+from fog_runtime.machine.service_manager import ServiceManager
+from fog_runtime.machine.suspension import SuspensionMonitor
+from fog_runtime.transports.edges import Edges
 from robot_agent.agent.core import decide
-from robot_agent.agent.exporter import Observed, RobotCollector, parent
+from robot_agent.agent.edges.exporter import Observed, RobotCollector, parent
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -30,11 +30,11 @@ if TYPE_CHECKING:
     from fog_contracts.messages import EgressRequest, Message
     from fog_runtime.clock import Clock
     from fog_runtime.health import Health
-    from fog_runtime.zenoh_edge import ZenohEdge
+    from fog_runtime.transports.zenoh_edge import ZenohEdge
     from robot_agent.agent.core import AgentCore
-    from robot_agent.agent.guardian_client import GuardianClient
-    from robot_agent.agent.lidar_edge import LidarEdge
-    from robot_agent.agent.store import Store
+    from robot_agent.agent.edges.guardian_client import GuardianClient
+    from robot_agent.agent.edges.lidar_edge import LidarEdge
+    from robot_agent.agent.edges.store import Store
     from robot_agent.guardian.link import BaseFeedback
     from robot_agent.hardware import LaserScan
 

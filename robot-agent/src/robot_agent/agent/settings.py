@@ -12,15 +12,15 @@ from msgspec import Meta
 from fog_contracts.commands import KEY_BYTES
 from fog_contracts.messages import Id
 from fog_contracts.site import Site
-from fog_runtime.operator_key import OperatorKeyError
-from fog_runtime.operator_key import read_operator_key as read_key
-from fog_runtime.robot_file import VARIABLES
-from fog_runtime.settings import CommonSettings, SettingsError
+from fog_runtime.access.operator_key import OperatorKeyError
+from fog_runtime.access.operator_key import read_operator_key as read_key
+from fog_runtime.configuration.robot_file import VARIABLES
+from fog_runtime.configuration.settings import CommonSettings, SettingsError
 from robot_agent.footprint import Footprint, FootprintError
 
 if TYPE_CHECKING:
     from fog_contracts.site import RobotSite
-    from fog_runtime.robot_file import RobotFile
+    from fog_runtime.configuration.robot_file import RobotFile
 
 SITE_FILE: Final = "site.toml"
 
@@ -28,8 +28,8 @@ SITE_FILE: Final = "site.toml"
 class Settings(CommonSettings, frozen=True, kw_only=True):
     """The robot's id, the seed of its particle filter, and its memory; what is mounted on it is in its robot file.
 
-    `input_log`: file for the log of the core's inputs, for `python -m robot_agent.agent.replay`; some 1.5 MB a minute.
-    The log of the previous run is kept beside it.
+    `input_log`: file for the log of the core's inputs, for `python -m robot_agent.agent.recording.replay`; some 1.5 MB
+    a minute. The log of the previous run is kept beside it.
 
     `obstacle_memory_s`: how long (s) a reported obstacle counts while no lidar looks there again.
 

@@ -19,11 +19,12 @@ from typing import TYPE_CHECKING, Final, Literal
 import msgspec
 
 from fog_contracts.messages import SENTENCE_MAX
-from fog_runtime import logs, signals
+from fog_runtime import logs
+from fog_runtime.configuration.robot_file import load_robot
+from fog_runtime.configuration.settings import SettingsError, load
 from fog_runtime.logs import Level
-from fog_runtime.machine_clock import MachineClock
-from fog_runtime.robot_file import load_robot
-from fog_runtime.settings import SettingsError, load
+from fog_runtime.machine import signals
+from fog_runtime.machine.machine_clock import MachineClock
 from robot_agent.device_signature import LISTEN_S, LineCheck
 from robot_agent.guardian.core import GuardianCore, Limits, Output
 from robot_agent.guardian.heartbeat import Heartbeats

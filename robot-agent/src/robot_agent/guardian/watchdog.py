@@ -20,9 +20,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from fog_runtime import parts, signals
-from fog_runtime.default_parts import DEFAULT_BASE
-from fog_runtime.service_manager import ServiceManager
+from fog_runtime.configuration import parts
+from fog_runtime.configuration.default_parts import DEFAULT_BASE
+from fog_runtime.machine import signals
+from fog_runtime.machine.service_manager import ServiceManager
 from robot_agent.guardian.heartbeat import silence_limit
 from robot_agent.guardian.protection import lock_memory, run_in_real_time
 from robot_agent.port_names import PortNameError

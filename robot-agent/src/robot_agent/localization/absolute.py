@@ -1,9 +1,10 @@
 """Absolute observations of the robot's pose: by its dock, a fiducial marker, or a person with a tape measure.
 
 The one input for whatever measures the pose without the lidar: `AgentCore.on_absolute_observation`. The contacts of the
-dock use it (`agent/docking.py`). A camera that sees a marker whose place in `map` is known would compose that place
-with the measured one, rotate its covariance into `map`, and stamp both with the time of the picture. The pose is fused
-with the estimate at the odometry of that time, so a picture may be as late as odometry is kept (`OdometryBuffer`).
+dock use it (`agent/maneuvering/docking.py`). A camera that sees a marker whose place in `map` is known would compose
+that place with the measured one, rotate its covariance into `map`, and stamp both with the time of the picture. The
+pose is fused with the estimate at the odometry of that time, so a picture may be as late as odometry is kept
+(`OdometryBuffer`).
 """
 
 from __future__ import annotations

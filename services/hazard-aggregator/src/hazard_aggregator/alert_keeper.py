@@ -12,8 +12,8 @@ from fog_contracts.handlers import Publication
 from fog_contracts.messages import AlertKind
 from fog_runtime import logs
 from fog_runtime.clock import ticker
-from fog_runtime.redis_connection import StoreRefusedError
-from hazard_aggregator.alerts import AlertEvent, Alerts
+from fog_runtime.stores.redis_connection import StoreRefusedError
+from hazard_aggregator.areas.alerts import AlertEvent, Alerts
 from hazard_aggregator.store import StoreError
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from fog_contracts.messages import Alert
     from fog_runtime.clock import Clock
-    from fog_runtime.edges import Edges
+    from fog_runtime.transports.edges import Edges
     from hazard_aggregator.core import Aggregator
     from hazard_aggregator.store import Store
 

@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING, Final
 
 from fog_contracts import channels as ch
 from fog_contracts.handlers import Publication
-from fog_runtime.mqtt_edge import Will
+from fog_runtime.transports.mqtt_edge import Will
 
 if TYPE_CHECKING:
     import asyncio
 
     from fog_contracts.handlers import Ids
-    from fog_runtime.edges import Edges
-    from fog_runtime.mqtt_edge import MqttEdge
+    from fog_runtime.transports.edges import Edges
+    from fog_runtime.transports.mqtt_edge import MqttEdge
 
 LAST_WILL: Final = Will(ch.AGGREGATOR_AVAILABILITY, ch.OFFLINE)
 

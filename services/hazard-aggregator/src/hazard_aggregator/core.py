@@ -25,12 +25,12 @@ if TYPE_CHECKING:
     from fog_contracts.channels import Channel
     from fog_contracts.handlers import Handler, Ids, Moment, QueryHandler
     from fog_contracts.messages import AreaDefinition, AreaHazard, NodeReading, NodeValue, RobotPose
-    from hazard_aggregator.area_override import AreaOverride
+    from hazard_aggregator.areas.area_override import AreaOverride
+    from hazard_aggregator.areas.node_report import NodeReport
     from hazard_aggregator.foreign_messages import ForeignMessage
     from hazard_aggregator.fusion import AreaFusion
-    from hazard_aggregator.node_report import NodeReport
     from hazard_aggregator.overrides import StoredOverrides
-    from hazard_aggregator.reading_order import Rejection
+    from hazard_aggregator.sensors.reading_order import Rejection
 
 
 _HALF_TICK_S: Final = 0.05

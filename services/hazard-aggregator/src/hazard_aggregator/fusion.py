@@ -10,15 +10,15 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from fog_contracts.channels import BLOCKED, CLEAR
+from hazard_aggregator.areas.members import THESIS_NODE, Members
+from hazard_aggregator.areas.node_report import node_reports
+from hazard_aggregator.areas.watched_area import WatchedArea
 from hazard_aggregator.debounce import DEFAULT_RULE
-from hazard_aggregator.members import THESIS_NODE, Members
-from hazard_aggregator.node_report import node_reports
-from hazard_aggregator.node_state import SourceState
-from hazard_aggregator.plausibility import Classification, classify_reading
-from hazard_aggregator.reading_order import ReadingOrder, Taken
-from hazard_aggregator.robot_poses import RobotPoses
+from hazard_aggregator.sensors.node_state import SourceState
+from hazard_aggregator.sensors.plausibility import Classification, classify_reading
+from hazard_aggregator.sensors.reading_order import ReadingOrder, Taken
+from hazard_aggregator.sensors.robot_poses import RobotPoses
 from hazard_aggregator.sources import Sources
-from hazard_aggregator.watched_area import WatchedArea
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -26,11 +26,11 @@ if TYPE_CHECKING:
 
     from fog_contracts.messages import AreaDefinition, AreaHazard, AreaState, NodeReading, NodeValue, RobotPose
     from fog_contracts.site import NodeSite
-    from hazard_aggregator.area_override import AreaOverride
+    from hazard_aggregator.areas.area_override import AreaOverride
+    from hazard_aggregator.areas.node_report import NodeReport
     from hazard_aggregator.debounce import Registry
-    from hazard_aggregator.node_report import NodeReport
-    from hazard_aggregator.node_state import NodeState
-    from hazard_aggregator.reading_order import Rejection
+    from hazard_aggregator.sensors.node_state import NodeState
+    from hazard_aggregator.sensors.reading_order import Rejection
     from hazard_aggregator.sources import Applied
 
 LATE_TICK_S: Final = 0.5

@@ -7,12 +7,12 @@ from collections import deque
 from typing import TYPE_CHECKING, Final
 
 from fog_runtime import logs
-from hazard_aggregator.area_history import period_of
+from hazard_aggregator.areas.area_history import period_of
 from hazard_aggregator.store import StoreError
 
 if TYPE_CHECKING:
     from fog_contracts.messages import AreaHazard
-    from hazard_aggregator.area_history import HistoryPage
+    from hazard_aggregator.areas.area_history import HistoryPage
     from hazard_aggregator.core import Aggregator
     from hazard_aggregator.store import Store
 

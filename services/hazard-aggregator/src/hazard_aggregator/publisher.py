@@ -11,13 +11,13 @@ from prometheus_client import Gauge
 from fog_contracts import channels as ch
 from fog_contracts.messages import AreaHazard, AreaState
 from fog_runtime import logs, metrics
-from hazard_aggregator.area_discovery import discovery_publication
+from hazard_aggregator.areas.area_discovery import discovery_publication
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from fog_contracts.handlers import Publication
-    from fog_runtime.edges import Edges
+    from fog_runtime.transports.edges import Edges
     from hazard_aggregator.core import Aggregator
     from hazard_aggregator.history_keeper import HistoryKeeper
 

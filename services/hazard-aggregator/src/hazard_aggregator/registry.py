@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import cache
 from typing import Any, Final
 
-from fog_runtime import parts
+from fog_runtime.configuration import parts
 from hazard_aggregator.debounce import RuleFactory
 
 GROUP: Final = "fognav.debounce_rules"

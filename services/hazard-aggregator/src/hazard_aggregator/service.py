@@ -9,25 +9,25 @@ from prometheus_client import Counter, Gauge
 
 from fog_runtime import logs
 from fog_runtime.clock import ticker
-from fog_runtime.edges import Edges
+from fog_runtime.transports.edges import Edges
 from hazard_aggregator.alert_keeper import AlertKeeper
-from hazard_aggregator.area_writer import AreaWriter
 from hazard_aggregator.availability import Availability
 from hazard_aggregator.history_keeper import HistoryKeeper
-from hazard_aggregator.override_writer import OverrideWriter
 from hazard_aggregator.publisher import Publisher
-from hazard_aggregator.records import Records
 from hazard_aggregator.store import StoreError, StoreLostError
+from hazard_aggregator.writers.area_writer import AreaWriter
+from hazard_aggregator.writers.override_writer import OverrideWriter
+from hazard_aggregator.writers.records import Records
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from fog_contracts.handlers import Publication
     from fog_runtime.clock import Clock
-    from fog_runtime.edges import Gate
     from fog_runtime.health import Health
-    from fog_runtime.mqtt_edge import MqttEdge
-    from fog_runtime.zenoh_edge import ZenohEdge
+    from fog_runtime.transports.edges import Gate
+    from fog_runtime.transports.mqtt_edge import MqttEdge
+    from fog_runtime.transports.zenoh_edge import ZenohEdge
     from hazard_aggregator.core import Aggregator
     from hazard_aggregator.store import Store
 

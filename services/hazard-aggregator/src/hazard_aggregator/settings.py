@@ -1,6 +1,6 @@
 """The settings of the hazard aggregator (environment FOGNAV_*), on top of those of every process."""
 
-from fog_runtime.settings import CommonSettings
+from fog_runtime.configuration.settings import CommonSettings
 from hazard_aggregator.debounce import DEFAULT_RULE
 
 

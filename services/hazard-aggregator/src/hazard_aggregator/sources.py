@@ -7,15 +7,15 @@ import re
 from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from hazard_aggregator.node_state import SourceState
-from hazard_aggregator.source_reader import is_online
+from hazard_aggregator.sensors.node_state import SourceState
+from hazard_aggregator.sensors.source_reader import is_online
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from fog_contracts.messages import NodeValue
-    from hazard_aggregator.plausibility import Classification
-    from hazard_aggregator.watched_area import WatchedArea
+    from hazard_aggregator.areas.watched_area import WatchedArea
+    from hazard_aggregator.sensors.plausibility import Classification
 
 _WRAP: Final = 2**32
 

@@ -9,11 +9,12 @@ import msgspec
 from msgspec import structs
 
 from fog_contracts.messages import AreaDefinition, AreaHazard, Count, Id, Message, Ring
-from fog_runtime import logs, store_keys, store_scripts
-from fog_runtime.audit import CursorError
-from fog_runtime.redis_store import Audit, Outcome, RecoveryError, RedisStore, StoreError, StoreLostError, Table
-from hazard_aggregator.alerts import StoredAlerts
-from hazard_aggregator.area_history import (
+from fog_runtime import logs
+from fog_runtime.stores import store_keys, store_scripts
+from fog_runtime.stores.audit import CursorError
+from fog_runtime.stores.redis_store import Audit, Outcome, RecoveryError, RedisStore, StoreError, StoreLostError, Table
+from hazard_aggregator.areas.alerts import StoredAlerts
+from hazard_aggregator.areas.area_history import (
     MAX_PERIODS,
     RETENTION_S,
     HistoryPage,
@@ -21,14 +22,14 @@ from hazard_aggregator.area_history import (
     page_of,
     sameness,
 )
-from hazard_aggregator.area_override import AreaOverride, Rest
+from hazard_aggregator.areas.area_override import AreaOverride, Rest
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from fog_contracts.messages import Alert
-    from fog_runtime.idempotency import Attempt
-    from hazard_aggregator.alerts import AlertEvent
+    from fog_runtime.stores.idempotency import Attempt
+    from hazard_aggregator.areas.alerts import AlertEvent
 
 __all__ = [
     "Audit",

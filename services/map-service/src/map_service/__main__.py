@@ -9,15 +9,15 @@ from fog_contracts import channels as ch
 from fog_runtime import logs, metrics, process
 from fog_runtime.backup_archive import STAMP
 from fog_runtime.clock import SystemClock, WallClock, boot_id
+from fog_runtime.configuration.settings import describe, load
+from fog_runtime.configuration.site import load_site
 from fog_runtime.health import Health
 from fog_runtime.http import Front, load_tokens, unused
-from fog_runtime.leadership import Leadership, process_id
-from fog_runtime.lease_store import LeaseStore
-from fog_runtime.memory import release_startup_memory
-from fog_runtime.mqtt_edge import MqttEdge
-from fog_runtime.settings import describe, load
-from fog_runtime.site import load_site
-from fog_runtime.zenoh_edge import ZenohEdge
+from fog_runtime.leases.leadership import Leadership, process_id
+from fog_runtime.leases.lease_store import LeaseStore
+from fog_runtime.machine.memory import release_startup_memory
+from fog_runtime.transports.mqtt_edge import MqttEdge
+from fog_runtime.transports.zenoh_edge import ZenohEdge
 from map_service.api import make_api
 from map_service.core import MapCore
 from map_service.registry import make_layers

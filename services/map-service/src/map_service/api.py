@@ -29,7 +29,6 @@ from fog_contracts.messages import (
     ZoneKind,
 )
 from fog_contracts.site import Place, Site
-from fog_runtime.audit import KINDS, AuditEntry, CursorError
 from fog_runtime.clock import Clock
 from fog_runtime.health import Health
 from fog_runtime.http import (
@@ -56,7 +55,8 @@ from fog_runtime.http import (
     next_page,
 )
 from fog_runtime.http.routes import InvalidBodyError
-from fog_runtime.idempotency import Attempt, IdempotencyError
+from fog_runtime.stores.audit import KINDS, AuditEntry, CursorError
+from fog_runtime.stores.idempotency import Attempt, IdempotencyError
 from fog_runtime.work import BusyError, Worker
 from map_service.costmap import LayeredCostmap
 from map_service.layers.base import Grid

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from fog_contracts.handlers import Moment, Publication
-    from fog_runtime.edges import Edges
+    from fog_runtime.transports.edges import Edges
     from map_service.core import MapCore
 
 VERSION = Gauge("fognav_map_seq", "Sequence number of the map version within this epoch")

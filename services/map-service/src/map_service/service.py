@@ -11,7 +11,7 @@ from prometheus_client import Counter, Gauge
 from fog_contracts import channels as ch
 from fog_runtime import logs
 from fog_runtime.clock import ticker
-from fog_runtime.edges import Edges
+from fog_runtime.transports.edges import Edges
 from map_service.publisher import Publisher
 from map_service.store import StoreError, StoreLostError
 from map_service.times_keeper import TimesKeeper
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from fog_contracts.handlers import Moment
-    from fog_runtime.audit import AuditPage
     from fog_runtime.clock import Clock
-    from fog_runtime.edges import Gate
     from fog_runtime.health import Health
-    from fog_runtime.mqtt_edge import MqttEdge
-    from fog_runtime.zenoh_edge import ZenohEdge
+    from fog_runtime.stores.audit import AuditPage
+    from fog_runtime.transports.edges import Gate
+    from fog_runtime.transports.mqtt_edge import MqttEdge
+    from fog_runtime.transports.zenoh_edge import ZenohEdge
     from map_service.core import MapCore
     from map_service.store import Store
 

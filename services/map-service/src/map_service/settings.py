@@ -1,7 +1,7 @@
 """The settings of the map-service (environment FOGNAV_*), on top of those of every process."""
 
 from fog_runtime.clock import WallClockSource
-from fog_runtime.settings import InflationSettings
+from fog_runtime.configuration.settings import InflationSettings
 
 
 class Settings(InflationSettings, frozen=True, kw_only=True):

@@ -7,14 +7,23 @@ from typing import TYPE_CHECKING, Final
 from msgspec import structs
 
 from fog_contracts.messages import Message, Zone
-from fog_runtime import store_keys
-from fog_runtime.redis_store import ANY, Audit, Outcome, RecoveryError, RedisStore, StoreError, StoreLostError, Table
+from fog_runtime.stores import store_keys
+from fog_runtime.stores.redis_store import (
+    ANY,
+    Audit,
+    Outcome,
+    RecoveryError,
+    RedisStore,
+    StoreError,
+    StoreLostError,
+    Table,
+)
 from map_service.zone_times import Progress
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from fog_runtime.idempotency import Attempt
+    from fog_runtime.stores.idempotency import Attempt
 
 __all__ = ["Audit", "Outcome", "RecoveryError", "Store", "StoreError", "StoreLostError"]
 

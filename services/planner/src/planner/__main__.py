@@ -7,17 +7,17 @@ import os
 
 from fog_runtime import logs, process
 from fog_runtime.clock import SystemClock
+from fog_runtime.configuration.settings import describe, load
+from fog_runtime.configuration.site import load_site
 from fog_runtime.health import Health
 from fog_runtime.http import Front, load_tokens, unused
-from fog_runtime.leadership import Leadership
-from fog_runtime.lease_store import LeaseStore
-from fog_runtime.memory import release_startup_memory
-from fog_runtime.settings import describe, load
-from fog_runtime.site import load_site
-from fog_runtime.zenoh_edge import ZenohEdge
-from planner.api import make_api
+from fog_runtime.leases.leadership import Leadership
+from fog_runtime.leases.lease_store import LeaseStore
+from fog_runtime.machine.memory import release_startup_memory
+from fog_runtime.transports.zenoh_edge import ZenohEdge
 from planner.config import PlannerConfig
 from planner.core import PlannerCore
+from planner.rest.api import make_api
 from planner.service import Service
 from planner.settings import Settings, read_key
 from planner.store import Store

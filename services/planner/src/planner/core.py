@@ -18,15 +18,15 @@ from typing import TYPE_CHECKING, Final
 from fog_contracts import channels as ch
 from fog_contracts.fencing import Fence
 from fog_contracts.handlers import Publication
-from planner.blocked_regions import BlockedRegions, cover
 from planner.config import PlannerConfig
-from planner.goal_fields import FieldJob, GoalFields
-from planner.missions import Missions
-from planner.path_monitor import effect_of_change, reason_from_pose
-from planner.planning_map import MapTracker
+from planner.maps.planning_map import MapTracker
 from planner.queries import Answerer, ExplainJob, View
-from planner.refusals import goal_out_of_reach
-from planner.replanner import Replanner
+from planner.reasons.blocked_regions import BlockedRegions, cover
+from planner.reasons.refusals import goal_out_of_reach
+from planner.replanning.missions import Missions
+from planner.replanning.path_monitor import effect_of_change, reason_from_pose
+from planner.replanning.replanner import Replanner
+from planner.search.goal_fields import FieldJob, GoalFields
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -45,8 +45,8 @@ if TYPE_CHECKING:
         RobotPose,
         RobotState,
     )
-    from planner.mission import Mission
-    from planner.planning_map import CostChange, PlanningMap, PreparedMap
+    from planner.maps.planning_map import CostChange, PlanningMap, PreparedMap
+    from planner.replanning.mission import Mission
 
     Job = FieldJob | ExplainJob
 

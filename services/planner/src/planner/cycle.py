@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from fog_contracts.channels import Channel
     from fog_contracts.handlers import Handler, Ids, Moment, Publication
-    from fog_runtime.zenoh_edge import ZenohEdge
+    from fog_runtime.transports.zenoh_edge import ZenohEdge
     from planner.core import Job, PlannerCore
 
     Emit = Callable[[Sequence[Publication]], object]

@@ -24,7 +24,7 @@ from planner.store import Audit, StoreError
 if TYPE_CHECKING:
     from fog_contracts.messages import CommandKind, CommandReply, Pose, RobotState
     from fog_runtime.clock import Clock
-    from fog_runtime.zenoh_edge import ZenohEdge
+    from fog_runtime.transports.zenoh_edge import ZenohEdge
     from planner.store import Store
 
 STATE_MAX_AGE_S: Final = 3.0

@@ -19,14 +19,14 @@ from fog_contracts import channels as ch
 from fog_contracts.messages import PlanReply, RobotPath, RobotPose, RobotRelease, RobotState
 from fog_runtime import logs, metrics
 from fog_runtime.clock import ticker
-from fog_runtime.edges import Edges
-from fog_runtime.zenoh_edge import ASKER
+from fog_runtime.transports.edges import Edges
+from fog_runtime.transports.zenoh_edge import ASKER
 from planner.cycle import Cycle
-from planner.dock_keeper import DockKeeper
-from planner.map_keeper import MapKeeper
-from planner.mission_keeper import MissionKeeper
+from planner.keepers.dock_keeper import DockKeeper
+from planner.keepers.map_keeper import MapKeeper
+from planner.keepers.mission_keeper import MissionKeeper
 from planner.query_queue import BusyError, QueryQueue
-from planner.refusals import busy
+from planner.reasons.refusals import busy
 from planner.robot_commands import RobotOperator
 from planner.threads import Threads
 
@@ -36,11 +36,11 @@ if TYPE_CHECKING:
     from fog_contracts.handlers import Handler, Ids, Moment, Publication
     from fog_contracts.messages import EgressRequest, Message, PlanRequest, Pose, Refusal
     from fog_runtime.clock import Clock
-    from fog_runtime.edges import Gate
     from fog_runtime.health import Health
-    from fog_runtime.zenoh_edge import ZenohEdge
+    from fog_runtime.transports.edges import Gate
+    from fog_runtime.transports.zenoh_edge import ZenohEdge
     from planner.core import Job, PlannerCore
-    from planner.mission_keeper import Order
+    from planner.keepers.mission_keeper import Order
     from planner.store import Store, StoredGoal
 
 TICK_S: Final = 0.1

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from fog_runtime.operator_key import OperatorKeyError, read_operator_key
-from fog_runtime.settings import InflationSettings, SettingsError
+from fog_runtime.access.operator_key import OperatorKeyError, read_operator_key
+from fog_runtime.configuration.settings import InflationSettings, SettingsError
 
 
 class Settings(InflationSettings, frozen=True, kw_only=True):

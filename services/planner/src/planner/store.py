@@ -5,13 +5,22 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from fog_contracts.messages import Message, RobotGoal
-from fog_runtime import store_keys
-from fog_runtime.redis_store import ANY, Audit, Outcome, RecoveryError, RedisStore, StoreError, StoreLostError, Table
+from fog_runtime.stores import store_keys
+from fog_runtime.stores.redis_store import (
+    ANY,
+    Audit,
+    Outcome,
+    RecoveryError,
+    RedisStore,
+    StoreError,
+    StoreLostError,
+    Table,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from fog_runtime.idempotency import Attempt
+    from fog_runtime.stores.idempotency import Attempt
 
 __all__ = ["ANY", "Audit", "RecoveryError", "Store", "StoreError", "StoreLostError", "StoredGoal"]
 

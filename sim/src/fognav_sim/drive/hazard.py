@@ -31,7 +31,7 @@ MakeBarrier = Callable[[AreaSite], SimObstacle]
 
 
 class SiteWithMap(Protocol):
-    """A site and its floor plan, as `fog_runtime.site.load_site` returns them."""
+    """A site and its floor plan, as `fog_runtime.configuration.site.load_site` returns them."""
 
     @property
     def site(self) -> Site:

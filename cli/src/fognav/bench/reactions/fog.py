@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from fog_contracts.grid import StaticMap
     from fog_contracts.messages import MapSnapshot
     from fog_runtime.clock import SystemClock
-    from fog_runtime.zenoh_edge import ZenohEdge
+    from fog_runtime.transports.zenoh_edge import ZenohEdge
 
 SITE: Final = "bench"
 ROBOT: Final = "r1"

@@ -17,7 +17,7 @@ from typing import Final
 from fog_contracts.messages import Pose
 from fog_contracts.site import RobotSite
 from fog_runtime.clock import SystemClock
-from fog_runtime.zenoh_edge import ZenohEdge
+from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fog_supervisor import net
 from fog_supervisor.servers import router_program
 from fog_supervisor.supervisor import Program, Supervisor

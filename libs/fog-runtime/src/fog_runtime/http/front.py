@@ -19,11 +19,12 @@ from typing import Any, Final, NoReturn, Self
 import uvicorn
 from fastapi import FastAPI
 
-from fog_runtime import logs, signals
+from fog_runtime import logs
+from fog_runtime.access.server_certificate import ServerCertificate
 from fog_runtime.files import write_port_file
 from fog_runtime.http.link import CoreLink, FrontLink
 from fog_runtime.http.routes import answer_call
-from fog_runtime.server_certificate import ServerCertificate
+from fog_runtime.machine import signals
 
 NICENESS: Final = 5
 """The front gets a third of the processor time of a core that wants some, too."""

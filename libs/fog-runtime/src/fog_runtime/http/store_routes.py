@@ -8,9 +8,9 @@ from fog_contracts.messages import Message
 from fog_runtime.http.problems import RETRY_AFTER, ProblemError
 from fog_runtime.http.routes import Body, Routes
 from fog_runtime.http.tokens import Admin, Caller, Viewer
-from fog_runtime.idempotency import Attempt, IdempotencyError
-from fog_runtime.redis_connection import StoreError, StoreRefusedError
-from fog_runtime.redis_store import RecoveryError, StoreStatus
+from fog_runtime.stores.idempotency import Attempt, IdempotencyError
+from fog_runtime.stores.redis_connection import StoreError, StoreRefusedError
+from fog_runtime.stores.redis_store import RecoveryError, StoreStatus
 
 IdempotencyKey = Annotated[
     str | None,

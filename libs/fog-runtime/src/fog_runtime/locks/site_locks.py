@@ -6,7 +6,7 @@
     redis/      server.pem server.key users
     zenoh/      server.pem server.key users access.json5
     http/       server.pem server.key             of the REST APIs and the gateway
-    credentials/NAME.toml                         one file for each user (`fog_runtime.credentials`)
+    credentials/NAME.toml                         one file for each user (`fog_runtime.access.credentials`)
     credentials/SITE/NAME.toml                    the same for further sites of the same servers, its floors
 
 Each server reads its own folder, each service its own credentials, so that none has another's secrets. Whoever adds a
@@ -25,7 +25,7 @@ import msgspec
 from fog_contracts.channels import ROLES
 from fog_contracts.generate.mqtt_acl import mqtt_acl
 from fog_contracts.generate.zenoh_acl import zenoh_acl
-from fog_runtime.credentials import Credentials, Server, to_toml
+from fog_runtime.access.credentials import Credentials, Server, to_toml
 from fog_runtime.files import PRIVATE, atomic_write
 from fog_runtime.locks import users
 from fog_runtime.locks.authority import SERVER_DAYS, Authority, expiry

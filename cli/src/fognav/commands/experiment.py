@@ -1,0 +1,214 @@
+"""`fognav experiment`: compare robots that plan for themselves with one that the fog leads, as the thesis did."""
+
+from __future__ import annotations
+
+from pathlib import Path  # noqa: TC003  # Typer reads annotations at run time
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from fognav import checkout, kernels
+from fognav.operate.options import JsonOption  # noqa: TC001  # Typer reads annotations at run time
+from fognav.output import NOT_TRUE, WrongUseError, console, exit_codes, print_json, print_line
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from fog_contracts.messages import ProfileName
+    from fognav_experiments.comparison.records import Folder, Record
+    from fognav_experiments.comparison.runner import Task
+    from fognav_experiments.scenarios.stage import Played
+
+experiment_app = typer.Typer(help="Compare setups as the thesis did, and play scenarios.")
+
+_SETUPS: Final[tuple[ProfileName, ...]] = ("default", "full", "fog")
+
+
+@experiment_app.callback(
+    invoke_without_command=True,
+    epilog="Example: fognav experiment --setups default,full,fog --runs 50 --seed 1 --out results",
+)
+def experiment_command(  # noqa: PLR0913  # each option is an argument
+    context: typer.Context,
+    *,
+    out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Folder of the records.")] = None,
+    setups: Annotated[str, typer.Option("--setups", metavar="A,B", help="default, full, fog.")] = ",".join(_SETUPS),
+    runs: Annotated[int, typer.Option("--runs", metavar="N", min=1, help="Runs of each setup.")] = 50,
+    seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of all draws.")] = 1,
+    only: Annotated[int | None, typer.Option("--only", metavar="RUN", min=1, help="Only this run.")] = None,
+    jobs: Annotated[int, typer.Option("--jobs", metavar="N", min=1, help="Drives at the same time.")] = 1,
+    site: Annotated[Path | None, typer.Option("--site", metavar="DIR", help="Site with experiment.toml.")] = None,
+) -> None:
+    """Repeat the thesis's experiment in lockstep: one drive per run, route and setup.
+
+    A run is the routes of the site's experiment.toml. On each a drawn watched area is blocked at a drawn moment, the
+    same for all setups. Each drive is one file, so a run that was killed goes on where it was when the command is
+    repeated. CPU times are worth comparing when nothing runs beside: --jobs 1. The exit code is 1 if a drive failed.
+    """
+    if context.invoked_subcommand is not None:
+        return
+    from fog_runtime.configuration.site import SiteError, load_site  # noqa: PLC0415  # keeps the other commands fast
+    from fognav.bench import machine  # noqa: PLC0415  # same
+    from fognav_experiments.comparison import runner  # noqa: PLC0415  # same
+    from fognav_experiments.comparison.records import Folder, FolderError  # noqa: PLC0415  # same
+
+    with exit_codes():
+        if out is None:
+            raise WrongUseError("name a folder for the records: --out DIR")
+        place = checkout.site_folder(site)
+        try:
+            loaded = load_site(place)
+            asked = runner.tasks(
+                runner.read_spec(loaded, place), seed, [only] if only else range(1, runs + 1), _chosen(setups)
+            )
+            folder, commit = Folder(out), checkout.revision()
+            folder.begin(runner.new(loaded, place, seed), {"commit": commit, **machine.describe()})
+        except (SiteError, runner.SpecError, FolderError) as error:
+            raise WrongUseError(str(error)) from error
+        kernels.warm_cache(print_line)
+        failed = _show(asked, folder, runner.run(place, asked, folder, jobs, commit))
+    print_line(f"{len(asked) - failed} of {len(asked)} drives succeeded; records in {out}")
+    if failed:
+        raise typer.Exit(NOT_TRUE)
+
+
+@experiment_app.command("report", epilog="Example: fognav experiment report results --out docs/results/estig")
+def report_command(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of the records.")],
+    *,
+    out: Annotated[Path | None, typer.Option("--out", metavar="DIR", help="Folder of the report.")] = None,
+    site: Annotated[Path | None, typer.Option("--site", metavar="DIR", help="Site of the drives.")] = None,
+) -> None:
+    """Write the report of an experiment: Markdown, one HTML file, figures and CSV.
+
+    It shows the thesis's figures with ours beside them, paired differences with their tests, and where CPU time went.
+    """
+    from fog_runtime.configuration.site import SiteError  # noqa: PLC0415  # keeps the other commands fast
+    from fognav_experiments.comparison.publish import publish  # noqa: PLC0415  # keeps the other commands fast
+    from fognav_experiments.comparison.records import Folder, FolderError  # noqa: PLC0415  # same
+    from fognav_experiments.comparison.runner import SpecError  # noqa: PLC0415  # same
+
+    with exit_codes():
+        try:
+            written = publish(Folder(folder), out or folder, checkout.site_folder(site))
+        except (FolderError, SiteError, SpecError, OSError) as error:
+            raise WrongUseError(str(error)) from error
+    for file in written:
+        print_line(str(file))
+
+
+@experiment_app.command("scenarios", epilog="Example: fognav experiment scenarios wifi-gap-5s kidnapped")
+def scenarios_command(
+    names: Annotated[list[str] | None, typer.Argument(metavar="[NAME]...", help="Scenarios; default: all.")] = None,
+    *,
+    table: Annotated[Path | None, typer.Option("--table", metavar="F", help="Write a table (Markdown) here.")] = None,
+    json: JsonOption = False,
+) -> None:
+    """Play drives on which something goes wrong, in lockstep, and check how they end.
+
+    Each is a file in experiments/scenarios with what happens and what is expected. The exit code is 1 if one of them
+    ends in another way.
+    """
+    from fog_runtime.files import SHARED, atomic_write  # noqa: PLC0415  # keeps the other commands fast
+    from fognav_experiments.scenarios.stage import ScenarioError, markdown_table, play, read_scenario  # noqa: PLC0415  # same
+
+    with exit_codes():
+        files = _scenario_files(names or [])
+        try:
+            scenarios = {file.stem: read_scenario(file) for file in files}
+        except ScenarioError as error:
+            raise WrongUseError(str(error)) from error
+        kernels.warm_cache(print_line)
+        drives = {}
+        for name, scenario in scenarios.items():
+            drives[name] = play(scenario, checkout.root() / "sites")
+            if not json:
+                _print_played(name, drives[name])
+        if table is not None:
+            atomic_write(table, markdown_table(drives).encode(), mode=SHARED)
+    if json:
+        print_json({"scenarios": [_played_row(name, played) for name, played in drives.items()]})
+    if any(played.deviations for played in drives.values()):
+        raise typer.Exit(NOT_TRUE)
+
+
+def _played_row(name: str, played: Played) -> dict[str, object]:
+    return {
+        "scenario": name, "title": played.scenario.title, "as_expected": not played.deviations,
+        "outcome": played.outcome, "distance_m": played.result.distance_m, "time_s": played.result.time_s,
+        "deviations": played.deviations,
+    }  # fmt: skip
+
+
+def _print_played(name: str, played: Played) -> None:
+    mark, time_s = "FAILED" if played.deviations else "ok    ", played.result.time_s or played.scenario.seconds
+    print_line(f"{mark} {name:22} {played.outcome:9} {played.result.distance_m:6.1f} m {time_s:6.1f} s")
+    for deviation in played.deviations:
+        print_line(f"       {deviation}")
+
+
+@experiment_app.command("film", epilog="Example: fognav experiment film drive.gif --from drives --run 2 --route ab")
+def film_command(  # each option is an argument
+    out: Annotated[Path, typer.Argument(metavar="FILE.gif", help="File of the film.")],
+    *,
+    source: Annotated[Path, typer.Option("--from", metavar="DIR", help="Folder of the records.")],
+    run: Annotated[int, typer.Option("--run", metavar="N", min=1, help="Run of the experiment.")] = 2,
+    route: Annotated[str | None, typer.Option("--route", metavar="R", help="Its route, as ab; default: first.")] = None,
+    setups: Annotated[str, typer.Option("--setups", metavar="A,B", help="default, full, fog.")] = "default,fog",
+    site: Annotated[Path | None, typer.Option("--site", metavar="DIR", help="Site with experiment.toml.")] = None,
+) -> None:
+    """Film one route of an experiment in several setups, side by side: map, hazards, paths and tracks, as a GIF.
+
+    The drives are those of the records that `fognav experiment --out DIR` wrote; nothing is driven again.
+    """
+    from fog_runtime.configuration.site import SiteError, load_site  # noqa: PLC0415  # keeps the other commands fast
+    from fognav.film import Film, UnfilmedDriveError  # noqa: PLC0415  # same
+    from fognav_experiments.comparison import runner  # noqa: PLC0415  # same
+    from fognav_experiments.comparison.records import Folder, FolderError  # noqa: PLC0415  # same
+
+    with exit_codes():
+        if out.suffix != ".gif":
+            raise WrongUseError(f"{out} is no GIF: name a file that ends in .gif")
+        place = checkout.site_folder(site)
+        try:
+            loaded, folder = load_site(place), Folder(source)
+            drawn = runner.recorded_draw(folder, loaded, place, run, route)
+            records = folder.read_drives(run, drawn.route.name, _chosen(setups))
+            size = Film(loaded, drawn, records).write(out)
+        except (SiteError, runner.SpecError, FolderError, UnfilmedDriveError) as error:
+            raise WrongUseError(str(error)) from error
+        except OSError as error:
+            raise WrongUseError(f"{out} can't be written: {error.strerror}. Name another file") from error
+    for record in records:
+        print_line(f"{record.setup:8} {record.distance_m:6.1f} m {record.time_s:6.1f} s")
+    print_line(f"{out}: {size / 1e6:.2f} MB")
+
+
+def _scenario_files(names: list[str]) -> list[Path]:
+    folder = checkout.root() / "experiments" / "scenarios"
+    known = {file.stem: file for file in sorted(folder.glob("*.toml"))}
+    if unknown := [name for name in names if name not in known]:
+        raise WrongUseError(f"no scenario {', '.join(unknown)}: there are {', '.join(known)}")
+    return [known[name] for name in names or known]
+
+
+def _chosen(setups: str) -> list[ProfileName]:
+    chosen = [known for name in setups.split(",") for known in _SETUPS if known == name.strip()]
+    if len(chosen) != len(setups.split(",")):
+        raise WrongUseError(f"--setups {setups} names an unknown setup: choose of {', '.join(_SETUPS)}")
+    return chosen
+
+
+def _show(asked: list[Task], folder: Folder, records: Iterator[Record]) -> int:
+    """Show each record as it comes; return how many of those asked for, new and old, failed."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    names = {task.name for task in asked}
+    with Progress(*columns, TimeRemainingColumn(), console=console, disable=not console.is_terminal) as progress:
+        known = sum(folder.has(name) for name in names)
+        task = progress.add_task("drives", total=len(names), completed=known)
+        for record in records:
+            progress.advance(task)
+            time_s = "" if record.time_s is None else f"{record.time_s:6.1f} s"
+            print_line(f"{record.name:20} {record.outcome:8} {record.distance_m:6.1f} m {time_s}  {record.area}")
+    return sum(not record.success for record in folder.read() if record.name in names)

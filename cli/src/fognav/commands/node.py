@@ -1,0 +1,441 @@
+"""`fognav node`: sensor nodes, from a place on the map to their calibration, and simulated ones."""
+
+import asyncio
+import math
+import time
+from collections.abc import Coroutine
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal, TypeVar
+
+import msgspec
+import typer
+
+from fog_contracts import channels as ch
+from fog_contracts.messages import Id, NodeCalibration, NodeReading, NodeUpdate
+from fog_contracts.site import NodeSite
+from fog_runtime.access.credentials import Credentials
+from fog_runtime.configuration.site import LoadedSite
+from fognav import checkout, kernels
+from fognav.locking import LocksOption, locks_errors, locks_folder, open_locks, own_credentials
+from fognav.nodes import on_broker, provisioning, site_file, updating
+from fognav.operate.fog import Fog, find_fog
+from fognav.operate.options import NUMBERS, FogOption, JsonOption
+from fognav.operate.systems import AGGREGATOR, BROKER
+from fognav.output import FailedError, WrongUseError, exit_codes, print_json, print_line
+
+node_app = typer.Typer(help="Add, watch, calibrate and simulate sensor nodes.", no_args_is_help=True)
+
+T = TypeVar("T")
+
+_SITE: Final = "estig"
+
+NameArgument = Annotated[str, typer.Argument(metavar="NODE", help="The node's id: a to z, 0 to 9 and -.")]
+SiteOption = Annotated[Path, typer.Option("--site", metavar="D", help="Folder of the site, or a name in sites/.")]
+BrokerOption = Annotated[
+    str | None,
+    typer.Option("--broker", metavar="URL", help="mqtt:// or mqtts:// address; default: that of the running demo."),
+]
+OutOption = Annotated[
+    Path,
+    typer.Option("--out", metavar="DIR", help="Where to write node.json; firmware/data is what pio uploads."),
+]
+WifiOption = Annotated[str, typer.Option("--wifi", metavar="NAME", help="Name of the Wi-Fi network.")]
+WifiPasswordOption = Annotated[
+    str, typer.Option("--wifi-password", envvar="FOGNAV_WIFI_PASSWORD", help="Its password; better in the variable.")
+]
+HostOption = Annotated[str, typer.Option("--fog-host", metavar="HOST", help="The fog node's name for the boards.")]
+TlsOption = Annotated[bool, typer.Option("--tls/--no-tls", help="Whether the broker's connections are encrypted.")]
+PasswordsOption = Annotated[
+    Path | None,
+    typer.Option("--passwords", metavar="F", help="Mosquitto's password file, which gets the node's password."),
+]
+ProfileOption = Annotated[
+    Literal["standard", "thesis"], typer.Option("--profile", help="How it is wired: docs/hardware.md draws both.")
+]
+
+
+@node_app.command(
+    "add",
+    context_settings=NUMBERS,
+    epilog="Example: fognav node add n8 --area z1 --pose 40.0,26.95,1.5708 --site sites/floor --wifi Lab",
+)
+def node_add(  # noqa: PLR0913  # each option is an argument
+    name: NameArgument,
+    *,
+    area: Annotated[str, typer.Option("--area", metavar="Z", help="The area that it watches.")],
+    pose: Annotated[str, typer.Option("--pose", metavar="X,Y,THETA", help="Metres, radians; frame of the map.")],
+    wifi: WifiOption,
+    wifi_password: WifiPasswordOption = "",
+    height: Annotated[float, typer.Option("--height", metavar="M", help="Above the floor.")] = 0.5,
+    site: SiteOption = Path(_SITE),
+    fog_host: HostOption = "fog.local",
+    tls: TlsOption = True,
+    passwords: PasswordsOption = None,
+    locks: LocksOption = None,
+    profile: ProfileOption = "standard",
+    out: OutOption = Path("firmware/data"),
+    json: JsonOption = False,
+) -> None:
+    """Add a node to a site, and write what its board needs to know.
+
+    Its range limits come from the map: the wall opposite, less 0.3 m. Calibrate it when it hangs.
+    """
+    with exit_codes():
+        loaded = site_file.load(checkout.site_folder(site))
+        target = out / provisioning.SETTINGS_FILE
+        if target.exists():
+            raise WrongUseError(f"{target} already exists: it is another node's. Move it, or name a folder with --out")
+        if any(node.id == name for node in loaded.site.nodes):
+            raise WrongUseError(
+                f"the site has a node {name} already: fognav node replace {name} makes a new board of it"
+            )
+        _compiled()
+        node = _placed(loaded, name, area, _pose(pose), height)
+        access = provisioning.Access(wifi, wifi_password, fog_host, 8883 if tls else 1883, tls)
+        members = provisioning.settings(loaded.site.id, node, access, provisioning.new_password(), profile)
+        text = site_file.with_node(loaded, node)
+        provisioning.provision(target, _let_in(members, target, locks), passwords)
+        site_file.write(loaded, text)
+        _tell_board(json, "added", node, target, passwords)
+
+
+@node_app.command("replace", epilog="Example: fognav node replace n3 --site sites/floor --wifi Lab --out board")
+def node_replace(  # noqa: PLR0913  # each option is an argument
+    name: NameArgument,
+    *,
+    wifi: WifiOption,
+    wifi_password: WifiPasswordOption = "",
+    site: SiteOption = Path(_SITE),
+    fog_host: HostOption = "fog.local",
+    tls: TlsOption = True,
+    passwords: PasswordsOption = None,
+    locks: LocksOption = None,
+    profile: ProfileOption = "standard",
+    out: OutOption = Path("firmware/data"),
+    json: JsonOption = False,
+) -> None:
+    """Write the settings of a new board for a node of the site, with a new password.
+
+    With --passwords the old board's password is worth nothing from the broker's next start on.
+    """
+    with exit_codes():
+        loaded = site_file.load(checkout.site_folder(site))
+        node = site_file.node_of(loaded, name)
+        target = out / provisioning.SETTINGS_FILE
+        if (other := provisioning.node_in(target)) not in (None, name):
+            raise WrongUseError(f"{target} is that of node {other}: move it, or name a folder with --out")
+        access = provisioning.Access(wifi, wifi_password, fog_host, 8883 if tls else 1883, tls)
+        members = provisioning.settings(loaded.site.id, node, access, provisioning.new_password(), profile)
+        provisioning.provision(target, _let_in(members, target, locks), passwords)
+        _tell_board(json, "replaced", node, target, passwords)
+
+
+@node_app.command("list", epilog="Example: fognav node list --json")
+def node_list(*, fog: FogOption = None, json: JsonOption = False) -> None:
+    """List the nodes with what they say, and since when."""
+    with exit_codes():
+        nodes = find_fog(fog).get(AGGREGATOR, "/api/v1/nodes")
+        if json:
+            print_json({"nodes": nodes})
+            return
+        for node in nodes:
+            print_line(_line(node))
+        if not nodes:
+            print_line("no nodes")
+
+
+@node_app.command("watch", epilog="Example: fognav node watch n1 --count 20")
+def node_watch(
+    name: NameArgument,
+    *,
+    count: Annotated[int | None, typer.Option("--count", metavar="N", min=1, help="End after N readings.")] = None,
+    broker: BrokerOption = None,
+    site: Annotated[str | None, typer.Option("--site-id", metavar="ID", help="Default: the running system's.")] = None,
+    fog: FogOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Show a node's readings as they come; Ctrl-C ends it.
+
+    With --json each is one line on standard output.
+    """
+    with exit_codes():
+        _run(_watch(_on(fog, broker, site), _checked(name), count, json=json))
+
+
+@node_app.command("calibrate", epilog="Example: fognav node calibrate n1 --site sites/floor")
+def node_calibrate(  # noqa: PLR0913  # each option is an argument
+    name: NameArgument,
+    *,
+    no_echo: Annotated[
+        bool, typer.Option("--no-echo", help="Learn how the board says that nothing echoes: point it at the open.")
+    ] = False,
+    folder: Annotated[
+        Path | None, typer.Option("--site", metavar="D", help="Folder of a site whose node gets the learned limits.")
+    ] = None,
+    broker: BrokerOption = None,
+    site: Annotated[str | None, typer.Option("--site-id", metavar="ID", help="Default: the running system's.")] = None,
+    fog: FogOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Let a node measure the free corridor, and take its range limits from that. Nobody may stand in its way.
+
+    With --site the limits are written into site.toml; without, the aggregator's next configuration replaces them.
+    """
+    with exit_codes():
+        loaded = None if folder is None else site_file.load(checkout.site_folder(folder))
+        node = None if loaded is None else site_file.node_of(loaded, name)
+        url, site_id, own = _on(fog, broker, site if loaded is None else loaded.site.id)
+        command = ch.LEARN_NO_ECHO if no_echo else ch.CALIBRATE
+        learned = _run(on_broker.learn(url, site_id, _checked(name), command, own))
+        failed = [
+            f"sonar {index + 1} {_RESULTS[result]}" for index, result in enumerate(learned.result) if result != "done"
+        ]
+        if loaded is not None and node is not None and not failed and not no_echo:
+            site_file.replace(loaded, _with_limits(node, learned))
+        if json:
+            print_json({"node": name, **msgspec.to_builtins(learned)})
+        else:
+            for index, limit in enumerate(learned.range_limit_m):
+                silent = ", no echo is clear" if learned.no_echo_is_clear[index] else ""
+                print_line(f"sonar {index + 1}: {_RESULTS[learned.result[index]]}; blocked below {limit:.2f} m{silent}")
+        if failed:
+            raise FailedError(f"node {name} keeps its old limits: {', '.join(failed)}")
+
+
+@node_app.command("key", epilog="Example: fognav node key update-key.pem")
+def node_key(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="The private key (PEM); made if there is none.")],
+) -> None:
+    """Print the public half of the key that signs updates: `update_key` of a board's node.json.
+
+    Keep the file where no server is: who has it can put any program onto the nodes.
+    """
+    with exit_codes():
+        print_line(updating.make_key(file))
+
+
+@node_app.command(
+    "update", epilog="Example: fognav node update n1 --image firmware.bin --number 2 --key update-key.pem"
+)
+def node_update(  # noqa: PLR0913  # each option is an argument
+    name: NameArgument,
+    *,
+    image: Annotated[Path, typer.Option("--image", metavar="F", help="The firmware, as PlatformIO makes it.")],
+    number: Annotated[
+        int, typer.Option("--number", metavar="N", min=1, max=2**31 - 1, help="Its number: above what runs.")
+    ],
+    key: Annotated[Path, typer.Option("--key", metavar="F", help="The private key that signs it: fognav node key.")],
+    board: Annotated[Literal["d1-mini", "d1-mini32"], typer.Option("--board", help="For which it is.")] = "d1-mini",
+    address: Annotated[
+        str | None, typer.Option("--url", metavar="URL", help="Where it is served; default: by this command.")
+    ] = None,
+    seconds: Annotated[float, typer.Option("--seconds", metavar="S", min=1.0, help="How long to wait.")] = 300.0,
+    broker: BrokerOption = None,
+    site: Annotated[str | None, typer.Option("--site-id", metavar="ID", help="Default: the running system's.")] = None,
+    fog: FogOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Sign new firmware, offer it to a node, and wait until the node has started anew.
+
+    The node fetches it while it goes on measuring. The offer is withdrawn at the end.
+    """
+    with exit_codes():
+        data = updating.read_image(image)
+        url, site_id, own = _on(fog, broker, site)
+        elsewhere = None if address is None else updating.ServedImage(address, fetched=True)
+        with nullcontext(elsewhere) if elsewhere is not None else updating.served(data, url) as image_at:
+            try:
+                offer = msgspec.convert(updating.signed_offer(data, number, board, key, image_at.url), NodeUpdate)
+            except msgspec.ValidationError as error:
+                raise WrongUseError(f"the offer is not valid: {error}") from error
+            reading = _run(on_broker.update(url, site_id, _checked(name), offer, own, seconds=seconds))
+        if not image_at.fetched:
+            raise FailedError(f"node {name} has restarted without fetching the image: look at its power, and try again")
+        if json:
+            print_json({"node": name, "number": number, "sha256": offer.sha256, "fw": reading.fw, "boot": reading.boot})
+        else:
+            print_line(f"node {name} has started anew, with firmware {reading.fw or 'that does not tell its name'}")
+
+
+@node_app.command(
+    "sim",
+    context_settings=NUMBERS,
+    epilog="Example: fognav node sim n1 --site estig --broker mqtt://localhost --person 40.0,28.4",
+)
+def node_sim(
+    name: NameArgument,
+    *,
+    person: Annotated[
+        list[str] | None, typer.Option("--person", metavar="X,Y", help="Somebody stands there; may be repeated.")
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option("--seconds", metavar="S", min=0.1, help="End after this time.")
+    ] = None,
+    site: SiteOption = Path(_SITE),
+    broker: BrokerOption = None,
+    fog: FogOption = None,
+) -> None:
+    """Run one node of a site with the firmware's own code, on a real broker and a simulated floor; Ctrl-C ends it."""
+    from fognav.nodes import simulated  # noqa: PLC0415  # the simulator's imports are slow
+
+    with exit_codes():
+        loaded = site_file.load(checkout.site_folder(site))
+        node = site_file.node_of(loaded, name)
+        persons = [_numbers("--person", text, 2) for text in person or ()]
+        url, _, _ = _on(fog, broker, loaded.site.id)
+        _compiled()
+        _run(_bounded(simulated.run(loaded, node, url, [(x, y) for x, y in persons]), seconds))
+
+
+_RESULTS: Final = {
+    "done": "learned",
+    "stuck": "says the same distance always: check its wiring",
+    "unsteady": "measured something that moved: let nobody stand there",
+    "too_near": "looks at something too near: turn the node",
+}
+
+
+async def _watch(on: tuple[str, str, Credentials], name: str, count: int | None, *, json: bool) -> None:
+    seen = 0
+    url, site, own = on
+    async for reading in on_broker.readings(url, site, name, own):
+        if json:
+            values = {"state": reading} if isinstance(reading, str) else msgspec.to_builtins(reading)
+            typer.echo(msgspec.json.encode(values).decode())
+        else:
+            print_line(f"{time.strftime('%H:%M:%S')} {reading if isinstance(reading, str) else _reading(reading)}")
+        if isinstance(reading, NodeReading):
+            seen += 1
+            if seen == count:
+                return
+
+
+def _reading(reading: NodeReading) -> str:
+    ranges = ", ".join("no echo" if value is None else f"{value:.2f} m" for value in reading.range_m)
+    return f"{reading.state:8s} {ranges}"
+
+
+async def _bounded(work: Coroutine[Any, Any, None], seconds: float | None) -> None:
+    try:
+        async with asyncio.timeout(seconds):
+            await work
+    except TimeoutError:
+        if seconds is None:
+            raise
+
+
+def _run(work: Coroutine[Any, Any, T]) -> T:
+    try:
+        return asyncio.run(work)
+    except KeyboardInterrupt:
+        raise typer.Exit(0) from None
+
+
+def _on(fog: str | None, broker: str | None, site: str | None) -> tuple[str, str, Credentials]:
+    """Return the broker's address, the site's id and the caller's credentials.
+
+    They are those that are given, else those of the running system.
+    """
+    if broker is not None and site is not None:
+        return broker, site, own_credentials()
+    found: Fog = find_fog(fog)
+    url = broker or found.system.urls.get(BROKER)
+    if url is None:
+        raise WrongUseError(
+            f"the broker of {found.system.name} is not known: name it with --broker mqtts://USER:PASSWORD@HOST"
+        )
+    return url, site or found.site, found.credentials
+
+
+def _checked(name: str) -> str:
+    try:
+        return msgspec.convert(name, Id)
+    except msgspec.ValidationError as error:
+        raise WrongUseError(f"{name}: an id has only a to z, 0 to 9 and -, at most 32") from error
+
+
+def _numbers(option: str, text: str, length: int) -> list[float]:
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != length or not all(map(math.isfinite, values)):
+        raise WrongUseError(f"{option} {text}: give {length} numbers with commas between them")
+    return values
+
+
+def _pose(text: str) -> tuple[float, float, float]:
+    x, y, theta = _numbers("--pose", text, 3)
+    return x, y, theta
+
+
+def _placed(loaded: LoadedSite, name: str, area: str, pose: tuple[float, float, float], height: float) -> NodeSite:
+    from fognav.nodes.placing import PlacingError, check_sees, sonar_limits  # noqa: PLC0415  # kernels are slow
+
+    areas = {known.id: known for known in loaded.site.areas}
+    if area not in areas:
+        raise WrongUseError(f"the site has no area {area!r}: it has {', '.join(areas) or 'none'}")
+    x, y, theta = pose
+    try:
+        members = {
+            "id": name,
+            "area": area,
+            "x": x,
+            "y": y,
+            "theta": round(math.remainder(theta, math.tau), 4),
+            "height": height,
+            "sonars": msgspec.to_builtins(sonar_limits(loaded.map, pose)),
+        }
+        node = msgspec.convert(members, NodeSite)
+        check_sees(node, areas[area], loaded.map)
+    except (PlacingError, msgspec.ValidationError) as error:
+        raise WrongUseError(f"node {name}: {error}") from error
+    return node
+
+
+def _let_in(members: dict[str, Any], target: Path, locks: Path | None) -> dict[str, Any]:
+    """Return a board's settings with the password that a site's locks give it, and write beside them whom it trusts."""
+    if (folder := locks_folder(locks)) is None:
+        return members
+    with locks_errors():
+        password, authority = provisioning.let_in(open_locks(folder), members["user"])
+    provisioning.write_authority(target.with_name(provisioning.AUTHORITY_FILE), authority)
+    return {**members, "password": password}
+
+
+def _tell_board(json: bool, verb: str, node: NodeSite, target: Path, passwords: Path | None) -> None:  # noqa: FBT001  # a flag of each command
+    if json:
+        values = {"node": node.id, "file": str(target), "range_limit_m": [sonar.range_limit for sonar in node.sonars]}
+        print_json({**values, "passwords": None if passwords is None else str(passwords)})
+        return
+    limits = " and ".join(f"{sonar.range_limit:.2f}" for sonar in node.sonars)
+    print_line(f"{verb} {node.id} in area {node.area}: blocked below {limits} m")
+    print_line(f"wrote {target}: flash it (firmware/README.md), then: fognav node calibrate {node.id}")
+    print_line("the hazard-aggregator reads the site at its start: restart it")
+
+
+def _with_limits(node: NodeSite, learned: NodeCalibration) -> NodeSite:
+    if len(node.sonars) != len(learned.range_limit_m):
+        raise FailedError(
+            f"node {node.id} has learned {len(learned.range_limit_m)} limits, and has {len(node.sonars)} sonars in the "
+            "site: make site.toml and the board's settings agree"
+        )
+    sonars = [
+        msgspec.structs.replace(sonar, range_limit=min(4.0, limit), no_echo_is_clear=silent)
+        for sonar, limit, silent in zip(node.sonars, learned.range_limit_m, learned.no_echo_is_clear, strict=True)
+    ]
+    return msgspec.structs.replace(node, sonars=sonars)
+
+
+def _line(node: dict[str, Any]) -> str:
+    age = "never heard" if node["age_s"] is None else f"{node['age_s']:.1f} s ago"
+    reason = f" ({node['reason']})" if node["reason"] else ""
+    return f"{node['id']}: area {node['area']}, {node['state']}{reason}, {age}, {node['received']} readings"
+
+
+def _compiled() -> None:
+    try:
+        kernels.warm_cache(print_line)
+    except kernels.KernelsError as error:
+        raise FailedError(str(error)) from error

@@ -1,0 +1,116 @@
+"""`fognav robot add`, `new` and `check`: a robot's credentials, and its commented file and the settings it gives."""
+
+import os
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import typer
+
+from fog_contracts.messages import Id
+from fog_runtime.configuration.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
+from fog_runtime.configuration.robot_file import ROBOT_FILE, RobotFile, default_robot, describe_robot, load_robot
+from fog_runtime.configuration.settings import SettingsError
+from fog_runtime.files import SHARED, atomic_write
+from fognav.locking import LocksOption, locks_errors, open_locks
+from fognav.operate.options import JsonOption
+from fognav.output import NOT_TRUE, WrongUseError, exit_codes, fail, print_json, print_line
+
+
+def robot_add(
+    robot: Annotated[str, typer.Argument(metavar="ROBOT", help="The robot's id: a to z, 0 to 9 and -.")],
+    *,
+    locks: LocksOption = None,
+    remove: Annotated[bool, typer.Option("--remove", help="Let it in no longer.")] = False,
+    json: JsonOption = False,
+) -> None:
+    """Let a robot into a site's fog, with a file of credentials.
+
+    The robot needs it as FOGNAV_CREDENTIALS_FILE.
+    For a robot that is known already they are new ones, and those of before are worth nothing any more.
+    """
+    with exit_codes(), locks_errors():
+        opened = open_locks(locks)
+        try:
+            msgspec.convert(robot, Id)
+        except msgspec.ValidationError as error:
+            raise WrongUseError(f"{robot!r}: an id has only a to z, 0 to 9 and -, at most 32") from error
+        file = None if remove else opened.add_robot(robot)
+        if remove and not opened.remove(robot):
+            raise WrongUseError(f"there is no robot {robot}. Known are: {', '.join(sorted(opened.users()))}")
+        if json:
+            print_json({"robot": robot, "credentials": None if file is None else str(file)})
+        elif file is None:
+            print_line(f"the router refuses {robot} once it was restarted")
+        else:
+            print_line(f"wrote {file}: copy it to the robot, for its owner only, and delete it here")
+
+
+def robot_new(
+    *,
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="File to write, e.g. robot.toml.")],
+    base: Annotated[str, typer.Option("--base", metavar="NAME", help="The robot's base.")] = DEFAULT_BASE,
+    lidar: Annotated[str, typer.Option("--lidar", metavar="NAME", help="The robot's lidar.")] = DEFAULT_LIDAR,
+    json: JsonOption = False,
+) -> None:
+    """Write a commented settings file for a robot, with every default.
+
+    Set the ports of base and lidar in it, then what you have measured; docs/robot-setup.md leads through it.
+    """
+    with exit_codes():
+        if out.exists():
+            raise WrongUseError(f"{out} already exists: name another file with --out, or remove it")
+        try:
+            text = robot_text(default_robot(base, lidar))
+            atomic_write(out, text.encode(), mode=SHARED)
+        except SettingsError as error:
+            raise WrongUseError(str(error)) from error
+        except OSError as error:
+            raise WrongUseError(f"{out} can't be written: {error.strerror}. Name another file with --out") from error
+        if json:
+            print_json({"file": str(out), "base": base, "lidar": lidar})
+        else:
+            print_line(f"wrote {out}: set the ports in it, then check it with: fognav robot check {out}")
+
+
+def robot_check(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="The robot's settings file.")],
+    *,
+    json: JsonOption = False,
+) -> None:
+    """Check a robot's settings file, and print what it sets.
+
+    FOGNAV_ variables that override single settings count, as they do for the robot's processes.
+    """
+    try:
+        values = effective(load_robot({**os.environ, ROBOT_FILE: str(file)}))
+    except SettingsError as error:
+        if json:
+            print_json({"ok": False, "problem": str(error)})
+            raise typer.Exit(NOT_TRUE) from error
+        fail(str(error))
+    if json:
+        print_json({"ok": True, **values})
+        return
+    for name, value in values.items():
+        print_line(f"{name} = {value}")
+
+
+def robot_text(robot: RobotFile) -> str:
+    """Return a commented robot file with these settings; raises `SettingsError` for unknown hardware."""
+    # Drivers need numpy: only this command waits for it.
+    from fog_contracts.generate.robot_toml import robot_toml  # noqa: PLC0415  # see above
+    from robot_agent import registry  # noqa: PLC0415  # same
+
+    return robot_toml(robot.settings, *registry.options(robot))
+
+
+def effective(robot: RobotFile) -> dict[str, object]:
+    """Return all effective settings by their dotted names; raises `SettingsError` for what no process would accept."""
+    from robot_agent import registry  # noqa: PLC0415  # drivers need numpy: the other commands don't wait for it
+    from robot_agent.agent.settings import read_footprint  # noqa: PLC0415  # same
+
+    registry.make_base(robot)
+    registry.make_lidar(robot)
+    read_footprint(robot)
+    return describe_robot(robot, *registry.options(robot))

@@ -1,0 +1,176 @@
+"""Loading of a site's folder: `site.toml` and its map, validated as a whole."""
+
+import re
+import tomllib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+
+from fog_contracts.channels import ROLES
+from fog_contracts.costs import is_traversable
+from fog_contracts.geometry import GeometryError, normalized_polygon
+from fog_contracts.grid import StaticMap
+from fog_contracts.site import AreaSite, Place, Site
+from fog_runtime.configuration.maps import MapFileError, load_map
+
+SITE_FILE: Final = "site.toml"
+_BORDER: Final = 1e-6
+"""Metres by which a vertex may lie off the map: the rounding error of a polygon drawn along the map's edge."""
+
+
+class SiteError(ValueError):
+    """A site is invalid; the message names the file, the field and the remedy.
+
+    The field `file` means the file as a whole.
+    """
+
+    def __init__(self, file: Path, field: str, problem: str, remedy: str) -> None:
+        where = f"{file}" if field == "file" else f"{file}: {field}:"
+        super().__init__(f"{where} {problem}. {remedy}")
+        self.file = file
+        self.field = field
+
+
+@dataclass(frozen=True)
+class LoadedSite:
+    """A validated site, its map, and its folder."""
+
+    site: Site
+    map: StaticMap
+    directory: Path
+
+
+def load_site(directory: Path, text: str | None = None) -> LoadedSite:
+    """Read and validate a site's folder, or what it would be with this `text` in its file; raises `SiteError`.
+
+    Ids are unique and every referenced id exists; areas are simple polygons on the map (counter-clockwise in the
+    result), nodes lie on the map, places and start poses on free cells.
+    """
+    file = directory / SITE_FILE
+    site = _read(file, text)
+    _check_ids(file, site)
+    try:
+        static = load_map(directory / site.map)
+    except MapFileError as error:
+        raise SiteError(file, "map", str(error), f"`map` is {site.map!r}, relative to {directory}") from error
+    areas = [_checked_area(file, area, f"areas[{n}]", static) for n, area in enumerate(site.areas)]
+    for index, node in enumerate(site.nodes):
+        _check_on_map(file, f"nodes[{index}] ({node.id})", node.x, node.y, static)
+    for name, place in site.places.items():
+        _check_free(file, f"places.{name}", place.x, place.y, static)
+    for index, robot in enumerate(site.robots):
+        _check_free(file, f"robots[{index}].start ({robot.id})", robot.start.x, robot.start.y, static)
+    return LoadedSite(msgspec.structs.replace(site, areas=areas), static, directory)
+
+
+def _read(file: Path, text: str | None) -> Site:
+    try:
+        data = tomllib.loads(file.read_text("utf-8") if text is None else text)
+    except OSError as error:
+        remedy = "A site is a folder with site.toml and its map; check the path"
+        raise SiteError(file, "file", f"can't be read ({error.strerror})", remedy) from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise SiteError(file, "file", f"is not valid TOML ({error})", "Correct that line") from error
+    try:
+        site = msgspec.convert(data, Site)
+    except msgspec.ValidationError as error:
+        problem, _, path = str(error).partition(" - at ")
+        if "places[...]" in path:
+            path = path.replace("places[...]", f"places.{_bad_place(data)}")
+        missing = re.search(r"required field `(\w+)`", problem)
+        remedy = f"Add `{missing[1]}`" if missing else "Correct the value"
+        raise SiteError(file, path.strip("`").removeprefix("$").lstrip(".") or "file", problem, remedy) from error
+    if unknown := _unknown_key(data, msgspec.to_builtins(site), ""):
+        raise SiteError(file, unknown, "is not a field of a site", "Correct its spelling or remove it")
+    return site
+
+
+def _bad_place(data: dict[str, Any]) -> str:
+    """Return the name of the invalid place, which the decoder's message does not contain."""
+    for name, place in data["places"].items():
+        try:
+            msgspec.convert(place, Place)
+        except msgspec.ValidationError:
+            return str(name)
+    return "(a name)"
+
+
+def _unknown_key(data: object, decoded: object, path: str) -> str | None:
+    """Return the path of the first key that decoding ignored, because it may be a misspelt optional field."""
+    if isinstance(data, dict) and isinstance(decoded, dict):
+        for key, value in data.items():
+            key_path = f"{path}.{key}" if path else key
+            if key not in decoded:
+                return key_path
+            if found := _unknown_key(value, decoded[key], key_path):
+                return found
+    elif isinstance(data, list) and isinstance(decoded, list | tuple):
+        for index, (value, other) in enumerate(zip(data, decoded, strict=True)):
+            if found := _unknown_key(value, other, f"{path}[{index}]"):
+                return found
+    return None
+
+
+def _check_unique(file: Path, field: str, names: Iterable[object]) -> None:
+    seen = set()
+    for name in names:
+        if name in seen:
+            raise SiteError(file, field, f"{name!r} is used twice", "Give each its own")
+        seen.add(name)
+
+
+def _check_known(file: Path, field: str, name: str, known: Iterable[str]) -> None:
+    names = sorted(known)
+    if name not in names:
+        raise SiteError(file, field, f"there is no {name!r}", f"Use one of: {', '.join(names) or '(none defined)'}")
+
+
+def _check_ids(file: Path, site: Site) -> None:
+    _check_unique(file, "areas.id", (area.id for area in site.areas))
+    _check_unique(file, "areas.number", (area.number for area in site.areas if area.number is not None))
+    _check_unique(file, "nodes.id", (node.id for node in site.nodes))
+    _check_unique(file, "robots.id", (robot.id for robot in site.robots))
+    for kind, ids in (("nodes", (node.id for node in site.nodes)), ("robots", (robot.id for robot in site.robots))):
+        for index, name in enumerate(ids):
+            if name in ROLES:
+                remedy = "Rename it: the brokers would give it that role's rights"
+                raise SiteError(file, f"{kind}[{index}].id", f"{name!r} is the name of a role", remedy)
+    _check_unique(file, "nodes.id and sources.id", [*(n.id for n in site.nodes), *(s.id for s in site.sources)])
+    areas = [area.id for area in site.areas]
+    for kind, watched in (("nodes", [n.area for n in site.nodes]), ("sources", [s.area for s in site.sources])):
+        for index, area in enumerate(watched):
+            _check_known(file, f"{kind}[{index}].area", area, areas)
+    if site.demo:
+        _check_known(file, "demo.start", site.demo.start, site.places)
+        _check_known(file, "demo.goal", site.demo.goal, site.places)
+        for index, area in enumerate(site.demo.areas):
+            _check_known(file, f"demo.areas[{index}]", area, areas)
+
+
+def _checked_area(file: Path, area: AreaSite, field: str, static: StaticMap) -> AreaSite:
+    try:
+        ring = normalized_polygon(area.polygon)
+    except GeometryError as error:
+        raise SiteError(file, f"{field}.polygon ({area.id})", str(error), "Correct the vertices") from error
+    for index, (x, y) in enumerate(ring):
+        _check_on_map(file, f"{field}.polygon ({area.id}), vertex {index}", x, y, static)
+    return msgspec.structs.replace(area, polygon=ring)
+
+
+def _check_on_map(file: Path, field: str, x: float, y: float, static: StaticMap) -> None:
+    left, bottom, right, top = static.geometry.bounds
+    if not (left - _BORDER <= x <= right + _BORDER and bottom - _BORDER <= y <= top + _BORDER):
+        extent = f"x {left:g} to {right:g}, y {bottom:g} to {top:g}"
+        raise SiteError(file, field, f"({x:g}, {y:g}) lies off the map ({extent})", "Move it onto the map")
+
+
+def _check_free(file: Path, field: str, x: float, y: float, static: StaticMap) -> None:
+    _check_on_map(file, field, x, y, static)
+    column, row = static.geometry.cell(x, y)
+    free = static.geometry.contains_cell(column, row) and is_traversable(int(static.cells[row, column]))
+    if not free:
+        problem = f"({x:g}, {y:g}) lies on a cell of the map that is occupied or unknown"
+        raise SiteError(file, field, problem, "Move it to a free cell")

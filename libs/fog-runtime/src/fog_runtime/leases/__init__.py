@@ -1,0 +1,1 @@
+"""Leases: which of several copies of a service may act."""

@@ -1,0 +1,262 @@
+"""Runs the lease of a process: one of several copies of a service leads, the others follow everything and say nothing.
+
+`lease` decides, `lease_store` asks Redis. The edges pass everything that is published through `admit`, and answer
+queries only while this process leads. See docs/adr/0012-one-leader-by-lease-and-epoch.md.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import re
+import secrets
+import socket
+import threading
+import time
+from collections import deque
+from typing import TYPE_CHECKING, Final, Protocol
+
+from prometheus_client import Counter, Gauge
+
+from fog_contracts import channels as ch
+from fog_contracts.fencing import epoch_in
+from fog_contracts.messages import Leader
+from fog_runtime import logs
+from fog_runtime.leases.lease import ANNOUNCE_S, Lease
+from fog_runtime.stores.redis_connection import StoreError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from fog_contracts.channels import Channel, Role
+    from fog_runtime.health import Health
+    from fog_runtime.leases.lease import Reply, Request
+    from fog_runtime.transports.zenoh_edge import ZenohEdge
+
+_TICK_S: Final = 0.05
+_RETRY_S: Final = 0.2
+_HELD_BACK: Final = 2048
+"""Messages that may wait while the lease is uncertain; the oldest are dropped first."""
+
+LEADS: Final = Gauge("fognav_leader", "Whether this process leads its service (1) or stands by (0)")
+EPOCH: Final = Gauge("fognav_epoch", "Epoch with which this process leads, its fencing number; 0 on standby")
+TAKEOVERS: Final = Counter("fognav_takeovers_total", "How often this process began to lead, or got another epoch")
+HELD_BACK: Final = Counter(
+    "fognav_held_back_messages_total", "Messages that waited because the lease was uncertain", ["channel"]
+)
+
+_log = logs.get("leadership")
+
+
+class Member(Protocol):
+    """A service whose copies take turns."""
+
+    async def lead(self, epoch: int, *, confirmed: bool) -> None:
+        """Load what is stored, continue with this epoch, and publish everything again.
+
+        `confirmed`: Redis granted the epoch. Raises `StoreError` to be called again.
+        """
+
+    def stand_by(self) -> None:
+        """Forget what only a leader may do; another process leads."""
+
+
+class LeaseKeeper(Protocol):
+    """Where leases are granted (`lease_store.LeaseStore`)."""
+
+    async def acquire(self, holder: str, request: Request) -> Reply:
+        """Take or renew the lease; None when there was no answer in time."""
+
+    async def release(self, holder: str) -> None:
+        """Give the lease back."""
+
+
+def process_id(service: Role) -> str:
+    """Return an id for this run of this process that is never used again: service, host, process and a random number.
+
+    A broker knows its clients by their ids, and disconnects one when another comes with the same.
+    """
+    host = re.sub(r"[^a-z0-9-]", "-", socket.gethostname().lower())[:40].strip("-") or "host"
+    return f"{service}-{host}-{os.getpid()}-{secrets.token_hex(4)}"
+
+
+class Leadership:
+    """Whether this process leads. For one event loop; only `admit` may be called on other threads."""
+
+    def __init__(
+        self,
+        service: Role,
+        keeper: LeaseKeeper,
+        zenoh: ZenohEdge,
+        health: Health,
+        *,
+        connected: Callable[[], bool],
+        epochs: Callable[[], Mapping[str, int]] = dict,
+    ) -> None:
+        """Prepare; `run` takes the lease.
+
+        `connected` tells whether this process could hear another leader; `epochs` returns the highest epochs received
+        of other services, which the announcement passes on.
+        """
+        self.holder = process_id(service)
+        self._service = service
+        self._keeper = keeper
+        self._zenoh = zenoh
+        self._health = health
+        self._connected = connected
+        self._epochs = epochs
+        self._lease = Lease(self.holder, time.monotonic())
+        self._term = (0, False)
+        """The epoch, and whether it is confirmed, that the service was last told."""
+        self._serving = 0
+        """The epoch with which the service has published everything; 0 before."""
+        self._waiting: deque[tuple[Channel, Callable[[], None]]] = deque(maxlen=_HELD_BACK)
+        self._sending = threading.Lock()
+        """Held while messages are sent or held back, so that they leave in their order."""
+        self._takeover: asyncio.Task[None] | None = None
+        self._announced_at = 0.0
+        health.set("lease", ok=False, detail="waiting for the lease")
+
+    # --- For the edges ----------------------------------------------------------------------------------------------
+
+    def admit(self, channel: Channel, message: object, send: Callable[[], None]) -> None:
+        """Send a message of this service: now, once the lease is certain, or never.
+
+        A message with an epoch is sent only if it is the current one: a core may not have taken it yet.
+        """
+        with self._sending:
+            permission = self._lease.permission(time.monotonic())
+            epoch = getattr(message, channel.epoch) if channel.epoch and message is not None else self._lease.epoch
+            if permission == "refused" or epoch != self._lease.epoch:
+                return
+            if permission == "granted":
+                self._send_waiting()
+                send()
+                return
+            HELD_BACK.labels(channel.name).inc()
+            self._waiting.append((channel, send))
+
+    def answers(self) -> bool:
+        """Whether this process answers queries: it leads, and its lease is certain."""
+        granted = self._lease.permission(time.monotonic()) == "granted"
+        return granted and self._serving == self._lease.epoch
+
+    def on_message(self, channel: Channel, message: object) -> None:
+        """Hear which epochs of this service others know."""
+        self._lease.on_epoch(epoch_in(channel, message, self._service))
+
+    def on_rival(self, epoch: int) -> None:
+        """Hear that another process sent a message of this service with this epoch."""
+        self._lease.on_rival(epoch)
+
+    # --- For the service and its REST interface ---------------------------------------------------------------------
+
+    def standby_reason(self) -> str:
+        """Return that this process stands by, and who leads; empty if it leads or takes over."""
+        if self._lease.epoch:
+            return ""
+        leader = self._lease.leader
+        if leader is None:
+            return "this process stands by, and does not know yet who leads"
+        return f"this process stands by: {leader.holder} leads with epoch {leader.epoch}"
+
+    def subscribe(self) -> None:
+        """Hear the announcements of other leaders."""
+        self._zenoh.subscribe(ch.LEADER, Leader, self._on_leader)
+
+    def _on_leader(self, ids: dict[str, str], leader: Leader) -> None:
+        if ids["role"] == self._service:
+            self._lease.on_leader(leader.epoch, leader.holder, time.monotonic())
+        else:
+            self.on_message(ch.LEADER, leader)
+
+    # --- Running ----------------------------------------------------------------------------------------------------
+
+    async def run(self, member: Member) -> None:
+        """Take the lease when it is free, renew it, and let the service lead or stand by; until cancelled."""
+        member.stand_by()
+        try:
+            async with asyncio.TaskGroup() as tasks:
+                tasks.create_task(self._request_loop(), name="lease requests")
+                while True:
+                    self._lease.tick(time.monotonic(), _proposal(), connected=self._connected())
+                    self._apply(member, tasks)
+                    self._announce()
+                    await asyncio.sleep(_TICK_S)
+        finally:
+            self._lease.give_up()
+            await self._keeper.release(self.holder)
+
+    async def _request_loop(self) -> None:
+        while True:
+            request = self._lease.request(time.monotonic())
+            if request is None:
+                await asyncio.sleep(_TICK_S / 2)
+                continue
+            reply = await self._keeper.acquire(self.holder, request)
+            self._lease.on_reply(request, reply, time.monotonic())
+            with self._sending:
+                if self._lease.permission(time.monotonic()) == "granted" and self._term[0] == self._lease.epoch:
+                    self._send_waiting()
+
+    def _apply(self, member: Member, tasks: asyncio.TaskGroup) -> None:
+        """Tell the service, the metrics and the health when another epoch, or none, is ours."""
+        term = (self._lease.epoch, self._lease.confirmed)
+        if term != self._term:
+            if term[0] != self._term[0]:
+                with self._sending:
+                    self._waiting.clear()
+            before, self._term = self._term, term
+            if self._takeover is not None:
+                self._takeover.cancel()
+            LEADS.set(term[0] > 0)
+            EPOCH.set(term[0])
+            if term[0]:
+                TAKEOVERS.inc()
+                _log.info("leading", epoch=term[0], confirmed=term[1], before=before[0], holder=self.holder)
+                self._takeover = tasks.create_task(self._take_over(member, *term), name="takeover")
+            else:
+                _log.warning("standing_by", epoch=before[0], reason=self.standby_reason())
+                member.stand_by()
+        self._report()
+
+    def _report(self) -> None:
+        """Set the health: standing by is healthy as long as somebody leads."""
+        epoch, confirmed = self._term
+        if not epoch:
+            self._health.set("lease", ok=self._lease.leader is not None, detail=self.standby_reason())
+        elif self._serving != epoch:
+            self._health.set("lease", ok=False, detail=f"taking over with epoch {epoch}")
+        else:
+            provisional = "" if confirmed else ", which is provisional until Redis answers"
+            silent = "; Redis does not answer, so nobody else can take over" if self._lease.redis_silent else ""
+            self._health.set("lease", ok=True, detail=f"leads with epoch {epoch}{provisional}{silent}")
+
+    async def _take_over(self, member: Member, epoch: int, confirmed: bool) -> None:  # noqa: FBT001  # a term's parts
+        while True:
+            try:
+                await member.lead(epoch, confirmed=confirmed)
+            except StoreError as error:
+                _log.warning("takeover_delayed", epoch=epoch, reason=str(error))
+                await asyncio.sleep(_RETRY_S)
+                continue
+            self._serving = epoch
+            return
+
+    def _announce(self) -> None:
+        now = time.monotonic()
+        if self._lease.permission(now) == "granted" and now - self._announced_at >= ANNOUNCE_S - _TICK_S / 2:
+            self._announced_at = now
+            leader = Leader(epoch=self._lease.epoch, holder=self.holder, epochs=dict(self._epochs()))
+            self._zenoh.publish(ch.LEADER, leader, role=self._service)
+
+    def _send_waiting(self) -> None:
+        """Send what was held back; the caller holds the lock."""
+        while self._waiting:
+            _, send = self._waiting.popleft()
+            send()
+
+
+def _proposal() -> int:
+    """Return an epoch for a process that knows nothing: the clock (ms), and no other process proposes the same."""
+    return int(time.time() * 1000) + secrets.randbelow(1000)

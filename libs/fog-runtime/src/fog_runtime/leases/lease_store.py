@@ -1,0 +1,92 @@
+"""The lease of a service in Redis: taken, renewed and given back in one atomic step each, with its fencing number."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from typing import TYPE_CHECKING, Any, Final, Self
+
+from fog_runtime.access.credentials import NOBODY
+from fog_runtime.leases.lease import ATTEMPT_S, LEASE_S, Granted, Held, Reply, Request
+from fog_runtime.stores.redis_connection import RedisConnection, StoreError
+
+if TYPE_CHECKING:
+    from fog_runtime.access.credentials import Credentials
+    from fog_runtime.stores.redis_connection import Command
+
+# The lease is "EPOCH HOLDER" and expires; the epoch stays. An epoch that Redis has granted is renewed as long as nobody
+# drew another one, even if the lease expired or Redis lost it meanwhile; a provisional one must be above every other.
+# Whoever asks in vain, but knows of a higher epoch than the leader's, leaves that in Redis (the floor), and the leader
+# draws one above it at its next renewal. Else nobody might tell it of a provisional epoch that receivers heard, and
+# they would refuse it for ever.
+# The clock (ms) only keeps epochs growing that Redis and all who could know have forgotten.
+_ACQUIRE: Final = """
+local holder, epoch, floor, confirmed = ARGV[1], tonumber(ARGV[2]), tonumber(ARGV[3]), ARGV[4] == '1'
+local stored = tonumber(redis.call('GET', KEYS[2]) or '0')
+local lease = redis.call('GET', KEYS[1])
+local held_epoch, held_by
+if lease then held_epoch, held_by = string.match(lease, '^(%d+) (.*)$') end
+local left = tonumber(redis.call('GET', KEYS[3]) or '0')
+if held_by and held_by ~= holder then
+  if floor > math.max(left, tonumber(held_epoch)) then redis.call('SET', KEYS[3], string.format('%.0f', floor)) end
+  return {0, held_epoch, held_by, redis.call('PTTL', KEYS[1])}
+end
+floor = math.max(floor, left)
+if epoch == 0 and held_by then epoch, confirmed = tonumber(held_epoch), true end
+if epoch <= floor or epoch < stored or (epoch == stored and not confirmed) then
+  epoch = math.max(stored + 1, floor + 1, tonumber(ARGV[5]))
+end
+local text = string.format('%.0f', epoch)
+if epoch ~= stored then redis.call('SET', KEYS[2], text) end
+redis.call('SET', KEYS[1], text .. ' ' .. holder, 'PX', ARGV[6])
+return {1, text}
+"""
+_RELEASE: Final = """
+local lease = redis.call('GET', KEYS[1])
+if lease and string.match(lease, '^%d+ (.*)$') == ARGV[1] then return redis.call('DEL', KEYS[1]) end
+return 0
+"""
+
+
+class LeaseStore:
+    """The lease of one service of a site; none of its calls raises for a Redis that does not answer."""
+
+    def __init__(self, url: str, site: str, service: str, *, credentials: Credentials = NOBODY) -> None:
+        self._redis = RedisConnection(url, timeout_s=ATTEMPT_S, credentials=credentials)
+        self._lease, self._epoch, self._floor = (f"fog:{site}:{service}:{name}" for name in ("lease", "epoch", "floor"))
+
+    async def __aenter__(self) -> Self:
+        """Return the store; it connects with the first command."""
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        """Close the connections."""
+        await self._redis.aclose()
+
+    async def acquire(self, holder: str, request: Request) -> Reply:
+        """Take or renew the lease; None when Redis did not answer in time: it may have done it all the same."""
+        arguments = (holder, request.epoch, request.floor, int(request.confirmed), _now_ms(), round(LEASE_S * 1000))
+        reply = await self._attempt(("EVAL", _ACQUIRE, 3, self._lease, self._epoch, self._floor, *arguments))
+        if reply is None:
+            return None
+        granted, epoch, *held = reply
+        if granted:
+            return Granted(int(epoch))
+        return Held(int(epoch), held[0].decode("utf-8", "replace"), max(0, held[1]) / 1000)
+
+    async def release(self, holder: str) -> None:
+        """Give the lease back, if this process holds it, so that another takes over at once; else it expires."""
+        await self._attempt(("EVAL", _RELEASE, 1, self._lease, holder))
+
+    async def _attempt(self, command: Command) -> Any:  # noqa: ANN401  # redis does not type its replies
+        """Execute a command once, in at most `ATTEMPT_S`; None when Redis did not answer, or refused it."""
+        try:
+            async with asyncio.timeout(ATTEMPT_S):
+                (reply,) = await self._redis.write(command)
+        except (StoreError, TimeoutError):
+            return None
+        return reply
+
+
+def _now_ms() -> int:
+    return int(time.time() * 1000)

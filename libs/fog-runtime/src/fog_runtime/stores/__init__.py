@@ -1,0 +1,1 @@
+"""Redis: versioned records, the audit trail, and what Redis may not lose."""

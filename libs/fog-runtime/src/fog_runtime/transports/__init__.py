@@ -1,0 +1,1 @@
+"""MQTT and zenoh: typed channels between processes."""

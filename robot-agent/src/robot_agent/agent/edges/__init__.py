@@ -1,0 +1,1 @@
+"""The agent's connections: the guardian, the lidar, the map, its files, and Prometheus."""

@@ -1,0 +1,169 @@
+"""The lidar edge: owns the port, runs the lidar's driver on it, and reopens it whenever it is lost.
+
+The stream of wheel commands reads the port, 20 times a second: its safety gate sees the newest samples, some 100 at a
+time cost a small computer far less than each alone, and the process is not woken for them.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import suppress
+from typing import TYPE_CHECKING, Final
+
+from fog_runtime import logs
+from fog_runtime.configuration.settings import SettingsError
+from robot_agent.device_signature import LISTEN_S
+from robot_agent.port_names import PortNameError
+from robot_agent.serial_port import Port, PortLost, open_port, refuse_speed
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from fog_runtime.clock import Clock
+    from robot_agent.device_signature import LineCheck
+    from robot_agent.hardware import LaserScan, LidarDriver, LidarSamples
+
+_LISTEN_PERIOD_S: Final = 0.02
+REOPEN_S: Final = 1.0
+ANSWER_S: Final = 0.1
+"""A device that is asked what it is has answered within this time."""
+
+_log = logs.get("lidar")
+
+
+class LidarEdge:
+    """Keeps a scan running on one port; `poll` reads it and calls the callbacks, all on the loop's thread."""
+
+    def __init__(
+        self,
+        path: str,
+        driver: LidarDriver,
+        clock: Clock,
+        on_samples: Callable[[LidarSamples, float], object],
+        on_scan: Callable[[LaserScan, float], object],
+        *,
+        check: Callable[[], LineCheck] | None = None,
+    ) -> None:
+        """Store the port's path, the driver and the callbacks; `check` makes a fresh check for each opening."""
+        self._path = path
+        self._driver = driver
+        self._clock = clock
+        self._on_samples = on_samples
+        self._on_scan = on_scan
+        self._check = check
+        self._last_logged = ""
+        self._resting = False
+        self._port: Port | None = None
+        self._lost: asyncio.Future[None] | None = None
+        self.problem = "the lidar's port was not opened yet"
+
+    async def run(self) -> None:
+        """Open the port, scan, and start over when it is lost, until cancelled.
+
+        Raises:
+            SettingsError: when the port's name is refused, or the clock's speed is a simulation's and the port real.
+
+        """
+        while True:
+            try:
+                with open_port(self._path, self._driver.serial.baud) as port:
+                    if (refusal := refuse_speed(self._clock.speed, port.device)) is not None:
+                        raise SettingsError(refusal)
+                    _log.info("port_open", path=self._path)
+                    await self._scan(port)
+            except PortLost as error:
+                self._report(str(error))
+            except PortNameError as error:
+                raise SettingsError(f"lidar.port: {error}") from error
+            await self._clock.sleep(REOPEN_S)
+
+    async def _scan(self, port: Port) -> None:
+        """Let `poll` use an open port until it is lost; raises `PortLost`."""
+        driver = self._driver
+        self._set_motor(port, on=True)
+        port.discard_input()
+        if (problem := await self._wrong_device(port)) is not None:
+            self._report(problem)
+            return
+        port.write(driver.begin(self._clock.now()))
+        self._resting = False
+        self._port, self._lost = port, asyncio.get_running_loop().create_future()
+        try:
+            await self._lost
+        finally:
+            self._port = None
+            # Laser and motor must not go on after an orderly end; a lost port can't be written to. The DTR line keeps
+            # its state when the port is closed.
+            with suppress(PortLost):
+                port.write(driver.stop_command)
+                self._set_motor(port, on=False)
+
+    def _set_motor(self, port: Port, *, on: bool) -> None:
+        """Let the motor turn, or stand still, as far as the device has a line for it."""
+        running = self._driver.serial.dtr
+        if running is not None:
+            port.set_line("dtr", on=running is on)
+
+    async def _wrong_device(self, port: Port) -> str | None:
+        """Listen before anything is written; return the sentence for another device on this port."""
+        if self._check is None:
+            return None
+        check = self._check()
+        until = self._clock.now() + LISTEN_S
+        while not check.settled and self._clock.now() < until:
+            await self._clock.sleep(_LISTEN_PERIOD_S)
+            check.feed(port.read_available())
+        if not check.silent:
+            return check.problem
+        for name, other in check.questions:
+            port.write(other.question)
+            await self._clock.sleep(ANSWER_S)
+            if (problem := check.answer(name, port.read_available())) is not None:
+                return problem
+        return None
+
+    @property
+    def corrupted(self) -> int:
+        """Number of damaged packets of the lidar."""
+        return self._driver.corrupted
+
+    def poll(self, now: float, *, on: bool = True) -> None:
+        """Read what has arrived, and pass it on; nothing while the port is closed. Call it 20 times a second.
+
+        Without `on` the lidar rests: its scan and motor are stopped, and started again when it is on.
+        """
+        port, driver, lost = self._port, self._driver, self._lost
+        if port is None or lost is None:
+            return
+        try:
+            if on is self._resting:
+                self._switch(port, now, on=on)
+            if self._resting:
+                return
+            events = driver.receive(port.read_available(), now)
+            if events.samples is not None:
+                self._on_samples(events.samples, now)
+            for scan in events.scans:
+                # After the caller's own work: localization by a scan must not delay the wheel command.
+                lost.get_loop().call_soon(self._on_scan, scan, now)
+            port.write(events.data + driver.tick(now))
+        except PortLost as error:
+            self._port = None
+            if not lost.done():
+                lost.set_exception(error)
+        self._report(driver.problem)
+
+    def _switch(self, port: Port, now: float, *, on: bool) -> None:
+        self._resting = not on
+        if not on:
+            port.write(self._driver.stop_command)
+        self._set_motor(port, on=on)
+        if on:
+            port.discard_input()
+            port.write(self._driver.begin(now))
+
+    def _report(self, problem: str) -> None:
+        self.problem = problem
+        if problem and problem != self._last_logged:
+            _log.warning("lidar_problem", reason=problem)
+        self._last_logged = problem

@@ -1,0 +1,107 @@
+"""The edge that brings the map to the core: from disk at the start, then from the map-service, whenever it is wanted.
+
+Decoding a large map and computing localization's fields takes most of a second on a small computer: it runs on a
+thread, while the stream of wheel commands goes on.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import random
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Final
+
+from fog_contracts import channels as ch
+from fog_contracts.codec import ContractError
+from fog_contracts.messages import MapSnapshot
+from fog_contracts.replica import MapError
+from fog_runtime import logs
+from fog_runtime.clock import Ticker
+from robot_agent.agent.sensing.pose_keeper import start_pose
+
+if TYPE_CHECKING:
+    from fog_contracts.site import RobotSite
+    from fog_runtime.clock import Clock, Phase
+    from fog_runtime.transports.zenoh_edge import ZenohEdge
+    from robot_agent.agent.core import AgentCore
+    from robot_agent.agent.edges.store import Store
+
+CHECK_S: Final = 0.05
+SNAPSHOT_TIMEOUT_S: Final = 3.0
+"""Timeout of a snapshot request."""
+
+_log = logs.get("agent")
+
+
+class MapLoader:
+    """Loads snapshots of one site's map into the core, on the loop's thread; one at a time."""
+
+    def __init__(
+        self, core: AgentCore, zenoh: ZenohEdge, store: Store, clock: Clock, *, site: str, phase: Phase | None = None
+    ) -> None:
+        """`phase` is that of the loops whose ticks this one shares."""
+        self._core = core
+        self._zenoh = zenoh
+        self._store = store
+        self._clock = clock
+        self._site = site
+        self._phase = phase
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="map")
+
+    async def run(self, body: RobotSite | None) -> None:
+        """Restore the stored state, then keep the map up to date until cancelled."""
+        try:
+            await self.restore(body)
+            await self.snapshot_loop()
+        finally:
+            self._thread.shutdown(wait=False, cancel_futures=True)
+
+    async def restore(self, body: RobotSite | None) -> None:
+        """Load the stored map and pose; without a stored pose, start at the site's start pose."""
+        snapshot = await asyncio.to_thread(self._store.snapshot, self._site)
+        if snapshot is not None:
+            try:
+                await self._load(snapshot)
+            except MapError as error:
+                _log.warning("stored_map_refused", reason=str(error))
+        saved = self._store.pose(self._site)
+        if saved is None and body is not None:
+            saved = start_pose(self._site, body)
+        if saved is not None:
+            self._core.restore(saved)
+        _log.info("state_restored", map=snapshot is not None, x=saved and saved.x, y=saved and saved.y)
+
+    async def snapshot_loop(self) -> None:
+        """Request a snapshot whenever the core wants one, with a growing delay after each failure."""
+        failures = 0
+        await self._clock.sleep(CHECK_S)  # a heartbeat may come first and confirm the stored map
+        async for now in Ticker(self._clock, CHECK_S, self._phase):
+            if not self._core.wants_snapshot(now) or await self._fetch():
+                failures = 0
+            else:
+                failures += 1
+                spread = random.uniform(0.5, 1.0)  # noqa: S311  # spreads attempts in time, no secret
+                await self._clock.sleep(spread * min(2.0**failures / 5, 3))
+
+    async def _fetch(self) -> bool:
+        """Request a snapshot and load it; False without a valid one."""
+        try:
+            snapshot = await self._zenoh.query(ch.MAP_SNAPSHOT, None, MapSnapshot, SNAPSHOT_TIMEOUT_S)
+            if snapshot is None:
+                return False
+            await self._load(snapshot)
+        except (ContractError, MapError) as error:
+            _log.warning("snapshot_refused", reason=str(error))
+            return False
+        version = self._core.replica.version
+        _log.info("map_loaded", epoch=snapshot.epoch, snapshot=snapshot.seq, seq=version and version.seq)
+        try:
+            await asyncio.to_thread(self._store.put_snapshot, snapshot)
+        except OSError as error:
+            _log.error("map_not_stored", reason=str(error))
+        return True
+
+    async def _load(self, snapshot: MapSnapshot) -> None:
+        loop = asyncio.get_running_loop()
+        prepared = await loop.run_in_executor(self._thread, self._core.prepare_map, snapshot)
+        self._core.load(prepared, self._clock.now())

@@ -1,0 +1,195 @@
+"""The way to the dock: from an operator's word, or a low battery, to the pose in front of it. Pure.
+
+The planner gives the goal in front of the dock to a robot that wants it, and the robot drives there like to any other.
+There it looks whether anything is in between, and asks its safety gate to let the base look for the dock. Whatever
+disables it meanwhile ends its wish: it never goes to its dock because of an older word.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from fog_contracts.costs import LETHAL
+from robot_agent.localization.absolute import AbsoluteObservation
+from robot_agent.localization.pose import Pose2, wrap
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from fog_contracts.messages import Pose
+    from fog_contracts.replica import Replica
+    from robot_agent.agent.path.mission import Mission
+    from robot_agent.config import AgentConfig
+    from robot_agent.hardware import BaseStatus
+    from robot_agent.localization.localizer import Localizer
+    from robot_agent.safety.gate import SafetyState
+
+GOAL_WITHIN_S: Final = 10.0
+"""A planner that gives no goal in front of the dock for this long gives none."""
+_SETTLED_S: Final = 1.0
+_SAME_M: Final = 0.01
+_STAGED_M: Final = 0.2
+_STAGED_RAD: Final = 0.35
+_SURROUNDINGS_M: Final = 0.5
+"""While it looks for its dock, the robot may come this much farther away than it began."""
+_ASIDE_M: Final = 0.05
+"""The way to the dock is wider than the body by this, on each side."""
+_DOCK_BEGINS_M: Final = 0.05
+_DOCK_HALF_M: Final = 0.3
+"""What the lidar sees from 5 cm before the docked robot's front on, within this half width, is the dock or its wall."""
+_SIGMAS: Final = (0.03, 0.03, 0.05)
+"""How exactly the dock's contacts tell the pose (m, m, rad)."""
+_KNOWN_WITHIN_M: Final = 1.0
+"""A pose farther from the dock than this was taken to another dock."""
+_STEP_M: Final = 0.025
+
+
+class Docking:
+    """One robot's wish for its dock. `now` is s of the robot's monotonic clock."""
+
+    def __init__(self, config: AgentConfig, localizer: Localizer) -> None:
+        self._config = config
+        self._localizer = localizer
+        self._dock, self._staging = _pose2(config.dock), _pose2(config.staging)
+        self._ordered_at: float | None = None
+        self._goal_before: str | None = None
+        self._tried = False
+        self._observed = False
+        self.given_up = ""
+        """Why the robot does not go to its dock any more, until it is told to again."""
+
+    @property
+    def ordered(self) -> bool:
+        """Whether the robot is on its way to its dock, or to be sent there."""
+        return self._ordered_at is not None
+
+    def order(self, state: SafetyState, mission: Mission, *, docked: bool, now: float) -> str | None:
+        """Let the robot go to its dock; return why it does not, None if it does."""
+        if self._staging is None:
+            return "the site gives this robot no dock: set `dock` of its [[robots]] entry in site.toml"
+        if not self._config.finds_dock:
+            return "this base does not drive into a dock by itself"
+        if docked:
+            return "the robot is on its dock"
+        if not state.enabled or state.mode == "FAULT":
+            return "the robot drives to its dock: enable it first"
+        self._ordered_at, self._goal_before, self.given_up = now, mission.goal_id, ""
+        if self._is_ours(mission):
+            mission.resume()  # the planner does not send the robot where it sends it already
+        return None
+
+    def give_up(self, reason: str = "") -> None:
+        """End the wish; `reason` is told until the next one."""
+        if self._ordered_at is not None:
+            self._ordered_at, self.given_up = None, reason
+
+    def order_if_low(self, status: BaseStatus, state: SafetyState, mission: Mission, now: float) -> None:
+        """Send an enabled robot without a mission to its dock once its battery is low, if its settings say so."""
+        if not state.enabled or status.docked:
+            self._tried = False
+        if status.battery is None or status.charging or mission.active or state.latched:
+            return
+        if status.battery < self._config.dock_below and not self._tried and self._ordered_at is None:
+            self._tried = self.order(state, mission, docked=False, now=now) is None
+
+    def wants_goal(self, mission: Mission) -> bool:
+        """Return whether the planner shall lead the robot to the front of its dock."""
+        return self._ordered_at is not None and not (mission.reached and self._is_ours(mission))
+
+    def is_due(self, state: SafetyState, mission: Mission, now: float, *, at_rest: bool) -> bool:
+        """Return whether the robot has arrived in front of its dock; end the wish if it can't any more."""
+        if self._ordered_at is None:
+            return False
+        if not state.enabled or state.latched or state.mode == "FAULT":
+            self.give_up()
+        elif self._is_ours(mission):
+            if mission.reached:
+                return at_rest
+            if not mission.active:
+                self.give_up("its goal was cancelled")
+        elif mission.active and mission.goal_id != self._goal_before:
+            self.give_up("the robot has got another goal")
+        elif now - self._ordered_at > GOAL_WITHIN_S:
+            self.give_up("the planner gives it no goal in front of its dock")
+        return False
+
+    def on_begun(self, refusal: str | None) -> None:
+        """Record whether the safety gate lets the base look for its dock."""
+        self._ordered_at, self.given_up = None, refusal or ""
+
+    def problem(self, replica: Replica, now: float, *, running: bool) -> str | None:
+        """Return why the base must not drive into its dock from where it is; None when it may.
+
+        running: it does so already.
+        """
+        pose, points = self._localizer.pose(now), self._localizer.points_in_map()
+        if self._dock is None or self._staging is None or pose is None or points is None:
+            return "the robot does not know where its dock is"
+        ahead = math.hypot(pose.x - self._dock.x, pose.y - self._dock.y)
+        if running:
+            begun = math.hypot(self._staging.x - self._dock.x, self._staging.y - self._dock.y)
+            if ahead > begun + _SURROUNDINGS_M:
+                return "the robot moved away from its dock"
+        else:
+            off = pose.relative_to(self._staging)
+            if math.hypot(off.x, off.y) > _STAGED_M or abs(off.theta) > _STAGED_RAD:
+                return "the robot is not in front of its dock"
+        if self._blocked_between(pose, ahead, replica):
+            return "the place between the robot and its dock is blocked"
+        if self._is_between(pose, points):
+            return "the lidar sees something between the robot and its dock"
+        return None
+
+    def without_dock(self, points: NDArray[np.float64], pose: Pose2) -> NDArray[np.float64]:
+        """Return the points (n, 2; m, in `base` of a robot at `pose`) without those of the dock."""
+        if self._dock is None or len(points) == 0:
+            return points
+        seen = self._dock.inverse_transform(pose.transform(points))
+        is_dock = (seen[:, 0] >= self._dock_begins) & (np.abs(seen[:, 1]) <= _DOCK_HALF_M)
+        kept: NDArray[np.float64] = points[~is_dock]
+        return kept
+
+    def observation(self, docked_for: float | None, now: float) -> AbsoluteObservation | None:
+        """Return the pose that the dock's contacts tell, once for each time that the robot comes to its dock."""
+        if docked_for is None:
+            self._observed = False
+        if docked_for is None or docked_for < _SETTLED_S or self._observed or self._dock is None:
+            return None
+        self._observed = True
+        pose = self._localizer.pose(now)
+        if pose is not None and math.hypot(pose.x - self._dock.x, pose.y - self._dock.y) > _KNOWN_WITHIN_M:
+            return None
+        return AbsoluteObservation(self._dock, np.diag(np.square(_SIGMAS)), now)
+
+    @property
+    def _dock_begins(self) -> float:
+        return self._config.radius - _DOCK_BEGINS_M
+
+    def _is_ours(self, mission: Mission) -> bool:
+        goal = None if mission.goal is None else mission.goal.pose
+        staging = self._staging
+        return goal is not None and staging is not None and math.dist((goal.x, goal.y), staging[:2]) <= _SAME_M
+
+    def _blocked_between(self, pose: Pose2, ahead: float, replica: Replica) -> bool:
+        geometry, dock = replica.geometry, self._dock
+        if geometry is None or dock is None:
+            return True
+        for share in np.linspace(0.0, 1.0, 2 + int(ahead / _STEP_M)):
+            cell = geometry.cell(pose.x + share * (dock.x - pose.x), pose.y + share * (dock.y - pose.y))
+            if not geometry.contains_cell(*cell) or replica.cost[cell[1], cell[0]] == LETHAL:
+                return True
+        return False
+
+    def _is_between(self, pose: Pose2, points: NDArray[np.float64]) -> bool:
+        assert self._dock is not None
+        seen, robot = self._dock.inverse_transform(points), pose.relative_to(self._dock)
+        ahead = (seen[:, 0] > robot.x) & (seen[:, 0] < self._dock_begins)
+        aside = np.abs(seen[:, 1]) <= self._config.radius + _ASIDE_M
+        return bool((ahead & aside).any())
+
+
+def _pose2(pose: Pose | None) -> Pose2 | None:
+    return None if pose is None else Pose2(pose.x, pose.y, wrap(pose.theta))

@@ -1,0 +1,132 @@
+"""Whether the path may still be driven: the fog's plan may be older than the robot's replica of the map.
+
+A path must not be driven when it is blocked near the robot, or for longer than the planner needs to replan, or when it
+was planned on another map, or on a version of the map that does not reach the robot.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from fog_contracts.costs import INSCRIBED
+from robot_agent.motion.path_follower import first_blocked
+
+if TYPE_CHECKING:
+    from fog_contracts.messages import RobotPath
+    from fog_contracts.replica import Replica, Version
+    from robot_agent.agent.path.mission import Mission, PathId
+    from robot_agent.motion.path_follower import PathFollower
+
+BLOCK_NEAR_M: Final = 3.0
+"""A blocked path this near stops the robot at once; farther away the planner gets `PLANNER_GRACE_S` to replan."""
+PLANNER_GRACE_S: Final = 1.0
+"""How long the planner may take for a path on the newest map."""
+MAP_GRACE_S: Final = 1.0
+"""How long the version of the map that a path was planned on may take to reach the robot."""
+
+
+class _Blockage(NamedTuple):
+    """Where along the path (m from its start) it is blocked, and the reason to report."""
+
+    position: float
+    reason: str
+
+
+class _Awaited(NamedTuple):
+    """A version of the map that a path names and the robot lacks, and since when (s)."""
+
+    epoch: int
+    seq: int
+    since: float
+
+
+class PathMonitor:
+    """Compares the path that is followed with the robot's replica of the map."""
+
+    def __init__(self) -> None:
+        self._checked: tuple[Version, PathId] | None = None
+        self._blockage: _Blockage | None = None
+        self._blocked_since: float | None = None
+        self._other_map_since: float | None = None
+        self._awaited: _Awaited | None = None
+
+    def begin(self) -> None:
+        """Begin to monitor a new path. One that replaces a blocked path gets no new grace period."""
+        self._blockage = self._checked = None
+
+    def reset(self) -> None:
+        """Forget the path: there is none to monitor."""
+        self._blockage = self._blocked_since = self._other_map_since = self._awaited = None
+
+    def check(self, mission: Mission, replica: Replica, now: float) -> None:
+        """Look for a blockage along the path whenever path or map may have changed; cheap when neither did."""
+        path_id, follower, path = mission.path_id, mission.follower, mission.path
+        if path_id is None or path is None or follower is None or replica.version is None:
+            self._clear()
+            return
+        if self._checked == (replica.version, path_id):
+            return
+        self._checked = (replica.version, path_id)
+        self._blockage = _find_blockage(path, follower, replica, replica.version)
+        if self._blockage is None:
+            self._clear()
+        elif self._blocked_since is None:
+            self._blocked_since = now
+
+    def problem(self, mission: Mission, version: Version | None, now: float) -> str | None:
+        """Return why the path must not be driven; None when it may. Call it steadily: it measures durations."""
+        path = mission.path
+        if path is None or not mission.active:
+            return None
+        if path.refusal is not None:
+            return f"the planner finds no path: {path.refusal.reason}"
+        if self._is_of_other_map(path, version, now):
+            return "the path was planned on another map than the robot's"
+        if version is not None and self._is_ahead_of_map(path, version, now):
+            return f"the path was planned on version {path.map_seq} of the map; the robot has version {version.seq}"
+        if self._blockage is None or self._blocked_since is None:
+            return None
+        progress = mission.follower.progress if mission.follower else 0.0
+        near = self._blockage.position - progress <= BLOCK_NEAR_M
+        return self._blockage.reason if near or now - self._blocked_since > PLANNER_GRACE_S else None
+
+    def _clear(self) -> None:
+        self._blockage = self._blocked_since = None
+
+    def _is_of_other_map(self, path: RobotPath, version: Version | None, now: float) -> bool:
+        if version is None or path.map_epoch == version.epoch:
+            self._other_map_since = None
+            return False
+        if self._other_map_since is None:
+            self._other_map_since = now
+        return now - self._other_map_since > PLANNER_GRACE_S
+
+    def _is_ahead_of_map(self, path: RobotPath, version: Version, now: float) -> bool:
+        """Return whether the robot's map lacks a version of its path for too long.
+
+        Newer paths may name newer versions meanwhile: each is awaited from when the one before has arrived.
+        """
+        if path.map_epoch != version.epoch or path.map_seq <= version.seq:
+            self._awaited = None
+            return False
+        if self._awaited is None or self._awaited.epoch != version.epoch or self._awaited.seq <= version.seq:
+            self._awaited = _Awaited(version.epoch, path.map_seq, now)
+        return now - self._awaited.since > MAP_GRACE_S
+
+
+def _find_blockage(path: RobotPath, follower: PathFollower, replica: Replica, version: Version) -> _Blockage | None:
+    """Return the first blockage of the rest of the path on the robot's map; None without one."""
+    assert replica.geometry is not None
+    same_map = path.map_epoch == version.epoch
+    if same_map and path.map_seq > version.seq:
+        # Checked as soon as the robot's map has caught up; `problem` limits how long it may lag.
+        return None
+    # A planner that knew this map may lead the robot out through cells that its lidar reported as an obstacle.
+    known = same_map and path.map_seq == version.seq
+    ahead = first_blocked(replica.cost, replica.geometry, follower, known_to_planner=known)
+    if ahead is None:
+        return None
+    column, row = replica.geometry.cell(*follower.points[-1])
+    goal_blocked = replica.geometry.contains_cell(column, row) and replica.cost[row, column] >= INSCRIBED
+    subject = "the goal is blocked" if goal_blocked else f"the path is blocked {ahead:.1f} m ahead"
+    return _Blockage(follower.progress + ahead, f"{subject} on the newest map; waiting for a new plan")

@@ -1,0 +1,1 @@
+"""The log of all inputs of the agent's core, and its replay."""

@@ -1,0 +1,1 @@
+"""The aggregator's REST API: areas, their history, overrides and alerts."""

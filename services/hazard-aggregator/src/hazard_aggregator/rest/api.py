@@ -1,0 +1,223 @@
+"""REST under /api/v1: areas with their state, and the health of nodes. Reading needs no token, PUT an operator's."""
+
+from collections.abc import Callable
+from typing import Annotated, Any
+
+import msgspec
+from fastapi import FastAPI
+
+from fog_contracts.geometry import GeometryError, normalized_polygon
+from fog_contracts.grid import GridGeometry
+from fog_contracts.messages import (
+    AlertPolicy,
+    AreaDefinition,
+    AreaHazard,
+    AreaState,
+    FusionPolicy,
+    Id,
+    Message,
+    Penalty,
+    Ring,
+    Source,
+    UnknownPolicy,
+)
+from fog_runtime.clock import Clock
+from fog_runtime.health import Health
+from fog_runtime.http import (
+    Answer,
+    Body,
+    IdempotencyKey,
+    IfMatch,
+    IfNoneMatch,
+    Operator,
+    ProblemError,
+    Routes,
+    Tokens,
+    add_recovery,
+    add_store_errors,
+    attempt_of,
+    etag,
+    expected_version,
+    make_app,
+    must_be_new,
+)
+from fog_runtime.stores.idempotency import IdempotencyError
+from hazard_aggregator.area_size import AreaError, check_size
+from hazard_aggregator.rest.alert_api import add_alerts
+from hazard_aggregator.rest.history_api import add_history
+from hazard_aggregator.rest.override_api import OverrideView, add_overrides, no_such_area, override_view
+from hazard_aggregator.service import Service
+from hazard_aggregator.store import StoreError
+from hazard_aggregator.writers.area_writer import ConflictError
+
+
+class AreaBody(Message, frozen=True, kw_only=True):
+    """The part of an area that an operator sets; polygon in m, frame `map`."""
+
+    label: Annotated[str, msgspec.Meta(max_length=100)] = ""
+    polygon: Ring
+    nodes: list[Id] = msgspec.field(default_factory=list)
+    sources: Annotated[list[Source], msgspec.Meta(max_length=50)] = msgspec.field(default_factory=list)
+    number: Annotated[int, msgspec.Meta(ge=0, le=9999)] | None = None
+    debounce: dict[str, Any] = msgspec.field(default_factory=dict)
+    fusion: FusionPolicy = FusionPolicy()
+    unknown: UnknownPolicy = UnknownPolicy()
+    alerts: AlertPolicy = AlertPolicy()
+    penalty: Penalty | None = None
+    removed: bool = False
+
+
+class AreaView(Message, frozen=True, kw_only=True):
+    """An area with its announced hazard; `withheld`: a newer hazard, a relief, is not announced until it is stored.
+
+    `override` is an operator's word, which counts instead of the nodes'.
+    """
+
+    definition: AreaDefinition
+    hazard: AreaHazard | None
+    withheld: bool
+    override: OverrideView | None
+
+
+class NodeView(Message, frozen=True, kw_only=True):
+    """Health of a node or source; `age_s` is the time since its last message, null before the first one."""
+
+    id: str
+    area: str
+    state: AreaState
+    reason: str
+    online: bool | None
+    age_s: float | None
+    received: int
+    ignored: int
+
+
+def make_api(
+    service: Service,
+    geometry: GridGeometry,
+    clock: Clock,
+    health: Health,
+    tokens: Tokens,
+    standby: Callable[[], str] = str,
+) -> FastAPI:
+    """Return the app over a running service; areas must lie on the map of this geometry.
+
+    While `standby` returns a reason, nothing can be written.
+    """
+    app = make_app("Fognav hazard-aggregator", health, tokens, standby=standby)
+    areas = Routes(app, "areas")
+    _add_areas(areas, service, geometry, clock)
+    add_history(areas, service, clock)
+    _add_nodes(Routes(app, "nodes"), service, clock)
+    add_alerts(Routes(app, "alerts"), service)
+    recovery = Routes(app, "store")
+    add_store_errors(recovery)
+    add_recovery(recovery, service.records)
+    return app
+
+
+def _add_areas(routes: Routes, service: Service, geometry: GridGeometry, clock: Clock) -> None:
+    add_store_errors(routes)
+    routes.raises(
+        ConflictError,
+        {412: "Somebody else changed the area"},
+        lambda error: ProblemError(412, str(error)),
+    )
+
+    def area_views() -> dict[str, AreaView]:
+        announced, withheld, now = service.core.announced(), service.core.withheld(), clock.now()
+        return {
+            d.id: AreaView(
+                definition=d,
+                hazard=announced.get(d.id),
+                withheld=d.id in withheld,
+                override=override_view(service, d.id, now),
+            )
+            for d in service.core.definitions()
+            if not d.removed
+        }
+
+    @routes.get("/api/v1/areas")
+    async def list_areas() -> list[AreaView]:
+        """List all areas with their state."""
+        return list(area_views().values())
+
+    @routes.get("/api/v1/areas/{area_id}", problems={404: "No area has this id"})
+    async def get_area(area_id: str) -> Answer[AreaView]:
+        """Return one area with its ETag."""
+        view = area_views().get(area_id)
+        if view is None:
+            raise no_such_area(area_id)
+        return Answer(view, etag(view.definition.version))
+
+    @routes.put("/api/v1/areas/{area_id}", status=(200, 201), raises=[ConflictError, IdempotencyError, StoreError])
+    async def put_area(
+        area_id: str,
+        body: Body[AreaBody],
+        caller: Operator,
+        if_match: IfMatch = None,
+        if_none_match: IfNoneMatch = None,
+        idempotency_key: IdempotencyKey = None,
+    ) -> Answer[AreaDefinition]:
+        """Add or replace an area; replies once it is durably stored.
+
+        With If-Match, only if it is unchanged; with `If-None-Match: *`, only if there is none.
+        """
+        new = area_id not in area_views()
+        definition = await service.areas.put_area(
+            _validated(area_id, body, service, geometry),
+            caller.name,
+            expected=expected_version(if_match),
+            must_be_new=must_be_new(if_none_match),
+            attempt=attempt_of(idempotency_key, caller, f"PUT /api/v1/areas/{area_id}", body),
+        )
+        return Answer(definition, etag(definition.version), status=201 if new else 200)
+
+    add_overrides(routes, service, clock)
+
+
+def _add_nodes(routes: Routes, service: Service, clock: Clock) -> None:
+    @routes.get("/api/v1/nodes")
+    async def nodes() -> list[NodeView]:
+        """Return the health of every node and source in each area that it watches."""
+        return [
+            NodeView(
+                id=node.id,
+                area=node.area,
+                state=node.state,
+                reason=node.reason,
+                online=node.online,
+                age_s=node.age,
+                received=node.received,
+                ignored=node.ignored,
+            )
+            for node in service.core.node_reports(clock.now())
+        ]
+
+
+def _validated(area_id: str, body: AreaBody, service: Service, geometry: GridGeometry) -> AreaDefinition:
+    try:
+        polygon = normalized_polygon(body.polygon)
+    except GeometryError as error:
+        raise ProblemError(422, f"{error}; draw a simple polygon", field="body.polygon") from error
+    for index, (x, y) in enumerate(polygon):
+        if not geometry.contains(x, y):
+            left, bottom, right, top = geometry.bounds
+            reach = f"the map reaches from ({left:.2f}, {bottom:.2f}) to ({right:.2f}, {top:.2f}) m"
+            raise ProblemError(422, f"({x:.2f}, {y:.2f}) lies off the map: {reach}", field=f"body.polygon.{index}")
+    for index, node in enumerate(body.nodes):
+        if node not in service.core.nodes:
+            detail = f"the site has no node {node}: add it to site.toml first, with its position and range limits"
+            raise ProblemError(422, detail, field=f"body.nodes.{index}")
+    try:
+        definition = msgspec.convert({**msgspec.to_builtins(body), "id": area_id, "polygon": polygon}, AreaDefinition)
+    except msgspec.ValidationError as error:  # the id comes from the path
+        raise ProblemError(
+            422, f"{area_id!r} is no valid id: use a to z, 0 to 9 and -, at most 32", field="path"
+        ) from error
+    try:
+        check_size(definition)
+        service.core.check(definition)
+    except AreaError as error:
+        raise ProblemError(422, error.problem, field=f"body.{error.field}") from error
+    return definition

@@ -1,0 +1,165 @@
+"""The confirmed state of one node or source in one area: debounce, silence, contradictions, flapping. Pure."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+from fog_contracts.messages import UnknownPolicy
+from hazard_aggregator.sensors.flapping import FlapDetector
+
+if TYPE_CHECKING:
+    from fog_contracts.messages import AreaState, Source
+    from fog_contracts.site import NodeSite
+    from hazard_aggregator.debounce import Rule
+    from hazard_aggregator.sensors.plausibility import Classification
+    from hazard_aggregator.sensors.source_reader import SourceReader
+
+_PERIODS: Final = 3
+"""A source is silent after so many of its periods."""
+
+
+@dataclass
+class NodeState:
+    """One node of one area; a node of the thesis has no `site`."""
+
+    id: str
+    site: NodeSite | None
+    rule: Rule
+    last_reading: float | None = None
+    last_confirmed: float = 0.0
+    state: AreaState = "unknown"
+    reason: str = "no reading received yet"
+    online: bool | None = None
+    ever_received: bool = False
+    unconfirmed: bool = True  # no state was confirmed since the last invalidation
+    explained_by: str | None = None
+    run_state: AreaState | None = None
+    run_began: float = 0.0
+    received: int = 0
+    ignored: int = 0
+    area_penalty: int | None = None
+    flaps: FlapDetector = field(default_factory=lambda: FlapDetector(UnknownPolicy().max_changes))
+
+    @property
+    def outcome(self) -> tuple[AreaState, str, str | None, bool]:
+        """All that an area's hazard depends on."""
+        return self.state, self.reason, self.explained_by, self.ever_received
+
+    @property
+    def penalty(self) -> int | None:
+        """The cost of the area while this one alone is blocked; None: the area is impassable then."""
+        own = None if self.site is None else self.site.penalty
+        return self.area_penalty if own is None else own
+
+    def silent_after(self, policy: UnknownPolicy) -> float:
+        """Return after how long a silence (s) the state is unknown."""
+        return policy.silent_after_s
+
+    def silent_for(self, now: float) -> float:
+        """Return the time (s) since the last reading was taken; without one, since the first call."""
+        if self.last_reading is None:
+            self.last_reading = self.last_confirmed = now
+        return now - self.last_reading
+
+    def invalidate(self, reason: str) -> None:
+        """Set the state to unknown until readings confirm another one."""
+        self.state = "unknown"
+        self.reason = reason
+        self.unconfirmed = True
+        self.explained_by = None
+        self.run_state = None
+        self.rule.reset()
+
+    def flap(self) -> None:
+        """Set the state to unknown until it is steady."""
+        reason = f"it flaps: it changed more than {self.flaps.max_changes} times within a minute"
+        if self.reason != reason:
+            self.invalidate(reason)
+
+    def restore_blocked(self) -> None:
+        """Set the state in which an earlier run left the node's area."""
+        self.state = "blocked"
+        self.reason = "the area was blocked before the restart"
+
+    def check_silence(self, limit: float, now: float) -> None:
+        """Invalidate the state of a node that was silent, or confirmed nothing, for longer than `limit` (s)."""
+        if self.silent_for(now) > limit:
+            reason = f"it has been silent for more than {limit:g} s"
+            # A few readings since an earlier silence confirmed nothing, and do not count after this one.
+            if self.state != "unknown" or self.reason != reason or self.run_state is not None:
+                self.invalidate(reason)
+        elif now - self.last_confirmed > limit and self.state != "unknown":
+            self.invalidate("its readings contradict one another")
+
+    def receive(self, taken_at: float) -> None:
+        """Record a sign of life (s, the receiver's clock)."""
+        self.silent_for(taken_at)
+        self.received += 1
+        self.last_reading = taken_at
+        self.ever_received = True
+        self.online = True
+
+    def apply(self, classification: Classification, taken_at: float, stamp: float, *, counts: bool = True) -> None:
+        """Apply one classified reading, taken at `taken_at` (s, the receiver's clock).
+
+        One that does not count is a sign of life, but no measurement of its own.
+        """
+        self.receive(taken_at)
+        if classification.explained_by is not None:
+            # Counts neither way: the debounce rule does not see it, and the timer that detects flapping restarts.
+            self.explained_by = classification.explained_by
+            self.last_confirmed = taken_at
+            return
+        if not counts:
+            return
+        if classification.state != self.run_state and not (classification.state == "unknown" and self.run_state):
+            self.run_state = classification.state
+            self.run_began = stamp
+        confirmed = self.rule.update(classification.observation, taken_at)
+        if confirmed is None:
+            return
+        self.last_confirmed = taken_at
+        self.explained_by = None
+        if confirmed == "unknown":
+            self.run_state = None
+        elif self.flaps.update(confirmed, taken_at):
+            self.flap()
+            return
+        if confirmed != self.state or self.unconfirmed:
+            # Later readings of the same state leave the reason: the hazard would change with every centimetre.
+            self.state, self.reason, self.unconfirmed = confirmed, classification.reason, False
+
+
+@dataclass
+class SourceState(NodeState):
+    """One source of one area, with its profile filled in; `pending` is a retained message of unknown age.
+
+    `misread`: its last message was not understood. `new`: its topics are not subscribed to yet, for this source.
+    `value_at`: boot and seq of a node's last value.
+    """
+
+    source: Source | None = None
+    reader: SourceReader | None = None
+    pending: bytes | None = None
+    misread: bool = False
+    new: bool = True
+    value_at: tuple[int, int] | None = None
+
+    @property
+    def penalty(self) -> int | None:
+        """The cost of the area while this source alone is blocked; None: the area is impassable then."""
+        own = None if self.source is None else self.source.penalty
+        return self.area_penalty if own is None else own
+
+    def silent_after(self, policy: UnknownPolicy) -> float:  # noqa: ARG002  # a source has its own period
+        """Return after how long a silence (s) the state is unknown: never, if the source publishes on change."""
+        return math.inf if self.source is None or self.source.period_s is None else _PERIODS * self.source.period_s
+
+    def invalidate(self, reason: str) -> None:
+        """Set the state to unknown until messages confirm another one."""
+        super().invalidate(reason)
+        self.misread = False
+        if self.reader is not None:
+            self.reader.reset()

@@ -1,0 +1,166 @@
+"""Keeps what is in force equal to what is stored: loads records, again after uncertain writes, and recovers them."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from fog_contracts import channels as ch
+from fog_runtime.stores.redis_connection import StoreRefusedError
+from hazard_aggregator.overrides import StoredOverrides
+from hazard_aggregator.store import Audit, RecoveryError, Stored, StoreError
+from hazard_aggregator.writers.unusable_areas import UnusableAreas
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from typing import Literal
+
+    from fog_contracts.handlers import Publication
+    from fog_runtime.clock import Clock
+    from fog_runtime.health import Health
+    from fog_runtime.stores.redis_store import StoreStatus
+    from fog_runtime.transports.edges import Edges
+    from fog_runtime.transports.mqtt_edge import MqttEdge
+    from hazard_aggregator.core import Aggregator
+    from hazard_aggregator.publisher import Publisher
+    from hazard_aggregator.store import Store
+
+
+class Records:
+    """The stored areas, hazards and overrides. Who changes one holds `lock`, and writes inside `uncertain_write`.
+
+    `loaded` is set once the records were loaded, before which nothing may be written; `boot` is `clock.boot_id`.
+    """
+
+    def __init__(  # noqa: PLR0913  # the process's parts
+        self,
+        core: Aggregator,
+        store: Store,
+        publisher: Publisher,
+        mqtt: MqttEdge,
+        edges: Edges,
+        clock: Clock,
+        health: Health,
+        boot: str,
+    ) -> None:
+        self.lock = asyncio.Lock()
+        self.loaded = asyncio.Event()
+        self._core = core
+        self._store = store
+        self._publisher = publisher
+        self._mqtt = mqtt
+        self._edges = edges
+        self._clock = clock
+        self._health = health
+        self._boot = boot
+        self._unusable = UnusableAreas(core.check, health)
+        self._reload_due = False
+
+    def mark_loaded(self) -> None:
+        """Record that the stored state is loaded, which allows writing."""
+        self.loaded.set()
+        self._health.set("store", ok=True)
+
+    def request_reload(self) -> None:
+        """Have the records loaded again: they may differ from what is in force."""
+        self._reload_due = True
+
+    @contextmanager
+    def uncertain_write(self) -> Iterator[None]:
+        """Reload the records after a failure: one may have been written although the reply was lost."""
+        if not self.loaded.is_set():
+            # Neither versions nor conditions can be judged by the site's definitions alone.
+            raise StoreRefusedError("the stored areas are not loaded yet: /readyz says why")
+        try:
+            yield
+        except StoreError as error:
+            self._reload_due = True
+            self._health.set("store", ok=False, detail=str(error))
+            raise
+
+    async def load(self) -> Sequence[Publication]:
+        """Put the stored records into force; return everything, to be published. Raises `StoreError`."""
+        async with self.lock:
+            stored = await self._store.load()
+            usable = self._unusable.made_usable(stored.definitions, stored.unreadable)
+            overrides = StoredOverrides(stored.overrides, stored.rests, self._boot)
+            changed = self._core.load_overrides(overrides, self._edges.now())
+            publications = [*changed, *self._core.restore(usable, stored.hazards, self._edges.now())]
+        await self.subscribe()
+        return publications
+
+    async def reload(self) -> None:
+        """Put stored records into force that differ from the known ones, if there may be any; raises `StoreError`."""
+        if not self._reload_due:
+            return
+        async with self.lock:
+            await self.reload_locked()
+        await self.subscribe()
+
+    async def reload_locked(self) -> None:
+        """Do the same for a caller that holds `lock`, who calls `subscribe` then."""
+        if not self._reload_due:
+            return
+        known = {definition.id: definition for definition in self._core.definitions()}
+        for definition in self._unusable.made_usable(*await self._store.areas()):
+            if definition != known.get(definition.id):
+                self._publisher.announce(self._core.put_area(definition, self._edges.now()))
+        overrides = StoredOverrides(*await self._store.overrides(), self._boot)
+        self._publisher.announce(self._core.load_overrides(overrides, self._edges.now()))
+        self._reload_due = False
+
+    async def load_again(self) -> None:
+        """Put the stored records into force whether or not they may differ, for a caller that holds `lock`."""
+        self._reload_due = True
+        await self.reload_locked()
+
+    async def subscribe(self) -> None:
+        """Subscribe to the thesis's topics of all areas, and to their sources' own."""
+        topics, again = self._core.source_topics(), self._core.pop_new_source_topics()
+        await self._mqtt.listen_to_foreign(topics, self._on_source, again)
+        for number in self._core.thesis_numbers():
+            await self._mqtt.add_number(ch.THESIS_AREA, number)
+
+    def _on_source(self, topic: str, payload: bytes | None, retained: bool) -> None:  # noqa: FBT001  # as the edge calls it
+        self._publisher.announce(self._core.on_source(topic, payload, self._edges.now(), retained=retained))
+
+    async def store_status(self) -> StoreStatus:
+        """Return what Redis and this process have; raises `StoreError`."""
+        known = self._in_memory()
+        counts = {
+            "areas": len(known.definitions),
+            "hazards": len(known.hazards),
+            "overrides": len(known.overrides),
+        }
+        return await self._store.status(counts if self.loaded.is_set() else {})
+
+    async def recover_store(self, action: Literal["restore", "accept"], who: str) -> None:
+        """Restore the records from memory, or accept those in Redis, after Redis lost records.
+
+        Raises `RecoveryError` and `StoreError`.
+        """
+        await self._store.require_loss()
+        audit = Audit(self._clock.stamp(), who, action)
+        async with self.lock:
+            if action == "accept":
+                await self._store.accept_loss(audit)
+                self._reload_due = True
+            elif self.loaded.is_set():
+                await self._store.restore(self._in_memory(), audit)
+            else:
+                raise RecoveryError(
+                    "this service was started after the loss and has no stored areas: restore a backup of Redis, or"
+                    " accept"
+                )
+
+    def _in_memory(self) -> Stored:
+        """Return what of the records in force is stored."""
+        overrides = self._core.overrides
+        return Stored(
+            [definition for definition in self._core.definitions() if definition.version > 0],
+            list(self._core.announced().values()),
+            overrides.all(),
+            overrides.rests(self._boot, self._clock.now()),
+            {},
+        )

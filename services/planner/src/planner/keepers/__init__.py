@@ -1,0 +1,1 @@
+"""What keeps the core in step with the store, the map and the docks."""

@@ -1,0 +1,1 @@
+"""The map that paths are planned on. Pure."""

@@ -1,0 +1,200 @@
+"""Searches a path on the costmap from a robot's position to a goal, both in metres."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from fog_contracts.costs import FREE, INSCRIBED, LETHAL
+from fog_kernels.astar import Planner, nearest_traversable
+from fog_kernels.lines import line_cost
+from planner.reasons.refusals import (
+    goal_occupied,
+    goal_out_of_reach,
+    nearest_reachable,
+    no_path,
+    refuse,
+    start_occupied,
+    start_outside,
+)
+from planner.search.route import Floats, Route
+
+if TYPE_CHECKING:
+    from fog_contracts.grid import GridGeometry
+    from fog_contracts.messages import PointXY, Refusal
+    from fog_kernels.astar import PlanResult
+    from fog_kernels.guides import Detour, GoalField
+    from planner.config import PlannerConfig
+    from planner.maps.planning_map import Cell, Grid, PlanningMap
+
+
+@dataclass(frozen=True)
+class Question:
+    """What a refusal leaves open: which hazards or zones close the start, the goal, or every path between them."""
+
+    kind: Literal["start", "goal", "path"]
+    start: PointXY
+    goal: PointXY
+    start_cell: Cell
+    """For a goal or path: the traversable cell where the search began."""
+    goal_cell: Cell
+
+
+@dataclass(frozen=True)
+class SearchResult:
+    """A route with its cost, as the kernels integrate it, or a refusal.
+
+    `question`: what the refusal does not tell yet; None when it is complete. `searched`: whether A* found out.
+    """
+
+    route: Route | None
+    cost: float
+    refusal: Refusal | None
+    question: Question | None = None
+    searched: bool = True
+
+
+def refused(refusal: Refusal, question: Question | None = None, *, searched: bool = False) -> SearchResult:
+    """Return the result of a search without a path."""
+    return SearchResult(None, math.inf, refusal, question, searched)
+
+
+Covers = Callable[[float, float, float], bool]
+"""Whether a point (m, frame `map`) lies in a blocked hazard or zone, or within a margin (m) of it."""
+
+
+Share = Callable[["Cell", "Cell"], "Detour | None"]
+"""Returns a bound for a search between two cells that others can use, too; None without one."""
+
+
+class PathSearch:
+    """Searches paths on maps of one geometry; owns the memory that A* needs."""
+
+    def __init__(self, config: PlannerConfig, geometry: GridGeometry) -> None:
+        self._config = config
+        self.geometry = geometry
+        self.planner = Planner(geometry.width, geometry.height)
+
+    def find(  # noqa: PLR0913  # what guides a search
+        self,
+        planning_map: PlanningMap,
+        covers: Covers,
+        start: PointXY,
+        goal: PointXY,
+        field: GoalField | None = None,
+        detour: Detour | None = None,
+        share: Share | None = None,
+    ) -> SearchResult:
+        """Return the cheapest path between two points (m, frame `map`), or why there is none.
+
+        `field` is that of the goal's cell, if there is one, `detour` a bound that holds for start and goal; without
+        one, `share` is asked for it when the search is long. Refusals name no hazard and no zone: the `question` can be
+        answered later.
+        """
+        geometry = self.geometry
+        first, last = geometry.cell(*start), geometry.cell(*goal)
+        impossible = None if geometry.contains_cell(*first) else start_outside(geometry, start)
+        impossible = impossible or goal_out_of_reach(planning_map, goal)
+        if impossible is not None:
+            return refused(impossible)
+        free = self._free_start(planning_map, covers, first)
+        if free is None:
+            return refused(start_occupied(start), Question("start", start, goal, first, last))
+        if planning_map.cost[last[1], last[0]] >= INSCRIBED:
+            nearest = nearest_reachable(planning_map, free, last)
+            return refused(goal_occupied(goal, nearest), Question("goal", start, goal, free, last))
+        found = self._search(planning_map, free, last, field, detour, share)
+        if found is None or found.timed_out:
+            return self._without_path(planning_map, Question("path", start, goal, free, last), found)
+        corners = self.planner.shortcut(planning_map.cost, found.cells)
+        points = self._points(planning_map.cost, corners, start, goal, escaping=free != first)
+        route = Route(points, self._config.point_spacing, escape_lines=int(free != first))
+        return SearchResult(route, route.cost(planning_map.cost, geometry), None)
+
+    def _without_path(self, planning_map: PlanningMap, question: Question, found: PlanResult | None) -> SearchResult:
+        if found is not None:
+            reason = f"no path was found within {self._config.max_expansions} expanded cells"
+            return refused(refuse(207, reason), searched=True)
+        return refused(no_path(nearest_reachable(planning_map, question.start_cell, question.goal_cell)), question)
+
+    def _search(
+        self,
+        planning_map: PlanningMap,
+        start: Cell,
+        goal: Cell,
+        field: GoalField | None,
+        detour: Detour | None,
+        share: Share | None,
+    ) -> PlanResult | None:
+        """Search a path between two traversable cells; None if they are not connected.
+
+        Most searches are short, so a few cells are expanded first; then it is worth to ask whether there is a path, and
+        for a bound.
+        """
+        if planning_map.has_components and not planning_map.reachable(start, goal):
+            return None
+        most, quick = self._config.max_expansions, self._config.quick_expansions
+        if quick < most and (share is not None or not planning_map.has_components):
+            found = self.planner.plan(planning_map.cost, start, goal, quick, field, detour)
+            if not found.timed_out:
+                return found if found.found else None
+            if not planning_map.reachable(start, goal):
+                return None
+            detour = share(start, goal) if share is not None else detour
+        found = self.planner.plan(planning_map.cost, start, goal, most, field, detour)
+        return found if found.found or found.timed_out else None
+
+    def _points(self, cost: Grid, corners: Floats, start: PointXY, goal: PointXY, *, escaping: bool) -> Floats:
+        """Return corners ((n, 2), columns and rows) as points (m) that start at the robot and end at the goal exactly.
+
+        Where the line between the exact point and the next corner crosses an impassable cell, the centre of the point's
+        cell is used: at most 4 cm away.
+        """
+        geometry = self.geometry
+        cells = corners.astype(np.float64)
+        exact_start, exact_goal = geometry.grid_coordinates(np.array((start, goal)))
+        if len(cells) == 1:
+            cells = np.concatenate((cells, cells))
+        if _is_passable(cost, cells[-2], exact_goal):
+            cells[-1] = exact_goal
+        if escaping:
+            cells = np.concatenate((exact_start[None, :], cells))
+        elif _is_passable(cost, exact_start, cells[1]):
+            cells[0] = exact_start
+        return geometry.centres(cells)
+
+    def _free_start(self, planning_map: PlanningMap, covers: Covers, start: Cell) -> Cell | None:
+        """Return the start's cell, or the nearest one where a robot may be; None when it is in a hazard, zone or wall.
+
+        The line to it may cross inscribed cells and lidar obstacles, but no wall and no blocked region.
+        """
+        column, row = start
+        if planning_map.cost[row, column] < INSCRIBED:
+            return start
+        if self._is_closed(planning_map, covers, start):
+            return None
+        reach = math.floor(self._config.escape_distance / self.geometry.resolution)
+        free = nearest_traversable(planning_map.cost, start, reach)
+        if free is None:
+            return None
+        steps = 2 * max(abs(free[0] - column), abs(free[1] - row))
+        for step in range(1, steps + 1):
+            x = round(column + (free[0] - column) * step / steps)
+            y = round(row + (free[1] - row) * step / steps)
+            if planning_map.static[y, x] != FREE or self._is_closed(planning_map, covers, (x, y)):
+                return None
+        return free
+
+    def _is_closed(self, planning_map: PlanningMap, covers: Covers, cell: Cell) -> bool:
+        """Whether a cell belongs to a blocked hazard or zone: only lethal cells do."""
+        if planning_map.cost[cell[1], cell[0]] != LETHAL:
+            return False
+        return covers(*self.geometry.centre(*cell), self.geometry.resolution * math.sqrt(0.5))
+
+
+def _is_passable(cost: Grid, a: Floats, b: Floats) -> bool:
+    return not math.isinf(line_cost(cost, float(a[0]), float(a[1]), float(b[0]), float(b[1])))

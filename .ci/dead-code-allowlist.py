@@ -35,6 +35,8 @@ _.ROLES
 _.DURABILITIES
 
 # --- Names that a library calls or reads. ---
+_.__signature__  # inspect and typer: what a command takes
+_.__annotations__
 _.capture_signals  # uvicorn
 _.should_exit
 _.timeout_graceful_shutdown

@@ -1,25 +1,41 @@
 """The whole firmware of the board on this computer, in simulated time, behind stand-ins for the board's libraries."""
 
+import asyncio
 import hashlib
 import json
 import shutil
 import subprocess
-from contextlib import suppress
+from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from queue import Empty, Queue
 from threading import Event, Thread
 from urllib.request import urlopen
 
 import msgspec
+import numpy as np
 import paho.mqtt.client as paho
 import pytest
+import zenoh
 from typer.testing import CliRunner
 
 from fog_contracts import channels as ch
 from fog_contracts.codec import decode, encode
-from fog_contracts.messages import NodeCalibration, NodeConfig, NodeReading, NodeUpdate, NodeValue
+from fog_contracts.grid import GridGeometry, StaticMap
+from fog_contracts.messages import (
+    AreaHazard,
+    MapDelta,
+    NodeCalibration,
+    NodeConfig,
+    NodeReading,
+    NodeUpdate,
+    NodeValue,
+)
+from fog_runtime.configuration.maps import save_map
+from fog_runtime.transports.zenoh_edge import session_config
 from fog_supervisor.servers import start_mosquitto
 from fognav.commands.node import node_app
+from fognav.programs import AGGREGATOR, MAP_SERVICE
+from fognav.stack import Stack, StackConfig
 
 # Compiled once, not by each worker of a parallel run.
 pytestmark = pytest.mark.xdist_group("firmware-board")
@@ -413,6 +429,14 @@ def test_image_that_differs_from_what_was_signed_is_not_started(updatable, tmp_p
     assert not (tmp_path / "update.txt").exists()
 
 
+def pass_on(lines, client):
+    """Publish on a real broker what the firmware publishes."""
+    for line in lines:
+        if line.startswith("publish "):
+            topic, qos, retained, text = line.removeprefix("publish ").split("|", 3)
+            client.publish(topic, text, int(qos), bool(int(retained)))
+
+
 class Bridge(Thread):
     """Passes messages between a board and a real broker, and the image that the board will fetch, until `ended`."""
 
@@ -433,10 +457,7 @@ class Bridge(Thread):
             if self.boards[-1].restarted:
                 self.boards.append(self._restart())
                 self.boards[-1].measures(3000, 3000)
-            for line in self.boards[-1].run(0.5):
-                if line.startswith("publish "):
-                    topic, qos, retained, text = line.removeprefix("publish ").split("|", 3)
-                    self._client.publish(topic, text, int(qos), bool(int(retained)))
+            pass_on(self.boards[-1].run(0.5), self._client)
             with suppress(Empty):
                 self._deliver(self._inbox.get(timeout=0.1))
         self._client.loop_stop()
@@ -446,6 +467,82 @@ class Bridge(Thread):
             with urlopen(json.loads(text)["url"], timeout=10) as answer:
                 (self._folder / "served").write_bytes(answer.read())
         self.boards[-1].send(ch.NODE_UPDATE, text)
+
+
+GAS = """
+id = "lab"
+map = "map.yaml"
+[[areas]]
+id = "kitchen"
+polygon = [[1.0, 1.0], [3.0, 1.0], [3.0, 2.0], [1.0, 2.0]]
+[[nodes]]
+id = "n1"
+area = "kitchen"
+x = 2.0
+y = 0.1
+theta = 1.57
+sonars = [{ range_limit = 1.5 }, { range_limit = 2.0 }]
+[[sources]]
+id = "gas"
+area = "kitchen"
+quantity = { node = "n1", kind = "gas" }
+number = { above = 2.0, hysteresis = 0.3 }
+"""
+
+
+@asynccontextmanager
+async def fog_with_a_gas_sensor(folder):
+    """Yield the port of a broker, with aggregator and map-service, and the hazards and deltas that they publish."""
+    folder.mkdir()
+    (folder / "site.toml").write_text(GAS)
+    save_map(folder / "map", StaticMap(GridGeometry(80, 60, 0.05, 0.0, 0.0), np.zeros((60, 80), np.uint8)))
+    hazards, causes = [], []
+    async with Stack(StackConfig(site_dir=folder, robot="none", extra={"HAZARDS_WAIT_S": "0"})) as stack:
+        await stack.start_servers()
+        with zenoh.open(session_config("client", connect=[stack.zenoh_endpoint])) as session:
+            session.declare_subscriber(
+                ch.MAP_DELTA.key(site="lab"),
+                lambda sample: causes.extend(decode(ch.MAP_DELTA, sample.payload.to_bytes(), MapDelta).causes),
+            )
+            client = paho.Client(paho.CallbackAPIVersion.VERSION2)
+            client.on_message = lambda _client, _data, got: hazards.append(
+                decode(ch.AREA_HAZARD, got.payload, AreaHazard)
+            )
+            client.connect("127.0.0.1", stack.mqtt_port)
+            client.subscribe(ch.AREA_HAZARD.key(site="lab", area="kitchen"), 1)
+            client.loop_start()
+            for name in (AGGREGATOR, MAP_SERVICE):
+                stack.supervisor.start(name)
+            await stack.supervisor.wait_ready([AGGREGATOR, MAP_SERVICE], 90)
+            yield client, hazards, causes
+            client.loop_stop()
+
+
+@pytest.mark.live
+async def test_gas_that_a_board_measures_becomes_a_hazard_with_hysteresis_and_changes_the_map(switch_on, tmp_path):
+    """Its sensor's volts pass the converter, the firmware, a real broker, the aggregator and the map-service."""
+    values = [{"kind": "gas", "sensor": "analog", "full_scale_v": 3.3}]
+    board = switch_on({**SETTINGS, "values": values})
+    board.measures(3000, 3000)
+    async with fog_with_a_gas_sensor(tmp_path / "site") as (client, hazards, causes):
+
+        async def measured_until(counts, reached):
+            board.tell(f"analog {counts}")
+            async with asyncio.timeout(60):
+                while not reached():
+                    pass_on(board.run(1), client)
+                    await asyncio.sleep(0.1)
+
+        await measured_until(400, lambda: hazards and hazards[-1].state == "clear")
+        await measured_until(700, lambda: hazards[-1].state == "blocked")
+        assert hazards[-1].cause == "source gas: 2.258 is above 2"
+        await measured_until(700, lambda: ("hazard", "kitchen", "blocked") in {(c.kind, c.id, c.state) for c in causes})
+        before = len(hazards)
+        for counts in (560, 700):  # 1.81 V: below the limit, within the hysteresis
+            board.tell(f"analog {counts}")
+            pass_on(board.run(2), client)
+        await measured_until(400, lambda: hazards[-1].state == "clear")
+        assert {hazard.state for hazard in hazards[before:-1]} <= {"blocked"}
 
 
 @pytest.fixture

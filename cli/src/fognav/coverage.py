@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from fog_contracts.costs import DEFAULT_INFLATION, FREE, LETHAL
+from fog_contracts.geometry import lengths_along
 from fog_contracts.raster import rasterize
 from fog_kernels.astar import Planner, nearest_traversable
 from fog_kernels.distance import squared_distance_capped
@@ -114,7 +115,7 @@ def coverage(site: Site, static: StaticMap) -> Coverage:
         if points is None:
             unreachable.append((start, goal))
             continue
-        travelled = np.concatenate(([0.0], np.hypot(*np.diff(points, axis=0).T).cumsum()))
+        travelled = lengths_along(points)
         columns, rows = _cells(static, points)
         routes.append(
             RouteCoverage(

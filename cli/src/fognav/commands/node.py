@@ -17,8 +17,9 @@ from fog_contracts.site import NodeSite
 from fog_runtime.access.credentials import Credentials
 from fog_runtime.configuration.site import LoadedSite
 from fognav import checkout, kernels
-from fognav.locking import LocksOption, locks_errors, locks_folder, open_locks, own_credentials
+from fognav.locking import own_credentials
 from fognav.nodes import on_broker, provisioning, site_file, updating
+from fognav.nodes.board_options import SITE, BoardOptions, SiteOption, with_board_options
 from fognav.operate.fog import Fog, find_fog
 from fognav.operate.options import NUMBERS, FogOption, JsonOption
 from fognav.operate.systems import AGGREGATOR, BROKER
@@ -28,30 +29,10 @@ node_app = typer.Typer(help="Add, watch, calibrate and simulate sensor nodes.", 
 
 T = TypeVar("T")
 
-_SITE: Final = "estig"
-
 NameArgument = Annotated[str, typer.Argument(metavar="NODE", help="The node's id: a to z, 0 to 9 and -.")]
-SiteOption = Annotated[Path, typer.Option("--site", metavar="D", help="Folder of the site, or a name in sites/.")]
 BrokerOption = Annotated[
     str | None,
     typer.Option("--broker", metavar="URL", help="mqtt:// or mqtts:// address; default: that of the running demo."),
-]
-OutOption = Annotated[
-    Path,
-    typer.Option("--out", metavar="DIR", help="Where to write node.json; firmware/data is what pio uploads."),
-]
-WifiOption = Annotated[str, typer.Option("--wifi", metavar="NAME", help="Name of the Wi-Fi network.")]
-WifiPasswordOption = Annotated[
-    str, typer.Option("--wifi-password", envvar="FOGNAV_WIFI_PASSWORD", help="Its password; better in the variable.")
-]
-HostOption = Annotated[str, typer.Option("--fog-host", metavar="HOST", help="The fog node's name for the boards.")]
-TlsOption = Annotated[bool, typer.Option("--tls/--no-tls", help="Whether the broker's connections are encrypted.")]
-PasswordsOption = Annotated[
-    Path | None,
-    typer.Option("--passwords", metavar="F", help="Mosquitto's password file, which gets the node's password."),
-]
-ProfileOption = Annotated[
-    Literal["standard", "thesis"], typer.Option("--profile", help="How it is wired: docs/hardware.md draws both.")
 ]
 
 
@@ -60,75 +41,51 @@ ProfileOption = Annotated[
     context_settings=NUMBERS,
     epilog="Example: fognav node add n8 --area z1 --pose 40.0,26.95,1.5708 --site sites/floor --wifi Lab",
 )
-def node_add(  # noqa: PLR0913  # each option is an argument
+@with_board_options
+def node_add(
     name: NameArgument,
     *,
     area: Annotated[str, typer.Option("--area", metavar="Z", help="The area that it watches.")],
     pose: Annotated[str, typer.Option("--pose", metavar="X,Y,THETA", help="Metres, radians; frame of the map.")],
-    wifi: WifiOption,
-    wifi_password: WifiPasswordOption = "",
     height: Annotated[float, typer.Option("--height", metavar="M", help="Above the floor.")] = 0.5,
-    site: SiteOption = Path(_SITE),
-    fog_host: HostOption = "fog.local",
-    tls: TlsOption = True,
-    passwords: PasswordsOption = None,
-    locks: LocksOption = None,
-    profile: ProfileOption = "standard",
-    out: OutOption = Path("firmware/data"),
-    json: JsonOption = False,
+    board: BoardOptions,
 ) -> None:
     """Add a node to a site, and write what its board needs to know.
 
     Its range limits come from the map: the wall opposite, less 0.3 m. Calibrate it when it hangs.
     """
     with exit_codes():
-        loaded = site_file.load(checkout.site_folder(site))
-        target = out / provisioning.SETTINGS_FILE
-        if target.exists():
-            raise WrongUseError(f"{target} already exists: it is another node's. Move it, or name a folder with --out")
+        loaded = site_file.load(checkout.site_folder(board.site))
+        if board.target.exists():
+            raise WrongUseError(
+                f"{board.target} already exists: it is another node's. Move it, or name a folder with --out"
+            )
         if any(node.id == name for node in loaded.site.nodes):
             raise WrongUseError(
                 f"the site has a node {name} already: fognav node replace {name} makes a new board of it"
             )
         _compiled()
         node = _placed(loaded, name, area, _pose(pose), height)
-        access = provisioning.Access(wifi, wifi_password, fog_host, 8883 if tls else 1883, tls)
-        members = provisioning.settings(loaded.site.id, node, access, provisioning.new_password(), profile)
         text = site_file.with_node(loaded, node)
-        provisioning.provision(target, _let_in(members, target, locks), passwords)
+        board.provision(loaded, node)
         site_file.write(loaded, text)
-        _tell_board(json, "added", node, target, passwords)
+        board.report("added", node)
 
 
 @node_app.command("replace", epilog="Example: fognav node replace n3 --site sites/floor --wifi Lab --out board")
-def node_replace(  # noqa: PLR0913  # each option is an argument
-    name: NameArgument,
-    *,
-    wifi: WifiOption,
-    wifi_password: WifiPasswordOption = "",
-    site: SiteOption = Path(_SITE),
-    fog_host: HostOption = "fog.local",
-    tls: TlsOption = True,
-    passwords: PasswordsOption = None,
-    locks: LocksOption = None,
-    profile: ProfileOption = "standard",
-    out: OutOption = Path("firmware/data"),
-    json: JsonOption = False,
-) -> None:
+@with_board_options
+def node_replace(name: NameArgument, *, board: BoardOptions) -> None:
     """Write the settings of a new board for a node of the site, with a new password.
 
     With --passwords the old board's password is worth nothing from the broker's next start on.
     """
     with exit_codes():
-        loaded = site_file.load(checkout.site_folder(site))
+        loaded = site_file.load(checkout.site_folder(board.site))
         node = site_file.node_of(loaded, name)
-        target = out / provisioning.SETTINGS_FILE
-        if (other := provisioning.node_in(target)) not in (None, name):
-            raise WrongUseError(f"{target} is that of node {other}: move it, or name a folder with --out")
-        access = provisioning.Access(wifi, wifi_password, fog_host, 8883 if tls else 1883, tls)
-        members = provisioning.settings(loaded.site.id, node, access, provisioning.new_password(), profile)
-        provisioning.provision(target, _let_in(members, target, locks), passwords)
-        _tell_board(json, "replaced", node, target, passwords)
+        if (other := provisioning.node_in(board.target)) not in (None, name):
+            raise WrongUseError(f"{board.target} is that of node {other}: move it, or name a folder with --out")
+        board.provision(loaded, node)
+        board.report("replaced", node)
 
 
 @node_app.command("list", epilog="Example: fognav node list --json")
@@ -272,7 +229,7 @@ def node_sim(
     seconds: Annotated[
         float | None, typer.Option("--seconds", metavar="S", min=0.1, help="End after this time.")
     ] = None,
-    site: SiteOption = Path(_SITE),
+    site: SiteOption = SITE,
     broker: BrokerOption = None,
     fog: FogOption = None,
 ) -> None:
@@ -392,27 +349,6 @@ def _placed(loaded: LoadedSite, name: str, area: str, pose: tuple[float, float, 
     except (PlacingError, msgspec.ValidationError) as error:
         raise WrongUseError(f"node {name}: {error}") from error
     return node
-
-
-def _let_in(members: dict[str, Any], target: Path, locks: Path | None) -> dict[str, Any]:
-    """Return a board's settings with the password that a site's locks give it, and write beside them whom it trusts."""
-    if (folder := locks_folder(locks)) is None:
-        return members
-    with locks_errors():
-        password, authority = provisioning.let_in(open_locks(folder), members["user"])
-    provisioning.write_authority(target.with_name(provisioning.AUTHORITY_FILE), authority)
-    return {**members, "password": password}
-
-
-def _tell_board(json: bool, verb: str, node: NodeSite, target: Path, passwords: Path | None) -> None:  # noqa: FBT001  # a flag of each command
-    if json:
-        values = {"node": node.id, "file": str(target), "range_limit_m": [sonar.range_limit for sonar in node.sonars]}
-        print_json({**values, "passwords": None if passwords is None else str(passwords)})
-        return
-    limits = " and ".join(f"{sonar.range_limit:.2f}" for sonar in node.sonars)
-    print_line(f"{verb} {node.id} in area {node.area}: blocked below {limits} m")
-    print_line(f"wrote {target}: flash it (firmware/README.md), then: fognav node calibrate {node.id}")
-    print_line("the hazard-aggregator reads the site at its start: restart it")
 
 
 def _with_limits(node: NodeSite, learned: NodeCalibration) -> NodeSite:

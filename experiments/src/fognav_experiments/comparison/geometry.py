@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from fog_contracts.costs import DEFAULT_INFLATION, LETHAL, Inflation
+from fog_contracts.geometry import lengths_along
 from fog_contracts.messages import Pose, RobotGoal
 from fog_contracts.raster import polygon_spans
 from fog_kernels.astar import Planner
@@ -74,7 +75,7 @@ class RouteGeometry:
         way = self._path(self._open, (start.x, start.y), (goal.x, goal.y))
         if way is None:
             return None
-        along = _along(way)
+        along = lengths_along(way)
         if drawn.trigger_m >= along[-1]:
             return Saving(float(along[-1]), float(along[-1]), met=False)
         warned = self._rest(closed, way, drawn.trigger_m, goal.x, goal.y)
@@ -114,13 +115,13 @@ class RouteGeometry:
         """Return the length (m) of the way up to `driven`, and from there on the shortest one at these costs."""
         px, py = _at(way, driven)
         rest = self._path(cost, (px, py), (x, y))
-        return None if rest is None else driven + float(_along(rest)[-1])
+        return None if rest is None else driven + float(lengths_along(rest)[-1])
 
     def _first_sight(self, way: Floats, since: float, polygon: Floats) -> float | None:
         """Return the distance (m) along the way, at least `since`, from which the lidar sees some of an obstacle."""
         outline = _every(np.vstack((polygon, polygon[:1])), _SPACING_M)
         grid = self._site.map.geometry
-        for driven in np.arange(since, _along(way)[-1], _STEP_M):
+        for driven in np.arange(since, lengths_along(way)[-1], _STEP_M):
             x, y = _at(way, float(driven))
             away = outline - (x, y)
             distances = np.hypot(away[:, 0], away[:, 1])
@@ -134,19 +135,13 @@ class RouteGeometry:
         return None
 
 
-def _along(way: Floats) -> Floats:
-    """Return the length (m) from the start to each point of a line (n, 2)."""
-    steps = np.hypot(*np.diff(way, axis=0).T)
-    return np.concatenate(([0.0], np.cumsum(steps)))
-
-
 def _at(way: Floats, driven: float) -> tuple[float, float]:
-    along = _along(way)
+    along = lengths_along(way)
     return float(np.interp(driven, along, way[:, 0])), float(np.interp(driven, along, way[:, 1]))
 
 
 def _every(way: Floats, spacing: float) -> Floats:
     """Return points of a line, `spacing` (m) apart."""
-    along = _along(way)
+    along = lengths_along(way)
     places = np.append(np.arange(0.0, along[-1], spacing), along[-1])
     return np.column_stack((np.interp(places, along, way[:, 0]), np.interp(places, along, way[:, 1])))

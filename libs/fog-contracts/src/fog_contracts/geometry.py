@@ -33,6 +33,14 @@ def sampled(corners: _Floats, spacing: float) -> _Floats:
     return np.concatenate((corners[:1], points))
 
 
+def lengths_along(line: _Floats) -> _Floats:
+    """Return how far (m) each point of a polyline (n, 2) is from its first one, along the line."""
+    if len(line) < 2:
+        return np.zeros(len(line))
+    along: _Floats = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))))
+    return along
+
+
 def signed_area(polygon: Polygon) -> float:
     """Area in m2, positive when the vertices run counter-clockwise (shoelace formula)."""
     return 0.5 * sum(x0 * y1 - x1 * y0 for (x0, y0), (x1, y1) in zip(polygon, [*polygon[1:], polygon[0]], strict=True))

@@ -134,7 +134,11 @@ class MqttEdge:
         Channels without a message type deliver text. `numbers` lists the areas of the thesis's topics, for which MQTT
         has no wildcard.
         """
-        self.subscriptions.add(channel, handler, kind, numbers)
+        self._subscriptions_of(channel).add(channel, handler, kind, numbers)
+
+    def _subscriptions_of(self, _channel: Channel) -> Subscriptions:
+        """Return the subscriptions of the connection that receives a channel."""
+        return self.subscriptions
 
     async def add_number(self, channel: Channel, number: str | int) -> None:
         """Subscribe the handlers of one of the thesis's channels to one more area, now and after every connection.

@@ -8,18 +8,17 @@ behind what it has not read yet.
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 from fog_runtime.access.credentials import NOBODY, Credentials
 from fog_runtime.transports.mqtt_edge import MqttEdge, Will
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Sequence
+    from collections.abc import Callable, Collection, Iterable
 
     from fog_contracts.channels import Channel
-    from fog_contracts.messages import Message
     from fog_runtime.clock import Clock
-    from fog_runtime.transports.mqtt_subscriptions import ForeignHandler, Ids
+    from fog_runtime.transports.mqtt_subscriptions import ForeignHandler, Subscriptions
 
 INPUTS: Final = "mqtt-inputs"
 """The second connection's name: in metrics, and at the end of its client id."""
@@ -57,17 +56,8 @@ class MqttEdgeWithInputs(MqttEdge):
         await super().wait_connected()
         await self._inputs.wait_connected()
 
-    def on(
-        self,
-        channel: Channel,
-        handler: Callable[[Ids, Any], object],
-        kind: type[Message] | None = None,
-        *,
-        numbers: Sequence[str | int] = (),
-    ) -> None:
-        """Call `handler(ids, message)` for each message of the channel; register before `run`."""
-        subscriptions = self._inputs.subscriptions if channel.name in self._channels else self.subscriptions
-        subscriptions.add(channel, handler, kind, numbers)
+    def _subscriptions_of(self, channel: Channel) -> Subscriptions:
+        return self._inputs.subscriptions if channel.name in self._channels else self.subscriptions
 
     async def add_number(self, channel: Channel, number: str | int) -> None:
         """Subscribe the handlers of one of the thesis's channels to one more area."""

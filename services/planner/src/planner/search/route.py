@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from fog_contracts.geometry import sampled
+from fog_contracts.geometry import lengths_along, sampled
 from fog_contracts.grid import GridGeometry, Window
 from fog_contracts.messages import PointXY
 from fog_kernels.lines import leaves, polyline_cost
@@ -37,9 +37,7 @@ class Route:
     @cached_property
     def along(self) -> Floats:
         """Distance (m) along the line of every point."""
-        if len(self.points) < 2:
-            return np.zeros(len(self.points))
-        return np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(self.points, axis=0).T))))
+        return lengths_along(self.points)
 
     @property
     def length(self) -> float:
@@ -61,8 +59,7 @@ class Route:
 
     @cached_property
     def _corner_along(self) -> Floats:
-        steps = np.hypot(*np.diff(self.corners, axis=0).T) if len(self.corners) > 1 else np.zeros(0)
-        return np.concatenate(([0.0], np.cumsum(steps)))
+        return lengths_along(self.corners)
 
     def remaining(self, along: float) -> Floats:
         """Return the polyline from `along` (m) to the end: a point there, then the corners that follow."""

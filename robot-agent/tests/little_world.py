@@ -69,6 +69,7 @@ class LittleWorld:
     seed: int = 1
     lidar_noise: float = 0.01
     start_agent: type = AgentCore
+    wheel_error: float = 0.0  # by how much the encoders count too far, as a share
 
     def __post_init__(self):
         self.static, self.geometry = grid_of(self.rooms, *self.size)
@@ -283,7 +284,7 @@ class LittleWorld:
         self.travelled += math.hypot(nx - self.x, ny - self.y)
         self.x, self.y = nx, ny
         for wheel, speed in enumerate((left, right)):
-            self.ticks[wheel] += speed * DT * (1 + 0.02 * self.rng.standard_normal()) / TICK_M
+            self.ticks[wheel] += speed * DT * (1 + self.wheel_error + 0.02 * self.rng.standard_normal()) / TICK_M
 
     def _scan(self):
         """Cast the beams that the head measures during this step."""

@@ -15,8 +15,11 @@ from fog_kernels import amcl
 from robot_agent.localization.pose import Pose2, wrap
 from robot_agent.localization.scan_match import match_scan
 from robot_agent.localization.uncertainty import Uncertainty, uncertainty
+from robot_agent.localization.unobserved import Along, least_certain, moved_to, observed, shifts_along
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from numpy.typing import NDArray
 
     from robot_agent.config import LocalizationConfig
@@ -42,7 +45,13 @@ _SKIP_SHARE_MAX: Final = 0.6
 _OTHER_CLUSTER: Final = 1.5
 """The estimate moves to another cluster of particles when that weighs this many times as much as its own."""
 _SAME_CLUSTER_M: Final = 0.75
+_ALL_M: Final = 10.0
+"""Size of bins that put the particles of a whole corridor into one cluster: they must not tear it at gaps."""
+_RESAMPLE_BELOW: Final = 0.5
+"""Share of the particles that must carry the weight where scans do not tell how far along a corridor the robot is."""
 _JUMP_M: Final = 1.0
+_JUMP_SIGMAS: Final = 3.0
+"""The estimate jumps when it moves farther than this, and than so many of its standard deviations."""
 _STRAIGHT_RAD: Final = 1e-6
 _GATE: Final = 11.345
 """Squared Mahalanobis distance (0.99 quantile, 3 degrees of freedom) beyond which two poses contradict each other."""
@@ -166,7 +175,7 @@ class ParticleFilter:
         sharpness = self._config.sharpness
         spread = least + (most - least) * self._rng.random((_SPREAD_SAMPLES, 1)) ** 2
         poses = np.array(pose) + self._rng.standard_normal((_SPREAD_SAMPLES, 3)) * spread
-        poses = self._drawn(poses, sharpness * fields.agreements(poses, points, fields.coarse))
+        poses = _drawn(self._rng, poses, sharpness * fields.agreements(poses, points, fields.coarse))
         poses += self._rng.standard_normal(poses.shape) * (_SPREAD_JITTER * least)
         log_weights = _SPREAD_SHARPNESS * sharpness * fields.agreements(poses, points, fields.fine)
         self._spread = None
@@ -175,12 +184,6 @@ class ParticleFilter:
         self._weights /= self._weights.sum()
         self._conclude(scan, fields)
         self._resample(fields, 0.0)
-
-    def _drawn(self, poses: NDArray[np.float64], log_weights: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return as many poses, drawn with low variance by their weights."""
-        cumulated = np.cumsum(np.exp(log_weights - log_weights.max()))
-        targets = (np.arange(len(poses)) + self._rng.random()) * (cumulated[-1] / len(poses))
-        return np.asarray(poses[np.minimum(np.searchsorted(cumulated, targets), len(poses) - 1)])
 
     def _update(self, scan: DeskewedScan, fields: MapFields, *, recover: bool) -> None:
         config = self._config
@@ -191,62 +194,92 @@ class ParticleFilter:
         self._move(scan.odom, max(length / config.update_distance, angle / config.update_angle))
         self._estimate = self.pose(scan.odom)
         self._anchor = scan.odom
-        random_share = self._update_weights(scan, fields)
-        predicted = self._estimate
-        self._conclude(scan, fields)
-        self.jumped = _distance(predicted, self._estimate) > _JUMP_M
+        predicted, reach = self._estimate, max(_JUMP_M, _JUMP_SIGMAS * self.uncertainty.along)
+        log_likelihoods = self._log_likelihoods(scan, fields)
+        kept = self._weigh(log_likelihoods)
+        self._conclude(scan, fields, one_cloud=kept is not None)
+        self.jumped = _distance(predicted, self._estimate) > reach
         # Unknown objects lower the average too: random particles are added only while the pose is not good.
-        self._resample(fields, random_share if recover else 0.0)
+        random_share = self._random_share() if recover else 0.0
+        # Each draw makes the cloud along a plain corridor more ragged: there it waits until few particles carry the
+        # weight (Grisetti, Stachniss and Burgard 2007).
+        if kept is None or random_share or self._effective < _RESAMPLE_BELOW * self.size:
+            self._resample(fields, random_share)
+            if not random_share:
+                self._move_along(kept)
 
     def _move(self, odom: Pose2, steps: float) -> None:
         """Move the particles along the odometry, in steps of the size that the noise is given for."""
-        count = min(max(1, round(steps)), _STEPS_MAX)
-        rot1, trans, rot2 = amcl.odometry_delta(self._anchor, odom)
-        turn = wrap(rot1 + rot2)
-        half = turn / (2.0 * count)
-        # Equal chords of one arc, which the first rotation aims so that they end where the odometry does.
-        aim = rot1 - 0.5 * turn
-        length = trans * math.sin(half) / math.sin(0.5 * turn) if abs(turn) > _STRAIGHT_RAD else trans / count
-        for number in range(count):
-            before = half + (aim if number == 0 else 0.0)
-            after = half - (aim if number == count - 1 else 0.0)
+        for before, length, after in _chords(self._anchor, odom, min(max(1, round(steps)), _STEPS_MAX)):
             amcl.motion_update(self._x, self._y, self._theta, before, length, after, self._config.alphas, self._state)
 
-    def _update_weights(self, scan: DeskewedScan, fields: MapFields) -> float:
-        """Weight the particles by a scan; return the share of random ones that augmented recovery asks for."""
+    def _log_likelihoods(self, scan: DeskewedScan, fields: MapFields) -> NDArray[np.float64]:
+        """Return the logarithms (n) of the particles' likelihoods by a scan, but for a constant; follow their mean."""
         config = self._config
         points = self._explained(scan.beams(config.beams), fields)
-        average = 0.0
+        agreements = np.zeros(self.size)
         if len(points):
             poses = np.column_stack((self._x, self._y, self._theta)).astype(np.float64)
             agreements = fields.agreements(poses, points, fields.fine)
-            average = float(self._weights @ agreements)
-            # AMCL's weight, 1 + sum of p^3, spans one order of magnitude at most and leaves the cloud three times as
-            # wide as need be at this odometry noise. The exponent here is linear in the same sum.
-            self._weights = self._weights * np.exp(config.sharpness * (agreements - agreements.max()))
-            self._weights /= self._weights.sum()
+        average = float(self._weights @ agreements)
         self._slow += (config.recovery_slow if self._slow else 1.0) * (average - self._slow)
         self._fast += (config.recovery_fast if self._fast else 1.0) * (average - self._fast)
+        # AMCL's weight, 1 + sum of p^3, spans one order of magnitude at most and leaves the cloud three times as
+        # wide as need be at this odometry noise. The exponent here is linear in the same sum.
+        return np.asarray(config.sharpness * (agreements - agreements.max()))
+
+    def _weigh(self, log_likelihoods: NDArray[np.float64]) -> Along | None:
+        """Weight the particles; return what they keep along the direction that the scan hardly observes, if any."""
+        before = least_certain(self._x, self._y, self._weights)
+        kept = None
+        if before is not None:
+            kept = observed(before, (self._x, self._y, self._theta), self._weights, log_likelihoods)
+        self._weights = self._weights * np.exp(log_likelihoods)
+        self._weights /= self._weights.sum()
+        self._move_along(kept)
+        return kept
+
+    def _move_along(self, kept: Along | None) -> None:
+        if kept is not None:
+            self._x, self._y = moved_to(kept, self._x, self._y, self._weights)
+
+    @property
+    def _effective(self) -> float:
+        """Number of equally weighted particles that would tell as much."""
+        return 1.0 / float(self._weights @ self._weights)
+
+    def _random_share(self) -> float:
+        """Return the share of random particles that augmented recovery asks for."""
         if self._slow <= 0.0:
             return 0.0
         return min(_RANDOM_SHARE_MAX, max(0.0, 1.0 - self._fast / self._slow))
 
     def _explained(self, points: NDArray[np.float64], fields: MapFields) -> NDArray[np.float64]:
-        """Return the beams (n, 2) without those that end far from every wall: persons and other unknown objects."""
+        """Return the beams (n, 2) without those that end far from every wall: persons and other unknown objects.
+
+        The end of a long corridor is neither, however uncertain it is where the robot will see it.
+        """
         assert self._estimate is not None
-        near = fields.wall_distances(self._estimate.transform(points)) <= _SKIP_M
+        ends = self._estimate.transform(points)
+        near = np.zeros(len(points), np.bool_)
+        for shift in shifts_along(self.covariance):
+            near |= fields.wall_distances(ends + shift) <= _SKIP_M
         return points[near] if near.sum() > (1.0 - _SKIP_SHARE_MAX) * len(points) else points
 
-    def _conclude(self, scan: DeskewedScan, fields: MapFields) -> None:
-        """Estimate pose and covariance from the weighted particles, and refine them by matching the scan."""
-        mean = self._cluster()
+    def _conclude(self, scan: DeskewedScan, fields: MapFields, *, one_cloud: bool = False) -> None:
+        """Estimate pose and covariance from the weighted particles, and refine them by matching the scan.
+
+        one_cloud: the particles are one cloud along a corridor, whatever gaps it has.
+        """
+        mean = self._cluster(one_cloud=one_cloud)
         matched = match_scan(fields, Pose2(mean.x, mean.y, mean.theta), mean.covariance, scan.beams(_MATCH_BEAMS))
         self._estimate, self.covariance = matched
 
-    def _cluster(self) -> amcl.Estimate:
+    def _cluster(self, *, one_cloud: bool) -> amcl.Estimate:
         """Return the cluster of particles around the estimate, or the heaviest one if that weighs clearly more."""
         config = self._config
-        groups = amcl.clusters(self._x, self._y, self._theta, self._weights, config.bin_xy, config.bin_theta)
+        bin_xy = _ALL_M if one_cloud else config.bin_xy
+        groups = amcl.clusters(self._x, self._y, self._theta, self._weights, bin_xy, config.bin_theta)
         heaviest, before = groups[0], self._estimate
         assert before is not None
         for group in groups:
@@ -273,6 +306,29 @@ class ParticleFilter:
             free_xy=fields.free_places if random_share else None,
             jitter=fields.geometry.resolution,
         )
+
+
+def _chords(begin: Pose2, end: Pose2, count: int) -> Iterator[tuple[float, float, float]]:
+    """Yield rotation, translation and rotation (rad, m, rad) of equal chords of one arc between two odometry poses.
+
+    The first rotation aims the arc so that it ends where the odometry does.
+    """
+    rot1, trans, rot2 = amcl.odometry_delta(begin, end)
+    turn = wrap(rot1 + rot2)
+    half = turn / (2.0 * count)
+    aim = rot1 - 0.5 * turn
+    length = trans * math.sin(half) / math.sin(0.5 * turn) if abs(turn) > _STRAIGHT_RAD else trans / count
+    for number in range(count):
+        yield half + (aim if number == 0 else 0.0), length, half - (aim if number == count - 1 else 0.0)
+
+
+def _drawn(
+    rng: np.random.Generator, poses: NDArray[np.float64], log_weights: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return as many poses (n, 3), drawn with low variance by their weights."""
+    cumulated = np.cumsum(np.exp(log_weights - log_weights.max()))
+    targets = (np.arange(len(poses)) + rng.random()) * (cumulated[-1] / len(poses))
+    return np.asarray(poses[np.minimum(np.searchsorted(cumulated, targets), len(poses) - 1)])
 
 
 def _distance(one: Pose2 | None, other: Pose2 | None) -> float:

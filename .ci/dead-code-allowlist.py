@@ -46,6 +46,11 @@ _.on_start  # numba's events
 _.on_end
 _.log_message
 _.pending_calls_threshold  # aiomqtt
+_.ensure_cache_path  # numba: where kernels are kept
+_.get_cache_path
+_.get_source_stamp
+_.get_disambiguator
+KernelLocator
 type_cells  # numba: a name that compiled signatures close over
 _.FACTORY  # bases, lidars, debounce rules and cost layers are found by their entry points
 _.SIGNATURE

@@ -26,6 +26,17 @@ def test_module_newer_than_its_cache_is_stale(tmp_path: Path) -> None:
     assert kernels._stale(tmp_path) == ["ray"]
 
 
+def test_module_that_imports_a_newer_one_is_stale(tmp_path: Path) -> None:
+    (tmp_path / "__pycache__").mkdir()
+    (tmp_path / "steps.py").write_text("LENGTH = 3\n")
+    (tmp_path / "ray.py").write_text("from fog_kernels.steps import LENGTH\n@njit(cache=True)\ndef cast(): ...\n")
+    index = tmp_path / "__pycache__" / "ray.cast-1.py311.nbi"
+    index.touch()
+    assert kernels._stale(tmp_path) == []
+    os.utime(tmp_path / "steps.py", (index.stat().st_mtime + 1.0,) * 2)
+    assert kernels._stale(tmp_path) == ["ray"]
+
+
 def test_progress_without_a_terminal_is_one_line_per_kernel() -> None:
     printed: list[str] = []
     with kernels._progress_display(printed.append) as show:

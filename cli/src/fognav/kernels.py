@@ -12,6 +12,7 @@ from typing import Final
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from fog_kernels.kernel_sources import sources_of
 from fognav.output import console
 
 _WARM_TIMEOUT_S: Final = 900.0
@@ -24,17 +25,22 @@ class KernelsError(RuntimeError):
 
 
 def _stale(folder: Path) -> list[str]:
-    """Return the kernel modules in the package's folder whose cache index is missing or older than their source."""
-    sources = [path for path in folder.glob("*.py") if _COMPILES.search(path.read_text("utf-8"))]
-    indices = list((folder / "__pycache__").glob("*.nbi"))
+    """Return the kernel modules in the package's folder whose cache index is missing or older than their sources."""
     return sorted(
-        source.stem
-        for source in sources
-        if not any(
-            index.name.startswith(f"{source.stem}.") and index.stat().st_mtime >= source.stat().st_mtime
-            for index in indices
-        )
+        module.stem
+        for module in folder.glob("*.py")
+        if _COMPILES.search(module.read_text("utf-8"))
+        and _compiled_at(module) < max(source.stat().st_mtime for source in sources_of(module))
     )
+
+
+def _indices(module: Path) -> list[Path]:
+    """Return numba's indices of a module's compiled kernels."""
+    return list((module.parent / "__pycache__").glob(f"{module.stem}.*.nbi"))
+
+
+def _compiled_at(module: Path) -> float:
+    return max((index.stat().st_mtime for index in _indices(module)), default=0.0)
 
 
 def is_warm() -> bool:

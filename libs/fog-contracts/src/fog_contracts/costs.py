@@ -1,8 +1,7 @@
 """Cost values of costmap cells, their weight on a path, and their inflation.
 
 The values are those of Nav2 (`nav2_costmap_2d/cost_values.hpp`), so that maps can be exchanged with it; the weights are
-those of NavFn. Compiled kernels hold these values as constants, and numba does not notice that an imported constant
-changed: after changing one, delete the kernels' cache (`__pycache__` of `fog_kernels`, or NUMBA_CACHE_DIR).
+those of NavFn. Compiled kernels hold these values as constants: each change compiles the kernels anew.
 
 No arrays here: every process reads its settings with this module, and the guardian starts faster without numpy.
 """

@@ -6,9 +6,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numba import types
+from numba.core import config
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
+
+# Before any kernel is compiled: each one's module imports this one first. numba's settings are no declared names.
+vars(config)["CACHE_LOCATOR_CLASSES"] = (
+    "fog_kernels.kernel_cache.KernelLocator,UserProvidedCacheLocator,InTreeCacheLocator,UserWideCacheLocator,"
+    "IPythonCacheLocator,ZipCacheLocator"
+)
 
 # Inputs are declared read-only, so that arrays made by np.frombuffer fit as well as writable ones.
 U8_GRID = types.Array(types.uint8, 2, "C", readonly=True)

@@ -1,0 +1,68 @@
+"""Where numba keeps compiled kernels, and when they are out of date.
+
+numba compiles a kernel anew when its own module has changed. But a kernel holds what it calls and the constants that it
+uses, whichever module they come from: here, a change of any module that the kernel's module imports makes it compile
+anew, too. numba finds this module by the name that `_arrays` gives it.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Protocol
+
+from numba.core import caching
+
+from fog_kernels.kernel_sources import digest_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+_PACKAGE: Final = Path(__file__).parent
+_CHOICES: Final[tuple[Any, ...]] = (
+    caching.UserProvidedCacheLocator,
+    caching.InTreeCacheLocator,
+    caching.UserWideCacheLocator,
+)
+"""numba's own, in its order."""
+
+
+class _Locator(Protocol):
+    """What numba asks for the place of one kernel."""
+
+    def ensure_cache_path(self) -> None: ...
+    def get_cache_path(self) -> str: ...
+    def get_disambiguator(self) -> str: ...
+
+
+class KernelLocator:
+    """numba's own place for a kernel, with a stamp of all of the kernel's sources."""
+
+    def __init__(self, own: _Locator, file: Path) -> None:
+        """`own`: the locator that numba would choose."""
+        self._own = own
+        self._py_file = str(file)  # numba names it in its warnings
+
+    @classmethod
+    def from_function(cls, py_func: Callable[..., Any], py_file: str) -> KernelLocator | None:
+        """Return the locator of a function of this package; None for another's, which numba locates by itself."""
+        file = Path(py_file)
+        if file.parent != _PACKAGE or not file.exists():
+            return None
+        own = next((found for choice in _CHOICES if (found := choice.from_function(py_func, py_file))), None)
+        return None if own is None else cls(own, file)
+
+    def ensure_cache_path(self) -> None:
+        """Make the folder; raises `OSError` if it can't be written."""
+        self._own.ensure_cache_path()
+
+    def get_cache_path(self) -> str:
+        """Return the folder of the compiled kernels."""
+        return self._own.get_cache_path()
+
+    def get_source_stamp(self) -> bytes:
+        """Return what must be the same for a compiled kernel to be used."""
+        return digest_of(Path(self._py_file))
+
+    def get_disambiguator(self) -> str:
+        """Return what tells kernels of one name apart."""
+        return self._own.get_disambiguator()

@@ -1,0 +1,91 @@
+"""Compiled kernels that are kept are used as long as nothing changes that they were compiled from, and no longer."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from compiler import compiled_only
+
+import fog_kernels
+from fog_kernels.kernel_sources import digest_of, sources_of
+
+FACTOR = "FACTOR = {}\n"
+CALLED = """
+from numba import int64, njit
+
+from fog_kernels import _arrays
+
+@njit(int64(int64), cache=True)
+def added(value):
+    return value + {}
+"""
+CALLING = """
+from numba import int64, njit
+
+from fog_kernels import _arrays, factor
+from fog_kernels.called import (
+    added,
+)
+
+TIMES = factor.FACTOR
+
+@njit(int64(int64), cache=True)
+def calling(value):
+    return TIMES * added(value)
+"""
+RUN = "from fog_kernels import warm\nfrom fog_kernels.calling import calling\nprint(calling(1), warm.cache_misses())"
+
+
+@pytest.fixture
+def package(tmp_path: Path) -> Path:
+    """A copy of the package, without its kernels, and with a kernel that calls one of another module."""
+    source, copy = Path(fog_kernels.__file__).parent, tmp_path / "fog_kernels"
+    copy.mkdir()
+    for name in ("__init__", "_arrays", "kernel_cache", "kernel_sources", "warm"):
+        shutil.copy(source / f"{name}.py", copy)
+    (copy / "factor.py").write_text(FACTOR.format(10))
+    (copy / "called.py").write_text(CALLED.format(1))
+    (copy / "calling.py").write_text(CALLING)
+    return copy
+
+
+def run(package: Path) -> tuple[int, int]:
+    """Return the kernel's result in a new process, and how many kernels were compiled."""
+    environment = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
+    environment["PYTHONPATH"] = str(package.parent)
+    done = subprocess.run(
+        [sys.executable, "-c", RUN], env=environment, capture_output=True, text=True, timeout=60, check=True
+    )
+    result, compiled = done.stdout.split()
+    return int(result), int(compiled)
+
+
+@compiled_only
+def test_kernel_is_compiled_anew_when_what_it_calls_or_a_constant_of_another_module_changes(package: Path) -> None:
+    assert run(package) == (20, 2)
+    assert run(package) == (20, 0)
+    (package / "called.py").write_text(CALLED.format(2))
+    assert run(package) == (30, 2)
+    (package / "factor.py").write_text(FACTOR.format(100))
+    assert run(package) == (300, 1)
+    assert run(package) == (300, 0)
+
+
+def test_sources_are_those_imported_directly_and_by_way_of_others() -> None:
+    folder = Path(fog_kernels.__file__).parent
+    names = {f"{source.parent.name}/{source.stem}" for source in sources_of(folder / "astar.py")}
+    assert {"fog_kernels/astar", "fog_kernels/_arrays", "fog_kernels/flood", "fog_kernels/steps"} < names
+    assert "fog_contracts/costs" in names
+    assert not {"fog_kernels/dwa", "fog_kernels/amcl", "fog_kernels/warm"} & names
+
+
+def test_digest_does_not_depend_on_the_folder(package: Path, tmp_path: Path) -> None:
+    moved = tmp_path / "elsewhere" / "fog_kernels"
+    shutil.copytree(package, moved)
+    assert digest_of(moved / "calling.py") == digest_of(package / "calling.py")
+    assert digest_of(moved / "called.py") != digest_of(package / "calling.py")

@@ -335,6 +335,21 @@ SENSORS: Final = Dashboard(
                     ),
                 ),
                 Panel(
+                    "Silence of each node",
+                    "Time since its last reading. They come 8 to 10 times a second.",
+                    (("fognav_node_silence_seconds", "{{node}} of {{area}}"),),
+                    unit="s",
+                ),
+                Panel(
+                    "Nodes that are not believed",
+                    "Nothing is known from them: they are silent, or flap.",
+                    (
+                        ("fognav_node_unknown", "{{node}} of {{area}}: unknown"),
+                        ("fognav_node_flapping", "{{node}} of {{area}}: flaps"),
+                    ),
+                    "states",
+                ),
+                Panel(
                     "Readings that do not count",
                     "In a second, by node and reason.",
                     (

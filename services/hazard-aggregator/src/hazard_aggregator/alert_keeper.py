@@ -1,4 +1,7 @@
-"""Keeps the alerts: evaluates them once a second, publishes them, and stores them with their history."""
+"""Keeps the alerts: evaluates them once a second, publishes them, and stores them with their history.
+
+The metrics of nodes follow the same reports.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +17,7 @@ from fog_runtime import logs
 from fog_runtime.clock import ticker
 from fog_runtime.stores.redis_connection import StoreRefusedError
 from hazard_aggregator.areas.alerts import AlertEvent, Alerts
+from hazard_aggregator.node_metrics import NodeMetrics
 from hazard_aggregator.store import StoreError
 
 if TYPE_CHECKING:
@@ -44,6 +48,7 @@ class AlertKeeper:
         self._edges = edges
         self._leading = leading
         self._alerts = Alerts()
+        self._nodes = NodeMetrics()
         self._events: deque[AlertEvent] = deque(maxlen=_QUEUE)
         self._loaded = False
         self._epoch = -1
@@ -84,6 +89,7 @@ class AlertKeeper:
         self._alerts, self._loaded, self._epoch = Alerts(), False, -1
         self._events.clear()
         ALERTS.clear()
+        self._nodes.show(())
 
     async def _load(self) -> None:
         if self._loaded:
@@ -98,9 +104,9 @@ class AlertKeeper:
 
     def _evaluate(self) -> None:
         at, before = self._edges.now(), self._alerts.active()
-        events = self._alerts.update(
-            self._core.definitions(), self._core.announced(), self._core.node_reports(at.now), at
-        )
+        reports = self._core.node_reports(at.now)
+        self._nodes.show(reports)
+        events = self._alerts.update(self._core.definitions(), self._core.announced(), reports, at)
         for event in events:
             _log.info(f"alert_{event.action}", alert=event.alert.id, reason=event.alert.reason)
         self._events += events

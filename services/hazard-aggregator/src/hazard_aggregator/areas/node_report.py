@@ -17,6 +17,7 @@ class NodeReport:
     """Health of a node; `age` is the time (s) since its last reading, None before the first one.
 
     `penalty` is the area's cost while this node or source alone is blocked; None: the area is impassable then.
+    `flapping`: it is unknown because it changed too often.
     """
 
     id: str
@@ -28,6 +29,7 @@ class NodeReport:
     received: int
     ignored: int
     penalty: int | None = None
+    flapping: bool = False
 
 
 def node_reports(areas: Iterable[WatchedArea], now: float) -> list[NodeReport]:
@@ -43,6 +45,7 @@ def node_reports(areas: Iterable[WatchedArea], now: float) -> list[NodeReport]:
             received=node.received,
             ignored=node.ignored,
             penalty=node.penalty,
+            flapping=node.state == "unknown" and node.flaps.flapping,
         )
         for area in areas
         for node in area.nodes.values()

@@ -1,0 +1,42 @@
+"""What Prometheus is told of each node: unknown, silent, flapping; nothing of a node that is gone."""
+
+import pytest
+from prometheus_client import REGISTRY
+
+from hazard_aggregator.areas.node_report import NodeReport
+from hazard_aggregator.node_metrics import NodeMetrics
+
+
+def report(node, state="clear", age=0.1, *, flapping=False) -> NodeReport:
+    return NodeReport(node, "hall", state, "", online=True, age=age, received=9, ignored=0, flapping=flapping)
+
+
+def metric(name: str, node: str) -> float | None:
+    return REGISTRY.get_sample_value(f"fognav_node_{name}", {"area": "hall", "node": node})
+
+
+@pytest.fixture
+def metrics():
+    shown = NodeMetrics()
+    yield shown
+    shown.show(())
+
+
+def test_node_is_unknown_silent_or_flapping(metrics):
+    metrics.show([report("n1"), report("n2", "unknown", 40.0), report("n3", "unknown", flapping=True)])
+    found = [[metric(name, node) for name in ("unknown", "silence_seconds", "flapping")] for node in ("n1", "n2", "n3")]
+    assert found == [[0, 0.1, 0], [1, 40.0, 0], [1, 0.1, 1]]
+
+
+def test_node_without_a_reading_has_no_silence(metrics):
+    metrics.show([report("n1", "unknown", None)])
+    assert (metric("unknown", "n1"), metric("silence_seconds", "n1")) == (1, None)
+    metrics.show(())
+    assert metric("unknown", "n1") is None
+
+
+def test_metrics_of_a_node_that_is_gone_are_removed(metrics):
+    metrics.show([report("n1"), report("n2")])
+    metrics.show([report("n2")])
+    assert [metric(name, "n1") for name in ("unknown", "silence_seconds", "flapping")] == [None, None, None]
+    assert metric("unknown", "n2") == 0

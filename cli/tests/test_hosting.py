@@ -13,13 +13,16 @@ from pathlib import Path
 import pytest
 
 from fog_runtime import backup
+from fog_runtime.backup_archive import STAMP, BackupError
 from fog_runtime.stores.redis_connection import RedisConnection
-from fognav.hosting import log_files, restoring, running, unit
+from fog_supervisor.supervisor import Program, Supervisor
+from fognav.hosting import backups, local_nodes, log_files, running, settings, unit
 from fognav.hosting.floors import hosted_sites
 from fognav.hosting.folders import FORMAT, NodeFolder, default_data
+from fognav.hosting.lock_changes import LockChanges
 from fognav.hosting.node import LocalNode, NodeConfig
 from fognav.locking import locks_errors
-from fognav.operate.registry import Registration, registered
+from fognav.operate.registry import Registration, System, registered
 from fognav.output import FailedError, WrongUseError
 
 ESTIG = Path(__file__).parents[2] / "sites" / "estig"
@@ -196,23 +199,98 @@ def connected(place: backup.Place) -> RedisConnection:
     return RedisConnection(place.redis_url, timeout_s=10.0, credentials=place.credentials)
 
 
-async def test_backup_is_restored_into_a_node_that_is_down(node, tmp_path):
-    site, folder, file = tmp_path / "site", node.config.folder, tmp_path / "fog.tar.gz"
-    shutil.copytree(ESTIG, site)
-    async with restoring.redis_of(folder, "estig", site) as place:
-        redis = connected(place)
-        await redis.write(("SET", "fog:estig:zones", "wet floor"))
-        await redis.aclose()
-        await backup.create(file, place, 1.0)
-    token = (folder.keys("estig") / "admin.token").read_text()
-    for lost in (folder.data("redis"), folder.keys("estig"), site):
-        shutil.rmtree(lost)
-    with folder.in_use(), pytest.raises(FailedError, match="fognav down"):
-        await restoring.restore(file, folder, site, replace=False)
-    await restoring.restore(file, folder, site, replace=False)
-    assert (folder.keys("estig") / "admin.token").read_text() == token
-    assert (site / "site.toml").read_bytes() == (ESTIG / "site.toml").read_bytes()
-    async with restoring.redis_of(folder, "estig", site) as place:
-        redis = connected(place)
-        assert await redis.read("GET", "fog:estig:zones") == b"wet floor"
-        await redis.aclose()
+async def test_backup_of_each_floor_is_restored_on_an_empty_machine(tmp_path, upstairs):
+    floors = {"estig": shutil.copytree(ESTIG, tmp_path / "site"), "upstairs": upstairs}
+    folder = NodeFolder(tmp_path / "data")
+    hosted_sites(list(floors.values()), folder.locks, ["localhost", "127.0.0.1"])
+    settings.remember(folder.path, settings.settings_of(floors, "127.0.0.1", [], simulate=False))
+    tokens = {}
+    for floor, directory in floors.items():
+        tokens[floor] = (folder.keys(floor) / "admin.token").read_text()
+        async with backups.redis_of(folder, floor, directory) as place:
+            redis = connected(place)
+            await redis.write(("SET", f"fog:{floor}:zones", f"wet floor of {floor}"))
+            await redis.aclose()
+        await backups.create(tmp_path / f"{floor}.tar.gz", folder, directory)
+    with pytest.raises(WrongUseError, match="name one of the sites"):
+        await backups.create(tmp_path / "both.tar.gz", folder, None)
+    assert (folder.data("upstairs.map-service") / STAMP).exists()
+    authority = (folder.locks / "authority.pem").read_bytes()
+    robot = (folder.locks / "credentials" / "upstairs" / "r1.toml").read_bytes()
+
+    empty = NodeFolder(tmp_path / "empty")
+    for floor, original in floors.items():
+        file, directory = tmp_path / f"{floor}.tar.gz", tmp_path / "restored" / floor
+        with empty.in_use(), pytest.raises(FailedError, match="fognav down"):
+            await backups.restore(file, empty, directory, replace=False)
+        await backups.restore(file, empty, directory, replace=False)
+        assert (directory / "site.toml").read_bytes() == (original / "site.toml").read_bytes()
+        assert (empty.keys(floor) / "admin.token").read_text() == tokens[floor]
+        async with backups.redis_of(empty, floor, directory) as place:
+            redis = connected(place)
+            assert await redis.read("GET", f"fog:{floor}:zones") == f"wet floor of {floor}".encode()
+            await redis.aclose()
+    assert (empty.locks / "authority.pem").read_bytes() == authority
+    assert (empty.locks / "credentials" / "upstairs" / "r1.toml").read_bytes() == robot
+    with pytest.raises(BackupError, match="nothing was changed"):
+        await backups.restore(tmp_path / "estig.tar.gz", empty, tmp_path / "restored" / "estig", replace=False)
+
+
+def hosted(name: str, pid: int, data: Path) -> System:
+    return System(name=name, kind="fog node", site="estig", urls={}, pids={"up": pid}, data=str(data))
+
+
+def test_one_of_several_nodes_is_named_by_site_or_data(tmp_path, monkeypatch):
+    one, other = tmp_path / "one", tmp_path / "other"
+    systems = [hosted("fog-estig", 1, one), hosted("fog-upstairs", 1, one), hosted("fog-estig", 2, other)]
+    monkeypatch.setattr(local_nodes, "registered", lambda: systems)
+    assert local_nodes.named_node("fog-upstairs", None).pid == 1
+    assert local_nodes.named_node(None, other).pid == 2
+    for name in (None, "fog-estig"):
+        with pytest.raises(WrongUseError, match=f"--data {other}"):
+            local_nodes.named_node(name, None)
+    with pytest.raises(WrongUseError, match="no such fog node runs, only"):
+        local_nodes.named_node("fog-cellar", None)
+    systems[:] = systems[:2]
+    assert local_nodes.named_node(None, None).names == ["fog-estig", "fog-upstairs"]
+    systems.clear()
+    assert local_nodes.named_node("fog-estig", None) is None
+
+
+def test_start_of_a_node_is_remembered_with_its_options_and_ports(tmp_path, monkeypatch):
+    monkeypatch.setenv("FOGNAV_MAP_PORT", "9002")
+    made = settings.settings_of({"estig": ESTIG}, "127.0.0.2", ["fog.local"], simulate=True)
+    settings.remember(tmp_path, made)
+    found = settings.recall(tmp_path)
+    assert found == made
+    assert found.arguments == ["--site", str(ESTIG), "--bind", "127.0.0.2", "--host", "fog.local", "--sim"]
+    assert found.environment["FOGNAV_MAP_PORT"] == "9002"
+    (tmp_path / settings.FILE).write_text("{")
+    with pytest.raises(FailedError, match="start it once"):
+        settings.recall(tmp_path)
+
+
+async def test_changed_locks_reach_their_program_alone_and_once(tmp_path):
+    shell = 'trap "echo told" HUP; echo started; while :; do sleep 0.02; done'
+    folders = {name: tmp_path / name for name in ("mosquitto", "zenoh-router", "planner")}
+    logs = {name: tmp_path / f"{name}.log" for name in folders}
+    async with Supervisor(lambda _: None) as supervisor:
+        for name, folder in folders.items():
+            folder.mkdir()
+            (folder / "users").write_text("somebody")
+            supervisor.add(Program(name=name, arguments=("/bin/sh", "-c", shell), log=logs[name]))
+            supervisor.start(name)
+        await until(lambda: all(log.exists() and log.read_text() for log in logs.values()))
+        changes = LockChanges(supervisor, {name: [folder] for name, folder in folders.items()})
+        assert await changes.round() is None
+        (folders["mosquitto"] / "users").write_text("n8")
+        (folders["zenoh-router"] / "users").write_text("r2")
+        assert [await changes.round() for _ in range(4)] == [None, "mosquitto", "zenoh-router", None]
+        await until(lambda: logs["mosquitto"].read_text() == "started\ntold\n")
+        await until(lambda: logs["zenoh-router"].read_text() == "started\nstarted\n")
+        (folders["planner"] / "server.pem").write_text("half")
+        assert await changes.round() is None
+        (folders["planner"] / "server.pem").write_text("whole")
+        assert [await changes.round() for _ in range(2)] == [None, "planner"]
+        await until(lambda: logs["planner"].read_text() == "started\nstarted\n")
+        assert logs["mosquitto"].read_text() == "started\ntold\n"

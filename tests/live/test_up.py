@@ -4,6 +4,8 @@ import json
 import os
 import shutil
 import signal
+import socket
+import struct
 import subprocess
 import sys
 import time
@@ -95,7 +97,43 @@ def require_refused(node: Node, data: Path, reason: str) -> None:
     assert reason in again.stderr
 
 
-def test_zone_survives_a_killed_service_and_a_restart_of_the_node(node):
+def admitted(port: int, user: str, password: str) -> bool:
+    """Whether the broker accepts a connection (MQTT 3.1.1, sections 3.1 and 3.2)."""
+
+    def text(words: str) -> bytes:
+        return struct.pack(">H", len(words)) + words.encode()
+
+    packet = text("MQTT") + struct.pack(">BBH", 4, 0xC2, 30) + text("test") + text(user) + text(password)
+    with (
+        socket.create_connection(("127.0.0.1", port), timeout=10) as plain,
+        net.unverified().wrap_socket(plain) as connection,
+    ):
+        connection.sendall(bytes((0x10, len(packet))) + packet)
+        return connection.recv(4) == b"\x20\x02\x00\x00"
+
+
+def require_new_node_and_robot_admitted(node: Node, folder: Path) -> None:
+    """Add a node and a robot to a running fog node, of which only the router may notice."""
+    site, board = shutil.copytree(ROOT / "sites" / "estig", folder / "site"), folder / "board"
+    before = node.systems()["estig"]["pids"]
+    locks = ("--locks", str(node.data / "locks"))
+    place = ("--area", "z1", "--pose", "40.0,26.95,1.5708")
+    node.run("node", "add", "n8", *place, "--wifi", "Lab", "--site", str(site), "--out", str(board), *locks)
+    node.wait(lambda: "changed: mosquitto uses" in node.printed.read_text(), "the broker knows the node")
+    password = json.loads((board / "node.json").read_bytes())["password"]
+    port = int(node.environment["FOGNAV_MQTT_PORT"])
+    node.wait(lambda: admitted(port, "n8", password), "the node is admitted")
+    assert not admitted(port, "n8", "wrong")
+    assert node.systems()["estig"]["pids"] == before
+
+    node.run("robot", "add", "r2", *locks)
+    node.wait(lambda: "changed: zenoh-router uses" in node.printed.read_text(), "the router knows the robot")
+    node.wait(lambda: "planner/estig" in (node.systems()["estig"]["connected"] or []), "it is connected again")
+    after = node.systems()["estig"]["pids"]
+    assert {name for name, pid in after.items() if before[name] != pid} == {"zenoh-router"}
+
+
+def test_zone_survives_a_killed_service_and_a_restart_of_the_node(node, tmp_path):
     node.up()
     (system,) = node.systems().values()
     assert set(system["connected"]) >= {"map-service/estig", "planner/estig", "hazard-aggregator/estig"}
@@ -108,14 +146,10 @@ def test_zone_survives_a_killed_service_and_a_restart_of_the_node(node):
     assert "wet floor" in node.run("zone", "list")
     assert "settings_loaded" in node.run("logs", "map-service", "-n", "1000")
 
+    require_new_node_and_robot_admitted(node, tmp_path)
+
     backup = node.data / "fog.tar.gz"
-    node.environment["FOGNAV_CREDENTIALS_FILE"] = str(node.data / "locks" / "credentials" / "administrator.toml")
-    redis = f"rediss://127.0.0.1:{node.environment['FOGNAV_REDIS_PORT']}/0"
-    saved = node.run(
-        "backup", str(backup), "--redis", redis, "--site", "sites/estig",
-        "--secrets", str(node.data / "keys" / "estig"), "--data", str(node.data / "data" / "map-service"),
-    )  # fmt: skip
-    del node.environment["FOGNAV_CREDENTIALS_FILE"]
+    saved = node.run("backup", str(backup), "--up", str(node.data))
     assert "backed up site estig" in saved
     node.run("zone", "add", "--circle", "80,20,1", "--reason", "after the backup")
     restoring = ("restore", str(backup), "--site", "sites/estig", "--up", str(node.data), "--replace")

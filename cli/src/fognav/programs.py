@@ -42,7 +42,7 @@ MODULES: Final[Mapping[str, str]] = {
     AGENT: "robot_agent",
 }
 """The Python module of each program that is ours."""
-_LOCKS: Final[Mapping[str, str]] = {BROKER: "mosquitto", REDIS: "redis", ROUTER: "zenoh"}
+LOCKS: Final[Mapping[str, str]] = {BROKER: "mosquitto", REDIS: "redis", ROUTER: "zenoh"}
 """The folder of each server's locks (`fog_runtime.locks.site_locks`)."""
 _FOLDERS: Final = ("logs", "ports", "data")
 
@@ -90,7 +90,7 @@ def server_programs(
 
     Raises `ServerError` when one is not installed.
     """
-    at = {name: locks(_LOCKS[name]) for name in SERVERS}
+    at = {name: locks(LOCKS[name]) for name in SERVERS}
     return (
         servers.mosquitto_program(folder.data(BROKER), ports.mqtt, address=ports.address, locks=at[BROKER]),
         servers.redis_program(folder.data(REDIS), ports.redis, locks=at[REDIS]),

@@ -2,8 +2,10 @@
 
 import asyncio
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated
 
 import typer
 
@@ -16,65 +18,91 @@ from fognav.output import FailedError, WrongUseError, check_writable, exit_codes
 
 FileArgument = Annotated[Path, typer.Argument(metavar="FILE", help="The backup, a tar.gz that only you can read.")]
 RedisOption = Annotated[str, typer.Option("--redis", envvar="FOGNAV_REDIS_URL", help="Redis of the fog node.")]
-SiteOption = Annotated[Path, typer.Option("--site", envvar="FOGNAV_SITE_DIR", help="The site's folder.")]
+SiteOption = Annotated[Path | None, typer.Option("--site", envvar="FOGNAV_SITE_DIR", help="The site's folder.")]
 SecretsOption = Annotated[
     Path | None, typer.Option("--secrets", help="Folder of tokens, keys and certificates; default: no secrets.")
 ]
-_DATA: Final = typer.Option(
-    "--data", envvar="FOGNAV_DATA_DIR", help="The services' data folder: notes when the backup was."
-)
-DataOption = Annotated[Path, _DATA]
+DataOption = Annotated[
+    Path | None,
+    typer.Option("--data", envvar="FOGNAV_DATA_DIR", help="The services' data folder: notes when the backup was."),
+]
+UpOption = Annotated[
+    Path | None,
+    typer.Option("--up", metavar="DIR", help="Data of a node of `fognav up`; instead of --data, --redis, --secrets."),
+]
 ReplaceOption = Annotated[bool, typer.Option("--replace", help="Replace what is there already.")]
 
 
-def backup_command(
+def backup_command(  # each option is an argument
     file: FileArgument,
     *,
-    site: SiteOption,
-    data: DataOption,
+    site: SiteOption = None,
+    data: DataOption = None,
     redis: RedisOption = "redis://127.0.0.1:6379/0",
     secrets: SecretsOption = None,
+    up: UpOption = None,
 ) -> None:
     """Back up a fog node into one file, while it runs."""
-    with exit_codes():
+    with exit_codes(), _backup_errors():
         check_writable(file)
-        try:
-            place = _place(redis, load_site(site).site.id, site, secrets, data)
-            _report("backed up", asyncio.run(backup.create(file, place, time.time())), file)
-        except (BackupError, CredentialsError, SiteError, ValueError) as error:
-            raise FailedError(str(error)) from error
+        if up is not None:
+            made = _create_of_node(file, up, site)
+        else:
+            folder = _required(site, "--site")
+            place = _place(redis, load_site(folder).site.id, folder, secrets, _required(data, "--data"))
+            made = asyncio.run(backup.create(file, place, time.time()))
+        _report("backed up", made, file)
 
 
 def restore_command(  # noqa: PLR0913  # each option is an argument
     file: FileArgument,
     *,
-    site: SiteOption,
-    data: Annotated[Path | None, _DATA] = None,
+    site: SiteOption = None,
+    data: DataOption = None,
     redis: RedisOption = "redis://127.0.0.1:6379/0",
     secrets: SecretsOption = None,
-    up: Annotated[
-        Path | None,
-        typer.Option("--up", metavar="DIR", help="A node of `fognav up`; instead of --data, --redis, --secrets."),
-    ] = None,
+    up: UpOption = None,
     replace: ReplaceOption = False,
 ) -> None:
     """Restore a backup; stop the services before. Everything is checked before anything is changed."""
-    with exit_codes(), locks_errors():
+    with exit_codes(), _backup_errors():
+        folder = _required(site, "--site")
+        if up is not None:
+            made = _restore_into_node(file, up, folder, replace=replace)
+        else:
+            place = _place(redis, read_archive(file).site, folder, secrets, _required(data, "--data"))
+            made = asyncio.run(backup.restore(file, place, replace=replace))
+        _report("restored", made, file)
+
+
+@contextmanager
+def _backup_errors() -> Iterator[None]:
+    """Turn errors of backups into those of commands."""
+    with locks_errors():
         try:
-            if up is not None:
-                _report("restored", _restore_into_node(file, up, site, replace=replace), file)
-                return
-            if data is None:
-                raise WrongUseError("name the services' data folder (--data), or that of `fognav up` (--up)")
-            place = _place(redis, read_archive(file).site, site, secrets, data)
-            _report("restored", asyncio.run(backup.restore(file, place, replace=replace)), file)
-        except (BackupError, CredentialsError, ValueError) as error:
+            yield
+        except WrongUseError:
+            raise
+        except (BackupError, CredentialsError, SiteError, ValueError) as error:
             raise FailedError(str(error)) from error
 
 
+def _required(folder: Path | None, option: str) -> Path:
+    if folder is None:
+        raise WrongUseError(f"name a folder with {option}; or the data folder of `fognav up` with --up")
+    return folder
+
+
+def _create_of_node(file: Path, up: Path, site: Path | None) -> Backup:
+    from fognav.hosting.backups import create  # noqa: PLC0415  # keeps the other commands fast
+    from fognav.hosting.folders import NodeFolder  # noqa: PLC0415  # same
+
+    return asyncio.run(create(file, NodeFolder(up), site))
+
+
 def _restore_into_node(file: Path, up: Path, site: Path, *, replace: bool) -> Backup:
-    from fognav.hosting.folders import NodeFolder  # noqa: PLC0415  # keeps the other commands fast
-    from fognav.hosting.restoring import restore  # noqa: PLC0415  # same
+    from fognav.hosting.backups import restore  # noqa: PLC0415  # keeps the other commands fast
+    from fognav.hosting.folders import NodeFolder  # noqa: PLC0415  # same
 
     return asyncio.run(restore(file, NodeFolder(up), site, replace=replace))
 

@@ -11,7 +11,6 @@ import typer
 
 from fognav import checkout, kernels, system
 from fognav.locking import locks_errors, own_hosts
-from fognav.operate.registry import registered
 from fognav.output import FailedError, exit_codes, print_line
 
 if TYPE_CHECKING:
@@ -19,8 +18,6 @@ if TYPE_CHECKING:
 
 _STOP_S: Final = 60.0
 _POLL_S: Final = 0.05
-_KIND: Final = "fog node"
-_UP: Final = "up"
 
 SitesOption = Annotated[
     list[Path] | None,
@@ -74,30 +71,41 @@ def up_command(  # noqa: PLR0913  # each option is an argument
             raise FailedError(str(error)) from error
         folder = NodeFolder(path)
         with folder.in_use():
-            _run(folders, folder, bind, [*own_hosts(), *(host or [])], sim=sim)
+            _run(folders, folder, bind, host or [], sim=sim)
 
 
 def _run(folders: list[Path], folder: "NodeFolder", bind: str, hosts: list[str], *, sim: bool) -> None:
     from fognav.hosting.floors import hosted_sites  # noqa: PLC0415  # keeps the other commands fast
     from fognav.hosting.node import NodeConfig  # noqa: PLC0415  # same
     from fognav.hosting.running import run_node  # noqa: PLC0415  # same
+    from fognav.hosting.settings import remember, settings_of  # noqa: PLC0415  # same
 
-    sites, locks = hosted_sites(folders, folder.locks, hosts)
+    sites, locks = hosted_sites(folders, folder.locks, [*own_hosts(), *hosts])
     config = NodeConfig(folder=folder, sites=sites, locks=locks, address=bind, simulate=sim)
+    remember(folder.path, settings_of({site.id: site.directory for site in sites}, bind, hosts, simulate=sim))
     asyncio.run(run_node(config, print_line))
 
 
-def down_command() -> None:
-    """End the fog node of `fognav up`; its data stays."""
+def down_command(
+    name: Annotated[
+        str | None, typer.Argument(metavar="NAME", help="As in fognav status, where several nodes run.")
+    ] = None,
+    *,
+    data: DataOption = None,
+) -> None:
+    """End the fog node of `fognav up`, with all its sites; its data stays, and other nodes of yours go on."""
+    from fognav.hosting.local_nodes import named_node  # noqa: PLC0415  # keeps the other commands fast
+
     with exit_codes():
-        pids = {each.pids[_UP] for each in registered() if each.kind == _KIND and _UP in each.pids}
-        if not pids:
+        node = named_node(name, data)
+        if node is None:
             print_line("no fog node of yours runs on this machine without containers")
-        for pid in pids:
-            _end(pid)
+        else:
+            end_node(node.pid)
 
 
-def _end(pid: int) -> None:
+def end_node(pid: int) -> None:
+    """End a fog node by the process that runs the others; raises `FailedError` if it does not end."""
     try:
         process = psutil.Process(pid)
         process.terminate()
@@ -124,10 +132,11 @@ def logs_command(
     """Show the logs of the fog node of `fognav up`."""
     from fognav.hosting import log_files  # noqa: PLC0415  # keeps the other commands fast
     from fognav.hosting.folders import default_data  # noqa: PLC0415  # same
+    from fognav.hosting.local_nodes import named_node  # noqa: PLC0415  # same
 
     with exit_codes():
-        running = next((each.data for each in registered() if each.kind == _KIND and each.data), None)
-        folder = (data or (Path(running) if running else default_data())) / "logs"
+        running = None if data else named_node(None, None)
+        folder = (data or (running.data if running else default_data())) / "logs"
         files = {file.stem: file for file in sorted(folder.glob("*.log"))}
         if unknown := [each for each in name or [] if each not in files]:
             raise FailedError(

@@ -8,6 +8,7 @@ from typing import Final
 from fog_runtime.configuration.site import LoadedSite, SiteError, load_site
 from fog_runtime.locks.site_locks import CREDENTIALS, SiteLocks
 from fog_runtime.locks.users import on_floor
+from fognav.hosting.folders import LOCKS_FILE
 from fognav.operate.systems import SERVICE_PORTS, port
 from fognav.output import WrongUseError
 
@@ -54,7 +55,7 @@ def hosted_sites(folders: Sequence[Path], locks: Path, hosts: Sequence[str]) -> 
     """
     loaded = _load(folders)
     first = next(iter(loaded))
-    known = SiteLocks.open(locks).sites if (locks / "locks.json").exists() else [first]
+    known = SiteLocks.open(locks).sites if (locks / LOCKS_FILE).exists() else [first]
     made = SiteLocks(locks, known[0])
     own = loaded.get(known[0])
     made.make(hosts, robots=_robots(own), nodes=_nodes(own))

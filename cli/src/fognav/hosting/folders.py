@@ -20,6 +20,8 @@ FORMAT: Final = 1
 """Incremented when an older `fognav up` could not use what a newer one has written."""
 _FORMAT_FILE: Final = "format"
 _LOCK: Final = "in-use"
+LOCKS_FILE: Final = "locks.json"
+"""What the folder of locks has once they were made."""
 
 
 def default_data() -> Path:
@@ -57,6 +59,15 @@ class NodeFolder(SystemFolder):
         except FileExistsError as error:
             raise FailedError(str(error)) from error
         return folder
+
+    def used(self) -> bool:
+        """Whether a fog node runs with this data now."""
+        with (self.path / _LOCK).open("w") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            except BlockingIOError:
+                return True
+        return False
 
     @contextmanager
     def in_use(self) -> Iterator[None]:

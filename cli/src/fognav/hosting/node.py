@@ -16,12 +16,16 @@ from fog_supervisor import net
 from fog_supervisor.supervisor import Event, Supervisor
 from fognav.hosting.floors import HostedSite
 from fognav.hosting.folders import NodeFolder
+from fognav.hosting.local_nodes import KIND, UP
+from fognav.hosting.lock_changes import LockChanges
+from fognav.hosting.settings import REDIS_PORT
 from fognav.operate.registry import System
 from fognav.operate.systems import MQTTS_PORT, ZENOH_PORT, port
 from fognav.output import WrongUseError
 from fognav.programs import (
     AGENT,
     BROKER,
+    LOCKS,
     MODULES,
     PLANNER,
     REDIS,
@@ -39,11 +43,6 @@ from fognav.programs import (
     simulator_settings,
 )
 
-KIND: Final = "fog node"
-REDIS_PORT: Final = ("FOGNAV_REDIS_PORT", 6380)
-"""Not 6379, where a Redis of the operating system listens."""
-UP: Final = "up"
-"""The name of the process that runs the others."""
 _HARDWARE: Final = {"BASE": DEFAULT_BASE, "LIDAR": DEFAULT_LIDAR}
 
 
@@ -111,6 +110,17 @@ class LocalNode:
             for name in names:
                 self.supervisor.start(name)
             await self.supervisor.wait_ready(names, timeout_s)
+
+    def lock_changes(self) -> LockChanges:
+        """Watch the files of every server's and service's locks."""
+        locks = self.config.locks
+        servers: dict[str, list[Path]] = {name: [locks.folder(folder)] for name, folder in LOCKS.items()}
+        services = {
+            site.name(service): [locks.folder("http"), locks.credentials(site.name(service))]
+            for site in self.config.sites
+            for service in SERVICES
+        }
+        return LockChanges(self.supervisor, servers | services)
 
     def system(self, site: HostedSite) -> System:
         """Return a site's part of the fog node as it is now."""

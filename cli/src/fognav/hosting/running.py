@@ -40,8 +40,8 @@ class Troubles:
             self._lasting.discard(trouble)
 
 
-async def run_node(config: NodeConfig, print_line: Callable[[str], None]) -> None:
-    """Run a fog node until a signal, then end all its programs.
+async def run_node(config: NodeConfig, print_line: Callable[[str], None], *, check: bool = False) -> None:
+    """Run a fog node until a signal, or with `check` until everything is ready; then end all its programs.
 
     Raises `FailedError` when a port is taken, `NotReadyError` when a program does not become ready, and as `LocalNode`.
     """
@@ -74,7 +74,8 @@ async def run_node(config: NodeConfig, print_line: Callable[[str], None]) -> Non
                     each.update()
                 await node.start(READY_S)
                 _announce(node, print_line)
-                await attend(node, registrations, say)
+                if not check:
+                    await attend(node, registrations, say)
     except asyncio.CancelledError:
         if not stopped:
             raise
@@ -95,7 +96,11 @@ async def attend(node: LocalNode, registrations: list[Registration], print_line:
     manager = ServiceManager()
     manager.ready()
     troubles = Troubles(print_line)
+    changes = node.lock_changes()
     while True:
+        with troubles.told("changed locks are not in force"):
+            if (changed := await changes.round()) is not None:
+                print_line(f"the locks have changed: {changed} uses the new ones")
         for site, each in zip(node.config.sites, registrations, strict=True):
             with troubles.told(f"the entry of site {site.id} in the register is not current"):
                 each.update()

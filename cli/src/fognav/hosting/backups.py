@@ -1,0 +1,106 @@
+"""Backs up and restores a fog node of `fognav up`: one file for each site, with the locks of all.
+
+A backup may be made while the node runs. It is restored while the node is down, on an empty machine, too; only its
+Redis runs meanwhile.
+"""
+
+import asyncio
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Final
+
+from fog_runtime import backup
+from fog_runtime.access.credentials import Credentials
+from fog_runtime.backup_archive import Backup, read_archive
+from fog_runtime.files import atomic_write
+from fog_runtime.locks.site_locks import SiteLocks
+from fog_runtime.locks.users import REDIS_ADMINISTRATOR, on_floor
+from fog_supervisor import net, servers
+from fog_supervisor.supervisor import Event, Supervisor
+from fognav.hosting.folders import LOCKS_FILE, NodeFolder
+from fognav.hosting.settings import REDIS_PORT, recall
+from fognav.output import WrongUseError
+from fognav.programs import MAP_SERVICE, REDIS, ProgramSet
+
+LOCKS: Final = "locks"
+_READY_S: Final = 60.0
+
+
+def site_of(folder: NodeFolder, directory: Path | None) -> tuple[str, Path]:
+    """Return id and folder of a node's site, of its only one without `directory`.
+
+    Raises `WrongUseError` if there is none or several, and as `recall`.
+    """
+    sites = {site: Path(path) for site, path in recall(folder.path).sites.items()}
+    found = {site: path for site, path in sites.items() if directory is None or path == directory.resolve()}
+    if len(found) != 1:
+        known = ", ".join(map(str, sites.values()))
+        raise WrongUseError(
+            f"name one of the sites of {folder.path} with --site: {known}. Each has a backup of its own"
+        )
+    return next(iter(found.items()))
+
+
+async def create(file: Path, folder: NodeFolder, directory: Path | None) -> Backup:
+    """Back up a site of a node, which may be running; raises as `site_of`, `redis_of` and `backup.create`."""
+    site, path = site_of(folder, directory)
+    async with _redis(folder, site, path) as place:
+        return await backup.create(file, place, time.time())
+
+
+async def restore(file: Path, folder: NodeFolder, directory: Path, *, replace: bool) -> Backup:
+    """Restore a backup of one site, whose folder is to be `directory`, while the node is down.
+
+    Raises `FailedError` while it runs, `BackupError`, and as `redis_of`.
+    """
+    with folder.in_use():
+        archive = await asyncio.to_thread(read_archive, file)
+        if not (folder.locks / LOCKS_FILE).exists():
+            # Redis needs them to start; where there are none, nothing is replaced.
+            for name, content in archive.folders.get(LOCKS, {}).items():
+                atomic_write(folder.locks / name, content.data, mode=content.mode)
+        async with redis_of(folder, archive.site, directory) as place:
+            return await backup.restore(file, place, replace=replace)
+
+
+@asynccontextmanager
+async def _redis(folder: NodeFolder, site: str, directory: Path) -> AsyncIterator[backup.Place]:
+    """Yield the place of a site of a node that runs, or else run its Redis."""
+    if folder.used():
+        port = recall(folder.path).ports[REDIS_PORT[0]]
+        yield _place(folder, site, directory, f"rediss://{net.LOOPBACK}:{port}/0")
+        return
+    with folder.in_use():
+        async with redis_of(folder, site, directory) as place:
+            yield place
+
+
+@asynccontextmanager
+async def redis_of(folder: NodeFolder, site: str, directory: Path) -> AsyncIterator[backup.Place]:
+    """Run the Redis of a fog node that is down; yield the place of a site of it, whose folder is `directory`.
+
+    Raises `LocksError` without the node's locks, `CredentialsError`, `ServerError` and `NotReadyError`.
+    """
+    program = servers.redis_program(
+        folder.data(REDIS), net.free_port(), locks=SiteLocks.open(folder.locks).folder("redis")
+    )
+    supervisor = Supervisor(_ignore)
+    ProgramSet(supervisor, folder, {}).add_server(program)
+    async with supervisor:
+        supervisor.start(REDIS)
+        await supervisor.wait_ready([REDIS], _READY_S)
+        yield _place(folder, site, directory, program.url)
+
+
+def _place(folder: NodeFolder, site: str, directory: Path, redis: str) -> backup.Place:
+    locks = SiteLocks.open(folder.locks)
+    credentials = Credentials.read(locks.credentials(REDIS_ADMINISTRATOR))
+    folders = {backup.SITE: directory, backup.SECRETS: folder.path / "keys" / site, LOCKS: folder.locks}
+    service = MAP_SERVICE if site == locks.sites[0] else on_floor(site, MAP_SERVICE)
+    return backup.Place(redis, site, folders, folder.data(service), credentials)
+
+
+def _ignore(_: Event) -> None:
+    """Leave out what happens to Redis: if it does not become ready, `NotReadyError` says why."""

@@ -364,10 +364,23 @@ def test_no_process_is_root_or_has_a_capability_or_can_write_to_its_image(sim: P
         assert "Read-only file system" in refused, f"{service}: {refused}"
 
 
-@pytest.mark.parametrize(("service", "program"), [("planner", "python -m planner"), ("sim-robot", "-m robot_agent")])
+@pytest.mark.parametrize(
+    ("service", "program"),
+    [
+        ("planner", r"python -m planner"),
+        ("map-service", r"python -m map_service"),
+        ("hazard-aggregator", r"python -m hazard_aggregator"),
+        ("zenoh", r"python -m fog_runtime\.router .*"),
+        ("mosquitto", r"mosquitto .*"),
+        ("redis", r"redis-server .*"),
+        ("gateway", r"caddy run .*"),
+        ("prometheus", r"prometheus .*"),
+        ("sim-robot", r"-m robot_agent"),
+    ],
+)
 def test_container_whose_program_hangs_is_unhealthy_until_it_goes_on(sim: Project, service: str, program: str) -> None:
     found = docker("top", sim.containers()[service]["Id"], "-eo", "pid,args").splitlines()[1:]
-    pid = min(int(line.split()[0]) for line in found if line.endswith(program))
+    pid = min(int(line.split()[0]) for line in found if re.search(f"{program}$", line))
     os.kill(pid, signal.SIGSTOP)
     try:
         wait(lambda: None if health(sim, service) == "unhealthy" else f"the {service} calls itself healthy", 60)

@@ -61,7 +61,7 @@ def node(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capture
 def test_each_program_gets_its_own_files(node):
     assert node.files("mosquitto") == {"server.pem", "server.key", "users", "access", "authority.pem", "mosquitto_sub"}
     assert node.files("redis") == {"server.pem", "server.key", "users", "authority.pem", "health"}
-    assert node.files("zenoh") == {"server.pem", "server.key", "users", "access.json5"}
+    assert node.files("zenoh") == {"server.pem", "server.key", "users", "access.json5", "health.toml"}
     assert node.files("gateway") == {"server.pem", "server.key"}
     assert node.files("map-service") == node.files("hazard-aggregator") == {"credentials.toml", "tokens.toml"}
     assert node.files("planner") == {"credentials.toml", "tokens.toml", "operator.key"}
@@ -163,6 +163,15 @@ def test_locks_of_another_site_are_refused(node, tmp_path, monkeypatch):
     (other / "site.toml").write_text(text.replace('id = "estig"', 'id = "annex"', 1), "utf-8")
     monkeypatch.setenv("FOGNAV_SITE_DIR", str(other))
     assert "has the locks of site estig, not of annex" in node.refused()
+
+
+def test_locks_of_a_version_that_did_not_check_the_router_get_its_password(node):
+    file = SiteLocks.open(node.locks).credentials("health")
+    text = file.read_text()
+    file.write_text("".join(line for line in text.splitlines(keepends=True) if not line.startswith("zenoh = ")))
+    node.run()
+    password = Credentials.read(node.out / "zenoh" / "health.toml").passwords["zenoh"]
+    assert f"health:{password}" in (node.out / "zenoh" / "users").read_text().splitlines()
 
 
 def test_rights_in_redis_are_those_of_this_version(node):

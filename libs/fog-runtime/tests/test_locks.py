@@ -16,7 +16,8 @@ from fog_runtime.clock import SystemClock
 from fog_runtime.leases.lease_store import LeaseStore
 from fog_runtime.locks import users
 from fog_runtime.locks.authority import Authority, AuthorityError
-from fog_runtime.locks.site_locks import LocksError, SiteLocks
+from fog_runtime.locks.members import LocksError
+from fog_runtime.locks.site_locks import SiteLocks
 from fog_runtime.router import RouterLocks, RouterLocksError
 from fog_runtime.stores.redis_connection import RedisConnection, StoreError
 from fog_runtime.stores.redis_store import RedisStore

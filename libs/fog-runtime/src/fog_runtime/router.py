@@ -1,11 +1,13 @@
 """A zenoh router process: `python -m fog_runtime.router --listen tcp/127.0.0.1:7447`.
 
 With `--certificate` and `--key` it encrypts (`--listen tls/…`), with `--users` it admits only these, and with
-`--access` each of them may only do what that list allows.
+`--access` each of them may only do what that list allows. With `--health-port` it says at `/readyz` of this computer
+whether it answers its clients (`router_health`).
 """
 
 import argparse
 import asyncio
+import contextlib
 import json
 import secrets
 from collections.abc import Sequence
@@ -16,6 +18,8 @@ import zenoh
 
 from fog_runtime import logs, process
 from fog_runtime.access.credentials import Credentials
+from fog_runtime.health import serve_health
+from fog_runtime.router_health import RouterHealth
 from fog_runtime.transports.zenoh_edge import session_config
 
 _log = logs.get("router")
@@ -69,16 +73,39 @@ class RouterLocks:
         return config
 
 
-async def run_router(listen: Sequence[str], connect: Sequence[str] = (), locks: RouterLocks | None = None) -> None:
+@dataclass(frozen=True, kw_only=True)
+class HealthPort:
+    """Where a router says whether it answers: a port of this computer, and as whom it asks itself."""
+
+    port: int
+    credentials: Path | None = None
+
+    def health(self, listen: str) -> RouterHealth:
+        """Return the health of a router that listens there; raises `CredentialsError`."""
+        protocol, _, rest = listen.partition("/")
+        port = rest.partition("?")[0].rpartition(":")[2]
+        return RouterHealth(f"{protocol}/localhost:{port}", Credentials.read(self.credentials))
+
+
+async def run_router(
+    listen: Sequence[str],
+    connect: Sequence[str] = (),
+    locks: RouterLocks | None = None,
+    health_port: HealthPort | None = None,
+) -> None:
     """Route between the clients of the endpoints `listen`, and those of the routers `connect`, until cancelled.
 
     Routers at `connect` need not be up yet. Without `locks` everybody is admitted. Raises `zenoh.ZError` if an endpoint
-    of `listen` is taken, and as `RouterLocks.config`.
+    of `listen` is taken, `OSError` if the port of its health is, and as `RouterLocks.config`.
     """
+    health = None if health_port is None else health_port.health(listen[0])
     session = await asyncio.to_thread(zenoh.open, (locks or RouterLocks()).config(listen, connect))
     try:
         _log.info("listening", endpoints=list(listen), zid=str(session.zid()))
-        await asyncio.get_running_loop().create_future()
+        with contextlib.ExitStack() as stack:
+            if health_port is not None and health is not None:
+                stack.enter_context(serve_health(health, port=health_port.port))
+            await asyncio.get_running_loop().create_future()
     finally:
         await asyncio.to_thread(session.close)
 
@@ -92,6 +119,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     for option, what in _LOCKS.items():
         parser.add_argument(option, type=Path, metavar="FILE", help=what)
+    parser.add_argument("--health-port", type=int, metavar="PORT", help="of this computer, where /readyz is served")
+    parser.add_argument("--health-credentials", type=Path, metavar="FILE", help="as whom it asks itself for /readyz")
     parser.add_argument("--log-level", default="info", choices=["debug", "info", "warning", "error"])
     parser.add_argument("--log-format", default="json", choices=["json", "text"])
     options = parser.parse_args(arguments)
@@ -99,7 +128,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if (options.certificate is None) != (options.key is None):
         parser.error("--certificate and --key belong together")
     locks = RouterLocks(**{option.removeprefix("--"): getattr(options, option.removeprefix("--")) for option in _LOCKS})
-    process.run(lambda: run_router(options.listen, options.connect, locks))
+    health = None
+    if options.health_port is not None:
+        health = HealthPort(port=options.health_port, credentials=options.health_credentials)
+    process.run(lambda: run_router(options.listen, options.connect, locks, health))
 
 
 if __name__ == "__main__":

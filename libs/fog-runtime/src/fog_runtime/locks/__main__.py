@@ -24,7 +24,8 @@ from fog_runtime.configuration.site import SiteError, load_site
 from fog_runtime.keys import TOKENS, make_keys
 from fog_runtime.locks.authority import AuthorityError
 from fog_runtime.locks.handing_out import hand_out
-from fog_runtime.locks.site_locks import LocksError, SiteLocks
+from fog_runtime.locks.members import LocksError
+from fog_runtime.locks.site_locks import SiteLocks
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -1,8 +1,8 @@
 """Which files of a site's locks each program of a fog node gets: in a folder of its own, which only it can read.
 
     mosquitto/  server.pem server.key users access authority.pem mosquitto_sub     the last two: its check of health
-    redis/      server.pem server.key users authority.pem health
-    zenoh/      server.pem server.key users access.json5
+    redis/      server.pem server.key users authority.pem health                   as above
+    zenoh/      server.pem server.key users access.json5 health.toml               the last one: as above
     gateway/    server.pem server.key
     hazard-aggregator/, map-service/, planner/    credentials.toml tokens.toml, the planner also operator.key
     simulation/ operator.key token credentials/NAME.toml                           of a simulated robot and its nodes
@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from fog_runtime.access.credentials import Credentials
+from fog_runtime.access.credentials import Credentials, to_toml
 from fog_runtime.access.token_file import create_token, read_tokens, revoke_token, token_hash
 from fog_runtime.files import atomic_write
 from fog_runtime.keys import OPERATOR_KEY, TOKENS
@@ -79,10 +79,11 @@ def _contents(
     check = _BROKER_CHECK.format(folder=seen_as, user=users.HEALTH, password=health["mqtt"])
     tokens = (locks.directory / TOKENS).read_bytes()
     key = (locks.directory / OPERATOR_KEY).read_bytes()
+    router_check = to_toml(users.HEALTH, authority=trusted.decode(), passwords={"zenoh": health["zenoh"]})
     found = {
         "mosquitto": {**_folder(locks, "mosquitto"), "authority.pem": trusted, "mosquitto_sub": check.encode()},
         "redis": {**_folder(locks, "redis"), "authority.pem": trusted, "health": health["redis"].encode()},
-        "zenoh": _folder(locks, "zenoh"),
+        "zenoh": {**_folder(locks, "zenoh"), "health.toml": router_check.encode()},
         "gateway": _folder(locks, "http"),
     }
     for service in users.SERVICES:

@@ -16,23 +16,22 @@ user hands out its file; here it may be removed then.
 from __future__ import annotations
 
 import datetime as dt
-import re
 import stat
 from typing import TYPE_CHECKING, Final, Self
 
 import msgspec
 
-from fog_contracts.channels import ROLES
 from fog_contracts.generate.mqtt_acl import mqtt_acl
 from fog_contracts.generate.zenoh_acl import zenoh_acl
-from fog_runtime.access.credentials import Credentials, Server, to_toml
+from fog_runtime.access.credentials import SERVERS, Credentials, Server, to_toml
 from fog_runtime.files import PRIVATE, atomic_write
 from fog_runtime.locks import users
 from fog_runtime.locks.authority import SERVER_DAYS, Authority, expiry
+from fog_runtime.locks.members import LocksError, Members, require_own_topics
 from fog_runtime.locks.server_files import ANYBODY, ServerFiles, user_of
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
 _PLAN: Final = "locks.json"
@@ -42,8 +41,6 @@ PROGRAMS: Final = ("mosquitto", "redis", "zenoh", "http")
 """The folders of what has a certificate."""
 CERTIFICATE, KEY, ACCESS = "server.pem", "server.key", "access"
 _RENEW_BEFORE: Final = dt.timedelta(days=SERVER_DAYS // 3)
-_DEVICE_TOPIC: Final = re.compile(r"(?!fog/)[\w.-]+/(?:(?:[\w.-]+|\+)/)*(?:[\w.-]+|\+|#)", re.ASCII)
-"""No topic of one level, such as the thesis's, and none of Fognav's own."""
 _PROGRAM_OF: Final[Mapping[Server, str]] = {"mqtt": "mosquitto", "zenoh": "zenoh", "redis": "redis"}
 
 
@@ -54,10 +51,6 @@ class _Plan(msgspec.Struct, frozen=True):
     mode: int = PRIVATE
     floors: list[str] = []
     devices: dict[str, list[str]] = {}
-
-
-class LocksError(ValueError):
-    """Locks can't be made or changed so; the message names the file and the remedy."""
 
 
 class SiteLocks:
@@ -106,10 +99,9 @@ class SiteLocks:
         self.renew(wanted, only_due=wanted == known_hosts)
         own: dict[str, Sequence[Server]] = {**users.SERVICES, **users.TOOLS, **users.THESIS}
         own[users.REDIS_ADMINISTRATOR] = ("redis",)
-        own[users.HEALTH] = users.HEALTH_SERVERS
+        own[users.HEALTH] = SERVERS
         own |= dict.fromkeys(self._plan.unrestricted, ("mqtt", "zenoh"))
-        missing = {user: servers for user, servers in own.items() if not self.credentials(user).exists()}
-        self._set_users(missing | self._not_yet_admitted(robots, nodes))
+        self._set_users(_without_passwords(own, self.credentials) | self._not_yet_admitted(robots, nodes))
         self._write_rights_in_redis()
         self._write_access()
 
@@ -122,15 +114,14 @@ class SiteLocks:
         if site not in self.sites:
             self._save(msgspec.structs.replace(self._plan, floors=[*self._plan.floors, site]))
         own = {users.on_floor(site, name): servers for name, servers in {**users.SERVICES, **users.TOOLS}.items()}
-        missing = {user: servers for user, servers in own.items() if not self.credentials(user).exists()}
         members = ([users.on_floor(site, each) for each in kind] for kind in (robots, nodes))
-        self._set_users(missing | self._not_yet_admitted(*members))
+        self._set_users(_without_passwords(own, self.credentials) | self._not_yet_admitted(*members))
         self._write_access()
 
     def _not_yet_admitted(self, robots: Sequence[str], nodes: Sequence[str]) -> dict[str, Sequence[Server]]:
-        self._require_different_ids(robots, nodes)
+        self._members.require_different_ids(robots, nodes)
         for member in (*robots, *nodes):
-            self._require_free_name(member)
+            self._members.require_free_name(member)
         # The credentials of robots and nodes need not stay here.
         handed_out: dict[str, Sequence[Server]] = dict.fromkeys(robots, ("zenoh",))
         handed_out |= dict.fromkeys(nodes, ("mqtt",))
@@ -140,6 +131,10 @@ class SiteLocks:
     @property
     def _files(self) -> ServerFiles:
         return ServerFiles(self._folder, self._plan.mode)
+
+    @property
+    def _members(self) -> Members:
+        return Members(self._files, unrestricted=self._plan.unrestricted, devices=self._plan.devices)
 
     @property
     def directory(self) -> Path:
@@ -171,12 +166,12 @@ class SiteLocks:
 
     def add_robot(self, robot: str) -> Path:
         """Let a robot in, or give it a new password; return its credentials. Raises `LocksError`."""
-        self._require_different_ids([robot], [])
+        self._members.require_different_ids([robot], [])
         return self._add(robot, ("zenoh",))
 
     def add_node(self, node: str) -> Path:
         """Let a sensor node in, or give it a new password; return its credentials. Raises `LocksError`."""
-        self._require_different_ids([], [node])
+        self._members.require_different_ids([], [node])
         return self._add(node, ("mqtt",))
 
     def add_device(self, device: str, topics: Sequence[str]) -> Path:
@@ -184,13 +179,8 @@ class SiteLocks:
 
         One that is known gets a new password and these topics. Returns its credentials. Raises `LocksError`.
         """
-        for topic in topics:
-            if not _DEVICE_TOPIC.fullmatch(topic):
-                raise LocksError(
-                    f"{device} can't have the topic {topic!r}: name one of its own with two levels at least, such as "
-                    "zigbee2mqtt/#, of letters, digits, '_', '.' and '-', and none below fog/"
-                )
-        self._require_free_name(device)
+        require_own_topics(device, topics)
+        self._members.require_free_name(device)
         if device in self.users() - set(self._plan.devices):
             raise LocksError(f"{device} is a robot or node already: give the device another name")
         self._save(msgspec.structs.replace(self._plan, devices={**self._plan.devices, device: list(topics)}))
@@ -201,7 +191,7 @@ class SiteLocks:
 
         Returns whether there was one. Raises `LocksError` for a part of Fognav.
         """
-        self._require_free_name(user)
+        self._members.require_free_name(user)
         found = False
         for program in _PROGRAM_OF.values():
             lines = self._files.lines(program)
@@ -254,15 +244,14 @@ class SiteLocks:
         changed = []
         for file in sorted((self._folder / CREDENTIALS).rglob("*.toml")):
             known = Credentials.read(file)
-            text = to_toml(
-                known.user, authority=self.authority.trusted, passwords=known.passwords, token=known.token
-            )  # fmt: skip
+            trusted = self.authority.trusted
+            text = to_toml(known.user, authority=trusted, passwords=known.passwords, token=known.token)
             atomic_write(file, text.encode(), mode=stat.S_IMODE(file.stat().st_mode))
             changed.append(file)
         return changed
 
     def _add(self, user: str, servers: Sequence[Server]) -> Path:
-        self._require_free_name(user)
+        self._members.require_free_name(user)
         self._set_users({user: servers})
         self._write_access()
         return self.credentials(user)
@@ -305,39 +294,25 @@ class SiteLocks:
     def _write_access(self) -> None:
         """Write what each user may do; robots and nodes are the users who have no role."""
         plan = self._plan
-        nodes = {floor: self._members("mosquitto", floor) for floor in plan.floors}
-        robots = {floor: self._members("zenoh", floor) for floor in plan.floors}
+        nodes = {floor: self._members.of("mosquitto", floor) for floor in plan.floors}
+        robots = {floor: self._members.of("zenoh", floor) for floor in plan.floors}
         access = mqtt_acl(plan.site, unrestricted=plan.unrestricted, floors=nodes, devices=plan.devices)
         self._files.write("mosquitto", ACCESS, access)
-        own = self._members("zenoh", "")
+        own = self._members.of("zenoh", "")
         access = zenoh_acl(plan.site, own, unrestricted=plan.unrestricted, floors=robots)
         self._files.write("zenoh", f"{ACCESS}.json5", access)
-
-    def _members(self, program: str, floor: str) -> list[str]:
-        """Return the users of a program who are no part of Fognav, by their names on a floor (or the first site)."""
-        members = [user for user in self._files.members(program) if not self._is_reserved(user)]
-        return [name for own, name in map(users.of_floor, members) if own == floor]
-
-    def _require_different_ids(self, robots: Sequence[str], nodes: Sequence[str]) -> None:
-        known_nodes, known_robots = (set(self._files.members(each)) for each in ("mosquitto", "zenoh"))
-        taken = set(robots) & ({*nodes} | known_nodes) | set(nodes) & (known_robots | {*self._plan.devices})
-        if taken := {user for user in taken if not self._is_reserved(user)}:
-            raise LocksError(
-                f"{', '.join(sorted(taken))}: a robot, a node and a device of one site need different ids, since each "
-                "is a user of its servers: rename one of them"
-            )
-
-    def _require_free_name(self, user: str) -> None:
-        if self._is_reserved(user):
-            raise LocksError(f"{user} is the name of a part of Fognav: give the robot, node or device another id")
-
-    def _is_reserved(self, user: str) -> bool:
-        parts = {*ROLES, users.REDIS_ADMINISTRATOR, users.HEALTH, ANYBODY}
-        return users.of_floor(user)[1] in parts or user in self._plan.unrestricted
 
 
 def _read_plan(folder: Path) -> _Plan:
     return msgspec.json.decode((folder / _PLAN).read_bytes(), type=_Plan)
+
+
+def _without_passwords(
+    own: Mapping[str, Sequence[Server]], file_of: Callable[[str], Path]
+) -> dict[str, Sequence[Server]]:
+    """Return who of these lacks a password; other versions may have made the credentials that are there."""
+    known = {user: Credentials.read(file).passwords for user in own if (file := file_of(user)).exists()}
+    return {user: servers for user, servers in own.items() if not set(servers) <= set(known.get(user, ()))}
 
 
 def _now() -> dt.datetime:

@@ -37,8 +37,7 @@ THESIS: Final[Mapping[str, Sequence[Server]]] = {"thesis-node": ("mqtt",), "thes
 """Nodes and robots of the master's thesis, of the first site only: its topics name no site."""
 REDIS_ADMINISTRATOR: Final = "administrator"
 HEALTH: Final = "health"
-"""Who asks broker and Redis whether they are well, and may do nothing else."""
-HEALTH_SERVERS: Final[Sequence[Server]] = ("mqtt", "redis")
+"""Who asks broker, router and Redis whether they are well, and may do nothing else."""
 _COMMANDS: Final = (
     "+get +set +setrange +del +hget +hset +hdel +hgetall +hlen +hincrby +xadd +xdel +xrange +xrevrange +pttl"
     " +eval +multi +exec +wait +ping +config|get +client|setname +client|id +hello +auth +select"

@@ -25,6 +25,7 @@ SOURCES = sorted({path.parent for path in ROOT.glob("*/src/*/__init__.py")} | {
 EDGES = {
     "fog_runtime",
     "fog_supervisor",
+    "fognav_experiments.comparison.agreement",
     "fognav_experiments.comparison.publish", "fognav_experiments.comparison.records",
     "fognav_experiments.comparison.report", "fognav_experiments.comparison.runner",
     "fognav_experiments.comparison.trial", "fognav_experiments.cpu", "fognav_experiments.gaps",
@@ -35,7 +36,8 @@ EDGES = {
     "fognav.demo.background", "fognav.demo.operator", "fognav.demo.options", "fognav.demo.placement",
     "fognav.demo.preparation", "fognav.demo.presence", "fognav.demo.report", "fognav.demo.run", "fognav.demo.scene",
     "fognav.demo.usage", "fognav.demo.view", "fognav.doctor", "fognav.film", "fognav.generated", "fognav.kernels",
-    "fognav.locking", "fognav.operate", "fognav.output", "fognav.page.app", "fognav.hosting", "fognav.programs",
+    "fognav.live_drive", "fognav.locking", "fognav.operate", "fognav.output", "fognav.page.app", "fognav.hosting",
+    "fognav.programs",
     "fognav.pytest_progress", "fognav.recording", "fognav.localization", "fognav.map_picture", "fognav.mutation",
     "fognav.nodes.board_options", "fognav.nodes.on_broker", "fognav.nodes.provisioning", "fognav.nodes.simulated",
     "fognav.nodes.site_file", "fognav.nodes.updating", "fognav.stack", "fognav.stack_doors", "fognav.system",

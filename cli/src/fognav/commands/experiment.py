@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path  # noqa: TC003  # Typer reads annotations at run time
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final, TypeVar
 
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -13,12 +13,14 @@ from fognav.operate.options import JsonOption  # noqa: TC001  # Typer reads anno
 from fognav.output import NOT_TRUE, WrongUseError, console, exit_codes, print_json, print_line
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from fog_contracts.messages import ProfileName
-    from fognav_experiments.comparison.records import Folder, Record
-    from fognav_experiments.comparison.runner import Task
+    from fognav_experiments.comparison.measured import MeasuredDrive
+    from fognav_experiments.comparison.records import DriveFiles, Record
     from fognav_experiments.scenarios.stage import Played
+
+    D = TypeVar("D", Record, MeasuredDrive)
 
 experiment_app = typer.Typer(help="Compare setups as the thesis did, and play scenarios.")
 
@@ -39,18 +41,27 @@ def experiment_command(  # noqa: PLR0913  # each option is an argument
     only: Annotated[int | None, typer.Option("--only", metavar="RUN", min=1, help="Only this run.")] = None,
     jobs: Annotated[int, typer.Option("--jobs", metavar="N", min=1, help="Drives at the same time.")] = 1,
     site: Annotated[Path | None, typer.Option("--site", metavar="DIR", help="Site with experiment.toml.")] = None,
+    live: Annotated[bool, typer.Option("--live", help="Drive by real processes, with real brokers.")] = False,
+    speed: Annotated[float, typer.Option("--speed", metavar="X", min=0.1, help="Of --live: times real time.")] = 1.0,
+    cpu_quota: Annotated[
+        float | None,
+        typer.Option("--cpu-quota", metavar="SHARE", min=0.01, max=4.0, help="Of --live: the robot's share of a core."),
+    ] = None,
 ) -> None:
-    """Repeat the thesis's experiment in lockstep: one drive per run, route and setup.
+    """Repeat the thesis's experiment in lockstep, or by real processes: one drive per run, route and setup.
 
     A run is the routes of the site's experiment.toml. On each a drawn watched area is blocked at a drawn moment, the
     same for all setups. Each drive is one file, so a run that was killed goes on where it was when the command is
-    repeated. CPU times are worth comparing when nothing runs beside: --jobs 1. The exit code is 1 if a drive failed.
+    repeated. CPU times are worth comparing when nothing runs beside: --jobs 1. Drives of --live stand beside those in
+    lockstep, and the report compares them. The exit code is 1 if a drive failed.
     """
     if context.invoked_subcommand is not None:
         return
     from fog_runtime.configuration.site import SiteError, load_site  # noqa: PLC0415  # keeps the other commands fast
     from fognav.bench import machine  # noqa: PLC0415  # same
+    from fognav.live_drive import LiveOptions, live_drives  # noqa: PLC0415  # same
     from fognav_experiments.comparison import runner  # noqa: PLC0415  # same
+    from fognav_experiments.comparison.measured import drive_name  # noqa: PLC0415  # same
     from fognav_experiments.comparison.records import Folder, FolderError  # noqa: PLC0415  # same
 
     with exit_codes():
@@ -67,7 +78,13 @@ def experiment_command(  # noqa: PLR0913  # each option is an argument
         except (SiteError, runner.SpecError, FolderError) as error:
             raise WrongUseError(str(error)) from error
         kernels.warm_cache(print_line)
-        failed = _show(asked, folder, runner.run(place, asked, folder, jobs, commit))
+        if live:
+            options = LiveOptions(speed=speed, cpu_quota=cpu_quota, commit=commit)
+            files = folder.measured("live")
+            names = [drive_name(task.drawn.run, task.drawn.route.name, task.setup, cpu_quota) for task in asked]
+            failed = _show(names, files, live_drives(loaded, asked, files, options, print_line))
+        else:
+            failed = _show([task.name for task in asked], folder.drives, runner.run(place, asked, folder, jobs, commit))
     print_line(f"{len(asked) - failed} of {len(asked)} drives succeeded; records in {out}")
     if failed:
         raise typer.Exit(NOT_TRUE)
@@ -200,15 +217,14 @@ def _chosen(setups: str) -> list[ProfileName]:
     return chosen
 
 
-def _show(asked: list[Task], folder: Folder, records: Iterator[Record]) -> int:
+def _show(names: Sequence[str], files: DriveFiles[D], records: Iterator[D]) -> int:
     """Show each record as it comes; return how many of those asked for, new and old, failed."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    names = {task.name for task in asked}
     with Progress(*columns, TimeRemainingColumn(), console=console, disable=not console.is_terminal) as progress:
-        known = sum(folder.has(name) for name in names)
+        known = sum(files.has(name) for name in names)
         task = progress.add_task("drives", total=len(names), completed=known)
         for record in records:
             progress.advance(task)
             time_s = "" if record.time_s is None else f"{record.time_s:6.1f} s"
             print_line(f"{record.name:20} {record.outcome:8} {record.distance_m:6.1f} m {time_s}  {record.area}")
-    return sum(not record.success for record in folder.read() if record.name in names)
+    return sum(not record.success for record in files.read() if record.name in names)

@@ -18,7 +18,7 @@ from fognav.demo.scene import Scene
 from fognav.demo.speed import SpeedWatch, TooFastError
 from fognav.demo.usage import Usage, children
 from fognav.output import WrongUseError
-from fognav.programs import WATCHDOG
+from fognav.programs import ROBOT, WATCHDOG
 from fognav.recording import recording
 from fognav.stack import Stack, StackConfig
 from fognav.stack_doors import doors_of
@@ -45,6 +45,7 @@ class Attempt:
         self.usage = Usage()
         self.restarts: dict[str, int] = {}
         """How often each process died and was restarted."""
+        self._stack: Stack | None = None
 
     # --- the system ---
 
@@ -65,9 +66,11 @@ class Attempt:
             robot_file=options.robot_file,
             seed=options.seed,
             speed=self.scene.speed,
+            extra=options.settings,
             doors=doors_of(self.plan.site.site),
         )
         async with Stack(config, self._on_process) as stack, self._keeping_logs(stack):
+            self._stack = stack
             if options.hazard and not self.plan.hazard:
                 self.scene.log_event("scenario: no barrier, because [demo] of site.toml lists no areas")
             self.scene.log_event(f"starting {len(stack.supervisor.names)} processes, logs in {stack.folder / 'logs'}")
@@ -137,11 +140,19 @@ class Attempt:
         )
 
     def _on_process(self, event: Event) -> None:
+        self._tell_of_robot(event)
         if event.kind == "exited":
             self.restarts[event.program] = self.restarts.get(event.program, 0) + 1
             self.scene.log_event(f"{event.program} died ({event.detail})")
         elif event.kind == "started" and event.program in self.restarts:
             self.scene.log_event(f"{event.program} was restarted")
+
+    def _tell_of_robot(self, event: Event) -> None:
+        tell = self.plan.options.on_robot_start
+        if tell is None or self._stack is None or event.kind != "started" or event.program not in ROBOT:
+            return
+        if (pid := self._stack.supervisor.pid(event.program)) is not None:
+            tell(pid)
 
     async def _sample(self, stack: Stack, presence: Presence) -> None:
         """Keep the processes' usage and the register's entry current."""
@@ -179,7 +190,7 @@ class Attempt:
             areas=plan.site.site.areas,
             truth=scene.truth,
             now=clock.now(),
-            hazard=HazardSchedule.of(plan.site, plan.options.seed) if plan.hazard else None,
+            hazard=HazardSchedule.of(plan.site, plan.options.seed, plan.options.request) if plan.hazard else None,
         )
         if scene.path is not None:
             self.drive.on_path(scene.path, clock.now())

@@ -1,8 +1,10 @@
 """The options of a demonstration, and the drive that they give on a site."""
 
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
+from fog_contracts.messages import ProfileName
 from fog_contracts.site import Place
 from fog_runtime.configuration import parts
 from fog_runtime.configuration.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
@@ -10,11 +12,17 @@ from fog_runtime.configuration.robot_file import ROBOT_FILE, default_robot, load
 from fog_runtime.configuration.site import LoadedSite
 from fognav.output import WrongUseError
 from fognav_sim import emulators
+from fognav_sim.drive.hazard import HazardRequest
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """The options of `fognav demo`."""
+    """The options of `fognav demo`, and what an experiment asks for beyond them.
+
+    `profile`: who plans. `request`: which area becomes blocked, and when; None draws both. `settings`: further FOGNAV_*
+    variables of all processes, without that prefix. `on_robot_start` is called with the id of each process of the robot
+    that is started, but not with those of its children.
+    """
 
     seed: int = 1
     speed: float = 1.0
@@ -24,6 +32,10 @@ class Options:
     robot_file: Path | None = None
     keep_running: bool = False
     record: Path | None = None
+    profile: ProfileName = "fog"
+    request: HazardRequest | None = None
+    settings: Mapping[str, str] = field(default_factory=dict)
+    on_robot_start: Callable[[int], object] | None = None
 
 
 def hardware(robot_file: Path | None, base: str | None, lidar: str | None) -> tuple[str, str]:

@@ -5,6 +5,8 @@ import time
 from collections.abc import Callable
 from typing import Final
 
+from fog_contracts.commands import PROFILE_OF
+from fog_contracts.messages import ProfileName
 from fog_runtime.clock import Clock
 from fognav.demo.background import Background
 from fognav.demo.operator import Operator
@@ -20,6 +22,7 @@ LOCALIZED_S: Final = 60.0
 AREAS_S: Final = 30.0
 ENABLED_S: Final = 60.0
 GOAL_S: Final = 60.0
+PROFILE_S: Final = 30.0
 _READY_FOR_S: Final = SafetyConfig().relax_after + 0.5
 """How long the robot must be ready before it is enabled, or its drive would begin in a protective stop; the margin is
 the period of its states."""
@@ -52,6 +55,8 @@ class Preparation:
         scene.phase = "waiting for the sensor nodes"
         await self._until(self._all_clear, AREAS_S, "all watched areas are clear")
         scene.log_event(f"nodes: all {len(self._plan.watched_areas)} watched areas are clear")
+        if self._plan.options.profile != "fog":
+            await self._choose(self._plan.options.profile)
         scene.phase = "enabling"
         deadline = clock.now() + _READY_TIMEOUT_S
         await self._until(
@@ -61,6 +66,17 @@ class Preparation:
         )
         operator.enabling_paused = False
         await self._until(self._is_enabled, ENABLED_S, "the robot is enabled")
+
+    async def _choose(self, profile: ProfileName) -> None:
+        """Let the robot navigate by another profile, which it accepts while it is disabled; raises `TimeoutError`."""
+        kind = next(command for command, name in PROFILE_OF.items() if name == profile)
+        deadline, problem = time.monotonic() + PROFILE_S, "no reply from the robot"
+        while (reply := await self._operator.command(kind)) is None or not reply.accepted:
+            problem = problem if reply is None else reply.reason
+            if time.monotonic() > deadline:
+                raise TimeoutError(f"the robot does not change to the profile {profile}: {problem}")
+            await asyncio.sleep(_RETRY_S)
+        self._scene.log_event(f"operator: profile {profile}")
 
     async def send_goal(self) -> DriveOutcome | None:
         """Send the goal to the planner, again while it is unavailable; return the outcome if it is not accepted."""

@@ -71,7 +71,7 @@ class Usage:
         elapsed = self._sampled - (self._started_at or 0.0)
         return {
             name: {
-                "cpu_percent": round(100.0 * used.cpu_s / elapsed, 1) if elapsed > 0 else 0.0,
+                "cpu_percent": round(100.0 * used.cpu_s / elapsed, 2) if elapsed > 0 else 0.0,
                 "rss_mb": round(used.rss_mb, 1),
             }
             for name, used in self._used.items()

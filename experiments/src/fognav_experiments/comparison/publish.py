@@ -12,6 +12,7 @@ from fognav_experiments.comparison import runner
 from fognav_experiments.comparison.document import Figure, to_html, to_markdown
 from fognav_experiments.comparison.draws import draw
 from fognav_experiments.comparison.geometry import RouteGeometry
+from fognav_experiments.comparison.measured import KINDS
 from fognav_experiments.comparison.records import FolderError, write_csv
 from fognav_experiments.comparison.report import TITLE, build, summary_rows
 
@@ -28,10 +29,11 @@ def publish(folder: Folder, target: Path, site: Path | None = None) -> list[Path
 
     `site`: folder of the floor; with it the report says what the map allows, if the drives were on this very floor.
     """
-    experiment, records = folder.description(), folder.read()
+    experiment, records = folder.description(), folder.drives.read()
+    measured = [drive for kind in KINDS for drive in folder.measured(kind).read()]
     if not records:
         raise FolderError(f"{folder.path} holds no drives yet: run `fognav experiment --out {folder.path}` first")
-    blocks = build(records, experiment, _savings(records, experiment["asked"], site))
+    blocks = build(records, experiment, _savings(records, experiment["asked"], site), measured)
     summary = io.StringIO()
     csv.writer(summary, lineterminator="\n").writerows(summary_rows(records))
     texts = {

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import csv
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Generic, Protocol, TypeVar
 
 import msgspec
 
 from fog_contracts.messages import ProfileName  # read at run time, when a file is decoded
 from fog_runtime.files import SHARED, atomic_write
+from fognav_experiments.comparison.measured import MeasuredDrive, drive_name
 from fognav_experiments.comparison.timeline import Timeline  # read at run time, when a file is decoded
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
     from pathlib import Path
+
+    from fognav_experiments.comparison.measured import Kind
 
 MOVE_BASE: Final = ("global planning", "layers", "local planning")
 """Components of a robot whose work the process `move_base` of the ROS navigation stack holds."""
@@ -72,7 +75,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def name(self) -> str:
         """Name of the record's file, without suffix."""
-        return file_name(self.run, self.route, self.setup)
+        return drive_name(self.run, self.route, self.setup)
 
     def cpu_percent(self, components: Iterable[str]) -> float:
         """Return the share of one core (%) that these components took on average over the drive."""
@@ -92,18 +95,60 @@ class FolderError(ValueError):
     """The folder can't be used; the message names the remedy."""
 
 
+class _Named(Protocol):
+    @property
+    def name(self) -> str: ...
+
+
+N = TypeVar("N", bound=_Named)
+
+
+class DriveFiles(Generic[N]):
+    """Records of one kind, a file each."""
+
+    def __init__(self, path: Path, kind: type[N]) -> None:
+        self.path = path
+        self._kind = kind
+
+    def has(self, name: str) -> bool:
+        """Whether there is a record with this name."""
+        return self._file(name).exists()
+
+    def write(self, record: N) -> None:
+        """Write a record; either it is there as a whole afterwards, or not at all. Raises `FolderError`."""
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            atomic_write(self._file(record.name), msgspec.json.encode(record), mode=SHARED)
+        except OSError as error:
+            raise FolderError(f"{self.path} can't be written: {error.strerror}. Name another folder") from error
+
+    def read(self) -> list[N]:
+        """Return all records by run, route and setup; raises `FolderError` for one that can't be read."""
+        records = []
+        for file in sorted(self.path.glob("*.json")):
+            try:
+                records.append(msgspec.json.decode(file.read_bytes(), type=self._kind))
+            except (OSError, msgspec.DecodeError) as error:
+                raise FolderError(f"{file} can't be read: {error}. Remove it, and run the experiment again") from error
+        return records
+
+    def _file(self, name: str) -> Path:
+        return self.path / f"{name}.json"
+
+
 class Folder:
     """A folder with the records of an experiment, and `experiment.json`, which says of which one."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._drives = path / "drives"
+        self.drives = DriveFiles(path / "drives", Record)
+        """Those in lockstep."""
 
     def begin(self, asked: Asked, machine: dict[str, Any]) -> None:
         """Create the folder, or verify that it is about the same experiment; raises `FolderError`."""
         file = self.path / "experiment.json"
         try:
-            self._drives.mkdir(parents=True, exist_ok=True)
+            self.path.mkdir(parents=True, exist_ok=True)
             known = msgspec.json.decode(file.read_bytes()) if file.exists() else None
         except (OSError, msgspec.DecodeError) as error:
             raise FolderError(f"{self.path} can't be used: {error}. Name another folder") from error
@@ -124,42 +169,20 @@ class Folder:
             raise FolderError(f"{self.path} holds no experiment: run `fognav experiment` first") from error
         return found
 
-    def has(self, name: str) -> bool:
-        """Whether there is a record with this name."""
-        return self._file(name).exists()
-
-    def write(self, record: Record) -> None:
-        """Write a record; either it is there as a whole afterwards, or not at all."""
-        atomic_write(self._file(record.name), msgspec.json.encode(record), mode=SHARED)
-
-    def read(self) -> list[Record]:
-        """Return all records by run, route and setup; raises `FolderError` for one that can't be read."""
-        records = []
-        for file in sorted(self._drives.glob("*.json")):
-            try:
-                records.append(msgspec.json.decode(file.read_bytes(), type=Record))
-            except (OSError, msgspec.DecodeError) as error:
-                raise FolderError(f"{file} can't be read: {error}. Remove it, and run the experiment again") from error
-        return records
+    def measured(self, kind: Kind) -> DriveFiles[MeasuredDrive]:
+        """Return the records of drives by real processes."""
+        return DriveFiles(self.path / kind, MeasuredDrive)
 
     def read_drives(self, run: int, route: str, setups: Iterable[str]) -> list[Record]:
         """Return the records of a run's route in these setups; raises `FolderError` if one is missing."""
-        known = {record.name: record for record in self.read()}
-        wanted = [file_name(run, route, setup) for setup in setups]
+        known = {record.name: record for record in self.drives.read()}
+        wanted = [drive_name(run, route, setup) for setup in setups]
         if missing := [name for name in wanted if name not in known]:
             raise FolderError(
                 f"{self.path} holds no drive {', '.join(missing)}: run `fognav experiment --only {run} --out "
                 f"{self.path}` first"
             )
         return [known[name] for name in wanted]
-
-    def _file(self, name: str) -> Path:
-        return self._drives / f"{name}.json"
-
-
-def file_name(run: int, route: str, setup: str) -> str:
-    """Return the name of a drive's record."""
-    return f"{run:04}-{route}-{setup}"
 
 
 def write_csv(path: Path, records: Sequence[Record]) -> None:

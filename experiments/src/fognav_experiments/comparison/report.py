@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from fognav_experiments.comparison import figures, limits
+from fognav_experiments.comparison import agreement, figures, limits
 from fognav_experiments.comparison.document import Block, Code, Figure, Heading, Paragraph, Table
 from fognav_experiments.comparison.records import MOVE_BASE, OF_FOG, ON_FOG, ON_ROBOT
 from fognav_experiments.comparison.statistics import Estimate, compare, estimate
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
     from fog_contracts.messages import ProfileName
     from fognav_experiments.comparison.geometry import Saving
+    from fognav_experiments.comparison.measured import MeasuredDrive
     from fognav_experiments.comparison.records import Record
 
 TITLE: Final = "What the fog saves a robot: the thesis's experiment, repeated"
@@ -81,11 +82,15 @@ def paired(records: Sequence[Record]) -> list[Drives]:
 
 
 def build(
-    records: Sequence[Record], experiment: Mapping[str, Any], savings: Mapping[tuple[int, str], Saving] | None = None
+    records: Sequence[Record],
+    experiment: Mapping[str, Any],
+    savings: Mapping[tuple[int, str], Saving] | None = None,
+    measured: Sequence[MeasuredDrive] = (),
 ) -> list[Block]:
     """Return the report of these records, measured on what `experiment` says.
 
-    `savings`: by run and route, what the map alone says of them, as far as that is known.
+    `savings`: by run and route, what the map alone says of them, as far as that is known. `measured`: drives by real
+    processes.
     """
     savings = savings or {}
     pairs = paired(records)
@@ -100,7 +105,7 @@ def build(
     return [
         *blocks,
         Heading("Beside the thesis"),
-        *_beside_thesis(pairs, met, setups),
+        *_beside_thesis(pairs, met, setups, measured),
         Heading("Distance, time and computation per route"),
         *_routes(pairs, setups),
         Heading("Paired differences"),
@@ -108,6 +113,7 @@ def build(
         *_bounds(pairs, savings),
         Heading("Where the computation goes"),
         *_components(pairs, setups),
+        *_measured(records, measured),
         Heading("One drive, seen from above"),
         *_tracks(pairs, setups),
         Heading("Drives that failed, and contacts"),
@@ -187,7 +193,15 @@ def _bounds(pairs: Sequence[Drives], savings: Mapping[tuple[int, str], Saving]) 
     return [Heading("What the floor allows to save"), *blocks] if blocks else []
 
 
-def _beside_thesis(pairs: Sequence[Drives], met: Sequence[Drives], setups: Sequence[ProfileName]) -> list[Block]:
+def _measured(records: Sequence[Record], measured: Sequence[MeasuredDrive]) -> list[Block]:
+    agreed, cost = agreement.agreement(measured, records), agreement.resources(measured)
+    blocks: list[Block] = [Heading("The same drives by real processes"), *agreed] if agreed else []
+    return [*blocks, Heading("What the robot's processes cost"), *cost] if cost else blocks
+
+
+def _beside_thesis(
+    pairs: Sequence[Drives], met: Sequence[Drives], setups: Sequence[ProfileName], measured: Sequence[MeasuredDrive]
+) -> list[Block]:
     ours = {"6.3, 6.7": _saved(pairs, met, QUANTITIES[0]), "6.4, 6.8": _saved(pairs, met, QUANTITIES[1])}
     shares = {setup: _mean(pairs, setup, QUANTITIES[2]) for setup in setups}
     ours["6.5, 6.9"] = ", ".join(f"{setup} {found.mean:.2f} %" for setup, found in shares.items())
@@ -197,7 +211,7 @@ def _beside_thesis(pairs: Sequence[Drives], met: Sequence[Drives], setups: Seque
             f": default / fog = {shares['default'].mean / shares['fog'].mean:.1f}; "
             f"whole robot {whole[0]:.2f} % and {whole[1]:.2f} %: {whole[0] / whole[1]:.1f}"
         )
-    ours["6.6, 6.10"] = "all setups run in one process in lockstep, which says nothing of a robot's memory"
+    ours["6.6, 6.10"] = _memory(measured)
     reactions = [record.reaction_s for drives in pairs for record in drives.values() if record.reaction_s is not None]
     if reactions:
         ours["(text)"] = (
@@ -222,6 +236,18 @@ def _beside_thesis(pairs: Sequence[Drives], met: Sequence[Drives], setups: Seque
             "processes."
         ),
     ]
+
+
+def _memory(measured: Sequence[MeasuredDrive]) -> str:
+    """Return in words the largest memory of the robot's processes, by setup."""
+    peaks: dict[str, float] = {}
+    for drive in measured:
+        if (peak := drive.robots_peak_mb()) is not None:
+            peaks[drive.setup] = max(peak, peaks.get(drive.setup, 0.0))
+    if not peaks:
+        return "all setups run in one process in lockstep, which says nothing of a robot's memory"
+    words = ", ".join(f"{setup} {peaks[setup]:.0f} MB" for setup in SETUPS if setup in peaks)
+    return f"largest of all the robot's processes together: {words}"
 
 
 def _saved(pairs: Sequence[Drives], met: Sequence[Drives], quantity: Quantity) -> str:

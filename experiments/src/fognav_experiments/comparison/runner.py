@@ -15,7 +15,8 @@ import msgspec
 
 from fog_runtime.configuration.site import load_site
 from fognav_experiments.comparison.draws import ExperimentSpec, draw
-from fognav_experiments.comparison.records import Asked, Folder, FolderError, file_name
+from fognav_experiments.comparison.measured import drive_name
+from fognav_experiments.comparison.records import Asked, Folder, FolderError
 from fognav_experiments.comparison.trial import drive
 from fognav_experiments.lockstep import release_drives
 
@@ -44,7 +45,7 @@ class Task(NamedTuple):
     @property
     def name(self) -> str:
         """Name of its record."""
-        return file_name(self.drawn.run, self.drawn.route.name, self.setup)
+        return drive_name(self.drawn.run, self.drawn.route.name, self.setup)
 
 
 def read_spec(site: LoadedSite, folder: Path) -> ExperimentSpec:
@@ -77,11 +78,11 @@ def tasks(spec: ExperimentSpec, seed: int, runs: Sequence[int], setups: Sequence
 
 def run(site_folder: Path, asked: list[Task], folder: Folder, jobs: int = 1, commit: str = "") -> Iterator[Record]:
     """Run the tasks that have no record yet, and yield each record once it is written; `commit` is only recorded."""
-    due = [task for task in asked if not folder.has(task.name)]
+    due = [task for task in asked if not folder.drives.has(task.name)]
     if jobs == 1:
         for task in due:
             record = _drive(site_folder, task, jobs, commit)
-            folder.write(record)
+            folder.drives.write(record)
             yield record
         return
     context = multiprocessing.get_context("spawn")
@@ -91,7 +92,7 @@ def run(site_folder: Path, asked: list[Task], folder: Folder, jobs: int = 1, com
             while waiting:
                 done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
                 for future in done:
-                    folder.write(future.result())
+                    folder.drives.write(future.result())
                     yield future.result()
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)

@@ -1,0 +1,191 @@
+"""One drive of an experiment by real processes: the demonstration's system, sent on a drawn route."""
+
+import asyncio
+import contextlib
+import json
+import os
+import signal
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+
+from fog_contracts.messages import Pose, ProfileName
+from fog_contracts.site import DemoPlan, Site
+from fog_runtime import logs
+from fog_runtime.configuration.maps import save_map
+from fog_runtime.configuration.site import SITE_FILE, LoadedSite, load_site
+from fog_supervisor.supervisor import NotReadyError
+from fognav import __version__
+from fognav.bench.cpu_quota import cpu_quota
+from fognav.bench.robot import NORMAL_PRIORITY
+from fognav.demo.options import Options
+from fognav.demo.run import Demo
+from fognav.output import FailedError
+from fognav_experiments.comparison.draws import RouteDraw
+from fognav_experiments.comparison.measured import MeasuredDrive, drive_name
+from fognav_experiments.comparison.records import DriveFiles
+from fognav_experiments.comparison.runner import Task
+from fognav_sim.drive.hazard import HazardRequest
+
+_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiveOptions:
+    """How drives run: `speed` times as fast as real time, the robot's processes within a share of one core, or not.
+
+    `commit`: the program's revision, which is only recorded.
+    """
+
+    speed: float = 1.0
+    cpu_quota: float | None = None
+    commit: str = ""
+
+
+def live_drives(
+    site: LoadedSite,
+    asked: Sequence[Task],
+    files: DriveFiles[MeasuredDrive],
+    options: LiveOptions,
+    on_event: Callable[[str], None],
+) -> Iterator[MeasuredDrive]:
+    """Drive those that have no record yet, one after another, and yield each record once it is written.
+
+    Raises as `drive_live` does.
+    """
+    for task in asked:
+        if not files.has(drive_name(task.drawn.run, task.drawn.route.name, task.setup, options.cpu_quota)):
+            drive = drive_live(site, task.drawn, task.setup, options, on_event)
+            files.write(drive)
+            yield drive
+
+
+def drive_live(
+    site: LoadedSite, drawn: RouteDraw, setup: ProfileName, options: LiveOptions, on_event: Callable[[str], None]
+) -> MeasuredDrive:
+    """Drive a drawn route in a setup by real processes; blocks until all of them have ended.
+
+    Raises `FailedError` for a system that does not start and for an interruption, `WrongUseError` for a quota that this
+    machine can't enforce.
+    """
+    with contextlib.ExitStack() as contexts:
+        folder = Path(contexts.enter_context(tempfile.TemporaryDirectory(prefix="fognav-drive-")))
+        write_route(site, drawn, folder)
+        settings: Mapping[str, str] = {}
+        on_robot: Callable[[int], object] = _nothing
+        if options.cpu_quota is not None:
+            on_robot, settings = contexts.enter_context(cpu_quota(options.cpu_quota)).add, NORMAL_PRIORITY
+        asked = Options(
+            seed=drawn.seed,
+            speed=options.speed,
+            profile=setup,
+            request=HazardRequest(area=drawn.area, trigger_m=drawn.trigger_m),
+            settings=settings,
+            on_robot_start=on_robot,
+        )
+        demo = Demo(load_site(folder), asked, on_event)
+        try:
+            report = asyncio.run(_run(demo))
+        except (NotReadyError, TimeoutError) as error:
+            raise FailedError(f"drive {drawn.run}, {drawn.route.name}, {setup}: {error}") from error
+        return _record(demo, report, drawn, setup, options)
+
+
+def write_route(site: LoadedSite, drawn: RouteDraw, folder: Path) -> None:
+    """Write a site like this one, whose robot starts where the route does, and whose demonstration is the route."""
+    origin = site.site.places[drawn.route.start]
+    start = Pose(x=origin.x, y=origin.y, theta=drawn.theta if origin.theta is None else origin.theta)
+    changed = msgspec.structs.replace(
+        site.site,
+        map="map.yaml",
+        robots=[msgspec.structs.replace(site.site.robots[0], start=start)],
+        demo=DemoPlan(start=drawn.route.start, goal=drawn.route.goal, areas=[drawn.area]),
+    )
+    save_map(folder / "map", site.map)
+    (folder / SITE_FILE).write_text(site_text(changed), "utf-8")
+
+
+def site_text(site: Site) -> str:
+    """Return a site as TOML, which `load_site` reads again."""
+    values = msgspec.to_builtins(site)
+    return "".join(f"{name} = {_toml(value)}\n" for name, value in values.items() if value is not None)
+
+
+def _toml(value: Any) -> str:  # noqa: ANN401  # whatever a site holds
+    match value:
+        case dict():
+            entries = [f"{json.dumps(key)} = {_toml(item)}" for key, item in value.items() if item is not None]
+            return f"{{ {', '.join(entries)} }}"
+        case list() | tuple():
+            return f"[{', '.join(_toml(item) for item in value)}]"
+        case bool() | str():
+            return json.dumps(value, ensure_ascii=False)
+        case int() | float():
+            return repr(value)
+        case _:
+            raise TypeError(f"a site holds a {type(value).__name__}, which TOML does not have")
+
+
+async def _run(demo: Demo) -> dict[str, object]:
+    logs.configure("experiment", "warning", "text")
+    stop = asyncio.Event()
+    with _signals(stop):
+        report = await demo.run(stop)
+    if stop.is_set():
+        raise FailedError("interrupted: repeat the command to go on with this drive")
+    return report
+
+
+@contextlib.contextmanager
+def _signals(stop: asyncio.Event) -> Iterator[None]:
+    loop = asyncio.get_running_loop()
+    for number in _SIGNALS:
+        loop.add_signal_handler(number, stop.set)
+    try:
+        yield
+    finally:
+        for number in _SIGNALS:
+            loop.remove_signal_handler(number)
+
+
+def _record(
+    demo: Demo, report: Mapping[str, Any], drawn: RouteDraw, setup: ProfileName, options: LiveOptions
+) -> MeasuredDrive:
+    summary, processes, speed = demo.attempt.summary(), report["processes"], demo.scene.speed
+    return MeasuredDrive(
+        kind="live",
+        setup=setup,
+        run=drawn.run,
+        route=drawn.route.name,
+        seed=drawn.seed,
+        area=drawn.area,
+        moment=drawn.moment,
+        trigger_m=drawn.trigger_m,
+        outcome=summary.outcome,
+        reason=summary.reason,
+        success=summary.success,
+        distance_m=summary.distance_m,
+        time_s=summary.time_s,
+        plans=summary.plans,
+        paths=summary.paths,
+        modes=summary.modes,
+        stops=summary.stops,
+        route_areas=summary.route_areas,
+        min_clearance_m=summary.min_clearance_m,
+        cpu_percent={name: round(used["cpu_percent"] / speed, 2) for name, used in processes.items()},
+        peak_mb={name: used["rss_mb"] for name, used in processes.items()},
+        cpu_quota=options.cpu_quota,
+        speed=speed,
+        restarts=sum(demo.attempt.restarts.values()),
+        load=round(os.getloadavg()[0], 2),
+        version=__version__,
+        commit=options.commit,
+    )
+
+
+def _nothing(_pid: int) -> None:
+    """Do nothing with a process that was started."""

@@ -1,0 +1,140 @@
+"""Whether lockstep tells the truth: the same drives by real processes, compared within stated tolerances. Pure.
+
+Noise is drawn as often as a process measures, and real processes are scheduled by the machine: no two live drives are
+equal to the millimetre. What must agree is what an experiment is about.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from fognav_experiments.comparison.document import Block, Paragraph, Table
+from fognav_experiments.comparison.measured import ROBOTS_PROCESSES
+from fognav_experiments.comparison.statistics import estimate
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from fognav_experiments.comparison.measured import MeasuredDrive
+    from fognav_experiments.comparison.records import Record
+
+DISTANCE_M: Final = 1.5
+DISTANCE_SHARE: Final = 0.03
+TIME_S: Final = 6.0
+TIME_SHARE: Final = 0.05
+PATHS: Final = 1
+STOPPING_MODES: Final = frozenset({"PROTECTIVE_STOP", "FAULT", "EGRESS"})
+"""Modes that a drive has not by chance: a robot slows down here and there, and holds for a moment at its goal."""
+
+
+class Compared(NamedTuple):
+    """A drive by real processes, the same one in lockstep, and in what they differ beyond the tolerances."""
+
+    live: MeasuredDrive
+    lockstep: Record
+    differences: list[str]
+
+
+def compare_drives(live: MeasuredDrive, lockstep: Record) -> Compared:
+    """Compare a drive by real processes with the same one in lockstep."""
+    found = []
+    if live.outcome != lockstep.outcome:
+        found.append(f"outcome {live.outcome} ({live.reason}), in lockstep {lockstep.outcome}")
+    if abs(live.distance_m - lockstep.distance_m) > max(DISTANCE_M, DISTANCE_SHARE * lockstep.distance_m):
+        found.append(f"{live.distance_m:.1f} m, in lockstep {lockstep.distance_m:.1f} m")
+    if live.time_s is not None and lockstep.time_s is not None:
+        if abs(live.time_s - lockstep.time_s) > max(TIME_S, TIME_SHARE * lockstep.time_s):
+            found.append(f"{live.time_s:.1f} s, in lockstep {lockstep.time_s:.1f} s")
+    elif live.time_s is not lockstep.time_s:
+        found.append("only one of them ended")
+    if abs(live.paths - lockstep.paths) > PATHS:
+        found.append(f"{live.paths} paths followed, in lockstep {lockstep.paths}")
+    if live.route_areas != lockstep.route_areas:
+        found.append(f"through {_listed(live.route_areas)}, in lockstep through {_listed(lockstep.route_areas)}")
+    if (stopped := _stopping(live.modes)) != (expected := _stopping(lockstep.modes)):
+        found.append(f"was in {_listed(sorted(stopped))}, in lockstep in {_listed(sorted(expected))}")
+    return Compared(live, lockstep, found)
+
+
+def compared(live: Sequence[MeasuredDrive], lockstep: Sequence[Record]) -> list[Compared]:
+    """Compare all drives of which there is one in lockstep, those under a quota left out."""
+    known = {record.name: record for record in lockstep}
+    return [compare_drives(drive, known[drive.name]) for drive in live if drive.name in known]
+
+
+def agreement(live: Sequence[MeasuredDrive], lockstep: Sequence[Record]) -> list[Block]:
+    """Return the comparison as a part of the report; nothing without live drives."""
+    pairs = compared(live, lockstep)
+    if not pairs:
+        return []
+    rows = [
+        [
+            pair.live.name, f"{pair.live.distance_m:.1f}", f"{pair.lockstep.distance_m:.1f}",
+            _seconds(pair.live.time_s), _seconds(pair.lockstep.time_s), f"{pair.live.paths}", f"{pair.lockstep.paths}",
+            "; ".join(pair.differences) or "yes",
+        ]
+        for pair in pairs
+    ]  # fmt: skip
+    agreed = sum(not pair.differences for pair in pairs)
+    speeds = sorted({pair.live.speed for pair in pairs})
+    return [
+        Paragraph(
+            f"{len(pairs)} of the drives were repeated by real processes: brokers, sockets, threads and serial lines, "
+            f"at {', '.join(f'{speed:g}' for speed in speeds)} times real time. {agreed} of them agree with lockstep "
+            f"in outcome, in distance within {DISTANCE_M} m or {100 * DISTANCE_SHARE:.0f} %, in time within "
+            f"{TIME_S:.0f} s or {100 * TIME_SHARE:.0f} %, in the number of paths within {PATHS}, in the watched areas "
+            f"that the robot crossed, and in whether it was in one of the modes {_listed(sorted(STOPPING_MODES))}."
+        ),
+        Table(
+            ["drive", "live, m", "lockstep, m", "live, s", "lockstep, s", "paths, live", "in lockstep", "agrees"], rows
+        ),
+    ]
+
+
+def resources(drives: Sequence[MeasuredDrive]) -> list[Block]:
+    """Return what the robot's processes cost, by setup and quota; nothing without a drive that measured it."""
+    measured = [drive for drive in drives if drive.cpu_percent and drive.peak_mb]
+    rows = []
+    for setup, quota in sorted({(drive.setup, drive.cpu_quota) for drive in measured}, key=str):
+        chosen = [drive for drive in measured if (drive.setup, drive.cpu_quota) == (setup, quota)]
+        shares = [_mean([drive.cpu_percent.get(name, 0.0) for drive in chosen]) for name in ROBOTS_PROCESSES]
+        peaks = [max(drive.peak_mb.get(name, 0.0) for drive in chosen) for name in ROBOTS_PROCESSES]
+        time_s = _mean([drive.time_s for drive in chosen if drive.time_s is not None])
+        rows.append([
+            setup, "none" if quota is None else f"{quota:g} of a core", str(len(chosen)),
+            *(f"{share:.2f}" for share in shares), f"{sum(shares):.2f}",
+            *(f"{peak:.0f}" for peak in peaks), f"{sum(peaks):.0f}", f"{time_s:.0f}",
+        ])  # fmt: skip
+    if not rows:
+        return []
+    names = [name.removeprefix("robot-") for name in ROBOTS_PROCESSES]
+    return [
+        Paragraph(
+            "What the robot's processes took, by the kernel's account: mean share of one core, per second of the "
+            "system's clock, and the largest resident memory of any drive. A quota limits all of them together to a "
+            "share of one core, as control groups enforce it."
+        ),
+        Table(
+            [
+                "setup", "quota", "drives", *(f"{name}, %" for name in names), "robot, %",
+                *(f"{name}, MB" for name in names), "robot, MB", "mean time, s",
+            ],
+            rows,
+        ),
+    ]  # fmt: skip
+
+
+def _mean(values: Sequence[float]) -> float:
+    return estimate(values).mean if values else 0.0
+
+
+def _stopping(modes: dict[str, int]) -> frozenset[str]:
+    return STOPPING_MODES & modes.keys()
+
+
+def _seconds(value: float | None) -> str:
+    return "-" if value is None else f"{value:.0f}"
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names) or "none"

@@ -139,7 +139,7 @@ PARTS: Final = (
     ),
     Part(
         "recoveries",
-        ("motion.recovery", "motion.recovery_moves", "motion.trail", "agent.recoveries", "agent.power"),
+        ("motion.recovery", "motion.recovery_moves", "motion.trail", "agent.path.recoveries", "agent.power"),
         ("motion/test_recovery.py", "motion/test_recovery_limits.py", "agent/test_power.py"),
         ("numpy", "hypothesis.strategies", "fog_kernels.clearance", "robot_agent.config", "robot_agent.motion.band"),
     ),

@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from fnmatch import fnmatchcase
@@ -109,6 +110,16 @@ def test_every_module_is_listed_as_pure_or_as_an_edge() -> None:
     assert undecided == [], (
         "each module is either listed in the contract 'Cores touch no world' (pyproject.toml) or in EDGES (here)"
     )
+
+
+MOST_MODULES = 25
+"""More than these in one folder, and nobody sees any more which of them belong together."""
+
+
+def test_no_folder_holds_more_modules_than_one_sees_at_a_glance() -> None:
+    folders = Counter(str(file.parent.relative_to(ROOT)) for package in SOURCES for file in package.rglob("*.py"))
+    crowded = {folder: count for folder, count in folders.items() if count > MOST_MODULES}
+    assert crowded == {}, "give those that belong together a folder of their own, named by what they do"
 
 
 def sources(listed: set[str]) -> dict[str, ast.Module]:

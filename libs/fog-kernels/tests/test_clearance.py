@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from compiler import examples
+from compiler import compiled_only, examples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -159,7 +159,8 @@ def keeps(outline, known: np.ndarray, pose) -> float:
     return float(np.where(depth > 0.0, -depth, away).min())
 
 
-@settings(max_examples=examples(150), deadline=None)
+@compiled_only
+@settings(max_examples=150, deadline=None)
 @given(seeds, st.sampled_from([ROUND, LONG]), st.booleans())
 def test_body_swept_along_the_commanded_arc_keeps_its_padding(seed, outline, narrow):
     """The whole arc until the horizon, not only the period; a body that starts too near comes no nearer.

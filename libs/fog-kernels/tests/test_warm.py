@@ -109,15 +109,15 @@ def test_unknown_profile_is_refused_with_the_known_ones() -> None:
 
 def test_progress_reports_every_kernel_once_by_name(tmp_path):
     cold = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
-    command = [sys.executable, "-m", "fog_kernels.warm", "map"]
-    names = [f"{module}.{name}" for module in warm.PROFILES["map"] for name in warm.kernels(module)]
+    command = [sys.executable, "-m", "fog_kernels.warm", "sim"]
+    names = [f"{module}.{name}" for module in warm.PROFILES["sim"] for name in warm.kernels(module)]
     done = subprocess.run(command, env=cold, capture_output=True, text=True, check=True)
     lines = [line for line in done.stdout.splitlines() if "kernels ready: " in line]
     assert [line.rpartition(" ")[2] for line in lines if "." in line] == names
     assert lines[-1].startswith(f"{len(names)} of {len(names)} ")
     again = subprocess.run(command, env=cold, capture_output=True, text=True, check=True)
     lines = [line for line in again.stdout.splitlines() if "kernels ready: " in line]
-    assert [line.rpartition(" ")[2] for line in lines] == list(warm.PROFILES["map"])
+    assert [line.rpartition(" ")[2] for line in lines] == list(warm.PROFILES["sim"])
     assert " 0 compiled now" in again.stdout
 
 

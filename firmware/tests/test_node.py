@@ -86,6 +86,19 @@ def test_real_change_is_reported_with_its_second_measurement(make_node, run):
     assert set(states[1:]) == {"blocked"}
 
 
+@pytest.mark.parametrize("count", [1, 2])
+def test_first_echo_of_an_obstacle_is_verified_without_the_pause(core, run, count):
+    """The aggregator takes readings that are less than 40 ms apart for one."""
+    sonars = [Sonar(range_limit=2.0)] * count
+    node = FirmwareNode(core, NodeSite(id="n1", area="z1", x=0.0, y=0.0, theta=0.0, sonars=sonars), 7, 100.0)
+    run(node, (3.0,) * count, 3.05)
+    published = run(node, (1.0,) * count, 1.0)
+    first = [reading.state for reading in published].index("blocked")
+    between = [after.uptime_ms - before.uptime_ms for before, after in itertools.pairwise(published)]
+    assert 44 <= between[first - 1] <= 58
+    assert min(between[first:]) >= 76
+
+
 def test_obstacle_at_the_limit_does_not_flap(make_node, run):
     node = make_node()
     run(node, (1.98, 3.0), 1.0)

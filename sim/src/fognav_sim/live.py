@@ -237,11 +237,11 @@ class VirtualNode:
             await self._mqtt.publish(ch.NODE_PROBLEM, problem, node=self._id)
 
 
-async def run_nodes(nodes: list[VirtualNode], clock: Clock) -> None:
-    """Let all nodes measure and publish, until cancelled."""
+async def run_nodes(nodes: list[VirtualNode], clock: Clock, step_s: float = STEP_S) -> None:
+    """Let all nodes measure and publish, until cancelled; each runs its code up to the present every `step_s` (s)."""
     async with asyncio.TaskGroup() as tasks:
         for node in nodes:
             tasks.create_task(node.connect())
-        async for _ in Ticker(clock, STEP_S):
+        async for _ in Ticker(clock, step_s):
             for node in nodes:
                 await node.measure()

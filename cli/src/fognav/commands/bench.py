@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated
@@ -303,6 +304,42 @@ def pipeline_command(
         return
     for name, value in (asked | figures).items():
         console.print(f"{name:28} {value}", markup=False)
+
+
+@bench_app.command("warning", epilog="Example: fognav bench warning --warnings 50 --json")
+def warning_command(
+    *,
+    warnings: Annotated[int, typer.Option("--warnings", metavar="N", min=1, help="Obstacles for each rule.")] = 50,
+    rule: Annotated[
+        list[str] | None, typer.Option("--rule", metavar="R", help="A debounce rule; may be repeated. Default: two.")
+    ] = None,
+    site: Annotated[Path, typer.Option("--site", metavar="D", help="Folder of the site.")] = Path("estig"),
+    seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of the obstacles.")] = 1,
+    json: Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")] = False,
+) -> None:
+    """Measure a warning: from an obstacle's first echo at a node to the path that a robot receives around it.
+
+    The whole fog runs as real processes behind locks, the nodes run the firmware's code, with an MQTT connection each,
+    and the robot is a stand-in with a goal. Obstacles close an area on its way, one after another. Times are in ms.
+    """
+    from fognav import checkout  # noqa: PLC0415  # keeps the other commands fast
+    from fognav.bench import machine, warning  # noqa: PLC0415  # same
+    from fognav.nodes import site_file  # noqa: PLC0415  # same
+
+    kernels.warm_cache(lambda text: console.print(text, markup=False))
+    rows = []
+    with exit_codes(), Progress(console=console, disable=not console.is_terminal) as progress:
+        loaded = site_file.load(checkout.site_folder(site))
+        for each in rule or ["evidence", "consecutive"]:
+            task = progress.add_task(each, total=warnings)
+            advance = partial(progress.advance, task)
+            rows.append(asyncio.run(warning.measure(loaded, each, warnings, seed, advance)))
+    if json:
+        print_json({"bench": "warning", "warnings": warnings, "seed": seed, "rows": rows, **machine.describe()})
+        return
+    for row in rows:
+        for name, value in row.items():
+            console.print(f"{name:28} {value}", markup=False)
 
 
 @bench_app.command("debounce", epilog="Example: fognav bench debounce --recordings DIR --png rules.png")

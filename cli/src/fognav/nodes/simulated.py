@@ -35,14 +35,16 @@ _AXLE_M: Final = 0.235
 class StillFloor:
     """A floor on which nothing moves: what a simulated node measures. `now` is the time of the clock (s)."""
 
-    def __init__(self, loaded: LoadedSite, persons: Sequence[Point], clock: SystemClock) -> None:
-        """Put persons on the site's floor; raises `WrongUseError` for one that does not stand on it."""
+    def __init__(
+        self, loaded: LoadedSite, persons: Sequence[Point], clock: SystemClock, *, world: type[World] = World
+    ) -> None:
+        """Put persons on the site's floor, a `world`; raises `WrongUseError` for one that does not stand on it."""
         self._clock = clock
         self.silent_nodes: frozenset[str] = frozenset()
         # A world has a robot: here one that lies below every sensor's cone.
         x, y = loaded.map.geometry.centre(*np.argwhere(loaded.map.cells == FREE)[0][::-1].tolist())
         mite = RobotSite(id="mite", start=Pose(x=x, y=y, theta=0.0), radius=_MITE_M, height=_MITE_M)
-        self.world = World(Floor(loaded.map.geometry, loaded.map.cells), mite, seed=1, axle_m=_AXLE_M)
+        self.world = world(Floor(loaded.map.geometry, loaded.map.cells), mite, seed=1, axle_m=_AXLE_M)
         for index, (x, y) in enumerate(persons):
             if not loaded.map.geometry.contains(x, y):
                 raise WrongUseError(f"--person {x:g},{y:g} is not on the map")

@@ -12,10 +12,17 @@ MeasurementCycle::Action MeasurementCycle::step(uint32_t now_us) {
         wait_us_ = pause_us_ + jitter_us();
         return Action::finished;
     }
+    if (phase_ == Phase::pause) begun_us_ = now_us;
     phase_ = Phase::listen;
     since_us_ = now_us;
     wait_us_ = kDecayUs;
     return Action::trigger;
+}
+
+void MeasurementCycle::hurry() {
+    const uint32_t taken_us = since_us_ - begun_us_;
+    const uint32_t rest_us = taken_us < kShortestUs ? kShortestUs - taken_us : 0;
+    if (rest_us < wait_us_) wait_us_ = rest_us;
 }
 
 uint32_t MeasurementCycle::jitter_us() {

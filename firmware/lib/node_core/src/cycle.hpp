@@ -8,6 +8,8 @@ namespace fognav {
 
 constexpr uint32_t kDecayUs = 27000;  // after a trigger, until its echoes have died away
 constexpr uint32_t kJitterUs = 6000;  // the pause is longer by up to so much
+// Of a cycle without its pause: the aggregator takes readings that are closer together than 40 ms for one.
+constexpr uint32_t kShortestUs = 45000;
 
 class MeasurementCycle {
 public:
@@ -28,6 +30,9 @@ public:
 
     void measured() { phase_ = Phase::decay; }
 
+    // After `finished`: leave the pause out, or most of it, this time.
+    void hurry();
+
     int current() const { return current_; }
 
 private:
@@ -40,6 +45,7 @@ private:
     int sonars_;
     uint32_t random_;
     uint32_t pause_us_ = 50000;
+    uint32_t begun_us_ = 0;  // of the cycle: its first trigger
     uint32_t since_us_ = 0;  // of the pause, or of the last trigger
     uint32_t wait_us_ = 0;
 };

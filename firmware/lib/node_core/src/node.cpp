@@ -51,6 +51,8 @@ void Node::take(const Sample& sample) {
 }
 
 Node::Event Node::finish() {
+    // What may be a spike, or the first echo of an obstacle, is measured again at once.
+    if (doubtful()) cycle_.hurry();
     if (calibrating_ && calibration_ended()) return report_calibration();
     reading_.uptime_ms = uptime_us_ / 1000;
     reading_.state = calibrating_ ? State::unknown : fuse(states_, reading_.sonars);
@@ -58,6 +60,13 @@ Node::Event Node::finish() {
     length_ = write_reading(reading_, message_, sizeof message_);
     ++reading_.seq;
     return Event::publish;
+}
+
+bool Node::doubtful() const {
+    for (int i = 0; i < config_.sonars; ++i) {
+        if (filters_[i].contradicted()) return true;
+    }
+    return false;
 }
 
 const char* Node::configure(const char* text, size_t size) {

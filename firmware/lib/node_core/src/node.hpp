@@ -77,6 +77,7 @@ public:
 private:
     void take(const Sample& sample);
     Event finish();
+    bool doubtful() const;
     void calibrate(CalibrationGoal goal);
     bool calibration_ended() const;
     Event report_calibration();

@@ -14,6 +14,9 @@ public:
     // Take a sample; return the one that counts now.
     Sample update(const Sample& sample);
 
+    // The last sample contradicts what counts, and is the first to do so.
+    bool contradicted() const { return held_ == 1; }
+
 private:
     Sample accepted_ = {Status::stuck, 0};
     Sample candidate_ = {Status::stuck, 0};

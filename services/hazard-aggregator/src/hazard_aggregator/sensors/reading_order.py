@@ -23,7 +23,7 @@ SILENT_S: Final = NODE_READING.max_age_s
 FORGOTTEN_S: Final = 30.0
 """After so long a silence an earlier boot, or an older seq, is a node that repeats its numbers, and no late reading."""
 MIN_PERIOD_S: Final = 0.04
-"""Readings closer together are one: between two measurements a node pauses for 50 ms (`NodeConfig.pause_ms`)."""
+"""Readings closer together are one: a node's are 45 ms apart at the least (the firmware's `kShortestUs`)."""
 _BOOTS: Final = 8
 _SEQ_RANGE: Final = 2**32
 

@@ -12,6 +12,7 @@ ROOT = Path(__file__).parents[1]
 COMPOSE = yaml.safe_load((ROOT / "docker-compose.yml").read_text("utf-8"))
 SERVICES: dict[str, dict[str, Any]] = COMPOSE["services"]
 HANDS_OUT = {"locks", "sim-locks"}
+BEHIND = {"hazard-aggregator", "map-service", "planner"}
 PI_MIB = 4096
 """Memory of the Raspberry Pi on which a fog node is to run."""
 
@@ -34,9 +35,20 @@ def test_no_registry_is_asked_for_an_image_of_ours():
     assert {service.get("pull_policy") for service in ours.values()} == {"never"}
 
 
-def test_images_of_others_have_one_version_each():
-    others = {service["image"] for service in SERVICES.values() if not service["image"].startswith("fognav/")}
-    assert [image for image in others if not re.search(r":v?\d+\.\d+\.\d+(-\w+)?$", image)] == []
+def test_images_of_others_have_a_version_and_a_digest_and_are_pulled_if_missing():
+    others = [service for service in SERVICES.values() if not service["image"].startswith("fognav/")]
+    pinned = re.compile(r":v?\d+\.\d+\.\d+(-\w+)?@sha256:[0-9a-f]{64}$")
+    assert [service["image"] for service in others if not pinned.search(service["image"])] == []
+    assert {service["pull_policy"] for service in others} == {"missing"}
+
+
+def test_base_of_our_images_has_a_digest_and_each_image_its_own_pins():
+    dockerfile = (ROOT / "deploy" / "images" / "Dockerfile").read_text("utf-8")
+    assert re.search(r"^ARG BASE=python:3\.11-slim-bookworm@sha256:[0-9a-f]{64}$", dockerfile, re.MULTILINE)
+    assert set(re.findall(r"^FROM (\S+)", dockerfile, re.MULTILINE)) == {"${BASE}", "packages", "scratch"}
+    builds = [service["build"]["args"] for service in SERVICES.values() if "build" in service]
+    assert [build["NAME"] for build in builds if not (ROOT / "requirements" / f"{build['NAME']}.txt").is_file()] == []
+    assert [path for build in builds for path in build["MEMBERS"].split() if not (ROOT / path).is_dir()] == []
 
 
 def test_services_of_one_image_are_built_alike():
@@ -73,6 +85,12 @@ def test_only_broker_router_and_gateway_are_reachable_from_outside():
     assert SERVICES["redis"]["networks"] == ["store"]
     internal = {name for name, network in COMPOSE["networks"].items() if network and network.get("internal")}
     assert internal == {"store", "web"}
+
+
+def test_services_believe_the_gateway_and_nobody_else_for_whom_it_asks():
+    believed = {name: SERVICES[name]["environment"].get("FOGNAV_HTTP_GATEWAY") for name in BEHIND}
+    assert believed == dict.fromkeys(BEHIND, "gateway")
+    assert "FORWARDED_ALLOW_IPS" not in (ROOT / "docker-compose.yml").read_text("utf-8")
 
 
 def test_memory_limits_leave_room_on_a_raspberry_pi():

@@ -48,16 +48,20 @@ PORTS: Final = {
 }
 HEALTHY_S: Final = 180.0
 """On a busy machine of two cores; an idle one needs 20 s, most of it for compiling the kernels."""
+MEGABYTES: Final = {"planner": 600, "map-service": 600, "sim-robot": 600, "hazard-aggregator": 300, "zenoh": 300}
+"""How large our images may be: those with numba, and those without."""
 STOP_S: Final = 10.0
 """After this time an engine kills a container that has not stopped."""
+CAP_SYS_RESOURCE: Final = 1 << 24
 ZONE: Final = {"kind": "BLOCKED", "shape": {"type": "circle", "centre": [9.0, 42.6], "radius": 0.5}, "reason": "wet"}
 
 
-def base_images() -> list[str]:
-    """Return the base images of our Dockerfiles."""
-    files = (ROOT / "deploy" / "images").glob("*.Dockerfile")
-    found = {line.split()[1] for file in files for line in file.read_text("utf-8").splitlines() if line[:5] == "FROM "}
-    return sorted(found)
+def base_image(*, pinned: bool = True) -> str:
+    """Return the base of our images, by its digest or (what an engine without a registry has) by its name only."""
+    (line,) = re.findall(
+        "^ARG BASE=(.+)$", (ROOT / "deploy" / "images" / "Dockerfile").read_text("utf-8"), re.MULTILINE
+    )
+    return str(line if pinned else line.partition("@")[0])
 
 
 def skip_reason() -> str | None:
@@ -76,10 +80,8 @@ def skip_reason() -> str | None:
         (("compose", "version"), "needs docker's compose plugin"),
     ]
     if choice != "1":
-        remedy = f"FOGNAV_COMPOSE=1 ./fognav test tests/compose, or docker pull {' '.join(base_images())}"
-        commands += [
-            (("image", "inspect", image), f"needs the base image {image} ({remedy})") for image in base_images()
-        ]
+        remedy = f"FOGNAV_COMPOSE=1 ./fognav test tests/compose, or docker pull {base_image()}"
+        commands.append((("image", "inspect", base_image()), f"needs the base image {base_image()} ({remedy})"))
     for command, requirement in commands:
         try:
             done = subprocess.run(["docker", *command], capture_output=True, text=True, timeout=20, check=False)
@@ -114,15 +116,24 @@ def has(kind: str, name: str) -> bool:
     return subprocess.run(["docker", kind, "inspect", name], capture_output=True, check=False).returncode == 0
 
 
+def available(image: str) -> bool:
+    """Return whether the engine has an image, pulled if necessary."""
+    pull = ["docker", "pull", "--quiet", image]
+    return has("image", image) or subprocess.run(pull, capture_output=True, timeout=600, check=False).returncode == 0
+
+
 def third_party(image: str) -> str:
-    """Return the name of the image, pulled if necessary, or that of its stand-in."""
-    if has("image", image):
-        return image
-    pulled = subprocess.run(["docker", "pull", "--quiet", image], capture_output=True, timeout=600, check=False)
-    if pulled.returncode == 0:
+    """Return the name of the image, or that of its stand-in."""
+    if available(image):
         return image
     run([str(STAND_INS)], 600)
     return f"fognav-stand-in/{image.rpartition('/')[2].partition(':')[0].removeprefix('eclipse-')}"
+
+
+def may_raise_limits() -> bool:
+    """Return whether the engine may give containers higher limits than its own; one inside a container may not."""
+    effective = re.search(r"CapEff:\s*(\w+)", Path("/proc/self/status").read_text("ascii"))
+    return effective is not None and bool(int(effective[1], 16) & CAP_SYS_RESOURCE)
 
 
 class Project:
@@ -139,13 +150,19 @@ class Project:
         self._command += ["--file", "docker-compose.yml"]
         services = json.loads(self("config", "--format", "json"))["services"]
         override: dict[str, Any] = {}
+        limits_allowed = may_raise_limits()
+        base = base_image(pinned=available(base_image()))
         for service, config in services.items():
             if (own := config["image"].removeprefix("fognav/")) != config["image"]:
                 override[service] = {"image": f"fognav-compose-test/{own}"}
             else:
                 override[service] = {"image": third_party(config["image"])}
-            if "build" in config and not has("network", "bridge"):
-                override[service]["build"] = {"network": "host"}
+            if not limits_allowed:
+                override[service]["ulimits"] = dict.fromkeys(config.get("ulimits", {}), 0)
+            if "build" in config:
+                override[service]["build"] = {"args": {"BASE": base}}
+                if not has("network", "bridge"):
+                    override[service]["build"]["network"] = "host"
         file = folder / "override.json"
         file.write_text(json.dumps({"services": override}), "utf-8")
         self._command += ["--file", str(file)]
@@ -185,6 +202,10 @@ class Project:
             file.write_text(self.locks("show", f"credentials/{user}.toml"), "utf-8")
             self._credentials[user] = Credentials.read(file)
         return self._credentials[user]
+
+    def image(self, service: str) -> str:
+        """Return the name of a service's image."""
+        return f"fognav-compose-test/{service}"
 
     def inside(self, service: str, script: str) -> str:
         """Run a shell command inside a service's container."""
@@ -265,6 +286,28 @@ def test_one_up_makes_every_service_healthy_and_creates_the_secrets(fog: Project
     assert set(containers) == FOG | {"locks", "kernels"}
     assert [containers[name]["State"]["ExitCode"] for name in ("locks", "kernels")] == [0, 0]
     assert {name: fog.containers()[name]["State"]["Health"]["Status"] for name in FOG} == dict.fromkeys(FOG, "healthy")
+
+
+def test_images_are_small(fog: Project, record_property: Callable[[str, object], None]) -> None:
+    sizes = {
+        name: int(docker("image", "inspect", "--format", "{{.Size}}", fog.image(name))) / 1e6 for name in MEGABYTES
+    }
+    for name, megabytes in sizes.items():
+        record_property(f"{name} MB", round(megabytes))
+    print({name: f"{megabytes:.0f} MB" for name, megabytes in sizes.items()})  # noqa: T201  # shown by `pytest -s`
+    assert {name: megabytes for name, megabytes in sizes.items() if megabytes > MEGABYTES[name]} == {}
+
+
+@pytest.mark.parametrize("service", ["planner", "zenoh"])
+def test_image_says_what_it_contains(fog: Project, service: str) -> None:
+    bill = json.loads(fog.inside(service, "cat /opt/fognav/sbom.json"))
+    assert (bill["bomFormat"], bill["metadata"]["component"]["name"]) == ("CycloneDX", "fognav")
+    pins = {"planner": "planner", "zenoh": "router"}[service]
+    pinned = set(re.findall(r"^([\w.-]+==[\w.]+)", (ROOT / "requirements" / f"{pins}.txt").read_text(), re.MULTILINE))
+    python = {f"{each['name']}=={each['version']}" for each in bill["components"] if "pypi" in each.get("purl", "")}
+    assert len(python) >= 8
+    assert python <= pinned
+    assert {each["name"] for each in bill["components"] if "pkg:deb" in each.get("purl", "")} >= {"libc6", "libssl3"}
 
 
 def test_first_start_logs_no_warning(fog: Project) -> None:

@@ -26,10 +26,20 @@ def test_thread_that_ends_meanwhile_keeps_no_other_from_its_priority(monkeypatch
         other.join()
 
 
-def test_priority_that_is_refused_is_told(monkeypatch):
-    def set_scheduler(*_):
-        raise PermissionError
+def refuse(*_):
+    raise PermissionError
 
-    monkeypatch.setattr(os, "sched_setscheduler", set_scheduler)
+
+def test_priority_that_is_refused_is_told(monkeypatch):
+    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    monkeypatch.setattr(os, "setpriority", refuse)
     assert run_in_real_time(5).startswith("refused: ")
     assert run_in_real_time(0) == "not requested"
+
+
+def test_program_that_gets_no_real_time_gets_more_of_the_processor_where_that_is_allowed(monkeypatch):
+    given = []
+    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    monkeypatch.setattr(os, "setpriority", lambda *call: given.append(call))
+    assert run_in_real_time(15).startswith("niceness -15, as SCHED_RR was refused: ")
+    assert (os.PRIO_PROCESS, os.getpid(), -15) in given

@@ -6,7 +6,10 @@ import ctypes
 import os
 from contextlib import suppress
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 _CURRENT: Final = 1
 _FUTURE: Final = 2
@@ -19,16 +22,32 @@ def run_in_real_time(priority: int) -> str:
 
     So programs of normal priority delay it by nothing but their last time slice. Later threads and children inherit it.
     All threads, because one of normal priority that waits for the processor may hold the interpreter's lock.
+
+    Where the system refuses (a container whose engine gives it no real-time share), they get a larger share of the
+    processor than other programs instead: the niceness `-priority`, which is better than nothing and no guarantee.
     """
     if priority <= 0:
         return "not requested"
     try:
-        for thread in Path("/proc/self/task").iterdir():
-            with suppress(ProcessLookupError):  # it has just ended
-                os.sched_setscheduler(int(thread.name), os.SCHED_RR, os.sched_param(priority))
+        _for_all_threads(lambda thread: os.sched_setscheduler(thread, os.SCHED_RR, os.sched_param(priority)))
     except OSError:
-        return "refused: grant CAP_SYS_NICE or an rtprio limit"
+        return _run_favoured(priority)
     return f"SCHED_RR {priority}"
+
+
+def _run_favoured(priority: int) -> str:
+    remedy = "grant CAP_SYS_NICE or an rtprio limit"
+    try:
+        _for_all_threads(lambda thread: os.setpriority(os.PRIO_PROCESS, thread, -priority))
+    except OSError:
+        return f"refused: {remedy}"
+    return f"niceness {-priority}, as SCHED_RR was refused: {remedy}"
+
+
+def _for_all_threads(change: Callable[[int], object]) -> None:
+    for thread in Path("/proc/self/task").iterdir():
+        with suppress(ProcessLookupError):  # it has just ended
+            change(int(thread.name))
 
 
 def lock_memory() -> str:

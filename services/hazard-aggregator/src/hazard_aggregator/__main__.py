@@ -51,7 +51,7 @@ async def main() -> None:
     own = settings.credentials()
     front = Front.fork(
         lambda: make_api(unused(), loaded.map.geometry, clock, health, tokens),
-        settings.http_host, settings.http_port, settings.http_certificate(),
+        settings.http_host, settings.http_port, settings.http_certificate(), settings.http_gateway,
     )  # fmt: skip
     async with (
         Store(

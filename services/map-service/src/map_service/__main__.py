@@ -44,7 +44,7 @@ async def main() -> None:
     own = settings.credentials()
     front = Front.fork(
         lambda: make_api(unused(), loaded.site, clock, health, tokens),
-        settings.http_host, settings.http_port, settings.http_certificate(),
+        settings.http_host, settings.http_port, settings.http_certificate(), settings.http_gateway,
     )  # fmt: skip
     async with (
         Store(settings.redis_url, site, service="map-service", data_dir=settings.data_dir, credentials=own) as store,

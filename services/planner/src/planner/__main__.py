@@ -40,7 +40,7 @@ async def main() -> None:
     own = settings.credentials()
     front = Front.fork(
         lambda: make_api(unused(), loaded.site, health, tokens),
-        settings.http_host, settings.http_port, settings.http_certificate(),
+        settings.http_host, settings.http_port, settings.http_certificate(), settings.http_gateway,
     )  # fmt: skip
     config = PlannerConfig(inflation=settings.inflation, release_length=settings.release_m)
     async with (

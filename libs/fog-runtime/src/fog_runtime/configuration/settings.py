@@ -68,6 +68,8 @@ class CommonSettings(msgspec.Struct, frozen=True, kw_only=True):
     http_certificate_file: Path | None = None
     http_key_file: Path | None = None
     """Certificate and private key (PEM) with which the REST API is served by HTTPS; without them by HTTP."""
+    http_gateway: str = ""
+    """Name or address of a gateway, which is believed for whom it asks (`X-Forwarded-For`); empty: nobody is."""
     port_file: Path | None = None
     log_level: Level = "info"
     log_format: Literal["json", "text"] = "json"

@@ -22,6 +22,7 @@ from fastapi import FastAPI
 from fog_runtime import logs
 from fog_runtime.access.server_certificate import ServerCertificate
 from fog_runtime.files import write_port_file
+from fog_runtime.http.gateway import BehindGateway
 from fog_runtime.http.link import CoreLink, FrontLink
 from fog_runtime.http.routes import answer_call
 from fog_runtime.machine import signals
@@ -68,12 +69,13 @@ class Front:
         host: str = "127.0.0.1",
         port: int = 0,
         certificate: ServerCertificate | None = None,
+        gateway: str = "",
     ) -> Self:
         """Fork the front, which accepts connections once `serve` runs; raises `OSError` when the port is taken.
 
         `make_app` is called there: the handlers of its routes are never called, and need nothing behind them. With a
-        `certificate` it speaks HTTPS. Fork before this process has threads and connections. The front ends with this
-        process.
+        `certificate` it speaks HTTPS. The host `gateway`, and no other, is believed for whom it asks. Fork before this
+        process has threads and connections. The front ends with this process.
         """
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         with socket.create_server((host, port), family=family, backlog=128) as listener:
@@ -81,7 +83,7 @@ class Front:
             with theirs:
                 pid = os.fork()
                 if pid == 0:
-                    _become_front(make_app, listener, theirs, certificate)
+                    _become_front(lambda: _behind(gateway, make_app()), listener, theirs, certificate)
             scheme = "http" if certificate is None else "https"
             return cls(pid, ours, scheme, host, int(listener.getsockname()[1]))
 
@@ -106,6 +108,12 @@ class Front:
             answering.cancel()
             os.kill(self._pid, signal.SIGKILL)  # it has ended, or hangs
             await asyncio.to_thread(os.waitpid, self._pid, 0)
+
+
+def _behind(gateway: str, app: FastAPI) -> FastAPI:
+    if gateway:
+        app.add_middleware(BehindGateway, gateway=gateway)
+    return app
 
 
 class _Server(uvicorn.Server):
@@ -165,6 +173,7 @@ async def _receive(
             lifespan="off",
             timeout_graceful_shutdown=2,
             server_header=False,
+            proxy_headers=False,  # it would believe everybody on this computer
             ssl_certfile=None if certificate is None else certificate.file,
             ssl_keyfile=None if certificate is None else certificate.key,
         )

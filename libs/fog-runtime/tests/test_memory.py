@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import subprocess
 import sys
 from functools import cache
 
 import pytest
+
+from fog_runtime.machine import memory
 
 CODE = """
 import gc
@@ -41,6 +44,47 @@ def test_compiler_is_released_after_the_start_and_still_works() -> None:
 def test_collector_of_garbage_passes_over_what_the_start_has_made() -> None:
     _, _, looked_at = _run()
     assert looked_at < 1_000, "modules alone are more than 100,000 objects, which take 90 ms"
+
+
+async def test_memory_is_released_as_soon_as_the_process_is_ready(monkeypatch: pytest.MonkeyPatch) -> None:
+    released: list[int] = []
+    monkeypatch.setattr(memory, "_POLL_S", 0.001)
+    monkeypatch.setattr(memory, "release_startup_memory", lambda: released.append(0))
+    ready: list[str] = []
+    waiting = asyncio.create_task(memory.release_when(lambda: bool(ready)))
+    await asyncio.sleep(0.01)
+    assert released == []
+    ready.append("map")
+    await asyncio.wait_for(waiting, 10.0)
+    assert released == [0]
+
+
+LIBRARIES = """
+import numpy as np
+from fog_runtime.machine.memory import release_startup_memory
+
+def held():
+    with open("/proc/self/smaps") as maps:
+        library, kib = False, 0
+        for line in maps:
+            if "-" in line.split()[0]:
+                library = "numpy" in line and ".so" in line
+            elif library and line.startswith("Rss:"):
+                kib += int(line.split()[1])
+    return kib
+
+np.linalg.svd(np.ones((3, 3)))
+before = held()
+release_startup_memory()
+print(before - held())
+assert np.linalg.svd(np.ones((3, 3)))[1].size == 3
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs /proc")
+def test_code_of_any_library_that_only_the_start_needed_is_released() -> None:
+    done = subprocess.run([sys.executable, "-c", LIBRARIES], capture_output=True, text=True, check=True, timeout=120)
+    assert int(done.stdout) > 2_000
 
 
 @cache

@@ -187,9 +187,11 @@ def _merged(changes: Sequence[Applied]) -> Applied | None:
     """Merge consecutive changes into one; None when there are none."""
     if len(changes) < 2:
         return changes[0] if changes else None
+    deltas_only = all(len(change.previous) == len(change.windows) for change in changes)
     return Applied(
         changes[-1].version,
         [window for change in changes for window in change.windows],
         [cause for change in changes for cause in change.causes],
         [trace for change in changes for trace in change.traces],
+        [cells for change in changes for cells in change.previous] if deltas_only else [],
     )

@@ -10,7 +10,7 @@ import hashlib
 import struct
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Final, Literal, get_args
 
@@ -62,6 +62,11 @@ def _unpack(packing: Packing, data: bytes, shape: tuple[int, int], subject: str)
     if len(data) != size:
         raise MapError(f"{subject} has {len(data)} cells or more instead of {shape[1]} x {shape[0]} = {size}")
     return np.frombuffer(data, dtype=np.uint8).reshape(shape)
+
+
+def _writable(cells: Grid) -> Grid:
+    """Return a copy; one of zeros takes no memory where nothing is written (most floors have no speed limits)."""
+    return cells.copy() if cells.any() else np.zeros(cells.shape, np.uint8)
 
 
 def plan_hash(geometry: GridGeometry, static: Grid) -> int:
@@ -264,6 +269,8 @@ class Applied:
     windows: list[tuple[Layer, Window]]
     causes: list[Cause]
     traces: list[Trace]
+    previous: list[Grid] = field(default_factory=list)
+    """What was in each window just before, unless a snapshot was loaded."""
 
 
 Outcome = Applied | Literal["waiting", "old", "gap"]
@@ -290,8 +297,8 @@ def decode_map(snapshot: MapSnapshot) -> DecodedMap:
     g = snapshot.geometry
     geometry = GridGeometry(g.width, g.height, g.resolution, g.origin_x, g.origin_y)
     layers: dict[Layer, Grid] = {
-        "cost": _unpack("zlib", snapshot.cost, geometry.shape, "the cost layer").copy(),
-        "speed": _unpack("zlib", snapshot.speed, geometry.shape, "the speed layer").copy(),
+        "cost": _writable(_unpack("zlib", snapshot.cost, geometry.shape, "the cost layer")),
+        "speed": _writable(_unpack("zlib", snapshot.speed, geometry.shape, "the speed layer")),
     }
     static = _unpack("zlib", snapshot.static, geometry.shape, "the static layer")
     hashes = TileHashes(layers, plan_hash(geometry, static))
@@ -395,7 +402,8 @@ class Replica:
             return self._reject()
         self.version = Version(delta.epoch, delta.seq, delta.hash)
         windows = [(layer, window) for layer, window, _ in pieces]
-        return Applied(self.version, windows, list(parts[0].causes), list(parts[0].traces))
+        before = [cells for _, _, cells in previous]
+        return Applied(self.version, windows, list(parts[0].causes), list(parts[0].traces), before)
 
     def _write(self, layer: Layer, window: Window, cells: Grid) -> Grid:
         """Write cells and return the previous ones."""

@@ -13,7 +13,7 @@ from fog_runtime.health import Health
 from fog_runtime.http import Front, load_tokens, unused
 from fog_runtime.leases.leadership import Leadership
 from fog_runtime.leases.lease_store import LeaseStore
-from fog_runtime.machine.memory import release_startup_memory
+from fog_runtime.machine.memory import release_startup_memory, release_when
 from fog_runtime.transports.zenoh_edge import ZenohEdge
 from planner.config import PlannerConfig
 from planner.core import PlannerCore
@@ -68,6 +68,7 @@ async def main() -> None:
                 tasks.create_task(service.tick_loop(), name="tick")
                 tasks.create_task(service.plan_loop(), name="plan")
                 tasks.create_task(front.serve(app, settings.port_file), name="http")
+                tasks.create_task(release_when(lambda: health.ready), name="memory")
         finally:
             service.close()
 

@@ -71,8 +71,8 @@ class Answerer:
         return _reply(found, None, view.planning_map)
 
     def release(self) -> None:
-        """Free the memory of searches; call it when no more queries wait."""
-        self._search = self._cuts = None
+        """Free the memory of searches and the copy of the map; call it when no more queries wait."""
+        self._search = self._cuts = self._on = None
 
     def explain(self, view: View, question: Question) -> Refusal | None:
         """Return the refusal that names what blocks; None if, on this map, nothing does."""

@@ -2,28 +2,34 @@
 
 from __future__ import annotations
 
+import asyncio
 import ctypes
 import gc
 import re
 import sys
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-_COMPILER: Final = "libllvmlite"
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
 _DONTNEED: Final = 4
 """`MADV_DONTNEED` of madvise(2)."""
 _MMAP_THRESHOLD: Final = -3
 """`M_MMAP_THRESHOLD` of mallopt(3)."""
 _LARGE: Final = 1 << 20
+_POLL_S: Final = 0.5
+_LIBRARY: Final = re.compile(r"\.so(\.|$)")
 _MAPPING: Final = re.compile(r"^([0-9a-f]+)-([0-9a-f]+) (\S+) \S+ \S+ \S+ *(.*)$")
 
 
 def release_startup_memory() -> int:
-    """Free what only the start needed; return the size (bytes) of the compiler's parts that are no longer in memory.
+    """Free what only the start needed; return the size (bytes) of the libraries' parts that are no longer in memory.
 
     The compiler (LLVM, some 65 MB of code and constants in memory) has loaded the kernels from their cache and is not
-    used any more. They are a file's: the system reads a page again if it is needed after all. Without /proc nothing is
-    released. Large arrays are returned to the system as soon as they are freed, from now on.
+    used any more, nor is most of the other libraries. They are files': the system maps a page again when it is needed
+    after all. Without /proc nothing is released. Large arrays are returned to the system as soon as they are freed,
+    from now on.
 
     What is in use now, most of it modules, is passed over by the garbage collector from now on. Each full collection
     would stop all threads while it looks at it: for 90 ms, where numba is imported.
@@ -46,15 +52,22 @@ def release_startup_memory() -> int:
     return released
 
 
+async def release_when(ready: Callable[[], bool]) -> None:
+    """Release what only the start needed once the process is ready: connecting and loading take more of it."""
+    while not ready():  # noqa: ASYNC110  # readiness has conditions in many places
+        await asyncio.sleep(_POLL_S)
+    release_startup_memory()
+
+
 def _unchanged_parts(smaps: str) -> list[tuple[int, int]]:
-    """Return the address ranges of the compiler's code and constants of which no page was changed in memory."""
+    """Return the address ranges of the libraries' code and constants of which no page was changed in memory."""
     found: list[tuple[int, int]] = []
     current: tuple[int, int] | None = None
     for line in smaps.splitlines():
         mapping = _MAPPING.match(line)
         if mapping is not None:
             begin, end, rights, name = mapping.groups()
-            wanted = rights in ("r-xp", "r--p") and _COMPILER in name
+            wanted = rights in ("r-xp", "r--p") and _LIBRARY.search(name) is not None
             current = (int(begin, 16), int(end, 16)) if wanted else None
         elif current is not None and line.startswith("Anonymous:") and line.split()[1] == "0":
             found.append(current)

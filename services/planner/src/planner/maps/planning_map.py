@@ -118,8 +118,7 @@ class MapTracker:
         self._inflation = inflation
         self._max_age_s = max_age_s
         self._follower = MapFollower(grace_s=grace_s)
-        self._previous: Grid = np.zeros((0, 0), dtype=np.uint8)
-        self._lower_bound: Grid = self._previous
+        self._lower_bound: Grid = np.zeros((0, 0), dtype=np.uint8)
         self._standing = StandingMap(standing_s)
         self._current: PlanningMap | None = None
         self._copy: PlanningMap | None = None
@@ -177,7 +176,7 @@ class MapTracker:
         self._standing.load(cost, same_floor=same_floor, now=now)
         if np.array_equal(self._standing.costs, self._lower_bound):
             self._standing.costs = self._lower_bound  # one array, so that fields are computed over one bound only
-        self._previous = cost.copy()
+        self._copy = None
         self._current = None
         return Loaded(before is None or before.epoch != applied.version.epoch, applied.traces)
 
@@ -193,21 +192,22 @@ class MapTracker:
     def on_delta(self, delta: MapDelta, now: float) -> list[CostChange]:
         """Apply a delta; return which costs it changed."""
         applied = self._follower.on_delta(delta, now)
-        return [] if applied is None else self._differences(applied)
+        if applied is None:
+            return []
+        self._copy = None
+        return self._differences(applied)
 
     def _differences(self, applied: Applied) -> list[CostChange]:
         changes = []
-        for layer, window in applied.windows:
+        for (layer, window), previous in zip(applied.windows, applied.previous, strict=True):
             if layer != "cost":
                 continue
-            previous = self._previous[window.rows, window.columns]
             cost = self._follower.replica.cost[window.rows, window.columns]
             self._adjust_lower_bound(window, cost)
             self._standing.update(window, cost)
             changed, decreased = cost != previous, cost < previous
             if changed.any():
                 changes.append(CostChange(window, changed, decreased, applied.traces))
-            self._previous[window.rows, window.columns] = cost
         return changes
 
     def _adjust_lower_bound(self, window: Window, cost: Grid) -> None:

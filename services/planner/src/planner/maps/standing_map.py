@@ -31,8 +31,8 @@ class StandingMap:
         """Never above the newest costs of traversable cells; another array whenever a cost changes."""
         self._lowest = self.costs
         """The lowest cost of each cell since the period began."""
-        self._trusted = self.costs
-        """The highest cost that each cell may get."""
+        self._distrusted = self.costs
+        """By how much the highest cost that each cell may get is below the highest of all: 0 for most, untouched."""
 
     def load(self, cost: Grid, *, same_floor: bool, now: float) -> None:
         """Begin with a whole costmap; on the same floor as before what is known of its cells is kept."""
@@ -41,7 +41,7 @@ class StandingMap:
             np.minimum(self._lowest, cost, out=self._lowest)
             return
         self.costs, self._lowest, self._begun = cost.copy(), cost.copy(), now
-        self._trusted = np.full(cost.shape, UNKNOWN, np.uint8)
+        self._distrusted = np.zeros(cost.shape, np.uint8)
 
     def update(self, window: Window, cost: Grid) -> None:
         """Follow a change of the costs in a window."""
@@ -55,13 +55,13 @@ class StandingMap:
         if fell.any():
             self.costs = self.costs.copy()
             self.costs[place][fell] = cost[fell]
-            self._trusted[place][fell] = cost[fell]
+            self._distrusted[place][fell] = UNKNOWN - cost[fell]
 
     def settle(self, cost: Grid, now: float) -> None:
         """Raise the costs to the lowest ones of the period, when it has ended; `cost` is the newest costmap."""
         if now - self._begun < self._period or self.costs.size == 0:
             return
-        lowest = np.minimum(self._lowest, self._trusted)
+        lowest = np.minimum(self._lowest, UNKNOWN - self._distrusted)
         if np.any(lowest > self.costs):
             self.costs = np.maximum(lowest, self.costs)
         self._lowest, self._begun = cost.copy(), now

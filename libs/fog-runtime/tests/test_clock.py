@@ -89,6 +89,77 @@ async def test_a_loop_with_an_offset_ticks_that_much_after_those_of_its_phase(fi
         assert await tick == pytest.approx(due, abs=0.035)
 
 
+async def test_a_function_is_called_at_the_ticks_of_its_phase_until_it_returns_true():
+    clock, phase, times = SystemClock(10.0), Phase(), []
+    origin = phase.next_tick(clock.now(), 0.5)
+
+    def body(now: float) -> bool:
+        times.append(now)
+        return len(times) == 3
+
+    loop_ticker = Ticker(clock, 0.5, phase, 0.1)
+    await loop_ticker.call(body)
+    assert loop_ticker.ticks == 3
+    for number, at in enumerate(times):
+        assert at >= origin + 0.1 + 0.5 * number
+    await asyncio.sleep(0.1)
+    assert len(times) == 3
+
+
+async def test_an_error_of_a_called_function_is_raised_and_ends_its_calls():
+    calls: list[float] = []
+
+    def fail(now: float) -> None:
+        calls.append(now)
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        await Ticker(SystemClock(), 0.01).call(fail)
+    await asyncio.sleep(0.05)
+    assert len(calls) == 1
+
+
+async def test_a_cancelled_loop_calls_its_function_no_more():
+    calls: list[float] = []
+    called = asyncio.Event()
+
+    def body(now: float) -> None:
+        calls.append(now)
+        called.set()
+
+    task = asyncio.create_task(Ticker(SystemClock(), 0.01).call(body))
+    await called.wait()
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+    made = len(calls)
+    await asyncio.sleep(0.05)
+    assert len(calls) == made
+
+
+@pytest.mark.parametrize(("first", "then"), [(0.05, 0.1), (0.1, 0.05), (0.1, 1.0)])
+async def test_another_period_keeps_to_the_ticks_that_loops_of_its_phase_have(first, then):
+    clock, phase = ManualClock(50.0), Phase()
+    loop_ticker, times = Ticker(clock, first, phase), []
+
+    async def run() -> None:
+        async for now in loop_ticker:
+            times.append(now)
+            if len(times) == 2:
+                loop_ticker.period = then
+
+    task = asyncio.create_task(run())
+    for _ in range(400):
+        await asyncio.sleep(0)
+        await asyncio.sleep(0)
+        clock.advance(0.01)
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+    after = [at - 50.0 for at in times[2:]]
+    assert after
+    assert after == pytest.approx([round(at / then) * then for at in after], abs=0.02)
+    assert loop_ticker.late == 0
+
+
 async def test_p99_of_few_ticks_is_the_largest_lateness():
     clock = ManualClock()
     loop_ticker = ticker(clock, 1.0)

@@ -82,7 +82,6 @@ async def main() -> None:
                 lidar_driver,
                 clock,
                 core.on_lidar_samples,
-                agent.on_scan,
                 check=partial(LineCheck, port, robot.settings.lidar.driver, registry.signatures()),
             )
             agent.subscribe()

@@ -142,11 +142,13 @@ class BaseTiming:
 
     `frame_timeout`: no valid frame for this long is a fault. `wake_timeout`: the base may take this long to report its
     driving mode before it is woken again. `ignored_after_wake`: frames that arrive sooner after waking may be older.
+    `frame_s`: the time between two frames; 0: not known, or not constant.
     """
 
     frame_timeout: float = 0.3
     wake_timeout: float = 1.0
     ignored_after_wake: float = 0.1
+    frame_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

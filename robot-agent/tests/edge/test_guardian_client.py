@@ -4,6 +4,7 @@ import asyncio
 import socket
 import time
 
+import msgspec
 import pytest
 from guardian_rig import DEADLINE_S
 
@@ -59,11 +60,12 @@ class Rig:
         self.path = path
         self.clock = SkippingClock()
         self.feedback = []
+        self.times = []
         self.losses = []
         self.client = GuardianClient(
             path,
             self.clock,
-            lambda feedback, _: self.feedback.append(feedback),
+            lambda feedback, at: (self.feedback.append(feedback), self.times.append(at)),
             lambda _, reason: self.losses.append(reason),
         )
 
@@ -71,6 +73,12 @@ class Rig:
         end = time.monotonic() + DEADLINE_S
         while not condition():
             assert time.monotonic() < end
+            await asyncio.sleep(0.01)
+
+    async def stream(self):
+        """Read the link at a steady rate, as the stream of wheel commands does."""
+        while True:
+            self.client.receive()
             await asyncio.sleep(0.01)
 
 
@@ -81,10 +89,11 @@ def command(seq=1, **more):
 @pytest.fixture
 async def rig(tmp_path):
     made = Rig(tmp_path / "guardian.sock")
-    task = asyncio.create_task(made.client.run())
+    tasks = [asyncio.create_task(loop) for loop in (made.client.run(), made.stream())]
     yield made
-    task.cancel()
-    await asyncio.gather(task, return_exceptions=True)
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
 
 
 async def test_missing_guardian_is_reported_and_connected_when_it_starts(rig):
@@ -118,6 +127,36 @@ async def test_bad_feedback_is_ignored_and_a_silent_base_is_reported(rig):
     rig.losses.clear()
     rig.client.send(command())
     assert not rig.losses
+    guardian.close()
+
+
+@pytest.mark.parametrize(("age", "trusted"), [(0.04, True), (0.3, False), (-0.01, False), (None, False)])
+async def test_feedback_counts_from_when_it_was_sent_by_the_clock_of_both(rig, age, trusted):
+    guardian = Guardian(rig.path)
+    await guardian.accept()
+    now = time.monotonic()
+    rig.clock.now = lambda: now
+    guardian.link.send(encode(msgspec.structs.replace(FEEDBACK, at=None if age is None else now - age)))
+    await rig.until(lambda: rig.feedback)
+    assert rig.times == [pytest.approx(now - age if trusted else now, abs=1e-6)]
+    guardian.close()
+
+
+async def test_a_flood_of_feedback_does_not_block_the_stream(rig):
+    guardian = Guardian(rig.path)
+    await guardian.accept()
+    await rig.until(lambda: rig.client.send(command()))
+    sent = 0
+    try:
+        while True:
+            guardian.link.send(encode(FEEDBACK))
+            sent += 1
+    except BlockingIOError:
+        pass
+    assert sent > 64
+    rig.client.receive()
+    assert len(rig.feedback) == 64
+    await rig.until(lambda: len(rig.feedback) == sent)
     guardian.close()
 
 

@@ -147,9 +147,7 @@ async def test_laser_and_motor_are_stopped_when_the_edge_ends(tmp_path, monkeypa
     monkeypatch.setattr(Port, "set_line", lambda _port, name, *, on: lines.append((name, on)))
     device, scans = RplidarEmulator(wavy_room), []
     with PtyPort(tmp_path / "lidar") as port:
-        edge = LidarEdge(
-            str(port.path), RplidarA1Driver(), SystemClock(), lambda *_: None, lambda s, _: scans.append(s)
-        )
+        edge = LidarEdge(str(port.path), RplidarA1Driver(), SystemClock(), lambda *_: None)
         task = asyncio.create_task(edge.run())
         end = time.monotonic() + DEADLINE_S
         while not scans:
@@ -157,7 +155,7 @@ async def test_laser_and_motor_are_stopped_when_the_edge_ends(tmp_path, monkeypa
             await asyncio.sleep(0.01)
             device.receive(port.read(), time.monotonic())
             port.write(device.outgoing(time.monotonic()))
-            edge.poll(time.monotonic())
+            scans.extend(edge.poll(time.monotonic()))
         assert lines == [("dtr", False)]
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
@@ -169,7 +167,7 @@ async def test_laser_and_motor_are_stopped_when_the_edge_ends(tmp_path, monkeypa
 async def test_simulated_speed_is_refused_on_a_real_port(tmp_path, monkeypatch):
     monkeypatch.setattr(Port, "device", "/dev/ttyUSB1")
     with PtyPort(tmp_path / "lidar") as port:
-        edge = LidarEdge(str(port.path), RplidarA1Driver(), SystemClock(5.0), lambda *_: None, lambda *_: None)
+        edge = LidarEdge(str(port.path), RplidarA1Driver(), SystemClock(5.0), lambda *_: None)
         with pytest.raises(SettingsError, match="FOGNAV_SPEED is 5, but /dev/ttyUSB1 is no simulated device"):
             await edge.run()
         assert port.read() == b""
@@ -179,7 +177,7 @@ async def test_simulated_speed_is_refused_on_a_real_port(tmp_path, monkeypatch):
 async def test_edge_waits_for_its_port_and_reopens_it(tmp_path):
     link = tmp_path / "lidar"
     scans = []
-    edge = LidarEdge(str(link), RplidarA1Driver(), SystemClock(), lambda *_: None, lambda scan, _: scans.append(scan))
+    edge = LidarEdge(str(link), RplidarA1Driver(), SystemClock(), lambda *_: None)
     task = asyncio.create_task(edge.run())
 
     async def until(condition, port=None, device=None):
@@ -187,7 +185,7 @@ async def test_edge_waits_for_its_port_and_reopens_it(tmp_path):
         while not condition():
             assert time.monotonic() < end
             await asyncio.sleep(0.01)
-            edge.poll(time.monotonic())
+            scans.extend(edge.poll(time.monotonic()))
             if port is not None:
                 device.receive(port.read(), time.monotonic())
                 port.write(device.outgoing(time.monotonic()))
@@ -228,9 +226,7 @@ async def test_lidar_commands_are_not_sent_to_a_base_on_the_lidars_port(tmp_path
         device.base.receive(make_base(default_robot()).wake(), time.monotonic())
     with PtyPort(tmp_path / "lidar") as port:
         check = partial(LineCheck, str(port.path), "rplidar-a1", signatures())
-        edge = LidarEdge(
-            str(port.path), RplidarA1Driver(), SystemClock(), lambda *_: None, lambda *_: None, check=check
-        )
+        edge = LidarEdge(str(port.path), RplidarA1Driver(), SystemClock(), lambda *_: None, check=check)
         task = asyncio.create_task(edge.run())
         try:
             end = time.monotonic() + DEADLINE_S
@@ -257,7 +253,6 @@ async def test_a_lidar_that_scans_or_is_silent_passes_the_check(tmp_path, comman
             RplidarA1Driver(),
             SystemClock(),
             lambda *_: None,
-            lambda scan, _: scans.append(scan),
             check=check,
         )
         task = asyncio.create_task(edge.run())
@@ -268,7 +263,7 @@ async def test_a_lidar_that_scans_or_is_silent_passes_the_check(tmp_path, comman
                 await asyncio.sleep(0.005)
                 device.receive(port.read(), time.monotonic())
                 port.write(device.outgoing(time.monotonic()))
-                edge.poll(time.monotonic())
+                scans.extend(edge.poll(time.monotonic()))
         finally:
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)
@@ -295,7 +290,7 @@ class Motor:
 
 
 async def test_resting_lidar_is_stopped_with_its_motor_and_started_anew():
-    edge = LidarEdge("/dev/none", RplidarA1Driver(), SystemClock(), lambda *_: None, lambda *_: None)
+    edge = LidarEdge("/dev/none", RplidarA1Driver(), SystemClock(), lambda *_: None)
     port = Motor()
     edge._port, edge._lost = port, asyncio.get_running_loop().create_future()
     for now in (1.0, 1.05, 1.1):
@@ -309,6 +304,6 @@ async def test_resting_lidar_is_stopped_with_its_motor_and_started_anew():
 
 @pytest.mark.live
 async def test_a_port_named_by_its_number_ends_the_agent_with_the_remedy():
-    edge = LidarEdge("/dev/ttyUSB7", RplidarA1Driver(), SystemClock(), lambda *_: None, lambda *_: None)
+    edge = LidarEdge("/dev/ttyUSB7", RplidarA1Driver(), SystemClock(), lambda *_: None)
     with pytest.raises(SettingsError, match=r"lidar.port: /dev/ttyUSB7 .*/dev/serial/by-id"):
         await edge.run()

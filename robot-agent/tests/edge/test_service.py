@@ -48,6 +48,9 @@ class FakeGuardian:
     def __init__(self):
         self.sent = []
 
+    def receive(self):
+        pass
+
     def send(self, command):
         self.sent.append((time.monotonic(), command))
 
@@ -59,16 +62,9 @@ class FakeLidar:
     def poll(self, now, *, on):
         assert on
         self.polled.append(now)
+        return self.scans
 
-
-class _Ticks:
-    def __init__(self, times):
-        self._times = times
-
-    async def __aiter__(self):
-        for now in self._times:
-            await asyncio.sleep(0)
-            yield float(now)
+    scans = ()
 
 
 class Rig:
@@ -139,19 +135,34 @@ def test_every_query_of_the_core_is_served_and_commands_are_logged(rig, monkeypa
     ]
 
 
-@pytest.mark.parametrize(("idle", "least", "most"), [(True, 0.09, 0.5), (False, 0.0, 0.075)])
-async def test_the_stream_runs_at_half_its_rate_while_the_robot_has_nothing_to_do(rig, monkeypatch, idle, least, most):
+async def test_the_stream_runs_at_half_its_rate_while_the_robot_has_nothing_to_do(rig, monkeypatch):
+    idle = True
     monkeypatch.setattr(AgentCore, "idle", property(lambda _core: idle))
-    guardian, lidar, now = FakeGuardian(), FakeLidar(), iter(np.arange(0.0, 100.0, 0.05))
-    monkeypatch.setattr(rig.service, "_stream", _Ticks(now))
+    guardian, lidar = FakeGuardian(), FakeLidar()
     task = asyncio.create_task(rig.service.stream_loop(guardian, lidar))
-    await rig.until(lambda: len(lidar.polled) >= 6)
+    await rig.until(lambda: len(lidar.polled) >= 5)
+    assert rig.service._stream.period == pytest.approx(2.0 * service_module.STREAM_S)
+    assert np.diff(lidar.polled).min() > service_module.STREAM_S
+    idle, before = False, len(lidar.polled)
+    await rig.until(lambda: len(lidar.polled) >= before + 2)
+    assert rig.service._stream.period == service_module.STREAM_S
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)
-    periods = np.diff(lidar.polled)
-    assert least < periods.min()
-    assert periods.max() < most
     assert len(guardian.sent) == len(lidar.polled)
+
+
+async def test_a_scan_is_localized_after_the_command_of_its_tick(rig, monkeypatch):
+    order = []
+    guardian, lidar = FakeGuardian(), FakeLidar()
+    lidar.scans = ("a scan",)
+    monkeypatch.setattr(guardian, "receive", lambda: order.append("feedback"))
+    monkeypatch.setattr(guardian, "send", lambda _command: order.append("command"))
+    monkeypatch.setattr(rig.core, "on_scan", lambda scan, _now: order.append(scan))
+    task = asyncio.create_task(rig.service.stream_loop(guardian, lidar))
+    await rig.until(lambda: len(order) >= 6)
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+    assert order[:6] == ["feedback", "command", "a scan"] * 2
 
 
 async def test_storage_that_hangs_does_not_make_the_service_manager_restart_the_agent(rig, monkeypatch):

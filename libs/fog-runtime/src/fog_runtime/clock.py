@@ -9,7 +9,7 @@ import random
 import time
 import zlib
 from collections import deque
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Final, Literal, Protocol, get_args
 
@@ -187,7 +187,8 @@ class Ticker:
     Ticks lie at multiples of the period after the first. Loops of one `phase` share their ticks, so that the process is
     woken once for all of them; one with an `offset` (s) ticks that much later than the others, for work on a thread of
     its own that would compete with them for the interpreter. A tick that was missed because the body took too long is
-    skipped: a burst of control cycles would act several times on the same state of the world.
+    skipped: a burst of control cycles would act several times on the same state of the world. The period may be changed
+    at any time, and counts from the next tick on.
     """
 
     def __init__(self, clock: Clock, period: float, phase: Phase | None = None, offset: float = 0.0) -> None:
@@ -197,6 +198,7 @@ class Ticker:
         self.period = period
         self._phase = phase or Phase()
         self._offset = offset
+        self._due_by = period
         self.ticks = 0
         self.late = 0
         """Ticks that were skipped, or came more than half a period after they were due."""
@@ -212,7 +214,7 @@ class Ticker:
 
     async def __aiter__(self) -> AsyncIterator[float]:
         """Yield `clock.now()` at every tick, the first at once, or when the phase's next one is due."""
-        due = self._phase.next_tick(self.clock.now(), self.period, self._offset)
+        due = self._first()
         while True:
             wait = due - self.clock.now()
             if wait > 0.0:
@@ -221,18 +223,73 @@ class Ticker:
                 # A body that never awaits must not starve the rest of the loop.
                 await asyncio.sleep(0)
             now = self.clock.now()
-            lateness = max(0.0, now - due)
-            self.ticks += 1
-            self._lateness.append(lateness)
-            if lateness > self.period / 2:
-                self.late += 1
+            self._record(now, due)
             yield now
+            due = self._following(due)
+
+    async def call(self, body: Callable[[float], object]) -> None:
+        """Call a plain function with `clock.now()` at every tick until it returns True; its errors are raised.
+
+        In the callback of the timer: it costs half of what it takes to wake a task, and the loops of one phase are
+        called one after the other.
+        """
+        loop = asyncio.get_running_loop()
+        end: asyncio.Future[None] = loop.create_future()
+        due = self._first()
+        timer: asyncio.TimerHandle | None = None
+
+        def schedule() -> None:
+            nonlocal timer
+            timer = loop.call_later(self.clock.real(max(0.0, due - self.clock.now())), tick)
+
+        def tick() -> None:
+            nonlocal due
+            if end.done():
+                return  # cancelled, and the task has not run since
+            try:
+                now = self.clock.now()
+                self._record(now, due)
+                if body(now) is True:
+                    end.set_result(None)
+                    return
+                due = self._following(due)
+                schedule()
+            except Exception as error:  # noqa: BLE001  # who awaits `end` raises it
+                end.set_exception(error)
+
+        schedule()
+        try:
+            await end
+        finally:
+            if timer is not None:
+                timer.cancel()
+
+    def _first(self) -> float:
+        self._due_by = self.period
+        return self._phase.next_tick(self.clock.now(), self.period, self._offset)
+
+    def _record(self, now: float, due: float) -> None:
+        """Record a tick that was due then and comes now."""
+        lateness = max(0.0, now - due)
+        self.ticks += 1
+        self._lateness.append(lateness)
+        if lateness > self.period / 2:
+            self.late += 1
+
+    def _following(self, due: float) -> float:
+        """Return when the next tick after the one of `due` is due, and count those that were missed."""
+        if self.period == self._due_by:
             due += self.period
-            behind = self.clock.now() - due
-            if behind >= self.period:
-                missed = int(behind // self.period)
-                self.late += missed
-                due += missed * self.period
+        else:
+            # A multiple of the new period, which the other loops of the phase use, too.
+            due = self._phase.next_tick(due + 0.5 * min(self.period, self._due_by), self.period, self._offset)
+            self._due_by = self.period
+        behind = self.clock.now() - due
+        if behind >= self.period:
+            missed = int(behind // self.period)
+            self.late += missed
+            due += missed * self.period
+        return due
 
 
 def ticker(clock: Clock, period: float) -> Ticker:

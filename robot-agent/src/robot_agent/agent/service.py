@@ -39,6 +39,8 @@ if TYPE_CHECKING:
     from robot_agent.hardware import LaserScan
 
 STREAM_S: Final = 0.05
+IDLE_STREAM_S: Final = 0.1
+"""A robot that stands and has nothing to do needs every other tick only."""
 CONTROL_AFTER_S: Final = 0.02
 """Decisions begin this long after a tick of the stream: at the same moment, their thread and the loop's would take the
 interpreter from one another some hundred times a second. They end before the next tick, which sends their speeds."""
@@ -103,7 +105,8 @@ class Service:
         """Once a second: store the pose if it changed, and report the health; more often until the robot is ready."""
         due = -math.inf
         self._manager.ready()
-        async for now in self._ticker(PUBLISH_S):
+        ticker = self._ticker(PUBLISH_S)
+        async for now in ticker:
             if now >= due:
                 due = now + HOUSEKEEPING_S - PUBLISH_S / 2
                 self._core.on_loop_health(self._loop_health())
@@ -111,8 +114,9 @@ class Service:
                 await self._announce_metrics()
                 self._report_health(self._clock.now(), lidar)
                 self._observe(self._clock.now(), lidar, guardian)
-            elif not self._health.ready:
+            else:
                 self._report_health(now, lidar)
+            ticker.period = HOUSEKEEPING_S if self._health.ready else PUBLISH_S
 
     async def _store_pose(self, now: float) -> None:
         pose = self._core.pose_to_store(now)
@@ -181,22 +185,26 @@ class Service:
         self._core.on_scan(scan, now)
 
     async def stream_loop(self, guardian: GuardianClient, lidar: LidarEdge) -> None:
-        """Stream wheel commands at 20 Hz, at rest at 10 Hz, each on the newest samples of the lidar."""
-        suspension, skip = SuspensionMonitor(), False
-        async for now in self._stream:
+        """Stream wheel commands at 20 Hz, at rest at 10 Hz, each on the newest of base and lidar."""
+        suspension = SuspensionMonitor()
+
+        def stream(now: float) -> None:
             if seconds := suspension.suspended():
                 SUSPENSIONS.inc()
                 _log.warning("computer_was_suspended", seconds=round(seconds, 1))
                 self._core.on_suspension(seconds)
-            # A robot at rest with nothing to do needs every other tick only.
-            skip = self._core.idle and not skip
-            if skip:
-                continue
-            lidar.poll(now, on=self._core.lidar_on)
+            guardian.receive()
+            scans = lidar.poll(now, on=self._core.lidar_on)
             guardian.send(self._core.stream(now, self._clock.stamp()))
+            # After the command, which localization must not delay.
+            for scan in scans:
+                self.on_scan(scan, now)
             # Here, because the housekeeping waits for the storage, which may hang while the robot drives well.
             missing = self._health.missing
             self._manager.alive(f"waiting for {', '.join(missing)}" if missing else "ready")
+            self._stream.period = IDLE_STREAM_S if self._core.idle else STREAM_S
+
+        await self._stream.call(stream)
 
     async def control_loop(self) -> None:
         """Plan and decide, 5 times a second in the profile `fog`, on a thread: what hangs can't block the stream."""
@@ -233,13 +241,15 @@ class Service:
 
     async def publish_loop(self) -> None:
         """Tick the core at 10 Hz, publish what it returns, and observe traces."""
-        async for _ in self._ticker(PUBLISH_S):
-            at = self._edges.now()
-            self._publish(self._core.tick(at))
-            if (request := self._core.egress_request(at.now)) is not None:
-                self._ask_for_way_out(request)
-            for trace in self._core.finished_traces():
-                metrics.observe_trace(trace, ["deliver", "command", "total"])
+        await self._ticker(PUBLISH_S).call(self._tick)
+
+    def _tick(self, _now: float) -> None:
+        at = self._edges.now()
+        self._publish(self._core.tick(at))
+        if (request := self._core.egress_request(at.now)) is not None:
+            self._ask_for_way_out(request)
+        for trace in self._core.finished_traces():
+            metrics.observe_trace(trace, ["deliver", "command", "total"])
 
     def _ask_for_way_out(self, request: EgressRequest) -> None:
         task = asyncio.get_running_loop().create_task(self._fetch_way_out(request), name="egress")

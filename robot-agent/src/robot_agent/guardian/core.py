@@ -1,7 +1,7 @@
 """The guardian's decisions: which bytes go to the base, and when the wheels must stop. Pure; time is an argument.
 
 The guardian trusts no other process. A command of the agent moves the wheels only while it is fresh; bumper, cliff,
-wheel drop, a base that leaves its driving mode or falls silent stop them within one sensor frame, latched until the
+wheel drop, a base that leaves its driving mode or falls silent stop them with their sensor frame, latched until the
 agent passes on an operator's reset. A base may keep its last velocity when the host is silent, so "stop" is always a
 command, repeated.
 
@@ -103,6 +103,8 @@ class GuardianCore:
         self._sent_at = _NEVER
         self._stepped_at: float | None = None
         self._feedback = FeedbackPolicy()
+        self.frames = 0
+        """Number of valid frames of the base."""
 
     @property
     def latched(self) -> str | None:
@@ -130,6 +132,7 @@ class GuardianCore:
         feedbacks: list[BaseFeedback] = []
         stop = b""
         while (reading := self.driver.next_event()) is not None:
+            self.frames += 1
             self._base.reading, self._base.reading_at = reading, now
             self._revival.on_answer()
             stop += self._check(reading.status, now)
@@ -319,6 +322,7 @@ class GuardianCore:
             stopped=self._stopped(now),
             corrupted=self.corrupted,
             bumped=self._bumped,
+            at=now,
         )
 
     def _stopped(self, now: float) -> str | None:

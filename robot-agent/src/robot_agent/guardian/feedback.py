@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from robot_agent.hardware import BaseReading, BaseStatus, WheelOdometry
 
 FEEDBACK_S: Final = 0.045
-"""The agent gets every third sensor frame while the wheels turn, and every change immediately."""
+"""The agent gets every fourth sensor frame while the wheels turn, and every change immediately."""
 FEEDBACK_AT_REST_S: Final = 0.09
 """And every seventh while they do not: an idle robot shall cost little."""
 

@@ -8,10 +8,11 @@ from __future__ import annotations
 import math
 from typing import Final
 
-SHORTEST_S: Final = 0.04
+SHORTEST_S: Final = 0.07
 """No two heartbeats are nearer to one another: they share the guardian's wake-ups for base and agent."""
-LONGEST_S: Final = 0.055
-"""The longest pause that the guardian leaves between two, however commands and frames wake it."""
+LONGEST_S: Final = 0.105
+"""The longest pause that the guardian leaves between two, however commands and frames wake it: a little more than that
+between two commands to a robot that stands, so that these alone wake its guardian."""
 LATENESS_S: Final = 0.095
 """Real seconds by which the machine may delay a heartbeat or the watchdog.
 
@@ -20,7 +21,7 @@ Programs of normal priority get 50 ms of each second before any with a real-time
 
 
 def silence_limit(speed: float) -> float:
-    """Return the real seconds without a heartbeat after which the guardian is killed: 0.15 at speed 1.
+    """Return the real seconds without a heartbeat after which the guardian is killed: 0.2 at speed 1.
 
     speed: simulated over wall time. It shortens the pauses, but no delay of the machine.
     """

@@ -44,7 +44,8 @@ class BaseFeedback(Struct, frozen=True, kw_only=True):
 
     `fault`: the guardian's latched fault (None: none). `stopped`: why the guardian keeps the wheels at zero
     whatever the agent requests (None: it does not). `corrupted`: damaged frames of the base so far. `bumped`: the fault
-    is a pressed bumper, from which the robot may back off.
+    is a pressed bumper, from which the robot may back off. `at`: when it was sent, s of the monotonic clock that agent
+    and guardian share (None: unknown).
     """
 
     seq: Count
@@ -54,6 +55,7 @@ class BaseFeedback(Struct, frozen=True, kw_only=True):
     stopped: Sentence | None
     corrupted: Count = 0
     bumped: bool = False
+    at: float | None = None
 
 
 encode = msgspec.msgpack.Encoder().encode

@@ -27,27 +27,23 @@ from fog_runtime.machine import signals
 from fog_runtime.machine.machine_clock import MachineClock
 from robot_agent.device_signature import LISTEN_S, LineCheck
 from robot_agent.guardian.core import GuardianCore, Limits, Output
-from robot_agent.guardian.heartbeat import Heartbeats
+from robot_agent.guardian.frame_clock import UNKNOWN_S, FrameClock
+from robot_agent.guardian.heartbeat import LONGEST_S, Heartbeats
 from robot_agent.guardian.link import PACKET_LIMIT, WheelCommand, decode_command, encode
 from robot_agent.guardian.protection import lock_memory, run_in_real_time
+from robot_agent.guardian.wakeups import Commands, Wakeups
 from robot_agent.guardian.watchdog import BAD_SETTINGS, PORT_LOST
 from robot_agent.registry import make_base, signatures
 from robot_agent.serial_port import Port, PortLost
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from types import FrameType
 
     from fog_contracts.robot import MotionSettings
     from robot_agent.guardian.revival import Attempt
 
-MOVING_S: Final = 0.015
-"""Period of looking at base and agent while a wheel turns: a sensor frame of the fastest base.
-
-Waiting for bytes would wake the process for each piece of a frame, which some adapters pass on every millisecond.
-"""
-RESTING_S: Final = 0.055
-"""The same while no wheel turns; but a command of the agent is applied at once, and comes a little more often."""
+RESTING_S: Final = LONGEST_S
+"""Period while no wheel turns; but a command of the agent is applied at once, and comes a little more often."""
 AGENT_LIVES_S: Final = 1.0
 """An agent sends a command every 0.05 s; one that was silent for longer than this hangs: another may take its place."""
 REFUSE_S: Final = 2.0
@@ -81,10 +77,11 @@ class Guardian:
         self._core = core
         self._check = check
         self._port = Port.from_fd(settings.base_fd, settings.base_port or None)
-        self._poll = select.poll()
-        self._events: dict[int, Callable[[], None]] = {}
+        self._wakeups = Wakeups()
+        self._frames = FrameClock(core.driver.timing.frame_s)
         self._moving = False
         self._agent: socket.socket | None = None
+        self._commands: Commands | None = None
         self._agent_heard_at = -1.0
         self._heartbeats = Heartbeats()
         self._latched: str | None = None
@@ -97,15 +94,15 @@ class Guardian:
 
     def run(self) -> int:
         """Guard until the watchdog or a signal ends it; returns the exit code."""
-        self._register(self._settings.watchdog_fd, self._on_watchdog_lost)
-        self._register(self._listener.fileno(), self._accept)
+        self._wakeups.watch(self._settings.watchdog_fd, self._on_watchdog_lost)
+        self._wakeups.watch(self._listener.fileno(), self._accept)
         try:
             # Bytes that arrived before this process started are stale.
             self._port.discard_input()
             if (problem := self._wrong_device()) is not None:
                 return self._refuse_port(problem)
             while not self._ended and self._signal is None:
-                self._wait(MOVING_S if self._moving else RESTING_S)
+                self._wait(self._frames.wait(self._clock.now()) if self._moving else RESTING_S)
                 self._cycle()
             self._port.write(self._core.stop_command())
         except PortLost as error:
@@ -114,16 +111,9 @@ class Guardian:
         self._log.info("ended", signal=self._signal and signal.Signals(self._signal).name)
         return 0
 
-    def _register(self, descriptor: int, handler: Callable[[], None]) -> None:
-        self._events[descriptor] = handler
-        self._poll.register(descriptor, select.POLLIN)
-
     def _wait(self, seconds: float) -> None:
         """Wait for an event, `seconds` at most and no longer than the next heartbeat may, and handle it."""
-        left = self._heartbeats.wait(seconds, self._clock.now())
-        for descriptor, _ in self._poll.poll(1000.0 * self._clock.real(left)):
-            if (handler := self._events.get(descriptor)) is not None:  # None: closed by the handler before
-                handler()
+        self._wakeups.wait(self._clock.real(self._heartbeats.wait(seconds, self._clock.now())))
 
     def _cycle(self) -> None:
         """Look at base and agent, and advance time."""
@@ -136,15 +126,18 @@ class Guardian:
         self._send_heartbeat()
         if self._core.moving != self._moving:
             self._moving = not self._moving
-            self._watch_agent()
+            self._on_motion()
 
-    def _watch_agent(self) -> None:
-        """Let the agent's commands wake this process while the wheels rest; later they are read in each cycle.
+    def _on_motion(self) -> None:
+        """Look at the base often, or seldom again.
 
-        The end of the link wakes it always.
+        Commands of the agent wake this process while the wheels rest; later they are read in each cycle. The end of the
+        link wakes it always.
         """
+        if self._moving:
+            self._frames.begin(self._clock.now())
         if self._agent is not None:
-            self._poll.register(self._agent.fileno(), 0 if self._moving else select.POLLIN)
+            self._wakeups.watch(self._agent.fileno(), self._read_agent, input_too=not self._moving)
 
     def _wrong_device(self) -> str | None:
         """Listen until the line sounds like a known device; return the sentence for another one than the base.
@@ -153,7 +146,7 @@ class Guardian:
         """
         check, until = self._check, self._clock.now() + LISTEN_S
         while not check.settled and self._clock.now() < until and self._signal is None:
-            select.select((self._port,), (), (), self._clock.real(MOVING_S))
+            select.select((self._port,), (), (), self._clock.real(UNKNOWN_S))
             check.feed(self._port.read_available())
             self._send_heartbeat()
         return check.problem
@@ -162,7 +155,7 @@ class Guardian:
         """Tell agents for a while why there is no base; the watchdog opens the port again, perhaps after a re-plug."""
         self._log.error("wrong_device", reason=problem)
         until = self._clock.now() + REFUSE_S
-        self._events[self._listener.fileno()] = lambda: self._refuse_agent(problem)
+        self._wakeups.watch(self._listener.fileno(), lambda: self._refuse_agent(problem))
         while self._clock.now() < until and not self._ended and self._signal is None:
             self._wait(RESTING_S)
             self._port.read_available()
@@ -180,8 +173,10 @@ class Guardian:
 
     def _read_base(self) -> None:
         data, now = self._port.read_available(), self._clock.now()
+        before = self._core.frames
         if data:
             self._apply(self._core.on_bytes(data, now))
+        self._frames.on_look(self._core.frames - before, now)
         if self._core.corrupted != self._corrupted:
             self._corrupted = self._core.corrupted
             self._limited_log.warning("frames_corrupted", "frames_corrupted", now, total=self._corrupted)
@@ -207,8 +202,8 @@ class Guardian:
             self._refuse(agent, reason)
             return
         self._drop_agent(f"another agent connected, and this one has sent no command for {AGENT_LIVES_S:g} s")
-        self._agent, self._agent_heard_at = agent, now
-        self._register(agent.fileno(), self._read_agent)
+        self._agent, self._agent_heard_at, self._commands = agent, now, Commands(agent)
+        self._wakeups.watch(agent.fileno(), self._read_agent)
         self._log.info("agent_connected")
 
     def _refuse(self, agent: socket.socket, reason: str) -> None:
@@ -219,16 +214,16 @@ class Guardian:
             agent.recv(PACKET_LIMIT)
 
     def _read_agent(self) -> None:
-        agent = self._agent
-        if agent is None:
+        agent, commands = self._agent, self._commands
+        if agent is None or commands is None:
             return  # dropped earlier in this cycle
         newest: WheelCommand | None = None
         reset = False
         for _ in range(PACKETS_PER_CYCLE):
+            if not commands.pending():
+                break
             try:
                 data = agent.recv(PACKET_LIMIT + 1)
-            except BlockingIOError:
-                break
             except ConnectionError as error:
                 self._drop_agent(str(error))
                 return
@@ -249,10 +244,9 @@ class Guardian:
     def _drop_agent(self, reason: str) -> None:
         if self._agent is None:
             return
-        self._poll.unregister(self._agent)
-        del self._events[self._agent.fileno()]
+        self._wakeups.forget(self._agent.fileno())
         self._agent.close()
-        self._agent = None
+        self._agent = self._commands = None
         self._log.warning("agent_lost", reason=reason)
         self._apply(self._core.on_agent_lost(self._clock.now()))
 

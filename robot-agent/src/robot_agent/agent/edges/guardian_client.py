@@ -1,9 +1,14 @@
-"""The agent's end of the guardian's socket: feedback in, wheel commands out, connected again whenever it breaks."""
+"""The agent's end of the guardian's socket: feedback in, wheel commands out, connected again whenever it breaks.
+
+The stream of wheel commands reads it, just before each command: the agent is not woken for each feedback, which says
+itself when it was sent.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import math
+import select
 import socket
 import struct
 from typing import TYPE_CHECKING, Final
@@ -24,12 +29,16 @@ FEEDBACK_TIMEOUT_S: Final = 1.0
 """Without feedback for this long the guardian receives nothing from its base."""
 RESET_VALID_S: Final = 1.0
 """An operator's reset that could not be passed on within this time expires: it must not clear a later fault."""
+_SENT_WITHIN_S: Final = 0.25
+"""Feedback waits no longer than this for the stream; an older or later time is that of another clock."""
+_PACKETS_AT_ONCE: Final = 64
+"""A flood of packets must not block the stream."""
 
 _log = logs.get("base")
 
 
 class GuardianClient:
-    """One connection to the guardian at a time; the callbacks run on the loop."""
+    """One connection to the guardian at a time; `receive` calls `on_feedback` with the time at which it was sent."""
 
     def __init__(
         self,
@@ -43,6 +52,9 @@ class GuardianClient:
         self._on_feedback = on_feedback
         self._on_lost = on_lost
         self._socket: socket.socket | None = None
+        self._readable = select.poll()
+        self._end: asyncio.Future[str] | None = None
+        """Set when the link is over, to the reason."""
         self._reset_until = -math.inf
         self._feedback_at = -math.inf
         self.pid: int | None = None
@@ -91,30 +103,31 @@ class GuardianClient:
             await self._clock.sleep(RETRY_S)
 
     async def _read(self, link: socket.socket) -> str:
-        """Pass feedback on until the link breaks; return the reason."""
-        loop = asyncio.get_running_loop()
-        end: asyncio.Future[str] = loop.create_future()
+        """Let `receive` pass feedback on until the link breaks; return the reason."""
         self._accepted = False
-        # One registration for all packets: it costs less than one for each.
-        loop.add_reader(link, self._receive, link, end)
+        self._end = asyncio.get_running_loop().create_future()
+        self._readable.register(link, select.POLLIN)
         try:
-            return await end
+            return await self._end
         finally:
-            loop.remove_reader(link)
+            self._readable.unregister(link)
+            self._end = None
 
-    def _receive(self, link: socket.socket, end: asyncio.Future[str]) -> None:
-        """Pass one packet on; set `end` when the link is over, or to what went wrong."""
-        if end.done():
-            return  # what waits for it has not run yet
+    def receive(self) -> None:
+        """Pass on what the guardian has sent; call it on the loop's thread, before each `send`."""
+        link, end = self._socket, self._end
+        if link is None or end is None or end.done():
+            return
         try:
-            reason = self._on_packet(link.recv(PACKET_LIMIT + 1))
-        except BlockingIOError:
-            return
-        except Exception as error:  # noqa: BLE001  # who awaits `end` raises it
+            for _ in range(_PACKETS_AT_ONCE):
+                # Asked first: an exception for each empty socket would cost more.
+                if not self._readable.poll(0):
+                    return
+                if (reason := self._on_packet(link.recv(PACKET_LIMIT + 1))) is not None:
+                    end.set_result(reason)
+                    return
+        except Exception as error:  # noqa: BLE001  # `run`, which awaits `end`, raises it
             end.set_exception(error)
-            return
-        if reason is not None:
-            end.set_result(reason)
 
     def _on_packet(self, data: bytes) -> str | None:
         """Pass a packet of the guardian on; return why the link ends with it, None if it does not."""
@@ -132,7 +145,8 @@ class GuardianClient:
             self._accepted = True
             _log.info("guardian_connected", socket=str(self._path))
         self._feedback_at, self._last_logged = now, ""
-        self._on_feedback(feedback, now)
+        sent_at = now if feedback.at is None else feedback.at
+        self._on_feedback(feedback, sent_at if 0.0 <= now - sent_at <= _SENT_WITHIN_S else now)
         return None
 
     def _lost(self, reason: str) -> None:

@@ -17,7 +17,7 @@ from robot_agent.port_names import PortNameError
 from robot_agent.serial_port import Port, PortLost, open_port, refuse_speed
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from fog_runtime.clock import Clock
     from robot_agent.device_signature import LineCheck
@@ -32,7 +32,7 @@ _log = logs.get("lidar")
 
 
 class LidarEdge:
-    """Keeps a scan running on one port; `poll` reads it and calls the callbacks, all on the loop's thread."""
+    """Keeps a scan running on one port; `poll` reads it, on the loop's thread."""
 
     def __init__(
         self,
@@ -40,16 +40,14 @@ class LidarEdge:
         driver: LidarDriver,
         clock: Clock,
         on_samples: Callable[[LidarSamples, float], object],
-        on_scan: Callable[[LaserScan, float], object],
         *,
         check: Callable[[], LineCheck] | None = None,
     ) -> None:
-        """Store the port's path, the driver and the callbacks; `check` makes a fresh check for each opening."""
+        """`on_samples` is called with the newest samples by `poll`; `check` makes a fresh check for each opening."""
         self._path = path
         self._driver = driver
         self._clock = clock
         self._on_samples = on_samples
-        self._on_scan = on_scan
         self._check = check
         self._last_logged = ""
         self._resting = False
@@ -127,31 +125,33 @@ class LidarEdge:
         """Number of damaged packets of the lidar."""
         return self._driver.corrupted
 
-    def poll(self, now: float, *, on: bool = True) -> None:
-        """Read what has arrived, and pass it on; nothing while the port is closed. Call it 20 times a second.
+    def poll(self, now: float, *, on: bool = True) -> Sequence[LaserScan]:
+        """Read what has arrived, and return the whole scans; none while the port is closed.
 
-        Without `on` the lidar rests: its scan and motor are stopped, and started again when it is on.
+        Call it 20 times a second, and use the scans only after what must not be delayed. Without `on` the lidar rests:
+        its scan and motor are stopped, and started again when it is on.
         """
         port, driver, lost = self._port, self._driver, self._lost
+        scans: Sequence[LaserScan] = ()
         if port is None or lost is None:
-            return
+            return scans
         try:
             if on is self._resting:
                 self._switch(port, now, on=on)
             if self._resting:
-                return
+                return scans
             events = driver.receive(port.read_available(), now)
+            scans = events.scans
             if events.samples is not None:
                 self._on_samples(events.samples, now)
-            for scan in events.scans:
-                # After the caller's own work: localization by a scan must not delay the wheel command.
-                lost.get_loop().call_soon(self._on_scan, scan, now)
-            port.write(events.data + driver.tick(now))
+            if reply := events.data + driver.tick(now):
+                port.write(reply)
         except PortLost as error:
             self._port = None
             if not lost.done():
                 lost.set_exception(error)
         self._report(driver.problem)
+        return scans
 
     def _switch(self, port: Port, now: float, *, on: bool) -> None:
         self._resting = not on

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from robot_agent.agent.core import AgentCore
     from robot_agent.agent.edges.store import Store
 
-CHECK_S: Final = 0.05
+CHECK_S: Final = 0.1
 SNAPSHOT_TIMEOUT_S: Final = 3.0
 """Timeout of a snapshot request."""
 
@@ -75,8 +75,12 @@ class MapLoader:
         """Request a snapshot whenever the core wants one, with a growing delay after each failure."""
         failures = 0
         await self._clock.sleep(CHECK_S)  # a heartbeat may come first and confirm the stored map
-        async for now in Ticker(self._clock, CHECK_S, self._phase):
-            if not self._core.wants_snapshot(now) or await self._fetch():
+        ticker = Ticker(self._clock, CHECK_S, self._phase)
+        while True:
+            if not self._core.wants_snapshot(self._clock.now()):
+                failures = 0
+            await ticker.call(self._core.wants_snapshot)
+            if await self._fetch():
                 failures = 0
             else:
                 failures += 1

@@ -86,7 +86,7 @@ class Roomba600Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
 class Roomba600Driver:
     """One Roomba's protocol; see `robot_agent.hardware.BaseDriver`."""
 
-    timing = BaseTiming(frame_timeout=0.3, wake_timeout=1.0, ignored_after_wake=0.1)
+    timing = BaseTiming(frame_timeout=0.3, wake_timeout=1.0, ignored_after_wake=0.1, frame_s=0.015)
 
     def __init__(self, options: Roomba600Options) -> None:
         self._stream = _STREAMS[options.baud]

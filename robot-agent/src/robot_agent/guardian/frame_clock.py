@@ -1,0 +1,62 @@
+"""When the guardian looks at its base while a wheel turns: every second frame, just after it has come. Pure.
+
+Waiting for bytes would wake the process for each piece of a frame, which some adapters pass on every millisecond; a
+look at each frame costs twice as much as one at two. A look at any other time than just after the second frame would
+let a frame wait for longer: so each look comes a little earlier than the last one, until one comes too early.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+FRAMES: Final = 2
+"""Frames of one look. The first of two waits for the second one: for no longer than any frame may wait that is looked
+for once a frame, at no particular moment."""
+UNKNOWN_S: Final = 0.015
+"""Period of the looks at a base of which the rate of its frames is not known, or that sends none."""
+EARLIER_S: Final = 0.0003
+"""Each look comes so much earlier."""
+LATER_S: Final = 0.002
+"""After a look that came too early, another one follows so much later."""
+TRIES: Final = 4
+"""So often, at most: the frame may be damaged, or the base silent."""
+
+
+class FrameClock:
+    """The looks at one base; `now` is s of the guardian's clock, `frame_s` s between two frames (0: not known)."""
+
+    def __init__(self, frame_s: float) -> None:
+        self._period = FRAMES * frame_s
+        self._missing = FRAMES
+        self._tries = 0
+        self._due = 0.0
+
+    def begin(self, now: float) -> None:
+        """Begin: a wheel turns."""
+        self._due = now
+        self._expect()
+
+    def wait(self, now: float) -> float:
+        """Return the time (s) until the next look."""
+        return max(0.0, self._due - now)
+
+    def on_look(self, frames: int, now: float) -> None:
+        """Take notice of how many whole frames the look at `now` has found, be it due or not."""
+        self._missing -= frames
+        if now < self._due:
+            return
+        if not self._period:
+            self._due = now + UNKNOWN_S
+        elif self._missing <= 0:
+            # After a pause of the machine there is nothing to catch up with.
+            self._due = max(self._due + self._period, now + 0.5 * self._period) - EARLIER_S
+            self._expect()
+        elif self._tries < TRIES:
+            self._tries += 1
+            self._due = now + LATER_S
+        else:
+            self._due = now + UNKNOWN_S
+            self._expect()
+
+    def _expect(self) -> None:
+        self._missing, self._tries = FRAMES, 0

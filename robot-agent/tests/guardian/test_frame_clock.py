@@ -1,0 +1,115 @@
+"""When the guardian looks at a base that sends frames: seldom, and yet soon after each frame."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import random
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robot_agent.guardian.frame_clock import EARLIER_S, FRAMES, LATER_S, UNKNOWN_S, FrameClock
+
+FRAME_S = 0.015
+SETTLED_S = 2.0
+END_S = 6.0
+WAKING_S = 0.0015
+"""By so much the kernel, which counts in milliseconds, wakes a process late."""
+LATE_S = FRAME_S + LATER_S + 3.0 * WAKING_S
+
+
+class Base:
+    """The frames of a base, and when each was whole; `damaged` ones are not valid."""
+
+    def __init__(self, phase=0.0, period=FRAME_S, jitter=0.0, seed=0, damaged=()):
+        chance = random.Random(seed)
+        numbers = [number for number in range(int(END_S / period)) if number not in damaged]
+        self.whole = [phase + number * period + chance.uniform(0.0, jitter) for number in numbers]
+        self._waiting = list(self.whole)
+
+    def read(self, until):
+        """Return how many frames have come, and take them away."""
+        count = sum(at <= until for at in self._waiting)
+        del self._waiting[:count]
+        return count
+
+
+def looks_at(base, frame_s=FRAME_S, seed=0):
+    """Return the times of the looks of a guardian whose wheels turn all the time."""
+    chance, clock, now = random.Random(seed), FrameClock(frame_s), 0.0
+    clock.begin(now)
+    times = []
+    while now < END_S - 2.0 * FRAME_S:
+        now += math.ceil(1000.0 * clock.wait(now)) / 1000.0 + chance.uniform(0.0, WAKING_S - 0.001)
+        clock.on_look(base.read(now), now)
+        times.append(now)
+        now += 0.0003
+    return times
+
+
+def delays(base, looks):
+    """Return how long each frame waited for its look, once the clock has settled."""
+    following = iter(looks)
+    look, waits = next(following), []
+    for at in base.whole:
+        while look < at:
+            look = next(following, math.inf)
+        if at > SETTLED_S and look < math.inf:
+            waits.append(look - at)
+    return waits
+
+
+@given(
+    phase=st.floats(0.0, FRAME_S),
+    drift=st.floats(-0.01, 0.01),
+    jitter=st.floats(0.0, 0.001),
+    seed=st.integers(0, 99),
+)
+def test_each_frame_is_looked_at_soon_whatever_its_phase_and_exact_rate(phase, drift, jitter, seed):
+    base = Base(phase, FRAME_S * (1.0 + drift), jitter, seed)
+    looks = looks_at(base, seed=seed)
+    waits = delays(base, looks)
+    # As if one looked once a frame, at no particular moment: then a frame waits for 7.5 ms on average, for 15 at most.
+    assert sum(waits) / len(waits) < 0.011
+    assert max(waits) < LATE_S
+    assert len(looks) / looks[-1] < 1.4 / (FRAMES * FRAME_S)
+
+
+@pytest.mark.parametrize("damaged", [{200}, {201}, {200, 201}, {200, 202, 203}])
+def test_damaged_frames_delay_others_for_moments_only(damaged):
+    base = Base(damaged=damaged)
+    waits = delays(base, looks_at(base))
+    assert len([wait for wait in waits if wait > LATE_S]) <= 1
+    assert max(waits) < 2.0 * FRAME_S
+
+
+def test_silent_base_is_looked_at_no_more_seldom_than_one_that_sends():
+    looks = looks_at(Base(phase=END_S))
+    assert len(looks) / looks[-1] < 250.0
+    assert max(after - before for before, after in itertools.pairwise(looks)) < UNKNOWN_S + 2.0 * WAKING_S
+
+
+def test_base_whose_rate_is_not_known_is_looked_at_by_the_clock():
+    pauses = [after - before for before, after in itertools.pairwise(looks_at(Base(), frame_s=0.0))]
+    assert all(UNKNOWN_S - 1e-9 < pause < UNKNOWN_S + 2.0 * WAKING_S for pause in pauses)
+
+
+def test_other_events_do_not_move_the_looks():
+    clock = FrameClock(FRAME_S)
+    clock.begin(0.0)
+    clock.on_look(2, 0.0)
+    due = clock.wait(0.0)
+    assert due == pytest.approx(FRAMES * FRAME_S - EARLIER_S)
+    clock.on_look(1, 0.02)
+    assert clock.wait(0.02) == pytest.approx(due - 0.02)
+    clock.on_look(1, due)  # the second one: both have come
+    assert clock.wait(due) == pytest.approx(FRAMES * FRAME_S - EARLIER_S)
+
+
+def test_pause_of_the_machine_is_not_made_up_for_by_looks_at_once():
+    clock = FrameClock(FRAME_S)
+    clock.begin(0.0)
+    clock.on_look(40, 0.6)
+    assert clock.wait(0.6) >= 0.5 * FRAMES * FRAME_S - EARLIER_S

@@ -76,6 +76,8 @@ class SafetyConfig:
     """For how long (s) the dock must have contact until the base has found it."""
     undock_max: float = 15.0
     back_off_max: float = 5.0
+    turn_max: float = 30.0
+    advance_max: float = 15.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

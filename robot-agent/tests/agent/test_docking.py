@@ -13,7 +13,7 @@ from fog_contracts.costs import LETHAL
 from fog_contracts.grid import GridGeometry
 from fog_contracts.messages import Pose, RobotGoal
 from robot_agent.agent.maneuvering.docking import Docking
-from robot_agent.agent.maneuvering.straight_back import StraightBack
+from robot_agent.agent.maneuvering.straight import Straight
 from robot_agent.agent.path.mission import Mission
 from robot_agent.hardware import BaseStatus
 from robot_agent.localization.pose import Pose2
@@ -216,7 +216,7 @@ def test_robot_that_was_carried_to_another_dock_is_not_told_to_be_on_its_own():
 
 
 def test_way_straight_back_is_measured_along_the_robots_own_axis():
-    back = StraightBack(0.3, 0.1)
+    back = Straight(-0.3, 0.1)
     assert back.remaining(Pose2(0.0, 0.0, 0.0)) == float("inf")
     back.begin(Pose2(1.0, 1.0, np.pi / 2))
     assert back.remaining(Pose2(1.2, 0.9, np.pi / 2)) == pytest.approx(0.2)

@@ -305,6 +305,54 @@ def test_back_off_ends_after_five_seconds():
     assert gate.run(0.2, maneuver_remaining=0.09, **BUMPED).mode == "FAULT"
 
 
+@pytest.mark.parametrize("kind", ["turn", "advance"])
+@pytest.mark.parametrize("changes", STOPS[:3] + STOPS[7:] + [(fault, "") for fault in FAULTS])
+def test_base_and_lidar_refuse_looking_around_and_end_it(kind, changes):
+    values, words = changes
+    gate = Gate(enabled=False, localization="lost")
+    assert words in gate.run(request=kind, maneuver_remaining=1.0, **values).refusal
+    gate = Gate(enabled=False, localization="lost")
+    assert gate.run(request=kind, maneuver_remaining=1.0).refusal is None
+    out = gate.run(maneuver_remaining=0.9, **values)
+    assert out.stop == "immediate"
+    assert gate.state.maneuver is None
+
+
+@pytest.mark.parametrize("kind", ["turn", "advance"])
+def test_looking_around_needs_neither_place_nor_map_and_ends_once_the_place_is_known(kind):
+    unknown = {"localization": "none", "map_loaded": False, "map_age": math.inf, "inside_blocked": "the zone x"}
+    gate = Gate(enabled=False, **unknown)
+    out = gate.run(request=kind, maneuver_remaining=1.0)
+    assert (out.refusal, out.mode, out.cap, out.mission_may_drive) == (None, "EGRESS", 0.10, False)
+    assert gate.run(1.0, maneuver_remaining=0.5).mode == "EGRESS"
+    assert gate.run(maneuver_remaining=0.4, localization="weak").mode == "EGRESS"
+    out = gate.run(maneuver_remaining=0.3, localization="good")
+    assert (out.mode, gate.state.enabled, out.stop) == ("INIT", False, "immediate")
+    assert any("the robot knows where it is" in reason for reason in out.reasons)
+
+
+@pytest.mark.parametrize(("kind", "longest"), [("turn", 30.0), ("advance", 15.0)])
+def test_looking_around_ends_after_its_way_after_its_time_and_when_nothing_moves(kind, longest):
+    gate = Gate(enabled=False, localization="lost", localization_detail="2 places look alike")
+    gate.run(request=kind, maneuver_remaining=1.0)
+    reasons = gate.run(maneuver_remaining=0.0).reasons
+    assert any("it is done, and the pose is unknown: 2 places look alike" in reason for reason in reasons)
+    gate.run(request=kind, maneuver_remaining=1.0)
+    reasons = gate.run(10.1, maneuver_remaining=1.0, maneuver_problem="an obstacle is near").reasons
+    assert any("came no nearer to its end for 10 s: an obstacle is near" in reason for reason in reasons)
+    gate.run(request=kind, maneuver_remaining=100.0)
+    for second in range(int(longest) + 1):
+        gate.run(1.0, maneuver_remaining=99.0 - second)
+    assert any(f"longer than {longest:.0f} s" in reason for reason in gate.out.reasons)
+
+
+def test_latched_fault_and_known_place_refuse_looking_around():
+    assert "knows where it is" in Gate().run(request="turn", maneuver_remaining=1.0).refusal
+    gate = Gate()
+    gate.run(cliff=True)
+    assert "a fault is latched" in gate.run(request="advance", maneuver_remaining=1.0, localization="lost").refusal
+
+
 def test_back_off_needs_a_bump():
     assert "bumped into nothing" in Gate().run(request="back_off").refusal
     gate = Gate()

@@ -85,6 +85,26 @@ def robot_back_off(*, robot: RobotOption = None, fog: FogOption = None, json: Js
     _run_command("back_off", robot, fog, json=json)
 
 
+@robot_app.command("turn", epilog="Example: fognav robot turn && fognav robot watch --seconds 15")
+def robot_turn(*, robot: RobotOption = None, fog: FogOption = None, json: JsonOption = False) -> None:
+    """Let a robot that does not know its place turn in place, to both sides and back.
+
+    `fognav robot status` lists the places that its scans leave. It stops turning once it knows, and then waits to be
+    enabled. Watch it: its lidar guards the turn, but it knows of no zone yet.
+    """
+    _run_command("turn", robot, fog, json=json)
+
+
+@robot_app.command("advance", epilog="Example: fognav robot advance && fognav robot watch --seconds 15")
+def robot_advance(*, robot: RobotOption = None, fog: FogOption = None, json: JsonOption = False) -> None:
+    """Let a robot that does not know its place drive 0.4 m straight ahead, slowly.
+
+    This tells places apart between which a turn does not decide. Watch it: its lidar guards the way, but it knows of no
+    zone yet.
+    """
+    _run_command("advance", robot, fog, json=json)
+
+
 @robot_app.command("stop", epilog="Example: fognav robot stop")
 def robot_stop(*, robot: RobotOption = None, fog: FogOption = None, json: JsonOption = False) -> None:
     """Stop a robot at once and end its mission."""
@@ -323,6 +343,8 @@ def _describe(state: Mapping[str, Any] | None, pose: Mapping[str, Any] | None) -
     parts = [state["mode"], *state["reasons"][:3]]
     if pose is not None:
         parts.append(f"at {_position(pose)}" + ("" if pose["localized"] else ", not localized"))
+    if places := state.get("places"):
+        parts.append("it may be at " + " or ".join(_position(place) for place in places))
     if state["goal_distance"] is not None:
         parts.append(f"{state['goal_distance']:.1f} m to the goal")
     return "; ".join(parts)

@@ -725,6 +725,7 @@ class RobotState(Message, frozen=True, kw_only=True):
     `proximity` has the strength of each of the base's light sensors, from the left to the right; empty without any.
     `metrics` is the address (host:port) at which Prometheus reaches the robot's metrics; empty if it can't.
     `docked`: it stands on its dock. `wants_dock`: it asks the planner for the goal in front of its dock.
+    `places`: where on the map it may be, most likely first, while its scans do not decide; empty otherwise.
     """
 
     mode: Mode
@@ -750,6 +751,7 @@ class RobotState(Message, frozen=True, kw_only=True):
     metrics: Annotated[str, Meta(max_length=128)] = ""
     docked: bool = False
     wants_dock: bool = False
+    places: Annotated[list[Pose], Meta(max_length=8)] = []
 
 
 VIEW_SECTORS: Final = 180
@@ -792,6 +794,8 @@ CommandKind = Literal[
     "dock",
     "undock",
     "back_off",
+    "turn",
+    "advance",
     "reset",
     "initial_pose",
     "profile_default",

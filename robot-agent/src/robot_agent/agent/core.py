@@ -315,6 +315,7 @@ class AgentCore:
             boot=self._config.boot,
             profile=self.profile.name,
             docking=self._maneuvers.docking,
+            hypotheses=self._localizer.hypotheses,
             at=at,
         )
 

@@ -23,6 +23,8 @@ _ACCEPTED: Final[Mapping[Request, str]] = {
     "reset": "the fault is reset; enable the robot to let it drive",
     "egress": "the robot leaves the blocked area slowly; watch it",
     "undock": "the robot leaves its dock, straight back; watch it",
+    "turn": "the robot turns in place to find out where it is; watch it",
+    "advance": "the robot drives 0.4 m ahead to find out where it is; watch it: it knows of no zone yet",
     "back_off": "the robot backs off by at most 10 cm; then reset its fault",
 }
 
@@ -59,7 +61,7 @@ class OperatorCommands:
         if refusal is not None:
             return _refused(refusal)
         match command.kind:
-            case "enable" | "disable" | "reset" | "egress" | "undock" | "back_off":
+            case "enable" | "disable" | "reset" | "egress" | "undock" | "back_off" | "turn" | "advance":
                 return self._request(command.kind, at.now)
             case "dock":
                 return self._send_to_dock(at.now)

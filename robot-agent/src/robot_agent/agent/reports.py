@@ -7,10 +7,12 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 import numpy as np
 
-from fog_contracts.messages import LoopHealth, RobotPose, RobotState
+from fog_contracts.messages import LoopHealth, Pose, RobotPose, RobotState
 from robot_agent.agent.power import power_warnings
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from fog_contracts.handlers import Moment
     from fog_contracts.messages import ProfileName, Trace
     from fog_contracts.replica import Version
@@ -18,6 +20,7 @@ if TYPE_CHECKING:
     from robot_agent.agent.path.mission import Mission
     from robot_agent.config import AgentConfig
     from robot_agent.guardian.link import BaseFeedback
+    from robot_agent.localization.hypotheses import Hypothesis
     from robot_agent.localization.localizer import Localizer
     from robot_agent.motion.local_planner import Decision
     from robot_agent.safety.gate import SafetyState
@@ -25,6 +28,7 @@ if TYPE_CHECKING:
 _VARIANCE_MIN: Final = (1e-4, 1e-4, 1e-4)
 _SPEED_LIMIT: Final = 10.0
 _REASON_LIMIT: Final = 500
+_PLACES_MAX: Final = 8
 
 
 def robot_pose(localizer: Localizer, config: AgentConfig, at: Moment) -> RobotPose | None:
@@ -62,12 +66,13 @@ def robot_state(  # noqa: PLR0913  # a message gathers from all parts of the age
     boot: str,
     profile: ProfileName,
     docking: Docking,
+    hypotheses: Sequence[Hypothesis],
     at: Moment,
 ) -> RobotState:
     """Return mode, reasons, goal, path, map version and the `epochs` received of each service.
 
     `hindrances` are reasons besides the safety gate's, and so is a charge below `battery_low` (of 1); `boot` is the id
-    of this run of the agent, `docking` its wish for the dock.
+    of this run of the agent, `docking` its wish for the dock, `hypotheses` where it may be, best first.
     """
     path = mission.path
     warnings = power_warnings(feedback.status if feedback else None, battery_low)
@@ -98,6 +103,7 @@ def robot_state(  # noqa: PLR0913  # a message gathers from all parts of the age
         proximity=list(feedback.status.proximity) if feedback else [],
         docked=feedback is not None and feedback.status.docked,
         wants_dock=docking.wants_goal(mission),
+        places=[Pose(x=one.pose.x, y=one.pose.y, theta=one.pose.theta) for one in hypotheses[:_PLACES_MAX]],
     )
 
 

@@ -24,6 +24,8 @@ _AMBIGUOUS: Final = 0.85
 """A second place that explains the scans this well, as a share of the best, leaves the search ambiguous."""
 _AMBIGUOUS_LATER: Final = 0.6
 """The same after more than one scan, for the product over all scans."""
+_HOPELESS: Final = math.log(1e-3)
+"""A place that explains the scans so much worse than the best one is dropped."""
 _APART_M: Final = 0.6
 _APART_RAD: Final = 0.5
 _MISFITS_MAX: Final = 2
@@ -75,14 +77,16 @@ class Hypotheses:
         return list(self._places)
 
     @property
+    def contenders(self) -> list[Hypothesis]:
+        """The best place, and those that explain the scans nearly as well; best first."""
+        limit = math.log(_AMBIGUOUS if self._scans == 1 else _AMBIGUOUS_LATER)
+        return [place for place in self._places if place.log_quality > self._places[0].log_quality + limit]
+
+    @property
     def decided(self) -> Pose2 | None:
         """The pose of the best place, if no other explains the scans nearly as well."""
-        if not self._places:
-            return None
-        limit = _AMBIGUOUS if self._scans == 1 else _AMBIGUOUS_LATER
-        if len(self._places) > 1 and self._places[1].log_quality > self._places[0].log_quality + math.log(limit):
-            return None
-        return self._places[0].pose if self._places[0].misfits == 0 else None
+        contenders = self.contenders
+        return contenders[0].pose if len(contenders) == 1 and contenders[0].misfits == 0 else None
 
     def add(self, scan: DeskewedScan, fields: MapFields, range_max: float) -> None:
         """Weigh the places by a scan, if the robot has moved since the last one that counted."""
@@ -93,10 +97,15 @@ class Hypotheses:
         moved = (self._weighed(place, place.pose.compose(step), points, fields, range_max) for place in self._places)
         left: list[Hypothesis] = []
         for place in sorted(moved, key=lambda one: -one.log_quality):
-            if place.misfits < _MISFITS_MAX and all(apart(place.pose, other.pose) for other in left):
+            possible = place.misfits < _MISFITS_MAX and self._is_possible(place, left)
+            if possible and all(apart(place.pose, other.pose) for other in left):
                 left.append(place)
         self._places, self.odom = left, scan.odom
         self._scans += 1
+
+    @staticmethod
+    def _is_possible(place: Hypothesis, better: list[Hypothesis]) -> bool:
+        return not better or place.log_quality > better[0].log_quality + _HOPELESS
 
     def _weighed(
         self, place: Hypothesis, pose: Pose2, points: NDArray[np.float64], fields: MapFields, range_max: float

@@ -48,8 +48,8 @@ class Relocalization:
 
     @property
     def places(self) -> list[Hypothesis]:
-        """The places that are left, best first."""
-        return self._hypotheses.places if self._hypotheses is not None else []
+        """The places between which the scans do not decide, best first."""
+        return self._hypotheses.contenders if self._hypotheses is not None else []
 
     def may_begin(self, now: float) -> bool:
         """Whether the last search without success is long enough ago."""
@@ -86,14 +86,16 @@ class Relocalization:
         hypotheses = self._hypotheses
         if hypotheses is None:
             return None
-        count = len(hypotheses.places)
-        if not count:
+        if not hypotheses.places:
             self._again_at = now + _SEARCH_EVERY_S
             self.cancel()
             return Outcome(None, hypotheses.odom, "the scan fits no place of the map: give the initial pose")
         found = hypotheses.decided
         if found is None:
-            detail = f"{count} places of the map look like this one: move or turn the robot, or give the initial pose"
+            detail = (
+                f"{len(hypotheses.contenders)} places of the map look like this one: let the robot turn or advance"
+                " (`fognav robot turn`), or give the initial pose"
+            )
             return Outcome(None, hypotheses.odom, detail)
         self.cancel()
         return Outcome(found, hypotheses.odom)

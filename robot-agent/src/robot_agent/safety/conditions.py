@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from robot_agent.config import SafetyConfig
 
 Localization = Literal["good", "weak", "lost", "none"]
-Request = Literal["enable", "disable", "reset", "egress", "dock", "undock", "back_off"]
+Request = Literal["enable", "disable", "reset", "egress", "dock", "undock", "back_off", "turn", "advance"]
 
 
 class Level(IntEnum):

@@ -159,7 +159,7 @@ def _apply_request(
             return _interrupted(replace(state, enabled=False)), None
         case "reset":
             return _reset(state, inputs, config)
-        case "egress" | "dock" | "undock" | "back_off" as kind:
+        case "egress" | "dock" | "undock" | "back_off" | "turn" | "advance" as kind:
             return _begin(kind, state, inputs, now, config)
     return _enable(state, inputs, findings)
 

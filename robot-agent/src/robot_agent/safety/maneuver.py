@@ -4,6 +4,7 @@
 - Docking: in front of its dock, the base's own program drives the robot into it.
 - Undocking: straight back off the dock.
 - A back-off: straight back by a few centimetres from what the robot has bumped into.
+- A turn in place, or some centimetres straight ahead, of a robot that does not know its place: scans may tell it then.
 
 Each suspends the conditions that it is made for (`robot_agent.safety.maneuver_rules`), and ends for good with anything
 else that would stop the robot.

@@ -13,7 +13,10 @@ if TYPE_CHECKING:
     from robot_agent.config import SafetyConfig
     from robot_agent.safety.conditions import SafetyInputs
 
-ManeuverKind = Literal["egress", "dock", "undock", "back_off"]
+ManeuverKind = Literal["egress", "dock", "undock", "back_off", "turn", "advance"]
+
+
+_POSE_WORDS: Final[Mapping[str, str]] = {"weak": "uncertain", "lost": "unknown", "none": "unknown"}
 
 
 class Rules(NamedTuple):
@@ -107,6 +110,26 @@ def _refuses_back_off(inputs: SafetyInputs) -> str | None:
     return None if inputs.bumped else "the robot has bumped into nothing: there is nothing to back off from"
 
 
+def _relevant_to_looking_around(inputs: SafetyInputs) -> SafetyInputs:
+    # A robot that does not know its place knows no zone, and needs no map to turn: base and lidar guard it.
+    return replace(
+        inputs, localization="good", inside_blocked=None, map_loaded=True, map_age=0.0, map_gap=0.0, mission=False
+    )
+
+
+def _refuses_looking_around(inputs: SafetyInputs) -> str | None:
+    return "the robot knows where it is: there is nothing to find out" if inputs.localization == "good" else None
+
+
+def _looking_around_end(inputs: SafetyInputs, _: SafetyConfig) -> tuple[str, bool] | None:
+    if inputs.localization == "good":
+        return "the robot knows where it is", True
+    if inputs.maneuver_remaining > 0.0:
+        return None
+    detail = f": {inputs.localization_detail}" if inputs.localization_detail else ""
+    return f"it is done, and the pose is {_POSE_WORDS[inputs.localization]}{detail}", True
+
+
 RULES: Final[Mapping[ManeuverKind, Rules]] = {
     "egress": Rules(
         "EGRESS",
@@ -151,5 +174,25 @@ RULES: Final[Mapping[ManeuverKind, Rules]] = {
         lambda c: c.back_off_max,
         lambda c: c.speed_back_off,
     ),
+    "turn": Rules(
+        "EGRESS",
+        "the turn",
+        "turning in place on an operator's command, to find out where it is",
+        _relevant_to_looking_around,
+        _refuses_looking_around,
+        _looking_around_end,
+        lambda c: c.turn_max,
+        lambda c: c.speed_egress,
+    ),
+    "advance": Rules(
+        "EGRESS",
+        "the advance",
+        "driving a little ahead on an operator's command, to find out where it is",
+        _relevant_to_looking_around,
+        _refuses_looking_around,
+        _looking_around_end,
+        lambda c: c.advance_max,
+        lambda c: c.speed_egress,
+    ),
 }
-"""Every maneuver; the mode EGRESS also stands for the back-off, DOCK for both ways."""
+"""Every maneuver; the mode EGRESS also stands for the back-off, the turn and the advance, DOCK for both ways."""

@@ -9,16 +9,20 @@ import msgspec
 
 from robot_agent.agent.maneuvering.docking import Docking
 from robot_agent.agent.maneuvering.egress import Egress
-from robot_agent.agent.maneuvering.straight_back import StraightBack
+from robot_agent.agent.maneuvering.straight import Straight
+from robot_agent.agent.maneuvering.turning import Turning
 from robot_agent.agent.safety_supervisor import ManeuverInputs
 from robot_agent.safety.gate import MANEUVERS
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from fog_contracts.replica import Replica
     from robot_agent.agent.motion_guard import MotionGuard
     from robot_agent.agent.path.path_driving import PathDriving
     from robot_agent.config import AgentConfig
     from robot_agent.guardian.link import BaseFeedback, WheelCommand
+    from robot_agent.guardian.link import Maneuver as BaseManeuver
     from robot_agent.localization.localizer import Localizer
     from robot_agent.localization.pose import Pose2
     from robot_agent.safety.conditions import Request
@@ -30,6 +34,15 @@ UNDOCK_M: Final = 0.3
 """Off the dock the robot has room to turn."""
 BACK_OFF_M: Final = 0.09
 """The guardian allows a centimetre more, and the wheels need some of it to come to rest."""
+ADVANCE_M: Final = 0.4
+"""Enough for two scans that tell places apart which look alike."""
+
+_BY_GUARDIAN: Final[Mapping[ManeuverKind, BaseManeuver]] = {
+    "dock": "seek_dock",
+    "undock": "leave_dock",
+    "back_off": "back_off",
+}
+"""Maneuvers for which the guardian has rules of its own, by their name there."""
 
 
 class Maneuvers:
@@ -41,15 +54,19 @@ class Maneuvers:
         self._drive = config.drive_train
         self.egress = Egress(config)
         self.docking = Docking(config, localizer)
-        self._undock = StraightBack(UNDOCK_M, config.safety.speed_egress)
-        self._back_off = StraightBack(BACK_OFF_M, config.safety.speed_back_off)
+        self._turning = Turning(config.drive_train.axle_m)
+        self._straight: dict[ManeuverKind, Straight] = {
+            "undock": Straight(-UNDOCK_M, config.safety.speed_egress),
+            "back_off": Straight(-BACK_OFF_M, config.safety.speed_back_off),
+            "advance": Straight(ADVANCE_M, config.safety.speed_egress),
+        }
         self._kind: ManeuverKind | None = None
 
     def on_request(self, request: Request, state: SafetyState) -> None:
         """Prepare for an operator's request."""
         if request == "egress" and state.maneuver is None:
             self.egress.begin()
-        if request in {"disable", "reset", "egress", "undock"}:
+        if request in {"disable", "reset", "egress", "undock", "turn", "advance"}:
             self.docking.give_up()
 
     def may_seek_dock(
@@ -66,12 +83,13 @@ class Maneuvers:
         odom = self._localizer.odom_at(now)
         if kind != self._kind:
             self._kind = kind
-            for straight in (self._undock, self._back_off):
-                straight.begin(odom)
-        if kind == "undock":
-            return ManeuverInputs(self._undock.remaining(odom), self._guard.reason)
-        if kind == "back_off":
-            return ManeuverInputs(self._back_off.remaining(odom), self._guard.reason)
+            for movement in (*self._straight.values(), self._turning):
+                movement.begin(odom)
+        if kind in self._straight:
+            return ManeuverInputs(self._straight[kind].remaining(odom), self._guard.reason)
+        if kind == "turn":
+            self._turning.advance(odom)
+            return ManeuverInputs(self._turning.remaining(odom), self._guard.reason)
         if kind == "dock" or self.docking.ordered:
             return ManeuverInputs(dock_problem=self._dock_problem(replica, now, running=kind == "dock"))
         if kind != "egress":
@@ -85,16 +103,21 @@ class Maneuvers:
         """Return the command of the maneuver that runs; None when none does."""
         if state.maneuver is None or safety.mode not in MANEUVERS:
             return None
-        command = partial(driving.command_directly, safety=safety, guard=self._guard.limit, now=now)
-        match state.maneuver.kind:
+        kind = state.maneuver.kind
+        wheels = self._wheels(kind, now)
+        command = driving.command_directly(wheels, safety=safety, guard=self._guard.limit, now=now)
+        return msgspec.structs.replace(command, maneuver=_BY_GUARDIAN.get(kind))
+
+    def _wheels(self, kind: ManeuverKind, now: float) -> Wheels:
+        match kind:
             case "egress":
-                return command(self.egress.wheels(self._localizer.pose(now)))
+                return self.egress.wheels(self._localizer.pose(now))
             case "dock":
-                return msgspec.structs.replace(command((0.0, 0.0)), maneuver="seek_dock")
-            case "undock":
-                return msgspec.structs.replace(command(self._undock.wheels), maneuver="leave_dock")
-            case "back_off":
-                return msgspec.structs.replace(command(self._back_off.wheels), maneuver="back_off")
+                return 0.0, 0.0
+            case "turn":
+                return self._turning.wheels(self._localizer.odom_at(now))
+            case "undock" | "back_off" | "advance":
+                return self._straight[kind].wheels
 
     def _dock_problem(self, replica: Replica, now: float, *, running: bool) -> str | None:
         problem = self.docking.problem(replica, now, running=running)

@@ -1,4 +1,4 @@
-"""Straight back by a short way, measured by the wheels: off the dock, or from what the robot has bumped into. Pure."""
+"""Straight ahead or back by a short way, measured by the wheels: off the dock, from a bump, or to look around. Pure."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ if TYPE_CHECKING:
     from robot_agent.safety.stop_field import Wheels
 
 
-class StraightBack:
-    """One such movement: how far (m) and how fast (m/s)."""
+class Straight:
+    """One such movement: how far (m, negative: back) and how fast (m/s)."""
 
     def __init__(self, distance: float, speed: float) -> None:
-        self._distance = distance
+        self._distance = abs(distance)
+        self._sign = math.copysign(1.0, distance)
         self._speed = speed
         self._begun_at: Pose2 | None = None
 
@@ -26,9 +27,10 @@ class StraightBack:
         """Return the way (m) that is left; infinite if it can't be measured."""
         if odom is None or self._begun_at is None:
             return math.inf
-        return self._distance + odom.relative_to(self._begun_at).x
+        return self._distance - self._sign * odom.relative_to(self._begun_at).x
 
     @property
     def wheels(self) -> Wheels:
         """The wheel speeds, m/s."""
-        return -self._speed, -self._speed
+        speed = self._sign * self._speed
+        return speed, speed

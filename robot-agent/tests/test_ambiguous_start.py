@@ -1,0 +1,104 @@
+"""A robot that is switched on where several places look alike: it says which, and a turn or a short drive decides."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from little_world import LittleWorld
+
+from fog_contracts.messages import RobotCommand
+
+ALIKE = {"rooms": [(1, 1, 4.5, 4), (6, 1, 9.5, 4)], "size": (11.0, 6.0)}
+# The second room has a niche that is so shallow that one scan does not tell the rooms apart.
+NICHE = {"rooms": [*ALIKE["rooms"], (7.6, 4, 8.4, 4.3)], "size": (11.0, 6.0)}
+
+
+def started(pose, **world):
+    """A robot that was switched on at a pose and has searched the map."""
+    world = LittleWorld(**world, pose=pose)
+    world.agent.load(world.master.snapshot(), world.now)
+    assert world.run(12.0, lambda one: one.state().places), world.state().reasons
+    world.run(2.0)
+    return world
+
+
+def turned(world, kind="turn", seconds=20.0):
+    """Let it make a maneuver; return the reason of the state when it is over."""
+    reply = world.command(kind)
+    assert reply.accepted, reply
+    assert world.run(0.3, lambda one: one.state().mode == "EGRESS")
+    assert world.run(seconds, lambda one: one.state().mode == "INIT"), world.state()
+    return "; ".join(world.state().reasons)
+
+
+def test_robot_at_rest_keeps_and_reports_the_places_between_which_its_scans_do_not_decide():
+    world = started((7.5, 2.3, 0.4), **NICHE)
+    state = world.state()
+    assert any("places of the map look like this one" in reason for reason in state.reasons)
+    assert any(math.hypot(place.x - 7.5, place.y - 2.3) < 0.2 for place in state.places)
+    world.run(20.0)
+    assert len(world.state().places) == len(state.places)
+    assert "the pose is lost" in world.command("enable").reason
+
+
+def test_turn_in_place_decides_between_places_and_the_robot_may_be_enabled():
+    world = started((7.5, 2.3, 0.4), **NICHE)
+    assert "the turn ended" in turned(world)
+    assert world.run(3.0, lambda one: one.agent.localizer.status == "good"), world.state().reasons
+    assert world.error()[0] < 0.1
+    assert world.state().places == []
+    assert world.travelled < 0.1
+    assert world.command("enable").accepted
+
+
+def test_turn_in_rooms_that_are_the_same_leaves_the_places_and_the_robot_where_it_is():
+    world = started((2.5, 2.3, 0.4), **ALIKE)
+    reasons = turned(world)
+    assert "the turn ended: it is done, and the pose is unknown" in reasons
+    assert len(world.state().places) >= 2
+    assert world.travelled < 0.1
+    assert abs(world.theta - 0.4) < 0.15
+    assert "the pose is lost" in world.command("enable").reason
+
+
+def test_advance_stays_within_its_distance_and_stops_before_what_the_lidar_sees():
+    world = started((2.0, 2.3, 0.0), **ALIKE)
+    assert "the advance ended" in turned(world, "advance")
+    assert 0.35 < world.travelled < 0.45
+    world = started((4.1, 2.3, 0.0), **ALIKE)
+    reply = world.command("advance")
+    assert reply.accepted
+    world.run(14.0)
+    assert not world.collided
+    assert world.state().mode == "INIT"
+    assert world.travelled < 0.25
+
+
+def test_robot_that_knows_where_it_is_does_not_turn():
+    world = LittleWorld().ready()
+    for kind in ("turn", "advance"):
+        reply = world.command(kind)
+        assert not reply.accepted
+        assert "the robot knows where it is" in reply.reason
+
+
+@pytest.mark.parametrize("kind", ["turn", "advance"])
+def test_unsigned_turn_is_refused(kind):
+    world = started((2.5, 2.3, 0.4), **ALIKE)
+    command = RobotCommand(kind=kind, robot="r1", operator="ann", nonce="n" * 16, **world.run_and_clock)
+    assert not world.ask(command).accepted
+    world.run(1.0)
+    assert world.state().mode == "INIT"
+
+
+@pytest.mark.parametrize("failure", ["lidar_on", "base_on"])
+def test_turn_ends_at_once_without_lidar_or_base(failure):
+    world = started((2.5, 2.3, 0.4), **ALIKE)
+    assert world.command("turn").accepted
+    world.run(2.0)
+    assert world.wheels != (0.0, 0.0)
+    setattr(world, failure, False)
+    world.run(0.6)
+    assert world.wheels == (0.0, 0.0)
+    assert world.state().mode == "INIT"

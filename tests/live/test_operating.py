@@ -97,6 +97,9 @@ def test_walk_through_a_running_demo_works_as_the_readme_says(tmp_path):
         assert len(re.findall(r"^\d\d:\d\d:\d\d NORMAL", watched, re.MULTILINE)) >= 2, watched
         assert "wet floor" in terminal.output["./fognav zone list"]
         assert "mission is ended" in terminal.output["./fognav robot stop"]
+        turn = terminal.run("./fognav robot turn")
+        assert turn.returncode == 1
+        assert "the robot knows where it is" in turn.stdout + turn.stderr
     finally:
         demo.terminate()
         assert demo.wait(30) == 1  # interrupted

@@ -83,8 +83,9 @@ class Maneuvers:
         odom = self._localizer.odom_at(now)
         if kind != self._kind:
             self._kind = kind
-            for movement in (*self._straight.values(), self._turning):
-                movement.begin(odom)
+            self._turning.begin(odom)
+            for straight in self._straight.values():
+                straight.begin(odom)
         if kind in self._straight:
             return ManeuverInputs(self._straight[kind].remaining(odom), self._guard.reason)
         if kind == "turn":

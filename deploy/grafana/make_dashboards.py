@@ -12,13 +12,21 @@ from typing import Final, cast
 from grafana_foundation_sdk.builders import common, dashboard, prometheus, stat, statetimeline, timeseries
 from grafana_foundation_sdk.cog.encoder import JSONEncoder
 from grafana_foundation_sdk.models.common import StackingMode, TimeZoneBrowser
-from grafana_foundation_sdk.models.dashboard import DashboardCursorSync, DataSourceRef, GridPos, VariableRefresh
+from grafana_foundation_sdk.models.dashboard import (
+    DashboardCursorSync,
+    DataSourceRef,
+    DynamicConfigValue,
+    GridPos,
+    VariableRefresh,
+)
 from panels import DASHBOARDS, Dashboard, Panel
 
 FOLDER: Final = Path(__file__).parent / "dashboards"
 _SOURCE: Final = DataSourceRef(type_val="prometheus", uid="prometheus")
 _WIDTH: Final = 24
 _HEIGHT: Final = 8
+_RECORDED: Final = "recorded "
+"""Legends of baselines begin so: lines to compare with, drawn dashed."""
 
 AnyPanel = timeseries.Panel | statetimeline.Panel | stat.Panel
 
@@ -29,6 +37,15 @@ def _empty(panel: Panel) -> AnyPanel:
     if panel.kind == "number":
         return stat.Panel()
     lines = timeseries.Panel().line_width(1).fill_opacity(10)
+    if any(legend.startswith(_RECORDED) for _, legend in panel.queries):
+        dashed = common.LineStyle().fill("dash").dash([8.0, 6.0]).build()
+        lines = lines.override_by_regexp(
+            f"^{_RECORDED}",
+            [
+                DynamicConfigValue(id_val="custom.lineStyle", value=dashed),
+                DynamicConfigValue(id_val="custom.fillOpacity", value=0),
+            ],
+        )
     if panel.kind == "stacked":
         lines = lines.stacking(common.StackingConfig().mode(StackingMode.NORMAL).group("A")).fill_opacity(40)
     return lines

@@ -57,10 +57,22 @@ ROBOTS: Final = Dashboard(
             "What Fognav costs the robot",
             (
                 Panel(
+                    "CPU of planning, beside recorded drives",
+                    "What a robot still plans itself, in cores, beside the means of recorded drives: `default` (it"
+                    " plans all itself and knows nothing of the fog), `full` (it plans itself, the fog reports hazards)"
+                    " and `fog`. Figures 6.5 and 6.9 of the master's thesis that Fognav follows show the same: above 1"
+                    " core in its `default`, 0.2 to 0.5 in its `full`. The baselines hold for the processor that they"
+                    " name; deploy/prometheus/make_baselines.py takes those of your own.",
+                    (
+                        (f"robot:planning_cpu:rate1m{_R}", "{{robot}} now"),
+                        ("baseline:planning_cpu:mean", "recorded {{setup}} ({{machine}})"),
+                    ),
+                    unit="percentunit",
+                    width=24,
+                ),
+                Panel(
                     "CPU by robot",
-                    "All of Fognav's processes on a robot, in cores. The fog plans, so this stays small: the master's"
-                    " thesis that Fognav follows reports above 1 core with planning on the robot (its figures 6.5 and"
-                    " 6.9).",
+                    "All of Fognav's processes on a robot, in cores. The fog plans, so this stays small.",
                     ((f"robot:cpu:rate1m{_R}", "{{robot}}"),),
                     unit="percentunit",
                 ),
@@ -73,7 +85,8 @@ ROBOTS: Final = Dashboard(
                 ),
                 Panel(
                     "CPU by thread",
-                    "Where an agent's time goes.",
+                    "Where an agent's time goes: `decide` plans, `map` unpacks the map, `python` does the rest; others"
+                    " are zenoh's.",
                     (
                         (
                             _rate(f"fognav_thread_cpu_seconds_total{_R}", "robot", "process", "thread") + " > 0.001",

@@ -49,6 +49,8 @@ class Prometheus:
         ports = {name: system.stack.port(name) for name in SERVICES}
         config = yaml.safe_load((DEPLOYED / "prometheus" / "prometheus.yml").read_text("utf-8"))
         config["global"] |= {"scrape_interval": "1s", "evaluation_interval": "1s"}
+        self.robots = folder / "robots"  # prometheus.yml names it relative to itself
+        self.robots.mkdir()
         config["rule_files"] = [str(DEPLOYED / "prometheus" / "rules" / "*.yml")]
         fog, robots = config["scrape_configs"]
         # One machine instead of one host name per service.
@@ -156,6 +158,8 @@ async def test_every_panel_has_data_and_every_rule_works_while_a_robot_drives_an
         await asyncio.sleep(0.5)
     for page, panel, query in panels():
         if page == "Robots":
+            if query.startswith("baseline:"):
+                continue
             found = [series["metric"] for series in prometheus.series(as_grafana_asks(query))]
             assert {labels.get("robot") for labels in found} == {"r1"}, f"{panel} shows what is no robot: {found}"
     groups = prometheus.ask("rules")["groups"]
@@ -190,18 +194,28 @@ async def test_pictures_of_all_pages_are_drawn_from_the_panels_own_queries(
     assert await asyncio.to_thread(drawn, prometheus, tmp_path) == pages
 
 
-async def test_robot_that_is_gone_is_no_target_any_more(system: LiveSystem, prometheus: Prometheus) -> None:
+async def wait_for_robots(prometheus: Prometheus, expected: list[str]) -> None:
     def robots() -> list[str]:
         found = prometheus.ask("targets")["activeTargets"]
-        return [target["labels"]["robot"] for target in found if target["labels"]["job"] == "robots"]
+        return sorted(target["labels"]["robot"] for target in found if target["labels"]["job"] == "robots")
 
-    async def wait(expected: list[str], timeout_s: float) -> None:
-        deadline = time.monotonic() + timeout_s
-        while await asyncio.to_thread(robots) != expected:
-            assert time.monotonic() < deadline, f"robots are not {expected}"
-            await asyncio.sleep(0.2)
+    deadline = time.monotonic() + 60.0
+    while await asyncio.to_thread(robots) != expected:
+        assert time.monotonic() < deadline, f"robots are not {expected}"
+        await asyncio.sleep(0.2)
 
-    await wait(["r1"], 60.0)
+
+async def test_robot_is_a_target_while_a_file_lists_it(system: LiveSystem, prometheus: Prometheus) -> None:
+    file = prometheus.robots / "workshop.json"
+    target = {"targets": [f"127.0.0.1:{system.stack.port(AGENT)}"], "labels": {"robot": "r9"}}
+    file.write_text(json.dumps([target]))
+    await wait_for_robots(prometheus, ["r1", "r9"])
+    file.write_text("[]")
+    await wait_for_robots(prometheus, ["r1"])
+
+
+async def test_robot_that_is_gone_is_no_target_any_more(system: LiveSystem, prometheus: Prometheus) -> None:
+    await wait_for_robots(prometheus, ["r1"])
     await system.stop_operator()
     await system.stack.supervisor.stop(AGENT)
-    await wait([], 60.0)
+    await wait_for_robots(prometheus, [])

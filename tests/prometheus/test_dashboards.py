@@ -12,12 +12,14 @@ import yaml
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "deploy" / "grafana" / "dashboards"
 FILES = sorted(FOLDER.glob("*.json"))
+BEGINNINGS = "baseline|disk|fognav|map|process|robot|stage"
 OF_PROMETHEUS = {"up", "ALERTS", "process_cpu_seconds_total", "process_resident_memory_bytes"}
 
 
 def recorded() -> set[str]:
-    rules = yaml.safe_load((ROOT / "deploy" / "prometheus" / "rules" / "records.yml").read_text("utf-8"))
-    return {rule["record"] for group in rules["groups"] for rule in group["rules"]}
+    folder = ROOT / "deploy" / "prometheus" / "rules"
+    files = [yaml.safe_load((folder / name).read_text("utf-8")) for name in ("records.yml", "baselines.yml")]
+    return {rule["record"] for file in files for group in file["groups"] for rule in group["rules"]}
 
 
 def exported() -> set[str]:
@@ -43,7 +45,7 @@ def test_panels_ask_only_for_metrics_that_exist(file: Path) -> None:
     assert len(asked) > 5
     for expression in asked:
         without_labels = re.sub(r"\{[^}]*\}|\(\w+(?:, \w+)*\) *\(|by \([^)]*\)", " ", expression)
-        names = set(re.findall(r"\b(?:fognav|process|robot|stage|disk|map)\w*[:_][\w:]+|\bup\b|ALERTS", without_labels))
+        names = set(re.findall(rf"\b(?:{BEGINNINGS})\w*[:_][\w:]+|\bup\b|ALERTS", without_labels))
         assert names, expression
         assert names <= exported() | recorded() | OF_PROMETHEUS, expression
 

@@ -28,7 +28,7 @@ def promtool(*arguments: str) -> str:
 
 @needs_promtool
 def test_configuration_is_valid_and_names_files_that_exist() -> None:
-    assert "2 rule files found" in promtool("check", "config", str(DEPLOYED / "prometheus.yml"))
+    assert "3 rule files found" in promtool("check", "config", str(DEPLOYED / "prometheus.yml"))
 
 
 @needs_promtool

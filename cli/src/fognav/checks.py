@@ -52,6 +52,16 @@ CHECKS: Final = (
         (sys.executable, "-m", "fognav", "channels", "--check"),
         "./fognav channels --write",
     ),
+    Check(
+        "generated files: dashboards",
+        (sys.executable, "deploy/grafana/make_dashboards.py", "--check"),
+        "python deploy/grafana/make_dashboards.py",
+    ),
+    Check(
+        "generated files: baselines",
+        (sys.executable, "deploy/prometheus/make_baselines.py", "--check"),
+        "python deploy/prometheus/make_baselines.py",
+    ),
 )
 
 

@@ -70,6 +70,8 @@ async def test_agent_localizes_refuses_a_wrong_key_and_drives_a_path(robot):
     assert 'fognav_robot_mode{mode="NORMAL"} 1.0' in text
     for process in ("agent", "guardian", "watchdog"):
         assert f'fognav_thread_cpu_seconds_total{{process="{process}",thread="python"}}' in text
+    for thread in ("decide", "map"):
+        assert f'fognav_thread_cpu_seconds_total{{process="agent",thread="{thread}"}}' in text
         assert f'fognav_process_resident_bytes{{process="{process}"}}' in text
     for name in ("robot_map_age_seconds", "particles", "pose_sigma_meters", "battery_volts", "serial_errors_total"):
         assert f"\nfognav_{name}" in text

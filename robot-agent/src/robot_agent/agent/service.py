@@ -19,6 +19,7 @@ from fog_runtime import logs, metrics
 from fog_runtime.clock import Phase, Ticker
 from fog_runtime.machine.service_manager import ServiceManager
 from fog_runtime.machine.suspension import SuspensionMonitor
+from fog_runtime.machine.task_usage import name_thread
 from fog_runtime.transports.edges import Edges
 from robot_agent.agent.core import decide
 from robot_agent.agent.edges.exporter import Observed, RobotCollector, parent
@@ -209,7 +210,7 @@ class Service:
     async def control_loop(self) -> None:
         """Plan and decide, 5 times a second in the profile `fog`, on a thread: what hangs can't block the stream."""
         loop = asyncio.get_running_loop()
-        thread = ThreadPoolExecutor(1, thread_name_prefix="decide")
+        thread = ThreadPoolExecutor(1, thread_name_prefix="decide", initializer=name_thread, initargs=("decide",))
         try:
             async for now in self._control:
                 self._control.period = self._core.profile.control_period

@@ -17,6 +17,7 @@ from fog_contracts.messages import MapSnapshot
 from fog_contracts.replica import MapError
 from fog_runtime import logs
 from fog_runtime.clock import Ticker
+from fog_runtime.machine.task_usage import name_thread
 from robot_agent.agent.sensing.pose_keeper import start_pose
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ class MapLoader:
         self._clock = clock
         self._site = site
         self._phase = phase
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="map")
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="map", initializer=name_thread, initargs=("map",))
 
     async def run(self, body: RobotSite | None) -> None:
         """Restore the stored state, then keep the map up to date until cancelled."""

@@ -1,0 +1,86 @@
+"""Writes the recorded CPU of robots in the setups `default`, `full` and `fog` as Prometheus's recording rules.
+
+The figures come from the report of an experiment (`fognav experiment report`): from its `drives.csv`, and the machine
+from its `README.md`. Dashboards show them beside what robots take now.
+
+Run: python deploy/prometheus/make_baselines.py [FOLDER] [--check]. FOLDER is the report's (docs/results/estig); one of
+your own says more of your robots' computers. With --check nothing is written, and the exit code is 1 if the file is out
+of date.
+"""
+
+import argparse
+import csv
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from statistics import fmean
+from typing import Final
+
+ROOT: Final = Path(__file__).parents[2]
+FILE: Final = Path(__file__).parent / "rules" / "baselines.yml"
+SETUPS: Final = ("default", "full", "fog")
+_COLUMN: Final = "cpu_move_base_percent"
+"""Planning, layers and local planning: what one program did on the thesis's robot, and its figures 6.5 and 6.9 show."""
+_MACHINE: Final = re.compile(r"^\| machine processor \| ([^|\"{}]+?) \|$", re.MULTILINE)
+
+
+def compared(drives: Sequence[Mapping[str, str]]) -> dict[str, list[float]]:
+    """Return the CPU (cores) of each drive, by setup: of those routes that succeeded in all setups.
+
+    Raises `SystemExit` if there are none.
+    """
+    routes: dict[tuple[str, str], dict[str, float]] = {}
+    for drive in drives:
+        if drive["success"] == "True":
+            routes.setdefault((drive["run"], drive["route"]), {})[drive["setup"]] = float(drive[_COLUMN]) / 100.0
+    complete = [found for found in routes.values() if set(SETUPS) <= found.keys()]
+    if not complete:
+        raise SystemExit(f"no route was driven in all of {', '.join(SETUPS)}: let `fognav experiment` go on")
+    return {setup: [found[setup] for found in complete] for setup in SETUPS}
+
+
+def rules(folder: Path) -> str:
+    """Return the file of rules for a report's folder; raises `SystemExit` if that is no report."""
+    try:
+        with (folder / "drives.csv").open(encoding="utf-8", newline="") as file:
+            drives = compared(list(csv.DictReader(file)))
+        machine = _MACHINE.search((folder / "README.md").read_text("utf-8"))
+    except (OSError, KeyError, ValueError) as error:
+        raise SystemExit(f"{folder} is no report ({error}): `fognav experiment report` writes one") from error
+    if machine is None:
+        raise SystemExit(f"{folder / 'README.md'} names no `machine processor`: `fognav experiment report` writes it")
+    lines = [
+        "# Made by deploy/prometheus/make_baselines.py from the report of an experiment: do not edit.",
+        "# CPU in cores of planning, layers and local planning, the mean of recorded drives in each setup.",
+        "groups:",
+        "  - name: baselines",
+        "    rules:",
+    ]
+    for setup, cores in drives.items():
+        lines += [
+            "      - record: baseline:planning_cpu:mean",
+            f"        expr: vector({fmean(cores):.5f})",
+            f'        labels: {{setup: {setup}, machine: "{machine[1]}", drives: "{len(cores)}"}}',
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def main() -> int:
+    """Write the file, or compare it."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", nargs="?", type=Path, default=ROOT / "docs" / "results" / "estig")
+    parser.add_argument("--check", action="store_true", help="write nothing")
+    options = parser.parse_args()
+    text = rules(options.folder)
+    if FILE.exists() and FILE.read_text("utf-8") == text:
+        return 0
+    if options.check:
+        print(f"{FILE.name} is out of date: run this without --check")
+        return 1
+    FILE.write_text(text, "utf-8")
+    print(f"wrote {FILE}")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

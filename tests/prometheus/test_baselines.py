@@ -1,0 +1,69 @@
+"""The recorded CPU that dashboards compare robots with comes from the report of an experiment."""
+
+import csv
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).parents[2]
+SCRIPT = ROOT / "deploy" / "prometheus" / "make_baselines.py"
+README = "| measured on |  |\n| --- | --- |\n| machine processor | Cortex-A72 |\n"
+
+
+@pytest.fixture(scope="module")
+def script():
+    spec = importlib.util.spec_from_file_location("make_baselines", SCRIPT)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def report(folder: Path, *drives: tuple[int, str, float, str], readme: str = README) -> Path:
+    """Write a report with drives of one route: run, setup, CPU in percent, and whether it succeeded."""
+    with (folder / "drives.csv").open("w", newline="") as file:
+        rows = csv.writer(file)
+        rows.writerow(["setup", "run", "route", "success", "cpu_move_base_percent"])
+        rows.writerows([setup, run, "ab", success, percent] for run, setup, percent, success in drives)
+    (folder / "README.md").write_text(readme)
+    return folder
+
+
+def recorded(text: str) -> dict[str, tuple[str, str, str]]:
+    (group,) = yaml.safe_load(text)["groups"]
+    return {
+        rule["labels"]["setup"]: (rule["expr"], rule["labels"]["machine"], rule["labels"]["drives"])
+        for rule in group["rules"]
+    }
+
+
+def test_recorded_baselines_are_those_of_the_published_report():
+    done = subprocess.run([sys.executable, SCRIPT, "--check"], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_baseline_is_the_mean_of_the_routes_that_were_driven_in_every_setup(script, tmp_path):
+    folder = report(
+        tmp_path,
+        *((1, setup, percent, "True") for setup, percent in (("default", 4.0), ("full", 2.0), ("fog", 1.0))),
+        *((2, setup, percent, "True") for setup, percent in (("default", 6.0), ("full", 2.5), ("fog", 1.5))),
+        (3, "default", 90.0, "True"), (3, "full", 90.0, "False"), (3, "fog", 90.0, "True"),
+    )  # fmt: skip
+    assert recorded(script.rules(folder)) == {
+        "default": ("vector(0.05000)", "Cortex-A72", "2"),
+        "full": ("vector(0.02250)", "Cortex-A72", "2"),
+        "fog": ("vector(0.01250)", "Cortex-A72", "2"),
+    }
+
+
+def test_folder_without_a_report_a_complete_route_or_a_machine_is_refused_with_the_remedy(script, tmp_path):
+    with pytest.raises(SystemExit, match="is no report"):
+        script.rules(tmp_path)
+    with pytest.raises(SystemExit, match="in all of default, full, fog"):
+        script.rules(report(tmp_path, (1, "default", 4.0, "True")))
+    drives = [(1, setup, 1.0, "True") for setup in ("default", "full", "fog")]
+    with pytest.raises(SystemExit, match="machine processor"):
+        script.rules(report(tmp_path, *drives, readme="# Empty\n"))

@@ -23,6 +23,7 @@ from fog_contracts.commands import PROFILE_OF
 from fog_contracts.geometry import distance_to_polygon
 from fog_contracts.handlers import Publication
 from fog_contracts.messages import RobotGoal
+from fog_contracts.site import Site
 from fog_contracts.stages import SPANS, durations_ms
 from fog_runtime.configuration.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fog_runtime.configuration.site import load_site
@@ -56,6 +57,7 @@ if TYPE_CHECKING:
     from fog_contracts.site import Place
     from fog_runtime.configuration.site import LoadedSite
     from fognav_experiments.cpu import CpuMeter
+    from fognav_experiments.rigs import Tuning
     from fognav_sim.sensors import Noise
 
 WARM_UP_S: Final = 12.0
@@ -110,18 +112,23 @@ class LockstepDrive:
         seed: int,
         noise: Noise | None,
         *,
-        watched: bool,
+        watched: bool | Site,
         hazard: HazardSchedule | None,
         bus: Bus | None,
         base: str = DEFAULT_BASE,
         lidar: str = DEFAULT_LIDAR,
         measure: Measure = unmeasured,
+        tuning: Tuning | None = None,
     ) -> None:
+        """`watched`: whether the site has its areas and nodes, or what it has instead of them."""
         robot = msgspec.structs.replace(site.site.robots[0], start=start)
         self.site, self.goal, self.seed, self.hazard = site, goal, seed, hazard
         bare = msgspec.structs.replace(site.site, areas=[], nodes=[])
-        floor = site if watched else dataclasses.replace(site, site=bare)
-        self.system = System(floor, robot, seed, noise=noise, base=base, lidar=lidar, bus=bus, measure=measure)
+        with_nodes = watched if isinstance(watched, Site) else site.site if watched else bare
+        floor = dataclasses.replace(site, site=with_nodes)
+        self.system = System(
+            floor, robot, seed, noise=noise, base=base, lidar=lidar, bus=bus, measure=measure, tuning=tuning
+        )
         self.world = self.system.world
         self.robot = self.system.robot
         self.events: list[DriveEvent] = []
@@ -328,19 +335,21 @@ def run_lockstep(  # noqa: PLR0913  # the options of a run
     hazard: HazardRequest | None = None,
     *,
     noise: Noise | None = None,
-    watched: bool = True,
+    watched: bool | Site = True,
     base: str = DEFAULT_BASE,
     lidar: str = DEFAULT_LIDAR,
     bus: Bus | None = None,
     profile: ProfileName = "fog",
     cpu: CpuMeter | None = None,
+    tuning: Tuning | None = None,
 ) -> LockstepResult:
     """Drive the site's first robot from `start` to `goal`; the result is the same for the same arguments.
 
     With `hazard` a barrier blocks an area, as in a demonstration: which one and after which distance the seed draws,
     unless they are requested, and never within 3 m of the robot. Without `watched` the site has neither areas nor
-    nodes: the robot's own lidar must find the barrier. `base` and `lidar` name the robot's hardware, `bus` carries the
-    messages (default: a new one), `profile` says who plans, `cpu` measures the components from the goal on.
+    nodes: the robot's own lidar must find the barrier; a `Site` says which ones there are. `base` and `lidar` name the
+    robot's hardware, `bus` carries the messages (default: a new one), `profile` says who plans, `cpu` measures the
+    components from the goal on, `tuning` changes nodes and robot.
 
     Raises `BarrierError` for an unknown area, one that no barrier can close, or if no area qualifies, `ValueError` for
     a start inside an obstacle.
@@ -353,6 +362,7 @@ def run_lockstep(  # noqa: PLR0913  # the options of a run
     run = LockstepDrive(
         site, start, mission, seed, noise,
         watched=watched, hazard=schedule, bus=bus, base=base, lidar=lidar, measure=cpu.measure if cpu else unmeasured,
+        tuning=tuning,
     )  # fmt: skip
     problem = run.warm_up()
     if problem is None and profile != "fog":

@@ -6,13 +6,14 @@ and guardian as bytes on their lines, and an operator. Lockstep leaves out socke
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, Literal
 
 from fog_contracts import channels as ch
 from fog_contracts.bus import Bus
 from fog_contracts.commands import signed_command
 from fog_contracts.handlers import Moment, Publication
-from fog_contracts.messages import CommandReply
+from fog_contracts.messages import CommandReply, NodeConfig
 from fog_runtime.configuration.default_parts import DEFAULT_BASE, DEFAULT_LIDAR
 from fog_runtime.configuration.robot_file import default_robot
 from fognav_experiments.processes import (
@@ -51,6 +52,7 @@ if TYPE_CHECKING:
     from fog_contracts.site import RobotSite
     from fog_runtime.configuration.site import LoadedSite
     from fognav_sim.emulators import BaseEmulator
+    from fognav_sim.nodes import SensorNode
     from fognav_sim.sensors import Noise
     from robot_agent.config import AgentConfig
 
@@ -74,6 +76,41 @@ TICK_STEPS: Final = 10
 def moment(now: float) -> Moment:
     """Return a time (s) of the emulated clock as the readings of a process's two clocks."""
     return Moment(now, STAMP + now)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tuning:
+    """What differs from the defaults: the nodes' pause between readings (ms), and the robot's highest speed (m/s)."""
+
+    pause_ms: int | None = None
+    speed_m_s: float | None = None
+
+    def agent(self, config: AgentConfig) -> AgentConfig:
+        """Return a robot's configuration with its highest speed."""
+        if self.speed_m_s is None:
+            return config
+        limits = replace(config.motion.limits, v_max=self.speed_m_s)
+        safety = replace(
+            config.safety,
+            speed_normal=self.speed_m_s,
+            speed_degraded=min(config.safety.speed_degraded, self.speed_m_s),
+        )
+        return replace(config, motion=replace(config.motion, limits=limits), safety=safety)
+
+    def tune(self, nodes: Iterable[SensorNode]) -> None:
+        """Configure the nodes' pause."""
+        if self.pause_ms is None:
+            return
+        for node in nodes:
+            sonars = node.node.sonars
+            node.configure(
+                NodeConfig(
+                    version=1,
+                    range_limit_m=[sonar.range_limit for sonar in sonars],
+                    no_echo_is_clear=[sonar.no_echo_is_clear for sonar in sonars],
+                    pause_ms=self.pause_ms,
+                )
+            )
 
 
 class RobotRig:
@@ -302,16 +339,20 @@ class System:
         bus: Bus | None = None,
         make_agent: Callable[[AgentConfig, int], AgentCore] = AgentCore,
         measure: Measure = unmeasured,
+        tuning: Tuning | None = None,
     ) -> None:
         """Assemble the system; `base` and `lidar` name the robot's hardware."""
+        tuned = tuning or Tuning()
         self.bus = bus or Bus(site.site.id)
         emulator = devices.make_base(base)
         self.world = World(Floor(site.map.geometry, site.map.cells), robot, seed, axle_m=emulator.axle_m, noise=noise)
         self.fog = FogRig(site, self.world, self.bus, seed, 0.0, measure=measure)
         self.robot = RobotRig(
             site, robot, self.world, emulator, self.bus, seed, 0.0,
-            base=base, lidar=lidar, make_agent=make_agent, measure=measure,
+            base=base, lidar=lidar, make_agent=lambda config, number: make_agent(tuned.agent(config), number),
+            measure=measure,
         )  # fmt: skip
+        tuned.tune(self.fog.nodes)
         self._steps = 0
 
     @property

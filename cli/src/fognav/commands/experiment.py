@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path  # noqa: TC003  # Typer reads annotations at run time
 from typing import TYPE_CHECKING, Annotated, Final, TypeVar
 
@@ -10,17 +11,20 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from fognav import checkout, kernels
 from fognav.operate.options import JsonOption  # noqa: TC001  # Typer reads annotations at run time
-from fognav.output import NOT_TRUE, WrongUseError, console, exit_codes, print_json, print_line
+from fognav.output import NOT_TRUE, FailedError, WrongUseError, console, exit_codes, print_json, print_line
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from fog_contracts.messages import ProfileName
+    from fog_runtime.configuration.site import LoadedSite
+    from fognav_experiments.comparison.draws import RouteDraw
     from fognav_experiments.comparison.measured import MeasuredDrive
-    from fognav_experiments.comparison.records import DriveFiles, Record
+    from fognav_experiments.comparison.records import DriveFiles, Folder, Record
     from fognav_experiments.scenarios.stage import Played
+    from fognav_experiments.sensitivity.planes import Plane, SweptDrive
 
-    D = TypeVar("D", Record, MeasuredDrive)
+    D = TypeVar("D", Record, MeasuredDrive, SweptDrive)
 
 experiment_app = typer.Typer(help="Compare setups as the thesis did, and play scenarios.")
 
@@ -200,6 +204,96 @@ def film_command(  # each option is an argument
     for record in records:
         print_line(f"{record.setup:8} {record.distance_m:6.1f} m {record.time_s:6.1f} s")
     print_line(f"{out}: {size / 1e6:.2f} MB")
+
+
+@experiment_app.command(
+    "sensitivity", epilog="Example: fognav experiment sensitivity --out sweep --readings 2,5,20 --pause 50,500"
+)
+def sensitivity_command(  # noqa: PLR0913  # each option is an argument
+    *,
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of records and report.")],
+    readings: Annotated[str, typer.Option("--readings", metavar="N,N", help="Readings that confirm.")] = "2,5,20",
+    pause: Annotated[str, typer.Option("--pause", metavar="MS,MS", help="Pauses of the nodes.")] = "50,500",
+    areas: Annotated[str, typer.Option("--areas", metavar="N,N", help="Watched areas; 0: all.")] = "1,4,0",
+    speeds: Annotated[str, typer.Option("--speeds", metavar="V,V", help="Speeds of the robot, m/s.")] = "0.2,0.3",
+    routes: Annotated[int, typer.Option("--routes", metavar="N", min=1, help="Routes of each point.")] = 3,
+    seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of all draws.")] = 1,
+    jobs: Annotated[int | None, typer.Option("--jobs", metavar="N", min=1, help="Drives at a time; all cores.")] = None,
+    cluster: Annotated[str | None, typer.Option("--cluster", metavar="ADDRESS", help="A Dask scheduler.")] = None,
+    site: Annotated[Path | None, typer.Option("--site", metavar="DIR", help="Site with experiment.toml.")] = None,
+) -> None:
+    """Sweep debouncing, the nodes' pause and number, and the robot's speed; draw what the fog saves as heat maps.
+
+    Two planes are driven, readings by pause and areas by speed, on the first routes whose obstacle bars the way. A
+    sweep that was killed goes on where it was. The drives run on every core, with --cluster on the workers of a Dask
+    cluster (fognav-experiments[cluster]), which need this version of Fognav and nothing else.
+    """
+    from fog_runtime.configuration.site import SiteError, load_site  # noqa: PLC0415  # keeps the other commands fast
+    from fognav_experiments.comparison import runner  # noqa: PLC0415  # same
+    from fognav_experiments.comparison.records import Folder, FolderError  # noqa: PLC0415  # same
+    from fognav_experiments.sensitivity.planes import Axis, Plane  # noqa: PLC0415  # same
+    from fognav_experiments.sensitivity.sweep import ClusterError  # noqa: PLC0415  # same
+
+    with exit_codes():
+        swept = (
+            Plane(Axis("readings", _values(readings)), Axis("pause_ms", _values(pause))),
+            Plane(Axis("areas", _values(areas)), Axis("speed_m_s", _values(speeds, float))),
+        )
+        command = (
+            f"fognav experiment sensitivity --readings {readings} --pause {pause} --areas {areas} --speeds {speeds} "
+            f"--routes {routes} --seed {seed} --out DIR"
+        )
+        try:
+            place = checkout.site_folder(site)
+            loaded = load_site(place)
+            drawn = runner.barred_routes(loaded, runner.read_spec(loaded, place), seed, routes)
+            folder = Folder(out)
+            folder.begin(runner.new(loaded, place, seed), _measured_on())
+            failed = _sweep(loaded, folder, swept, drawn, command, jobs=jobs, cluster=cluster)
+        except (SiteError, runner.SpecError, FolderError) as error:
+            raise WrongUseError(str(error)) from error
+        except ClusterError as error:
+            raise FailedError(str(error)) from error
+    if failed:
+        raise typer.Exit(NOT_TRUE)
+
+
+def _measured_on() -> dict[str, object]:
+    from fognav.bench import machine  # noqa: PLC0415  # keeps the other commands fast
+
+    return {"commit": checkout.revision(), **machine.describe()}
+
+
+def _sweep(  # noqa: PLR0913  # what is driven, where and how
+    site: LoadedSite,
+    folder: Folder,
+    swept: Sequence[Plane],
+    drawn: Sequence[RouteDraw],
+    command: str,
+    *,
+    jobs: int | None,
+    cluster: str | None,
+) -> int:
+    """Drive a sweep and publish it; return how many drives failed."""
+    from fognav_experiments.comparison.records import DriveFiles  # noqa: PLC0415  # keeps the other commands fast
+    from fognav_experiments.sensitivity import planes, publish, sweep  # noqa: PLC0415  # same
+
+    kernels.warm_cache(print_line)
+    asked, files = planes.sweep_tasks(swept, drawn), DriveFiles(folder.path / "sweep", planes.SweptDrive)
+    names = [task.name for task in asked]
+    with sweep.workers(jobs or os.cpu_count() or 1, cluster) as pool:
+        failed = _show(names, files, sweep.sweep(site, asked, files, pool, checkout.revision()))
+    drives = [drive for drive in files.read() if drive.name in names]
+    for file in publish.publish(drives, swept, command, folder.description()["measured_on"], folder.path):
+        print_line(str(file))
+    return failed
+
+
+def _values(text: str, kind: type[float] = int) -> list[float]:
+    try:
+        return [kind(part) for part in text.split(",")]
+    except ValueError as error:
+        raise WrongUseError(f"{text} is no list of numbers: write them as 2,5,20") from error
 
 
 def _scenario_files(names: list[str]) -> list[Path]:

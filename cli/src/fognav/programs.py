@@ -8,7 +8,7 @@ data/NAME/        what it stores
 import asyncio
 import os
 import sys
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -84,16 +84,25 @@ class SystemFolder:
 
 
 def server_programs(
-    folder: SystemFolder, ports: ServerPorts, locks: Callable[[str], Path | None]
+    folder: SystemFolder,
+    ports: ServerPorts,
+    locks: Callable[[str], Path | None],
+    embedded: Collection[str] = (),
 ) -> Sequence[ServerProgram]:
     """Return broker, store and router, configured in the folder; `locks` gives the folder of each one's locks, if any.
 
-    Raises `ServerError` when one is not installed.
+    Those named in `embedded` are Python packages instead (`fog_supervisor.embedded`). Raises `ServerError` when one is
+    not installed.
     """
     at = {name: locks(LOCKS[name]) for name in SERVERS}
+    if BROKER in embedded:
+        broker = servers.embedded_broker_program(ports.mqtt, address=ports.address, locks=at[BROKER])
+    else:
+        broker = servers.mosquitto_program(folder.data(BROKER), ports.mqtt, address=ports.address, locks=at[BROKER])
+    store = servers.embedded_redis_program if REDIS in embedded else servers.redis_program
     return (
-        servers.mosquitto_program(folder.data(BROKER), ports.mqtt, address=ports.address, locks=at[BROKER]),
-        servers.redis_program(folder.data(REDIS), ports.redis, locks=at[REDIS]),
+        broker,
+        store(folder.data(REDIS), ports.redis, locks=at[REDIS]),
         servers.router_program(ports.zenoh, address=ports.address, locks=at[ROUTER]),
     )
 

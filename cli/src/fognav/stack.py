@@ -46,7 +46,8 @@ class StackConfig:
 
     `robot` is the id of the site's robot, `base` and `lidar` name its hardware, and `robot_file` has its settings, of
     which the ports do not count; `extra` contains further FOGNAV_ settings for every process. With `doors` the servers
-    encrypt, and admit only those users; without, everybody on this machine.
+    encrypt, and admit only those users; without, everybody on this machine. The servers named in `embedded` are Python
+    packages (`fog_supervisor.embedded`).
     """
 
     site_dir: Path
@@ -58,6 +59,7 @@ class StackConfig:
     speed: float = 1.0
     extra: Mapping[str, str] | None = None
     doors: Doors | None = None
+    embedded: frozenset[str] = frozenset()
 
 
 def _new_folder() -> Path:
@@ -162,7 +164,7 @@ class Stack:
 
     def _prepare(self) -> None:
         ports = ServerPorts(mqtt=self.mqtt_port, redis=self.redis_port, zenoh=self.zenoh_port)
-        server_set = server_programs(self.files, ports, self.doors.of)
+        server_set = server_programs(self.files, ports, self.doors.of, self.config.embedded)
         self._urls = {program.name: program.url for program in server_set}
         programs = ProgramSet(
             self.supervisor,

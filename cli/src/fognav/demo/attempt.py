@@ -68,6 +68,7 @@ class Attempt:
             speed=self.scene.speed,
             extra=options.settings,
             doors=doors_of(self.plan.site.site),
+            embedded=options.embedded,
         )
         async with Stack(config, self._on_process) as stack, self._keeping_logs(stack):
             self._stack = stack

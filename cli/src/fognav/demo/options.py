@@ -36,6 +36,8 @@ class Options:
     request: HazardRequest | None = None
     settings: Mapping[str, str] = field(default_factory=dict)
     on_robot_start: Callable[[int], object] | None = None
+    embedded: frozenset[str] = frozenset()
+    """The servers that are Python packages, because they can't be installed here."""
 
 
 def hardware(robot_file: Path | None, base: str | None, lidar: str | None) -> tuple[str, str]:

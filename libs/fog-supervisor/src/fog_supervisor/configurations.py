@@ -69,6 +69,10 @@ tls-key-file {locks}/server.key
 tls-auth-clients no
 aclfile {locks}/users
 """
+_REDIS_ADMITTING: Final = """\
+port {port}
+aclfile {locks}/users
+"""
 
 
 def mosquitto(listener: str, data: str, *, locks: str | None = None, extra: Sequence[str] = ()) -> str:
@@ -82,12 +86,14 @@ def mosquitto(listener: str, data: str, *, locks: str | None = None, extra: Sequ
     return _MOSQUITTO.format(listener=listener, data=data, doors=doors) + "".join(f"{line}\n" for line in extra)
 
 
-def redis(bind: str, data: str, *, port: int = REDIS_PORT, locks: str | None = None) -> str:
+def redis(bind: str, data: str, *, port: int = REDIS_PORT, locks: str | None = None, encrypted: bool = True) -> str:
     """Return a `redis.conf` of a server whose acknowledged writes survive a crash.
 
-    `bind` is the address on which it listens, `data` the folder of its append-only file; `locks` as for `mosquitto`.
+    `bind` is the address on which it listens, `data` the folder of its append-only file; `locks` as for `mosquitto`,
+    but with `encrypted` False only the users count.
     """
-    doors = f"port {port}\n" if locks is None else _REDIS_LOCKED.format(port=port, locks=locks)
+    locked = _REDIS_LOCKED if encrypted else _REDIS_ADMITTING
+    doors = f"port {port}\n" if locks is None else locked.format(port=port, locks=locks)
     return _REDIS.format(bind=bind, data=data, doors=doors)
 
 

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import IO, Final, Self
 
 from fog_supervisor import configurations
+from fog_supervisor.embedded import STORE, valkey_server
 from fog_supervisor.net import LOOPBACK, free_port, reachable, unverified
 
 _READY_S: Final = 60.0
@@ -96,6 +97,34 @@ def mosquitto_program(
     return ServerProgram(
         name="mosquitto", port=port, address=address, url=f"{scheme}://{reachable(address)}:{port}",
         command=(program, "-c", str(file)),
+    )  # fmt: skip
+
+
+def embedded_broker_program(port: int, *, address: str = LOOPBACK, locks: Path | None = None) -> ServerProgram:
+    """Return what stands in for Mosquitto where it is not installed; `address` and `locks` as for that."""
+    locked = [] if locks is None else ["--locks", str(locks)]
+    module = "fog_supervisor.embedded.broker"
+    scheme = "mqtt" if locks is None else "mqtts"
+    return ServerProgram(
+        name="mosquitto", port=port, address=address, url=f"{scheme}://{reachable(address)}:{port}",
+        command=(sys.executable, "-m", module, "--listen", f"{address}:{port}", *locked),
+    )  # fmt: skip
+
+
+def embedded_redis_program(folder: Path, port: int, *, locks: Path | None = None) -> ServerProgram:
+    """Return what stands in for Redis where it is not installed; as `redis_program`, but it never encrypts.
+
+    Raises `ServerError` when its package has no program for this computer.
+    """
+    program = valkey_server()
+    if program is None:
+        raise ServerError(f"{STORE} has no server for this computer: install redis-server")
+    file = folder / "redis.conf"
+    text = configurations.redis(LOOPBACK, str(folder), port=port, locks=_text(locks), encrypted=False)
+    file.write_text(text, "utf-8")
+    return ServerProgram(
+        name="redis", port=port, url=f"redis://{LOOPBACK}:{port}/0", command=(str(program), str(file)),
+        probe=b"PING\r\n", reply=b"+PONG" if locks is None else b"-NOAUTH",
     )  # fmt: skip
 
 

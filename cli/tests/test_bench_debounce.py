@@ -1,6 +1,7 @@
 """`fognav bench debounce`: the figures of a recording, and what it says about files that are no recordings."""
 
 import json
+from pathlib import Path
 
 import pytest
 from PIL import Image
@@ -60,3 +61,24 @@ def test_default_rule_confirms_recorded_obstacles_within_a_quarter_second_and_ra
     assert evidence["reading_to_confirmed_median_ms"] <= 220
     assert evidence["false_alarms_per_h"] <= five["false_alarms_per_h"]
     assert evidence["missed_percent"] <= five["missed_percent"]
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("rule", ["consecutive", "evidence"])
+def test_table_in_the_documentation_is_what_its_command_gives(data_dir, monkeypatch, rule):
+    monkeypatch.setattr(debounce, "RULES", {rule: debounce.RULES[rule]})
+    rows = debounce.measure(sonar_recording.recordings_in(data_dir / "hcsr04"), 500, 5.0, 1, lambda _: None)
+    written = (Path(__file__).parents[2] / "docs" / "benchmarks.md").read_text("utf-8").splitlines()
+    assert [line for line in written if line.startswith(f"| {rule} |")] == debounce.table(rows)[2:]
+
+
+@pytest.mark.data
+def test_default_rule_beats_five_in_a_row_at_every_share_of_echoes(data_dir):
+    found = sonar_recording.recordings_in(data_dir / "hcsr04")
+    rows = debounce.measure(found, 150, 0.2, 1, lambda _: None)
+    figures = {(row["rule"], row["echo_rate"]): row for row in rows}
+    for echo_rate in debounce.ECHO_RATES:
+        evidence, five = figures["evidence", echo_rate], figures["consecutive", echo_rate]
+        assert evidence["detection_median_ms"] < five["detection_median_ms"]
+        assert evidence["known_percent"] > five["known_percent"]
+        assert all(evidence[name] <= five[name] for name in ("missed_percent", "lost_percent", "false_alarms_per_h"))

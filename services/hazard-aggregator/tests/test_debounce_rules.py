@@ -31,7 +31,7 @@ def run(readings, period: float = PERIOD, rule=None, **options):
 
 def free_rule(*sonars: SonarSample):
     rule = make_rule("hall", {}, find_rule)
-    assert run([seen(*(sonars or (FREE,)))] * 6, rule=rule)[-1] == "clear"
+    assert run([seen(*(sonars or (FREE,)))] * 8, rule=rule)[-1] == "clear"
     return rule
 
 
@@ -65,17 +65,17 @@ def test_half_of_the_echoes_suffice():
     assert "blocked" in run(readings, rule=free_rule())
 
 
-def test_six_free_readings_clear_and_one_echo_restarts_them():
+def test_eight_free_readings_clear_and_one_echo_restarts_them():
     rule = make_rule("hall", {}, find_rule)
     assert run([seen(echo(0.80)), seen(echo(0.81))], rule=rule)[-1] == "blocked"
-    assert run([seen(FREE)] * 5 + [seen(echo(0.80))] + [seen(FREE)] * 5, rule=rule).count("clear") == 0
+    assert run([seen(FREE)] * 7 + [seen(echo(0.80))] + [seen(FREE)] * 7, rule=rule).count("clear") == 0
     assert run([seen(FREE)], rule=rule) == ["clear"]
 
 
 def test_one_sonar_blocks_a_node_and_all_clear_it():
     rule = free_rule(FREE, FREE)
     assert run([seen(FREE, echo(0.80)), seen(FREE, echo(0.82))], rule=rule)[-1] == "blocked"
-    assert run([seen(FREE, FREE)] * 5, rule=rule) == [None] * 5
+    assert run([seen(FREE, FREE)] * 7, rule=rule) == [None] * 7
     assert run([seen(FREE, FREE)], rule=rule) == ["clear"]
 
 
@@ -113,8 +113,8 @@ SAMPLES = st.one_of(
 
 
 @given(st.lists(SAMPLES, max_size=60))
-def test_clear_is_only_confirmed_after_six_more_free_than_lost_readings_without_an_echo(samples):
-    """However the readings are mixed: an echo within the last five readings forbids `clear` after a blockage."""
+def test_clear_is_only_confirmed_after_eight_more_free_than_lost_readings_without_an_echo(samples):
+    """However the readings are mixed: an echo within the last seven readings forbids `clear` after a blockage."""
     rule = make_rule("hall", {}, find_rule)
     run([seen(echo(0.80)), seen(echo(0.81))], rule=rule)
     free = 0
@@ -122,7 +122,7 @@ def test_clear_is_only_confirmed_after_six_more_free_than_lost_readings_without_
         confirmed = rule.update(seen(sample), 0.0)
         free = free + 1 if sample is FREE else 0 if sample.state == "blocked" else free
         if confirmed == "clear":
-            assert free >= 6
+            assert free >= 8
         if confirmed in ("clear", "unknown"):
             return
 
@@ -131,7 +131,7 @@ def test_clear_is_only_confirmed_after_six_more_free_than_lost_readings_without_
 def test_decision_bounds_are_those_of_wald(samples, echo_rate):
     """A single echo never blocks: with these errors no likelihood of one reading reaches the bound."""
     rule = make_rule("hall", {"rule": "evidence", "echo_rate": echo_rate}, find_rule)
-    if math.log(echo_rate / 0.01) < math.log(0.99 / 2e-4):
+    if math.log(echo_rate / 0.01) < math.log(0.999 / 2e-4):
         assert rule.update(seen(samples[0]), 0.0) is None
 
 

@@ -7,7 +7,7 @@ replaced by the background, as if the obstacle had not echoed, and everything pa
 from __future__ import annotations
 
 from itertools import pairwise
-from statistics import median
+from statistics import mean, median
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
@@ -42,13 +42,15 @@ _BLOCK: Final = 20
 class Trial(NamedTuple):
     """Times (s) from the obstacle's arrival to its detection (None: missed) and from its departure to `clear`.
 
-    `reading_s`: from the first reading that shows it to its detection; `lost`: how often it was taken for gone.
+    `reading_s`: from the first reading that shows it to its detection; `lost`: how often it was taken for gone;
+    `known`: the share of its presence in which the area was blocked.
     """
 
     detected_s: float | None
     reading_s: float | None
     cleared_s: float | None
     lost: int
+    known: float
 
 
 def measure(
@@ -97,12 +99,17 @@ def run_trial(recording: Recording, choice: Mapping[str, Any], echo_rate: float,
     gone = next((i for i in range(leaves, len(ranges)) if confirmed[i] == "clear"), None)
     inside = [state for state in confirmed[first:leaves] if state is not None] if first is not None else []
     lost = sum(a == "blocked" and b == "clear" for a, b in pairwise(inside))
+    known, state = 0, "clear"
+    for each in confirmed[_BEFORE:leaves]:
+        state = each or state
+        known += state == "blocked"
     period = recording.period_s
     return Trial(
         None if detected is None else (detected - _BEFORE) * period,
         None if detected is None else (detected - shown) * period,
         None if gone is None else (gone - leaves) * period,
         lost,
+        known / count,
     )
 
 
@@ -133,6 +140,7 @@ def _figures(trials: Sequence[Trial]) -> dict[str, Any]:
         "reading_to_confirmed_median_ms": _ms(reading, 50),
         "missed_percent": round(100 * (1 - len(detected) / len(trials)), 2),
         "lost_percent": round(100 * sum(trial.lost > 0 for trial in trials) / len(trials), 2),
+        "known_percent": round(100 * mean(trial.known for trial in trials), 1),
         "clear_median_ms": round(1000 * median(cleared)) if cleared else None,
     }
 

@@ -1,4 +1,4 @@
-"""Draws the comparison of debounce rules: detection time, misses and lost obstacles by the share of echoes."""
+"""Draws the comparison of debounce rules by the share of echoes: detection time, misses, losses, what is known."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ _PANELS: Final = (
     ("detection_p95_ms", "time to detection, 95th percentile, ms"),
     ("missed_percent", "obstacles missed for 2 s, %"),
     ("lost_percent", "obstacles lost within 4 s, %"),
+    ("known_percent", "share of its 4 s an obstacle is known, %"),
 )
 _COLOURS: Final = ("#d62728", "#1f77b4", "#2ca02c", "#9467bd", "#ff7f0e")
 _WIDTH: Final = 380

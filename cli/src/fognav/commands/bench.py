@@ -360,8 +360,9 @@ def debounce_command(
     """Compare the debounce rules on recorded echoes.
 
     Obstacles of the recordings come, stay and go, with 50 to 100 % of their echoes. Figures: time to detection, misses
-    after 2 s, losses within 4 s, and false alarms per hour of the background, as recorded and with 2 % false echoes;
-    and what the evidence rule learns from the recordings: echo_rate and false_echo_rate.
+    after 2 s, losses within 4 s, how much of these 4 s the obstacle is known, and false alarms per hour of the
+    background, as recorded and with 2 % false echoes; and what the evidence rule learns from the recordings: echo_rate
+    and false_echo_rate.
     """
     from fognav.bench import debounce, debounce_plot, machine, sonar_recording  # noqa: PLC0415  # as above
 

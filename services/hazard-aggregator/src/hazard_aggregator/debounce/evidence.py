@@ -48,7 +48,7 @@ class Options(Struct, frozen=True, kw_only=True):
     echo_rate: Probability = 0.6
     false_echo_rate: Probability = 0.01
     false_alarm: Probability = 2e-4
-    missed: Probability = 0.01
+    missed: Probability = 0.001
     doubtful_m: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.05
     to_unknown: Annotated[int, Meta(ge=1, le=1000)] = 5
 

@@ -60,3 +60,13 @@ def test_epochs_are_heard_from_the_service_itself_and_from_those_that_received_t
     leader = Leader(epoch=3, holder="p", epochs={"map-service": 8})
     assert epoch_in(ch.LEADER, leader, "map-service") == 8
     assert epoch_in(ch.LEADER, leader, "planner") == 0
+
+
+def test_message_with_an_epoch_that_no_service_can_have_is_refused_and_fences_nobody_off():
+    fence, handled = Fence(), []
+    handlers = fence.guarded({ch.MAP_HEARTBEAT: lambda _, message, __: handled.append(message) or ()})
+    with pytest.raises(RefusedMessageError, match="no map-service can have it"):
+        handlers[ch.MAP_HEARTBEAT]({}, MapHeartbeat(epoch=2**53, seq=1, hash=0, sent=(0, 0.0)), AT)
+    handlers[ch.MAP_HEARTBEAT]({}, MapHeartbeat(epoch=5, seq=1, hash=0, sent=(0, 0.0)), AT)
+    assert [message.epoch for message in handled] == [5]
+    assert fence.epochs[ch.MAP] == 5

@@ -6,6 +6,7 @@
 import math
 import os
 
+import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
@@ -40,6 +41,25 @@ def test_grant_that_was_read_too_late_permits_nothing():
     request = lease.request(103.0)
     lease.on_reply(request, Granted(5), 103.1)
     assert lease.permission(103.1) == "granted"
+
+
+@pytest.mark.parametrize("hear", ["on_epoch", "on_rival", "on_leader"])
+def test_forged_epoch_leaves_room_for_a_leader_above_it(hear):
+    lease = leading(at=100.0)
+
+    def forge() -> None:
+        if hear == "on_leader":
+            lease.on_leader(2**53, "b", 100.1)
+        else:
+            getattr(lease, hear)(2**53)
+
+    forge()
+    assert lease.permission(100.1) == "pending"
+    request = lease.request(100.1)
+    lease.on_reply(request, Granted(request.floor + 1), 100.2)
+    assert request.floor + 1 < 2**53, "a number that messages and Redis can carry"
+    forge()
+    assert lease.permission(100.3) == "granted", "the same again is no news"
 
 
 def test_leader_acts_on_while_redis_promptly_fails_to_answer():

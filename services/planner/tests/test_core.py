@@ -136,6 +136,16 @@ class Drive:
         return self.paths[-1]
 
 
+def test_robot_whose_search_took_too_long_gets_its_path_when_its_goal_has_a_distance_field() -> None:
+    drive = Drive(start=LEFT, config=PlannerConfig(unguided_expansions=200, quick_expansions=5))
+    refused = drive.go(*RIGHT)
+    assert refused.refusal is not None
+    assert refused.refusal.code == 207
+    drive.step(2.0)
+    assert drive.paths[-1].refusal is None
+    assert drive.paths[-1].points
+
+
 def test_path_leads_from_the_robot_to_the_goal_by_its_corners_only() -> None:
     path = Drive(start=LEFT).go(*RIGHT)
     assert path.points[0] == LEFT

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import httpx
 import pytest
+from prometheus_client import REGISTRY
 from ring_map import LEFT, RIGHT, RingMap, goal, pose
 
 import planner.service
@@ -92,6 +93,17 @@ def rig() -> Rig:
 def test_service_subscribes_to_every_channel_and_serves_every_query_of_the_core(rig: Rig) -> None:
     assert rig.session.subscribed.keys() == rig.core.handlers().keys()
     assert rig.session.served == rig.core.query_handlers().keys()
+
+
+@pytest.mark.usefixtures("rig")
+def test_counters_have_a_value_before_their_first_event() -> None:
+    for name, labels in (
+        ("fognav_plans_total", {"reason": "clearing"}),
+        ("fognav_plan_refusals_total", {"code": "205"}),
+        ("fognav_plans_avoided_total", {"reason": "unreachable"}),
+        ("fognav_stage_seconds_count", {"stage": "plan"}),
+    ):
+        assert REGISTRY.get_sample_value(name, labels) is not None, name
 
 
 def test_messages_keep_their_time_of_arrival_until_the_core_handles_them(rig: Rig) -> None:

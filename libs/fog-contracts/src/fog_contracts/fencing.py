@@ -8,7 +8,7 @@ sends its own epoch.
 from __future__ import annotations
 
 from functools import wraps
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from fog_contracts.handlers import RefusedMessageError
 
@@ -17,6 +17,13 @@ if TYPE_CHECKING:
 
     from fog_contracts.channels import Channel
     from fog_contracts.handlers import Handler, Ids, Moment, Publication
+
+
+HEARD_LIMIT: Final = 2**52
+"""No clock (ms) gives an epoch as high as this one. Higher ones count as this when they are heard of, so that whoever
+forges one leaves room for a leader above it ..."""
+HIGHEST_EPOCH: Final = HEARD_LIMIT + 2**32
+"""... and messages with an epoch above this are refused: not so many leaders can have followed one another."""
 
 
 class Fence:
@@ -35,7 +42,9 @@ class Fence:
         self._highest[service] = max(epoch, self._highest.get(service, 0))
 
     def require_current(self, service: str, epoch: int) -> None:
-        """Raise `RefusedMessageError` for an epoch below the highest one of its service."""
+        """Raise `RefusedMessageError` for an epoch below the highest one of its service, or one that none can have."""
+        if epoch > HIGHEST_EPOCH:
+            raise RefusedMessageError(f"its epoch {epoch} is above {HIGHEST_EPOCH}: no {service} can have it")
         if epoch < (highest := self._highest.get(service, 0)):
             raise RefusedMessageError(f"its epoch {epoch} is below {highest}: another {service} has taken over")
 
@@ -50,8 +59,8 @@ class Fence:
         @wraps(handler)
         def handle(ids: Ids, message: object, at: Moment) -> Sequence[Publication]:
             service, epoch = channel.publishers[0], getattr(message, channel.epoch)
-            self.raise_to(service, epoch)
             self.require_current(service, epoch)
+            self.raise_to(service, epoch)
             return handler(ids, message, at)
 
         return handle

@@ -37,6 +37,7 @@ class Publisher:
     """
 
     def __init__(self, core: Aggregator, edges: Edges, history: HistoryKeeper, site: str) -> None:
+        metrics.expect_stages(["debounce"])
         self._site = site
         self.write_pending = asyncio.Event()
         self._core = core

@@ -48,6 +48,7 @@ class Publisher:
     """Publishes the core's publications, and makes it continue changes that are only partly on the map."""
 
     def __init__(self, core: MapCore, edges: Edges, now: Callable[[], Moment]) -> None:
+        metrics.expect_stages(["costmap"])
         self._core = core
         self._edges = edges
         self._now = now

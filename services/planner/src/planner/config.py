@@ -44,6 +44,8 @@ class PlannerConfig:
     """How long a heartbeat may be ahead of the deltas before a snapshot is fetched."""
     max_expansions: int = 2 * MAX_CELLS
     """More than a search expands on the largest map; fewer would refuse goals there that can be reached."""
+    unguided_expansions: int = 20_000_000
+    """More cells are not expanded (0.7 s) for a robot whose goal has no distance field yet: it is refused so long."""
     quick_expansions: int = 40_000
     """After so many expanded cells (1 ms) a search first asks whether the goal can be reached at all ..."""
     detour_searches: int = 3

@@ -250,17 +250,12 @@ class PlannerCore:
         """Use the result of a job that has run; return whether it calls for an immediate `tick`."""
         if isinstance(job, FieldJob):
             self._fields.add(job)
+            if self._map.current is not None and self._fields.guide(job.goal) is not None:
+                self.missions.search_again(job.goal, self._map.current.geometry)
             return False
         self._explaining = None
-        version, changed = (job.view.planning_map.version, job.view.revision), False
-        for robot, (plan, _) in job.questions.items():
-            plan.explained_for, plan.explained_at = version, now
-            refusal = job.answers.get(robot)
-            mission = self.missions.of(robot)
-            if refusal is not None and mission.plan is plan and refusal != plan.refusal:
-                mission.replace_refusal(refusal)
-                changed = True
-        return changed
+        plans = {robot: plan for robot, (plan, _) in job.questions.items()}
+        return self.missions.explain(plans, job.answers, (job.view.planning_map.version, job.view.revision), now)
 
     def _explain_job(self, at: Moment, planning_map: PlanningMap) -> ExplainJob | None:
         """Return the job that explains the refusals whose reasons are unknown or may have changed."""

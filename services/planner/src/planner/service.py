@@ -13,8 +13,6 @@ from functools import partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
-from prometheus_client import Counter, Gauge
-
 from fog_contracts import channels as ch
 from fog_contracts.messages import PlanReply, RobotPath, RobotPose, RobotRelease, RobotState
 from fog_runtime import logs, metrics
@@ -25,6 +23,7 @@ from planner.cycle import Cycle
 from planner.keepers.dock_keeper import DockKeeper
 from planner.keepers.map_keeper import MapKeeper
 from planner.keepers.mission_keeper import MissionKeeper
+from planner.keepers.plan_metrics import PlanMetrics
 from planner.query_queue import BusyError, QueryQueue
 from planner.reasons.refusals import busy
 from planner.robot_commands import RobotOperator
@@ -47,20 +46,6 @@ TICK_S: Final = 0.1
 BUSY_PAUSE_S: Final = 0.25
 MOST_UNRECORDED: Final = 1000
 """After so many publications they are recorded although searches are left."""
-
-PLANS = Counter("fognav_plans_total", "Replans, by reason", ["reason"])
-REFUSALS = Counter("fognav_plan_refusals_total", "Replans that ended in a refusal, by Nav2's code", ["code"])
-AVOIDED = Counter(
-    "fognav_plans_avoided_total",
-    "Path searches that were not needed, by reason: a change was far from the path, lowered no cost for a refused"
-    " robot, or left the goal out of reach",
-    ["reason"],
-)
-DETOURS = Counter(
-    "fognav_plan_shared_bounds_total", "Bounds of the way round a closure, computed once for several robots' searches"
-)
-ROBOTS = Gauge("fognav_planner_robots", "Robots with a mission")
-FIELD_BYTES = Gauge("fognav_planner_goal_fields_bytes", "Memory of the distance fields of all goals")
 
 _log = logs.get("planner")
 
@@ -99,7 +84,7 @@ class Service:
         self.operator = RobotOperator(zenoh, store, clock, key)
         self._docks = DockKeeper(staging, self.send)
         self._jobs: set[asyncio.Task[None]] = set()
-        self._exported_counts: dict[tuple[int, object], int] = {}
+        self._metrics = PlanMetrics()
         self.poses: dict[str, RobotPose] = {}
         self.states: dict[str, RobotState] = {}
         self._paths: dict[str, RobotPath] = {}
@@ -245,7 +230,7 @@ class Service:
             connected = self._zenoh.connected
             self._health.set("zenoh", ok=connected, detail="" if connected else "not connected to the router")
             self._health.set("robots", ok=True, detail=self.operator.doubled_detail())
-            self._update_metrics()
+            self._metrics.update(self._core, len(self.goals))
 
     def _change_goal(self, change: Callable[[], object]) -> None:
         self._cycle.change_goal(change)
@@ -304,18 +289,6 @@ class Service:
     def _record_release(self, robot: str, release: RobotRelease) -> None:
         if (path := self._paths.get(robot)) is not None:
             self._paths[robot] = path.after(release)
-
-    def _update_metrics(self) -> None:
-        ROBOTS.set(len(self.goals))
-        FIELD_BYTES.set(self._core.fields_bytes)
-        replanner = self._core.replanner
-        DETOURS.inc(replanner.detours.computed - self._exported_counts.get((id(DETOURS), None), 0))
-        self._exported_counts[id(DETOURS), None] = replanner.detours.computed
-        for counter, values in ((PLANS, replanner.plans), (REFUSALS, replanner.refusals), (AVOIDED, replanner.avoided)):
-            for label, count in dict(values).items():
-                key = (id(counter), label)
-                counter.labels(str(label)).inc(count - self._exported_counts.get(key, 0))
-                self._exported_counts[key] = count
 
     def close(self) -> None:
         """Shut the threads down once their current work is done."""

@@ -14,8 +14,9 @@ The holder may act until a deadline, counted from *before* its last request was 
   answer that it was too late to read: the deadline has passed, and it waits for the answer to its next request.
 
 Whoever hears an epoch above its own stops acting at once and asks Redis. If it still holds the lease, the other epoch
-is an old one, or was made without Redis: it continues with one above. Without Redis it gives way to a leader that is
-alive, and else makes a provisional epoch above all that it heard, which Redis confirms or corrects later.
+is an old one, or was made without Redis: it continues with one above, for which a forged epoch leaves room
+(`HEARD_LIMIT`). Without Redis it gives way to a leader that is alive, and else makes a provisional epoch above all that
+it heard, which Redis confirms or corrects later.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from typing import Final, Literal
+
+from fog_contracts.fencing import HEARD_LIMIT
 
 LEASE_S: Final = 1.2
 """Duration of the lease in Redis."""
@@ -173,16 +176,19 @@ class Lease:
         if self.leader is None or epoch >= self.leader.epoch:
             self.leader = Leader(epoch, holder, now)
         if epoch >= self.epoch:
-            self._floor = max(self._floor, epoch)
+            self._hear(epoch)
 
     def on_epoch(self, epoch: int) -> None:
         """Handle an epoch of this service that others have seen, whoever sent it and when; our own is no news."""
         if epoch > self.epoch:
-            self._floor = max(self._floor, epoch)
+            self._hear(epoch)
 
     def on_rival(self, epoch: int) -> None:
         """Handle a message of another process of this service that leads, or did; ours must be above its epoch."""
-        self._floor = max(self._floor, epoch)
+        self._hear(epoch)
+
+    def _hear(self, epoch: int) -> None:
+        self._floor = max(self._floor, min(epoch, HEARD_LIMIT))
 
     def _leader_heard_at(self) -> float:
         """When a leader with an epoch not below ours was last heard."""
@@ -222,5 +228,5 @@ class Lease:
         self._extend(since)
 
     def _stand_by(self, leader: Leader | None) -> None:
-        self._floor = max(self._floor, self.epoch, leader.epoch if leader is not None else 0)
+        self._floor = max(self._floor, self.epoch, min(leader.epoch, HEARD_LIMIT) if leader is not None else 0)
         self.epoch, self.confirmed, self.leader, self._deadline = 0, False, leader, -math.inf

@@ -166,6 +166,27 @@ class _Publisher:
         metrics.count_bytes(self._channel.name, "sent", len(data))
 
 
+class _Publishers:
+    """The publishers by key; a new one is declared by the thread that first needs it."""
+
+    def __init__(self, declare: Callable[[Callable[[zenoh.Session], object]], None]) -> None:
+        self._declare = declare
+        self._by_key: dict[str, _Publisher] = {}
+        self._lock = threading.Lock()
+
+    def of(self, channel: Channel, key: str) -> _Publisher:
+        publisher = self._by_key.get(key)
+        if publisher is not None:
+            return publisher
+        with self._lock:
+            publisher = self._by_key.get(key)
+            if publisher is not None:
+                return publisher
+            publisher = self._by_key[key] = _Publisher(channel, key)
+        self._declare(publisher.declare)
+        return publisher
+
+
 class _Subscription(Generic[M]):
     """Passes samples from zenoh's threads to the loop: all in order, or only the newest of each key."""
 
@@ -371,9 +392,9 @@ class ZenohEdge:
         self._loop = asyncio.get_running_loop()
         self._session: zenoh.Session | None = None
         self._closed = False
-        self._publishers: dict[str, _Publisher] = {}
+        self._publishers = _Publishers(self._declare)
         self._lock = threading.Lock()
-        """Held while a publisher is added, and while the session begins to take declarations."""
+        """Held while the session begins to take declarations."""
         self._declared: list[object] = []
         self._undeclared: list[Callable[[zenoh.Session], object]] = []
         self._tasks: set[asyncio.Task[None]] = set()
@@ -428,19 +449,7 @@ class ZenohEdge:
         """
         key = self._key(channel, ids)
         data = encode(channel, message)
-        publisher = self._publishers.get(key)
-        if publisher is None:
-            publisher = self._add_publisher(channel, key)
-        publisher.put(data)
-
-    def _add_publisher(self, channel: Channel, key: str) -> _Publisher:
-        with self._lock:
-            publisher = self._publishers.get(key)
-            if publisher is not None:
-                return publisher
-            publisher = self._publishers[key] = _Publisher(channel, key)
-        self._declare(publisher.declare)
-        return publisher
+        self._publishers.of(channel, key).put(data)
 
     def subscribe(self, channel: Channel, kind: type[M], handler: Callable[[Ids, M], object], **ids: str) -> None:
         """Call `handler(ids, message)` for each message, with every value of the ids that are not given.

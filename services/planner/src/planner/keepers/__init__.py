@@ -1,1 +1,1 @@
-"""What keeps the core in step with the store, the map and the docks."""
+"""What keeps the core in step with the store, the map, the docks and the metrics."""

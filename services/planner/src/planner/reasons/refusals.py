@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 _OBSTACLE: Final = Cause(kind="obstacle", id="lidar", state="seen")
 _WALL: Final = Cause(kind="map", id="static", state="occupied")
+TIMEOUT: Final[PlanCode] = 207
 _NEAR_GOAL_M: Final = 5.0
 """How far from a goal in a wall a reachable point is searched."""
 
@@ -30,12 +31,12 @@ def refuse(code: PlanCode, reason: str, causes: Iterable[Cause] = (), nearest: P
 
 def no_map() -> Refusal:
     """Refuse because no map was received yet."""
-    return refuse(207, "the planner has no map yet: try again when it is ready")
+    return refuse(TIMEOUT, "the planner has no map yet: try again when it is ready")
 
 
 def busy(reason: str) -> Refusal:
     """Refuse because too many queries are waiting."""
-    return refuse(207, reason)
+    return refuse(TIMEOUT, reason)
 
 
 def start_outside(geometry: GridGeometry, start: PointXY) -> Refusal:

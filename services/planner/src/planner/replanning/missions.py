@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
+from planner.reasons.refusals import TIMEOUT
 from planner.replanning.mission import Mission
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
     from fog_contracts.grid import GridGeometry
-    from fog_contracts.messages import RobotGoal
+    from fog_contracts.messages import Refusal, RobotGoal
     from planner.config import PlannerConfig
     from planner.maps.planning_map import Cell
-    from planner.replanning.mission import ReplanReason
+    from planner.replanning.mission import Explained, Plan, ReplanReason
 
 _URGENCY: Final[dict[ReplanReason, int]] = {
     "map": 0, "off_path": 1, "epoch": 2, "goal": 3, "clearing": 4, "refused": 5,
@@ -92,6 +93,28 @@ class Missions:
             if robot in located and (reason := mission.replan_due(now, config)) is not None
         ]
         return sorted(due, key=lambda entry: (_URGENCY[entry[2]], entry[1].danger))
+
+    def explain(
+        self, plans: Mapping[str, Plan], answers: Mapping[str, Refusal], explained_for: Explained, now: float
+    ) -> bool:
+        """Use the explained refusals of these robots' plans; return whether one differs from what was published."""
+        changed = False
+        for robot, plan in plans.items():
+            plan.explained_for, plan.explained_at = explained_for, now
+            refusal, mission = answers.get(robot), self.of(robot)
+            if refusal is not None and mission.plan is plan and refusal != plan.refusal:
+                mission.replace_refusal(refusal)
+                changed = True
+        return changed
+
+    def search_again(self, goal: Cell, geometry: GridGeometry) -> None:
+        """Search again for the robots whose search for a path to a goal's cell took too long: it has a field now."""
+        for _, mission in self.active():
+            target, plan = mission.target, mission.plan
+            if target is None or plan is None or plan.refusal is None or plan.refusal.code != TIMEOUT:
+                continue
+            if geometry.cell(target.x, target.y) == goal:
+                mission.request_replan("refused", [])
 
     def goal_cells(self, geometry: GridGeometry) -> Iterator[Cell]:
         """Yield the cells of all goals that lie on the map."""

@@ -96,7 +96,7 @@ class Replanner:
         assert target is not None
         geometry = planning_map.geometry
         if self._search is None or self._search.geometry != geometry:
-            self._search = PathSearch(self._config, geometry)
+            self._search = PathSearch(self._config, geometry, self._config.unguided_expansions)
         goal = geometry.cell(target.x, target.y)
         trip = _trip(mission, geometry)
         detour = None if trip is None else self.detours.guide(*trip)

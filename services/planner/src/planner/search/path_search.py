@@ -13,6 +13,7 @@ from fog_contracts.costs import FREE, INSCRIBED, LETHAL
 from fog_kernels.astar import Planner, nearest_traversable
 from fog_kernels.lines import line_cost
 from planner.reasons.refusals import (
+    TIMEOUT,
     goal_occupied,
     goal_out_of_reach,
     nearest_reachable,
@@ -74,8 +75,10 @@ Share = Callable[["Cell", "Cell"], "Detour | None"]
 class PathSearch:
     """Searches paths on maps of one geometry; owns the memory that A* needs."""
 
-    def __init__(self, config: PlannerConfig, geometry: GridGeometry) -> None:
+    def __init__(self, config: PlannerConfig, geometry: GridGeometry, unguided_expansions: int | None = None) -> None:
+        """`unguided_expansions`: how many cells a search without a field may expand; by default as many as others."""
         self._config = config
+        self._most_unguided = min(unguided_expansions or config.max_expansions, config.max_expansions)
         self.geometry = geometry
         self.planner = Planner(geometry.width, geometry.height)
 
@@ -109,16 +112,23 @@ class PathSearch:
             return refused(goal_occupied(goal, nearest), Question("goal", start, goal, free, last))
         found = self._search(planning_map, free, last, field, detour, share)
         if found is None or found.timed_out:
-            return self._without_path(planning_map, Question("path", start, goal, free, last), found)
+            most = self._most(field)
+            return self._without_path(planning_map, Question("path", start, goal, free, last), found, most)
         corners = self.planner.shortcut(planning_map.cost, found.cells)
         points = self._points(planning_map.cost, corners, start, goal, escaping=free != first)
         route = Route(points, self._config.point_spacing, escape_lines=int(free != first))
         return SearchResult(route, route.cost(planning_map.cost, geometry), None)
 
-    def _without_path(self, planning_map: PlanningMap, question: Question, found: PlanResult | None) -> SearchResult:
+    def _most(self, field: GoalField | None) -> int:
+        """Return how many cells a search may expand."""
+        return self._config.max_expansions if field is not None else self._most_unguided
+
+    def _without_path(
+        self, planning_map: PlanningMap, question: Question, found: PlanResult | None, most: int
+    ) -> SearchResult:
         if found is not None:
-            reason = f"no path was found within {self._config.max_expansions} expanded cells"
-            return refused(refuse(207, reason), searched=True)
+            reason = f"no path was found within {most} expanded cells"
+            return refused(refuse(TIMEOUT, reason), searched=True)
         return refused(no_path(nearest_reachable(planning_map, question.start_cell, question.goal_cell)), question)
 
     def _search(
@@ -137,7 +147,7 @@ class PathSearch:
         """
         if planning_map.has_components and not planning_map.reachable(start, goal):
             return None
-        most, quick = self._config.max_expansions, self._config.quick_expansions
+        most, quick = self._most(field), self._config.quick_expansions
         if quick < most and (share is not None or not planning_map.has_components):
             found = self.planner.plan(planning_map.cost, start, goal, quick, field, detour)
             if not found.timed_out:

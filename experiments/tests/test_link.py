@@ -49,3 +49,19 @@ def test_each_direction_can_be_cut_alone():
     link.down(lambda at: heard.append(at) or (), moment(2.0))
     assert list(link.up(said, moment(2.0))) == []
     assert [at.now for at in heard] == [2.0]
+
+
+def test_a_query_takes_the_delay_both_ways_and_is_lost_when_either_is_cut():
+    link, replies = Link(), []
+    link.ask(lambda at: at.now, lambda asked, at: replies.append((asked, at.now)), moment(0.0))
+    assert replies == [(0.0, 0.0)]
+    link.delay_s = 1.0
+    link.ask(lambda at: at.now, lambda asked, at: replies.append((asked, at.now)), moment(10.0))
+    for tenth in range(100, 130):
+        link.due(moment(tenth / 10))
+    assert replies[1:] == [(11.0, 12.0)]
+    for cut in ("is_heard", "hears"):
+        link = Link()
+        setattr(link, cut, False)
+        link.ask(lambda at: at.now, lambda asked, at: replies.append((asked, at.now)), moment(20.0))
+    assert len(replies) == 2

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from fog_contracts.handlers import Moment, Publication
 
     Arrival = Callable[[Moment], Sequence[Publication]]
+    R = TypeVar("R")
 
 
 class Link:
@@ -37,6 +38,24 @@ class Link:
     def up(self, publications: Sequence[Publication], at: Moment) -> Sequence[Publication]:
         """Send what the robot publishes; return what arrives at once."""
         return self._pass(lambda _when: publications, at, down=False) if self.is_heard and publications else ()
+
+    def ask(self, answer: Callable[[Moment], R], receive: Callable[[R, Moment], None], at: Moment) -> None:
+        """Send a query of the robot's: `answer` is called once it arrives, and `receive` once its reply does.
+
+        Either may be lost; then `receive` is not called.
+        """
+
+        def reply(when: Moment) -> Sequence[Publication]:
+            answered = answer(when)
+
+            def arrive(then: Moment) -> Sequence[Publication]:
+                receive(answered, then)
+                return ()
+
+            return self.down(arrive, when)
+
+        if self.is_heard:
+            self._pass(reply, at, down=False)
 
     def due(self, at: Moment) -> Sequence[Publication]:
         """Let what was under way long enough arrive; return what is published then. Call it every 10 ms."""

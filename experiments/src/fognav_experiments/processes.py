@@ -42,6 +42,10 @@ USED: Final[Mapping[ProfileName, frozenset[ch.Channel]]] = {
 """What a robot receives from the fog that its profile uses."""
 
 
+QUERY_TIMEOUT_S: Final = 3.0
+"""How long a robot waits for the reply to a query."""
+
+
 def unmeasured(_component: str) -> AbstractContextManager[object]:
     """Measure nothing."""
     return nullcontext()
@@ -211,6 +215,8 @@ class AgentProcess:
         """The robot's Wi-Fi: all messages go through it."""
         self.received_bytes = 0
         """Bytes of the messages that were received and are of use in the robot's profile."""
+        self._map_due = 0.0
+        self._way_out_until: float | None = None
         handlers = {channel: self._measured(channel, handler) for channel, handler in core.handlers().items()}
         bus.subscribe(handlers, only={"robot": robot})
         bus.serve(core.query_handlers(), only={"robot": robot})
@@ -234,13 +240,17 @@ class AgentProcess:
         self._bus.publish(self.link.due(at))
 
     def fetch_map(self, at: Moment) -> None:
-        """Load a snapshot if the core requests one and the map is served; call it 20 times a second."""
-        if self.link.whole and self.core.wants_snapshot(at.now):
-            snapshot = self._bus.query(ch.MAP_SNAPSHOT, None, MapSnapshot, at)
-            if snapshot is not None:
-                self.received_bytes += len(snapshot.cost) + len(snapshot.speed) + len(snapshot.static)
-                with self._measure("layers"):
-                    self.core.load(snapshot, at.now)
+        """Ask for a snapshot if the core wants one and none is under way; call it 20 times a second."""
+        if self.link.whole and self.core.wants_snapshot(at.now) and at.now >= self._map_due:
+            self._map_due = at.now + QUERY_TIMEOUT_S
+            self.link.ask(lambda when: self._bus.query(ch.MAP_SNAPSHOT, None, MapSnapshot, when), self._load, at)
+
+    def _load(self, snapshot: MapSnapshot | None, at: Moment) -> None:
+        self._map_due = at.now
+        if snapshot is not None:
+            self.received_bytes += len(snapshot.cost) + len(snapshot.speed) + len(snapshot.static)
+            with self._measure("layers"):
+                self.core.load(snapshot, at.now)
 
     def control(self, at: Moment) -> None:
         """Run the robot's own global planner, if its profile has one, and its local planner, as often as this says."""
@@ -264,8 +274,23 @@ class AgentProcess:
         with self._measure("messages"):
             publications = self.core.tick(at)
         self._bus.publish(self.link.up(publications, at))
+        self._ask_for_way_out(at)
+
+    def _ask_for_way_out(self, at: Moment) -> None:
+        if self._way_out_until is not None and at.now >= self._way_out_until:
+            self._on_way_out(self._way_out_until, None, at)
         if (request := self.core.egress_request(at.now)) is not None:
-            reply = self._bus.query(ch.PLANNER_EGRESS, request, PlanReply, at) if self.link.whole else None
+            until = self._way_out_until = at.now + QUERY_TIMEOUT_S if self.link.whole else at.now
+            self.link.ask(
+                lambda when: self._bus.query(ch.PLANNER_EGRESS, request, PlanReply, when),
+                lambda reply, when: self._on_way_out(until, reply, when),
+                at,
+            )
+
+    def _on_way_out(self, asked: float, reply: PlanReply | None, at: Moment) -> None:
+        """Pass on the reply to the query that times out at `asked`; one that comes later is nobody's."""
+        if asked == self._way_out_until:
+            self._way_out_until = None
             self.core.on_egress_reply(reply, at.now)
 
 

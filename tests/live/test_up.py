@@ -21,7 +21,7 @@ from fog_supervisor import net
 pytestmark = [pytest.mark.live, pytest.mark.timeout(300)]
 
 ROOT = Path(__file__).parents[2]
-START_S = 180.0
+START_S = 180.0 if "FOGNAV_UPGRADE_FROM" not in os.environ else 1200.0
 PORTS = ("MQTT", "REDIS", "ZENOH", "AGGREGATOR", "MAP", "PLANNER")
 
 
@@ -31,6 +31,8 @@ class Node:
     def __init__(self, folder: Path, *options: str) -> None:
         self.data = folder / "data"
         self.options = options
+        self.source: Path | None = None
+        """The checkout of another version, which runs instead of this one."""
         (folder / "runtime").mkdir(mode=0o700)
         self.printed = folder / "up.txt"
         taken: set[int] = set()
@@ -42,9 +44,11 @@ class Node:
 
     def up(self) -> None:
         command = [sys.executable, "-m", "fognav", "up", "--data", str(self.data), "--bind", "127.0.0.1"]
+        found = [] if self.source is None else [*self.source.glob("*/src"), *self.source.glob("*/*/src")]
+        environment = {**self.environment, "PYTHONPATH": os.pathsep.join(map(str, found))}
         with self.printed.open("wb") as output:
             self.process = subprocess.Popen(
-                [*command, *self.options], env=self.environment, stdin=subprocess.DEVNULL, stdout=output, stderr=output
+                [*command, *self.options], env=environment, stdin=subprocess.DEVNULL, stdout=output, stderr=output
             )
         self.wait(lambda: "is up:" in self.printed.read_text(), "it is up")
 
@@ -205,3 +209,33 @@ def test_two_floors_on_one_node_have_a_robot_each_and_share_no_hazard(tmp_path):
         node.down()
     finally:
         node.end()
+
+
+@pytest.mark.timeout(1800)  # each version compiles its kernels once
+@pytest.mark.skipif("FOGNAV_UPGRADE_FROM" not in os.environ, reason="set it to a version, of which git has the sources")
+def test_data_of_an_older_version_is_used_by_this_one(node, tmp_path):
+    node.source = tmp_path / "older"
+    node.source.mkdir()
+    packed = subprocess.run(
+        ["git", "-C", str(ROOT), "archive", os.environ["FOGNAV_UPGRADE_FROM"]], capture_output=True, check=True
+    ).stdout
+    subprocess.run(["tar", "-x", "-C", str(node.source)], input=packed, check=True)
+    node.options = ("--site", str(node.source / "sites" / "estig"))
+    node.up()
+    node.run("zone", "add", "--circle", "90,20,1", "--reason", "wet floor")
+    node.run("area", "override", "z1", "--state", "blocked", "--for", "1h", "--reason", "box")
+    node.wait(lambda: "blocked" in node.run("area", "history", "z1"), "the history has it")
+    kept = ("keys/estig/admin.token", "keys/estig/operator.key", "locks/authority.pem", "locks/credentials/r1.toml")
+    before = {name: (node.data / name).read_bytes() for name in kept}
+    node.down()
+    node.source = None
+    node.up()
+    assert "wet floor" in node.run("zone", "list")
+    listed = json.loads(node.run("area", "list", "--json").partition("\nfognav:")[0])["areas"]
+    (area,) = [each for each in listed if each["definition"]["id"] == "z1"]
+    assert area["hazard"]["state"] == "blocked"
+    assert area["override"]["reason"] == "box"
+    assert node.run("area", "history", "z1").count("blocked") >= 1
+    assert before == {name: (node.data / name).read_bytes() for name in kept}
+    node.run("zone", "add", "--circle", "80,20,1", "--reason", "dry soon")
+    node.down()

@@ -31,6 +31,7 @@ from fognav.commands.status import status_command
 from fognav.commands.store import store_app
 from fognav.commands.token import token_app
 from fognav.commands.up import down_command, logs_command, up_command
+from fognav.commands.upgrade import upgrade_command
 from fognav.commands.zone import zone_app
 from fognav.operate.options import NUMBERS, JsonOption
 from fognav.output import (
@@ -79,6 +80,7 @@ app.command(
     "restore", epilog="Example: fognav restore fog.tar.gz --site sites/estig --secrets keys --data /var/lib/fognav"
 )(restore_command)
 app.command("up", epilog="Example: fognav up --site sites/estig --site sites/floor2")(up_command)
+app.command("upgrade", epilog="Example: fognav upgrade --check")(upgrade_command)
 app.command("down", epilog="Example: fognav down")(down_command)
 app.command("logs", epilog="Example: fognav logs map-service -f")(logs_command)
 app.command("status", epilog="Example: fognav status --json")(status_command)

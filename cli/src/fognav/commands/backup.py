@@ -43,7 +43,7 @@ def backup_command(  # each option is an argument
     up: UpOption = None,
 ) -> None:
     """Back up a fog node into one file, while it runs."""
-    with exit_codes(), _backup_errors():
+    with exit_codes(), backup_errors():
         check_writable(file)
         if up is not None:
             made = _create_of_node(file, up, site)
@@ -65,7 +65,7 @@ def restore_command(  # noqa: PLR0913  # each option is an argument
     replace: ReplaceOption = False,
 ) -> None:
     """Restore a backup; stop the services before. Everything is checked before anything is changed."""
-    with exit_codes(), _backup_errors():
+    with exit_codes(), backup_errors():
         folder = _required(site, "--site")
         if up is not None:
             made = _restore_into_node(file, up, folder, replace=replace)
@@ -76,7 +76,7 @@ def restore_command(  # noqa: PLR0913  # each option is an argument
 
 
 @contextmanager
-def _backup_errors() -> Iterator[None]:
+def backup_errors() -> Iterator[None]:
     """Turn errors of backups into those of commands."""
     with locks_errors():
         try:

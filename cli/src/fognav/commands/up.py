@@ -2,11 +2,9 @@
 
 import asyncio
 import os
-import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated
 
-import psutil
 import typer
 
 from fognav import checkout, kernels, system
@@ -15,9 +13,6 @@ from fognav.output import FailedError, exit_codes, print_line
 
 if TYPE_CHECKING:
     from fognav.hosting.folders import NodeFolder
-
-_STOP_S: Final = 60.0
-_POLL_S: Final = 0.05
 
 SitesOption = Annotated[
     list[Path] | None,
@@ -42,6 +37,7 @@ def up_command(  # noqa: PLR0913  # each option is an argument
         typer.Option("--host", metavar="NAME", help="Another name of this computer, for its certificates."),
     ] = None,
     sim: Annotated[bool, typer.Option("--sim", help="Simulate each site's first robot and its sensor nodes.")] = False,
+    check: Annotated[bool, typer.Option("--check", help="End it as soon as everything is ready.")] = False,
     systemd: Annotated[bool, typer.Option("--systemd", help="Write a unit for systemd instead of running.")] = False,
     yes: Annotated[bool, typer.Option("--yes", help="Install missing system packages without asking.")] = False,
 ) -> None:
@@ -71,10 +67,12 @@ def up_command(  # noqa: PLR0913  # each option is an argument
             raise FailedError(str(error)) from error
         folder = NodeFolder(path)
         with folder.in_use():
-            _run(folders, folder, bind, host or [], sim=sim)
+            _run(folders, folder, bind, host or [], sim=sim, check=check)
 
 
-def _run(folders: list[Path], folder: "NodeFolder", bind: str, hosts: list[str], *, sim: bool) -> None:
+def _run(  # the options
+    folders: list[Path], folder: "NodeFolder", bind: str, hosts: list[str], *, sim: bool, check: bool
+) -> None:
     from fognav.hosting.floors import hosted_sites  # noqa: PLC0415  # keeps the other commands fast
     from fognav.hosting.node import NodeConfig  # noqa: PLC0415  # same
     from fognav.hosting.running import run_node  # noqa: PLC0415  # same
@@ -83,7 +81,7 @@ def _run(folders: list[Path], folder: "NodeFolder", bind: str, hosts: list[str],
     sites, locks = hosted_sites(folders, folder.locks, [*own_hosts(), *hosts])
     config = NodeConfig(folder=folder, sites=sites, locks=locks, address=bind, simulate=sim)
     remember(folder.path, settings_of({site.id: site.directory for site in sites}, bind, hosts, simulate=sim))
-    asyncio.run(run_node(config, print_line))
+    asyncio.run(run_node(config, print_line, check=check))
 
 
 def down_command(
@@ -94,7 +92,7 @@ def down_command(
     data: DataOption = None,
 ) -> None:
     """End the fog node of `fognav up`, with all its sites; its data stays, and other nodes of yours go on."""
-    from fognav.hosting.local_nodes import named_node  # noqa: PLC0415  # keeps the other commands fast
+    from fognav.hosting.local_nodes import end_node, named_node  # noqa: PLC0415  # keeps the other commands fast
 
     with exit_codes():
         node = named_node(name, data)
@@ -102,24 +100,7 @@ def down_command(
             print_line("no fog node of yours runs on this machine without containers")
         else:
             end_node(node.pid)
-
-
-def end_node(pid: int) -> None:
-    """End a fog node by the process that runs the others; raises `FailedError` if it does not end."""
-    try:
-        process = psutil.Process(pid)
-        process.terminate()
-        deadline = time.monotonic() + _STOP_S
-        # One that has ended stays a zombie until its parent looks.
-        while process.is_running() and process.status() != psutil.STATUS_ZOMBIE:
-            if time.monotonic() > deadline:
-                raise FailedError(
-                    f"process {pid} has not ended within {_STOP_S:.0f} s: look at its terminal, or kill it"
-                )
-            time.sleep(_POLL_S)
-    except psutil.NoSuchProcess:
-        pass
-    print_line(f"the fog node (process {pid}) has ended")
+            print_line(f"the fog node (process {node.pid}) has ended")
 
 
 def logs_command(

@@ -1,15 +1,20 @@
 """The fog nodes of this user that run on this machine without containers, by the register."""
 
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
+import psutil
+
 from fognav.operate.registry import System, registered
-from fognav.output import WrongUseError
+from fognav.output import FailedError, WrongUseError
 
 KIND: Final = "fog node"
 UP: Final = "up"
 """The name of the process that runs the others."""
+_STOP_S: Final = 60.0
+_POLL_S: Final = 0.05
 
 
 class RunningNode(NamedTuple):
@@ -48,3 +53,20 @@ def named_node(name: str | None, data: Path | None) -> RunningNode | None:
     if nodes and not found:
         raise WrongUseError(f"no such fog node runs, only: {'; '.join(map(str, nodes))}. Name one of these")
     return found[0] if found else None
+
+
+def end_node(pid: int) -> None:
+    """End a fog node by the process that runs the others; raises `FailedError` if it does not end."""
+    try:
+        process = psutil.Process(pid)
+        process.terminate()
+        deadline = time.monotonic() + _STOP_S
+        # One that has ended stays a zombie until its parent looks.
+        while process.is_running() and process.status() != psutil.STATUS_ZOMBIE:
+            if time.monotonic() > deadline:
+                raise FailedError(
+                    f"process {pid} has not ended within {_STOP_S:.0f} s: look at its terminal, or kill it"
+                )
+            time.sleep(_POLL_S)
+    except psutil.NoSuchProcess:
+        pass

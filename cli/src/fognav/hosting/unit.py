@@ -2,13 +2,14 @@
 
 import os
 import shlex
+import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
 from fognav import checkout
-from fognav.output import WrongUseError
+from fognav.output import FailedError, WrongUseError
 
 NAME: Final = "fognav.service"
 _TEXT: Final = """\
@@ -56,6 +57,21 @@ def write_unit(arguments: Sequence[str]) -> Path:
     file.write_text(unit_text(arguments), "utf-8")
     file.chmod(0o600)  # settings may be secrets
     return file
+
+
+def is_active() -> bool:
+    """Whether systemd runs the unit now."""
+    try:
+        return subprocess.run(["systemctl", "--user", "is-active", "--quiet", NAME], check=False).returncode == 0
+    except OSError:
+        return False  # a computer without systemd
+
+
+def start() -> None:
+    """Let systemd start the unit; raises `FailedError`."""
+    done = subprocess.run(["systemctl", "--user", "start", NAME], check=False, capture_output=True, text=True)
+    if done.returncode != 0:
+        raise FailedError(f"systemd did not start {NAME}: {done.stderr.strip()}. Look at: journalctl --user -u {NAME}")
 
 
 def _program() -> list[str]:

@@ -1,0 +1,109 @@
+"""Upgrades a fog node of `fognav up` in its checkout: with a backup first, and back again if the new version fails."""
+
+import asyncio
+import os
+import shutil
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from fognav.hosting import backups, unit
+from fognav.hosting.folders import NodeFolder
+from fognav.hosting.local_nodes import end_node, running_nodes
+from fognav.hosting.settings import NodeSettings, recall
+from fognav.hosting.versions import Versions
+from fognav.output import FailedError
+
+BACKUPS: Final = "backups"
+_START_S: Final = 1800.0
+"""For the first start of a version: a Raspberry Pi compiles the kernels for minutes."""
+
+
+class Upgrade:
+    """The upgrade of one node to one version; all of this version's code that it needs is loaded before."""
+
+    def __init__(self, folder: NodeFolder, versions: Versions, print_line: Callable[[str], None]) -> None:
+        """Take a node's folder and its checkout.
+
+        Raises `FailedError` for a folder with which no node was started, or whose last upgrade was cut short.
+        """
+        self._folder = folder
+        self._versions = versions
+        self._print_line = print_line
+        self._settings: NodeSettings = recall(folder.path)
+        self._kept = folder.path.with_name(f"{folder.path.name}.before-upgrade")
+        if self._kept.exists():
+            raise FailedError(
+                f"an upgrade was cut short: {self._kept} has the data of before. Check out the version that wrote it, "
+                f"and move it to {folder.path}; or remove it, if the fog node runs well"
+            )
+
+    def run(self, to: str) -> None:
+        """Upgrade to a commit. Raises `FailedError` after everything is as it was before, or says what is not."""
+        before = self._versions.current()
+        for file in self._back_up():
+            self._print_line(f"backup: {file}")
+        by_systemd = unit.is_active()
+        for node in running_nodes():
+            if node.data == self._folder.path:
+                end_node(node.pid)
+        with self._folder.in_use():
+            shutil.copytree(self._folder.path, self._kept, symlinks=True)
+        try:
+            self._versions.go_to(to)
+            self._try_start()
+        except (FailedError, OSError, KeyboardInterrupt) as error:
+            self._go_back(before)
+            self._start_again(by_systemd=by_systemd)
+            raise FailedError(
+                f"version {to[:12]} failed; version and data are those of before, {before[:12]}: {error}"
+            ) from error
+        shutil.rmtree(self._kept)
+        self._print_line(f"upgraded to {to[:12]}; it starts with all data")
+        self._start_again(by_systemd=by_systemd)
+
+    def _back_up(self) -> list[Path]:
+        folder = self._folder.path / BACKUPS
+        folder.mkdir(mode=0o700, exist_ok=True)
+        stamp = time.strftime("%Y-%m-%dT%H-%M-%S")
+        files = []
+        for site, directory in self._settings.sites.items():
+            files.append(folder / f"{stamp}-{site}.tar.gz")
+            asyncio.run(backups.create(files[-1], self._folder, Path(directory)))
+        return files
+
+    def _try_start(self) -> None:
+        """Let the version that is there now start everything, and end it when it is ready; raises `FailedError`."""
+        data = ["--data", str(self._folder.path), "--check"]
+        command = [str(self._versions.launcher), "up", *self._settings.arguments, *data]
+        environment = {**os.environ, **self._settings.environment}
+        try:
+            done = subprocess.run(
+                command, check=False, capture_output=True, text=True, timeout=_START_S, env=environment,
+                stdin=subprocess.DEVNULL,
+            )  # fmt: skip
+        except subprocess.TimeoutExpired as error:
+            raise FailedError(f"it was not ready within {_START_S:.0f} s") from error
+        if done.returncode != 0:
+            raise FailedError(f"it does not start: {done.stderr.strip()}")
+
+    def _go_back(self, to: str) -> None:
+        try:
+            self._versions.go_to(to)
+        except FailedError as error:
+            raise FailedError(
+                f"going back to {to[:12]} failed, too: {error}. Check it out by hand; the data is in {self._kept}: "
+                f"move it to {self._folder.path}"
+            ) from error
+        shutil.rmtree(self._folder.path)
+        self._kept.rename(self._folder.path)
+
+    def _start_again(self, *, by_systemd: bool) -> None:
+        if by_systemd:
+            unit.start()
+            self._print_line(f"{unit.NAME} runs again")
+        else:
+            options = " ".join([*self._settings.arguments, "--data", str(self._folder.path)])
+            self._print_line(f"start it: ./fognav up {options}")

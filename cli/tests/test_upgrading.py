@@ -1,0 +1,145 @@
+"""Upgrades of a fog node in a small repository, whose `fognav` is a script: what is kept, and the way back."""
+
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from fognav.hosting import settings, unit, upgrading
+from fognav.hosting.floors import hosted_sites
+from fognav.hosting.folders import NodeFolder
+from fognav.hosting.upgrading import BACKUPS, Upgrade
+from fognav.hosting.versions import Versions
+from fognav.output import FailedError, WrongUseError
+
+ESTIG = Path(__file__).parents[2] / "sites" / "estig"
+LAUNCHER = """\
+#!/bin/sh
+here=$(dirname "$0")
+echo "{name} $*" >>"$here/calls"
+[ "$1" = up ] || exit {set_up}
+while [ "$1" != --data ]; do shift; done
+echo {name} >"$2/data/redis/written-by"
+exit {start}
+"""
+
+
+def git(root: Path, *arguments: str) -> str:
+    identity = ["-c", "user.name=a", "-c", "user.email=a@example.org", "-c", "commit.gpgsign=false"]
+    done = subprocess.run(["git", "-C", str(root), *identity, *arguments], capture_output=True, text=True, check=True)
+    return done.stdout.strip()
+
+
+@pytest.fixture
+def add_version(tmp_path: Path) -> Callable[..., str]:
+    root = tmp_path / "checkout"
+    root.mkdir()
+    git(root, "init", "-q")
+    (root / ".gitignore").write_text("calls\n")
+
+    def add(name: str, *, set_up: int = 0, start: int = 0) -> str:
+        (root / "fognav").write_text(LAUNCHER.format(name=name, set_up=set_up, start=start))
+        (root / "fognav").chmod(0o755)
+        git(root, "add", "-A")
+        git(root, "commit", "-qm", f"version {name}")
+        return git(root, "rev-parse", "HEAD")
+
+    return add
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> NodeFolder:
+    made = NodeFolder(tmp_path / "data")
+    hosted_sites([ESTIG], made.locks, ["localhost", "127.0.0.1"])
+    made.keys("estig")
+    settings.remember(made.path, settings.settings_of({"estig": ESTIG}, "127.0.0.1", [], simulate=False))
+    return made
+
+
+@pytest.fixture
+def started(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """What was started again; no node runs, and systemd does not know one."""
+    found: list[str] = []
+    monkeypatch.setattr(upgrading, "running_nodes", list)
+    monkeypatch.setattr(unit, "is_active", lambda: True)
+    monkeypatch.setattr(unit, "start", lambda: found.append("unit"))
+    return found
+
+
+def calls(root: Path) -> list[str]:
+    return [" ".join(line.split()[:2]) for line in (root / "calls").read_text().splitlines()]
+
+
+@pytest.mark.live
+def test_upgrade_makes_a_backup_tries_the_new_version_and_keeps_the_data(add_version, folder, started, tmp_path):
+    root = tmp_path / "checkout"
+    old = add_version("old")
+    new = add_version("new")
+    git(root, "reset", "-q", "--hard", old)
+    versions = Versions(root)
+    assert versions.changes(new) == ["version new"]
+    token = (folder.path / "keys" / "estig" / "admin.token").read_text()
+    told: list[str] = []
+    Upgrade(folder, versions, told.append).run(versions.commit(new))
+    assert git(root, "rev-parse", "HEAD") == new
+    assert calls(root) == ["new --version", "new up"]
+    assert (folder.path / "keys" / "estig" / "admin.token").read_text() == token
+    assert (folder.path / "data" / "redis" / "written-by").read_text() == "new\n"
+    (backup,) = (folder.path / BACKUPS).glob("*-estig.tar.gz")
+    assert f"backup: {backup}" in told
+    assert started == ["unit"]
+    assert not folder.path.with_name("data.before-upgrade").exists()
+    with pytest.raises(WrongUseError, match="not newer"):
+        versions.changes(old)
+
+
+@pytest.mark.live
+@pytest.mark.parametrize("broken", [{"set_up": 1}, {"start": 1}])
+def test_version_that_fails_leaves_version_and_data_of_before(add_version, folder, started, tmp_path, broken):
+    root = tmp_path / "checkout"
+    old = add_version("old")
+    new = add_version("new", **broken)
+    git(root, "reset", "-q", "--hard", old)
+    (folder.data("redis") / "written-by").write_text("old\n")
+    with pytest.raises(FailedError, match=f"are those of before, {old[:12]}"):
+        Upgrade(folder, Versions(root), lambda _: None).run(new)
+    assert git(root, "rev-parse", "HEAD") == old
+    assert calls(root)[-1] == "old --version"  # its environment is there again, too
+    assert (folder.path / "data" / "redis" / "written-by").read_text() == "old\n"
+    assert started == ["unit"]
+    assert not folder.path.with_name("data.before-upgrade").exists()
+
+
+@pytest.mark.live
+def test_own_changes_of_files_stay_or_stop_the_upgrade(add_version, folder, started, tmp_path):
+    root = tmp_path / "checkout"
+    (root / "site.toml").write_text("a")
+    old = add_version("old")
+    (root / "site.toml").write_text("b")
+    new = add_version("new")
+    git(root, "reset", "-q", "--hard", old)
+    (root / "site.toml").write_text("mine")
+    with pytest.raises(FailedError, match=r"site\.toml"):
+        Upgrade(folder, Versions(root), lambda _: None).run(new)
+    assert (git(root, "rev-parse", "HEAD"), (root / "site.toml").read_text()) == (old, "mine")
+    assert started == ["unit"]
+
+
+def test_upgrade_that_was_cut_short_is_told(folder, add_version, tmp_path):
+    add_version("old")
+    shutil.copytree(folder.path, folder.path.with_name("data.before-upgrade"))
+    with pytest.raises(FailedError, match="cut short"):
+        Upgrade(folder, Versions(tmp_path / "checkout"), lambda _: None)
+
+
+def test_newest_version_is_the_highest_release(add_version, tmp_path):
+    root = tmp_path / "checkout"
+    for name in ("v0.9.0", "v0.10.0", "v0.2.0"):
+        add_version(name)
+        git(root, "tag", name)
+    versions = Versions(root)
+    assert versions.newest() == versions.commit("v0.10.0")
+    with pytest.raises(FailedError, match="v9"):
+        versions.commit("v9")

@@ -5,6 +5,7 @@
 
 import asyncio
 import contextlib
+import dataclasses
 import os
 import random
 import sys
@@ -16,11 +17,13 @@ from redis.asyncio import Redis
 from redis.exceptions import RedisError
 
 from fog_contracts.messages import Message
-from fog_runtime.stores.redis_connection import RedisAddress, parse_address
+from fog_runtime.access.credentials import Credentials
+from fog_runtime.locks.site_locks import SiteLocks
+from fog_runtime.stores.redis_connection import RedisAddress, RedisConnection, parse_address
 from fog_runtime.stores.redis_store import Audit, RedisStore, StoreError, Table
 from fog_supervisor import configurations
 from fog_supervisor.net import LOOPBACK, free_port
-from fog_supervisor.servers import Server, ServerProgram, find_program
+from fog_supervisor.servers import Server, ServerProgram, find_program, start_redis
 
 pytestmark = pytest.mark.live
 KILLS = int(os.environ.get("FOGNAV_KILLS", "1"))
@@ -173,3 +176,70 @@ def test_addresses():
     ):  # fmt: skip
         with pytest.raises(ValueError, match="must look like redis://host:6379/0"):
             parse_address(url)
+
+
+LOCKED_SENTINEL = """
+port 0
+tls-port {port}
+bind 127.0.0.1
+tls-cert-file {locks}/server.pem
+tls-key-file {locks}/server.key
+tls-ca-cert-file {authority}
+tls-auth-clients no
+tls-replication yes
+protected-mode no
+dir {folder}
+sentinel monitor fognav 127.0.0.1 {primary} 1
+sentinel auth-user fognav administrator
+sentinel auth-pass fognav {password}
+"""
+
+
+@pytest.fixture
+def locked_cluster(tmp_path):
+    """A locked Redis and one Sentinel: the address, whom services are there, and the authority of nobody there."""
+    locks = SiteLocks(tmp_path / "locks", "lab")
+    locks.make([LOOPBACK, "localhost"])
+    own, administrator = (Credentials.read(locks.credentials(user)) for user in ("map-service", "administrator"))
+    authority = tmp_path / "authority.pem"
+    authority.write_text(locks.authority.trusted)
+    with start_redis(tmp_path, locks=locks.folder("redis")) as redis:
+        home, port = tmp_path / "sentinel", free_port({redis.port})
+        text = LOCKED_SENTINEL.format(
+            port=port, locks=locks.folder("redis"), authority=authority, folder=home, primary=redis.port,
+            password=administrator.passwords["redis"],
+        )  # fmt: skip
+        encrypted = dataclasses.replace(program("sentinel", home, port, text, "--sentinel"), encrypted=True)
+        with Server(encrypted, home):
+            yield f"{LOOPBACK}:{port}/fognav/0", own
+
+
+async def store_once(url, credentials):
+    connection = RedisConnection(url, timeout_s=5.0, credentials=credentials)
+    try:
+        async with asyncio.timeout(60):
+            while True:
+                try:
+                    return await connection.write(("HSET", "fog:lab:zones", "z1", "{}"))
+                except StoreError as error:
+                    if "no Sentinel knows" not in str(error):  # it has not asked the primary yet
+                        raise
+                await asyncio.sleep(0.2)
+    finally:
+        await connection.aclose()
+
+
+async def test_sentinels_and_their_primary_are_reached_by_tls(locked_cluster):
+    address, own = locked_cluster
+    assert await store_once(f"rediss+sentinel://{address}", own) == [1]
+
+
+async def test_sentinels_of_another_authority_are_not_believed(locked_cluster, tmp_path):
+    address, own = locked_cluster
+    stranger = SiteLocks(tmp_path / "stranger", "lab")
+    stranger.make([LOOPBACK])
+    other = Credentials(own.user, passwords=own.passwords, authority=stranger.authority.trusted)
+    connection = RedisConnection(f"rediss+sentinel://{address}", timeout_s=5.0, credentials=other)
+    with pytest.raises(StoreError, match="no Sentinel knows"):
+        await connection.write(("HSET", "fog:lab:zones", "z1", "{}"))
+    await connection.aclose()

@@ -3,6 +3,7 @@
 import json
 import selectors
 import socket
+import sys
 import threading
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -55,6 +56,14 @@ class Health:
             "missing": missing,
             "parts": {name: {"ok": ok, "detail": detail} for name, (ok, detail) in conditions.items()},
         }
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+
+    def handle_error(self, _request: object, client_address: object) -> None:
+        """Log what ended a request, which nearly always is that its client has gone; the base writes a traceback."""
+        _log.debug("request_failed", client=str(client_address), reason=repr(sys.exception()))
 
 
 class HealthServer:
@@ -122,8 +131,7 @@ def serve_health(health: Health, host: str = "127.0.0.1", port: int = 0, port_fi
         def log_message(self, format: str, *args: object) -> None:  # noqa: A002  # the name is http.server's
             _log.debug("request_served", line=format % args)
 
-    server = ThreadingHTTPServer((host, port), Handler)
-    server.daemon_threads = True
+    server = _Server((host, port), Handler)
     running = HealthServer(server)
     _log.info("listening", url=f"http://{host}:{running.port}", port=running.port)
     write_port_file(port_file, running.port)

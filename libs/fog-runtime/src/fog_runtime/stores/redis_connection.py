@@ -1,7 +1,7 @@
 """A connection to Redis, or through Sentinels to the primary of several, with errors that name cause and remedy.
 
     redis://[user:password@]host:port/db[?wait=N]       (rediss:// over TLS)
-    redis+sentinel://[user:password@]host:port,host:port,.../name[/db][?wait=N]
+    redis+sentinel://[user:password@]host:port,host:port,.../name[/db][?wait=N]     (rediss+sentinel:// all over TLS)
 
 `name` is the name under which the Sentinels monitor the primary. With `wait`, a write is acknowledged once N replicas
 have it in memory (`WAIT`), so that it survives the loss of the primary.
@@ -31,7 +31,7 @@ Command = tuple[Argument, ...]
 
 SENTINEL_PORT: Final = 26379
 _PORT: Final = 6379
-_SCHEMES: Final = frozenset({"redis", "rediss", "redis+sentinel"})
+_SCHEMES: Final = frozenset({"redis", "rediss", "redis+sentinel", "rediss+sentinel"})
 _FORMS: Final = (
     "Redis's address must look like redis://host:6379/0 or, with Sentinels,"
     " redis+sentinel://host1:26379,host2:26379/NAME/0?wait=1 (NAME as in `sentinel monitor NAME ...`)"
@@ -69,7 +69,7 @@ class RedisAddress(NamedTuple):
 def parse_address(url: str) -> RedisAddress:
     """Parse an address as in the module's docstring; raises `ValueError` that shows how it must look."""
     parts = urlsplit(url)
-    sentinels = parts.scheme == "redis+sentinel"
+    sentinels = parts.scheme.endswith("+sentinel")
     credentials, _, hosts_text = parts.netloc.rpartition("@")
     username, _, password = credentials.partition(":")
     path = [segment for segment in parts.path.split("/") if segment]
@@ -86,7 +86,13 @@ def parse_address(url: str) -> RedisAddress:
     if not valid:
         raise ValueError(_FORMS)
     return RedisAddress(
-        hosts, unquote(username) or None, unquote(password) or None, db, name, replicas, parts.scheme == "rediss"
+        hosts,
+        unquote(username) or None,
+        unquote(password) or None,
+        db,
+        name,
+        replicas,
+        parts.scheme.startswith("rediss"),
     )
 
 
@@ -210,11 +216,12 @@ def _connect(address: RedisAddress, timeout_s: float, credentials: Credentials) 
         "password": address.password,
         "retry": Retry(NoBackoff(), 1),
     }
+    tls: dict[str, Any] = {"ssl": True, "ssl_ca_data": credentials.authority or None} if address.tls else {}
+    options |= tls
     if not address.sentinel_name:
         ((host, port),) = address.hosts
-        tls: dict[str, Any] = {"ssl": True, "ssl_ca_data": credentials.authority or None} if address.tls else {}
-        return Redis(host=host, port=port, **tls, **options), None
+        return Redis(host=host, port=port, **options), None
     sentinels: Sequence[tuple[str, int]] = address.hosts
-    once = {**timeouts, "retry": Retry(NoBackoff(), 0)}
+    once = {**timeouts, **tls, "retry": Retry(NoBackoff(), 0)}
     sentinel = _Sentinels(sentinels, sentinel_kwargs=once, **options)
     return sentinel.master_for(address.sentinel_name), sentinel

@@ -45,6 +45,7 @@ _.do_GET
 _.on_start  # numba's events
 _.on_end
 _.log_message
+_.handle_error
 _.pending_calls_threshold  # aiomqtt
 _.ensure_cache_path  # numba: where kernels are kept
 _.get_cache_path

@@ -1,41 +1,27 @@
 """Who asks, for a service behind a gateway: the gateway is believed, and nobody else."""
 
 import asyncio
-import contextlib
 
 import httpx
 import pytest
+from fronts import running_front
 
 from fog_runtime.health import Health
-from fog_runtime.http import ClientHost, Front, Routes, Tokens, make_app
+from fog_runtime.http import ClientHost, Routes, Tokens, make_app
 from fog_runtime.http.gateway import AGAIN_S, KNOWN_S, BehindGateway, addresses_of
 
 CLIENT, LIAR = "192.0.2.7", "198.51.100.9"
 
 
-@contextlib.asynccontextmanager
-async def service(folder, gateway):
-    """Run a front that tells who asks; yield its address."""
+def telling_app():
+    """Make an app that tells who asks."""
+    made = make_app("Test", Health(), Tokens())
 
-    def make():
-        made = make_app("Test", Health(), Tokens())
+    @Routes(made, "test").get("/who")
+    async def who(client: ClientHost) -> str:
+        return client
 
-        @Routes(made, "test").get("/who")
-        async def who(client: ClientHost) -> str:
-            return client
-
-        return made
-
-    task = asyncio.create_task(Front.fork(make, gateway=gateway).serve(make(), folder / "port"))
-    try:
-        async with asyncio.timeout(60):
-            while not (folder / "port").exists():
-                assert not task.done()
-                await asyncio.sleep(0.01)
-        yield f"http://127.0.0.1:{int((folder / 'port').read_text())}"
-    finally:
-        task.cancel()
-        await asyncio.gather(task, return_exceptions=True)
+    return made
 
 
 @pytest.mark.parametrize(
@@ -51,7 +37,7 @@ async def service(folder, gateway):
 )
 async def test_service_believes_its_gateway_only(tmp_path, gateway, said, believed):
     headers = {} if said is None else {"X-Forwarded-For": said}
-    async with service(tmp_path, gateway) as url, httpx.AsyncClient() as client:
+    async with running_front(telling_app, tmp_path, gateway=gateway) as url, httpx.AsyncClient() as client:
         assert (await client.get(f"{url}/who", headers=headers)).json() == believed
 
 

@@ -1,11 +1,10 @@
 """The REST base over a real socket."""
 
-import asyncio
-import contextlib
 from typing import Annotated
 
 import httpx
 import pytest
+from fronts import running_front
 from pydantic import BaseModel, Field
 
 from fog_contracts.messages import Zone
@@ -89,24 +88,9 @@ async def client(tokens, tmp_path):
     async def bug() -> None:
         raise RuntimeError("inner detail")
 
-    async with running(app, tmp_path) as url, httpx.AsyncClient(base_url=url) as http:
+    async with running_front(lambda: app, tmp_path) as url, httpx.AsyncClient(base_url=url) as http:
         http.health = health
         yield http
-
-
-@contextlib.asynccontextmanager
-async def running(app, folder):
-    task = asyncio.create_task(Front.fork(lambda: app).serve(app, folder / "port"))
-    try:
-        async with asyncio.timeout(60):
-            while not (folder / "port").exists():
-                assert not task.done()
-                await asyncio.sleep(0.01)
-        yield f"http://127.0.0.1:{int((folder / 'port').read_text())}"
-    finally:
-        task.cancel()
-        (ended,) = await asyncio.gather(task, return_exceptions=True)
-    assert isinstance(ended, asyncio.CancelledError), ended
 
 
 def is_problem(answer, status):

@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import re
 import time
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -25,6 +25,7 @@ from fog_supervisor import net
 from fog_supervisor.supervisor import NotReadyError, log_tail
 from fognav.bench.fleet import closures, hazard_message, percentile
 from fognav.bench.fleet_stand_ins import Receivers, StandIns
+from fognav.bench.running import in_background
 from fognav.bench.site import SITE, write_site
 from fognav.output import FailedError
 from fognav.programs import PLANNER, REDIS, ROUTER
@@ -196,11 +197,8 @@ async def _stand_ins(
             connect=[endpoint], clock=SystemClock(), role="map-service", id=SITE, site=SITE, credentials=own
         ) as edge:
             world = StandIns(edge, map_, fleet, receivers, quiet_s)
-            publishing = asyncio.create_task(world.publish_loop(), name="stand-ins")
             try:
-                yield world
+                async with in_background(world.publish_loop(), "stand-ins"):
+                    yield world
             finally:
-                publishing.cancel()
-                with suppress(asyncio.CancelledError):
-                    await publishing
                 receivers.close()

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import re
 import time
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -20,6 +20,7 @@ from fog_runtime.transports.zenoh_edge import ZenohEdge
 from fog_supervisor import net
 from fog_supervisor.supervisor import NotReadyError, log_tail
 from fognav.bench.office import corridor_rows, make_office
+from fognav.bench.running import in_background
 from fognav.bench.site import SITE, write_site
 from fognav.output import FailedError
 from fognav.programs import MAP_SERVICE, PLANNER, SERVERS
@@ -176,10 +177,5 @@ async def _robot(stack: Stack, place: PointXY) -> AsyncIterator[_Robot]:
         connect=[stack.zenoh_endpoint], clock=SystemClock(), role="robot-agent", id=ROBOT, site=SITE
     ) as edge:
         robot = _Robot(stack, edge, place)
-        publishing = asyncio.create_task(robot.publish_loop(), name="robot")
-        try:
+        async with in_background(robot.publish_loop(), "robot"):
             yield robot
-        finally:
-            publishing.cancel()
-            with suppress(asyncio.CancelledError):
-                await publishing

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 from abc import ABC, abstractmethod
-from contextlib import AsyncExitStack
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from pathlib import Path
-from typing import Self
+from typing import TYPE_CHECKING, Self
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Coroutine
 
 
 class RunningSystem(ABC):
@@ -28,6 +32,18 @@ class RunningSystem(ABC):
 
     async def __aexit__(self, *_: object) -> None:
         await self._contexts.aclose()
+
+
+@asynccontextmanager
+async def in_background(work: Coroutine[None, None, None], name: str) -> AsyncIterator[None]:
+    """Run a loop while the context is open, and cancel it then; raises what the loop raised."""
+    task = asyncio.create_task(work, name=name)
+    try:
+        yield
+    finally:
+        task.cancel()
+        with suppress(asyncio.CancelledError):
+            await task
 
 
 def first_child(pid: int) -> int | None:

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import asyncio
 import time
-from contextlib import asynccontextmanager, suppress
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from fog_contracts import channels as ch
 from fog_contracts.codec import decode, encode
 from fog_contracts.messages import RobotPath, RobotPose, RobotState
 from fog_runtime.clock import SystemClock, ticker
+from fognav.bench.running import in_background
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from contextlib import AbstractAsyncContextManager
 
     import zenoh
 
@@ -56,16 +55,9 @@ class StandingRobot:
         """Forget the paths so far."""
         self.paths = []
 
-    @asynccontextmanager
-    async def publishing(self) -> AsyncIterator[None]:
+    def publishing(self) -> AbstractAsyncContextManager[None]:
         """Publish pose and state meanwhile."""
-        task = asyncio.create_task(self._publish(), name="robot")
-        try:
-            yield
-        finally:
-            task.cancel()
-            with suppress(asyncio.CancelledError):
-                await task
+        return in_background(self._publish(), "robot")
 
     async def _publish(self) -> None:
         x, y, theta = self._pose.x, self._pose.y, self._pose.theta

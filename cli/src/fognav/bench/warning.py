@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import random
 import time
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
@@ -23,6 +23,7 @@ from fog_runtime.clock import SystemClock
 from fog_runtime.transports.zenoh_edge import session_config
 from fog_supervisor import net
 from fog_supervisor.supervisor import NotReadyError, log_tail
+from fognav.bench.running import in_background
 from fognav.bench.standing_robot import StandingRobot
 from fognav.nodes.simulated import StillFloor
 from fognav.output import FailedError
@@ -157,13 +158,8 @@ async def _nodes(stack: Stack, loaded: LoadedSite, floor: StillFloor) -> AsyncIt
         )
         for sensor in make_nodes(loaded.site.nodes, int(time.time()), clock.now(), "firmware", apart=0.025)
     ]  # fmt: skip
-    running = asyncio.create_task(run_nodes(nodes, clock, _NODES_STEP_S), name="nodes")
-    try:
+    async with in_background(run_nodes(nodes, clock, _NODES_STEP_S), "nodes"):
         yield
-    finally:
-        running.cancel()
-        with suppress(asyncio.CancelledError):
-            await running
 
 
 class _Trials:

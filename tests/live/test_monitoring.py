@@ -146,6 +146,10 @@ def as_grafana_asks(query: str) -> str:
 async def test_every_panel_has_data_and_every_rule_works_while_a_robot_drives_and_a_hazard_appears(
     system: LiveSystem, prometheus: Prometheus
 ) -> None:
+    deadline = time.monotonic() + 60.0
+    while not await asyncio.to_thread(prometheus.series, 'fognav_plans_total{reason="goal"} == 0'):
+        assert time.monotonic() < deadline, "the planner was not asked before the first plan"
+        await asyncio.sleep(0.2)
     await system.drive_to(*GOAL)
     await system.simulate(SimCommand(place=[BARRIER]))
     await system.until(lambda: system.hazard("z1") == "blocked", 20, "the barrier is seen")
@@ -156,6 +160,9 @@ async def test_every_panel_has_data_and_every_rule_works_while_a_robot_drives_an
         assert time.monotonic() < deadline, f"no data: {missing}"
         missing = [entry for entry in missing if not await asyncio.to_thread(prometheus.series, entry[2])]
         await asyncio.sleep(0.5)
+    # The first plan counts as well: a counter that appeared with its first event would show no rise.
+    (plans,) = prometheus.series('increase(fognav_plans_total{reason="goal"}[2m])')
+    assert float(plans["value"][1]) > 0.5
     for page, panel, query in panels():
         if page == "Robots":
             if query.startswith("baseline:"):

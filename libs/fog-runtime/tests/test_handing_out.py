@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from fog_runtime.access.credentials import Credentials
+from fog_runtime.access.token_file import token_hash
 from fog_runtime.keys import ADMIN_TOKEN, OPERATOR_KEY, TOKENS
 from fog_runtime.locks import __main__ as command
 from fog_runtime.locks.handing_out import OWNERS, SIMULATION
@@ -106,6 +107,15 @@ def test_new_token_reaches_every_service(node):
         assert 'name = "anna"' in (node.out / service / TOKENS).read_text()
     node.run("token", "revoke", "anna")
     assert not any('name = "anna"' in (node.out / service / TOKENS).read_text() for service in SERVICES)
+
+
+def test_new_token_is_printed_even_if_it_can_not_be_handed_out(node, capsys):
+    (node.out / "planner" / TOKENS).unlink()
+    (node.out / "planner" / TOKENS).mkdir()
+    assert command.main(["token", "create", "ann", "operator"]) == 1
+    printed = capsys.readouterr()
+    assert TOKENS in printed.err
+    assert token_hash(printed.out.strip()) in (node.locks / TOKENS).read_text("utf-8")
 
 
 def test_simulated_robot_gets_secrets_only_where_one_is_wanted(node):

@@ -157,7 +157,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         settings = load(Settings, environ=os.environ)
         site = load_site(settings.site_dir).site
         locks = _make(settings, site)
-        printed = _carry_out(options, locks)
+        # At once: what is printed only once must not be lost when handing out fails.
+        sys.stdout.write(_carry_out(options, locks))
         _keep_owner(settings.locks_dir)
         changed = hand_out(
             locks,
@@ -168,7 +169,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (AuthorityError, CredentialsError, LocksError, SettingsError, SiteError, TokensError, OSError) as error:
         sys.stderr.write(f"{error}\n")
         return 1
-    sys.stdout.write(printed)
     for file in changed:
         sys.stderr.write(f"handed out {file.relative_to(settings.handed_out_dir)}\n")
     return 0

@@ -6,7 +6,7 @@ import pytest
 from fog_contracts import channels as ch
 from fog_contracts.messages import RobotObstacles, RobotPose, RobotState, Trace
 from robot_agent.agent.path.path_traces import PathTraces
-from robot_agent.agent.publishing import PublishingPolicy
+from robot_agent.agent.publishing import STANDING_POSE_S, PublishingPolicy
 
 POSE = RobotPose(x=0.0, y=0.0, theta=0.0, covariance=[0.0] * 9, v=0.0, w=0.0, radius=0.2, height=0.3, stamp=0.0)
 STATE = RobotState(mode="HOLD", reasons=["the map is 1.2 s old"], enabled=True, battery=0.8, goal_id=None, map_epoch=1,
@@ -14,13 +14,13 @@ STATE = RobotState(mode="HOLD", reasons=["the map is 1.2 s old"], enabled=True, 
 REPORT = RobotObstacles(points=[], stamp=0.0, ttl=10.0)
 
 
-def run(seconds, *, step=0.1, state=lambda _now: STATE, pose=POSE, report=REPORT):
+def run(seconds, *, step=0.1, state=lambda _now: STATE, pose=POSE, report=REPORT, standing=lambda _now: False):
     """Return the times at which each channel was published."""
     policy = PublishingPolicy("r1")
     times = {ch.ROBOT_POSE: [], ch.ROBOT_STATE: [], ch.ROBOT_OBSTACLES: []}
     for number in range(round(seconds / step)):
         now = 100.0 + number * step
-        for publication in policy.due(pose, state(now), lambda: report, now):
+        for publication in policy.due(lambda: pose, state(now), lambda: report, now, standing=standing(now)):
             assert publication.ids == {"robot": "r1"}
             times[publication.channel].append(round(now - 100.0, 3))
     return times
@@ -31,6 +31,15 @@ def test_pose_is_published_at_10_hz_and_state_and_obstacles_at_1_hz(step):
     times = run(3.0, step=step)
     assert len(times[ch.ROBOT_POSE]) == pytest.approx(30, abs=1)
     assert len(times[ch.ROBOT_STATE]) == len(times[ch.ROBOT_OBSTACLES]) == pytest.approx(3, abs=1)
+
+
+def test_a_robot_that_stands_publishes_its_pose_twice_a_second_and_at_once_when_it_moves():
+    times = run(3.0, standing=lambda now: now < 101.65)[ch.ROBOT_POSE]
+    standing = [at for at in times if at < 1.65]
+    assert len(standing) == 4
+    assert times[4] == 1.7
+    assert len(times[4:]) == pytest.approx(13, abs=1)
+    assert ch.ROBOT_POSE.max_age_s / 2 >= STANDING_POSE_S
 
 
 @pytest.mark.parametrize(
@@ -58,7 +67,7 @@ def test_obstacles_are_computed_only_when_a_report_is_due():
     calls = []
     policy = PublishingPolicy("r1")
     for number in range(20):
-        policy.due(None, STATE, lambda at=number: calls.append(at), 100.0 + number * 0.1)
+        policy.due(lambda: None, STATE, lambda at=number: calls.append(at), 100.0 + number * 0.1)
     assert calls == [0, 10]
 
 

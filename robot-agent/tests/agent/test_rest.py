@@ -10,7 +10,7 @@ from little_world import AGENT, L_PATH, LittleWorld
 from fog_contracts.messages import Pose
 from robot_agent.agent import rest_policy
 from robot_agent.agent.core import AgentCore
-from robot_agent.agent.rest_policy import RestPolicy
+from robot_agent.agent.rest_policy import IdleScans, RestPolicy
 
 AFTER = 20.0
 
@@ -176,3 +176,12 @@ def test_base_of_a_robot_that_shall_not_put_it_to_sleep_stays_awake():
     w = SleepyWorld(start_agent=RestingAgent).ready()
     w.run(AFTER + 5.0)
     assert w.asked == [False]
+
+
+def test_an_idle_robot_that_knows_where_it_is_looks_at_every_third_scan_and_any_other_at_all():
+    scans = IdleScans()
+    assert [scans.counts(idle=True, status="good") for _ in range(7)] == [False, False, True] * 2 + [False]
+    assert scans.counts(idle=False, status="good")
+    assert not scans.counts(idle=True, status="good")
+    for status in ("weak", "lost", "none"):
+        assert scans.counts(idle=True, status=status)

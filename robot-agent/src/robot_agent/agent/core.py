@@ -35,7 +35,7 @@ from robot_agent.agent.path.path_driving import PathDriving
 from robot_agent.agent.prepared_map import PreparedMap, prepare_map
 from robot_agent.agent.publishing import PublishingPolicy
 from robot_agent.agent.reports import hindrances, robot_pose, robot_state
-from robot_agent.agent.rest_policy import RestPolicy
+from robot_agent.agent.rest_policy import IdleScans, RestPolicy
 from robot_agent.agent.safety_supervisor import SafetySupervisor, safety_inputs
 from robot_agent.agent.sensing.obstacle_reporter import ObstacleReporter
 from robot_agent.agent.sensing.pose_keeper import PoseKeeper
@@ -97,6 +97,7 @@ class AgentCore:
         self._maneuvers = Maneuvers(config, self._localizer, self._guard)
         self._safety = SafetySupervisor(config.safety)
         self._rest = RestPolicy(config.rest_after)
+        self._idle_scans = IdleScans()
         self._reporter = ObstacleReporter(config.obstacle_ttl, config.obstacle_limit)
         self._commands = OperatorCommands(config, self)
         self._publishing = PublishingPolicy(config.robot)
@@ -176,9 +177,14 @@ class AgentCore:
         self._guard.on_samples(samples)
 
     def on_scan(self, scan: LaserScan, now: float) -> None:
-        """Handle a whole scan that arrived at `now`; repeated identical scans don't correct the pose."""
+        """Handle a whole scan that arrived at `now`.
+
+        Repeated identical scans don't correct the pose, and an idle robot looks at every third one only.
+        """
         self._lidar.on_scan(scan.repeats, now)
         self._rest.on_scan()
+        if not self._idle_scans.counts(idle=self.idle, status=self._localizer.status):
+            return
         if scan.repeats < self._config.safety.identical_scans:
             self._localizer.on_scan(scan, now)
             self._guard.on_scan(scan, self.replica)
@@ -286,7 +292,13 @@ class AgentCore:
     def tick(self, at: Moment) -> Sequence[Publication]:
         """Advance time, at least ten times a second; return what to publish now."""
         self._pose_keeper.search(self.safety.mode, at.now, at_rest=self._driving.wheels.at_rest)
-        return self._publishing.due(self.pose(at), self.state(at), partial(self._report_obstacles, at), at.now)
+        return self._publishing.due(
+            partial(self.pose, at),
+            self.state(at),
+            partial(self._report_obstacles, at),
+            at.now,
+            standing=self.idle and self._localizer.twist() == (0.0, 0.0),
+        )
 
     def _report_obstacles(self, at: Moment) -> RobotObstacles | None:
         if self.profile.onboard:

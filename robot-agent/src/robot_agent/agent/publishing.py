@@ -1,4 +1,4 @@
-"""When the robot publishes: its pose at 10 Hz, its state on change and at 1 Hz, obstacles at 1 Hz."""
+"""When the robot publishes: its pose at 10 Hz, standing at 2 Hz, its state on change and at 1 Hz, obstacles at 1 Hz."""
 
 from __future__ import annotations
 
@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from fog_contracts.messages import Message, RobotObstacles, RobotPose, RobotState
 
 POSE_S: Final = ch.ROBOT_POSE.period_s
+STANDING_POSE_S: Final = 0.5
+"""Period of the same pose again: half the age up to which others use it."""
 STATE_S: Final = ch.ROBOT_STATE.period_s
 OBSTACLES_S: Final = ch.ROBOT_OBSTACLES.period_s
 _SLACK_S: Final = 0.05
@@ -28,18 +30,29 @@ class PublishingPolicy:
 
     def __init__(self, robot: str) -> None:
         self._ids = {"robot": robot}
-        self._pose_due = self._state_at = self._obstacles_at = -math.inf
+        self._pose_due = self._standing_due = self._state_at = self._obstacles_at = -math.inf
         self._content: object = None
 
     def due(
-        self, pose: RobotPose | None, state: RobotState, obstacles: Callable[[], RobotObstacles | None], now: float
+        self,
+        pose: Callable[[], RobotPose | None],
+        state: RobotState,
+        obstacles: Callable[[], RobotObstacles | None],
+        now: float,
+        *,
+        standing: bool = False,
     ) -> list[Publication]:
-        """Return the publications that are due; `obstacles` is called only when its report is due."""
+        """Return the publications that are due; `pose` and `obstacles` are called only when they are due.
+
+        `standing`: the robot neither moves nor is about to. A robot that begins to move publishes its pose at once.
+        """
         messages: list[tuple[ch.Channel, Message]] = []
-        if pose is not None and now >= self._pose_due - _SLACK_S:
+        due = self._standing_due if standing else self._pose_due
+        if now >= due - _SLACK_S and (found := pose()) is not None:
             # Counted from when it was due, so that uneven ticks keep the rate.
-            self._pose_due = max(self._pose_due, now - _SLACK_S) + POSE_S
-            messages.append((ch.ROBOT_POSE, pose))
+            begun = max(due, now - _SLACK_S)
+            self._pose_due, self._standing_due = begun + POSE_S, begun + STANDING_POSE_S
+            messages.append((ch.ROBOT_POSE, found))
         content = _content(state)
         if content != self._content or now - self._state_at >= STATE_S - _SLACK_S:
             self._content, self._state_at = content, now

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from robot_agent.motion.local_planner import Decision
     from robot_agent.safety.gate import SafetyState
 
-_VARIANCE_MIN: Final = (1e-4, 1e-4, 1e-4)
+_VARIANCE_MIN: Final = np.diag((1e-4, 1e-4, 1e-4))
 _SPEED_LIMIT: Final = 10.0
 _REASON_LIMIT: Final = 500
 _PLACES_MAX: Final = 8
@@ -37,12 +37,12 @@ def robot_pose(localizer: Localizer, config: AgentConfig, at: Moment) -> RobotPo
     if pose is None:
         return None
     v, w = localizer.twist()
-    covariance = localizer.covariance() + np.diag(_VARIANCE_MIN)
+    covariance = localizer.covariance() + _VARIANCE_MIN
     return RobotPose(
         x=pose.x,
         y=pose.y,
         theta=pose.theta,
-        covariance=[float(value) for value in covariance.ravel()],
+        covariance=covariance.ravel().tolist(),
         v=min(max(v, -_SPEED_LIMIT), _SPEED_LIMIT),
         w=min(max(w, -_SPEED_LIMIT), _SPEED_LIMIT),
         radius=config.radius,

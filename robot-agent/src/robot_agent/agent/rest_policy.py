@@ -10,12 +10,29 @@ import math
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
-    from robot_agent.safety.conditions import Request
+    from robot_agent.safety.conditions import Localization, Request
 
 SCANS_TO_WAKE: Final = 3
 """So many whole scans show that the head rotates evenly."""
 WAKE_TIMEOUT_S: Final = 8.0
 """A lidar that has not woken after this long counts as silent."""
+IDLE_SCANS: Final = 3
+"""An idle robot that knows where it is looks at one of so many whole scans: two a second."""
+
+
+class IdleScans:
+    """Which whole scans count. An idle robot only looks for whether its pose still holds, after it was carried, say."""
+
+    def __init__(self) -> None:
+        self._skipped = 0
+
+    def counts(self, *, idle: bool, status: Localization) -> bool:
+        """Return whether to localize by the newest scan: by all of them, unless an idle robot knows where it is."""
+        if idle and status == "good" and self._skipped < IDLE_SCANS - 1:
+            self._skipped += 1
+            return False
+        self._skipped = 0
+        return True
 
 
 class RestPolicy:

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from robot_agent.localization.pose import Pose2
 from robot_agent.motion.surfaces import smoothed
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from robot_agent.localization.deskew import DeskewedScan
-    from robot_agent.localization.pose import Pose2
 
 SCANS: Final = 4
 """With the newest scan alone a robot beside an obstacle waits for the scan whose noise shows it farthest away, moves,
@@ -27,14 +27,17 @@ class RecentScans:
 
     def __init__(self) -> None:
         self._newest: DeskewedScan | None = None
-        self._scans: deque[tuple[float, Pose2, NDArray[np.float64]]] = deque(maxlen=SCANS)
-        """Time, pose in `odom` and points in `base` of each."""
+        self._scans: deque[tuple[float, NDArray[np.float64]]] = deque(maxlen=SCANS)
+        """Time and points in `odom` of each."""
+        self._odom = Pose2(0.0, 0.0, 0.0)
+        """Pose in `odom` of the newest."""
 
     def add(self, scan: DeskewedScan, now: float) -> None:
         """Add the newest scan; the same one again is ignored."""
         if self._newest is not scan:
             self._newest = scan
-            self._scans.append((now, scan.odom, smoothed(scan.points)))
+            self._odom = scan.odom
+            self._scans.append((now, scan.odom.transform(smoothed(scan.points))))
 
     def points(self, newest: Pose2, now: float) -> NDArray[np.float64]:
         """Return all points (n, 2; m) in the frame in which `newest` is the pose of the newest scan."""
@@ -42,5 +45,5 @@ class RecentScans:
             self._scans.popleft()
         if not self._scans:
             return np.zeros((0, 2))
-        last = self._scans[-1][1]
-        return np.vstack([newest.compose(odom.relative_to(last)).transform(points) for _, odom, points in self._scans])
+        origin = newest.compose(Pose2(0.0, 0.0, 0.0).relative_to(self._odom))
+        return origin.transform(np.concatenate([points for _, points in self._scans]))

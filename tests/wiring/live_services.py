@@ -242,8 +242,13 @@ class Link:
     def send(self, command: WheelCommand) -> None:
         self.sent.append(command)
 
-    def poll(self, now: float, *, on: bool) -> None:
+    def receive(self) -> None:
+        """The guardian is silent."""
+
+    def poll(self, now: float, *, on: bool) -> tuple[()]:
         """The lidar is silent."""
+        del now, on
+        return ()
 
 
 class LiveServices:

@@ -66,6 +66,8 @@ _INITIAL_WHEEL_TRAVEL_M: Final = (28.9, 0.04)
 _GUARDIAN_STEPS: Final = 2
 _LIDAR_STEPS: Final = 2
 _STREAM_STEPS: Final = 5
+_IDLE_STREAM_STEPS: Final = 10
+_MAP_STEPS: Final = 10
 _CONTROL_AFTER_STEPS: Final = 2
 """How much later than the stream decisions begin: `CONTROL_AFTER_S` of the agent's service."""
 FogProcessName = Literal["aggregator", "map-service", "planner"]
@@ -159,7 +161,7 @@ class RobotRig:
         self._from_lidar = b""
         self._lidar_on = True
         self._steps = 0
-        self._skip = False
+        self._stream_steps = _STREAM_STEPS
         self._nonce = 0
 
     @property
@@ -180,20 +182,16 @@ class RobotRig:
         """Run the agent's loops that are due: as those of its process, all of them in the first step."""
         at, step = moment(self.now), self._steps - 1
         self.process.deliver(at)
-        if step % _STREAM_STEPS == 0:
+        if step % _MAP_STEPS == 0:
             self.process.fetch_map(at)
         since_first = step - _CONTROL_AFTER_STEPS
         if since_first >= 0 and since_first % round(self.agent.profile.control_period / STEP_S) == 0:
             self.process.control(at)
-        if step % _STREAM_STEPS == 0 and not self._rests_this_time():
+        if step % self._stream_steps == 0:
             command = link.decode_command(link.encode(self.process.stream(at)))
+            self._stream_steps = _IDLE_STREAM_STEPS if self.agent.idle else _STREAM_STEPS
             with self._measure("guardian"):
                 self._to_base += self.guardian.on_command(command, at.now).data
-
-    def _rests_this_time(self) -> bool:
-        """Whether the stream leaves this tick out: every other one while the robot has nothing to do."""
-        self._skip = self.agent.idle and not self._skip
-        return self._skip
 
     def _run_guardian(self, data: bytes, now: float) -> None:
         with self._measure("guardian"):

@@ -231,8 +231,12 @@ class Ticker:
         """Call a plain function with `clock.now()` at every tick until it returns True; its errors are raised.
 
         In the callback of the timer: it costs half of what it takes to wake a task, and the loops of one phase are
-        called one after the other.
+        called one after the other. Clocks without timers of their own, which are moved by hand, wake a task.
         """
+        if not isinstance(self.clock, SystemClock):
+            async for now in self:
+                if body(now) is True:
+                    return
         loop = asyncio.get_running_loop()
         end: asyncio.Future[None] = loop.create_future()
         due = self._first()

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from robot_agent.agent.edges.store import Store
 
 CHECK_S: Final = 0.1
+FIRST_CHECK_S: Final = 0.05
 SNAPSHOT_TIMEOUT_S: Final = 3.0
 """Timeout of a snapshot request."""
 
@@ -75,7 +76,7 @@ class MapLoader:
     async def snapshot_loop(self) -> None:
         """Request a snapshot whenever the core wants one, with a growing delay after each failure."""
         failures = 0
-        await self._clock.sleep(CHECK_S)  # a heartbeat may come first and confirm the stored map
+        await self._clock.sleep(FIRST_CHECK_S)  # a heartbeat may come first and confirm the stored map
         ticker = Ticker(self._clock, CHECK_S, self._phase)
         while True:
             if not self._core.wants_snapshot(self._clock.now()):

@@ -8,7 +8,7 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from fognav.__main__ import app
-from fognav.bench import debounce, sonar_recording
+from fognav.bench.debounce_rules import comparison, sonar_recording
 
 HEAD = "Timestamp,Raw Distance (cm)\n"
 
@@ -25,7 +25,7 @@ def test_figures_of_a_recording_compare_the_rules_and_are_drawn(tmp_path):
     result = CliRunner().invoke(app, [*asked, "--png", str(picture)])
     assert result.exit_code == 0, result.output
     figures = json.loads(result.stdout)
-    assert {row["rule"] for row in figures["rows"]} == set(debounce.RULES)
+    assert {row["rule"] for row in figures["rows"]} == set(comparison.RULES)
     by_rule = {row["rule"]: row for row in figures["rows"] if row["echo_rate"] == 1.0}
     assert by_rule["evidence"]["detection_median_ms"] < by_rule["consecutive"]["detection_median_ms"]
     assert by_rule["evidence"]["missed_percent"] == 0
@@ -55,7 +55,7 @@ def test_folder_without_a_usable_recording_is_refused_with_the_reason(tmp_path, 
 @pytest.mark.data
 def test_default_rule_confirms_recorded_obstacles_within_a_quarter_second_and_raises_no_more_alarms(data_dir):
     found = sonar_recording.recordings_in(data_dir / "hcsr04")
-    rows = debounce.measure(found, 100, 0.2, 1, lambda _: None)
+    rows = comparison.measure(found, 100, 0.2, 1, lambda _: None)
     by_rule = {row["rule"]: row for row in rows if row["echo_rate"] == 1.0}
     evidence, five = by_rule["evidence"], by_rule["consecutive"]
     assert evidence["reading_to_confirmed_median_ms"] <= 220
@@ -66,18 +66,18 @@ def test_default_rule_confirms_recorded_obstacles_within_a_quarter_second_and_ra
 @pytest.mark.data
 @pytest.mark.parametrize("rule", ["consecutive", "evidence"])
 def test_table_in_the_documentation_is_what_its_command_gives(data_dir, monkeypatch, rule):
-    monkeypatch.setattr(debounce, "RULES", {rule: debounce.RULES[rule]})
-    rows = debounce.measure(sonar_recording.recordings_in(data_dir / "hcsr04"), 500, 5.0, 1, lambda _: None)
+    monkeypatch.setattr(comparison, "RULES", {rule: comparison.RULES[rule]})
+    rows = comparison.measure(sonar_recording.recordings_in(data_dir / "hcsr04"), 500, 5.0, 1, lambda _: None)
     written = (Path(__file__).parents[2] / "docs" / "benchmarks.md").read_text("utf-8").splitlines()
-    assert [line for line in written if line.startswith(f"| {rule} |")] == debounce.table(rows)[2:]
+    assert [line for line in written if line.startswith(f"| {rule} |")] == comparison.table(rows)[2:]
 
 
 @pytest.mark.data
 def test_default_rule_beats_five_in_a_row_at_every_share_of_echoes(data_dir):
     found = sonar_recording.recordings_in(data_dir / "hcsr04")
-    rows = debounce.measure(found, 150, 0.2, 1, lambda _: None)
+    rows = comparison.measure(found, 150, 0.2, 1, lambda _: None)
     figures = {(row["rule"], row["echo_rate"]): row for row in rows}
-    for echo_rate in debounce.ECHO_RATES:
+    for echo_rate in comparison.ECHO_RATES:
         evidence, five = figures["evidence", echo_rate], figures["consecutive", echo_rate]
         assert evidence["detection_median_ms"] < five["detection_median_ms"]
         assert evidence["known_percent"] > five["known_percent"]

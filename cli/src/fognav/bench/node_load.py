@@ -1,8 +1,8 @@
 """Publishes the readings of many nodes and the poses of many robots, as a process of its own: no other work delays it.
 
-`python -m fognav.bench.node_load SITE MQTT_URL ZENOH_ENDPOINT NODES RATE ROBOTS SECONDS`. From the first line of its
-standard input on, so many seconds are measured: nodes see obstacles, in turn. At the end it writes what it has sent as
-one JSON object.
+`python -m fognav.bench.node_load SITE MQTT_URL ZENOH_ENDPOINT NODES RATE ROBOTS SECONDS [CREDENTIALS]`. From the first
+line of its standard input on, so many seconds are measured: nodes see obstacles, in turn. At the end it writes what it
+has sent as one JSON object. CREDENTIALS is the file of a user who may publish all of it.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import socket
 import sys
 import threading
 import time
+from pathlib import Path
 from typing import Final
-from urllib.parse import urlsplit
 
 import msgspec
 import zenoh
@@ -22,6 +22,8 @@ import zenoh
 from fog_contracts import channels as ch
 from fog_contracts.codec import encode
 from fog_contracts.messages import NodeReading, RobotPose
+from fog_runtime.access.credentials import Credentials
+from fog_runtime.transports.mqtt_broker import Broker
 from fog_runtime.transports.zenoh_edge import session_config
 
 BLOCKED_S: Final = 0.5
@@ -42,7 +44,11 @@ def main() -> None:
     nodes, robots, rate, seconds = int(sys.argv[4]), int(sys.argv[6]), float(sys.argv[5]), float(sys.argv[7])
     stop, begun = threading.Event(), threading.Event()
     threading.Thread(target=_await_line, args=(begun,), daemon=True).start()
-    with _connected(url) as broker, zenoh.open(session_config("client", connect=[endpoint])) as session:
+    own = Credentials.read(Path(sys.argv[8]) if len(sys.argv) > 8 else None)
+    with (
+        _connected(url, own) as broker,
+        zenoh.open(session_config("client", connect=[endpoint], credentials=own)) as session,
+    ):
         poses = threading.Thread(target=_publish_poses, args=(session, site, robots, stop))
         poses.start()
         sent, late_s = _publish_readings(broker, site, nodes, rate, seconds, begun)
@@ -59,16 +65,20 @@ def _await_line(begun: threading.Event) -> None:
     begun.set()
 
 
-def _connected(url: str) -> socket.socket:
+def _connected(url: str, credentials: Credentials) -> socket.socket:
     """Return a connection that is an MQTT 3.1.1 session (section 3.1 of its standard).
 
     A client library would queue what it can't send yet, and deliver it later than this process says.
     """
-    parts = urlsplit(url)
-    broker = socket.create_connection((parts.hostname or "127.0.0.1", parts.port or 1883), timeout=30.0)
+    server = Broker.of(url, credentials)
+    broker = socket.create_connection((server.host, server.port), timeout=30.0)
     broker.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    name = b"fognav-bench"
-    variable = b"\x00\x04MQTT\x04\x02\x00\x00" + len(name).to_bytes(2, "big") + name
+    if server.tls:
+        broker = credentials.tls_context().wrap_socket(broker, server_hostname=server.host)
+    login = [text.encode() for text in (server.user, server.password) if text is not None]
+    flags = (0x02 | 0xC0 * bool(login)).to_bytes()  # a clean session; user and password follow
+    words = b"".join(len(text).to_bytes(2, "big") + text for text in (b"fognav-bench", *login))
+    variable = b"\x00\x04MQTT\x04" + flags + b"\x00\x00" + words
     broker.sendall(b"\x10" + _length(len(variable)) + variable)
     if (answer := broker.recv(4)) != b"\x20\x02\x00\x00":
         raise SystemExit(f"the broker at {url} refuses the connection: {answer.hex()}")

@@ -21,6 +21,7 @@ import zenoh
 from fog_contracts import channels as ch
 from fog_contracts.codec import decode
 from fog_contracts.messages import MapDelta
+from fog_runtime.access.credentials import NOBODY
 from fog_runtime.transports.zenoh_edge import session_config
 from fog_supervisor import net
 from fognav.bench.office import make_office
@@ -28,6 +29,7 @@ from fognav.bench.site import SITE, write_site
 from fognav.output import FailedError
 from fognav.programs import AGGREGATOR, MAP_SERVICE, SERVERS
 from fognav.stack import Stack, StackConfig
+from fognav.stack_doors import Doors
 
 if TYPE_CHECKING:
     from asyncio.subprocess import Process
@@ -38,6 +40,8 @@ if TYPE_CHECKING:
 
 LARGEST_AREA: Final = 130
 """Nodes of one area, at most a third of all; the others share theirs with three more."""
+_BENCH: Final = "bench"
+"""The user who stands for all nodes and robots."""
 _AREA: Final = 4
 _SIDE: Final = 1.0
 """Side of an area (m)."""
@@ -93,12 +97,23 @@ class _Fog:
         return answer.body
 
 
-async def measure(
-    folder: Path, *, nodes: int, rate: float, robots: int, seconds: float, on_phase: Callable[[str], object]
+async def measure(  # noqa: PLR0913  # what is measured
+    folder: Path,
+    *,
+    nodes: int,
+    rate: float,
+    robots: int,
+    seconds: float,
+    on_phase: Callable[[str], object],
+    locked: bool = True,
 ) -> dict[str, Any]:
-    """Return the figures; times in ms, None when no hazard reached the map. `folder` is empty."""
+    """Return the figures; times in ms, None when no hazard reached the map. `folder` is empty.
+
+    `locked`: broker, Redis and router encrypt, and ask everybody for a password.
+    """
     write_nodes(folder, nodes)
-    config = StackConfig(site_dir=folder, robot="none", extra={"HAZARDS_WAIT_S": "0"})
+    doors = Doors(site=SITE, unrestricted=(_BENCH,)) if locked else None
+    config = StackConfig(site_dir=folder, robot="none", extra={"HAZARDS_WAIT_S": "0"}, doors=doors)
     async with Stack(config) as stack:
         on_phase("starting broker, Redis, router, aggregator and map-service")
         await stack.start_servers(_READY_S)
@@ -106,7 +121,8 @@ async def measure(
             stack.supervisor.start(name)
         await stack.supervisor.wait_ready([*SERVERS, AGGREGATOR, MAP_SERVICE], _READY_S)
         fog, traces = _Fog(stack), _Traces()
-        with zenoh.open(session_config("client", connect=[stack.zenoh_endpoint])) as session:
+        own = stack.doors.credentials(_BENCH) if locked else NOBODY
+        with zenoh.open(session_config("client", connect=[stack.zenoh_endpoint], credentials=own)) as session:
             session.declare_subscriber(ch.MAP_DELTA.key(site=SITE), traces.on_delta)
             async with _load(stack, nodes, rate, robots, seconds) as load:
                 # Kernels are loaded just then, and each node's first readings change its area.
@@ -163,6 +179,8 @@ def _free_corners(floor: StaticMap) -> list[tuple[float, float]]:
 async def _load(stack: Stack, nodes: int, rate: float, robots: int, seconds: float) -> AsyncIterator[Process]:
     """Run the load generator, which measures once it is told to."""
     options = [SITE, stack.mqtt_url, stack.zenoh_endpoint, str(nodes), str(rate), str(robots), str(seconds)]
+    if (credentials := stack.doors.file(_BENCH)) is not None:
+        options.append(str(credentials))
     pipe = asyncio.subprocess.PIPE
     load = await asyncio.create_subprocess_exec(
         sys.executable, "-m", "fognav.bench.node_load", *options, stdin=pipe, stdout=pipe, stderr=pipe

@@ -281,12 +281,13 @@ def pipeline_command(
     rate: Annotated[float, typer.Option("--rate", metavar="HZ", min=1.0, max=50.0, help="Readings per second.")] = 20.0,
     robots: Annotated[int, typer.Option("--robots", metavar="N", min=0, max=200, help="Robots with poses.")] = 50,
     seconds: Annotated[float, typer.Option("--seconds", metavar="S", min=4.0, help="How long they publish.")] = 30.0,
+    open_: Annotated[bool, typer.Option("--open", help="Without locks: no encryption, no passwords.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Write one JSON object to standard output.")] = False,
 ) -> None:
     """Measure the way from readings to the map.
 
-    Broker, aggregator and map-service are real processes, and so is the generator of the load. Readings that the
-    aggregator did not get are lost; times are in ms, from the confirmation of a hazard to the map's delta.
+    Broker, aggregator and map-service are real processes behind locks; so is the generator of the load. Readings that
+    the aggregator did not get are lost; times are in ms, from the confirmation of a hazard to the map's delta.
     """
     from fognav.bench import machine, pipeline  # noqa: PLC0415  # keeps the other commands fast
 
@@ -294,11 +295,11 @@ def pipeline_command(
     with exit_codes(), TemporaryDirectory(prefix="fognav-") as folder:
         figures = asyncio.run(
             pipeline.measure(
-                Path(folder), nodes=nodes, rate=rate, robots=robots, seconds=seconds,
+                Path(folder), nodes=nodes, rate=rate, robots=robots, seconds=seconds, locked=not open_,
                 on_phase=lambda text: console.print(text, markup=False),
             )
         )  # fmt: skip
-    asked = {"nodes": nodes, "rate": rate, "robots": robots, "seconds": seconds}
+    asked = {"nodes": nodes, "rate": rate, "robots": robots, "seconds": seconds, "locked": not open_}
     if json:
         print_json({"bench": "pipeline", **asked, **figures, **machine.describe()})
         return
@@ -364,7 +365,8 @@ def debounce_command(
     background, as recorded and with 2 % false echoes; and what the evidence rule learns from the recordings: echo_rate
     and false_echo_rate.
     """
-    from fognav.bench import debounce, debounce_plot, machine, sonar_recording  # noqa: PLC0415  # as above
+    from fognav.bench import machine  # noqa: PLC0415  # keeps the other commands fast
+    from fognav.bench.debounce_rules import comparison, plot, sonar_recording  # noqa: PLC0415  # same
 
     with exit_codes():
         check_writable(png)
@@ -372,9 +374,9 @@ def debounce_command(
             loaded = sonar_recording.recordings_in(recordings)
         except ValueError as error:
             raise WrongUseError(str(error)) from error
-        rows = debounce.measure(loaded, trials, hours, seed, lambda rule: console.print(rule, markup=False))
+        rows = comparison.measure(loaded, trials, hours, seed, lambda rule: console.print(rule, markup=False))
         if png is not None:
-            debounce_plot.draw(rows, png)
+            plot.draw(rows, png)
     learned = [{"echo_rate": round(r.echo_rate, 3), "false_echo_rate": round(r.false_echo_rate, 3)} for r in loaded]
     asked = {"trials": trials, "hours": hours, "seed": seed, "readings": sum(r.samples for r in loaded)}
     if json:
@@ -382,7 +384,7 @@ def debounce_command(
         return
     for values in learned:
         console.print("learned: " + "  ".join(f"{name} {value}" for name, value in values.items()), markup=False)
-    for line in debounce.table(rows):
+    for line in comparison.table(rows):
         console.print(line, markup=False, soft_wrap=True)
 
 

@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from fognav.bench.sonar_recording import SpikeFilter, filtered
+from fognav.bench.debounce_rules.sonar_recording import SpikeFilter, filtered
 from hazard_aggregator.debounce import Observation, SonarSample, make_rule
 from hazard_aggregator.registry import find_rule
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from fognav.bench.sonar_recording import Recording
+    from fognav.bench.debounce_rules.sonar_recording import Recording
     from hazard_aggregator.debounce import Rule
 
 STRESS_RATE: Final = 0.02

@@ -1,0 +1,1 @@
+"""The comparison of debounce rules on recorded echoes (`fognav bench debounce`)."""

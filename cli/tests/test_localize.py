@@ -20,6 +20,7 @@ from fognav.localization.evaluation import track
 from fognav.localization.logs import read_log
 from fognav.output import WrongUseError
 from robot_agent.config import LocalizationConfig
+from robot_agent.localization.map_fields import map_fields
 from robot_agent.localization.pose import Pose2
 
 BEAMS = np.arange(180) * math.pi / 180.0 - math.pi / 2.0
@@ -124,6 +125,27 @@ def test_kidnapped_robot_is_found_again(folder):
     assert found["recovered_after_scans"] is not None
     assert found["recovered_after_scans"] <= 15
     assert found["falsely_good_share"] == 0.0
+
+
+def test_random_starts_and_kidnappings_of_a_log_are_counted(folder):
+    trials = ("localize", "--map", folder / "floor.yaml", "--log", folder / "drive.jsonl.gz", "--trials", 4)
+    code, starts = run(*trials, "--global")
+    assert code == 0
+    assert (starts["starts"], starts["scans_each"], starts["wrong"]) == (4, 10, 0)
+    assert starts["right_share"] + starts["undecided"] / 4 == 1.0
+    assert starts["right_share"] >= 0.5
+    code, carried = run(*trials, "--kidnap")
+    assert (carried["kidnappings"], carried["scans"]) == (4, 4 * 45)
+    assert carried["falsely_good_kidnappings"] == len(carried["deceived"])
+    assert code == bool(carried["falsely_good_scans"])
+
+
+@pytest.mark.parametrize("kinds", [[], ["--global", "--kidnap"]])
+def test_trials_without_their_kind_are_refused(folder, kinds):
+    words = ["localize", "--map", str(folder / "floor.yaml"), "--log", str(folder / "drive.jsonl.gz"), "--trials", "2"]
+    result = CliRunner().invoke(app, [*words, *kinds])
+    assert result.exit_code == 2
+    assert "--global or --kidnap" in result.output
 
 
 def test_log_of_another_building_is_never_good(folder, tmp_path):
@@ -258,10 +280,9 @@ def test_robot_carried_between_places_that_look_alike_is_not_good_where_suddenly
         )
         for scan in after
     ]
-    samples = track(
-        load_map(tmp_path / "floor.yaml"), [*before, *carried], LocalizationConfig(range_max=30.0), seed=485191,
-        search=False,
-    )  # fmt: skip
+    floor, config = load_map(tmp_path / "floor.yaml"), LocalizationConfig(range_max=30.0)
+    fields = map_fields(floor.cells, floor.geometry, config)
+    samples = track(fields, [*before, *carried], config, seed=485191, search=False)
     assert samples[len(before) - 1].status == "good"
     assert not [sample for sample in samples if sample.status == "good" and sample.position_error > 0.5]
     assert samples[-1].status == "good"

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from fog_contracts.grid import StaticMap
     from fognav.localization.logs import LogScan
     from robot_agent.config import LocalizationConfig
+    from robot_agent.localization.map_fields import MapFields
 
 _START_SIGMAS: Final = (0.2, 0.1)
 """Standard deviations (m, rad) of the pose at which tracking starts: the reference's."""
@@ -77,7 +77,7 @@ def with_noise(scans: Sequence[LogScan], seed: int) -> list[LogScan]:
 
 
 def track(
-    map_: StaticMap,
+    fields: MapFields,
     scans: Sequence[LogScan],
     config: LocalizationConfig,
     *,
@@ -87,7 +87,7 @@ def track(
 ) -> list[Sample]:
     """Run the localizer over scans with references; start at the first reference, or by a search of the whole map."""
     localizer = Localizer(config, seed)
-    localizer.load_map(localizer.fields_of(map_.cells, map_.geometry))
+    localizer.load_map(fields)
     samples: list[Sample] = []
     heading = scans[0].odom.theta
     for number, scan in enumerate(scans):
@@ -157,20 +157,26 @@ def figures(samples: Sequence[Sample], *, search: bool, gap: int | None = None) 
         "heading_error_p95_deg": _percentile(headings[used], 95),
         "lost_share": round(float(np.mean([sample.status == "lost" for sample in samples[converged or 0 :]])), 4),
         "good_share": round(float(good.mean()), 4),
-        "falsely_good_share": round(float((good & (errors > _FALSELY_GOOD_M)).mean()), 4),
+        "falsely_good_share": round(float(np.mean([is_falsely_good(sample) for sample in samples])), 4),
         "converged_after_scans": None if converged is None else converged + 1,
-        "converged_right": converged is not None and _is_right(samples[converged]),
+        "converged_right": converged is not None and is_right(samples[converged]),
         "sigma_along_median_m": _percentile(np.array([sample.sigma_along for sample in samples])[used], 50),
         "update_ms": _percentile(np.array([sample.milliseconds for sample in samples]), 50),
     }
     if gap is not None:
-        right = [number for number in range(gap, len(samples)) if relied[number] and _is_right(samples[number])]
+        right = [number for number in range(gap, len(samples)) if relied[number] and is_right(samples[number])]
         found["recovered_after_scans"] = right[0] - gap + 1 if right else None
     return found
 
 
-def _is_right(sample: Sample) -> bool:
+def is_right(sample: Sample) -> bool:
+    """Return whether an estimate is near enough to the reference to go on from."""
     return sample.position_error <= _RIGHT_M and sample.heading_error <= _RIGHT_RAD
+
+
+def is_falsely_good(sample: Sample) -> bool:
+    """Return whether an estimate is good by its status and yet far from the reference."""
+    return sample.status == "good" and sample.position_error > _FALSELY_GOOD_M
 
 
 def _percentile(values: NDArray[np.float64], percent: float) -> float | None:

@@ -139,6 +139,17 @@ def test_particles_that_are_certain_or_at_several_places_have_no_direction_to_ca
     assert least_certain(*wide, weights) is None
 
 
+def test_direction_that_the_last_scan_observed_is_left_to_the_weights():
+    """On a recorded floor with scans metres apart, particles that were kept wide led a robot astray."""
+    drive = Drive(20.0, 1)
+    drive.filter._set_particles(np.array([3.0, 2.0, 0.0]) + drive.rng.normal(size=(500, 3)) * (0.4, 0.02, 0.01))
+    unobserved = np.zeros(500)
+    drive.filter.covariance = np.diag([0.06**2, 0.03**2, 1e-4])
+    assert drive.filter._weigh(unobserved) is None
+    drive.filter.covariance = np.diag([0.3**2, 0.03**2, 1e-4])
+    assert drive.filter._weigh(unobserved).variance == pytest.approx(0.16, rel=0.2)
+
+
 def test_particles_are_shifted_and_stretched_along_one_direction_only():
     rng = np.random.default_rng(1)
     x, y = (rng.standard_normal((2, 500)) * np.array([[0.5], [0.05]])).astype(np.float32)

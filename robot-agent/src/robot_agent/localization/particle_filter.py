@@ -15,7 +15,7 @@ from fog_kernels import amcl
 from robot_agent.localization.pose import Pose2, wrap
 from robot_agent.localization.scan_match import match_scan
 from robot_agent.localization.uncertainty import Uncertainty, uncertainty
-from robot_agent.localization.unobserved import Along, least_certain, moved_to, observed, shifts_along
+from robot_agent.localization.unobserved import ALONG_LEAST_M, Along, least_certain, moved_to, observed, shifts_along
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -230,10 +230,10 @@ class ParticleFilter:
 
     def _weigh(self, log_likelihoods: NDArray[np.float64]) -> Along | None:
         """Weight the particles; return what they keep along the direction that the scan hardly observes, if any."""
-        before = least_certain(self._x, self._y, self._weights)
-        kept = None
-        if before is not None:
-            kept = observed(before, (self._x, self._y, self._theta), self._weights, log_likelihoods)
+        # Where matching the last scan left no doubt, the weights of this one may speak for themselves.
+        unseen = self.uncertainty.along >= ALONG_LEAST_M
+        before = least_certain(self._x, self._y, self._weights) if unseen else None
+        kept = before and observed(before, (self._x, self._y, self._theta), self._weights, log_likelihoods)
         self._weights = self._weights * np.exp(log_likelihoods)
         self._weights /= self._weights.sum()
         self._move_along(kept)

@@ -17,7 +17,7 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-_ALONG_LEAST_M: Final = 0.15
+ALONG_LEAST_M: Final = 0.15
 """A smaller deviation needs no care: scans have observed it."""
 _ACROSS_MOST_M: Final = 0.3
 _SIGNIFICANT: Final = 3.0
@@ -48,7 +48,7 @@ def least_certain(x: NDArray[np.float32], y: NDArray[np.float32], weights: NDArr
     off_x, off_y = x - mean_x, y - mean_y
     xx, xy, yy = float(weights @ (off_x * off_x)), float(weights @ (off_x * off_y)), float(weights @ (off_y * off_y))
     middle, half = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)
-    if middle + half < _ALONG_LEAST_M**2 or middle - half > _ACROSS_MOST_M**2:
+    if middle + half < ALONG_LEAST_M**2 or middle - half > _ACROSS_MOST_M**2:
         return None
     angle = 0.5 * math.atan2(2.0 * xy, xx - yy)
     cos, sin = math.cos(angle), math.sin(angle)
@@ -96,7 +96,7 @@ def shifts_along(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return offsets (n, 2; m) along the least certain direction of a covariance (3, 3), two deviations either way."""
     variances, vectors = np.linalg.eigh(covariance[:2, :2])
     sigma = math.sqrt(max(0.0, float(variances[1])))
-    if sigma < _ALONG_LEAST_M:
+    if sigma < ALONG_LEAST_M:
         return np.zeros((1, 2))
     reach = _REACH_SIGMAS * sigma
     offsets = np.linspace(-reach, reach, 1 + 2 * math.ceil(reach / _SHIFT_M))

@@ -85,6 +85,7 @@ def test_figures_come_with_schema_machine_and_versions(monkeypatch: pytest.Monke
     printed = json.loads(done.stdout)
     assert (printed["schema"], printed["bench"], printed["robots"]) == (1, "fleet", 2)
     assert printed["machine"]["cores"] >= 1
+    assert printed["machine"]["governor"]
     assert set(printed["versions"]) == {"python", "numba", "numpy"}
     assert {"replan_p50_ms", "replan_p99_ms", "cut_off_ms", "rss_mb", "bytes_per_robot"} <= printed.keys()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 from importlib.metadata import version
+from pathlib import Path
 
 
 def describe() -> dict[str, object]:
@@ -14,6 +15,7 @@ def describe() -> dict[str, object]:
             "processor": _processor(),
             "architecture": platform.machine(),
             "cores": os.cpu_count(),
+            "governor": _governor(),
             "load": round(os.getloadavg()[0], 1),
             "system": platform.platform(terse=True),
         },
@@ -25,6 +27,14 @@ def sentence() -> str:
     """Return the machine in a few words, with its load."""
     load = os.getloadavg()[0]
     return f"{_processor()}, {os.cpu_count()} cores, {platform.platform(terse=True)}, load {load:.0f} at the end"
+
+
+def _governor(cpu: Path = Path("/sys/devices/system/cpu/cpu0")) -> str:
+    """Return what decides on the processor's clock; where the system does not tell it, as virtual machines do, so."""
+    try:
+        return (cpu / "cpufreq" / "scaling_governor").read_text("ascii").strip()
+    except OSError:
+        return "not told by the system"
 
 
 def _processor() -> str:

@@ -91,7 +91,10 @@ def down_command(
     *,
     data: DataOption = None,
 ) -> None:
-    """End the fog node of `fognav up`, with all its sites; its data stays, and other nodes of yours go on."""
+    """End the fog node of `fognav up`; its data stays.
+
+    It ends with all its sites; other nodes of yours go on.
+    """
     from fognav.hosting.local_nodes import end_node, named_node  # noqa: PLC0415  # keeps the other commands fast
 
     with exit_codes():

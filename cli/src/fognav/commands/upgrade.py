@@ -20,7 +20,7 @@ def upgrade_command(
     data: DataOption = None,
     check: Annotated[bool, typer.Option("--check", help="Tell what would change, and change nothing.")] = False,
 ) -> None:
-    """Upgrade this checkout, and the fog node of `fognav up` that runs from it; all data stays.
+    """Upgrade this checkout and its fog node, with all data.
 
     It makes a backup of each site, ends the node, and starts the new version once. If that fails, version and data are
     those of before.

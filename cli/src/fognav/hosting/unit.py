@@ -62,9 +62,10 @@ def write_unit(arguments: Sequence[str]) -> Path:
 def is_active() -> bool:
     """Whether systemd runs the unit now."""
     try:
-        return subprocess.run(["systemctl", "--user", "is-active", "--quiet", NAME], check=False).returncode == 0
+        done = subprocess.run(["systemctl", "--user", "is-active", NAME], check=False, capture_output=True)
     except OSError:
         return False  # a computer without systemd
+    return done.returncode == 0
 
 
 def start() -> None:

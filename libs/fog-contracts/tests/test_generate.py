@@ -69,7 +69,7 @@ def test_field_limits_and_choices_are_those_of_its_values():
 
 def test_message_parts_are_found_in_lists_and_unions():
     assert parts(m.Zone) == [*get_args(m.Shape), m.WeeklySchedule]
-    assert parts(m.RobotState) == [m.LoopHealth, m.Trace, m.Power]
+    assert parts(m.RobotState) == [m.LoopHealth, m.Trace, m.Power, m.Pose]
 
 
 def test_a_type_without_a_word_is_named():

@@ -37,6 +37,17 @@ def test_module_that_imports_a_newer_one_is_stale(tmp_path: Path) -> None:
     assert kernels._stale(tmp_path) == ["ray"]
 
 
+def test_module_whose_source_was_only_touched_is_not_stale_after_a_check(tmp_path: Path) -> None:
+    (tmp_path / "__pycache__").mkdir()
+    (tmp_path / "ray.py").write_text("@njit(cache=True)\ndef cast(): ...\n")
+    index = tmp_path / "__pycache__" / "ray.cast-1.py311.nbi"
+    index.touch()
+    os.utime(index, (0, 0))
+    assert kernels._stale(tmp_path) == ["ray"]
+    kernels._mark_checked(tmp_path)
+    assert kernels._stale(tmp_path) == []
+
+
 def test_progress_without_a_terminal_is_one_line_per_kernel() -> None:
     printed: list[str] = []
     with kernels._progress_display(printed.append) as show:

@@ -68,7 +68,7 @@ async def test_echoes_block_an_area_and_free_readings_clear_it(fog, until):
         await until(lambda: node.state == "blocked", "blocked", lambda: fog.log("hazard_aggregator"))
         trace = node.hazards[-1].trace
         assert 0 < trace.first_reading <= trace.confirmed
-        await node.read(3.0, 6)
+        await node.read(3.0, 8)
         await until(lambda: node.state == "clear", "clear", lambda: fog.log("hazard_aggregator"))
         await until(lambda: node.lines[-2:] == ["7,3.500,4.500", "7,-999,-999"], "thesis lines")
 
@@ -137,7 +137,7 @@ async def test_without_redis_danger_is_announced_and_relief_waits(fog, until):
         fog.redis.kill()
         await node.read(0.8, 5)
         await until(lambda: node.state == "blocked", "blocked without the store")
-        await node.read(3.0, 6)
+        await node.read(3.0, 8)
         async with asyncio.timeout(60):
             for _ in iter(int, 1):
                 if "fognav_hazards_withheld 1.0" in (await client.get(f"{url}/metrics")).text:
@@ -146,7 +146,7 @@ async def test_without_redis_danger_is_announced_and_relief_waits(fog, until):
         assert node.state == "blocked"
         assert (await client.get(f"{url}/readyz")).json()["missing"] == ["store"]
         fog.redis.start()
-        await node.read(3.0, 6)
+        await node.read(3.0, 8)
         await until(lambda: node.state == "clear", "clear once it is stored", lambda: fog.log("hazard_aggregator"))
 
 
@@ -178,7 +178,7 @@ async def test_robot_in_the_cone_does_not_block_the_area(fog, until):
     fog.start("hazard_aggregator")
     await fog.ready("hazard_aggregator")
     async with connected_node(fog) as (node, zenoh):
-        await node.read(3.0, 6)
+        await node.read(3.0, 8)
         await until(lambda: node.state == "clear", "clear")
         robot = RobotPose(
             x=3.5, y=3.5, theta=0.0, covariance=[0.0] * 9, v=0.0, w=0.0, radius=0.17, height=0.35, stamp=1.0

@@ -87,7 +87,7 @@ def robot_back_off(*, robot: RobotOption = None, fog: FogOption = None, json: Js
 
 @robot_app.command("turn", epilog="Example: fognav robot turn && fognav robot watch --seconds 15")
 def robot_turn(*, robot: RobotOption = None, fog: FogOption = None, json: JsonOption = False) -> None:
-    """Let a robot that does not know its place turn in place, to both sides and back.
+    """Let a robot turn in place to find out where it is.
 
     `fognav robot status` lists the places that its scans leave. It stops turning once it knows, and then waits to be
     enabled. Watch it: its lidar guards the turn, but it knows of no zone yet.
@@ -97,7 +97,7 @@ def robot_turn(*, robot: RobotOption = None, fog: FogOption = None, json: JsonOp
 
 @robot_app.command("advance", epilog="Example: fognav robot advance && fognav robot watch --seconds 15")
 def robot_advance(*, robot: RobotOption = None, fog: FogOption = None, json: JsonOption = False) -> None:
-    """Let a robot that does not know its place drive 0.4 m straight ahead, slowly.
+    """Let a robot drive 0.4 m ahead to find out where it is.
 
     This tells places apart between which a turn does not decide. Watch it: its lidar guards the way, but it knows of no
     zone yet.

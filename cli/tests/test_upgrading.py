@@ -1,5 +1,6 @@
 """Upgrades of a fog node in a small repository, whose `fognav` is a script: what is kept, and the way back."""
 
+import os
 import shutil
 import subprocess
 from collections.abc import Callable
@@ -125,6 +126,20 @@ def test_own_changes_of_files_stay_or_stop_the_upgrade(add_version, folder, star
         Upgrade(folder, Versions(root), lambda _: None).run(new)
     assert (git(root, "rev-parse", "HEAD"), (root / "site.toml").read_text()) == (old, "mine")
     assert started == ["unit"]
+
+
+@pytest.mark.live
+def test_data_that_cannot_be_copied_aside_changes_nothing_and_leaves_no_copy(add_version, folder, started, tmp_path):
+    root = tmp_path / "checkout"
+    old = add_version("old")
+    new = add_version("new")
+    git(root, "reset", "-q", "--hard", old)
+    os.mkfifo(folder.data("redis") / "no-file")
+    with pytest.raises(FailedError, match="nothing was changed"):
+        Upgrade(folder, Versions(root), lambda _: None).run(new)
+    assert git(root, "rev-parse", "HEAD") == old
+    assert started == ["unit"]
+    assert not folder.path.with_name("data.before-upgrade").exists()
 
 
 def test_upgrade_that_was_cut_short_is_told(folder, add_version, tmp_path):

@@ -49,8 +49,12 @@ class Upgrade:
         for node in running_nodes():
             if node.data == self._folder.path:
                 end_node(node.pid)
-        with self._folder.in_use():
-            shutil.copytree(self._folder.path, self._kept, symlinks=True)
+        try:
+            with self._folder.in_use():
+                self._keep()
+        except FailedError:
+            self._start_again(by_systemd=by_systemd)
+            raise
         try:
             self._versions.go_to(to)
             self._try_start()
@@ -63,6 +67,17 @@ class Upgrade:
         shutil.rmtree(self._kept)
         self._print_line(f"upgraded to {to[:12]}; it starts with all data")
         self._start_again(by_systemd=by_systemd)
+
+    def _keep(self) -> None:
+        """Copy the data aside; raises `FailedError` and leaves no copy behind if it can't be."""
+        try:
+            shutil.copytree(self._folder.path, self._kept, symlinks=True)
+        except OSError as error:
+            shutil.rmtree(self._kept, ignore_errors=True)
+            raise FailedError(
+                f"{self._folder.path} can't be copied beside itself, and nothing was changed; make room for it, and "
+                f"repeat the upgrade: {error}"
+            ) from error
 
     def _back_up(self) -> list[Path]:
         folder = self._folder.path / BACKUPS

@@ -42,6 +42,13 @@ def test_a_robot_that_stands_publishes_its_pose_twice_a_second_and_at_once_when_
     assert ch.ROBOT_POSE.max_age_s / 2 >= STANDING_POSE_S
 
 
+def test_a_standing_robot_whose_state_changes_publishes_its_pose_with_it():
+    other = msgspec.structs.replace(STATE, mode="NORMAL")
+    times = run(1.0, standing=lambda _now: True, state=lambda now: other if now >= 100.15 else STATE)
+    assert times[ch.ROBOT_POSE][:2] == [0.0, 0.2]
+    assert times[ch.ROBOT_STATE][:2] == [0.0, 0.2]
+
+
 @pytest.mark.parametrize(
     ("change", "times"),
     [

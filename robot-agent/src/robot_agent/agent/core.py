@@ -297,7 +297,7 @@ class AgentCore:
             self.state(at),
             partial(self._report_obstacles, at),
             at.now,
-            standing=self.idle and self._localizer.twist() == (0.0, 0.0),
+            standing=self.idle and self._localizer.status == "good" and self._localizer.twist() == (0.0, 0.0),
         )
 
     def _report_obstacles(self, at: Moment) -> RobotObstacles | None:

@@ -44,17 +44,21 @@ class PublishingPolicy:
     ) -> list[Publication]:
         """Return the publications that are due; `pose` and `obstacles` are called only when they are due.
 
-        `standing`: the robot neither moves nor is about to. A robot that begins to move publishes its pose at once.
+        `standing`: the robot knows where it is, and neither moves nor is about to. Its pose is published at once when
+        it begins to move, and with each change of its state: it may just have found out that it is elsewhere.
         """
         messages: list[tuple[ch.Channel, Message]] = []
-        due = self._standing_due if standing else self._pose_due
+        content = _content(state)
+        changed = content != self._content
+        due = self._pose_due
+        if standing:
+            due = now if changed else self._standing_due
         if now >= due - _SLACK_S and (found := pose()) is not None:
             # Counted from when it was due, so that uneven ticks keep the rate.
             begun = max(due, now - _SLACK_S)
             self._pose_due, self._standing_due = begun + POSE_S, begun + STANDING_POSE_S
             messages.append((ch.ROBOT_POSE, found))
-        content = _content(state)
-        if content != self._content or now - self._state_at >= STATE_S - _SLACK_S:
+        if changed or now - self._state_at >= STATE_S - _SLACK_S:
             self._content, self._state_at = content, now
             messages.append((ch.ROBOT_STATE, state))
         if now - self._obstacles_at >= OBSTACLES_S - _SLACK_S:

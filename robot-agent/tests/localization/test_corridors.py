@@ -139,6 +139,50 @@ def test_particles_that_are_certain_or_at_several_places_have_no_direction_to_ca
     assert least_certain(*wide, weights) is None
 
 
+@pytest.mark.parametrize("count", [2, 3, 4])
+@pytest.mark.parametrize("first_share", [0.05, 0.5, 0.9])
+def test_clouds_with_gaps_between_them_along_a_corridor_have_no_direction_to_care_for(count, first_share):
+    rng = np.random.default_rng(1)
+    cloud = np.arange(1000) % count
+    x, y = rng.standard_normal((2, 1000)) * np.array([[0.2], [0.03]]) + np.array([2.5 * cloud, 0.0 * cloud])
+    weights = np.where(cloud == 0, first_share, (1.0 - first_share) / (count - 1))
+    assert least_certain(x.astype(np.float32), y.astype(np.float32), weights / weights.sum()) is None
+
+
+def test_particles_of_hardly_any_weight_do_not_join_two_clouds():
+    rng = np.random.default_rng(1)
+    x = np.concatenate((rng.normal(0.0, 0.2, 400), rng.normal(2.5, 0.2, 400), rng.uniform(0.0, 2.5, 200)))
+    weights = np.repeat([1.0, 0.01], [800, 200])
+    assert least_certain(x.astype(np.float32), np.zeros(1000, np.float32), weights / weights.sum()) is None
+
+
+@given(st.integers(0, 10_000), st.floats(0.2, 20.0), st.sampled_from(["normal", "flat", "hole"]))
+@settings(max_examples=100)
+def test_one_cloud_however_ragged_keeps_its_direction(seed, sigma, kind):
+    rng = np.random.default_rng(seed)
+    x = rng.uniform(-1.7, 1.7, 500) if kind == "flat" else rng.standard_normal(500)
+    if kind == "hole":
+        x = x[np.abs(x - 0.5) > 0.15]
+    weights = rng.uniform(0.0, 1.0, len(x)) ** 2
+    x, y = (sigma * x).astype(np.float32), rng.normal(0.0, 0.05, len(x)).astype(np.float32)
+    assert least_certain(x, y, weights / weights.sum()) is not None
+
+
+@pytest.mark.parametrize("apart", [2.5, 4.0])
+def test_estimate_stays_where_particles_are_when_they_are_at_two_places_of_one_corridor(apart):
+    for seed in range(3):
+        drive = Drive(60.0, seed)
+        drive.true = Pose2(25.0, 2.0, 0.0)
+        poses = np.array(drive.true) + drive.rng.standard_normal((1000, 3)) * (0.2, 0.03, 0.01)
+        poses[500:, 0] += apart
+        drive.filter._set_particles(poses)
+        drive.filter._estimate, drive.filter._anchor = drive.true, drive.odom
+        drive.filter.covariance = np.diag([0.2**2, 0.03**2, 0.01**2])
+        for _ in range(10):
+            drive.advance()
+            assert min(abs(drive.error), abs(drive.error - apart)) < 0.35, f"{drive.error:.2f} m, seed {seed}"
+
+
 def test_direction_that_the_last_scan_observed_is_left_to_the_weights():
     """On a recorded floor with scans metres apart, particles that were kept wide led a robot astray."""
     drive = Drive(20.0, 1)

@@ -46,7 +46,7 @@ _OTHER_CLUSTER: Final = 1.5
 """The estimate moves to another cluster of particles when that weighs this many times as much as its own."""
 _SAME_CLUSTER_M: Final = 0.75
 _ALL_M: Final = 10.0
-"""Size of bins that put the particles of a whole corridor into one cluster: they must not tear it at gaps."""
+"""Size of bins that put the one cloud along a corridor into one cluster: they must not tear off its sparse ends."""
 _RESAMPLE_BELOW: Final = 0.5
 """Share of the particles that must carry the weight where scans do not tell how far along a corridor the robot is."""
 _JUMP_M: Final = 1.0
@@ -269,7 +269,7 @@ class ParticleFilter:
     def _conclude(self, scan: DeskewedScan, fields: MapFields, *, one_cloud: bool = False) -> None:
         """Estimate pose and covariance from the weighted particles, and refine them by matching the scan.
 
-        one_cloud: the particles are one cloud along a corridor, whatever gaps it has.
+        one_cloud: the particles are one cloud along a corridor (`least_certain`), however ragged its ends are.
         """
         mean = self._cluster(one_cloud=one_cloud)
         matched = match_scan(fields, Pose2(mean.x, mean.y, mean.theta), mean.covariance, scan.beams(_MATCH_BEAMS))

@@ -20,6 +20,13 @@ if TYPE_CHECKING:
 ALONG_LEAST_M: Final = 0.15
 """A smaller deviation needs no care: scans have observed it."""
 _ACROSS_MOST_M: Final = 0.3
+_GAP_SIGMAS: Final = 0.25
+"""Neighbours on the line that lie so many of all particles' deviations apart belong to two clouds, ..."""
+_CLOUDS_SHARE: Final = 0.85
+"""... but are several places only if the clouds' means hold more than this share of the variance: the halves of a
+normal cloud hold 0.64, and a few stray particles beside it add to that."""
+_LIGHT: Final = 0.1
+"""A particle of less than this share of the average weight does not fill a gap."""
 _SIGNIFICANT: Final = 3.0
 """A term of the regression counts from so many of its standard errors on."""
 _STRONG: Final = 0.5
@@ -42,7 +49,8 @@ class Along(NamedTuple):
 def least_certain(x: NDArray[np.float32], y: NDArray[np.float32], weights: NDArray[np.float64]) -> Along | None:
     """Return mean and variance of particles (n; m, weights of sum 1) along their least certain direction.
 
-    None if they are certain enough in every direction, or uncertain in all: then they are at several places.
+    None if they are certain enough in every direction, uncertain in all, or in clouds with gaps between them along that
+    direction: in the last two cases they are at several places, of which the mean is none.
     """
     mean_x, mean_y = float(weights @ x), float(weights @ y)
     off_x, off_y = x - mean_x, y - mean_y
@@ -52,6 +60,8 @@ def least_certain(x: NDArray[np.float32], y: NDArray[np.float32], weights: NDArr
         return None
     angle = 0.5 * math.atan2(2.0 * xy, xx - yy)
     cos, sin = math.cos(angle), math.sin(angle)
+    if _in_several_clouds(cos * off_x + sin * off_y, weights):
+        return None
     return Along((cos, sin), cos * mean_x + sin * mean_y, middle + half)
 
 
@@ -101,6 +111,18 @@ def shifts_along(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
     reach = _REACH_SIGMAS * sigma
     offsets = np.linspace(-reach, reach, 1 + 2 * math.ceil(reach / _SHIFT_M))
     return np.asarray(np.outer(offsets, vectors[:, 1]))
+
+
+def _in_several_clouds(along: NDArray[np.float32], weights: NDArray[np.float64]) -> bool:
+    """Whether gaps divide places (n; m) on a line, with weights of sum 1, into clouds narrow for their distance."""
+    heavy = np.flatnonzero(weights * len(weights) >= _LIGHT)
+    order = heavy[np.argsort(along[heavy])]
+    places, shares = along[order].astype(np.float64), weights[order] / weights[order].sum()
+    places -= shares @ places
+    variance = float(shares @ np.square(places))
+    number = np.concatenate(([0], np.cumsum(np.diff(places) > _GAP_SIGMAS * math.sqrt(variance))))
+    means = np.bincount(number, shares * places) / np.bincount(number, shares)
+    return float(shares @ np.square(means[number])) > _CLOUDS_SHARE * variance
 
 
 def _standardized(values: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:

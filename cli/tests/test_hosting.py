@@ -13,7 +13,9 @@ from pathlib import Path
 import pytest
 
 from fog_runtime import backup
+from fog_runtime.access.credentials import Credentials
 from fog_runtime.backup_archive import STAMP, BackupError
+from fog_runtime.locks.site_locks import SiteLocks
 from fog_runtime.stores.redis_connection import RedisConnection
 from fog_supervisor.supervisor import Program, Supervisor
 from fognav.hosting import backups, local_nodes, log_files, running, settings, unit
@@ -234,6 +236,42 @@ async def test_backup_of_each_floor_is_restored_on_an_empty_machine(tmp_path, up
     assert (empty.locks / "credentials" / "upstairs" / "r1.toml").read_bytes() == robot
     with pytest.raises(BackupError, match="nothing was changed"):
         await backups.restore(tmp_path / "estig.tar.gz", empty, tmp_path / "restored" / "estig", replace=False)
+
+
+async def test_older_backup_of_one_floor_locks_nobody_out_who_was_added_since(tmp_path, upstairs):
+    estig = shutil.copytree(ESTIG, tmp_path / "site")
+    folder, hosts = NodeFolder(tmp_path / "data"), ["localhost", "127.0.0.1"]
+    hosted_sites([estig], folder.locks, hosts)
+    folder.keys("estig")
+    SiteLocks.open(folder.locks).add_robot("sold")
+    settings.remember(folder.path, settings.settings_of({"estig": estig}, "127.0.0.1", [], simulate=False))
+    await backups.create(tmp_path / "older.tar.gz", folder, estig)
+    hosted_sites([estig, upstairs], folder.locks, hosts)
+    SiteLocks.open(folder.locks).add_robot("r7")
+    SiteLocks.open(folder.locks).remove("sold")
+    before = SiteLocks.open(folder.locks).users()
+    made, refused = await backups.restore(tmp_path / "older.tar.gz", folder, estig, replace=True)
+    assert (sorted(made.folders), refused) == (["secrets", "site"], ["sold"])
+    assert SiteLocks.open(folder.locks).users() == before
+    service = Credentials.read(SiteLocks.open(folder.locks).credentials("upstairs.map-service"))
+    async with backups.redis_of(folder, "estig", estig) as place:
+        redis = RedisConnection(place.redis_url, timeout_s=10.0, credentials=service)
+        assert await redis.read("PING")
+        await redis.aclose()
+
+
+async def test_locks_of_another_authority_are_replaced_by_those_of_the_backup(tmp_path):
+    estig, hosts = shutil.copytree(ESTIG, tmp_path / "site"), ["localhost", "127.0.0.1"]
+    for name in ("data", "fresh"):
+        folder = NodeFolder(tmp_path / name)
+        hosted_sites([estig], folder.locks, hosts)
+        folder.keys("estig")
+        settings.remember(folder.path, settings.settings_of({"estig": estig}, "127.0.0.1", [], simulate=False))
+    original = NodeFolder(tmp_path / "data")
+    await backups.create(tmp_path / "older.tar.gz", original, estig)
+    made, _ = await backups.restore(tmp_path / "older.tar.gz", folder, estig, replace=True)
+    assert backups.LOCKS in made.folders
+    assert (folder.locks / "authority.pem").read_bytes() == (original.locks / "authority.pem").read_bytes()
 
 
 def hosted(name: str, pid: int, data: Path) -> System:

@@ -286,6 +286,25 @@ def test_making_locks_again_changes_no_password_even_of_a_robot_whose_file_was_h
     assert not locks.credentials("r1").exists()
 
 
+def test_users_whom_the_servers_lists_lack_are_admitted_again_with_the_passwords_of_their_credentials(tmp_path):
+    locks = SiteLocks(tmp_path, "lab")
+    locks.make(HOSTS)
+    older = {program: (locks.folder(program) / "users").read_text() for program in ("mosquitto", "redis", "zenoh")}
+    locks.add_floor("upstairs", robots=["r1"])
+    service = Credentials.read(locks.credentials("upstairs.map-service")).passwords
+    robot = Credentials.read(locks.credentials("upstairs.r1")).passwords
+    for program, text in older.items():
+        (locks.folder(program) / "users").write_text(text)
+    locks.make(HOSTS)
+    locks.add_floor("upstairs", robots=["r1"])
+    listed = (locks.folder("zenoh") / "users").read_text().splitlines()
+    assert f"upstairs.map-service:{service['zenoh']}" in listed
+    assert f"upstairs.r1:{robot['zenoh']}" in listed
+    for program in ("mosquitto", "redis"):
+        assert "upstairs.map-service" in (locks.folder(program) / "users").read_text()
+    assert Credentials.read(locks.credentials("upstairs.map-service")).passwords == service
+
+
 def test_a_robot_is_added_replaced_and_removed(tmp_path):
     locks = SiteLocks(tmp_path, "lab")
     locks.make(HOSTS)

@@ -33,7 +33,7 @@ UpOption = Annotated[
 ReplaceOption = Annotated[bool, typer.Option("--replace", help="Replace what is there already.")]
 
 
-def backup_command(  # each option is an argument
+def backup_command(
     file: FileArgument,
     *,
     site: SiteOption = None,
@@ -101,10 +101,15 @@ def _create_of_node(file: Path, up: Path, site: Path | None) -> Backup:
 
 
 def _restore_into_node(file: Path, up: Path, site: Path, *, replace: bool) -> Backup:
-    from fognav.hosting.backups import restore  # noqa: PLC0415  # keeps the other commands fast
+    from fognav.hosting.backups import LOCKS, restore  # noqa: PLC0415  # keeps the other commands fast
     from fognav.hosting.folders import NodeFolder  # noqa: PLC0415  # same
 
-    return asyncio.run(restore(file, NodeFolder(up), site, replace=replace))
+    made, refused = asyncio.run(restore(file, NodeFolder(up), site, replace=replace))
+    if LOCKS not in made.folders:
+        print_line(f"the locks in {up} stay: they have the same authority, and what was added since")
+    if refused:
+        print_line(f"they do not admit {', '.join(refused)}, whom the backup has: add them again, if they shall be")
+    return made
 
 
 def _place(redis: str, name: str, site: Path, secrets: Path | None, data: Path) -> backup.Place:

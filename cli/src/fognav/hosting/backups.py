@@ -6,7 +6,7 @@ Redis runs meanwhile.
 
 import asyncio
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Final
@@ -15,7 +15,8 @@ from fog_runtime import backup
 from fog_runtime.access.credentials import Credentials
 from fog_runtime.backup_archive import Backup, read_archive
 from fog_runtime.files import atomic_write
-from fog_runtime.locks.site_locks import SiteLocks
+from fog_runtime.locks.server_files import ANYBODY, USERS, user_of
+from fog_runtime.locks.site_locks import AUTHORITY, SiteLocks
 from fog_runtime.locks.users import REDIS_ADMINISTRATOR, on_floor
 from fog_supervisor import net, servers
 from fog_supervisor.supervisor import Event, Supervisor
@@ -50,10 +51,14 @@ async def create(file: Path, folder: NodeFolder, directory: Path | None) -> Back
         return await backup.create(file, place, time.time())
 
 
-async def restore(file: Path, folder: NodeFolder, directory: Path, *, replace: bool) -> Backup:
+async def restore(
+    file: Path, folder: NodeFolder, directory: Path, *, replace: bool
+) -> tuple[Backup, Sequence[str]]:
     """Restore a backup of one site, whose folder is to be `directory`, while the node is down.
 
-    Raises `FailedError` while it runs, `BackupError`, and as `redis_of`.
+    With `replace`, locks of the same authority stay: they are those of all sites, and newer. Returns what was restored,
+    and whom the backup's locks would have admitted besides. Raises `FailedError` while the node runs, `BackupError`,
+    and as `redis_of`.
     """
     with folder.in_use():
         archive = await asyncio.to_thread(read_archive, file)
@@ -61,8 +66,26 @@ async def restore(file: Path, folder: NodeFolder, directory: Path, *, replace: b
             # Redis needs them to start; where there are none, nothing is replaced.
             for name, content in archive.folders.get(LOCKS, {}).items():
                 atomic_write(folder.locks / name, content.data, mode=content.mode)
+        stay = replace and _same_authority(archive, folder.locks)
+        refused = sorted(_users(archive) - SiteLocks.open(folder.locks).users()) if stay else []
         async with redis_of(folder, archive.site, directory) as place:
-            return await backup.restore(file, place, replace=replace)
+            return await backup.restore(file, place, replace=replace, keep={LOCKS} if stay else ()), refused
+
+
+def _same_authority(archive: Backup, locks: Path) -> bool:
+    """Whether somebody who trusts the backup's servers may trust those of the locks here, too."""
+    file, own = archive.folders.get(LOCKS, {}).get(AUTHORITY), locks / AUTHORITY
+    return file is not None and own.exists() and not _certificates(file.data).isdisjoint(_certificates(own.read_bytes()))
+
+
+def _certificates(authority: bytes) -> set[bytes]:
+    return set(authority.split(b"-----BEGIN CERTIFICATE-----")[1:])
+
+
+def _users(archive: Backup) -> set[str]:
+    """Return everybody whom a server of the backup's locks admits."""
+    lists = [file.data.decode() for name, file in archive.folders[LOCKS].items() if Path(name).name == USERS]
+    return {user_of(line) for text in lists for line in text.splitlines()} - {ANYBODY}
 
 
 @asynccontextmanager

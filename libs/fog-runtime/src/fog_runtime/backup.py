@@ -25,7 +25,7 @@ from fog_runtime.stores.redis_connection import Command, RedisConnection, StoreE
 from fog_runtime.version import VERSION
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Collection, Sequence
 
 SITE: Final = "site"
 SECRETS: Final = "secrets"
@@ -66,12 +66,14 @@ async def create(file: Path, place: Place, now: float) -> Backup:
     return backup
 
 
-async def restore(file: Path, place: Place, *, replace: bool) -> Backup:
+async def restore(file: Path, place: Place, *, replace: bool, keep: Collection[str] = ()) -> Backup:
     """Restore a backup into Redis and into the folders; everything is checked before anything is changed.
 
-    What is there already is only replaced with `replace`. Raises `BackupError`.
+    What is there already is only replaced with `replace`, and the folders named in `keep` are not touched at all.
+    Returns what was restored. Raises `BackupError`.
     """
     backup = await asyncio.to_thread(read_archive, file)
+    backup = backup._replace(folders={name: files for name, files in backup.folders.items() if name not in keep})
     if unknown := sorted(set(backup.folders) - set(place.folders)):
         raise BackupError(f"{file} has a folder {unknown[0]!r}, for which there is no place: name it by its variable")
     redis = RedisConnection(place.redis_url, timeout_s=_TIMEOUT_S, credentials=place.credentials)

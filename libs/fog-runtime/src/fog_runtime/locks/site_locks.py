@@ -101,7 +101,7 @@ class SiteLocks:
         own[users.REDIS_ADMINISTRATOR] = ("redis",)
         own[users.HEALTH] = SERVERS
         own |= dict.fromkeys(self._plan.unrestricted, ("mqtt", "zenoh"))
-        self._set_users(_without_passwords(own, self.credentials) | self._not_yet_admitted(robots, nodes))
+        self._set_users(_locked_out(own, self._files, self.credentials) | self._not_yet_admitted(robots, nodes))
         self._write_rights_in_redis()
         self._write_access()
 
@@ -115,7 +115,7 @@ class SiteLocks:
             self._save(msgspec.structs.replace(self._plan, floors=[*self._plan.floors, site]))
         own = {users.on_floor(site, name): servers for name, servers in {**users.SERVICES, **users.TOOLS}.items()}
         members = ([users.on_floor(site, each) for each in kind] for kind in (robots, nodes))
-        self._set_users(_without_passwords(own, self.credentials) | self._not_yet_admitted(*members))
+        self._set_users(_locked_out(own, self._files, self.credentials) | self._not_yet_admitted(*members))
         self._write_access()
 
     def _not_yet_admitted(self, robots: Sequence[str], nodes: Sequence[str]) -> dict[str, Sequence[Server]]:
@@ -252,15 +252,17 @@ class SiteLocks:
 
     def _add(self, user: str, servers: Sequence[Server]) -> Path:
         self._members.require_free_name(user)
-        self._set_users({user: servers})
+        self._set_users({user: servers}, anew=True)
         self._write_access()
         return self.credentials(user)
 
-    def _set_users(self, added: Mapping[str, Sequence[Server]]) -> None:
-        """Give each of these users new passwords for these servers."""
+    def _set_users(self, added: Mapping[str, Sequence[Server]], *, anew: bool = False) -> None:
+        """Admit these users to these servers; with `anew`, or where none are here, they get new passwords."""
         trusted = self.authority.trusted
+        known = {user: {} if anew else _passwords(self.credentials(user)) for user in added}
         passwords: dict[str, dict[Server, str]] = {
-            user: {server: users.new_password() for server in servers} for user, servers in added.items()
+            user: {server: known[user].get(server) or users.new_password() for server in servers}
+            for user, servers in added.items()
         }
         for server, program in _PROGRAM_OF.items():
             new = [
@@ -284,11 +286,8 @@ class SiteLocks:
         for line in self._files.lines("redis"):
             if (user := user_of(line)) == ANYBODY:
                 continue
-            file = self.credentials(user)
-            known = file.exists()
-            lines.append(
-                users.line("redis", user, Credentials.read(file).passwords["redis"], self._plan.site) if known else line
-            )
+            password = _passwords(self.credentials(user)).get("redis")
+            lines.append(line if password is None else users.line("redis", user, password, self._plan.site))
         self._files.write_lines("redis", lines)
 
     def _write_access(self) -> None:
@@ -307,12 +306,23 @@ def _read_plan(folder: Path) -> _Plan:
     return msgspec.json.decode((folder / _PLAN).read_bytes(), type=_Plan)
 
 
-def _without_passwords(
-    own: Mapping[str, Sequence[Server]], file_of: Callable[[str], Path]
+def _locked_out(
+    own: Mapping[str, Sequence[Server]], files: ServerFiles, file_of: Callable[[str], Path]
 ) -> dict[str, Sequence[Server]]:
-    """Return who of these lacks a password; other versions may have made the credentials that are there."""
-    known = {user: Credentials.read(file).passwords for user in own if (file := file_of(user)).exists()}
-    return {user: servers for user, servers in own.items() if not set(servers) <= set(known.get(user, ()))}
+    """Return who of these lacks a password, or a place in a server's list.
+
+    Another version may have made the credentials that are there, and an older backup the lists.
+    """
+    admitted = {server: set(files.members(program)) for server, program in _PROGRAM_OF.items()}
+    return {
+        user: servers
+        for user, servers in own.items()
+        if not set(servers) <= set(_passwords(file_of(user))) or any(user not in admitted[each] for each in servers)
+    }
+
+
+def _passwords(file: Path) -> Mapping[Server, str]:
+    return Credentials.read(file).passwords if file.exists() else {}
 
 
 def _now() -> dt.datetime:

@@ -90,6 +90,20 @@ def test_changed_pins_version_or_members_trigger_the_set_up_again(checkout: Path
     assert len(uv_log(checkout)) > calls
 
 
+def test_set_up_that_failed_half_way_is_done_again_when_the_checkout_is_back(checkout: Path) -> None:
+    start(checkout / "fognav", checkout)
+    pins, uv = checkout / "requirements" / "dev.txt", checkout.parent / "tools" / "uv"
+    before, works = pins.read_text(), uv.read_text()
+    pins.write_text("pinned==2 --hash=sha256:0\n")
+    uv.write_text(works + 'case "$*" in *--editable*) exit 2;; esac\n')
+    assert start(checkout / "fognav", checkout).returncode == 1
+    pins.write_text(before)
+    uv.write_text(works)
+    calls = len(uv_log(checkout))
+    assert start(checkout / "fognav", checkout).returncode == 0
+    assert any("requirements/dev.txt" in call for call in uv_log(checkout)[calls:])
+
+
 def test_lock_of_a_dead_process_is_removed(checkout: Path) -> None:
     ended = subprocess.Popen(["true"])
     ended.wait()

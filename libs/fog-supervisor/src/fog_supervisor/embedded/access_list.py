@@ -1,10 +1,14 @@
-"""Mosquitto's `acl_file` and `password_file`, evaluated as Mosquitto does."""
+"""Mosquitto's `acl_file` and `password_file`, evaluated as Mosquitto does.
+
+Of an `acl_file` only what Fognav writes: a right in each line, `%u` as the only variable of a `pattern`, and a name for
+everybody who is admitted.
+"""
 
 import base64
 import binascii
 import hashlib
 import hmac
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import zip_longest
 from typing import Literal, Self
@@ -36,12 +40,28 @@ class _Rules:
     denied: list[_Levels] = field(default_factory=list)
 
     def add(self, access: str, topic: str) -> None:
+        """Add a line's topic; raises `ValueError` for an unknown access."""
         levels = tuple(topic.split("/"))
-        if access == "deny":
-            self.denied.append(levels)
-        for right in ("read", "write") if access == "readwrite" else (access,):
-            if right in self.allowed:
-                self.allowed[right].append(levels)
+        match access:
+            case "deny":
+                self.denied.append(levels)
+            case "readwrite":
+                self.allowed["read"].append(levels)
+                self.allowed["write"].append(levels)
+            case "read" | "write":
+                self.allowed[access].append(levels)
+            case _:
+                raise ValueError(f"{access!r} is no access")
+
+    def allow(self, right: Right, topic: Sequence[str], user: str) -> bool | None:
+        """Whether these lines, in which `%u` is the user, allow a topic or deny it; None if none says anything."""
+        if _covered(self.denied, topic, user):
+            return False
+        return _covered(self.allowed[right], topic, user) or None
+
+
+def _covered(patterns: Iterable[_Levels], topic: Sequence[str], user: str) -> bool:
+    return any(matches([user if level == "%u" else level for level in each], topic) for each in patterns)
 
 
 class AccessList:
@@ -59,25 +79,30 @@ class AccessList:
         for line in text.splitlines():
             word, _, rest = line.strip().partition(" ")
             match word:
-                case "" | "#":
+                case _ if not word or word.startswith("#"):
                     continue
                 case "user":
                     rules = made._users.setdefault(rest.strip(), _Rules())
                 case "topic" | "pattern":
                     access, _, topic = rest.strip().partition(" ")
-                    (made._patterns if word == "pattern" else rules).add(access, topic.strip())
+                    try:
+                        (made._patterns if word == "pattern" else rules).add(access, topic.strip())
+                    except ValueError as error:
+                        raise _unknown(line) from error
                 case _:
-                    raise ValueError(f"{line!r} is no line of an access list: write it again (fognav ca create)")
+                    raise _unknown(line)
         return made
 
     def allows(self, user: str, right: Right, topic: str) -> bool:
         """Whether a user may publish or receive on a topic, or on each topic of a filter."""
         levels = topic.split("/")
-        rules = self._users.get(user, _Rules())
-        if any(matches(each, levels) for each in rules.denied):
-            return False
-        patterns = (tuple(user if level == "%u" else level for level in each) for each in self._patterns.allowed[right])
-        return any(matches(each, levels) for each in (*rules.allowed[right], *patterns))
+        own = self._users.get(user, _Rules()).allow(right, levels, "%u")  # which is no variable there
+        # What a user's own lines say goes before the patterns of all.
+        return bool(self._patterns.allow(right, levels, user) if own is None else own)
+
+
+def _unknown(line: str) -> ValueError:
+    return ValueError(f"{line!r} is no line of an access list: write it again (fognav ca create)")
 
 
 class Passwords:

@@ -1,4 +1,7 @@
-"""Every command that a document tells people to type has the options and arguments that it is given there."""
+"""Every command that a document tells people to type exists, and has the options that it is given there.
+
+Their values, and a command's arguments, are not looked at.
+"""
 
 import re
 import shlex

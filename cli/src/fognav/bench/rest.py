@@ -37,7 +37,7 @@ IDLE_S: Final = 5.0
 _READY_S: Final = 120.0
 
 
-async def measure(  # all that a run consists of, by name
+async def measure(
     folder: Path, floor: StaticMap, *, zones: int, clients: int, seconds: float, idle_s: float = IDLE_S
 ) -> dict[str, float | int | dict[str, int]]:
     """Return the gaps between heartbeats (ms), without clients (`idle_`) and with them, and what these were answered.

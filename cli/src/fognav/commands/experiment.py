@@ -170,7 +170,7 @@ def _print_played(name: str, played: Played) -> None:
 
 
 @experiment_app.command("film", epilog="Example: fognav experiment film drive.gif --from drives --run 2 --route ab")
-def film_command(  # each option is an argument
+def film_command(
     out: Annotated[Path, typer.Argument(metavar="FILE.gif", help="File of the film.")],
     *,
     source: Annotated[Path, typer.Option("--from", metavar="DIR", help="Folder of the records.")],

@@ -70,9 +70,7 @@ def up_command(  # noqa: PLR0913  # each option is an argument
             _run(folders, folder, bind, host or [], sim=sim, check=check)
 
 
-def _run(  # the options
-    folders: list[Path], folder: "NodeFolder", bind: str, hosts: list[str], *, sim: bool, check: bool
-) -> None:
+def _run(folders: list[Path], folder: "NodeFolder", bind: str, hosts: list[str], *, sim: bool, check: bool) -> None:
     from fognav.hosting.floors import hosted_sites  # noqa: PLC0415  # keeps the other commands fast
     from fognav.hosting.node import NodeConfig  # noqa: PLC0415  # same
     from fognav.hosting.running import run_node  # noqa: PLC0415  # same

@@ -7,14 +7,18 @@ connected to it connects again.
 
 import hashlib
 import signal
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
 from fog_supervisor.supervisor import Supervisor
+from fognav.output import FailedError
 from fognav.programs import BROKER
 
 _REREAD_ON: Final[Mapping[str, signal.Signals]] = {BROKER: signal.SIGHUP}
+_READY_S: Final = 180.0
+"""How long a restarted program may take before the others are brought up to date without it."""
 
 
 class LockChanges:
@@ -27,13 +31,25 @@ class LockChanges:
         self._in_force = {name: self._digest(name) for name in files}
         self._seen = dict(self._in_force)
         self._restarting: str | None = None
+        self._restarted_at = 0.0
 
     async def round(self) -> str | None:
-        """Bring the changes of one program into force; return its name, or None. Raises `OSError`."""
+        """Bring the changes of one program into force; return its name, or None.
+
+        Raises `OSError`, and once for each restart `FailedError`, if the program does not become ready after it.
+        """
         if self._restarting is not None:
-            if await self._supervisor.missing([self._restarting]):
+            name = self._restarting
+            missing = await self._supervisor.missing([name])
+            late = time.monotonic() - self._restarted_at > _READY_S
+            if missing and not late:
                 return None  # never two at once
             self._restarting = None
+            if missing:
+                raise FailedError(
+                    f"{name} is not ready {_READY_S:.0f} s after its restart with them ({missing[name]}). Its log says "
+                    f"why (fognav logs {name}); the other programs get theirs"
+                )
         for name in self._files:
             found, before = self._digest(name), self._seen[name]
             self._seen[name] = found
@@ -50,7 +66,7 @@ class LockChanges:
             return  # it died, and reads them at its next start
         number = _REREAD_ON.get(name)
         if number is None:
-            self._restarting = name
+            self._restarting, self._restarted_at = name, time.monotonic()
             await self._supervisor.restart(name)
         else:
             self._supervisor.kill(name, number)

@@ -4,12 +4,14 @@ import asyncio
 import contextlib
 import socket
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Final
 
 from fog_runtime.machine import signals
 from fog_runtime.machine.service_manager import ServiceManager
 from fog_supervisor.supervisor import Event
 from fognav.hosting import log_files
+from fognav.hosting.lock_changes import LockChanges
 from fognav.hosting.node import LocalNode, NodeConfig
 from fognav.operate.registry import Registration
 from fognav.output import FailedError
@@ -43,7 +45,8 @@ class Troubles:
 async def run_node(config: NodeConfig, print_line: Callable[[str], None], *, check: bool = False) -> None:
     """Run a fog node until a signal, or with `check` until everything is ready; then end all its programs.
 
-    Raises `FailedError` when a port is taken, `NotReadyError` when a program does not become ready, and as `LocalNode`.
+    Raises `FailedError` when a port is taken or a signal cuts the check short, `NotReadyError` when a program does not
+    become ready, and as `LocalNode`.
     """
 
     def say(line: str) -> None:
@@ -67,18 +70,17 @@ async def run_node(config: NodeConfig, print_line: Callable[[str], None], *, che
     try:
         require_free_ports(node)
         async with node.supervisor:
-            with contextlib.ExitStack() as entries:
-                registrations = [_registration(node, index) for index in range(len(config.sites))]
-                for each in registrations:
-                    entries.enter_context(each)
-                    each.update()
+            with _registered(node) as registrations:
+                changes = node.lock_changes()  # before the start: programs may have read what changes during it
                 await node.start(READY_S)
                 _announce(node, print_line)
                 if not check:
-                    await attend(node, registrations, say)
+                    await attend(node, registrations, changes, say)
     except asyncio.CancelledError:
         if not stopped:
             raise
+        if check:
+            raise FailedError("a signal ended the check before it was done: repeat it (fognav up --check)") from None
         print_line("the fog node has ended; its data stays in " + str(config.folder.path))
     finally:
         node.remove_devices()
@@ -86,17 +88,23 @@ async def run_node(config: NodeConfig, print_line: Callable[[str], None], *, che
             loop.remove_signal_handler(number)
 
 
-def _registration(node: LocalNode, index: int) -> Registration:
-    site = node.config.sites[index]
-    return Registration(lambda: node.system(site))
+@contextlib.contextmanager
+def _registered(node: LocalNode) -> Iterator[list[Registration]]:
+    """Enter each site of the node into the register; yield the entries, in the order of the sites."""
+    with contextlib.ExitStack() as entries:
+        registrations = [entries.enter_context(Registration(partial(node.system, site))) for site in node.config.sites]
+        for each in registrations:
+            each.update()
+        yield registrations
 
 
-async def attend(node: LocalNode, registrations: list[Registration], print_line: Callable[[str], None]) -> None:
+async def attend(
+    node: LocalNode, registrations: list[Registration], changes: LockChanges, print_line: Callable[[str], None]
+) -> None:
     """Keep the register and the service manager informed, and the logs bounded; robots need none of that to drive."""
     manager = ServiceManager()
     manager.ready()
     troubles = Troubles(print_line)
-    changes = node.lock_changes()
     while True:
         with troubles.told("changed locks are not in force"):
             if (changed := await changes.round()) is not None:

@@ -2,7 +2,9 @@
 
 import asyncio
 import errno
+import os
 import shutil
+import signal
 import socket
 import stat
 import time
@@ -11,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
 from fog_runtime import backup
 from fog_runtime.access.credentials import Credentials
@@ -18,7 +21,8 @@ from fog_runtime.backup_archive import STAMP, BackupError
 from fog_runtime.locks.site_locks import SiteLocks
 from fog_runtime.stores.redis_connection import RedisConnection
 from fog_supervisor.supervisor import Program, Supervisor
-from fognav.hosting import backups, local_nodes, log_files, running, settings, unit
+from fognav.__main__ import app
+from fognav.hosting import backups, local_nodes, lock_changes, log_files, running, settings, unit
 from fognav.hosting.floors import hosted_sites
 from fognav.hosting.folders import FORMAT, NodeFolder, default_data
 from fognav.hosting.lock_changes import LockChanges
@@ -148,7 +152,7 @@ async def test_bookkeeping_that_fails_is_told_once_and_ends_nothing(node, tmp_pa
     told: list[str] = []
     site = node.config.sites[0]
     with Registration(lambda: node.system(site)) as registration:
-        attending = asyncio.create_task(running.attend(node, [registration], told.append))
+        attending = asyncio.create_task(running.attend(node, [registration], node.lock_changes(), told.append))
         try:
             await until(lambda: len(told) >= 2)
             assert "site estig" in told[0]
@@ -169,6 +173,35 @@ async def test_bookkeeping_that_fails_is_told_once_and_ends_nothing(node, tmp_pa
         finally:
             attending.cancel()
             await asyncio.wait({attending})
+
+
+async def test_check_that_a_signal_ends_has_failed(node, tmp_path, monkeypatch):
+    async def start(_: LocalNode, timeout_s: float) -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+        await asyncio.sleep(timeout_s)
+
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setattr(running, "require_free_ports", lambda _: None)
+    monkeypatch.setattr(LocalNode, "start", start)
+    with pytest.raises(FailedError, match="ended the check"):
+        await running.run_node(node.config, lambda _: None, check=True)
+    await running.run_node(node.config, lambda _: None)
+
+
+async def test_locks_that_change_while_the_node_starts_come_into_force(node, tmp_path, monkeypatch):
+    async def start(started: LocalNode, _: float) -> None:
+        started.config.locks.add_robot("r7")
+
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setattr(running, "PERIOD_S", 0.01)
+    monkeypatch.setattr(running, "require_free_ports", lambda _: None)
+    monkeypatch.setattr(LocalNode, "start", start)
+    told: list[str] = []
+    running_node = asyncio.create_task(running.run_node(node.config, told.append))
+    await until(lambda: "the locks have changed: zenoh-router uses the new ones" in told or running_node.done())
+    running_node.cancel()
+    await asyncio.wait({running_node})
+    assert "the locks have changed: zenoh-router uses the new ones" in told
 
 
 def test_log_is_cut_without_a_copy_on_a_full_disk(tmp_path):
@@ -260,6 +293,19 @@ async def test_older_backup_of_one_floor_locks_nobody_out_who_was_added_since(tm
         await redis.aclose()
 
 
+def test_backup_of_a_node_takes_a_site_by_its_name(tmp_path):
+    folder = NodeFolder(tmp_path / "data")
+    hosted_sites([ESTIG], folder.locks, ["localhost", "127.0.0.1"])
+    folder.keys("estig")
+    settings.remember(folder.path, settings.settings_of({"estig": ESTIG}, "127.0.0.1", [], simulate=False))
+    file = tmp_path / "estig.tar.gz"
+    done = CliRunner().invoke(app, ["backup", str(file), "--up", str(folder.path), "--site", "estig"])
+    assert (done.exit_code, file.exists()) == (0, True), done.output
+    done = CliRunner().invoke(app, ["backup", str(file), "--up", str(folder.path), "--site", "cellar"])
+    assert done.exit_code != 0
+    assert "name one of the sites" in " ".join(done.output.split())
+
+
 async def test_locks_of_another_authority_are_replaced_by_those_of_the_backup(tmp_path):
     estig, hosts = shutil.copytree(ESTIG, tmp_path / "site"), ["localhost", "127.0.0.1"]
     for name in ("data", "fresh"):
@@ -303,6 +349,10 @@ def test_start_of_a_node_is_remembered_with_its_options_and_ports(tmp_path, monk
     assert found == made
     assert found.arguments == ["--site", str(ESTIG), "--bind", "127.0.0.2", "--host", "fog.local", "--sim"]
     assert found.environment["FOGNAV_MAP_PORT"] == "9002"
+    monkeypatch.setenv("FOGNAV_MAP_PORT", "9003")
+    assert found.command(Path("/my data")) == (
+        f"FOGNAV_MAP_PORT=9002 ./fognav up --site {ESTIG} --bind 127.0.0.2 --host fog.local --sim --data '/my data'"
+    )
     (tmp_path / settings.FILE).write_text("{")
     with pytest.raises(FailedError, match="start it once"):
         settings.recall(tmp_path)
@@ -332,3 +382,27 @@ async def test_changed_locks_reach_their_program_alone_and_once(tmp_path):
         assert [await changes.round() for _ in range(2)] == [None, "planner"]
         await until(lambda: logs["planner"].read_text() == "started\nstarted\n")
         assert logs["mosquitto"].read_text() == "started\ntold\n"
+
+
+async def test_program_that_stays_unready_is_told_once_and_holds_no_other_back(tmp_path, monkeypatch):
+    async def never() -> str | None:
+        return "its port is closed"
+
+    folders = {name: tmp_path / name for name in ("zenoh-router", "planner")}
+    async with Supervisor(lambda _: None) as supervisor:
+        for name, folder in folders.items():
+            folder.mkdir()
+            (folder / "users").write_text("somebody")
+            program = ("/bin/sleep", "600")
+            supervisor.add(Program(name=name, arguments=program, log=tmp_path / f"{name}.log", ready=never))
+            supervisor.start(name)
+        await until(lambda: all(supervisor.pid(name) for name in folders))
+        changes = LockChanges(supervisor, {name: [folder] for name, folder in folders.items()})
+        for folder in folders.values():
+            (folder / "users").write_text("r2")
+        assert [await changes.round() for _ in range(3)] == [None, "zenoh-router", None]
+        await until(lambda: supervisor.pid("zenoh-router"))
+        monkeypatch.setattr(lock_changes, "_READY_S", 0.0)
+        with pytest.raises(FailedError, match=r"zenoh-router is not ready .*its port is closed"):
+            await changes.round()
+        assert await changes.round() == "planner"

@@ -8,11 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from fognav.hosting import settings, unit, upgrading
+from fognav.hosting import local_nodes, settings, unit, upgrading
 from fognav.hosting.floors import hosted_sites
 from fognav.hosting.folders import NodeFolder
+from fognav.hosting.local_nodes import RunningNode
 from fognav.hosting.upgrading import BACKUPS, Upgrade
 from fognav.hosting.versions import Versions
+from fognav.operate.registry import System
 from fognav.output import FailedError, WrongUseError
 
 ESTIG = Path(__file__).parents[2] / "sites" / "estig"
@@ -60,11 +62,14 @@ def folder(tmp_path: Path) -> NodeFolder:
 
 
 @pytest.fixture
-def started(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """What was started again; no node runs, and systemd does not know one."""
+def started(folder: NodeFolder, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """What was started again: systemd runs this node, and a terminal another one."""
     found: list[str] = []
-    monkeypatch.setattr(upgrading, "running_nodes", list)
-    monkeypatch.setattr(unit, "is_active", lambda: True)
+    nodes = [RunningNode(1, folder.path, ["fog-estig"]), RunningNode(2, folder.path / "other", ["fog-other"])]
+    monkeypatch.setattr(upgrading, "running_nodes", lambda: nodes)
+    monkeypatch.setattr(upgrading, "end_node", lambda pid: found.append(f"end {pid}"))
+    monkeypatch.setattr(upgrading, "systems_of", lambda _: [])
+    monkeypatch.setattr(unit, "runs", lambda pid: pid == 1)
     monkeypatch.setattr(unit, "start", lambda: found.append("unit"))
     return found
 
@@ -83,14 +88,14 @@ def test_upgrade_makes_a_backup_tries_the_new_version_and_keeps_the_data(add_ver
     assert versions.changes(new) == ["version new"]
     token = (folder.path / "keys" / "estig" / "admin.token").read_text()
     told: list[str] = []
-    Upgrade(folder, versions, told.append).run(versions.commit(new))
+    Upgrade(folder, versions, told.append).run(versions.named(new))
     assert git(root, "rev-parse", "HEAD") == new
     assert calls(root) == ["new --version", "new up"]
     assert (folder.path / "keys" / "estig" / "admin.token").read_text() == token
     assert (folder.path / "data" / "redis" / "written-by").read_text() == "new\n"
     (backup,) = (folder.path / BACKUPS).glob("*-estig.tar.gz")
     assert f"backup: {backup}" in told
-    assert started == ["unit"]
+    assert started == ["end 1", "unit"]
     assert not folder.path.with_name("data.before-upgrade").exists()
     with pytest.raises(WrongUseError, match="not newer"):
         versions.changes(old)
@@ -109,7 +114,7 @@ def test_version_that_fails_leaves_version_and_data_of_before(add_version, folde
     assert git(root, "rev-parse", "HEAD") == old
     assert calls(root)[-1] == "old --version"  # its environment is there again, too
     assert (folder.path / "data" / "redis" / "written-by").read_text() == "old\n"
-    assert started == ["unit"]
+    assert started == ["end 1", "unit"]
     assert not folder.path.with_name("data.before-upgrade").exists()
 
 
@@ -125,7 +130,7 @@ def test_own_changes_of_files_stay_or_stop_the_upgrade(add_version, folder, star
     with pytest.raises(FailedError, match=r"site\.toml"):
         Upgrade(folder, Versions(root), lambda _: None).run(new)
     assert (git(root, "rev-parse", "HEAD"), (root / "site.toml").read_text()) == (old, "mine")
-    assert started == ["unit"]
+    assert started == ["end 1", "unit"]
 
 
 @pytest.mark.live
@@ -138,7 +143,7 @@ def test_data_that_cannot_be_copied_aside_changes_nothing_and_leaves_no_copy(add
     with pytest.raises(FailedError, match="nothing was changed"):
         Upgrade(folder, Versions(root), lambda _: None).run(new)
     assert git(root, "rev-parse", "HEAD") == old
-    assert started == ["unit"]
+    assert started == ["end 1", "unit"]
     assert not folder.path.with_name("data.before-upgrade").exists()
 
 
@@ -155,6 +160,54 @@ def test_newest_version_is_the_highest_release(add_version, tmp_path):
         add_version(name)
         git(root, "tag", name)
     versions = Versions(root)
-    assert versions.newest() == versions.commit("v0.10.0")
-    with pytest.raises(FailedError, match="v9"):
-        versions.commit("v9")
+    assert versions.newest() == versions.named("v0.10.0")
+    with pytest.raises(FailedError, match=r"no version v9: name one of the releases \(v0\.10\.0, v0\.9\.0"):
+        versions.named("v9")
+
+
+def test_branch_and_release_are_fetched_before_they_are_named(add_version, tmp_path):
+    root, clone = tmp_path / "checkout", tmp_path / "clone"
+    old = add_version("old")
+    git(root, "branch", "-M", "main")
+    git(tmp_path, "clone", "-q", str(root), str(clone))
+    new = add_version("new")
+    git(root, "tag", "v2.0.0")
+    versions = Versions(clone)
+    assert [versions.named(name) for name in ("main", "v2.0.0", old[:12])] == [new, new, old]
+    assert versions.current() == old
+
+
+def test_nothing_is_upgraded_under_a_demo_of_the_same_checkout(add_version, folder, monkeypatch, tmp_path):
+    root = tmp_path / "checkout"
+    old = add_version("old")
+    (root / ".venv" / "bin").mkdir(parents=True)
+    program = root / ".venv" / "bin" / "python"
+    program.symlink_to("/bin/sleep")
+    with subprocess.Popen([program, "600"]) as running, subprocess.Popen(["/bin/sleep", "600"]) as other:
+        systems = [
+            System(name=name, kind="demo", site="estig", urls={}, pids={"sim": each.pid})
+            for name, each in (("demo", running), ("elsewhere", other))
+        ]
+        monkeypatch.setattr(local_nodes, "registered", lambda: systems)
+        try:
+            with pytest.raises(FailedError, match=r"^demo would run on with parts of both versions"):
+                Upgrade(folder, Versions(root), lambda _: None).run(old)
+        finally:
+            running.kill()
+            other.kill()
+    assert not (folder.path / BACKUPS).exists()
+
+
+@pytest.mark.live
+def test_interrupted_copy_of_the_data_leaves_none_behind(add_version, folder, started, monkeypatch, tmp_path):
+    def copy(_: Path, to: Path, *, symlinks: bool) -> None:
+        assert symlinks
+        to.mkdir()
+        raise KeyboardInterrupt
+
+    old = add_version("old")
+    monkeypatch.setattr(upgrading.shutil, "copytree", copy)
+    with pytest.raises(FailedError, match="interrupted"):
+        Upgrade(folder, Versions(tmp_path / "checkout"), lambda _: None).run(old)
+    assert not folder.path.with_name("data.before-upgrade").exists()
+    assert started == ["end 1", "unit"]

@@ -13,6 +13,7 @@ from fog_runtime import backup
 from fog_runtime.access.credentials import CredentialsError
 from fog_runtime.backup_archive import Backup, BackupError, read_archive
 from fog_runtime.configuration.site import SiteError, load_site
+from fognav import checkout
 from fognav.locking import locks_errors, own_credentials
 from fognav.output import FailedError, WrongUseError, check_writable, exit_codes, print_line
 
@@ -93,18 +94,26 @@ def _required(folder: Path | None, option: str) -> Path:
     return folder
 
 
+def _named(site: Path | None) -> Path | None:
+    """Return a site's folder, also by its name in `sites/`; a folder without a site, to restore one, as it is."""
+    try:
+        return site and checkout.site_folder(site)
+    except WrongUseError:
+        return site
+
+
 def _create_of_node(file: Path, up: Path, site: Path | None) -> Backup:
     from fognav.hosting.backups import create  # noqa: PLC0415  # keeps the other commands fast
     from fognav.hosting.folders import NodeFolder  # noqa: PLC0415  # same
 
-    return asyncio.run(create(file, NodeFolder(up), site))
+    return asyncio.run(create(file, NodeFolder(up), _named(site)))
 
 
 def _restore_into_node(file: Path, up: Path, site: Path, *, replace: bool) -> Backup:
     from fognav.hosting.backups import LOCKS, restore  # noqa: PLC0415  # keeps the other commands fast
     from fognav.hosting.folders import NodeFolder  # noqa: PLC0415  # same
 
-    made, refused = asyncio.run(restore(file, NodeFolder(up), site, replace=replace))
+    made, refused = asyncio.run(restore(file, NodeFolder(up), _named(site) or site, replace=replace))
     if LOCKS not in made.folders:
         print_line(f"the locks in {up} stay: they have the same authority, and what was added since")
     if refused:

@@ -32,7 +32,7 @@ def upgrade_command(
     with exit_codes(), backup_errors():
         versions = Versions(checkout.root())
         current = versions.current()
-        to = versions.newest() if revision is None else versions.commit(revision)
+        to = versions.newest() if revision is None else versions.named(revision)
         if to == current:
             print_line(f"this is {current[:12]} already: nothing to upgrade")
             return

@@ -51,9 +51,7 @@ async def create(file: Path, folder: NodeFolder, directory: Path | None) -> Back
         return await backup.create(file, place, time.time())
 
 
-async def restore(
-    file: Path, folder: NodeFolder, directory: Path, *, replace: bool
-) -> tuple[Backup, Sequence[str]]:
+async def restore(file: Path, folder: NodeFolder, directory: Path, *, replace: bool) -> tuple[Backup, Sequence[str]]:
     """Restore a backup of one site, whose folder is to be `directory`, while the node is down.
 
     With `replace`, locks of the same authority stay: they are those of all sites, and newer. Returns what was restored,
@@ -75,7 +73,9 @@ async def restore(
 def _same_authority(archive: Backup, locks: Path) -> bool:
     """Whether somebody who trusts the backup's servers may trust those of the locks here, too."""
     file, own = archive.folders.get(LOCKS, {}).get(AUTHORITY), locks / AUTHORITY
-    return file is not None and own.exists() and not _certificates(file.data).isdisjoint(_certificates(own.read_bytes()))
+    return (
+        file is not None and own.exists() and not _certificates(file.data).isdisjoint(_certificates(own.read_bytes()))
+    )
 
 
 def _certificates(authority: bytes) -> set[bytes]:

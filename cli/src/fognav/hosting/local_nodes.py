@@ -40,6 +40,21 @@ def running_nodes() -> list[RunningNode]:
     ]
 
 
+def systems_of(checkout: Path) -> list[System]:
+    """Return the registered systems, fog nodes and others, with a program that runs the code of a checkout."""
+    environment = checkout / ".venv"
+    return [
+        each for each in registered() if any(_program(pid).is_relative_to(environment) for pid in each.pids.values())
+    ]
+
+
+def _program(pid: int) -> Path:
+    try:
+        return Path(next(iter(psutil.Process(pid).cmdline()), ""))
+    except (psutil.NoSuchProcess, psutil.AccessDenied):
+        return Path()
+
+
 def named_node(name: str | None, data: Path | None) -> RunningNode | None:
     """Return the node with a site's name in `fognav status` and this data folder, or the only one; None without any.
 

@@ -1,5 +1,6 @@
 """How a fog node was last started, in a file of its data folder, by which other commands back it up and start it."""
 
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
@@ -37,6 +38,12 @@ class NodeSettings(msgspec.Struct, frozen=True, kw_only=True):
         """The variables that give the ports."""
         return {name: str(number) for name, number in self.ports.items()}
 
+    def command(self, data: Path) -> str:
+        """Return what starts the node again from this shell, with the variables that it lacks."""
+        here = _ports()
+        lacking = [f"{name}={number}" for name, number in self.ports.items() if here.get(name) != number]
+        return shlex.join([*lacking, "./fognav", "up", *self.arguments, "--data", str(data)])
+
 
 def settings_of(sites: dict[str, Path], address: str, hosts: Sequence[str], *, simulate: bool) -> NodeSettings:
     """Return the settings of a node that is started from this shell."""
@@ -45,8 +52,12 @@ def settings_of(sites: dict[str, Path], address: str, hosts: Sequence[str], *, s
         address=address,
         hosts=list(hosts),
         simulate=simulate,
-        ports={setting[0]: port(setting) for setting in _PORTS},
+        ports=_ports(),
     )
+
+
+def _ports() -> dict[str, int]:
+    return {setting[0]: port(setting) for setting in _PORTS}
 
 
 def remember(folder: Path, settings: NodeSettings) -> None:

@@ -59,13 +59,14 @@ def write_unit(arguments: Sequence[str]) -> Path:
     return file
 
 
-def is_active() -> bool:
-    """Whether systemd runs the unit now."""
+def runs(pid: int) -> bool:
+    """Whether this process is the one that systemd runs as the unit."""
+    command = ["systemctl", "--user", "show", "--property=MainPID", "--value", NAME]
     try:
-        done = subprocess.run(["systemctl", "--user", "is-active", NAME], check=False, capture_output=True)
+        done = subprocess.run(command, check=False, capture_output=True, text=True)
     except OSError:
         return False  # a computer without systemd
-    return done.returncode == 0
+    return done.returncode == 0 and done.stdout.strip() == str(pid)
 
 
 def start() -> None:

@@ -11,7 +11,7 @@ from typing import Final
 
 from fognav.hosting import backups, unit
 from fognav.hosting.folders import NodeFolder
-from fognav.hosting.local_nodes import end_node, running_nodes
+from fognav.hosting.local_nodes import end_node, running_nodes, systems_of
 from fognav.hosting.settings import NodeSettings, recall
 from fognav.hosting.versions import Versions
 from fognav.output import FailedError
@@ -42,12 +42,14 @@ class Upgrade:
 
     def run(self, to: str) -> None:
         """Upgrade to a commit. Raises `FailedError` after everything is as it was before, or says what is not."""
+        self._require_nothing_else_runs()
         before = self._versions.current()
         for file in self._back_up():
             self._print_line(f"backup: {file}")
-        by_systemd = unit.is_active()
+        by_systemd = False
         for node in running_nodes():
             if node.data == self._folder.path:
+                by_systemd = by_systemd or unit.runs(node.pid)
                 end_node(node.pid)
         try:
             with self._folder.in_use():
@@ -62,7 +64,7 @@ class Upgrade:
             self._go_back(before)
             self._start_again(by_systemd=by_systemd)
             raise FailedError(
-                f"version {to[:12]} failed; version and data are those of before, {before[:12]}: {error}"
+                f"version {to[:12]} failed; version and data are those of before, {before[:12]}: {_reason(error)}"
             ) from error
         shutil.rmtree(self._kept)
         self._print_line(f"upgraded to {to[:12]}; it starts with all data")
@@ -72,12 +74,21 @@ class Upgrade:
         """Copy the data aside; raises `FailedError` and leaves no copy behind if it can't be."""
         try:
             shutil.copytree(self._folder.path, self._kept, symlinks=True)
-        except OSError as error:
+        except (OSError, KeyboardInterrupt) as error:
             shutil.rmtree(self._kept, ignore_errors=True)
             raise FailedError(
                 f"{self._folder.path} can't be copied beside itself, and nothing was changed; make room for it, and "
-                f"repeat the upgrade: {error}"
+                f"repeat the upgrade: {_reason(error)}"
             ) from error
+
+    def _require_nothing_else_runs(self) -> None:
+        """Raise `FailedError` if the files of other systems would change while they run."""
+        others = [each.name for each in systems_of(self._versions.root) if each.data != str(self._folder.path)]
+        if others:
+            raise FailedError(
+                f"{', '.join(others)} would run on with parts of both versions: nothing was changed. End first what "
+                f"else runs from {self._versions.root} (fognav down, Ctrl-C), or give it a checkout of its own"
+            )
 
     def _back_up(self) -> list[Path]:
         folder = self._folder.path / BACKUPS
@@ -120,5 +131,8 @@ class Upgrade:
             unit.start()
             self._print_line(f"{unit.NAME} runs again")
         else:
-            options = " ".join([*self._settings.arguments, "--data", str(self._folder.path)])
-            self._print_line(f"start it: ./fognav up {options}")
+            self._print_line(f"start it: {self._settings.command(self._folder.path)}")
+
+
+def _reason(error: BaseException) -> str:
+    return "it was interrupted" if isinstance(error, KeyboardInterrupt) else str(error)

@@ -1,5 +1,6 @@
 """The versions of the checkout: which one is there, which one is newest, and how to change it."""
 
+import contextlib
 import subprocess
 from pathlib import Path
 from typing import Final
@@ -8,6 +9,8 @@ from fognav.output import FailedError, WrongUseError
 
 _SET_UP_S: Final = 1800.0
 _GIT_S: Final = 300.0
+_SHOWN: Final = 5
+"""Releases that an error names."""
 
 
 class Versions:
@@ -28,13 +31,32 @@ class Versions:
 
         Raises `FailedError`.
         """
+        self._fetch()
+        tags = self._git("tag", "--list", "v*", "--sort=-version:refname").split()
+        return self._commit(f"refs/tags/{tags[0]}") if tags else self._commit("@{upstream}")
+
+    def named(self, version: str) -> str:
+        """Fetch, and return the commit of a tag, of a branch as it is at its remote, or of another revision.
+
+        Raises `FailedError`.
+        """
+        self._fetch()
+        remotes = [f"refs/remotes/{remote}/{version}" for remote in self._git("remote").split()]
+        for revision in (f"refs/tags/{version}", *remotes, version):
+            # What a name is not, it may still be in another way.
+            with contextlib.suppress(FailedError):
+                return self._commit(revision)
+        tags = self._git("tag", "--list", "v*", "--sort=-version:refname").split()
+        raise FailedError(
+            f"no version {version}: name one of the releases ({', '.join(tags[:_SHOWN]) or 'there is none yet'}), "
+            "a branch or a commit"
+        )
+
+    def _fetch(self) -> None:
         if self._git("remote"):
             self._git("fetch", "--quiet", "--tags")
-        tags = self._git("tag", "--list", "v*", "--sort=-version:refname").split()
-        return self.commit(tags[0]) if tags else self.commit("@{upstream}")
 
-    def commit(self, revision: str) -> str:
-        """Return the commit of a tag, branch or commit; raises `FailedError` if it is unknown."""
+    def _commit(self, revision: str) -> str:
         return self._git("rev-parse", "--verify", "--quiet", "--end-of-options", f"{revision}^{{commit}}")
 
     def changes(self, to: str) -> list[str]:
@@ -53,6 +75,11 @@ class Versions:
         """
         self._git("reset", "--quiet", "--keep", commit)
         self._run([str(self.launcher), "--version"], _SET_UP_S)
+
+    @property
+    def root(self) -> Path:
+        """The folder of the checkout."""
+        return self._root
 
     @property
     def launcher(self) -> Path:

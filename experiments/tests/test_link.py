@@ -7,7 +7,9 @@ from hypothesis import strategies as st
 
 from fog_contracts import channels as ch
 from fog_contracts.handlers import Publication
+from fog_contracts.messages import MapSnapshot
 from fognav_experiments.link import Link
+from fognav_experiments.processes import QUERY_TIMEOUT_S, AgentProcess
 from fognav_experiments.rigs import moment
 
 
@@ -65,3 +67,49 @@ def test_a_query_takes_the_delay_both_ways_and_is_lost_when_either_is_cut():
         setattr(link, cut, False)
         link.ask(lambda at: at.now, lambda asked, at: replies.append((asked, at.now)), moment(20.0))
     assert len(replies) == 2
+
+
+class Asking:
+    """A robot's core that always wants a map, and what it was given; beside it a bus that answers every query."""
+
+    def __init__(self):
+        self.loaded, self.asked = [], []
+
+    def handlers(self):
+        return {}
+
+    query_handlers = handlers
+
+    def wants_snapshot(self, _now):
+        return True
+
+    def load(self, _snapshot, now):
+        self.loaded.append(now)
+
+    def subscribe(self, *_, **__):
+        pass
+
+    serve = subscribe
+
+    def query(self, _channel, _request, _reply, at):
+        self.asked.append(at.now)
+        return MapSnapshot(
+            site="s", epoch=1, seq=1, hash="0" * 64, geometry=None, cost=b"", speed=b"", static=b"",
+        )  # fmt: skip
+
+
+def test_a_map_that_comes_after_its_query_has_timed_out_is_not_loaded():
+    robot = Asking()
+    process = AgentProcess(robot, "r1", robot)
+    process.link.delay_s = 2.0
+    for twentieth in range(200):
+        process.link.due(moment(twentieth / 20))
+        process.fetch_map(moment(twentieth / 20))
+    assert robot.asked == [2.0, 5.0, 8.0]
+    assert robot.loaded == []
+    process.link.delay_s = 0.4
+    for twentieth in range(200, 400):
+        process.link.due(moment(twentieth / 20))
+        process.fetch_map(moment(twentieth / 20))
+    assert robot.loaded
+    assert all(any(0.0 < now - asked <= QUERY_TIMEOUT_S for asked in robot.asked) for now in robot.loaded)

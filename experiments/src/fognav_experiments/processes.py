@@ -242,10 +242,17 @@ class AgentProcess:
     def fetch_map(self, at: Moment) -> None:
         """Ask for a snapshot if the core wants one and none is under way; call it 20 times a second."""
         if self.link.whole and self.core.wants_snapshot(at.now) and at.now >= self._map_due:
-            self._map_due = at.now + QUERY_TIMEOUT_S
-            self.link.ask(lambda when: self._bus.query(ch.MAP_SNAPSHOT, None, MapSnapshot, when), self._load, at)
+            until = self._map_due = at.now + QUERY_TIMEOUT_S
+            self.link.ask(
+                lambda when: self._bus.query(ch.MAP_SNAPSHOT, None, MapSnapshot, when),
+                lambda snapshot, when: self._load(until, snapshot, when),
+                at,
+            )
 
-    def _load(self, snapshot: MapSnapshot | None, at: Moment) -> None:
+    def _load(self, until: float, snapshot: MapSnapshot | None, at: Moment) -> None:
+        """Load the reply to the query that times out at `until`; one that comes later is nobody's."""
+        if until != self._map_due or at.now >= until:
+            return
         self._map_due = at.now
         if snapshot is not None:
             self.received_bytes += len(snapshot.cost) + len(snapshot.speed) + len(snapshot.static)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import msgspec
 import pytest
 
-from fognav_experiments.comparison.agreement import agreement, compare_drives, resources
+from fognav_experiments.comparison.agreement import agreement, compare_drives, compared, resources
 from fognav_experiments.comparison.document import to_markdown
 from fognav_experiments.comparison.measured import MeasuredDrive
 from fognav_experiments.comparison.records import Folder, FolderError, Record
+from fognav_experiments.comparison.report import build
 
 SHARED = {
     "setup": "fog", "run": 2, "route": "ab", "seed": 7, "area": "z4", "moment": "before", "trigger_m": 0.0,
@@ -50,7 +51,6 @@ def test_the_report_counts_those_that_agree_and_leaves_out_drives_under_a_quota(
     limited = msgspec.structs.replace(LIVE, cpu_quota=0.2, distance_m=200.0)
     other = msgspec.structs.replace(LIVE, setup="full")
     text = to_markdown(agreement([LIVE, limited, other], [LOCKSTEP]))
-    assert "1 of the drives were repeated" in text
     assert "1 of them agree with lockstep" in text
     assert "200" not in text
     assert agreement([other], [LOCKSTEP]) == []
@@ -59,10 +59,58 @@ def test_the_report_counts_those_that_agree_and_leaves_out_drives_under_a_quota(
 def test_cost_is_that_of_the_robot_s_processes_by_setup_and_quota():
     limited = msgspec.structs.replace(LIVE, cpu_quota=0.2, cpu_percent={"robot-agent": 8.0, "robot-guardian": 2.0})
     text = to_markdown(resources([LIVE, limited]))
-    assert "| fog | none | 1 | 6.00 | 1.00 | 0.00 | 7.00 | 200 | 30 | 0 | 230 | 240 |" in text
-    assert "| fog | 0.2 of a core | 1 | 8.00 | 2.00 | 0.00 | 10.00 |" in text
+    assert "| fog | none | 1 | - | 1 to 1 | 1 | 6.00 | 1.00 | 0.00 | 7.00 | 200 | 30 | 0 | 230 | 240 |" in text
+    assert "| fog | 0.2 of a core | 1 | - | 1 to 1 | 1 | 8.00 | 2.00 | 0.00 | 10.00 |" in text
     assert resources([msgspec.structs.replace(LIVE, cpu_percent={}, peak_mb={})]) == []
     assert LIVE.robots_peak_mb() == 230.0
+
+
+def test_drives_of_different_commits_are_not_called_the_same_and_each_names_commit_and_load():
+    live = msgspec.structs.replace(LIVE, commit="2ba7f7651ee5", load=16.8)
+    text = to_markdown(agreement([live], [LOCKSTEP], begun_with="7217190"))
+    assert "## The same routes and seeds by real processes" in text
+    assert (
+        "The routes and seeds of 1 drives were repeated by real processes and another version of the program: brokers"
+        in text
+    )
+    assert "| 0002-ab-fog | 2ba7f7651ee5 | 7217190 | 16.8 |" in text
+    same = to_markdown(agreement([live], [msgspec.structs.replace(LOCKSTEP, commit="2ba7f76")], begun_with="7217190"))
+    assert "## The same drives by real processes" in same
+    assert "1 of the drives were repeated by real processes: brokers" in same
+
+
+def test_the_cost_of_one_commit_is_not_mixed_with_that_of_another():
+    drives = [msgspec.structs.replace(LIVE, commit=commit, load=load) for commit, load in (("a", 2.0), ("b", 20.0))]
+    text = to_markdown(resources(drives))
+    assert "| fog | none | 1 | a | 2 to 2 | 1 | 6.00 |" in text
+    assert "| fog | none | 1 | b | 20 to 20 | 1 | 6.00 |" in text
+
+
+def test_a_drive_that_failed_has_no_mean_time_and_stands_in_the_report():
+    failed = msgspec.structs.replace(LIVE, route="cd", success=False, outcome="timeout", reason="late", time_s=None)
+    assert "| 200 | 30 | 0 | 230 | - |" in to_markdown(resources([failed]))
+    record = msgspec.structs.replace(
+        LOCKSTEP, track=[(0.0, 0.0), (1.0, 1.0)], cpu_s={"local planning": 2.4, "localization": 2.4, "guardian": 2.4}
+    )
+    cpu_s = {"local planning": 2.4, "localization": 2.4}
+    others = [msgspec.structs.replace(record, setup=setup, cpu_s=cpu_s) for setup in ("default", "full")]
+    experiment = {"asked": {"site": "estig", "site_digest": "0", "seed": 1}, "measured_on": {"commit": "7217190"}}
+    text = to_markdown(build([record, *others], experiment, measured=[failed]))
+    assert "| 0002-cd-fog | live | timeout | late |" in text
+    assert "None of 3 drives in lockstep failed" in text
+    assert "Of 1 drives by real processes 1 failed, and 0 had a protective stop or a fault." in text
+    assert "at 1 drive at a time" in text
+    assert "| fog / default | 2.00 | 2.00 | 2.00 | +1.00 |" in text
+    assert "so ratios count" not in text
+
+
+def test_a_drive_at_another_speed_is_another_record_and_is_compared_with_the_same_one_in_lockstep():
+    fast = msgspec.structs.replace(LIVE, speed=2.0, asked_speed=4.0)
+    assert fast.name == "0002-ab-fog-speed4"
+    assert [pair.lockstep for pair in compared([fast], [LOCKSTEP])] == [LOCKSTEP]
+    text = to_markdown(resources([LIVE, fast]))
+    assert "| fog | none | 1 | - |" in text
+    assert "| fog | none | 2 | - |" in text
 
 
 def test_drives_with_and_without_a_quota_stand_beside_one_another(tmp_path):

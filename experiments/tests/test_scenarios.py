@@ -15,7 +15,7 @@ import pytest
 from fog_runtime.configuration.site import load_site
 from fognav_experiments.lockstep import DriveEvent
 from fognav_experiments.scenarios.description import Expected, FaultyNode, Scenario, SilentNode, deviations
-from fognav_experiments.scenarios.stage import ScenarioError, _Stage, play, read_scenario
+from fognav_experiments.scenarios.stage import Played, ScenarioError, _Stage, markdown_page, play, read_scenario
 
 ROOT = Path(__file__).parents[2]
 FILES = {file.stem: file for file in sorted((ROOT / "experiments" / "scenarios").glob("*.toml"))}
@@ -94,3 +94,10 @@ def test_nodes_that_fail_at_the_same_time_come_back_each_at_its_own_end():
         return sorted(node.node.id for node in fog.nodes)
 
     assert [heard(now) for now in (0.0, 10.0, 20.0)] == [["n3"], ["n1", "n3"], ["n1", "n2", "n3"]]
+
+
+def test_the_page_of_scenarios_says_on_what_they_were_played():
+    played = Played(read_scenario(FILES["wifi-gap-5s"]), Result(), "reached", [])
+    page = markdown_page({"wifi-gap-5s": played}, {"commit": "3baacc2", "machine cores": 2})
+    assert "1 in one go, in lockstep; measured on: commit 3baacc2, machine cores 2." in page
+    assert "| reached | 10.0 | 40 | yes |" in page

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from importlib.metadata import version
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -27,6 +28,7 @@ from fognav_experiments.sensitivity.planes import (
     varied_site,
 )
 from fognav_experiments.sensitivity.publish import publish
+from fognav_experiments.sensitivity.sources import digest
 
 ESTIG = Path(__file__).parents[2] / "sites" / "estig"
 _spec = importlib.util.spec_from_file_location("ring_site", Path(__file__).parent / "ring_site.py")
@@ -117,13 +119,25 @@ def test_a_heat_map_has_a_cell_for_every_point_and_the_greenest_where_most_is_sa
     assert {"40.0 m", "30.0 m", "20.0 m", "133 s"} <= set(words)
     files = publish(drives, [DEBOUNCE], "fognav experiment sensitivity", {"machine": {"cores": 2}}, tmp_path)
     assert {file.name for file in files} == {"README.md", "report.html", "readings-pause-ms.svg"}
-    assert "| 2 | 50 | 1 | 40.0 | 133.3 |" in (tmp_path / "README.md").read_text("utf-8")
+    text = (tmp_path / "README.md").read_text("utf-8")
+    assert "| 2 | 50 | 1 | 40.0 | 133.3 |" in text
+    assert "confidence interval" not in text
+
+
+def test_the_page_names_the_interval_of_several_routes_and_the_commits_of_its_drives(tmp_path):
+    drives = [swept("default", BASE, 100.0 + run, run, commit="a") for run in (1, 2)]
+    drives += [swept("fog", DEBOUNCE.points()[0], 60.0, run) for run in (1, 2)]
+    publish(drives, [DEBOUNCE], "fognav experiment sensitivity", {}, tmp_path)
+    text = (tmp_path / "README.md").read_text("utf-8")
+    assert "with the 95 % confidence interval where there is more than one route" in text
+    assert "| commit | a: 2 of the drives |" in text
+    assert "| commit | not known: 2 of the drives |" in text
 
 
 # --- where they are driven ---
 
 
-def test_a_cluster_of_two_workers_drives_a_sweep_and_goes_on_where_it_was(tmp_path):
+def test_a_cluster_of_two_workers_of_these_sources_drives_a_sweep_and_goes_on_where_it_was(tmp_path, monkeypatch):
     site = ring.ring_site()
     plane = Plane(Axis("readings", [3]), Axis("pause_ms", [100]))
     asked = sweep_tasks([plane], [DRAWN])
@@ -132,8 +146,16 @@ def test_a_cluster_of_two_workers_drives_a_sweep_and_goes_on_where_it_was(tmp_pa
         LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
         sweeping.workers(1, cluster.scheduler_address) as pool,
     ):
+        with monkeypatch.context() as patch:
+            patch.setattr(sweeping, "digest", lambda: "0" * 16)
+            with pytest.raises(
+                sweeping.ClusterError, match=r"runs other sources of Fognav .+ than this machine \(0000"
+            ):
+                next(sweeping.sweep(site, asked, files, pool))
+        assert files.read() == []
         drives = list(sweeping.sweep(site, asked, files, pool))
         assert list(sweeping.sweep(site, asked, files, pool)) == []
+    assert {(drive.version, drive.sources) for drive in drives} == {(version("fognav-experiments"), digest())}
     assert {drive.setup for drive in drives} == {"default", "fog"}
     assert all(drive.success for drive in drives)
     assert gain(drives, plane.points()[0]).metres.mean > 0.5

@@ -43,5 +43,5 @@ def test_a_robot_that_plans_for_itself_drives_live_as_it_does_in_lockstep(tmp_pa
     assert result.exit_code == 0, result.output
     text = (out / "README.md").read_text("utf-8")
     assert "1 of the drives were repeated by real processes" in text
-    assert f"| {lockstep.name} | {live.distance_m:.1f} | {lockstep.distance_m:.1f} |" in text
+    assert f"| {live.load:.1f} | {live.distance_m:.1f} | {lockstep.distance_m:.1f} |" in text
     assert "largest of all the robot's processes together: default" in text

@@ -45,6 +45,10 @@ class LiveOptions:
     cpu_quota: float | None = None
     commit: str = ""
 
+    def name(self, task: Task) -> str:
+        """Return the name of a drive's record."""
+        return drive_name(task.drawn.run, task.drawn.route.name, task.setup, self.cpu_quota, self.speed)
+
 
 def live_drives(
     site: LoadedSite,
@@ -58,7 +62,7 @@ def live_drives(
     Raises as `drive_live` does.
     """
     for task in asked:
-        if not files.has(drive_name(task.drawn.run, task.drawn.route.name, task.setup, options.cpu_quota)):
+        if not files.has(options.name(task)):
             drive = drive_live(site, task.drawn, task.setup, options, on_event)
             files.write(drive)
             yield drive
@@ -180,6 +184,7 @@ def _record(
         peak_mb={name: used["rss_mb"] for name, used in processes.items()},
         cpu_quota=options.cpu_quota,
         speed=speed,
+        asked_speed=options.speed,
         restarts=sum(demo.attempt.restarts.values()),
         load=round(os.getloadavg()[0], 2),
         version=__version__,

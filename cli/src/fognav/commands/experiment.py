@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 experiment_app = typer.Typer(help="Compare setups as the thesis did, and play scenarios.")
 
+_NOT_SWEPT: Final = "none"
 _SETUPS: Final[tuple[ProfileName, ...]] = ("default", "full", "fog")
 
 
@@ -65,12 +66,13 @@ def experiment_command(  # noqa: PLR0913  # each option is an argument
     from fognav.bench import machine  # noqa: PLC0415  # same
     from fognav.live_drive import LiveOptions, live_drives  # noqa: PLC0415  # same
     from fognav_experiments.comparison import runner  # noqa: PLC0415  # same
-    from fognav_experiments.comparison.measured import drive_name  # noqa: PLC0415  # same
     from fognav_experiments.comparison.records import Folder, FolderError  # noqa: PLC0415  # same
 
     with exit_codes():
         if out is None:
             raise WrongUseError("name a folder for the records: --out DIR")
+        if cpu_quota is not None and speed != 1.0:
+            raise WrongUseError(f"--cpu-quota {cpu_quota:g} is a share of real time: leave --speed {speed:g} out")
         place = checkout.site_folder(site)
         try:
             loaded = load_site(place)
@@ -85,8 +87,9 @@ def experiment_command(  # noqa: PLR0913  # each option is an argument
         if live:
             options = LiveOptions(speed=speed, cpu_quota=cpu_quota, commit=commit)
             files = folder.measured("live")
-            names = [drive_name(task.drawn.run, task.drawn.route.name, task.setup, cpu_quota) for task in asked]
-            failed = _show(names, files, live_drives(loaded, asked, files, options, print_line))
+            failed = _show(
+                [options.name(task) for task in asked], files, live_drives(loaded, asked, files, options, print_line)
+            )
         else:
             failed = _show([task.name for task in asked], folder.drives, runner.run(place, asked, folder, jobs, commit))
     print_line(f"{len(asked) - failed} of {len(asked)} drives succeeded; records in {out}")
@@ -132,7 +135,8 @@ def scenarios_command(
     ends in another way.
     """
     from fog_runtime.files import SHARED, atomic_write  # noqa: PLC0415  # keeps the other commands fast
-    from fognav_experiments.scenarios.stage import ScenarioError, markdown_table, play, read_scenario  # noqa: PLC0415  # same
+    from fognav_experiments.comparison.document import flat  # noqa: PLC0415  # same
+    from fognav_experiments.scenarios.stage import ScenarioError, markdown_page, play, read_scenario  # noqa: PLC0415  # same
 
     with exit_codes():
         files = _scenario_files(names or [])
@@ -147,7 +151,7 @@ def scenarios_command(
             if not json:
                 _print_played(name, drives[name])
         if table is not None:
-            atomic_write(table, markdown_table(drives).encode(), mode=SHARED)
+            atomic_write(table, markdown_page(drives, dict(flat(_measured_on()))).encode(), mode=SHARED)
     if json:
         print_json({"scenarios": [_played_row(name, played) for name, played in drives.items()]})
     if any(played.deviations for played in drives.values()):
@@ -212,9 +216,13 @@ def film_command(
 def sensitivity_command(  # noqa: PLR0913  # each option is an argument
     *,
     out: Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder of records and report.")],
-    readings: Annotated[str, typer.Option("--readings", metavar="N,N", help="Readings that confirm.")] = "2,5,20",
+    readings: Annotated[
+        str, typer.Option("--readings", metavar="N,N", help="Readings that confirm; none: not swept.")
+    ] = "2,5,20",
     pause: Annotated[str, typer.Option("--pause", metavar="MS,MS", help="Pauses of the nodes.")] = "50,500",
-    areas: Annotated[str, typer.Option("--areas", metavar="N,N", help="Watched areas; 0: all.")] = "1,4,0",
+    areas: Annotated[
+        str, typer.Option("--areas", metavar="N,N", help="Watched areas; 0: all; none: not swept.")
+    ] = "1,4,0",
     speeds: Annotated[str, typer.Option("--speeds", metavar="V,V", help="Speeds of the robot, m/s.")] = "0.2,0.3",
     routes: Annotated[int, typer.Option("--routes", metavar="N", min=1, help="Routes of each point.")] = 3,
     seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Seed of all draws.")] = 1,
@@ -224,9 +232,10 @@ def sensitivity_command(  # noqa: PLR0913  # each option is an argument
 ) -> None:
     """Sweep debouncing, the nodes' pause and number, and the robot's speed; draw what the fog saves as heat maps.
 
-    Two planes are driven, readings by pause and areas by speed, on the first routes whose obstacle bars the way. A
-    sweep that was killed goes on where it was. The drives run on every core, with --cluster on the workers of a Dask
-    cluster (fognav-experiments[cluster]), which need this version of Fognav and nothing else.
+    Two planes are driven, readings by pause and areas by speed, on the first routes whose obstacle bars the way; with
+    --readings none or --areas none only the other. A sweep that was killed goes on where it was. The drives
+    run on every core, with --cluster on the workers of a Dask cluster (fognav-experiments[cluster]), which need the
+    same sources of Fognav and nothing else.
     """
     from fog_runtime.configuration.site import SiteError, load_site  # noqa: PLC0415  # keeps the other commands fast
     from fognav_experiments.comparison import runner  # noqa: PLC0415  # same
@@ -235,14 +244,16 @@ def sensitivity_command(  # noqa: PLR0913  # each option is an argument
     from fognav_experiments.sensitivity.sweep import ClusterError  # noqa: PLC0415  # same
 
     with exit_codes():
-        swept = (
-            Plane(Axis("readings", _values(readings)), Axis("pause_ms", _values(pause))),
-            Plane(Axis("areas", _values(areas)), Axis("speed_m_s", _values(speeds, float))),
-        )
-        command = (
-            f"fognav experiment sensitivity --readings {readings} --pause {pause} --areas {areas} --speeds {speeds} "
-            f"--routes {routes} --seed {seed} --out DIR"
-        )
+        swept, command = [], "fognav experiment sensitivity"
+        if readings != _NOT_SWEPT:
+            swept.append(Plane(Axis("readings", _values(readings)), Axis("pause_ms", _values(pause))))
+        if areas != _NOT_SWEPT:
+            swept.append(Plane(Axis("areas", _values(areas)), Axis("speed_m_s", _values(speeds, float))))
+        if not swept:
+            raise WrongUseError("--readings none --areas none leaves nothing to sweep: leave one of them out")
+        command += f" --readings {readings}" + ("" if readings == _NOT_SWEPT else f" --pause {pause}")
+        command += f" --areas {areas}" + ("" if areas == _NOT_SWEPT else f" --speeds {speeds}")
+        command += f" --routes {routes} --seed {seed} --out DIR"
         try:
             place = checkout.site_folder(site)
             loaded = load_site(place)

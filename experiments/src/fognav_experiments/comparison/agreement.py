@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from fognav_experiments.comparison.document import Block, Paragraph, Table
+from fognav_experiments.comparison.document import Block, Heading, Paragraph, Table
 from fognav_experiments.comparison.measured import ROBOTS_PROCESSES
 from fognav_experiments.comparison.statistics import estimate
 
@@ -59,17 +59,24 @@ def compare_drives(live: MeasuredDrive, lockstep: Record) -> Compared:
 def compared(live: Sequence[MeasuredDrive], lockstep: Sequence[Record]) -> list[Compared]:
     """Compare all drives of which there is one in lockstep, those under a quota left out."""
     known = {record.name: record for record in lockstep}
-    return [compare_drives(drive, known[drive.name]) for drive in live if drive.name in known]
+    found = ((drive, known.get(drive.in_lockstep or "")) for drive in live)
+    return [compare_drives(drive, record) for drive, record in found if record is not None]
 
 
-def agreement(live: Sequence[MeasuredDrive], lockstep: Sequence[Record]) -> list[Block]:
-    """Return the comparison as a part of the report; nothing without live drives."""
+def agreement(live: Sequence[MeasuredDrive], lockstep: Sequence[Record], begun_with: str = "") -> list[Block]:
+    """Return the comparison as a part of the report, with its heading; nothing without live drives.
+
+    `begun_with`: the commit of the records in lockstep that name none.
+    """
     pairs = compared(live, lockstep)
     if not pairs:
         return []
+    equal = [_same_commit(pair.live.commit, pair.lockstep.commit or begun_with) for pair in pairs]
+    same = all(equal)
     rows = [
         [
-            pair.live.name, f"{pair.live.distance_m:.1f}", f"{pair.lockstep.distance_m:.1f}",
+            pair.live.name, pair.live.commit or "-", pair.lockstep.commit or begun_with or "-", f"{pair.live.load:.1f}",
+            f"{pair.live.distance_m:.1f}", f"{pair.lockstep.distance_m:.1f}",
             _seconds(pair.live.time_s), _seconds(pair.lockstep.time_s), f"{pair.live.paths}", f"{pair.lockstep.paths}",
             "; ".join(pair.differences) or "yes",
         ]
@@ -77,33 +84,42 @@ def agreement(live: Sequence[MeasuredDrive], lockstep: Sequence[Record]) -> list
     ]  # fmt: skip
     agreed = sum(not pair.differences for pair in pairs)
     speeds = sorted({pair.live.speed for pair in pairs})
+    subject = f"{len(pairs)} of the drives" if same else f"The routes and seeds of {len(pairs)} drives"
+    version = "" if same else f" and {'in part ' if any(equal) else ''}another version of the program"
     return [
+        Heading(f"The same {'drives' if same else 'routes and seeds'} by real processes"),
         Paragraph(
-            f"{len(pairs)} of the drives were repeated by real processes: brokers, sockets, threads and serial lines, "
+            f"{subject} were repeated by real processes{version}: brokers, sockets, threads and serial lines, "
             f"at {', '.join(f'{speed:g}' for speed in speeds)} times real time. {agreed} of them agree with lockstep "
             f"in outcome, in distance within {DISTANCE_M} m or {100 * DISTANCE_SHARE:.0f} %, in time within "
             f"{TIME_S:.0f} s or {100 * TIME_SHARE:.0f} %, in the number of paths within {PATHS}, in the watched areas "
             f"that the robot crossed, and in whether it was in one of the modes {_listed(sorted(STOPPING_MODES))}."
         ),
         Table(
-            ["drive", "live, m", "lockstep, m", "live, s", "lockstep, s", "paths, live", "in lockstep", "agrees"], rows
+            [
+                "drive", "commit, live", "commit, lockstep", "load, live", "live, m", "lockstep, m", "live, s",
+                "lockstep, s", "paths, live", "paths, lockstep", "agrees",
+            ],
+            rows,
         ),
-    ]
+    ]  # fmt: skip
 
 
 def resources(drives: Sequence[MeasuredDrive]) -> list[Block]:
-    """Return what the robot's processes cost, by setup and quota; nothing without a drive that measured it."""
+    """Return what the robot's processes cost, by setup, quota, speed and commit; nothing if no drive measured it."""
     measured = [drive for drive in drives if drive.cpu_percent and drive.peak_mb]
     rows = []
-    for setup, quota in sorted({(drive.setup, drive.cpu_quota) for drive in measured}, key=str):
-        chosen = [drive for drive in measured if (drive.setup, drive.cpu_quota) == (setup, quota)]
+    for setup, quota, speed, commit in sorted({_circumstances(drive) for drive in measured}, key=str):
+        chosen = [drive for drive in measured if _circumstances(drive) == (setup, quota, speed, commit)]
         shares = [_mean([drive.cpu_percent.get(name, 0.0) for drive in chosen]) for name in ROBOTS_PROCESSES]
         peaks = [max(drive.peak_mb.get(name, 0.0) for drive in chosen) for name in ROBOTS_PROCESSES]
-        time_s = _mean([drive.time_s for drive in chosen if drive.time_s is not None])
+        times = [drive.time_s for drive in chosen if drive.time_s is not None]
+        loads = [drive.load for drive in chosen]
         rows.append([
-            setup, "none" if quota is None else f"{quota:g} of a core", str(len(chosen)),
+            setup, "none" if quota is None else f"{quota:g} of a core", f"{speed:g}", commit or "-",
+            f"{min(loads):.0f} to {max(loads):.0f}", str(len(chosen)),
             *(f"{share:.2f}" for share in shares), f"{sum(shares):.2f}",
-            *(f"{peak:.0f}" for peak in peaks), f"{sum(peaks):.0f}", f"{time_s:.0f}",
+            *(f"{peak:.0f}" for peak in peaks), f"{sum(peaks):.0f}", _seconds(_mean(times) if times else None),
         ])  # fmt: skip
     if not rows:
         return []
@@ -116,12 +132,22 @@ def resources(drives: Sequence[MeasuredDrive]) -> list[Block]:
         ),
         Table(
             [
-                "setup", "quota", "drives", *(f"{name}, %" for name in names), "robot, %",
+                "setup", "quota", "speed", "commit", "load", "drives", *(f"{name}, %" for name in names), "robot, %",
                 *(f"{name}, MB" for name in names), "robot, MB", "mean time, s",
             ],
             rows,
         ),
     ]  # fmt: skip
+
+
+def _circumstances(drive: MeasuredDrive) -> tuple[str, float | None, float, str]:
+    """Return what a drive's cost depends on, its route apart."""
+    return drive.setup, drive.cpu_quota, drive.speed, drive.commit
+
+
+def _same_commit(one: str, other: str) -> bool:
+    """Whether two revisions, shortened or not, are the same; one that is not known is no other's."""
+    return bool(one and other) and (one.startswith(other) or other.startswith(one))
 
 
 def _mean(values: Sequence[float]) -> float:

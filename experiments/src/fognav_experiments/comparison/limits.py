@@ -76,6 +76,32 @@ def computation(default: Mapping[str, float], fog: Mapping[str, float], robot: t
     )
 
 
+def error(shared: Sequence[Sequence[float]], setups: Sequence[str]) -> list[Block]:
+    """Return how far figures of CPU time can be trusted: by the spread of the work that all setups do alike.
+
+    shared: per route, by setup, the share of a core (%) of that work.
+    """
+    rows = []
+    for number, setup in enumerate(setups[1:], start=1):
+        ratios = sorted(values[number] / values[0] for values in shared if values[0] > 0.0)
+        if ratios:
+            rows.append([
+                f"{setup} / {setups[0]}", f"{estimate(ratios).mean:.2f}", f"{ratios[0]:.2f}", f"{ratios[-1]:.2f}",
+                f"{estimate([values[number] - values[0] for values in shared]).mean:+.2f}",
+            ])  # fmt: skip
+    if not rows:
+        return []
+    return [
+        Paragraph(
+            "The error of all figures of CPU time: localization, safety and wheels, lidar driver and guardian do the "
+            "same work in every setup, and should take the same share. What they took differs between the setups of "
+            "one route as this table says, for the machine was loaded more or less. It does not make all setups "
+            "dearer alike: a difference of CPU time of this size says nothing of the setups."
+        ),
+        Table(["work that all setups share", "mean ratio", "least", "most", "mean difference, % of a core"], rows),
+    ]
+
+
 def text(found: Estimate) -> str:
     """Return a mean with its 95 % confidence interval."""
     digits = 1 if abs(found.mean) >= 10.0 else 2

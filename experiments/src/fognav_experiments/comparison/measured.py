@@ -20,7 +20,8 @@ class MeasuredDrive(msgspec.Struct, frozen=True, kw_only=True):
     Distance and areas are those of the simulator's ground truth, with a real robot those of its own poses.
     `cpu_percent`: mean share (%) of one core that each process took, per second of the system's clock. `peak_mb`: its
     largest resident memory (MB), sampled once a second. `cpu_quota`: share of one core that the robot's processes had
-    together; None without a limit. `restarts`: processes that died. `load`: the machine's load average at the end.
+    together; None without a limit. `asked_speed`: that of the command, from which `speed` differs where the machine
+    could not sustain it. `restarts`: processes that died. `load`: the machine's load average at the end.
     """
 
     kind: Kind
@@ -46,6 +47,7 @@ class MeasuredDrive(msgspec.Struct, frozen=True, kw_only=True):
     peak_mb: dict[str, float] = {}
     cpu_quota: float | None = None
     speed: float = 1.0
+    asked_speed: float = 1.0
     restarts: int = 0
     load: float = 0.0
     version: str = ""
@@ -54,13 +56,19 @@ class MeasuredDrive(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def name(self) -> str:
         """Name of the record's file, without suffix."""
-        return drive_name(self.run, self.route, self.setup, self.cpu_quota)
+        return drive_name(self.run, self.route, self.setup, self.cpu_quota, self.asked_speed)
+
+    @property
+    def in_lockstep(self) -> str | None:
+        """Name of the drive in lockstep that it repeats; None under a quota, which lockstep does not have."""
+        return drive_name(self.run, self.route, self.setup) if self.cpu_quota is None else None
 
     def robots_peak_mb(self) -> float | None:
         """Return the sum (MB) of the largest memories of the robot's processes; None if they were not measured."""
         return sum(self.peak_mb.get(name, 0.0) for name in ROBOTS_PROCESSES) if self.peak_mb else None
 
 
-def drive_name(run: int, route: str, setup: str, cpu_quota: float | None = None) -> str:
-    """Return the name of a drive's record; without a quota the same as that in lockstep."""
-    return f"{run:04}-{route}-{setup}" + ("" if cpu_quota is None else f"-quota{cpu_quota:g}")
+def drive_name(run: int, route: str, setup: str, cpu_quota: float | None = None, speed: float = 1.0) -> str:
+    """Return the name of a drive's record; without a quota and in real time the same as that in lockstep."""
+    quota = "" if cpu_quota is None else f"-quota{cpu_quota:g}"
+    return f"{run:04}-{route}-{setup}{quota}" + ("" if speed == 1.0 else f"-speed{speed:g}")

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 MOVE_BASE: Final = ("global planning", "layers", "local planning")
 """Components of a robot whose work the process `move_base` of the ROS navigation stack holds."""
 ON_ROBOT: Final = (*MOVE_BASE, "localization", "safety and wheels", "messages", "lidar driver", "guardian")
+ALIKE: Final = ("localization", "safety and wheels", "lidar driver", "guardian")
+"""Components of a robot that do the same work in every setup."""
 ON_FOG: Final = ("aggregator", "map-service", "planner")
 OF_FOG: Final[dict[ProfileName, tuple[str, ...]]] = {
     "default": (),

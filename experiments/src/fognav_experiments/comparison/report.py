@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from fognav_experiments.comparison import agreement, figures, limits
 from fognav_experiments.comparison.document import Block, Code, Figure, Heading, Paragraph, Table, flat
-from fognav_experiments.comparison.records import MOVE_BASE, OF_FOG, ON_FOG, ON_ROBOT
+from fognav_experiments.comparison.records import ALIKE, MOVE_BASE, OF_FOG, ON_FOG, ON_ROBOT
 from fognav_experiments.comparison.statistics import Estimate, compare, estimate
 from fognav_experiments.comparison.thesis import REPORTED
 
@@ -113,11 +113,12 @@ def build(
         *_bounds(pairs, savings),
         Heading("Where the computation goes"),
         *_components(pairs, setups),
-        *_measured(records, measured),
+        *agreement.agreement(measured, records, str(experiment["measured_on"].get("commit", ""))),
+        *_cost(measured),
         Heading("One drive, seen from above"),
         *_tracks(pairs, setups),
         Heading("Drives that failed, and contacts"),
-        *_failures(records),
+        *_failures(records, measured),
     ]
 
 
@@ -147,9 +148,9 @@ def _introduction(records: Sequence[Record], pairs: Sequence[Drives], experiment
         ),
         Paragraph(
             f"{len(records)} drives stand, {len(pairs)} of them in each of the setups on the same run and "
-            f"route: these are compared. CPU is what the thread spent, by the kernel's account, with {jobs} "
-            f"drives at a time at a load average of {min(loads, default=0.0):.1f} to "
-            f"{max(loads, default=0.0):.1f}; a loaded machine makes all setups dearer alike, so ratios count."
+            f"route: these are compared. CPU is what the thread spent, by the kernel's account, at "
+            f"{' or '.join(map(str, jobs))} drive{'' if jobs == [1] else 's'} at a time and a load average of "
+            f"{min(loads, default=0.0):.1f} to {max(loads, default=0.0):.1f}."
         ),
         Code(command),
         Table(["measured on", ""], [["site", f"{asked['site']} ({asked['site_digest']})"], *rows]),
@@ -185,10 +186,9 @@ def _bounds(pairs: Sequence[Drives], savings: Mapping[tuple[int, str], Saving]) 
     return [Heading("What the floor allows to save"), *blocks] if blocks else []
 
 
-def _measured(records: Sequence[Record], measured: Sequence[MeasuredDrive]) -> list[Block]:
-    agreed, cost = agreement.agreement(measured, records), agreement.resources(measured)
-    blocks: list[Block] = [Heading("The same drives by real processes"), *agreed] if agreed else []
-    return [*blocks, Heading("What the robot's processes cost"), *cost] if cost else blocks
+def _cost(measured: Sequence[MeasuredDrive]) -> list[Block]:
+    cost = agreement.resources(measured)
+    return [Heading("What the robot's processes cost"), *cost] if cost else []
 
 
 def _beside_thesis(
@@ -325,6 +325,7 @@ def _components(pairs: Sequence[Drives], setups: Sequence[ProfileName]) -> list[
             "serial ports, which lockstep does not have; what a setup does not use of the fog is not counted."
         ),
         Table(["component", *setups], rows),
+        *limits.error([[drives[setup].cpu_percent(ALIKE) for setup in setups] for drives in pairs], setups),
     ]
     if "default" in setups and "fog" in setups:
         first, last = ({name: _share(pairs, setup, [name]) for name in MOVE_BASE} for setup in ("default", "fog"))
@@ -348,15 +349,32 @@ def _tracks(pairs: Sequence[Drives], setups: Sequence[ProfileName]) -> list[Bloc
     return [Figure("tracks.svg", svg, caption)]
 
 
-def _failures(records: Sequence[Record]) -> list[Block]:
+def _failures(records: Sequence[Record], measured: Sequence[MeasuredDrive]) -> list[Block]:
     rows = [
-        [record.name, record.outcome, record.reason, str(record.contacts), "; ".join(record.stops)]
+        [record.name, "lockstep", record.outcome, record.reason, str(record.contacts), "; ".join(record.stops)]
         for record in records
         if not record.success or record.contacts or record.stops
     ]
+    blocks: list[Block] = []
     if not rows:
-        return [Paragraph(f"None of {len(records)} drives failed, touched anything, or had a protective stop.")]
-    return [Table(["drive", "outcome", "reason", "contacts", "protective stops and faults"], rows)]
+        words = f"None of {len(records)} drives in lockstep failed, touched anything, or had a protective stop."
+        blocks.append(Paragraph(words))
+    rows += [
+        [drive.name, drive.kind, drive.outcome, drive.reason, "not counted", "; ".join(drive.stops)]
+        for drive in measured
+        if not drive.success or drive.stops
+    ]
+    if measured:
+        failed = sum(not drive.success for drive in measured)
+        stopped = sum(bool(drive.stops) for drive in measured)
+        blocks.append(
+            Paragraph(
+                f"Of {len(measured)} drives by real processes {failed} failed, and {stopped} had a protective stop or "
+                "a fault."
+            )
+        )
+    header = ["drive", "made", "outcome", "reason", "contacts", "protective stops and faults"]
+    return [*blocks, Table(header, rows)] if rows else blocks
 
 
 def summary_rows(records: Sequence[Record]) -> list[list[str]]:

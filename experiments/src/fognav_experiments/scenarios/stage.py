@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from functools import cache, partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import msgspec
 
@@ -95,8 +95,25 @@ def play(scenario: Scenario, sites: Path) -> Played:
     return Played(scenario, result, name, deviations(scenario.expected, result, name, result.events[before:]))
 
 
-def markdown_table(drives: Mapping[str, Played]) -> str:
-    """Return a Markdown table of scenarios that were played, by name: what happens, and how each drive ended."""
+_PAGE: Final = """\
+# Drives on which something goes wrong
+
+```
+fognav experiment scenarios --table FILE
+```
+
+{count} in one go, in lockstep; measured on: {facts}.
+
+Times are those of the simulated clock. `driving` means that the robot had not ended its drive after the scenario's
+time, which may be what is expected. What is expected of each, and checked, stands in its file.
+"""
+
+
+def markdown_page(drives: Mapping[str, Played], measured_on: Mapping[str, object]) -> str:
+    """Return a Markdown page of scenarios that were played, by name: what happens, and how each drive ended.
+
+    `measured_on`: commit, machine and versions, by name.
+    """
     rows = [
         f"| [{name}](../../experiments/scenarios/{name}.toml) | {played.scenario.title} | {played.outcome} | "
         f"{played.result.distance_m:.1f} | {played.result.time_s or played.scenario.seconds:.0f} | "
@@ -104,7 +121,8 @@ def markdown_table(drives: Mapping[str, Played]) -> str:
         for name, played in drives.items()
     ]
     header = ["| scenario | what happens | outcome | m | s | as expected |", "| --- | --- | --- | --- | --- | --- |"]
-    return "\n".join([*header, *rows]) + "\n"
+    facts = ", ".join(f"{name} {value}" for name, value in measured_on.items())
+    return "\n".join([_PAGE.format(count=len(drives), facts=facts), *header, *rows]) + "\n"
 
 
 class _Stage:

@@ -75,7 +75,10 @@ class Plane(NamedTuple):
 
 
 class SweptDrive(msgspec.Struct, frozen=True, kw_only=True):
-    """One drive of a sweep: lengths in m, times in s of the simulated clock."""
+    """One drive of a sweep: lengths in m, times in s of the simulated clock.
+
+    version, sources: of the program on the machine that drove it, the latter as a digest; `commit`: its revision.
+    """
 
     variation: Variation
     setup: ProfileName
@@ -88,6 +91,8 @@ class SweptDrive(msgspec.Struct, frozen=True, kw_only=True):
     distance_m: float
     time_s: float | None
     commit: str = ""
+    version: str = ""
+    sources: str = ""
 
     @property
     def name(self) -> str:

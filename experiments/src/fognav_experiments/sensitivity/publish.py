@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import TYPE_CHECKING, Any, Final
 
 from fog_runtime.files import SHARED, atomic_write
@@ -37,13 +38,13 @@ def publish(
         Heading(TITLE, 1),
         Paragraph(
             "The same drawn obstacles are met by a robot on its own and by one that the fog leads, in lockstep. Each "
-            "cell says how many metres and seconds the second saves on average, with its 95 % confidence interval; "
+            f"cell says how many metres and seconds the second saves{_spread(drives, planes)}; "
             "one quantity changes along each side, all others are as by default. Only routes count on which the "
             "obstacle bars the shortest way. Of a part of the areas only, which ones are watched is drawn per route: "
             "an obstacle that no sensor sees saves nothing."
         ),
         Code(command),
-        Table(["measured on", ""], [[name, str(value)] for name, value in flat(measured_on)]),
+        Table(["measured on", ""], [*([name, str(value)] for name, value in flat(measured_on)), *_commits(drives)]),
     ]
     for plane in planes:
         blocks += _plane(drives, plane)
@@ -59,6 +60,20 @@ def publish(
     for name, content in texts.items():
         atomic_write(target / name, content.encode(), mode=SHARED)
     return [target / name for name in texts]
+
+
+def _spread(drives: Sequence[SweptDrive], planes: Sequence[Plane]) -> str:
+    """Return in words what a cell's figures are; a single route has no confidence interval."""
+    found = [gain(drives, point) for plane in planes for point in plane.points()]
+    if any(cell.metres.n > 1 for cell in found if cell is not None):
+        return " on average, with the 95 % confidence interval where there is more than one route"
+    return " on the one route, which says nothing of others"
+
+
+def _commits(drives: Sequence[SweptDrive]) -> list[list[str]]:
+    """Return how many of the drives each commit made."""
+    counts = sorted(Counter(drive.commit or "not known" for drive in drives).items())
+    return [["commit", f"{commit}: {count} of the drives"] for commit, count in counts]
 
 
 def _plane(drives: Sequence[SweptDrive], plane: Plane) -> list[Block]:

@@ -6,7 +6,9 @@ import contextlib
 import multiprocessing
 import os
 import signal
+import socket
 from concurrent.futures import FIRST_COMPLETED, Executor, ProcessPoolExecutor, wait
+from importlib.metadata import version
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Final
 
@@ -14,6 +16,7 @@ from fog_contracts.messages import Pose
 from fognav_experiments.lockstep import release_drives, run_lockstep
 from fognav_experiments.rigs import Tuning
 from fognav_experiments.sensitivity.planes import SweptDrive, varied_site
+from fognav_experiments.sensitivity.sources import digest
 from fognav_sim.drive.hazard import HazardRequest
 
 if TYPE_CHECKING:
@@ -57,8 +60,12 @@ def workers(jobs: int, cluster: str | None) -> Iterator[Executor]:
 def sweep(
     site: LoadedSite, asked: Sequence[SweepTask], files: DriveFiles[SweptDrive], pool: Executor, commit: str = ""
 ) -> Iterator[SweptDrive]:
-    """Run the drives that have no record yet, and yield each record once it is written; `commit` is only recorded."""
-    waiting = {pool.submit(swept_drive, site, task, commit) for task in asked if not files.has(task.name)}
+    """Run the drives that have no record yet, and yield each record once it is written; `commit` is only recorded.
+
+    Raises `ClusterError` if a worker runs other sources than this process.
+    """
+    due, sources = [task for task in asked if not files.has(task.name)], digest()
+    waiting = {pool.submit(swept_drive, site, task, commit, sources) for task in due}
     try:
         while waiting:
             done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
@@ -71,8 +78,17 @@ def sweep(
             future.cancel()
 
 
-def swept_drive(site: LoadedSite, task: SweepTask, commit: str) -> SweptDrive:
-    """Drive one task in lockstep; the same whenever and wherever it is repeated."""
+def swept_drive(site: LoadedSite, task: SweepTask, commit: str, sources: str) -> SweptDrive:
+    """Drive one task in lockstep; the same whenever and wherever it is repeated.
+
+    commit, sources: revision and digest of the sources of who asks. Raises `ClusterError` if this process has others:
+    the drive would be recorded for a commit that did not make it.
+    """
+    if (own := digest()) != sources:
+        raise ClusterError(
+            f"the worker {socket.gethostname()} runs other sources of Fognav {version('fognav-experiments')} ({own}) "
+            f"than this machine ({sources}): install the same on it, and start it again"
+        )
     drawn, variation = task.drawn, task.variation
     origin, goal = (site.site.places[name] for name in (drawn.route.start, drawn.route.goal))
     result = run_lockstep(
@@ -98,6 +114,8 @@ def swept_drive(site: LoadedSite, task: SweepTask, commit: str) -> SweptDrive:
         distance_m=result.distance_m,
         time_s=result.time_s,
         commit=commit,
+        version=version("fognav-experiments"),
+        sources=own,
     )
 
 

@@ -1,0 +1,38 @@
+"""Options of `fognav experiment` that contradict each other, or leave nothing to do."""
+
+from __future__ import annotations
+
+import pytest
+from typer.testing import CliRunner
+
+from fognav.commands import experiment
+
+OUT = ["--out", "unused"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--live", "--cpu-quota", "0.2", "--speed", "4", *OUT], "--cpu-quota 0.2 is a share of real time"),
+        (["sensitivity", "--readings", "none", "--areas", "none", *OUT], "leaves nothing to sweep"),
+    ],
+)
+def test_options_that_exclude_each_other_are_refused(tmp_path, monkeypatch, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    result = CliRunner().invoke(experiment.experiment_app, arguments)
+    assert result.exit_code == 2
+    assert words in " ".join(result.output.split())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_sweep_of_one_plane_drives_no_other_and_its_page_names_that_command(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(experiment, "_sweep", lambda *args, **_: asked.append(args) or 0)
+    arguments = ["sensitivity", "--areas", "none", "--routes", "1", "--out", str(tmp_path / "sweep")]
+    result = CliRunner().invoke(experiment.experiment_app, arguments, catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    ((_, _, planes, _, command),) = asked
+    assert [(plane.x.quantity, plane.y.quantity) for plane in planes] == [("readings", "pause_ms")]
+    assert command == (
+        "fognav experiment sensitivity --readings 2,5,20 --pause 50,500 --areas none --routes 1 --seed 1 --out DIR"
+    )

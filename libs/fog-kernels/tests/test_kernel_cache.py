@@ -39,6 +39,12 @@ def calling(value):
     return TIMES * added(value)
 """
 RUN = "from fog_kernels import warm\nfrom fog_kernels.calling import calling\nprint(calling(1), warm.cache_misses())"
+WARM = "from fog_kernels import warm\nwarm.PROFILES['two'] = 'called', 'calling'\nwarm.warm('two')\n"
+KILLED = """
+import os
+from numba.core import caching
+caching.IndexDataCacheFile._save_data = lambda *_: os._exit(9)
+"""
 
 
 @pytest.fixture
@@ -54,15 +60,25 @@ def package(tmp_path: Path) -> Path:
     return copy
 
 
-def run(package: Path) -> tuple[int, int]:
-    """Return the kernel's result in a new process, and how many kernels were compiled."""
+def python(package: Path, code: str) -> subprocess.CompletedProcess[str]:
     environment = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
     environment["PYTHONPATH"] = str(package.parent)
-    done = subprocess.run(
-        [sys.executable, "-c", RUN], env=environment, capture_output=True, text=True, timeout=60, check=True
+    return subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60, check=False
     )
+
+
+def run(package: Path, first: str = "") -> tuple[int, int]:
+    """Return the kernel's result in a new process, and how many kernels were compiled."""
+    done = python(package, first + RUN)
+    assert done.returncode == 0, done.stderr
     result, compiled = done.stdout.split()
     return int(result), int(compiled)
+
+
+def kept(package: Path) -> set[str]:
+    """Return the names of the files in numba's cache."""
+    return {file.name for file in (package / "__pycache__").glob("*.nb[ic]*")}
 
 
 @compiled_only
@@ -73,6 +89,29 @@ def test_kernel_is_compiled_anew_when_what_it_calls_or_a_constant_of_another_mod
     (package / "factor.py").write_text(FACTOR.format(100))
     assert run(package) == (300, 1)
     assert run(package) == (300, 0)
+
+
+@compiled_only
+def test_process_that_dies_while_it_saves_a_kernel_leaves_no_old_one_in_its_place(package: Path) -> None:
+    assert run(package) == (20, 2)
+    (package / "called.py").write_text(CALLED.format(2))
+    assert python(package, KILLED + RUN).returncode == 9
+    assert run(package) == (30, 2)
+    assert run(package) == (30, 0)
+
+
+@compiled_only
+def test_warming_removes_kernels_of_older_sources_and_nothing_else(package: Path) -> None:
+    assert run(package) == (20, 2)
+    other = package / "__pycache__" / "called_too.added-4.py311.1.nbc"
+    other.touch()
+    older = kept(package) - {other.name}
+    (package / "called.py").write_text(CALLED.format(2))
+    assert run(package, WARM) == (30, 2)
+    assert other.name in kept(package)
+    assert not older & kept(package)
+    assert len(kept(package)) == 1 + len(older)
+    assert run(package) == (30, 0)
 
 
 def test_sources_are_those_imported_directly_and_by_way_of_others() -> None:

@@ -3,6 +3,9 @@
 numba compiles a kernel anew when its own module has changed. But a kernel holds what it calls and the constants that it
 uses, whichever module they come from: here, a change of any module that the kernel's module imports makes it compile
 anew, too. numba finds this module by the name that `_arrays` gives it.
+
+The names of a kernel's files tell the sources, too. numba writes an index with their stamp first, then the code: under
+one name for all sources, older code would count as up to date after a process that was killed in between.
 """
 
 from __future__ import annotations
@@ -64,5 +67,20 @@ class KernelLocator:
         return digest_of(Path(self._py_file))
 
     def get_disambiguator(self) -> str:
-        """Return what tells kernels of one name apart."""
-        return self._own.get_disambiguator()
+        """Return what tells kernels of one name apart, and those of other sources: a part of their files' names."""
+        return f"{self._own.get_disambiguator()}-{_sources_tag(Path(self._py_file))}"
+
+
+def remove_outdated(file: Path, folder: Path) -> None:
+    """Remove the kernels of the module in `file` from numba's `folder` that were compiled from other sources than now.
+
+    Raises `OSError` if the folder can't be written.
+    """
+    current = f"-{_sources_tag(file)}."
+    for found in folder.glob(f"{file.stem}.*.nb[ic]*"):  # indices and code, also halves of them that a kill left
+        if current not in found.name:
+            found.unlink(missing_ok=True)  # another process may remove it at the same time
+
+
+def _sources_tag(file: Path) -> str:
+    return digest_of(file).hex()[:12]

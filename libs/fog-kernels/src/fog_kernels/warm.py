@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING
 from numba.core import event
 from numba.core.dispatcher import Dispatcher
 
+from fog_kernels.kernel_cache import remove_outdated
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -114,9 +116,9 @@ class _Compiled(event.Listener):
 def warm(profile: str = "all", on_progress: Callable[[int, int, str], None] = lambda *_: None) -> None:
     """Compile, or load from the cache, every kernel that the profile's processes use.
 
-    All signatures are explicit, so importing a module compiles it. `on_progress` is called with the number of kernels
-    that are ready, their total number, and the name of the kernel compiled or module loaded last. Raises ValueError for
-    an unknown profile.
+    All signatures are explicit, so importing a module compiles it. Kernels of these modules that were compiled from
+    older sources are removed. `on_progress` is called with the number of kernels that are ready, their total number,
+    and the name of the kernel compiled or module loaded last. Raises ValueError for an unknown profile.
     """
     if profile not in PROFILES:
         raise ValueError(f"profile must be one of {', '.join(sorted(PROFILES))}, not {profile!r}")
@@ -128,8 +130,16 @@ def warm(profile: str = "all", on_progress: Callable[[int, int, str], None] = la
         listener = _Compiled(module_kernels, lambda done, name: on_progress(before + done, total, f"{module}.{name}"))  # noqa: B023  # called in this pass only
         with event.install_listener("numba:compile", listener):
             importlib.import_module(f"fog_kernels.{module}")
+        _remove_outdated(f"fog_kernels.{module}")
         ready += len(module_kernels)
         on_progress(ready, total, module)
+
+
+def _remove_outdated(module: str) -> None:
+    own = [each for each in _dispatchers() if each.py_func.__module__ == module]
+    for file, folder in {(each.py_func.__code__.co_filename, each.stats.cache_path) for each in own}:
+        if folder is not None:  # a helper that is compiled into its callers only
+            remove_outdated(Path(file), Path(folder))
 
 
 def cache_misses() -> int:

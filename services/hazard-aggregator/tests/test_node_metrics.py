@@ -35,6 +35,16 @@ def test_node_without_a_reading_has_no_silence(metrics):
     assert metric("unknown", "n1") is None
 
 
+def test_node_without_a_reading_since_its_definition_changed_has_no_silence_any_more(metrics):
+    metrics.show([report("n1", age=0.1), report("n2", age=0.2)])
+    for _ in range(2):
+        metrics.show([report("n1", "unknown", None), report("n2", age=0.3)])
+        assert [metric("silence_seconds", node) for node in ("n1", "n2")] == [None, 0.3]
+        assert metric("unknown", "n1") == 1
+    metrics.show([report("n1", age=0.4)])
+    assert metric("silence_seconds", "n1") == 0.4
+
+
 def test_metrics_of_a_node_that_is_gone_are_removed(metrics):
     metrics.show([report("n1"), report("n2")])
     metrics.show([report("n2")])

@@ -34,7 +34,14 @@ class NodeMetrics:
             FLAPPING.labels(*labels).set(report.flapping)
             if report.age is not None:
                 SILENCE.labels(*labels).set(report.age)
+            else:
+                _remove_silence(labels)  # of the readings before its definition changed
         for labels in gone - self._shown:
-            for gauge in (UNKNOWN, FLAPPING, SILENCE):
-                with suppress(KeyError):  # without a reading it had no silence
-                    gauge.remove(*labels)
+            UNKNOWN.remove(*labels)
+            FLAPPING.remove(*labels)
+            _remove_silence(labels)
+
+
+def _remove_silence(labels: tuple[str, str]) -> None:
+    with suppress(KeyError):  # without a reading it had none
+        SILENCE.remove(*labels)

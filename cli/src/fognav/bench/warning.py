@@ -37,12 +37,15 @@ from fognav_sim.nodes import make_nodes
 from fognav_sim.world import World
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Sequence
+    from collections.abc import AsyncIterator, Callable, Iterable, Mapping, Sequence
 
     from fog_contracts.messages import Trace
     from fog_contracts.site import NodeSite
     from fog_runtime.configuration.site import LoadedSite
+    from fognav.bench.standing_robot import Arrived
     from fognav_sim.drive.hazard import PlannedHazard
+
+    TraceKey = tuple[str, int, int]  # area, epoch and sequence number
 
 _BENCH: Final = "bench"
 """The user who stands for the robot."""
@@ -92,7 +95,7 @@ class _Deltas:
     """When the map's deltas arrived (s), by the traces of the hazards in them."""
 
     def __init__(self) -> None:
-        self.arrived: dict[tuple[str, int, int], float] = {}
+        self.arrived: dict[TraceKey, float] = {}
 
     def on_delta(self, sample: zenoh.Sample) -> None:
         """Note a delta; it is called on another thread."""
@@ -102,8 +105,24 @@ class _Deltas:
             self.arrived[_key(trace)] = now
 
 
-def _key(trace: Trace) -> tuple[str, int, int]:
+def _key(trace: Trace) -> TraceKey:
     return trace.area, trace.epoch, trace.seq
+
+
+def first_warning(
+    paths: Iterable[Arrived], area: str, placed: float, echo: float | None, deltas: Mapping[TraceKey, float]
+) -> Warned | None:
+    """Return the moments of the first of these paths around an area that answers an obstacle; None if one is missing.
+
+    The obstacle was placed at `placed` (s), and had its first echo at `echo`. `deltas` says when those of the map
+    arrived (s): a path may be here before the delta that it answers, since each has a subscriber of its own.
+    """
+    for arrived in paths:
+        trace = next((t for t in arrived.path.traces if t.area == area and t.first_reading >= placed), None)
+        delta = None if trace is None else deltas.get(_key(trace))
+        if trace is not None and delta is not None and echo is not None:
+            return Warned(echo, trace.first_reading, trace.confirmed, delta, arrived.at)
+    return None
 
 
 async def measure(
@@ -143,8 +162,8 @@ def figures(rule: str, warned: Sequence[Warned | None]) -> dict[str, Any]:
     row: dict[str, Any] = {"rule": rule, "warnings": len(warned), "missed": len(warned) - len(arrived)}
     for name, (begin, end) in _SPANS.items():
         times = [1000.0 * (getattr(each, end) - getattr(each, begin)) for each in arrived]
-        for p in (50, 99):
-            row[f"{name}_p{p}_ms"] = round(float(np.percentile(times, p)), 1) if times else None
+        for label, p in (("p50", 50), ("p99", 99), ("max", 100)):
+            row[f"{name}_{label}_ms"] = round(float(np.percentile(times, p)), 1) if times else None
     return row
 
 
@@ -223,13 +242,10 @@ class _Trials:
         polygon = next(each.polygon for each in self._loaded.site.areas if each.id == area)
         deadline = time.monotonic() + _TIMEOUT_S
         while time.monotonic() < deadline:
-            for arrived in list(self.robot.paths):
-                trace = next((t for t in arrived.path.traces if t.area == area and t.first_reading >= placed), None)
-                around = entry_distance(arrived.path.points, polygon) is None
-                if trace is None or not around or self._world.echo is None:
-                    continue
-                delta = self._deltas.arrived[_key(trace)]
-                return Warned(self._world.echo, trace.first_reading, trace.confirmed, delta, arrived.at)
+            paths = [each for each in self.robot.paths if entry_distance(each.path.points, polygon) is None]
+            warned = first_warning(paths, area, placed, self._world.echo, self._deltas.arrived)
+            if warned is not None:
+                return warned
             await asyncio.sleep(_POLL_S)
         return None
 

@@ -131,7 +131,8 @@ class _Robot:
             PLANNER, "PUT", f"/api/v1/robots/{ROBOT}/goal", {"pose": {"x": goal[0], "y": goal[1]}}
         )
         path, figures["path_ms"] = await self._next_path(0, begun)
-        # The first path was searched without the goal's distance field, others are guided by it.
+        # The goal's distance field guides the next path. The first one did without, unless so long a search is refused
+        # (the planner's `unguided_expansions`): then it waited for the field.
         await asyncio.sleep(1.0)
         x, y = path.points[len(path.points) // 2]
         shape = {

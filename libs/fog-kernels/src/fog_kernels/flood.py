@@ -1,7 +1,8 @@
 """Exact costs to one cell from all others: Dijkstra's search (1959) on a circular bucket queue (Dial 1969)."""
 
 # Kernels take arrays and scalars, typed by their compiled signatures, and are single functions where a call per cell
-# would cost more than its work.
+# would cost more than its work. So `astar`, `detour` and this module read the weights around a cell by the same lines:
+# as a function, even one that numba inlines, they make a field take 1.4 times as long, and a search twice.
 # ruff: noqa: ANN401, C901, PLR0912, PLR0913, PLR0915
 
 from __future__ import annotations

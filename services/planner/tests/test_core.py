@@ -38,6 +38,7 @@ from fog_contracts.messages import (
 from fog_kernels.astar import Planner
 from planner.config import PlannerConfig
 from planner.core import PlannerCore
+from planner.search.goal_fields import GoalFields
 from planner.search.route import Route
 
 
@@ -144,6 +145,25 @@ def test_robot_whose_search_took_too_long_gets_its_path_when_its_goal_has_a_dist
     drive.step(2.0)
     assert drive.paths[-1].refusal is None
     assert drive.paths[-1].points
+
+
+def test_search_that_took_too_long_leaves_a_passable_path_until_the_goal_has_a_distance_field() -> None:
+    drive = Drive(start=LEFT)
+    first = drive.go(*RIGHT)
+    search = drive.core.replanner._search
+    assert search is not None
+    mission = drive.core.missions.of("r1")
+    drive.core._fields = drive.core.replanner._fields = GoalFields(0)
+    search._most_unguided = 5
+    mission.request_replan("map", [])
+    drive.publish(drive.core.tick(drive.moment))
+    assert mission.search_ran_out
+    assert mission.plan is not None
+    assert mission.plan.refusal is None
+    assert drive.paths[-1].plan_id == first.plan_id
+    geometry = drive.map.geometry
+    drive.core.missions.search_again(geometry.cell(*RIGHT), geometry)
+    assert mission.replan == "refused"
 
 
 def test_path_leads_from_the_robot_to_the_goal_by_its_corners_only() -> None:

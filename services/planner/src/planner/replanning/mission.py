@@ -70,6 +70,8 @@ class Mission:
     """How far along its path (m) the robot meets the first of the changes that caused the replan."""
     refused_search_at: float = -math.inf
     """When a search was last repeated after a refusal."""
+    search_ran_out: bool = False
+    """Whether the last search took too long; a passable path is kept all the same."""
     switches: SwitchLimiter = field(default_factory=SwitchLimiter)
     goal_sent: float = -math.inf
     """When the goal was published last; -inf for one that is new or changed."""
@@ -105,7 +107,7 @@ class Mission:
 
     def _reset(self, reason: ReplanReason | None) -> None:
         self.plan, self.replan, self.traces, self.danger = None, reason, [], math.inf
-        self.switches = SwitchLimiter()
+        self.switches, self.search_ran_out = SwitchLimiter(), False
 
     def request_replan(self, reason: ReplanReason, traces: list[Trace], danger: float = math.inf) -> None:
         """Request a replan; the first reason is kept, except that `map` replaces it.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from planner.reasons.refusals import TIMEOUT
 from planner.replanning.mission import Mission
 
 if TYPE_CHECKING:
@@ -110,8 +109,8 @@ class Missions:
     def search_again(self, goal: Cell, geometry: GridGeometry) -> None:
         """Search again for the robots whose search for a path to a goal's cell took too long: it has a field now."""
         for _, mission in self.active():
-            target, plan = mission.target, mission.plan
-            if target is None or plan is None or plan.refusal is None or plan.refusal.code != TIMEOUT:
+            target = mission.target
+            if target is None or not mission.search_ran_out:
                 continue
             if geometry.cell(target.x, target.y) == goal:
                 mission.request_replan("refused", [])

@@ -10,6 +10,8 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+from planner.reasons.refusals import TIMEOUT
+
 if TYPE_CHECKING:
     from planner.config import PlannerConfig
     from planner.maps.planning_map import PlanningMap
@@ -21,8 +23,13 @@ if TYPE_CHECKING:
 def is_kept(
     plan: Plan, found: SearchResult, reason: ReplanReason, planning_map: PlanningMap, config: PlannerConfig
 ) -> bool:
-    """Whether the current plan is kept: the same refusal, or a passable path that is not clearly worse."""
+    """Whether the current plan is kept: the same refusal, or a passable path that is not clearly worse.
+
+    A search that took too long says nothing about a path that is passable: the robot goes on.
+    """
     if found.refusal is not None:
+        if ran_out(found) and reason not in ("goal", "off_path") and not math.isinf(remaining_cost(plan, planning_map)):
+            return True
         before = plan.refusal
         if before is None or found.question is None:
             return before == found.refusal
@@ -33,6 +40,11 @@ def is_kept(
     remaining = remaining_cost(plan, planning_map)
     share = config.min_saving if reason == "clearing" else config.hysteresis
     return not math.isinf(remaining) and found.cost >= (1.0 - share) * remaining
+
+
+def ran_out(found: SearchResult) -> bool:
+    """Whether a search took too long, so that there may be a path all the same."""
+    return found.refusal is not None and found.refusal.code == TIMEOUT
 
 
 def remaining_cost(plan: Plan, planning_map: PlanningMap) -> float:

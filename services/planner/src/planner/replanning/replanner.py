@@ -6,7 +6,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Literal
 
 from planner.replanning.mission import Plan
-from planner.replanning.replan_policy import is_kept, is_other_way, must_wait
+from planner.replanning.replan_policy import is_kept, is_other_way, must_wait, ran_out
 from planner.search.detours import Detours
 from planner.search.path_search import PathSearch
 
@@ -72,6 +72,7 @@ class Replanner:
             self.refusals[found.refusal.code] = self.refusals.get(found.refusal.code, 0) + 1
             if not found.searched:
                 self.count_avoided("unreachable")
+        mission.search_ran_out = ran_out(found)
         plan = mission.plan
         if plan is not None:
             if is_kept(plan, found, reason, planning_map, self._config):

@@ -242,6 +242,44 @@ def test_paths_are_published_one_by_one_and_a_long_cycle_leaves_the_rest_for_the
     assert core.searched == robots
 
 
+class EndlessCore(PlannerCore):
+    """Whose searches never end; each takes 0.2 s by the rig's clock."""
+
+    def plan(self, at: Moment) -> Iterator[str]:
+        for robot in super().plan(at):
+            self.clock.advance(0.2)
+            yield robot
+        while True:
+            self.clock.advance(0.2)
+            yield "r0"
+
+    clock: ManualClock
+
+
+async def test_paths_are_recorded_after_half_a_second_although_searches_are_left(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(planner.service, "MOST_UNRECORDED", 10**9)
+    core = EndlessCore(epoch=1)
+    rig = Rig(core)
+    core.clock = rig.clock
+    ring_map = RingMap()
+    core.load(ring_map.master.snapshot(), 10.0)
+    core.handlers()[ch.MAP_HEARTBEAT]({}, ring_map.master.heartbeat(0.0), Moment(10.0, 10.0))
+    core.handlers()[ch.ROBOT_POSE]({"robot": "r0"}, pose(*LEFT), Moment(10.0, 10.0))
+    core.set_goal("r0", goal(*RIGHT, "r0"))
+    planning = asyncio.create_task(rig.service.plan_loop())
+    rig.service._wake.set()
+    try:
+        async with asyncio.timeout(10.0):
+            while "r0" not in rig.service._paths:  # noqa: ASYNC110  # set by the loop of plans
+                await asyncio.sleep(0.001)
+    finally:
+        planning.cancel()
+        rig.service.close()
+    assert rig.service._paths["r0"].points
+
+
 class WaitingCore(PlannerCore):
     """Whose second search waits until the first one's path was published; notes whether it was."""
 

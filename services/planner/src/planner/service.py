@@ -45,7 +45,8 @@ if TYPE_CHECKING:
 TICK_S: Final = 0.1
 BUSY_PAUSE_S: Final = 0.25
 MOST_UNRECORDED: Final = 1000
-"""After so many publications they are recorded although searches are left."""
+UNRECORDED_S: Final = 0.5
+"""After so many publications, or so long, they are recorded although searches are left."""
 
 _log = logs.get("planner")
 
@@ -89,7 +90,9 @@ class Service:
         self.states: dict[str, RobotState] = {}
         self._paths: dict[str, RobotPath] = {}
         self._sent: list[Publication] = []
-        """What was published and is not recorded yet."""
+        """What was published and is not recorded yet ..."""
+        self._unrecorded_since = 0.0
+        """... and when the first of it was."""
 
     # --- For the API ------------------------------------------------------------------------------------------------
 
@@ -219,7 +222,7 @@ class Service:
             result = await self._threads.run("core", lambda: self._cycle.run(self._edges.now, self._publish))
             if result.unfinished:
                 self._wake.set()
-            if not result.unfinished or len(self._sent) >= MOST_UNRECORDED:
+            if not result.unfinished or self._must_record():
                 self._record()
             for robot, goal_id in result.reached:
                 self.missions.end(robot, goal_id)
@@ -259,7 +262,14 @@ class Service:
         """Publish on the calling thread."""
         for publication in publications:
             self._edges.publish(publication)
+        if publications and not self._sent:
+            self._unrecorded_since = self._clock.now()
         self._sent += publications
+
+    def _must_record(self) -> bool:
+        """Whether what was published is recorded although searches are left: it is much, or a while ago."""
+        late = bool(self._sent) and self._clock.now() - self._unrecorded_since >= UNRECORDED_S
+        return late or len(self._sent) >= MOST_UNRECORDED
 
     def _record(self) -> None:
         """Record what was published since the last call, for logs, metrics and the API."""

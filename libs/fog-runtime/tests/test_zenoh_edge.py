@@ -208,6 +208,46 @@ async def test_edge_opened_before_any_router_works_once_there_is_one(tmp_path):
             await until_present(b, {("planner", "p1")})
 
 
+async def test_threads_that_publish_before_and_while_the_session_opens_lose_no_delta(tmp_path):
+    port = free_port()
+    endpoint = f"tcp/127.0.0.1:{port}"
+    deltas, errors = [], []
+    connected = threading.Event()
+    async with edge(endpoint, "a") as a, edge(endpoint, "b") as b:
+        b.subscribe(ch.MAP_DELTA, m.MapDelta, lambda _, message: deltas.append(message.seq))
+
+        def publish(seqs):
+            try:
+                for seq in seqs:
+                    a.publish(ch.MAP_DELTA, delta(seq))
+                    a.publish(ch.ROBOT_POSE, pose(1.0), robot=f"r{seq}")
+                    connected.wait(0.02)
+            except Exception as error:  # noqa: BLE001  # shown by the test
+                errors.append(error)
+
+        threads = [threading.Thread(target=publish, args=(range(first, 100, 2),)) for first in (0, 1)]
+        for thread in threads:
+            thread.start()
+        with start_router(tmp_path, port):
+            await until(lambda: a.connected and b.connected, "no connection")
+            connected.set()
+            await asyncio.to_thread(lambda: [thread.join() for thread in threads])
+            await until(lambda: len(set(deltas)) == 100, f"missing: {sorted(set(range(100)) - set(deltas))}")
+    assert errors == []
+    for first in (0, 1):
+        assert [seq for seq in deltas if seq % 2 == first] == list(range(first, 100, 2))
+
+
+async def test_message_that_zenoh_fails_to_send_is_counted_and_does_not_end_the_caller(router):
+    async with edge(router.endpoint) as a:
+        a.publish(ch.ROBOT_POSE, pose(1.0), robot="r1")
+        await asyncio.to_thread(a._session.close)
+        before = counter("fognav_dropped_messages_total", ch.ROBOT_POSE)
+        for robot in ("r1", "r2", "r2"):
+            a.publish(ch.ROBOT_POSE, pose(1.0), robot=robot)
+        assert counter("fognav_dropped_messages_total", ch.ROBOT_POSE) == before + 3
+
+
 async def test_queries_are_answered_by_plain_and_async_handlers_with_ids(router):
     async def command(ids, request):
         await asyncio.sleep(0)

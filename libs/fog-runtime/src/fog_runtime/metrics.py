@@ -48,7 +48,9 @@ BYTES: Final = Counter(
     ["channel", "direction"],
 )
 DROPPED: Final = Counter(
-    "fognav_dropped_messages_total", "Messages dropped without a connection or because a queue was full", ["channel"]
+    "fognav_dropped_messages_total",
+    "Messages dropped without a connection, because a queue was full, or because zenoh failed to send them",
+    ["channel"],
 )
 ANSWERED: Final = Counter("fognav_answered_queries_total", "Queries answered with a reply", ["channel"])
 REPLY_SECONDS: Final = Histogram(

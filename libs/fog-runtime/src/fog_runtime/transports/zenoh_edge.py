@@ -183,7 +183,12 @@ class _Publishers:
             if publisher is not None:
                 return publisher
             publisher = self._by_key[key] = _Publisher(channel, key)
-        self._declare(publisher.declare)
+        try:
+            self._declare(publisher.declare)
+        except zenoh.ZError:
+            with self._lock:
+                del self._by_key[key]  # the next message declares it again
+            raise
         return publisher
 
 
@@ -445,11 +450,17 @@ class ZenohEdge:
         """Publish without waiting, from any thread; raises `ContractError` for a message that violates its contract.
 
         Without a connection the message is lost, except on channels of durability `recovered` and, for the latest
-        message, `latest`: these messages reach their subscribers as soon as there is a connection.
+        message, `latest`: these messages reach their subscribers as soon as there is a connection. One that zenoh
+        fails to send is lost, logged and counted.
         """
         key = self._key(channel, ids)
         data = encode(channel, message)
-        self._publishers.of(channel, key).put(data)
+        try:
+            self._publishers.of(channel, key).put(data)
+        except zenoh.ZError as error:
+            # Whoever publishes goes on: it would end the loop of a process.
+            metrics.DROPPED.labels(channel.name).inc()
+            self._limited.warning("message_dropped", key, self._clock.now(), key=key, reason=str(error))
 
     def subscribe(self, channel: Channel, kind: type[M], handler: Callable[[Ids, M], object], **ids: str) -> None:
         """Call `handler(ids, message)` for each message, with every value of the ids that are not given.

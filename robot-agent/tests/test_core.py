@@ -222,6 +222,13 @@ def test_missed_delta_holds_the_robot_until_a_snapshot_is_loaded(driving):
     assert driving.run(4.0, lambda w: w.state().mode == "NORMAL")
 
 
+def test_snapshot_with_an_epoch_that_no_map_service_can_have_is_refused_and_the_robot_keeps_its_map(driving):
+    with pytest.raises(MapError, match="no map-service can have"):
+        driving.agent.load(msgspec.structs.replace(driving.master.snapshot(), epoch=2**53), driving.now)
+    driving.run(2.0)
+    assert driving.state().mode == "NORMAL"
+
+
 def test_late_deltas_do_not_make_the_map_fresh_while_newer_ones_are_missing(driving):
     boxes = [(3.0 + 0.2 * i, 3.9, 3.1 + 0.2 * i, 4.0) for i in range(4)]
     late = [delta for box in boxes for delta in driving.block(*box, publish=False)]

@@ -3,7 +3,7 @@
 import pytest
 
 from fog_contracts import channels as ch
-from fog_contracts.fencing import Fence, epoch_in
+from fog_contracts.fencing import HEARD_LIMIT, MOST_AHEAD, Fence, epoch_in
 from fog_contracts.handlers import Moment, RefusedMessageError
 from fog_contracts.messages import Leader, MapHeartbeat, RobotGoal, ZoneSet
 
@@ -62,11 +62,30 @@ def test_epochs_are_heard_from_the_service_itself_and_from_those_that_received_t
     assert epoch_in(ch.LEADER, leader, "planner") == 0
 
 
-def test_message_with_an_epoch_that_no_service_can_have_is_refused_and_fences_nobody_off():
+def test_message_with_an_epoch_that_no_service_can_have_is_refused_and_leaves_room_above_it():
     fence, handled = Fence(), []
     handlers = fence.guarded({ch.MAP_HEARTBEAT: lambda _, message, __: handled.append(message) or ()})
+    handlers[ch.MAP_HEARTBEAT]({}, MapHeartbeat(epoch=5, seq=1, hash=0, sent=(0, 0.0)), AT)
     with pytest.raises(RefusedMessageError, match="no map-service can have it"):
         handlers[ch.MAP_HEARTBEAT]({}, MapHeartbeat(epoch=2**53, seq=1, hash=0, sent=(0, 0.0)), AT)
-    handlers[ch.MAP_HEARTBEAT]({}, MapHeartbeat(epoch=5, seq=1, hash=0, sent=(0, 0.0)), AT)
-    assert [message.epoch for message in handled] == [5]
-    assert fence.epochs[ch.MAP] == 5
+    following = fence.epochs[ch.MAP] + 1
+    assert following < HEARD_LIMIT + 2**32
+    handlers[ch.MAP_HEARTBEAT]({}, MapHeartbeat(epoch=following, seq=1, hash=0, sent=(0, 0.0)), AT)
+    assert [message.epoch for message in handled] == [5, following]
+
+
+def test_receiver_that_starts_late_gets_up_to_a_leader_that_had_to_follow_forged_epochs():
+    fence = Fence()
+    epoch = HEARD_LIMIT + 3 * MOST_AHEAD
+    for _ in range(2):
+        with pytest.raises(RefusedMessageError):
+            fence.accept("planner", epoch)
+    fence.accept("planner", epoch)
+    assert fence.epochs == {"planner": epoch}
+
+
+def test_epoch_that_came_another_way_raises_no_further_than_a_message():
+    fence = Fence()
+    assert not fence.reaches("planner", 2**53)
+    fence.raise_to("planner", 2**53)
+    assert fence.epochs == {"planner": HEARD_LIMIT + MOST_AHEAD}

@@ -3,6 +3,7 @@
 `FOGNAV_HISTORIES` sets how many random histories of the model are tried.
 """
 
+import contextlib
 import math
 import os
 
@@ -12,6 +13,8 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 from lease_model import LEASE_S, LeaseModel
 
+from fog_contracts.fencing import HEARD_LIMIT, MOST_AHEAD, Fence
+from fog_contracts.handlers import RefusedMessageError
 from fog_runtime.leases.lease import Granted, Held, Lease
 
 ATTEMPT_S, STEP_S = 0.4, 0.05
@@ -58,8 +61,35 @@ def test_forged_epoch_leaves_room_for_a_leader_above_it(hear):
     request = lease.request(100.1)
     lease.on_reply(request, Granted(request.floor + 1), 100.2)
     assert request.floor + 1 < 2**53, "a number that messages and Redis can carry"
-    forge()
-    assert lease.permission(100.3) == "granted", "the same again is no news"
+    assert lease.permission(100.3) == "granted"
+
+
+@pytest.mark.parametrize("forged", [HEARD_LIMIT + 2, HEARD_LIMIT + MOST_AHEAD, HEARD_LIMIT + 2**32, 2**53])
+def test_leader_continues_above_an_epoch_that_was_forged_to_its_receivers(forged):
+    lease, fence = leading(at=100.0), Fence()
+    for round_ in range(3):
+        now = 100.1 + 0.3 * round_
+        with contextlib.suppress(RefusedMessageError):
+            fence.accept("planner", forged)
+        lease.on_epoch(fence.epochs["planner"])  # as receivers report it
+        request = lease.request(now)
+        if request is not None:
+            lease.on_reply(request, Granted(max(lease.epoch, request.floor + 1)), now + 0.01)
+        fence.accept("planner", lease.epoch)
+        assert lease.permission(now + 0.02) == "granted"
+
+
+@pytest.mark.parametrize("hear", ["on_rival", "on_leader"])
+def test_leader_above_all_clocks_still_gives_way_to_a_higher_epoch(hear):
+    lease = leading(HEARD_LIMIT + 5, at=100.0)
+    if hear == "on_leader":
+        lease.on_leader(HEARD_LIMIT + 6, "b", 100.1)
+    else:
+        lease.on_rival(HEARD_LIMIT + 6)
+    assert lease.permission(100.1) == "pending"
+    request = lease.request(100.1)
+    assert request is not None
+    assert request.floor == HEARD_LIMIT + 6
 
 
 def test_leader_acts_on_while_redis_promptly_fails_to_answer():

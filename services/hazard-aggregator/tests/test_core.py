@@ -258,6 +258,15 @@ def test_aggregator_goes_above_a_foreign_hazard_and_publishes_its_own_word_again
         rig.core.set_epoch(epoch + 1)
 
 
+def test_aggregator_gets_above_a_forged_epoch_as_far_as_receivers_follow_it():
+    rig = Rig()
+    rig.deliver(ch.AGGREGATOR_HEARTBEAT, heartbeat(epoch=2**53))
+    assert rig.core.outranked_by is not None
+    rig.core.set_epoch(rig.core.outranked_by + 1)
+    assert rig.core.epoch < 2**53
+    assert rig.core.outranked_by is None
+
+
 def test_foreign_heartbeat_with_a_higher_epoch_outranks_and_a_lower_one_does_not():
     rig = Rig()
     rig.deliver(ch.AGGREGATOR_HEARTBEAT, heartbeat(epoch=4))

@@ -226,6 +226,15 @@ def test_heartbeats_of_a_replaced_aggregator_are_refused():
         fog.beat(CLEAR, GATE, epoch=5)
 
 
+def test_heartbeat_with_an_epoch_that_no_aggregator_can_have_is_refused_and_the_living_one_is_believed_still():
+    fog = running()
+    with pytest.raises(RefusedMessageError, match="no aggregator can have it"):
+        fog.beat(CLEAR, GATE, epoch=2**53)
+    fog.run(1.0, CLEAR, GATE)
+    assert fog.layer.aggregator.epoch == 5
+    assert fog.state() == ("clear", 0)
+
+
 def test_new_aggregator_is_believed_once_its_heartbeats_kept_arriving():
     fog = running()
     own = [structs.replace(h, epoch=6) for h in (CLEAR, GATE)]

@@ -35,6 +35,7 @@ from fog_contracts.messages import (
     Zone,
     ZoneSet,
 )
+from fog_contracts.replica import MapError
 from fog_kernels.astar import Planner
 from planner.config import PlannerConfig
 from planner.core import PlannerCore
@@ -164,6 +165,14 @@ def test_search_that_took_too_long_leaves_a_passable_path_until_the_goal_has_a_d
     geometry = drive.map.geometry
     drive.core.missions.search_again(geometry.cell(*RIGHT), geometry)
     assert mission.replan == "refused"
+
+
+def test_snapshot_with_an_epoch_that_no_map_service_can_have_is_refused_and_changes_nothing() -> None:
+    core, ring_map = PlannerCore(epoch=7), RingMap()
+    with pytest.raises(MapError, match="no map-service can have"):
+        core.load(RingMap(epoch=2**53).master.snapshot(), 100.0)
+    core.load(ring_map.master.snapshot(), 100.0)
+    assert core.fence.epochs == {ch.MAP: 1}
 
 
 def test_path_leads_from_the_robot_to_the_goal_by_its_corners_only() -> None:

@@ -20,10 +20,19 @@ if TYPE_CHECKING:
 
 
 HEARD_LIMIT: Final = 2**52
-"""No clock (ms) gives an epoch as high as this one. Higher ones count as this when they are heard of, so that whoever
-forges one leaves room for a leader above it ..."""
-HIGHEST_EPOCH: Final = HEARD_LIMIT + 2**32
-"""... and messages with an epoch above this are refused: not so many leaders can have followed one another."""
+"""No clock (ms) gives an epoch as high as this one: above it, epochs rise in steps of at most `MOST_AHEAD`."""
+MOST_AHEAD: Final = 2**20
+"""How far one message may raise the highest known epoch above `HEARD_LIMIT`. So many leaders don't follow one another
+unheard, and it takes billions of forged messages to leave no room for a leader above them."""
+
+
+def within_reach(epoch: int, known: int) -> int:
+    """Return how far an epoch that is heard of may raise the highest known one: it may be forged.
+
+    Receivers and leaders limit what they hear alike. So a leader can always get an epoch that its receivers accept,
+    and one whose own epoch lies above `HEARD_LIMIT` still gives way to a higher one.
+    """
+    return min(epoch, max(known, HEARD_LIMIT) + MOST_AHEAD)
 
 
 class Fence:
@@ -38,15 +47,31 @@ class Fence:
         return dict(self._highest)
 
     def raise_to(self, service: str, epoch: int) -> None:
-        """Refuse messages of the service below an epoch that came another way, as the reply to a query."""
-        self._highest[service] = max(epoch, self._highest.get(service, 0))
+        """Refuse messages of the service below an epoch that came another way, as far as it is `within_reach`."""
+        highest = self._highest.get(service, 0)
+        self._highest[service] = max(within_reach(epoch, highest), highest)
+
+    def reaches(self, service: str, epoch: int) -> bool:
+        """Return whether the service can have the epoch, by the highest one that is known of it."""
+        return epoch <= within_reach(epoch, self._highest.get(service, 0))
 
     def require_current(self, service: str, epoch: int) -> None:
-        """Raise `RefusedMessageError` for an epoch below the highest one of its service, or one that none can have."""
-        if epoch > HIGHEST_EPOCH:
-            raise RefusedMessageError(f"its epoch {epoch} is above {HIGHEST_EPOCH}: no {service} can have it")
+        """Raise `RefusedMessageError` for an epoch below the highest one of its service, or far above all possible."""
+        if not self.reaches(service, epoch):
+            raise RefusedMessageError(f"its epoch {epoch} is far above all before: no {service} can have it yet")
         if epoch < (highest := self._highest.get(service, 0)):
             raise RefusedMessageError(f"its epoch {epoch} is below {highest}: another {service} has taken over")
+
+    def accept(self, service: str, epoch: int) -> None:
+        """Raise the highest epoch of the service to that of a message; raises as `require_current`.
+
+        A refused epoch raises it, too, but only by a step: a receiver that has just started, and has heard of none,
+        gets up to a leader that had to follow forged ones.
+        """
+        try:
+            self.require_current(service, epoch)
+        finally:
+            self.raise_to(service, epoch)
 
     def guarded(self, handlers: Mapping[Channel, Handler]) -> dict[Channel, Handler]:
         """Return the handlers, refusing messages of lower epochs on the channels that carry one (`Channel.epoch`)."""
@@ -59,8 +84,7 @@ class Fence:
         @wraps(handler)
         def handle(ids: Ids, message: object, at: Moment) -> Sequence[Publication]:
             service, epoch = channel.publishers[0], getattr(message, channel.epoch)
-            self.require_current(service, epoch)
-            self.raise_to(service, epoch)
+            self.accept(service, epoch)
             return handler(ids, message, at)
 
         return handle

@@ -25,6 +25,7 @@ from fog_contracts import channels as ch
 from fog_contracts.fencing import Fence
 from fog_contracts.follower import MapFollower
 from fog_contracts.messages import LoopHealth
+from fog_contracts.replica import MapError
 from robot_agent.agent.blocked_places import BlockedPlaces
 from robot_agent.agent.fog_inputs import FogInputs
 from robot_agent.agent.maneuvering.maneuvers import Maneuvers
@@ -134,6 +135,8 @@ class AgentCore:
     def load(self, map_: MapSnapshot | PreparedMap, now: float) -> None:
         """Load a snapshot, from the map-service or from disk, prepared or not; raises `MapError` when it is invalid."""
         prepared = map_ if isinstance(map_, PreparedMap) else self.prepare_map(map_)
+        if not self._fence.reaches(ch.MAP, prepared.snapshot.epoch):
+            raise MapError(f"the snapshot has epoch {prepared.snapshot.epoch}, which no {ch.MAP} can have yet")
         self._map.on_snapshot(prepared.decoded, now)
         self._fence.raise_to(ch.MAP, prepared.snapshot.epoch)
         self._pose_keeper.load_map(prepared.snapshot.site, prepared.fields)

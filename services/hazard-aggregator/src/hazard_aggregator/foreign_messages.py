@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Final, Literal, NamedTuple
 
+from fog_contracts.fencing import within_reach
+
 _MAX_FOREIGN: Final = 100
 """Messages of others between two calls of `pop`; further ones are not counted."""
 
@@ -19,7 +21,7 @@ class ForeignMessage(NamedTuple):
 
 
 class ForeignMessages:
-    """Collects them; `epoch` is the highest one of another sender, 0 before the first."""
+    """Collects them; `epoch` is the highest one of another sender that receivers follow, 0 before the first."""
 
     def __init__(self) -> None:
         self.epoch = 0
@@ -27,7 +29,7 @@ class ForeignMessages:
 
     def add(self, kind: ForeignKind, epoch: int, area: str) -> None:
         """Record a message that another sender published."""
-        self.epoch = max(self.epoch, epoch)
+        self.epoch = max(self.epoch, within_reach(epoch, self.epoch))
         if len(self._found) < _MAX_FOREIGN:
             self._found.append(ForeignMessage(kind, epoch, area))
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from fog_contracts import channels as ch
+from fog_contracts.fencing import within_reach
 from fog_contracts.handlers import RefusedMessageError
 from fog_contracts.hazards import digest
 from fog_contracts.liveness import HeartbeatWatch
@@ -40,6 +41,7 @@ class AggregatorMonitor:
 
     def __init__(self) -> None:
         self._believed: _Sender | None = None
+        self._reach = 0  # the highest epoch that an aggregator can have, as far as epochs were heard
         self._newest: _Sender | None = None  # the believed one, or one with a higher epoch that is not trusted yet
         self._missing: dict[str, float] = {}  # since when the map lacks what the heartbeat lists, by area
         self._digest_differs = False
@@ -56,8 +58,12 @@ class AggregatorMonitor:
     ) -> None:
         """Handle a heartbeat, given the newest hazard received of each area, and the areas whose definition is known.
 
-        Raises `RefusedMessageError` for an aggregator that another one has replaced.
+        Raises `RefusedMessageError` for an aggregator that another one has replaced, and for an epoch that none can
+        have yet: it is forged, and would fence off all others.
         """
+        self._reach = max(self._reach, within_reach(heartbeat.epoch, self._reach))
+        if heartbeat.epoch > self._reach:
+            raise RefusedMessageError(f"its epoch {heartbeat.epoch} is far above all before: no aggregator can have it")
         newest = self._newest
         if newest is None or heartbeat.epoch > newest.heartbeat.epoch:
             newest = self._newest = _Sender(heartbeat)

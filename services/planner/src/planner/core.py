@@ -18,8 +18,9 @@ from typing import TYPE_CHECKING, Final
 from fog_contracts import channels as ch
 from fog_contracts.fencing import Fence
 from fog_contracts.handlers import Publication
+from fog_contracts.replica import MapError
 from planner.config import PlannerConfig
-from planner.maps.planning_map import MapTracker
+from planner.maps.planning_map import MapTracker, PreparedMap
 from planner.queries import Answerer, ExplainJob, View
 from planner.reasons.blocked_regions import BlockedRegions, cover
 from planner.reasons.refusals import goal_out_of_reach
@@ -45,7 +46,7 @@ if TYPE_CHECKING:
         RobotPose,
         RobotState,
     )
-    from planner.maps.planning_map import CostChange, PlanningMap, PreparedMap
+    from planner.maps.planning_map import CostChange, PlanningMap
     from planner.replanning.mission import Mission
 
     Job = FieldJob | ExplainJob
@@ -159,6 +160,9 @@ class PlannerCore:
 
         One that `prepare_map` has prepared on another thread is loaded in 2 ms.
         """
+        version = snapshot.decoded.version if isinstance(snapshot, PreparedMap) else snapshot
+        if not self.fence.reaches(ch.MAP, version.epoch):
+            raise MapError(f"the snapshot has epoch {version.epoch}, which no {ch.MAP} can have yet")
         loaded = self._map.load(snapshot, now)
         planning_map = self._map.current
         assert planning_map is not None

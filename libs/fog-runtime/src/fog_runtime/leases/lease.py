@@ -14,9 +14,9 @@ The holder may act until a deadline, counted from *before* its last request was 
   answer that it was too late to read: the deadline has passed, and it waits for the answer to its next request.
 
 Whoever hears an epoch above its own stops acting at once and asks Redis. If it still holds the lease, the other epoch
-is an old one, or was made without Redis: it continues with one above, for which a forged epoch leaves room
-(`HEARD_LIMIT`). Without Redis it gives way to a leader that is alive, and else makes a provisional epoch above all that
-it heard, which Redis confirms or corrects later.
+is an old one, or was made without Redis: it continues with one above. A forged epoch leaves room for that, because a
+leader counts no further than receivers follow it (`within_reach`). Without Redis it gives way to a leader that is
+alive, and else makes a provisional epoch above all that it heard, which Redis confirms or corrects later.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import math
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from fog_contracts.fencing import HEARD_LIMIT
+from fog_contracts.fencing import within_reach
 
 LEASE_S: Final = 1.2
 """Duration of the lease in Redis."""
@@ -173,6 +173,7 @@ class Lease:
         """Handle the announcement of a process that leads; our own is ignored."""
         if holder == self.holder:
             return
+        epoch = self._within_reach(epoch)
         if self.leader is None or epoch >= self.leader.epoch:
             self.leader = Leader(epoch, holder, now)
         if epoch >= self.epoch:
@@ -188,7 +189,10 @@ class Lease:
         self._hear(epoch)
 
     def _hear(self, epoch: int) -> None:
-        self._floor = max(self._floor, min(epoch, HEARD_LIMIT))
+        self._floor = max(self._floor, self._within_reach(epoch))
+
+    def _within_reach(self, epoch: int) -> int:
+        return within_reach(epoch, max(self._floor, self.epoch))
 
     def _leader_heard_at(self) -> float:
         """When a leader with an epoch not below ours was last heard."""
@@ -228,5 +232,5 @@ class Lease:
         self._extend(since)
 
     def _stand_by(self, leader: Leader | None) -> None:
-        self._floor = max(self._floor, self.epoch, min(leader.epoch, HEARD_LIMIT) if leader is not None else 0)
+        self._floor = max(self._floor, self.epoch, self._within_reach(leader.epoch) if leader is not None else 0)
         self.epoch, self.confirmed, self.leader, self._deadline = 0, False, leader, -math.inf

@@ -7,7 +7,7 @@ import math
 import pytest
 from little_world import LittleWorld
 
-from fog_contracts.messages import RobotCommand
+from fog_contracts.messages import Pose, RobotCommand
 
 ALIKE = {"rooms": [(1, 1, 4.5, 4), (6, 1, 9.5, 4)], "size": (11.0, 6.0)}
 # The second room has a niche that is so shallow that one scan does not tell the rooms apart.
@@ -73,6 +73,60 @@ def test_advance_stays_within_its_distance_and_stops_before_what_the_lidar_sees(
     assert not world.collided
     assert world.state().mode == "INIT"
     assert world.travelled < 0.25
+
+
+def uncertain():
+    """A robot in a plain corridor, where the lidar can't confirm the pose that it was given."""
+    world = LittleWorld(rooms=[(1.0, 1.0, 61.0, 3.0)], size=(62.0, 4.0), pose=(28.0, 2.0, 0.0))
+    world.agent.load(world.master.snapshot(), world.now)
+    world.run(0.6)
+    assert world.command("initial_pose", pose=Pose(x=28.0, y=2.0, theta=0.0)).accepted
+    world.run(1.0)
+    assert world.agent.localizer.status == "weak"
+    return world
+
+
+def test_robot_with_an_uncertain_pose_does_not_advance_into_a_blocked_place_that_it_knows():
+    world = uncertain()
+    world.block(28.2, 1.5, 29.2, 2.5)
+    reply = world.command("advance")
+    assert (reply.accepted, reply.reason) == (False, "a blocked part of the map is on the way ahead")
+    world.run(2.0)
+    assert world.travelled < 0.01
+
+
+@pytest.mark.parametrize("rectangle", [(28.5, 1.5, 29.0, 2.5), (28.2, 2.1, 28.3, 2.5), (28.2, 1.5, 28.3, 1.9)])
+def test_body_with_an_uncertain_pose_keeps_off_what_is_blocked_before_and_beside_its_centre(rectangle):
+    world = uncertain()
+    world.block(*rectangle)
+    assert "on the way ahead" in world.command("advance").reason
+    assert world.command("turn").accepted
+
+
+def test_place_that_is_blocked_on_the_way_ends_an_advance_with_an_uncertain_pose():
+    world = uncertain()
+    world.block(28.7, 1.5, 29.2, 2.5)
+    assert world.command("advance").accepted
+    world.run(1.5)
+    assert world.travelled > 0.05
+    world.block(28.4, 1.5, 29.2, 2.5)
+    world.run(0.3)
+    assert world.wheels == (0.0, 0.0)
+    assert any("the advance ended: a blocked part of the map is on" in reason for reason in world.state().reasons)
+    world.run(5.0)
+    assert world.x < 28.4 - 0.17
+
+
+@pytest.mark.parametrize("kind", ["turn", "advance"])
+def test_robot_in_a_place_that_is_blocked_by_an_uncertain_pose_neither_turns_nor_advances(kind):
+    world = uncertain()
+    assert world.command(kind).accepted
+    world.run(1.0)
+    world.block(27.5, 1.5, 28.6, 2.5)
+    world.run(0.3)
+    assert world.wheels == (0.0, 0.0)
+    assert world.state().mode == "INIT"
+    assert not world.command(kind).accepted
 
 
 def test_robot_that_knows_where_it_is_does_not_turn():

@@ -319,16 +319,37 @@ def test_base_and_lidar_refuse_looking_around_and_end_it(kind, changes):
 
 
 @pytest.mark.parametrize("kind", ["turn", "advance"])
-def test_looking_around_needs_neither_place_nor_map_and_ends_once_the_place_is_known(kind):
+def test_looking_around_without_a_pose_needs_no_map_and_ends_once_the_place_is_known(kind):
     unknown = {"localization": "none", "map_loaded": False, "map_age": math.inf, "inside_blocked": "the zone x"}
     gate = Gate(enabled=False, **unknown)
     out = gate.run(request=kind, maneuver_remaining=1.0)
     assert (out.refusal, out.mode, out.cap, out.mission_may_drive) == (None, "EGRESS", 0.10, False)
     assert gate.run(1.0, maneuver_remaining=0.5).mode == "EGRESS"
-    assert gate.run(maneuver_remaining=0.4, localization="weak").mode == "EGRESS"
+    assert gate.run(maneuver_remaining=0.4, localization="weak", inside_blocked=None).mode == "EGRESS"
     out = gate.run(maneuver_remaining=0.3, localization="good")
     assert (out.mode, gate.state.enabled, out.stop) == ("INIT", False, "immediate")
     assert any("the robot knows where it is" in reason for reason in out.reasons)
+
+
+@pytest.mark.parametrize("kind", ["turn", "advance"])
+@pytest.mark.parametrize(("changes", "words"), [
+    ({"inside_blocked": "the zone x"}, "the robot is in the zone x"),
+    ({"blocked_ahead": "the zone x"}, "the zone x is on the way ahead"),
+])  # fmt: skip
+def test_zone_refuses_and_ends_looking_around_by_an_uncertain_pose(kind, changes, words):
+    gate = Gate(enabled=False, localization="weak")
+    assert words in gate.run(request=kind, maneuver_remaining=1.0, **changes).refusal
+    assert gate.run(request=kind, maneuver_remaining=1.0).refusal is None
+    out = gate.run(maneuver_remaining=0.9, **changes)
+    assert (out.mode, out.stop, gate.state.maneuver) == ("INIT", "immediate", None)
+    assert any(words in reason for reason in out.reasons)
+
+
+@pytest.mark.parametrize("kind", ["turn", "advance"])
+@pytest.mark.parametrize("localization", ["weak", "lost", "none"])
+def test_robot_on_its_dock_does_not_look_around(kind, localization):
+    out = Gate(enabled=False, localization=localization, **ON_DOCK).run(request=kind, maneuver_remaining=1.0)
+    assert out.refusal == "the robot is on its dock: undock it first"
 
 
 @pytest.mark.parametrize(("kind", "longest"), [("turn", 30.0), ("advance", 15.0)])

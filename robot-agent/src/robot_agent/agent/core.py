@@ -238,6 +238,8 @@ class AgentCore:
     def _evaluate_safety(self, now: float, request: Request | None = None) -> SafetyOutputs:
         pose = self._localizer.pose(now)
         trusted = pose if self._localizer.status in {"good", "weak"} else None
+        maneuver = self._maneuvers.inputs(self._safety.state, self.replica, trusted, now)
+        ahead = self._maneuvers.way_ahead(request, maneuver)
         inputs = safety_inputs(
             self._base,
             self._lidar,
@@ -246,7 +248,8 @@ class AgentCore:
             self._driving.mission,
             path_problem=self._driving.path_problem(self.replica, self._guard, self.safety, now),
             inside_blocked=self._navigation.inside_blocked(trusted, self._reporter, now) if trusted else None,
-            maneuver=self._maneuvers.inputs(self._safety.state, self.replica, trusted, now),
+            blocked_ahead=self._navigation.blocked_ahead(trusted, ahead, self._reporter, now) if trusted else None,
+            maneuver=maneuver,
             caution=self._navigation.caution(pose, now) if pose else None,
             resting=self._rest.reason,
             now=now,

@@ -6,8 +6,11 @@ for no message of the fog's planner.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
+import numpy as np
+
+from robot_agent.localization.pose import Pose2
 from robot_agent.profiles import FOG, PROFILES
 
 if TYPE_CHECKING:
@@ -21,10 +24,12 @@ if TYPE_CHECKING:
     from robot_agent.agent.sensing.obstacle_reporter import ObstacleReporter
     from robot_agent.config import AgentConfig
     from robot_agent.localization.localizer import Localizer
-    from robot_agent.localization.pose import Pose2
     from robot_agent.onboard.navigator import OnboardNavigator
     from robot_agent.onboard.search import Found, Search
     from robot_agent.profiles import Profile
+
+_STEP_M: Final = 0.05
+"""Distance between the places on the way ahead that are looked up in the map."""
 
 
 class Navigation:
@@ -132,6 +137,19 @@ class Navigation:
         if self._onboard is None:
             return self._places.containing(pose, self.replica, reporter, now)
         return self._places.named(pose, self.replica) if self.profile.hazards else None
+
+    def blocked_ahead(self, pose: Pose2, way: float, reporter: ObstacleReporter, now: float) -> str | None:
+        """Return the name of a blocked place that the body would reach, `way` m straight ahead; None at 0 m."""
+        if way <= 0.0:
+            return None
+        radius = self._config.radius
+        steps = 2 + int((way + radius) / _STEP_M), 2 + int(2.0 * radius / _STEP_M)
+        for along in np.linspace(0.0, way + radius, steps[0]):
+            for aside in np.linspace(-radius, radius, steps[1]):
+                place = pose.compose(Pose2(float(along), float(aside), 0.0))
+                if (name := self.inside_blocked(place, reporter, now)) is not None:
+                    return name
+        return None
 
     def caution(self, pose: Pose2, now: float) -> str | None:
         """Return why the robot must drive slowly where it is; None when it need not."""

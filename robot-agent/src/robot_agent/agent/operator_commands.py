@@ -24,7 +24,7 @@ _ACCEPTED: Final[Mapping[Request, str]] = {
     "egress": "the robot leaves the blocked area slowly; watch it",
     "undock": "the robot leaves its dock, straight back; watch it",
     "turn": "the robot turns in place to find out where it is; watch it",
-    "advance": "the robot drives 0.4 m ahead to find out where it is; watch it: it knows of no zone yet",
+    "advance": "the robot drives 0.4 m ahead to find out where it is; watch it: without a pose it heeds no zone",
     "back_off": "the robot backs off by at most 10 cm; then reset its fault",
 }
 

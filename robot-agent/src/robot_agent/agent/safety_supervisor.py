@@ -21,7 +21,10 @@ if TYPE_CHECKING:
 
 
 class ManeuverInputs(NamedTuple):
-    """How the maneuver goes: m to its end, what keeps the robot from it, and why the base must not seek its dock."""
+    """How the maneuver goes, and why the base must not seek its dock.
+
+    remaining: m to its end, rad of a turn. problem: what keeps the robot from it.
+    """
 
     remaining: float = math.inf
     problem: str | None = None
@@ -58,6 +61,7 @@ def safety_inputs(  # noqa: PLR0913  # the gate weighs every source of the agent
     *,
     path_problem: str | None,
     inside_blocked: str | None,
+    blocked_ahead: str | None,
     maneuver: ManeuverInputs,
     caution: str | None,
     resting: str | None,
@@ -88,6 +92,7 @@ def safety_inputs(  # noqa: PLR0913  # the gate weighs every source of the agent
         released_remaining=follower.released_remaining if follower else 0.0,
         path_problem=path_problem,
         inside_blocked=inside_blocked,
+        blocked_ahead=blocked_ahead,
         maneuver_remaining=maneuver.remaining,
         maneuver_problem=maneuver.problem,
         dock_problem=maneuver.dock_problem,

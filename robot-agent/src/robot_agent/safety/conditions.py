@@ -38,7 +38,8 @@ class SafetyInputs(msgspec.Struct, frozen=True, kw_only=True):
     map_age: since the map copy was last confirmed to be the newest version. map_gap: for how long deltas have been
     missing, 0 when none are. plan_age: since the planner's last message about the goal. released_remaining: m of
     released path ahead. path_problem: why the path must not be driven. inside_blocked: the blocked area or zone that
-    the robot is in. maneuver_remaining: m to the end of the maneuver that runs, infinite while that is not known.
+    the robot is in; blocked_ahead: the one on the way of an advance that runs or is asked for, both by a pose that is
+    good or weak. maneuver_remaining: m to the end of the maneuver that runs, rad of a turn, infinite while not known.
     maneuver_problem: what keeps the robot from getting there. dock_problem: why the base must not drive into its dock
     by itself. caution: a reason to drive slowly here. guardian_lost: why there is no link to the guardian.
     base_stopped: why the guardian keeps the wheels at zero. bumped: the fault that it has latched is a bump.
@@ -68,6 +69,7 @@ class SafetyInputs(msgspec.Struct, frozen=True, kw_only=True):
     released_remaining: float = 0.0
     path_problem: str | None = None
     inside_blocked: str | None = None
+    blocked_ahead: str | None = None
     maneuver_remaining: float = math.inf
     maneuver_problem: str | None = None
     dock_problem: str | None = None

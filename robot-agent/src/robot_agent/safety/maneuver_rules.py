@@ -111,19 +111,32 @@ def _refuses_back_off(inputs: SafetyInputs) -> str | None:
 
 
 def _relevant_to_looking_around(inputs: SafetyInputs) -> SafetyInputs:
-    # A robot that does not know its place knows no zone, and needs no map to turn: base and lidar guard it.
+    # A robot that does not know its place knows no zone, and needs no map to turn: base and lidar guard it. But an
+    # uncertain pose is good enough to drive by, so that it is good enough for zones and areas, too.
+    inside = inputs.inside_blocked if inputs.localization == "weak" else None
     return replace(
-        inputs, localization="good", inside_blocked=None, map_loaded=True, map_age=0.0, map_gap=0.0, mission=False
+        inputs, localization="good", inside_blocked=inside, map_loaded=True, map_age=0.0, map_gap=0.0, mission=False
     )
 
 
 def _refuses_looking_around(inputs: SafetyInputs) -> str | None:
-    return "the robot knows where it is: there is nothing to find out" if inputs.localization == "good" else None
+    if inputs.docked_for is not None:
+        return "the robot is on its dock: undock it first"
+    if inputs.localization == "good":
+        return "the robot knows where it is: there is nothing to find out"
+    return _lies_ahead(inputs)
+
+
+def _lies_ahead(inputs: SafetyInputs) -> str | None:
+    """Return the sentence about a blocked place on the way of an advance; None without one."""
+    return None if inputs.blocked_ahead is None else f"{inputs.blocked_ahead} is on the way ahead"
 
 
 def _looking_around_end(inputs: SafetyInputs, _: SafetyConfig) -> tuple[str, bool] | None:
     if inputs.localization == "good":
         return "the robot knows where it is", True
+    if (ahead := _lies_ahead(inputs)) is not None:
+        return ahead, False
     if inputs.maneuver_remaining > 0.0:
         return None
     detail = f": {inputs.localization_detail}" if inputs.localization_detail else ""

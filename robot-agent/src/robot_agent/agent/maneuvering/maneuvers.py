@@ -98,6 +98,12 @@ class Maneuvers:
         self.egress.advance(trusted, now)
         return ManeuverInputs(self.egress.remaining, self.egress.problem(self._guard.reason))
 
+    def way_ahead(self, request: Request | None, inputs: ManeuverInputs) -> float:
+        """Return how far (m) an advance that runs, or is requested now, drives straight ahead; 0 without one."""
+        if self._kind == "advance":
+            return max(0.0, min(ADVANCE_M, inputs.remaining))
+        return ADVANCE_M if request == "advance" else 0.0
+
     def command(
         self, state: SafetyState, safety: SafetyOutputs, driving: PathDriving, now: float
     ) -> WheelCommand | None:

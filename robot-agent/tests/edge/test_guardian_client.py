@@ -12,6 +12,7 @@ from fog_runtime.clock import SystemClock
 from robot_agent.agent.edges.guardian_client import FEEDBACK_TIMEOUT_S, RESET_VALID_S, GuardianClient
 from robot_agent.guardian.link import BaseFeedback, WheelCommand, decode_command, encode
 from robot_agent.hardware import BaseStatus, WheelOdometry
+from robot_agent.localization.odometry_buffer import OdometryBuffer
 
 pytestmark = pytest.mark.live
 
@@ -130,7 +131,9 @@ async def test_bad_feedback_is_ignored_and_a_silent_base_is_reported(rig):
     guardian.close()
 
 
-@pytest.mark.parametrize(("age", "trusted"), [(0.04, True), (0.3, False), (-0.01, False), (None, False)])
+@pytest.mark.parametrize(
+    ("age", "trusted"), [(0.04, True), (0.3, True), (20.0, True), (31.0, False), (-0.01, False), (None, False)]
+)
 async def test_feedback_counts_from_when_it_was_sent_by_the_clock_of_both(rig, age, trusted):
     guardian = Guardian(rig.path)
     await guardian.accept()
@@ -139,6 +142,36 @@ async def test_feedback_counts_from_when_it_was_sent_by_the_clock_of_both(rig, a
     guardian.link.send(encode(msgspec.structs.replace(FEEDBACK, at=None if age is None else now - age)))
     await rig.until(lambda: rig.feedback)
     assert rig.times == [pytest.approx(now - age if trusted else now, abs=1e-6)]
+    guardian.close()
+
+
+async def test_feedback_that_waited_while_the_agent_was_late_keeps_its_times_and_so_all_odometry(rig):
+    guardian = Guardian(rig.path)
+    await guardian.accept()
+    now = time.monotonic()
+    rig.clock.now = lambda: now
+    ages = [0.05 * count for count in range(16, -1, -1)]
+    for age in ages:
+        guardian.link.send(encode(msgspec.structs.replace(FEEDBACK, at=now - age)))
+    await rig.until(lambda: len(rig.times) == len(ages))
+    assert rig.times == pytest.approx([now - age for age in ages], abs=1e-6)
+    odometry = OdometryBuffer()
+    for number, at in enumerate(rig.times):
+        odometry.add(at, 0.015 * number, 0.0, 0.0)
+    assert odometry.pose(now - 0.4).x == pytest.approx(0.015 * 8, abs=1e-6)
+    assert odometry.twist()[0] == pytest.approx(0.3, abs=1e-3)
+    guardian.close()
+
+
+async def test_times_of_feedback_never_go_back_even_when_another_clock_shows_late(rig):
+    guardian = Guardian(rig.path)
+    await guardian.accept()
+    now = time.monotonic()
+    rig.clock.now = lambda: now
+    for age in (0.2, 0.3, -5.0, 0.1):
+        guardian.link.send(encode(msgspec.structs.replace(FEEDBACK, at=now - age)))
+    await rig.until(lambda: len(rig.times) == 4)
+    assert rig.times == pytest.approx([now - 0.2, now - 0.2, now, now], abs=1e-6)
     guardian.close()
 
 

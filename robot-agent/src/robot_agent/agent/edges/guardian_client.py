@@ -29,8 +29,8 @@ FEEDBACK_TIMEOUT_S: Final = 1.0
 """Without feedback for this long the guardian receives nothing from its base."""
 RESET_VALID_S: Final = 1.0
 """An operator's reset that could not be passed on within this time expires: it must not clear a later fault."""
-_SENT_WITHIN_S: Final = 0.25
-"""Feedback waits no longer than this for the stream; an older or later time is that of another clock."""
+_SENT_WITHIN_S: Final = 30.0
+"""The first feedback of a link that is older than this, by the time that it says, says that of another clock."""
 _PACKETS_AT_ONCE: Final = 64
 """A flood of packets must not block the stream."""
 
@@ -38,7 +38,10 @@ _log = logs.get("base")
 
 
 class GuardianClient:
-    """One connection to the guardian at a time; `receive` calls `on_feedback` with the time at which it was sent."""
+    """One connection to the guardian at a time; `receive` calls `on_feedback` with the time at which it was sent.
+
+    Where the guardian tells no time, or one of another clock, it is the time of arrival.
+    """
 
     def __init__(
         self,
@@ -62,6 +65,10 @@ class GuardianClient:
         self._last_logged = ""
         self._accepted = False
         """Whether the guardian has sent feedback on this link."""
+        self._shares_clock = True
+        """Whether the times that the guardian tells on this link are those of this clock, as far as that is known."""
+        self._sent_at = -math.inf
+        """The time of the last feedback that was passed on."""
         self._limited = logs.RateLimited(_log)
 
     def send(self, command: WheelCommand) -> bool:
@@ -143,11 +150,22 @@ class GuardianClient:
             return f"the guardian refuses this agent: {feedback}"
         if not self._accepted:
             self._accepted = True
+            self._shares_clock = feedback.at is None or now - feedback.at <= _SENT_WITHIN_S
             _log.info("guardian_connected", socket=str(self._path))
         self._feedback_at, self._last_logged = now, ""
-        sent_at = now if feedback.at is None else feedback.at
-        self._on_feedback(feedback, sent_at if 0.0 <= now - sent_at <= _SENT_WITHIN_S else now)
+        self._on_feedback(feedback, self._time_of(feedback, now))
         return None
+
+    def _time_of(self, feedback: BaseFeedback, now: float) -> float:
+        """Return when feedback was sent, never before the one that came before it; `now` if another clock says when.
+
+        After a delay of this process many wait, of which each but the last is old: their times are as good as ever.
+        """
+        if feedback.at is not None and feedback.at > now:
+            self._shares_clock = False
+        sent_at = now if feedback.at is None or not self._shares_clock else feedback.at
+        self._sent_at = max(sent_at, self._sent_at)
+        return self._sent_at
 
     def _lost(self, reason: str) -> None:
         if reason != self._last_logged:

@@ -85,6 +85,15 @@ def test_twin_rooms_are_kept_as_hypotheses_by_a_search_until_the_drive_decides()
     assert not one.active
 
 
+def test_single_place_that_the_last_scan_contradicts_is_not_called_several_that_look_alike(monkeypatch):
+    one = Relocalization(CONFIG)
+    monkeypatch.setattr(one, "_hypotheses", Hypotheses([Hypothesis(TRUE, -0.1, misfits=1)], ORIGIN))
+    outcome = one.outcome(0.0)
+    assert outcome.pose is None
+    assert "the last scan does not fit the only place of the map that is left" in outcome.detail
+    assert "fognav robot turn" in outcome.detail
+
+
 def test_search_without_any_place_may_begin_again_after_ten_seconds_only():
     one = Relocalization(CONFIG)
     rng = np.random.default_rng(1)

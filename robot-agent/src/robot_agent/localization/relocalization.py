@@ -92,10 +92,13 @@ class Relocalization:
             return Outcome(None, hypotheses.odom, "the scan fits no place of the map: give the initial pose")
         found = hypotheses.decided
         if found is None:
-            detail = (
-                f"{len(hypotheses.contenders)} places of the map look like this one: let the robot turn or advance"
-                " (`fognav robot turn`), or give the initial pose"
-            )
-            return Outcome(None, hypotheses.odom, detail)
+            return Outcome(None, hypotheses.odom, _undecided(len(hypotheses.contenders)))
         self.cancel()
         return Outcome(found, hypotheses.odom)
+
+
+def _undecided(contenders: int) -> str:
+    """Return why the scans do not decide; a single place that is left has just been contradicted by one."""
+    alike = f"{contenders} places of the map look like this one"
+    why = alike if contenders > 1 else "the last scan does not fit the only place of the map that is left"
+    return f"{why}: let the robot turn or advance (`fognav robot turn`), or give the initial pose"

@@ -367,6 +367,15 @@ def test_looking_around_ends_after_its_way_after_its_time_and_when_nothing_moves
     assert any(f"longer than {longest:.0f} s" in reason for reason in gate.out.reasons)
 
 
+@pytest.mark.parametrize("kind", ["turn", "advance"])
+def test_looking_around_that_goes_the_wrong_way_ends_and_says_so_by_its_name(kind):
+    gate = Gate(enabled=False, localization="lost")
+    gate.run(request=kind, maneuver_remaining=1.0)
+    gate.run(maneuver_remaining=0.5)
+    reasons = gate.run(maneuver_remaining=0.65).reasons
+    assert any(f"the robot moved away from the end of the {kind}" in reason for reason in reasons)
+
+
 def test_latched_fault_and_known_place_refuse_looking_around():
     assert "knows where it is" in Gate().run(request="turn", maneuver_remaining=1.0).refusal
     gate = Gate()

@@ -155,7 +155,7 @@ def test_distance_to_the_edge_must_shrink():
     gate.remaining += 0.09
     assert gate.run().mode == "EGRESS"
     gate.remaining += 0.04
-    assert "moved away" in "; ".join(gate.run().reasons)
+    assert "moved away from the end of the egress" in "; ".join(gate.run().reasons)
 
 
 def test_egress_without_a_way_out_ends_after_ten_seconds():

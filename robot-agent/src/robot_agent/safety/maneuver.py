@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 class Maneuver(msgspec.Struct, frozen=True):
-    """A maneuver that runs: since when (s), the smallest distance to go so far (m), and when it last shrank (s)."""
+    """A maneuver that runs: since when (s), the least that was left of it (m, of a turn rad), and since when (s)."""
 
     since: float
     best: float
@@ -61,7 +61,7 @@ def proceed(
 ) -> Maneuver | End:
     """Return the maneuver as it goes on at `now` (s, monotonic), or why it ends.
 
-    findings: those of the relevant inputs. The distance to go must shrink steadily. The time counts from when the lidar
+    findings: those of the relevant inputs. What is left must shrink steadily. The time counts from when the lidar
     runs.
     """
     rules = RULES[maneuver.kind]
@@ -83,7 +83,7 @@ def _progress(maneuver: Maneuver, inputs: SafetyInputs, now: float, config: Safe
     if maneuver.kind == "dock":
         return maneuver  # the base's own program finds its way
     if not remaining <= maneuver.best + config.egress_back:
-        return End("the robot moved away from the way out")
+        return End(f"the robot moved away from the end of {RULES[maneuver.kind].name}")
     if remaining < maneuver.best - config.egress_step:
         return replace(maneuver, best=remaining, shrank_at=now)
     if now - maneuver.shrank_at >= config.egress_stall:

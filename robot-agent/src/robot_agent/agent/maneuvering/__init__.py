@@ -1,1 +1,1 @@
-"""Maneuvers beside the path: to the dock, out of a blocked area, straight back. Pure."""
+"""Maneuvers beside the path: to the dock and off it, out of a blocked area, back from a bump, to look around. Pure."""

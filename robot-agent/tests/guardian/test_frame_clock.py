@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from robot_agent.guardian.frame_clock import EARLIER_S, FRAMES, LATER_S, UNKNOWN_S, FrameClock
 
 FRAME_S = 0.015
-SETTLED_S = 2.0
 END_S = 6.0
 WAKING_S = 0.0015
 """By so much the kernel, which counts in milliseconds, wakes a process late."""
@@ -50,13 +49,13 @@ def looks_at(base, frame_s=FRAME_S, seed=0):
 
 
 def delays(base, looks):
-    """Return how long each frame waited for its look, once the clock has settled."""
+    """Return how long each frame waited for its look."""
     following = iter(looks)
     look, waits = next(following), []
     for at in base.whole:
         while look < at:
             look = next(following, math.inf)
-        if at > SETTLED_S and look < math.inf:
+        if look < math.inf:
             waits.append(look - at)
     return waits
 

@@ -96,6 +96,7 @@ def test_channel_row_is_consistent(channel):
     if channel.rate_hz is not None:
         assert channel.period_s == pytest.approx(1 / channel.rate_hz)
         assert channel.max_age_s > channel.period_s, "stale between two messages of the normal rate"
+        assert channel.max_age_s > channel.idle_period_s >= channel.period_s
     else:
         assert channel.period_s == math.inf
 

@@ -112,6 +112,11 @@ def test_document_row_shows_the_channels_properties():
     )
 
 
+def test_document_row_shows_the_rate_of_an_idle_publisher():
+    line = next(line for line in channels_markdown({}).splitlines() if "/pose`" in line)
+    assert "| 10 Hz, idle 2.5 Hz |" in line
+
+
 def test_routes_are_listed_with_parameters_responses_and_token():
     lines = channels_markdown({"map-service": OPENAPI}).splitlines()
     assert (

@@ -58,17 +58,18 @@ class SafetyConfig:
     stops_to_fault: int = 3
     stops_within: float = 60.0
     late: float = 0.15
-    """The agent streams every 0.05 s; when it did not for this long, its computer ran it too late."""
+    """The agent streams every 0.05 s, idle every 0.1 s; when it did not for this long, its computer ran it too late."""
     late_explains: float = 0.5
     """For how long such a delay explains old sensor data: until another scan and messages of the guardian are in."""
     ramp: float = 0.5
     """Time in which a ramp brings the fastest possible wheel to rest."""
     egress_max: float = 60.0
     egress_stall: float = 10.0
-    """How long the way out may not become shorter by `egress_step` (m): planning and turning take some seconds."""
+    """How long what is left of a maneuver may not shrink by `egress_step`: planning and turning take some seconds."""
     egress_step: float = 0.05
+    """m, of a turn rad."""
     egress_back: float = 0.10
-    """By how much (m) the way out may become longer again: the pose's noise."""
+    """By how much (m, of a turn rad) what is left may grow again: the pose's noise."""
     egress_end: float = 0.05
     """The way out is driven to within this (m) of its end."""
     dock_max: float = 60.0

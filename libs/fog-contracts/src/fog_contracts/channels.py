@@ -58,8 +58,9 @@ class Channel:
     request (None: text, or a query without a request), and `reply` the type of the reply; publishers of a query answer
     it, subscribers send it. A published zenoh channel of durability `latest` can also be queried for its latest
     message, without a request.
-    `limit` and `reply_limit` are in bytes. `rate_hz` is the rate in normal operation (None: on change). A value that
-    arrived more than `max_age_s` ago is stale (infinite: it holds until the next, or the message says how long).
+    `limit` and `reply_limit` are in bytes. `rate_hz` is the rate in normal operation (None: on change), `idle_hz` that
+    of a publisher with nothing new to tell (None: the same). A value that arrived more than `max_age_s` ago is stale
+    (infinite: it holds until the next, or the message says how long).
     """
 
     name: str
@@ -76,6 +77,7 @@ class Channel:
     reply: type[m.Message] | None = None
     reply_limit: int = 0
     rate_hz: float | None = None
+    idle_hz: float | None = None
     max_age_s: float = math.inf
     qos: Literal[0, 1] = 0
     values: tuple[str, ...] = ()
@@ -98,6 +100,11 @@ class Channel:
     def period_s(self) -> float:
         """Seconds between two messages in normal operation; infinite for what is published on change only."""
         return math.inf if self.rate_hz is None else 1.0 / self.rate_hz
+
+    @property
+    def idle_period_s(self) -> float:
+        """Seconds between two messages of a publisher with nothing new to tell."""
+        return self.period_s if self.idle_hz is None else 1.0 / self.idle_hz
 
     def key(self, **ids: str) -> str:
         """Return the topic or key with these ids; raises `ValueError` for a missing, unknown or malformed id."""
@@ -242,7 +249,8 @@ ROBOT_RELEASE     = _pub(  "robot_release",     FOG + "robots/{robot}/release", 
     publishers=(PLANNER,), subscribers=(ROBOT, CONSOLE),   durability=VOLATILE, rate_hz=2, max_age_s=1.5,
     epoch="planner_epoch")
 ROBOT_POSE        = _pub(  "robot_pose",        FOG + "robots/{robot}/pose",      m.RobotPose,      limit=KIB,
-    publishers=(ROBOT,), subscribers=(AGGREGATOR, MAP, PLANNER, CONSOLE), durability=VOLATILE, rate_hz=10, max_age_s=1)
+    publishers=(ROBOT,), subscribers=(AGGREGATOR, MAP, PLANNER, CONSOLE), durability=VOLATILE, rate_hz=10,
+    idle_hz=2.5, max_age_s=1)
 ROBOT_STATE       = _pub(  "robot_state",       FOG + "robots/{robot}/state",     m.RobotState,     limit=16 * KIB,
     publishers=(ROBOT,), subscribers=(MAP, PLANNER, CONSOLE), durability=VOLATILE, rate_hz=1, max_age_s=3)
 ROBOT_OBSTACLES   = _pub(  "robot_obstacles",   FOG + "robots/{robot}/obstacles", m.RobotObstacles, limit=64 * KIB,

@@ -25,7 +25,7 @@ Maneuver = Literal["seek_dock", "leave_dock", "back_off"]
 
 
 class WheelCommand(Struct, frozen=True, kw_only=True):
-    """Wheel speeds that the agent requests (m/s), 20 times a second; `seq` grows by one with each.
+    """Wheel speeds that the agent requests (m/s), 20 times a second, 10 times when idle; `seq` grows by one with each.
 
     `reset` passes on an operator's authenticated reset: the guardian clears a latched fault and wakes the base again.
     `maneuver` goes on as long as it is asked for. `rest`: the base may sleep until a command without it.

@@ -45,7 +45,8 @@ if TYPE_CHECKING:
 RESTING_S: Final = LONGEST_S
 """Period while no wheel turns; but a command of the agent is applied at once, and comes a little more often."""
 AGENT_LIVES_S: Final = 1.0
-"""An agent sends a command every 0.05 s; one that was silent for longer than this hangs: another may take its place."""
+"""An agent sends a command every 0.05 s, an idle one every 0.1 s; one that was silent for longer than this hangs, and
+another may take its place."""
 REFUSE_S: Final = 2.0
 PACKETS_PER_CYCLE: Final = 64
 """Limit per cycle: a flood of packets must not block the sensors."""

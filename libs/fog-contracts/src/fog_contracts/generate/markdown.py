@@ -207,7 +207,8 @@ def _names(roles: Sequence[Role]) -> str:
 
 
 def _rate(row: Channel) -> str:
-    return "on change" if row.rate_hz is None else f"{row.rate_hz:g} Hz"
+    idle = "" if row.idle_hz is None else f", idle {row.idle_hz:g} Hz"
+    return "on change" if row.rate_hz is None else f"{row.rate_hz:g} Hz{idle}"
 
 
 def _age(row: Channel) -> str:

@@ -20,8 +20,10 @@ if TYPE_CHECKING:
 ALONG_LEAST_M: Final = 0.15
 """A smaller deviation needs no care: scans have observed it."""
 _ACROSS_MOST_M: Final = 0.3
-_GAP_SIGMAS: Final = 0.25
-"""Neighbours on the line that lie so many of all particles' deviations apart belong to two clouds, ..."""
+_GAP_SIGMAS: Final = 0.5
+_GAP_M: Final = 1.0
+"""Neighbours on the line that lie so many of all particles' deviations and metres apart belong to two clouds, ... In
+plain corridors of 100 m a single cloud falls into clumps 0.5 to almost 1 m apart; in longer ones even farther."""
 _CLOUDS_SHARE: Final = 0.85
 """... but are several places only if the clouds' means hold more than this share of the variance: the halves of a
 normal cloud hold 0.64, and a few stray particles beside it add to that."""
@@ -120,7 +122,8 @@ def _in_several_clouds(along: NDArray[np.float32], weights: NDArray[np.float64])
     places, shares = along[order].astype(np.float64), weights[order] / weights[order].sum()
     places -= shares @ places
     variance = float(shares @ np.square(places))
-    number = np.concatenate(([0], np.cumsum(np.diff(places) > _GAP_SIGMAS * math.sqrt(variance))))
+    least = max(_GAP_M, _GAP_SIGMAS * math.sqrt(variance))
+    number = np.concatenate(([0], np.cumsum(np.diff(places) > least)))
     means = np.bincount(number, shares * places) / np.bincount(number, shares)
     return float(shares @ np.square(means[number])) > _CLOUDS_SHARE * variance
 

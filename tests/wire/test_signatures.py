@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import re
 
 import numpy as np
 import pytest
@@ -76,6 +77,9 @@ def test_a_damaged_beginning_hides_no_device(name):
 @given(st.binary(max_size=600))
 def test_noise_is_nobody(data):
     assume(b"\xa5\x5a" not in data)  # with five more bytes that is a lidar's descriptor
+    assume(
+        not re.search(rb"[A-Za-z]{4}", data)
+    )  # a base that starts sends text, and Hypothesis tries the words of sources
     assert not any(each.recognizes(data) for each in SIGNATURES.values())
     assert foreign("roomba600", data, SIGNATURES) is None
 
